@@ -1,0 +1,20 @@
+"""Finds the MJCF files: in a checkout they lie in `assets/`, in a wheel inside the package."""
+
+from pathlib import Path
+
+_PACKAGE = Path(__file__).parent
+
+
+def asset_path(name: str) -> Path:
+    """Path of the MJCF file `name`.
+
+    Args:
+        name: file name, such as `cartpole.xml`.
+
+    Raises:
+        FileNotFoundError: neither the checkout nor the wheel has it.
+    """
+    for folder in (_PACKAGE / "_assets", _PACKAGE.parent / "assets"):
+        if (folder / name).is_file():
+            return folder / name
+    raise FileNotFoundError(f"no model {name!r} beside codrl_mj in {_PACKAGE}: the installation is incomplete")

@@ -1,0 +1,5 @@
+"""Thin shells that turn a task and its physics into the environments that agents know."""
+
+from codrl_mj.envs.single import ActuatedEnv
+
+__all__ = ["ActuatedEnv"]

@@ -1,0 +1,180 @@
+"""One environment, as Gymnasium knows it."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from codrl_mj.motor import Actuator, check_stable, resolve
+from codrl_mj.physics import PHYSICS, MujocoPhysics, Physics
+from codrl_mj.physics.base import check_integrator, inner_step_count
+from codrl_mj.physics.offscreen import OffscreenRenderer
+from codrl_mj.tasks import Task, find_task
+
+
+class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
+    """A classic-control task whose actions go through an actuator.
+
+    Observation, action, reward, start and end are Gymnasium's for the task; what differs is the force: the action
+    chooses the desired one, the actuator delivers the actual one. With `actuator="ideal"` they are equal and the
+    environment is a drop-in for Gymnasium's.
+
+    Every step's `info` has `desired_force`, `actual_force` [N or N*m], `current`, `reference_current` [A], `voltage`
+    [V] (NaN where the actuator is ideal) and `saturated` (bool), each at the end of the step.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - as Gymnasium has it
+
+    def __init__(
+        self,
+        task: str,
+        actuator: str | Actuator | Mapping[str, Any] | None = "paper",
+        physics: str = "mujoco",
+        integrator: str | None = None,
+        inner_steps: int | None = None,
+        timestep: float | None = None,
+        allow_unstable: bool = False,
+        render_mode: str | None = None,
+        width: int = 480,
+        height: int = 480,
+        camera: str = "fixed",
+        pretty: bool = False,
+        **options: float,
+    ) -> None:
+        """Build the environment.
+
+        Args:
+            task: the task's name, such as `cartpole`.
+            actuator: a name (`ideal`, `paper`, `weak`, `weaker`, `open_loop`), an `Actuator`, or a mapping of its
+                fields.
+            physics: `mujoco`, or `analytic` (Gymnasium's own equations).
+            integrator: one of the task's integrators; the default is Gymnasium's.
+            inner_steps: integration steps per environment step; the default is the paper's inner loop with a motor and
+                one without.
+            timestep: instead of `inner_steps`, the integration step [s], which must divide the environment step.
+            allow_unstable: build the environment even if the current loop is unstable.
+            render_mode: None or `rgb_array`.
+            width: width of rendered images [px].
+            height: height of rendered images [px].
+            camera: a camera of the model: `fixed` or `close`.
+            pretty: shadows, reflections and multisampling.
+            **options: the task's own options (CartPole: `center_radius`).
+
+        Raises:
+            ValueError: an argument is unknown or out of bounds, or the current loop is unstable; the message names it.
+            CallbackInUseError: another library's MuJoCo callback is installed.
+        """
+        self.task: Task = find_task(task)
+        self.actuator: Actuator | None = resolve(actuator, self.task.name)
+        self.options = _options(self.task, options)
+        self.inner_steps = inner_step_count(self.task, self.actuator, inner_steps, timestep)
+        self.integrator = check_integrator(self.task, integrator)
+        if self.actuator is not None and not allow_unstable:
+            check_stable(self.actuator, self.task.step_duration / self.inner_steps)
+        if physics not in PHYSICS:
+            raise ValueError(f"physics = {physics!r}: must be one of {', '.join(PHYSICS)}")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode = {render_mode!r}: must be None or 'rgb_array'")
+        self.physics: Physics = PHYSICS[physics](self.task, self.actuator, self.inner_steps, self.integrator)
+        self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": round(1 / self.task.step_duration)}
+        self._view = {"width": width, "height": height, "camera": camera, "pretty": pretty}
+        self._renderer: OffscreenRenderer | None = None
+        self._drawn: MujocoPhysics | None = None
+        self.action_space = self.task.action_space
+        self.observation_space = self.task.observation_space
+
+    @property
+    def model(self) -> Any:
+        """The `mujoco.MjModel` (MuJoCo physics only); one `mj_step` of it is one integration step."""
+        return self._mujoco_physics().model
+
+    @property
+    def data(self) -> Any:
+        """The `mujoco.MjData` (MuJoCo physics only)."""
+        return self._mujoco_physics().data
+
+    @property
+    def state(self) -> np.ndarray:
+        """The mechanical state, shape (n,), float64, in Gymnasium's order."""
+        return self.physics.state.copy()
+
+    def _mujoco_physics(self) -> MujocoPhysics:
+        if not isinstance(self.physics, MujocoPhysics):
+            raise AttributeError("physics='analytic' has no MuJoCo model or data; use physics='mujoco'")
+        return self.physics
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode; the motor is at rest.
+
+        Args:
+            seed: seed of the initial state; the same seed draws the state that Gymnasium's environment draws.
+            options: Gymnasium's reset options for the task (CartPole: the bounds `low` and `high`).
+        """
+        super().reset(seed=seed)
+        self.physics.reset(self.task.initial(self.np_random, options))
+        return self.task.observation(self.physics.state), {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Advance by one environment step.
+
+        Args:
+            action: an element of the action space.
+
+        Raises:
+            ValueError: the action is not in the action space.
+            SimulationDivergedError: the simulation left the finite numbers.
+        """
+        if not self.action_space.contains(action):
+            raise ValueError(f"action = {action!r}: not in {self.action_space}")
+        state = self.physics.state
+        signals = self.physics.step(float(self.task.desired_force(np.asarray(action))))
+        next_state = self.physics.state
+        reward = self.task.reward(state, np.asarray(signals.actual_force), next_state, self.options)
+        terminated = bool(self.task.terminated(next_state))
+        return self.task.observation(next_state), float(reward), terminated, False, signals._asdict()
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """The present state as an image, shape (height, width, 3), uint8; None if there is no render mode.
+
+        Raises:
+            RenderingUnavailableError: no OpenGL context can be made here; the message has the remedy.
+        """
+        if self.render_mode is None:
+            gymnasium.logger.warn("render() without a render mode: pass render_mode='rgb_array' when making it")
+            return None
+        if self._drawn is None:  # the analytic physics is drawn with the task's ideal model
+            own = self.physics
+            self._drawn = own if isinstance(own, MujocoPhysics) else MujocoPhysics(self.task, None, 1, self.integrator)
+            self._renderer = OffscreenRenderer(self._drawn.model, **self._view)  # type: ignore[arg-type]
+        assert self._renderer is not None
+        self._drawn.show(self.physics.state)
+        return self._renderer.render(self._drawn.data)
+
+    def close(self) -> None:
+        """Free the OpenGL context."""
+        if self._renderer is not None:
+            self._renderer.close()
+        self._renderer = self._drawn = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the renderer, which a copy makes anew."""
+        return self.__dict__ | {"_renderer": None, "_drawn": None}
+
+
+def _options(task: Task, given: Mapping[str, float]) -> Any:
+    """The task's options, checked.
+
+    Raises:
+        ValueError: unknown option, or one that is not a number > 0.
+    """
+    known = task.options._fields
+    for name, value in given.items():
+        if name not in known:
+            raise ValueError(f"unknown option {name!r} of {task.name}: it has {', '.join(known) or 'none'}")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
+            raise ValueError(f"{name} = {value!r}: must be a number > 0")
+    return task.options(**{name: float(value) for name, value in given.items()})

@@ -1,0 +1,21 @@
+"""The actuator as mathematics: parameters, one step of the current loop, stability, named actuators. No MuJoCo."""
+
+from codrl_mj.motor.catalog import NAMED, named_actuator, resolve
+from codrl_mj.motor.current_loop import advance
+from codrl_mj.motor.parameters import Actuator, CurrentLoop, Motor, from_vector, to_vector
+from codrl_mj.motor.stability import check_stable, closed_loop_matrix, spectral_radius
+
+__all__ = [
+    "NAMED",
+    "Actuator",
+    "CurrentLoop",
+    "Motor",
+    "advance",
+    "check_stable",
+    "closed_loop_matrix",
+    "from_vector",
+    "named_actuator",
+    "resolve",
+    "spectral_radius",
+    "to_vector",
+]

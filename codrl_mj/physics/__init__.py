@@ -1,0 +1,20 @@
+"""Simulation of a task: in MuJoCo or on Gymnasium's analytic dynamics, behind one small interface."""
+
+from codrl_mj.physics.analytic import AnalyticPhysics
+from codrl_mj.physics.base import Physics, Signals, SimulationDivergedError
+from codrl_mj.physics.mjcf import motors, set_actuator
+from codrl_mj.physics.mujoco_single import MujocoPhysics
+
+PHYSICS: dict[str, type[AnalyticPhysics] | type[MujocoPhysics]] = {"mujoco": MujocoPhysics, "analytic": AnalyticPhysics}
+"""The physics that an environment can be built on."""
+
+__all__ = [
+    "PHYSICS",
+    "AnalyticPhysics",
+    "MujocoPhysics",
+    "Physics",
+    "Signals",
+    "SimulationDivergedError",
+    "motors",
+    "set_actuator",
+]

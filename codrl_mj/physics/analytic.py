@@ -1,0 +1,90 @@
+"""A task on the installed Gymnasium environment, unmodified, driven with an arbitrary force through its attributes."""
+
+from typing import Any, Protocol
+
+import gymnasium
+import numpy as np
+
+from codrl_mj.motor import Actuator, advance, to_vector
+from codrl_mj.physics.base import Signals, check_finite, ideal_signals, motor_signals
+from codrl_mj.tasks import Task
+
+
+class Driver(Protocol):
+    """Drives one Gymnasium environment class by one integration step at a time."""
+
+    speed: int
+    """Index of the actuated body's velocity in the state."""
+
+    def __call__(self, env: Any, state: np.ndarray, force: float, timestep: float, integrator: str) -> np.ndarray:
+        """The state one integration step later."""
+
+
+class CartPoleDriver:
+    """`CartPoleEnv`: the force magnitude, the time step and the integrator are attributes."""
+
+    speed = 1
+
+    def __call__(self, env: Any, state: np.ndarray, force: float, timestep: float, integrator: str) -> np.ndarray:
+        """One `step` with `force_mag` set to the force."""
+        env.force_mag = force
+        env.tau = timestep
+        env.kinematics_integrator = integrator
+        env.state = state
+        env.steps_beyond_terminated = None  # the end of an episode is the task's to judge
+        env.step(1)
+        return env.state
+
+
+DRIVERS: dict[str, Driver] = {"cartpole": CartPoleDriver()}
+"""The driver of each task's Gymnasium environment."""
+
+
+class AnalyticPhysics:
+    """A task on Gymnasium's own equations. See `codrl_mj.physics.base.Physics`."""
+
+    def __init__(self, task: Task, actuator: Actuator | None, inner_steps: int, integrator: str) -> None:
+        """Make the Gymnasium environment."""
+        self.task = task
+        self.actuator = actuator
+        self.inner_steps = inner_steps
+        self._integrator = integrator
+        self._timestep = task.step_duration / inner_steps
+        self._env = gymnasium.make(task.gymnasium_id, disable_env_checker=True).unwrapped
+        self._driver = DRIVERS[task.name]
+        self._parameters = None if actuator is None else to_vector(actuator)
+        self.reset(np.zeros(len(task.state_names)))
+
+    def reset(self, state: np.ndarray) -> None:
+        """Start an episode from `state`, with the motor at rest."""
+        self.state = np.array(state, dtype=np.float64)
+        self._loop = (0.0, 0.0, 0.0)  # current, integral, previous error
+        self._time = 0.0
+
+    def step(self, desired_force: float) -> Signals:
+        """Advance by one environment step, with the desired force (at most the task's `max_force`) held over it.
+
+        Raises:
+            SimulationDivergedError: the state is no longer finite.
+        """
+        signals = ideal_signals(desired_force)
+        for _ in range(self.inner_steps):
+            if self.actuator is not None:
+                signals = self._motor(self.actuator, desired_force, float(self.state[self._driver.speed]))
+            self.state = self._driver(self._env, self.state, signals.actual_force, self._timestep, self._integrator)
+            self._time += self._timestep
+        check_finite(self.task, self.state, self._time)
+        return signals
+
+    def _motor(self, actuator: Actuator, desired_force: float, speed: float) -> Signals:
+        """Advance the loop by one integration step."""
+        arm = actuator.motor.arm_radius
+        *loop, voltage = advance(
+            self._parameters,  # type: ignore[arg-type]
+            self._timestep,
+            *self._loop,
+            desired_torque=desired_force * arm,
+            speed=speed / arm,
+        )
+        self._loop = tuple(loop)  # type: ignore[assignment]
+        return motor_signals(actuator, desired_force, self._loop[0], voltage)

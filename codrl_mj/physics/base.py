@@ -1,0 +1,124 @@
+"""The small interface behind which a task is simulated."""
+
+import math
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from codrl_mj.motor import Actuator
+from codrl_mj.tasks import Task
+
+
+class Signals(NamedTuple):
+    """What the actuator did during one environment step; values at the end of its last integration step."""
+
+    desired_force: float
+    """Force asked for [N], or torque [N*m]."""
+    actual_force: float
+    """Force delivered [N], or torque [N*m]."""
+    current: float
+    """Motor current [A]; NaN for the ideal actuator, which has none."""
+    reference_current: float
+    """Current asked for [A]; NaN for the ideal actuator."""
+    voltage: float
+    """Terminal voltage [V]; NaN for the ideal actuator."""
+    saturated: bool
+    """Whether the voltage was at its limit."""
+
+
+def ideal_signals(desired_force: float) -> Signals:
+    """The signals of an ideal actuator: it delivers what is desired, and has no current and no voltage."""
+    return Signals(desired_force, desired_force, math.nan, math.nan, math.nan, False)
+
+
+def motor_signals(actuator: Actuator, desired_force: float, current: float, voltage: float) -> Signals:
+    """The signals of a motor that was asked for `desired_force` and has reached `current` under `voltage`."""
+    motor = actuator.motor
+    return Signals(
+        desired_force=desired_force,
+        actual_force=motor.torque_constant * current / motor.arm_radius,
+        current=current,
+        reference_current=desired_force * motor.arm_radius / motor.torque_constant,
+        voltage=voltage,
+        saturated=abs(voltage) >= actuator.controller.max_voltage,
+    )
+
+
+class Physics(Protocol):
+    """One simulation of one task."""
+
+    state: np.ndarray
+    """The mechanical state in the task's order, shape (n,), float64; a new array after every step."""
+
+    def reset(self, state: np.ndarray) -> None:
+        """Start an episode from `state`, with the motor at rest: no current, no integral, no past error."""
+
+    def step(self, desired_force: float) -> Signals:
+        """Advance by one environment step, with the desired force (at most the task's `max_force`) held over it.
+
+        Raises:
+            SimulationDivergedError: the state is no longer finite.
+        """
+
+
+class SimulationDivergedError(ArithmeticError):
+    """A simulation left the finite numbers."""
+
+
+def check_finite(task: Task, state: np.ndarray, time: float) -> None:
+    """Raise if `state` is not finite, saying which entry of which task and when.
+
+    Raises:
+        SimulationDivergedError: as it says.
+    """
+    if np.isfinite(state).all():
+        return
+    broken = ", ".join(f"{n} = {v}" for n, v in zip(task.state_names, state, strict=True) if not np.isfinite(v))
+    raise SimulationDivergedError(
+        f"{task.name}: the simulation diverged at t = {time:g} s: {broken}. Reset the environment; if this repeats, "
+        "shorten the integration step (inner_steps) or lower the gains"
+    )
+
+
+def inner_step_count(task: Task, actuator: Actuator | None, inner_steps: int | None, timestep: float | None) -> int:
+    """Integration steps in one environment step.
+
+    Args:
+        task: the task, whose `step_duration` they divide.
+        actuator: with a motor the default is the paper's inner loop, without one Gymnasium's single step.
+        inner_steps: their number, or None.
+        timestep: the integration step [s], or None; give at most one of the two.
+
+    Raises:
+        ValueError: both were given, the number is below 1, or the timestep does not divide the environment step.
+    """
+    if inner_steps is not None and timestep is not None:
+        raise ValueError(f"inner_steps = {inner_steps} and timestep = {timestep:g}: give one of them, not both")
+    if timestep is not None:
+        if not (math.isfinite(timestep) and timestep > 0):
+            raise ValueError(f"timestep = {timestep}: must be a finite number > 0 [s]")
+        count = round(task.step_duration / timestep)
+        if count < 1 or not math.isclose(count * timestep, task.step_duration, rel_tol=1e-9):
+            raise ValueError(
+                f"timestep = {timestep:g} s does not divide {task.name}'s environment step of "
+                f"{task.step_duration:g} s: the ratio is {task.step_duration / timestep:.6g}, must be an integer >= 1"
+            )
+        return count
+    if inner_steps is None:
+        return 1 if actuator is None else task.motor_inner_steps
+    if isinstance(inner_steps, bool) or not isinstance(inner_steps, int) or inner_steps < 1:
+        raise ValueError(f"inner_steps = {inner_steps!r}: must be an integer >= 1")
+    return inner_steps
+
+
+def check_integrator(task: Task, integrator: str | None) -> str:
+    """The integrator's name, defaulting to Gymnasium's.
+
+    Raises:
+        ValueError: the task has no such integrator.
+    """
+    if integrator is None:
+        return task.integrators[0]
+    if integrator not in task.integrators:
+        raise ValueError(f"integrator = {integrator!r}: {task.name} has {', '.join(task.integrators)}")
+    return integrator

@@ -1,0 +1,84 @@
+"""Puts an `Actuator` into an MJCF actuator, and reads it back."""
+
+import mujoco
+import numpy as np
+
+from codrl_mj.assets import asset_path
+from codrl_mj.callbacks import ACT_NAMES
+from codrl_mj.motor import Actuator, from_vector, to_vector
+from codrl_mj.motor.parameters import PARAMETER_NAMES, SIGNATURE
+from codrl_mj.tasks import Task
+
+
+def set_actuator(target: mujoco.MjsActuator, actuator: Actuator | None, max_force: float | None) -> None:
+    """Make an actuator of an `MjSpec` one of our motors, or an ideal one.
+
+    Call `codrl_mj.callbacks.install()` before simulating a model that holds our motors.
+
+    Args:
+        target: the actuator, with its joint transmission set; its gear, dynamics, gain, bias, range and user data are
+            overwritten.
+        actuator: motor and current loop; None makes a plain `<motor>` of gear 1.
+        max_force: limit of the desired force [N] or torque [N*m] at the joint; None for no limit.
+    """
+    ideal = actuator is None
+    arm = 1.0 if actuator is None else actuator.motor.arm_radius
+    target.gear = [1.0 / arm, 0, 0, 0, 0, 0]
+    target.ctrllimited = int(max_force is not None)
+    target.ctrlrange = [0.0, 0.0] if max_force is None else [-max_force * arm, max_force * arm]
+    target.dyntype = mujoco.mjtDyn.mjDYN_NONE if ideal else mujoco.mjtDyn.mjDYN_USER
+    target.actdim = 0 if ideal else len(ACT_NAMES)
+    target.gaintype = mujoco.mjtGain.mjGAIN_FIXED
+    target.gainprm = [float(ideal)] + [0.0] * (mujoco.mjNGAIN - 1)
+    target.biastype = mujoco.mjtBias.mjBIAS_NONE if ideal else mujoco.mjtBias.mjBIAS_USER
+    target.userdata = [] if actuator is None else to_vector(actuator)
+
+
+def motors(model: mujoco.MjModel) -> dict[int, Actuator]:
+    """Our motors in a compiled model.
+
+    Args:
+        model: any MuJoCo model.
+
+    Returns:
+        The actuator (motor, arm, controller) by actuator index, in order.
+
+    Raises:
+        ValueError: an actuator carries our signature but not our layout, or a parameter out of bounds; or it uses
+            MuJoCo's actuator delay, which the callback does not see.
+    """
+    found = {}
+    for index in range(model.nactuator):
+        user = model.actuator_user[index]
+        if len(user) == 0 or user[0] != SIGNATURE:
+            continue
+        name = model.actuator(index).name or f"actuator {index}"
+        expected = {
+            "dyntype": (model.actuator_dyntype[index], mujoco.mjtDyn.mjDYN_USER, 'dyntype="user"'),
+            "biastype": (model.actuator_biastype[index], mujoco.mjtBias.mjBIAS_USER, 'biastype="user"'),
+            "actdim": (model.actuator_actnum[index], len(ACT_NAMES), f'actdim="{len(ACT_NAMES)}"'),
+            "delay": (model.actuator_delay[index], 0.0, 'delay="0"'),
+        }
+        for field, (value, wanted, remedy) in expected.items():
+            if value != wanted:
+                raise ValueError(f"{name}: {field} = {value:g}: a motor of codrl_mj needs {remedy}")
+        gear = model.actuator_gear[model.actuator_outadr[index]]
+        if not gear[0] > 0 or np.any(gear[1:]):
+            raise ValueError(f"{name}: gear = {gear}: a motor of codrl_mj needs gear = 1/arm > 0 and no other entry")
+        try:
+            found[index] = from_vector(user[: len(PARAMETER_NAMES)], 1.0 / gear[0])
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
+    return found
+
+
+def task_model(task: Task, actuator: Actuator | None, timestep: float) -> mujoco.MjModel:
+    """Compile a task's model with the given actuator and integration step.
+
+    A diverging simulation is left to diverge, so that it can be reported, instead of being reset by the engine.
+    """
+    spec = mujoco.MjSpec.from_file(str(asset_path(task.asset)))
+    spec.option.timestep = timestep
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    set_actuator(spec.actuator("motor"), actuator, task.max_force)
+    return spec.compile()

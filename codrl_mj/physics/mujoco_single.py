@@ -1,0 +1,98 @@
+"""One simulation of a task in MuJoCo, the motor in the control callback."""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from codrl_mj import callbacks
+from codrl_mj.callbacks.kernels import CURRENT, VOLTAGE
+from codrl_mj.motor import Actuator
+from codrl_mj.physics.base import Signals, check_finite, ideal_signals, motor_signals
+from codrl_mj.physics.mjcf import task_model
+from codrl_mj.tasks import Task
+
+
+class MujocoPhysics:
+    """A task's MJCF model and its data. See `codrl_mj.physics.base.Physics`.
+
+    One `mj_step` is one integration step. With CartPole's explicit Euler integrator the positions are then moved by the
+    old velocity instead of the new one, which for slide and hinge joints is exactly Gymnasium's update.
+    """
+
+    def __init__(self, task: Task, actuator: Actuator | None, inner_steps: int, integrator: str) -> None:
+        """Compile the model and install the callbacks if there is a motor."""
+        self.task = task
+        self.actuator = actuator
+        self.inner_steps = inner_steps
+        self._explicit = integrator == "euler"
+        self.model = task_model(task, actuator, task.step_duration / inner_steps)
+        self.data = mujoco.MjData(self.model)
+        self._qpos_order, self._qvel_order = list(task.qpos), list(task.qvel)
+        self._bind()
+        self.reset(np.zeros(len(task.state_names)))
+
+    def _bind(self) -> None:
+        """Take the views that a step uses, and make sure that the callbacks are there."""
+        self._qpos, self._qvel = self.data.qpos, self.data.qvel
+        self._ctrl, self._act = self.data.ctrl, self.data.act
+        if self.actuator is not None:
+            callbacks.install()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the views, which a copy takes of its own data."""
+        return {name: value for name, value in self.__dict__.items() if name not in _VIEWS}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore, in this or another process."""
+        self.__dict__.update(state)
+        self._bind()
+
+    def _read_state(self) -> np.ndarray:
+        state = np.empty(len(self.task.state_names))
+        state[self._qpos_order] = self._qpos
+        state[self._qvel_order] = self._qvel
+        return state
+
+    def reset(self, state: np.ndarray) -> None:
+        """Start an episode from `state`, with the motor at rest."""
+        if self.actuator is not None:
+            callbacks.install()  # raises if somebody replaced ours since the last episode
+        mujoco.mj_resetData(self.model, self.data)
+        self._qpos[:] = state[self._qpos_order]
+        self._qvel[:] = state[self._qvel_order]
+        self.state = self._read_state()
+
+    def show(self, state: np.ndarray) -> None:
+        """Bring the body poses up to date with `state`, for drawing; the motor and the episode are left alone."""
+        self._qpos[:] = state[self._qpos_order]
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+
+    def step(self, desired_force: float) -> Signals:
+        """Advance by one environment step, with the desired force (at most the task's `max_force`) held over it.
+
+        Raises:
+            SimulationDivergedError: the state is no longer finite.
+        """
+        model, data = self.model, self.data
+        arm = 1.0 if self.actuator is None else self.actuator.motor.arm_radius
+        self._ctrl[0] = desired_force * arm
+        if self._explicit:
+            timestep = model.opt.timestep
+            for _ in range(self.inner_steps):
+                moved = self._qpos + timestep * self._qvel
+                mujoco.mj_step(model, data)
+                self._qpos[:] = moved
+        else:
+            mujoco.mj_step(model, data, self.inner_steps)
+        self.state = self._read_state()
+        check_finite(self.task, self.state, data.time)
+        if self.actuator is None:
+            return ideal_signals(desired_force)
+        current, voltage = float(self._act[CURRENT]), float(self._act[VOLTAGE])
+        return motor_signals(self.actuator, desired_force, current, voltage)
+
+
+_VIEWS = ("_qpos", "_qvel", "_ctrl", "_act")

@@ -1,0 +1,74 @@
+"""CartPole: keep a pole upright on a cart that is pushed left or right. Gymnasium's CartPole-v1.
+
+The paper's option: no reward while the cart is farther than `center_radius` from the centre (it uses 0.1 m).
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.classic_control import utils
+
+from codrl_mj.tasks.base import Task
+
+# Gymnasium's CartPole-v1
+FORCE = 10.0  # N
+X_LIMIT = 2.4  # m
+ANGLE_LIMIT = 12 * 2 * np.pi / 360  # rad
+
+
+class Options(NamedTuple):
+    """Options of CartPole."""
+
+    center_radius: float = np.inf
+    """Distance from the centre [m] beyond which a step earns nothing; the paper uses 0.1."""
+
+
+def initial(generator: np.random.Generator, options: dict[str, Any] | None) -> np.ndarray:
+    """Draw the four state entries uniformly from (-0.05, 0.05), or from the reset options' `low` and `high`."""
+    low, high = utils.maybe_parse_reset_bounds(options, -0.05, 0.05)
+    return generator.uniform(low=low, high=high, size=(4,))
+
+
+def desired_force(action: np.ndarray) -> np.ndarray:
+    """Push left at action 0, right at action 1 [N]."""
+    return np.where(action == 1, FORCE, -FORCE)
+
+
+def observation(state: np.ndarray) -> np.ndarray:
+    """The state as float32."""
+    return state.astype(np.float32)
+
+
+def terminated(state: np.ndarray) -> np.ndarray:
+    """The cart has left the track or the pole has fallen past 12 degrees."""
+    return (np.abs(state[..., 0]) > X_LIMIT) | (np.abs(state[..., 2]) > ANGLE_LIMIT)
+
+
+def reward(state: np.ndarray, force: np.ndarray, next_state: np.ndarray, options: Options) -> np.ndarray:
+    """1 a step, the last one included; 0 outside `center_radius`."""
+    return np.where(np.abs(next_state[..., 0]) > options.center_radius, 0.0, 1.0)
+
+
+_HIGH = np.array([X_LIMIT * 2, np.inf, ANGLE_LIMIT * 2, np.inf], dtype=np.float32)
+
+TASK = Task(
+    name="cartpole",
+    gymnasium_id="CartPole-v1",
+    asset="cartpole.xml",
+    step_duration=0.02,
+    motor_inner_steps=1,
+    max_force=FORCE,
+    integrators=("euler", "semi-implicit"),
+    state_names=("x [m]", "x_dot [m/s]", "theta [rad]", "theta_dot [rad/s]"),
+    qpos=(0, 2),
+    qvel=(1, 3),
+    action_space=spaces.Discrete(2),
+    observation_space=spaces.Box(-_HIGH, _HIGH, dtype=np.float32),
+    options=Options,
+    initial=initial,
+    desired_force=desired_force,
+    observation=observation,
+    reward=reward,
+    terminated=terminated,
+)
