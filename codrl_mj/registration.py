@@ -15,6 +15,7 @@ class Registered(NamedTuple):
 
 ENVIRONMENTS: dict[str, Registered] = {
     # limits and thresholds are Gymnasium's for the environments rebuilt
+    "pendulum": Registered("codrl_mj/Pendulum-v0", 200, None),
     "cartpole": Registered("codrl_mj/CartPole-v0", 500, 475.0),
 }
 """Task name -> its registration."""

@@ -78,7 +78,7 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
             raise ValueError(f"render_mode = {render_mode!r}: must be None or 'rgb_array'")
         self.physics: Physics = PHYSICS[physics](self.task, self.actuator, self.inner_steps, self.integrator)
         self.render_mode = render_mode
-        self.metadata = {**self.metadata, "render_fps": round(1 / self.task.step_duration)}
+        self.metadata = {**self.metadata, "render_fps": self.task.render_fps}
         self._view = {"width": width, "height": height, "camera": camera, "pretty": pretty}
         self._renderer: OffscreenRenderer | None = None
         self._drawn: MujocoPhysics | None = None
@@ -122,16 +122,16 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
         """Advance by one environment step.
 
         Args:
-            action: an element of the action space.
+            action: an element of the action space; a continuous one may lie outside its bounds, where the desired
+                force saturates.
 
         Raises:
-            ValueError: the action is not in the action space.
+            ValueError: the action is not in the action space, or not a number.
             SimulationDivergedError: the simulation left the finite numbers.
         """
-        if not self.action_space.contains(action):
-            raise ValueError(f"action = {action!r}: not in {self.action_space}")
+        desired_force = float(self.task.desired_force(self.task.check_action(action)))
         state = self.physics.state
-        signals = self.physics.step(float(self.task.desired_force(np.asarray(action))))
+        signals = self.physics.step(desired_force)
         next_state = self.physics.state
         reward = self.task.reward(state, np.asarray(signals.actual_force), next_state, self.options)
         terminated = bool(self.task.terminated(next_state))

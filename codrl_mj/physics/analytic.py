@@ -11,13 +11,45 @@ from codrl_mj.tasks import Task
 
 
 class Driver(Protocol):
-    """Drives one Gymnasium environment class by one integration step at a time."""
+    """Drives one Gymnasium environment by one integration step at a time."""
 
     speed: int
     """Index of the actuated body's velocity in the state."""
 
-    def __call__(self, env: Any, state: np.ndarray, force: float, timestep: float, integrator: str) -> np.ndarray:
+    def __init__(self, gymnasium_id: str) -> None:
+        """Make the Gymnasium environment."""
+
+    def __call__(self, state: np.ndarray, force: float, timestep: float, integrator: str) -> np.ndarray:
         """The state one integration step later."""
+
+
+def _unwrapped(gymnasium_id: str) -> Any:
+    return gymnasium.make(gymnasium_id, disable_env_checker=True).unwrapped
+
+
+class PendulumDriver:
+    """`PendulumEnv`: the torque limit and the time step are attributes, the action is the torque."""
+
+    speed = 1
+
+    def __init__(self, gymnasium_id: str) -> None:
+        """Make the Gymnasium environment, without a torque limit."""
+        self._env = _unwrapped(gymnasium_id)
+        self._env.max_torque = np.inf
+
+    def __call__(
+        self,
+        state: np.ndarray,
+        force: float,
+        timestep: float,
+        integrator: str,  # noqa: ARG002 - it has one only
+    ) -> np.ndarray:
+        """One `step` with the torque as a float64 action, which Gymnasium does not round."""
+        env = self._env
+        env.dt = timestep
+        env.state = state
+        env.step(np.array([force]))
+        return env.state
 
 
 class CartPoleDriver:
@@ -25,8 +57,13 @@ class CartPoleDriver:
 
     speed = 1
 
-    def __call__(self, env: Any, state: np.ndarray, force: float, timestep: float, integrator: str) -> np.ndarray:
+    def __init__(self, gymnasium_id: str) -> None:
+        """Make the Gymnasium environment."""
+        self._env = _unwrapped(gymnasium_id)
+
+    def __call__(self, state: np.ndarray, force: float, timestep: float, integrator: str) -> np.ndarray:
         """One `step` with `force_mag` set to the force."""
+        env = self._env
         env.force_mag = force
         env.tau = timestep
         env.kinematics_integrator = integrator
@@ -36,7 +73,7 @@ class CartPoleDriver:
         return env.state
 
 
-DRIVERS: dict[str, Driver] = {"cartpole": CartPoleDriver()}
+DRIVERS: dict[str, type[Driver]] = {"pendulum": PendulumDriver, "cartpole": CartPoleDriver}
 """The driver of each task's Gymnasium environment."""
 
 
@@ -50,8 +87,7 @@ class AnalyticPhysics:
         self.inner_steps = inner_steps
         self._integrator = integrator
         self._timestep = task.step_duration / inner_steps
-        self._env = gymnasium.make(task.gymnasium_id, disable_env_checker=True).unwrapped
-        self._driver = DRIVERS[task.name]
+        self._driver = DRIVERS[task.name](task.gymnasium_id)
         self._parameters = None if actuator is None else to_vector(actuator)
         self.reset(np.zeros(len(task.state_names)))
 
@@ -71,7 +107,7 @@ class AnalyticPhysics:
         for _ in range(self.inner_steps):
             if self.actuator is not None:
                 signals = self._motor(self.actuator, desired_force, float(self.state[self._driver.speed]))
-            self.state = self._driver(self._env, self.state, signals.actual_force, self._timestep, self._integrator)
+            self.state = self._driver(self.state, signals.actual_force, self._timestep, self._integrator)
             self._time += self._timestep
         check_finite(self.task, self.state, self._time)
         return signals

@@ -9,6 +9,7 @@ from codrl_mj import callbacks
 from codrl_mj.callbacks.kernels import CURRENT, VOLTAGE
 from codrl_mj.motor import Actuator
 from codrl_mj.physics.base import Signals, check_finite, ideal_signals, motor_signals
+from codrl_mj.physics.constrain import compiled_constrain
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.tasks import Task
 
@@ -17,7 +18,8 @@ class MujocoPhysics:
     """A task's MJCF model and its data. See `codrl_mj.physics.base.Physics`.
 
     One `mj_step` is one integration step. With CartPole's explicit Euler integrator the positions are then moved by the
-    old velocity instead of the new one, which for slide and hinge joints is exactly Gymnasium's update.
+    old velocity instead of the new one, which for slide and hinge joints is exactly Gymnasium's update. Where the task
+    has bounds (`Task.constrain`), the state is put back inside them after every integration step.
     """
 
     def __init__(self, task: Task, actuator: Actuator | None, inner_steps: int, integrator: str) -> None:
@@ -36,6 +38,7 @@ class MujocoPhysics:
         """Take the views that a step uses, and make sure that the callbacks are there."""
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
         self._ctrl, self._act = self.data.ctrl, self.data.act
+        self._constrain = compiled_constrain(self.task.constrain) if self.task.constrain is not None else None
         if self.actuator is not None:
             callbacks.install()
 
@@ -54,13 +57,16 @@ class MujocoPhysics:
         state[self._qvel_order] = self._qvel
         return state
 
+    def _write_state(self, state: np.ndarray) -> None:
+        self._qpos[:] = state[self._qpos_order]
+        self._qvel[:] = state[self._qvel_order]
+
     def reset(self, state: np.ndarray) -> None:
         """Start an episode from `state`, with the motor at rest."""
         if self.actuator is not None:
             callbacks.install()  # raises if somebody replaced ours since the last episode
         mujoco.mj_resetData(self.model, self.data)
-        self._qpos[:] = state[self._qpos_order]
-        self._qvel[:] = state[self._qvel_order]
+        self._write_state(state)
         self.state = self._read_state()
 
     def show(self, state: np.ndarray) -> None:
@@ -79,12 +85,15 @@ class MujocoPhysics:
         model, data = self.model, self.data
         arm = 1.0 if self.actuator is None else self.actuator.motor.arm_radius
         self._ctrl[0] = desired_force * arm
-        if self._explicit:
+        if self._explicit or self._constrain is not None:
             timestep = model.opt.timestep
             for _ in range(self.inner_steps):
                 moved = self._qpos + timestep * self._qvel
                 mujoco.mj_step(model, data)
-                self._qpos[:] = moved
+                if self._explicit:
+                    self._qpos[:] = moved
+                if self._constrain is not None:
+                    self._write_state(self._constrain(self._read_state()[np.newaxis], timestep)[0])
         else:
             mujoco.mj_step(model, data, self.inner_steps)
         self.state = self._read_state()
@@ -95,4 +104,4 @@ class MujocoPhysics:
         return motor_signals(self.actuator, desired_force, current, voltage)
 
 
-_VIEWS = ("_qpos", "_qvel", "_ctrl", "_act")
+_VIEWS = ("_qpos", "_qvel", "_ctrl", "_act", "_constrain")

@@ -30,6 +30,8 @@ class Task:
     """Integration steps per environment step when a motor is in the loop; one when the actuator is ideal."""
     max_force: float
     """Largest desired force [N] or torque [N*m] of any action."""
+    render_fps: int
+    """Frames per second of a video with one frame a step, Gymnasium's; rarely real time."""
     integrators: tuple[str, ...]
     """Names of the integrators that can be chosen; the first is Gymnasium's."""
     state_names: tuple[str, ...]
@@ -47,10 +49,34 @@ class Task:
     initial: Callable[[np.random.Generator, dict[str, Any] | None], np.ndarray]
     """(generator, reset options) -> one initial state, shape (n,); draws what Gymnasium draws."""
     desired_force: Callable[[np.ndarray], np.ndarray]
-    """(actions (N, ...)) -> desired forces (N,)."""
+    """(actions (N, *action shape), or one action) -> desired forces (N,), or one; a `Box`'s actions saturate."""
     observation: Callable[[np.ndarray], np.ndarray]
     """(states (N, n)) -> observations (N, k), float32."""
     reward: Callable[[np.ndarray, np.ndarray, np.ndarray, Options], np.ndarray]
     """(states before, forces delivered, states after, options) -> rewards (N,)."""
     terminated: Callable[[np.ndarray], np.ndarray]
     """(states) -> whether the episode ends there, (N,) bool."""
+    constrain: Callable[[np.ndarray, float], np.ndarray] | None = None
+    """(states (N, n) as integrated, integration step [s]) -> states within the bounds that Gymnasium's `step` keeps:
+    speed limits, walls, wrapped angles. Applied after every integration step; None where there are no bounds. Plain
+    Python on purpose: `codrl_mj.physics.constrain` compiles it. Must let NaN through."""
+
+    def check_action(self, action: Any) -> np.ndarray:
+        """One action as an array, checked.
+
+        An action of a `Box` may lie outside its bounds: the desired force saturates, as Gymnasium's does.
+
+        Args:
+            action: an element of a `Discrete` space, or an array of the `Box`'s shape and any floating-point type.
+
+        Raises:
+            ValueError: not an element; for a `Box` a wrong shape, a type that is not floating-point, or NaN.
+        """
+        array = np.asarray(action)
+        if isinstance(self.action_space, spaces.Box):
+            valid = array.dtype.kind == "f" and array.shape == self.action_space.shape and not np.isnan(array).any()
+        else:
+            valid = self.action_space.contains(action)
+        if not valid:
+            raise ValueError(f"action = {action!r}: not in {self.action_space}")
+        return array

@@ -59,6 +59,7 @@ TASK = Task(
     step_duration=0.02,
     motor_inner_steps=1,
     max_force=FORCE,
+    render_fps=50,
     integrators=("euler", "semi-implicit"),
     state_names=("x [m]", "x_dot [m/s]", "theta [rad]", "theta_dot [rad/s]"),
     qpos=(0, 2),

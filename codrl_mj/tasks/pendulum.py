@@ -1,0 +1,126 @@
+"""Pendulum: swing a rod up and hold it there with a weak torque at its pivot. Gymnasium's Pendulum-v1.
+
+## Description
+
+A uniform rod (mass 1 kg, length 1 m) hangs from a pivot under a gravity of 10 m/s^2. The actuator turns the pivot. Two
+newton metres do not lift the rod in one go: it has to be swung.
+
+## Observation space
+
+`Box([-1, -1, -8], [1, 1, 8], (3,), float32)`
+
+| index | observation | min | max | unit |
+| --- | --- | --- | --- | --- |
+| 0 | cos(theta): height of the tip over the pivot | -1 | 1 | m |
+| 1 | sin(theta): distance of the tip to the left of the pivot | -1 | 1 | m |
+| 2 | angular velocity of the rod | -8 | 8 | rad/s |
+
+theta is 0 upright and grows counter-clockwise. The state is (theta, theta_dot); theta is not wrapped.
+
+## Action space
+
+`Box(-2, 2, (1,), float32)`: the desired torque [N*m]; it saturates at +-2. Gymnasium computes with float32 actions in
+float32; here they become float64 first, so the two differ by some 1e-8 a step unless the actions are float64.
+
+## Reward
+
+-(angle^2 + 0.1 theta_dot^2 + 0.001 torque^2): angle (wrapped to [-pi, pi)) and theta_dot are those *before* the step,
+the torque is the one delivered *in* it: the motor's, which need not be the desired one.
+
+## Start
+
+theta uniform in [-pi, pi] rad, theta_dot uniform in [-1, 1] rad/s. `reset(options={"x_init": ..., "y_init": ...})` sets
+the two bounds, as in Gymnasium.
+
+## End
+
+Never; truncated after 200 steps (10 s).
+
+## Arguments
+
+Those of `codrl_mj.envs.ActuatedEnv`. The task has no options of its own (Gymnasium's `g` is the model's gravity here).
+One integration step an environment step, with and without a motor (the paper's choice); semi-implicit Euler, as in
+the installed Gymnasium (the paper says explicit).
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.classic_control import utils
+
+from codrl_mj.tasks.base import Task
+
+# Gymnasium's Pendulum-v1
+MAX_TORQUE = 2.0  # N*m
+MAX_SPEED = 8.0  # rad/s
+
+
+class Options(NamedTuple):
+    """Pendulum has no options."""
+
+
+def initial(generator: np.random.Generator, options: dict[str, Any] | None) -> np.ndarray:
+    """Draw angle and speed uniformly within +-pi and +-1, or within the reset options' `x_init` and `y_init`."""
+    given = options or {}
+    high = np.array([utils.verify_number_and_cast(given.get(*entry)) for entry in (("x_init", np.pi), ("y_init", 1.0))])
+    return generator.uniform(low=-high, high=high)
+
+
+def desired_force(action: np.ndarray) -> np.ndarray:
+    """The action as a torque [N*m], saturated."""
+    return np.clip(action[..., 0].astype(np.float64), -MAX_TORQUE, MAX_TORQUE)
+
+
+def constrain(state: np.ndarray, timestep: float) -> np.ndarray:
+    """Limit the speed; the angle moves by the limited one."""
+    bounded = state.copy()
+    for row in bounded:
+        excess = row[1] - MAX_SPEED if row[1] > MAX_SPEED else row[1] + MAX_SPEED if row[1] < -MAX_SPEED else 0.0
+        if excess != 0.0:
+            row[0] -= excess * timestep
+            row[1] = MAX_SPEED if excess > 0.0 else -MAX_SPEED
+    return bounded
+
+
+def observation(state: np.ndarray) -> np.ndarray:
+    """(cos(theta), sin(theta), theta_dot) as float32."""
+    theta, speed = state[..., 0], state[..., 1]
+    return np.stack([np.cos(theta), np.sin(theta), speed], axis=-1).astype(np.float32)
+
+
+def terminated(state: np.ndarray) -> np.ndarray:
+    """Never."""
+    return np.zeros(state.shape[:-1], dtype=bool)
+
+
+def reward(state: np.ndarray, force: np.ndarray, next_state: np.ndarray, options: Options) -> np.ndarray:
+    """Minus the squares of angle, speed and torque: the state's before the step, the torque's delivered in it."""
+    angle = (state[..., 0] + np.pi) % (2 * np.pi) - np.pi
+    return -(angle**2 + 0.1 * state[..., 1] ** 2 + 0.001 * force**2)
+
+
+_HIGH = np.array([1.0, 1.0, MAX_SPEED], dtype=np.float32)
+
+TASK = Task(
+    name="pendulum",
+    gymnasium_id="Pendulum-v1",
+    asset="pendulum.xml",
+    step_duration=0.05,
+    motor_inner_steps=1,
+    max_force=MAX_TORQUE,
+    render_fps=30,
+    integrators=("semi-implicit",),
+    state_names=("theta [rad]", "theta_dot [rad/s]"),
+    qpos=(0,),
+    qvel=(1,),
+    action_space=spaces.Box(-MAX_TORQUE, MAX_TORQUE, (1,), np.float32),
+    observation_space=spaces.Box(-_HIGH, _HIGH, dtype=np.float32),
+    options=Options,
+    initial=initial,
+    desired_force=desired_force,
+    observation=observation,
+    reward=reward,
+    terminated=terminated,
+    constrain=constrain,
+)
