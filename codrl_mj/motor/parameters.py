@@ -11,6 +11,7 @@ Source of the equations and of the defaults: *Control-Optimized Deep Reinforceme
 import dataclasses
 import difflib
 import math
+import numbers
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -22,7 +23,7 @@ def _check(owner: object, field: str, *, above: float | None = None, least: floa
     value = getattr(owner, field)
     bound = f"> {above:g}" if above is not None else f">= {least:g}"
     name = f"{type(owner).__name__}.{field}"
-    if isinstance(value, bool) or (not isinstance(value, int | float) and not hasattr(value, "__float__")):
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise ValueError(f"{name} = {value!r}: must be a number {bound}")
     number = float(value)
     infinite_is_fine = field == "max_voltage"
@@ -213,7 +214,7 @@ def from_vector(vector: Sequence[float], arm_radius: float) -> Actuator:
         )
     values: dict[str, Any] = dict(zip(PARAMETER_NAMES, map(float, vector), strict=False))
     for flag, kind in (("bemf_compensation", bool), ("substeps", int)):
-        if values[flag] != kind(values[flag]):
+        if not math.isfinite(values[flag]) or values[flag] != kind(values[flag]):
             raise ValueError(f"CurrentLoop.{flag} = {values[flag]:g}: must be a whole {kind.__name__}")
         values[flag] = kind(values[flag])
     return Actuator(

@@ -38,7 +38,11 @@ def spectral_radius(actuator: Actuator, timestep: float) -> float:
         actuator: motor and gains.
         timestep: mechanical step [s].
     """
-    return float(np.abs(np.linalg.eigvals(closed_loop_matrix(actuator, timestep))).max())
+    substeps = actuator.controller.substeps
+    one = dataclasses.replace(actuator, controller=dataclasses.replace(actuator.controller, substeps=1))
+    radius = np.abs(np.linalg.eigvals(closed_loop_matrix(one, timestep / substeps))).max()
+    with np.errstate(over="ignore", under="ignore"):  # a power of the matrix itself would overflow into NaN
+        return float(radius**substeps)
 
 
 def check_stable(actuator: Actuator, timestep: float) -> None:
