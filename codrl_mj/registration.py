@@ -17,6 +17,7 @@ ENVIRONMENTS: dict[str, Registered] = {
     # limits and thresholds are Gymnasium's for the environments rebuilt
     "pendulum": Registered("codrl_mj/Pendulum-v0", 200, None),
     "cartpole": Registered("codrl_mj/CartPole-v0", 500, 475.0),
+    "acrobot": Registered("codrl_mj/Acrobot-v0", 500, -100.0),
 }
 """Task name -> its registration."""
 

@@ -13,6 +13,7 @@ from codrl_mj.motor.parameters import Actuator, CurrentLoop, Motor
 PAPER: dict[str, Actuator] = {
     # The paper, Experimental Results: gains and arm of each task. R, L, kT, kE are the dataclass defaults.
     "pendulum": Actuator(Motor(), CurrentLoop(kp=1.0, ki=20.0, kd=1e-6)),
+    "acrobot": Actuator(Motor(), CurrentLoop(kp=1.0, ki=10.0, kd=1e-6)),
     "cartpole": Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=4.3, ki=1.0, kd=1e-6, kff=0.6)),
 }
 """The paper's motor and gains, by task."""

@@ -73,7 +73,39 @@ class CartPoleDriver:
         return env.state
 
 
-DRIVERS: dict[str, type[Driver]] = {"pendulum": PendulumDriver, "cartpole": CartPoleDriver}
+class AcrobotDriver:
+    """`AcrobotEnv`: the torques to choose from and the time step are attributes."""
+
+    speed = 3
+    _LARGEST = 1e6  # N*m
+
+    def __init__(self, gymnasium_id: str) -> None:
+        """Make the Gymnasium environment."""
+        self._env = _unwrapped(gymnasium_id)
+
+    def __call__(
+        self,
+        state: np.ndarray,
+        force: float,
+        timestep: float,
+        integrator: str,  # noqa: ARG002 - it has one only
+    ) -> np.ndarray:
+        """One `step` with the torque as the only one to choose from."""
+        if not abs(force) < self._LARGEST:  # Gymnasium wraps angles turn by turn: it would not come back
+            return np.full(4, np.nan)
+        env = self._env
+        env.AVAIL_TORQUE = [force]
+        env.dt = timestep
+        env.state = state
+        env.step(0)
+        return env.state
+
+
+DRIVERS: dict[str, type[Driver]] = {
+    "pendulum": PendulumDriver,
+    "cartpole": CartPoleDriver,
+    "acrobot": AcrobotDriver,
+}
 """The driver of each task's Gymnasium environment."""
 
 

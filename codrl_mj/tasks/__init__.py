@@ -2,10 +2,10 @@
 
 import difflib
 
-from codrl_mj.tasks import cartpole, pendulum
+from codrl_mj.tasks import acrobot, cartpole, pendulum
 from codrl_mj.tasks.base import Task
 
-TASKS: dict[str, Task] = {module.TASK.name: module.TASK for module in (pendulum, cartpole)}
+TASKS: dict[str, Task] = {module.TASK.name: module.TASK for module in (pendulum, cartpole, acrobot)}
 """Every task by its name on the command line."""
 
 

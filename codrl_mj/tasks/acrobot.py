@@ -1,0 +1,139 @@
+"""Acrobot: swing the tip of a two-link chain above a line with a motor between the links. Gymnasium's Acrobot-v1.
+
+## Description
+
+Two links (1 kg, 1 m each, centre of mass in the middle, 1 kg m^2 about it) hang from a fixed shoulder under a gravity of
+9.8 m/s^2. The actuator turns the elbow between them. These are Gymnasium's default ("book") dynamics, without its
+torque noise.
+
+## Observation space
+
+`Box` of shape (6,), float32
+
+| index | observation | min | max | unit |
+| --- | --- | --- | --- | --- |
+| 0 | cos(theta1) | -1 | 1 | |
+| 1 | sin(theta1) | -1 | 1 | |
+| 2 | cos(theta2) | -1 | 1 | |
+| 3 | sin(theta2) | -1 | 1 | |
+| 4 | angular velocity of theta1 | -4 pi | 4 pi | rad/s |
+| 5 | angular velocity of theta2 | -9 pi | 9 pi | rad/s |
+
+theta1 is the first link's angle, 0 hanging down; theta2 is the second link's relative to the first. Both grow
+counter-clockwise and are wrapped to [-pi, pi] after every integration step. The state is (theta1, theta2, their
+velocities).
+
+## Action space
+
+`Discrete(3)`: the desired torque at the elbow is -1, 0 or 1 N m.
+
+## Reward
+
+-1 a step; 0 for the step that reaches the goal.
+
+## Start
+
+All four state entries uniform in [-0.1, 0.1] (rad, rad/s), rounded to float32 as Gymnasium does.
+`reset(options={"low": ..., "high": ...})` sets the bounds.
+
+## End
+
+The tip is more than 1 m above the shoulder: -cos(theta1) - cos(theta1 + theta2) > 1. Truncated after 500 steps (100 s).
+
+## Arguments
+
+Those of `codrl_mj.envs.ActuatedEnv`. The task has no options of its own. An environment step of 0.2 s is one
+integration step (RK4, Gymnasium's) when the actuator is ideal, and ten of 0.02 s with a motor, the paper's choice; the
+torque is held over each of them.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.classic_control import utils
+
+from codrl_mj.tasks.base import Task
+
+# Gymnasium's Acrobot-v1
+TORQUE = 1.0  # N*m
+MAX_SPEED_1 = 4 * math.pi  # rad/s
+MAX_SPEED_2 = 9 * math.pi  # rad/s
+GOAL_HEIGHT = 1.0  # m above the shoulder
+
+
+class Options(NamedTuple):
+    """Acrobot has no options."""
+
+
+def initial(generator: np.random.Generator, options: dict[str, Any] | None) -> np.ndarray:
+    """Draw the four entries uniformly from (-0.1, 0.1), or from the reset options' `low` and `high`, as float32."""
+    low, high = utils.maybe_parse_reset_bounds(options, -0.1, 0.1)
+    return generator.uniform(low=low, high=high, size=(4,)).astype(np.float32).astype(np.float64)
+
+
+def desired_force(action: np.ndarray) -> np.ndarray:
+    """Actions 0, 1, 2 ask for -1, 0, 1 N*m."""
+    return TORQUE * (action - 1.0)
+
+
+def constrain(state: np.ndarray, timestep: float) -> np.ndarray:
+    """Wrap the angles and limit the speeds."""
+    bounded = state.copy()
+    turn = 2 * math.pi
+    for row in bounded:
+        for angle in range(2):
+            if row[angle] > math.pi:
+                row[angle] -= turn * math.ceil((row[angle] - math.pi) / turn)
+            elif row[angle] < -math.pi:
+                row[angle] += turn * math.ceil((-math.pi - row[angle]) / turn)
+        for speed, limit in ((2, MAX_SPEED_1), (3, MAX_SPEED_2)):
+            if row[speed] > limit:
+                row[speed] = limit
+            elif row[speed] < -limit:
+                row[speed] = -limit
+    return bounded
+
+
+def observation(state: np.ndarray) -> np.ndarray:
+    """Cosines and sines of the angles, and the speeds, as float32."""
+    theta1, theta2, speed1, speed2 = (state[..., entry] for entry in range(4))
+    entries = [np.cos(theta1), np.sin(theta1), np.cos(theta2), np.sin(theta2), speed1, speed2]
+    return np.stack(entries, axis=-1).astype(np.float32)
+
+
+def terminated(state: np.ndarray) -> np.ndarray:
+    """The tip is above the goal line."""
+    return -np.cos(state[..., 0]) - np.cos(state[..., 1] + state[..., 0]) > GOAL_HEIGHT
+
+
+def reward(state: np.ndarray, force: np.ndarray, next_state: np.ndarray, options: Options) -> np.ndarray:
+    """-1 a step, 0 for the step that reaches the goal."""
+    return np.where(terminated(next_state), 0.0, -1.0)
+
+
+_HIGH = np.array([1.0, 1.0, 1.0, 1.0, MAX_SPEED_1, MAX_SPEED_2], dtype=np.float32)
+
+TASK = Task(
+    name="acrobot",
+    gymnasium_id="Acrobot-v1",
+    asset="acrobot.xml",
+    step_duration=0.2,
+    motor_inner_steps=10,
+    max_force=TORQUE,
+    render_fps=15,
+    integrators=("rk4",),
+    state_names=("theta1 [rad]", "theta2 [rad]", "theta1_dot [rad/s]", "theta2_dot [rad/s]"),
+    qpos=(0, 1),
+    qvel=(2, 3),
+    action_space=spaces.Discrete(3),
+    observation_space=spaces.Box(-_HIGH, _HIGH, dtype=np.float32),
+    options=Options,
+    initial=initial,
+    desired_force=desired_force,
+    observation=observation,
+    reward=reward,
+    terminated=terminated,
+    constrain=constrain,
+)
