@@ -1,0 +1,26 @@
+"""The environment's arguments as a configuration, for training runs and the command line."""
+
+import dataclasses
+from typing import Any, Literal
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvConfig:
+    """Arguments of an environment other than task, actuator and rendering; None leaves the task's default."""
+
+    physics: Literal["mujoco", "analytic"] = "mujoco"
+    """`mujoco`, or `analytic`: Gymnasium's own equations."""
+    integrator: str | None = None
+    """One of the task's integrators (CartPole: `euler` or `semi-implicit`); the default is Gymnasium's."""
+    inner_steps: int | None = None
+    """Integration steps per environment step; the default is the paper's inner loop with a motor and 1 without."""
+    max_episode_steps: int | None = None
+    """Time limit [environment steps]; the default is Gymnasium's."""
+    center_radius: float | None = None
+    """CartPole: distance from the centre [m] beyond which a step earns nothing. The paper trains with 0.1."""
+    allow_unstable: bool = False
+    """Build the environment even if the current loop is unstable."""
+
+    def as_arguments(self) -> dict[str, Any]:
+        """The keyword arguments for `gymnasium.make`, without those left at the task's default."""
+        return {name: value for name, value in dataclasses.asdict(self).items() if value is not None}

@@ -1,0 +1,143 @@
+"""Cross-validation of a task's MuJoCo physics against the installed Gymnasium.
+
+The oracle of every check is the analytic physics: an unmodified Gymnasium environment driven through its attributes.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from codrl_mj.motor import Actuator, named_actuator
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Physics
+from codrl_mj.physics.base import inner_step_count
+from codrl_mj.tasks import Task, find_task
+
+STATE_BOUNDS: dict[str, tuple[float, ...]] = {
+    # beyond what an episode can reach: all angles, and speeds of a falling pole
+    "cartpole": (4.8, 10.0, np.pi, 10.0),
+}
+"""States are drawn uniformly within plus and minus these, in the units of the task's state."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """The outcome of one check."""
+
+    name: str
+    """What was compared."""
+    oracle: str
+    """What it was compared with."""
+    samples: int
+    """How many steps were compared."""
+    worst: float
+    """Largest difference found, each state entry measured against max(1, its size)."""
+    tolerance: float
+    """Largest difference allowed."""
+    where: str
+    """Where the largest difference was found."""
+
+    @property
+    def passed(self) -> bool:
+        """Whether the port is right as far as this check sees; a NaN is a failure."""
+        return bool(self.worst <= self.tolerance)
+
+
+def _difference(task: Task, ours: np.ndarray, oracle: np.ndarray) -> tuple[float, str]:
+    difference = np.abs(ours - oracle) / np.maximum(1.0, np.abs(oracle))
+    worst = int(np.argmax(np.where(np.isnan(difference), np.inf, difference)))
+    return float(difference[worst]), task.state_names[worst]
+
+
+def _build(kind: type, task: Task, actuator: Actuator | None, integrator: str) -> Physics:
+    return kind(task, actuator, inner_step_count(task, actuator, None, None), integrator)
+
+
+def one_step(task: Task, integrator: str, samples: int, seed: int) -> Check:
+    """One integration step with an ideal actuator from random states under random forces; tolerance 1e-12.
+
+    Args:
+        task: the task.
+        integrator: one of the task's integrators.
+        samples: random states.
+        seed: of the states and forces.
+    """
+    generator = np.random.default_rng(seed)
+    bounds = np.array(STATE_BOUNDS[task.name])
+    mujoco, analytic = (_build(kind, task, None, integrator) for kind in (MujocoPhysics, AnalyticPhysics))
+    worst, where = 0.0, ""
+    for _ in range(samples):
+        state = generator.uniform(-bounds, bounds)
+        force = float(generator.uniform(-task.max_force, task.max_force))
+        for physics in (mujoco, analytic):
+            physics.reset(state)
+            physics.step(force)
+        difference, entry = _difference(task, mujoco.state, analytic.state)
+        if not difference <= worst:
+            worst, where = difference, f"{entry} from {np.array2string(state, precision=3)}, force {force:.3g}"
+    oracle = f"Gymnasium {task.gymnasium_id}"
+    return Check(f"one step, {integrator}", oracle, samples, worst, 1e-12, where)
+
+
+def episodes(task: Task, actuator: str, integrator: str, steps: int, seeds: range) -> Check:
+    """Whole runs under the same random bang-bang forces, motor in the loop; tolerance 1e-9.
+
+    Args:
+        task: the task.
+        actuator: a named actuator.
+        integrator: one of the task's integrators.
+        steps: environment steps of each run; the task's ends are ignored.
+        seeds: one run each.
+    """
+    resolved = named_actuator(actuator, task.name)
+    mujoco, analytic = (_build(kind, task, resolved, integrator) for kind in (MujocoPhysics, AnalyticPhysics))
+    worst, where = 0.0, ""
+    for seed in seeds:
+        generator = np.random.default_rng(seed)
+        initial = task.initial(generator, None)
+        forces = task.max_force * generator.choice([-1.0, 1.0], steps)
+        for physics in (mujoco, analytic):
+            physics.reset(initial)
+        for index, force in enumerate(forces):
+            delivered = [physics.step(float(force)).actual_force for physics in (mujoco, analytic)]
+            difference, entry = _difference(task, mujoco.state, analytic.state)
+            if not (gap := abs(delivered[0] - delivered[1]) / task.max_force) <= difference:
+                difference, entry = gap, "force"
+            if not difference <= worst:
+                worst, where = difference, f"{entry} at step {index + 1} of seed {seed}"
+    oracle = f"Gymnasium {task.gymnasium_id}" + (" and the motor in Python" if resolved else "")
+    name = f"{steps} steps, {integrator}, {actuator} actuator"
+    return Check(name, oracle, steps * len(seeds), worst, 1e-9, where)
+
+
+def validate(
+    task_name: str, samples: int = 10_000, runs: int = 4, on_check: Callable[[Check], None] | None = None
+) -> list[Check]:
+    """Cross-validate one task.
+
+    Args:
+        task_name: the task.
+        samples: random states for the one-step check.
+        runs: runs for each whole-run check.
+        on_check: called with each outcome as it arrives.
+
+    Raises:
+        ValueError: unknown task, or a count below 1.
+    """
+    for name, value in (("samples", samples), ("runs", runs)):
+        if value < 1:
+            raise ValueError(f"{name} = {value}: must be >= 1")
+
+    def checks(task: Task) -> Iterator[Check]:
+        for integrator in task.integrators:
+            yield one_step(task, integrator, samples, seed=0)
+        for actuator in ("ideal", "paper", "weaker"):
+            for integrator in task.integrators:
+                yield episodes(task, actuator, integrator, 500, range(runs))
+
+    outcomes = []
+    for check in checks(find_task(task_name)):
+        outcomes.append(check)
+        if on_check is not None:
+            on_check(check)
+    return outcomes

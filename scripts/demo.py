@@ -1,0 +1,94 @@
+"""The main job in one command: learn to balance through a weak actuator.
+
+Cross-validates CartPole against Gymnasium, trains the same agent twice (on the ideal actuator and through the actuator
+`weaker`), deploys both policies on `weaker`, prints one table and films them side by side.
+"""
+
+import argparse
+import functools
+import shutil
+import sys
+from pathlib import Path
+
+from codrl_mj.env_config import EnvConfig
+from codrl_mj.evaluation import make_env, run_episodes, summarize
+from codrl_mj.motor import named_actuator
+from codrl_mj.policies import load_policy
+from codrl_mj.rendering import Panel, film
+from codrl_mj.terminal import print_checks, print_evaluations, progress_bar, train_with_bars
+from codrl_mj.training import TrainConfig, load_config
+from codrl_mj.validation import validate
+
+TASK, REAL = "cartpole", "weaker"
+PAPER_REWARD = EnvConfig(center_radius=0.1)  # the paper trains with no reward beyond 0.1 m from the centre
+
+
+def finished(out: Path, config: TrainConfig) -> bool:
+    """Whether `out` already holds this very run."""
+    return (out / "policy.json").is_file() and load_config(out) == config
+
+
+def main() -> int:
+    """Run the demonstration."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("runs/demo"), help="folder for runs and video")
+    parser.add_argument("--seed", type=int, default=0, help="training seed")
+    parser.add_argument("--total-steps", type=int, default=200_000, help="training steps of each policy")
+    parser.add_argument("--episodes", type=int, default=100, help="test episodes of each row of the table")
+    options = parser.parse_args()
+
+    print("1/4  Is the MuJoCo cart-pole Gymnasium's?")
+    with progress_bar() as bar:
+        row = bar.add_task("cross-validating", total=None)
+        checks = validate(TASK, on_check=lambda _: bar.advance(row))
+    print_checks(checks)
+    if not all(check.passed for check in checks):
+        return 1
+
+    print(f"\n2/4  Train PPO twice: on the ideal actuator, and through the actuator {REAL!r}")
+    runs = {
+        actuator: (
+            TrainConfig(TASK, actuator, seed=options.seed, total_steps=options.total_steps, env=PAPER_REWARD),
+            options.out / f"{actuator}-seed{options.seed}",
+        )
+        for actuator in ("ideal", REAL)
+    }
+    waiting = {}
+    for actuator, (config, out) in runs.items():
+        if finished(out, config):
+            print(f"     {out} is trained already (delete it to train anew)")
+        else:
+            shutil.rmtree(out, ignore_errors=True)  # what a run that was stopped left behind
+            waiting[f"trained on {actuator}"] = (config, out)
+    if waiting:
+        train_with_bars(waiting)
+
+    print(f"\n3/4  Deploy both on {REAL!r}, under Gymnasium's own reward: 500 is full marks")
+    evaluations, panels = {}, []
+    for trained, (_, out) in runs.items():
+        policy = load_policy(out)
+        for deployed in ("ideal", REAL):
+            motor = named_actuator(deployed, TASK)
+            episodes = run_episodes(policy, functools.partial(make_env, TASK, motor), options.episodes)
+            evaluations[f"trained on {trained}, run on {deployed}"] = summarize(TASK, motor, episodes)
+            if deployed == REAL:
+                title = f"trained on {trained}: {episodes[0].total:.0f} of 500"
+                panels.append(Panel(title, TASK, motor, episodes[0]))
+    print_evaluations(evaluations)
+
+    print(f"\n4/4  Film both on {REAL!r}")
+    with progress_bar("{task.completed}/{task.total} frames") as bar:
+        row = bar.add_task("filming", total=None)
+        video = film(
+            panels,
+            options.out / "side_by_side.mp4",
+            on_frame=lambda done, total: bar.update(row, completed=done, total=total),
+        )
+    print(f"\nOpen {video}")
+    for trained, (_, out) in runs.items():
+        print(f"Open {out / 'learning_curve.png'} (the learning curve, trained on {trained})")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
