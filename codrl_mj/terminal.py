@@ -18,7 +18,7 @@ from codrl_mj.training import TrainConfig, train
 from codrl_mj.validation import Check
 
 
-def _console() -> Console:
+def console() -> Console:
     """A console on standard output; 110 columns where it goes to a file, which has no width of its own."""
     return Console() if sys.stdout.isatty() else Console(width=110)
 
@@ -32,7 +32,7 @@ def progress_bar(*columns: str) -> Progress:
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
-        console=_console(),
+        console=console(),
     )
 
 
@@ -106,7 +106,7 @@ def print_evaluations(evaluations: Mapping[str, Evaluation]) -> None:
             "–" if result.peak_voltage is None else f"{result.peak_voltage:.1f} V",
             f"{result.saturated_percent:.1f} %",
         )
-    _console().print(table)
+    console().print(table)
 
 
 def print_checks(checks: Sequence[Check]) -> None:
@@ -117,4 +117,4 @@ def print_checks(checks: Sequence[Check]) -> None:
     for check in checks:
         verdict = "[green]passed" if check.passed else f"[red]FAILED at {check.where}"
         table.add_row(check.name, f"{check.samples:,}", f"{check.worst:.1e}", f"{check.tolerance:.0e}", verdict)
-    _console().print(table)
+    console().print(table)
