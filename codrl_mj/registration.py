@@ -18,6 +18,8 @@ ENVIRONMENTS: dict[str, Registered] = {
     "pendulum": Registered("codrl_mj/Pendulum-v0", 200, None),
     "cartpole": Registered("codrl_mj/CartPole-v0", 500, 475.0),
     "acrobot": Registered("codrl_mj/Acrobot-v0", 500, -100.0),
+    "mountain_car": Registered("codrl_mj/MountainCar-v0", 200, -110.0),
+    "mountain_car_continuous": Registered("codrl_mj/MountainCarContinuous-v0", 999, 90.0),
 }
 """Task name -> its registration."""
 

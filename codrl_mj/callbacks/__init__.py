@@ -1,7 +1,8 @@
 """The only code that touches raw mjModel and mjData memory: structure layout, callbacks, installation."""
 
+from codrl_mj.callbacks.hill import HILL_NAMES
 from codrl_mj.callbacks.install import CallbackInUseError, install, installed, uninstall
 from codrl_mj.callbacks.kernels import ACT_NAMES
 from codrl_mj.callbacks.layout import LayoutError
 
-__all__ = ["ACT_NAMES", "CallbackInUseError", "LayoutError", "install", "installed", "uninstall"]
+__all__ = ["ACT_NAMES", "HILL_NAMES", "CallbackInUseError", "LayoutError", "install", "installed", "uninstall"]

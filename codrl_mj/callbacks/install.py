@@ -1,12 +1,28 @@
 """Installing our callbacks into MuJoCo, and taking them out, without trampling on anybody else's."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import mujoco
 
+from codrl_mj.callbacks.hill import compiled_hill
 from codrl_mj.callbacks.kernels import compiled
 
-_NAMES = ("control", "act_bias")
+
+class _Part(NamedTuple):
+    """Callbacks that are installed together."""
+
+    names: tuple[str, ...]
+    """MuJoCo's names, as in `mujoco.set_mjcb_...`; also the fields of what `compile` returns."""
+    compile: Callable[[], Any]
+    remedy: str
+    """What else a user could do than to install them."""
+
+
+_PARTS = {
+    "motor": _Part(("control", "act_bias"), compiled, "actuator='ideal' or physics='analytic'"),
+    "hill": _Part(("passive",), compiled_hill, "physics='analytic'"),
+}
 
 
 class CallbackInUseError(RuntimeError):
@@ -17,38 +33,59 @@ def _present(name: str) -> Any:
     return getattr(mujoco, f"get_mjcb_{name}")()
 
 
-def _is_ours(name: str) -> bool:
-    return bool(compiled.cache_info().currsize) and _present(name) is getattr(compiled(), name)
+def _is_ours(part: _Part, name: str) -> bool:
+    was_compiled = part.compile.cache_info().currsize  # type: ignore[attr-defined]
+    return bool(was_compiled) and _present(name) is getattr(part.compile(), name)
 
 
-def installed() -> bool:
-    """Whether MuJoCo runs our callbacks at present."""
-    return all(_is_ours(name) for name in _NAMES)
+def installed(*parts: str) -> bool:
+    """Whether MuJoCo runs our callbacks at present.
+
+    Args:
+        *parts: as for `install`.
+    """
+    return all(_is_ours(part, name) for part in _chosen(parts) for name in part.names)
 
 
-def install() -> None:
-    """Install the callbacks that run our motors; harmless when they are installed already.
+def install(*parts: str) -> None:
+    """Install the callbacks that run our motors, or our hills; harmless when they are installed already.
 
-    The callbacks are process-wide, as all of MuJoCo's are. They act on actuators that carry our signature in their user
-    data and on nothing else: other models, and foreign actuators of the same model, behave as without them.
+    The callbacks are process-wide, as all of MuJoCo's are. They act on actuators and joints that carry our signature in
+    their user data and on nothing else: other models, and foreign actuators and joints of the same model, behave as
+    without them. A process in which no model has a hill need not pay for the hill's callback.
+
+    Args:
+        *parts: `motor` (`mjcb_control` and `mjcb_act_bias`), `hill` (`mjcb_passive`) or both; none means `motor`.
 
     Raises:
-        CallbackInUseError: `mjcb_control` or `mjcb_act_bias` is somebody else's; nothing was changed.
+        ValueError: no such part.
+        CallbackInUseError: one of the callbacks is somebody else's; nothing was changed.
         LayoutError: the installed MuJoCo's memory is not laid out as its introspection says.
     """
-    for name in _NAMES:
-        if _present(name) is not None and not _is_ours(name):
-            raise CallbackInUseError(
-                f"mujoco.mjcb_{name} is already set, to {_present(name)!r}: refusing to replace it. Remove it with "
-                f"mujoco.set_mjcb_{name}(None) first, or build the environment with actuator='ideal' or "
-                "physics='analytic', which need no callback"
-            )
-    for name in _NAMES:
-        getattr(mujoco, f"set_mjcb_{name}")(getattr(compiled(), name))
+    chosen = _chosen(parts)
+    for part in chosen:
+        for name in part.names:
+            if _present(name) is not None and not _is_ours(part, name):
+                raise CallbackInUseError(
+                    f"mujoco.mjcb_{name} is already set, to {_present(name)!r}: refusing to replace it. Remove it with "
+                    f"mujoco.set_mjcb_{name}(None) first, or build the environment with {part.remedy}, which "
+                    "needs no such callback"
+                )
+    pointers = {name: getattr(part.compile(), name) for part in chosen for name in part.names}
+    for name, pointer in pointers.items():
+        getattr(mujoco, f"set_mjcb_{name}")(pointer)
 
 
 def uninstall() -> None:
-    """Remove our callbacks; anybody else's stay where they are."""
-    for name in _NAMES:
-        if _is_ours(name):
-            getattr(mujoco, f"set_mjcb_{name}")(None)
+    """Remove all our callbacks; anybody else's stay where they are."""
+    for part in _PARTS.values():
+        for name in part.names:
+            if _is_ours(part, name):
+                getattr(mujoco, f"set_mjcb_{name}")(None)
+
+
+def _chosen(names: tuple[str, ...]) -> list[_Part]:
+    for name in names:
+        if name not in _PARTS:
+            raise ValueError(f"callbacks {name!r}: must be one of {', '.join(_PARTS)}")
+    return [_PARTS[name] for name in names or ("motor",)]

@@ -10,11 +10,10 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numba
-from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic
 
 from codrl_mj.callbacks.layout import check_layout, offset
+from codrl_mj.callbacks.memory import array, f64, i32, i64, u8
 from codrl_mj.motor.current_loop import advance
 from codrl_mj.motor.parameters import PARAMETER_NAMES, SIGNATURE, TORQUE_CONSTANT
 
@@ -33,6 +32,7 @@ state one step later (the candidate), and the voltage between them."""
 TICK, COMMITTED_CURRENT, COMMITTED_INTEGRAL, COMMITTED_ERROR, CURRENT, INTEGRAL, ERROR, VOLTAGE = range(len(ACT_NAMES))
 
 MODEL_FIELDS = (
+    "nu",
     "nactuator",
     "nuser_actuator",
     "opt.timestep",
@@ -49,23 +49,9 @@ MODEL_FIELDS = (
     "actuator_ctrllimited",
     "actuator_ctrlrange",
 )
-DATA_FIELDS = ("time", "pstack", "act", "ctrl", "actuator_velocity")
-
-
-def _pointer(element: Any) -> Any:
-    """A numba intrinsic that turns an integer address into a typed pointer."""
-
-    @intrinsic
-    def pointer(typing_context: Any, address: Any) -> Any:  # noqa: ARG001 - numba fixes the arguments
-        def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
-            return builder.inttoptr(arguments[0], ir.PointerType(context.get_data_type(element)))
-
-        return types.CPointer(element)(types.uintp), codegen
-
-    return pointer
-
-
-_f64, _i32, _i64, _u8 = (_pointer(kind) for kind in (types.float64, types.int32, types.int64, types.uint8))
+DATA_FIELDS = ("time", "act", "ctrl", "actuator_velocity")
+PBASE_NEIGHBOURS = ("narena", "nbuffer", "pstack", "maxuse_stack")
+"""Fields of mjData around `pbase`, which the bindings do not show."""
 
 
 class Callbacks(NamedTuple):
@@ -86,10 +72,10 @@ def compiled() -> Callbacks:
     Raises:
         LayoutError: the installed MuJoCo's memory is not laid out as its introspection says.
     """
-    check_layout(MODEL_FIELDS, DATA_FIELDS)
+    check_layout(MODEL_FIELDS, (*DATA_FIELDS, *PBASE_NEIGHBOURS))
     model_at = {field: offset("mjModel", field) for field in MODEL_FIELDS}
     data_at = {field: offset("mjData", field) for field in (*DATA_FIELDS, "pbase")}
-    nactuator_at, nuser_at = model_at["nactuator"], model_at["nuser_actuator"]
+    nu_at, nactuator_at, nuser_at = model_at["nu"], model_at["nactuator"], model_at["nuser_actuator"]
     timestep_at = model_at["opt.timestep"]
     disableflags_at, disableactuator_at = model_at["opt.disableflags"], model_at["opt.disableactuator"]
     dyntype_at, biastype_at = model_at["actuator_dyntype"], model_at["actuator_biastype"]
@@ -105,62 +91,59 @@ def compiled() -> Callbacks:
     loop = numba.njit(inline="always")(advance)
 
     @numba.njit(inline="always")
-    def array(struct: int, at: int) -> int:
-        """Address of the array whose pointer `struct` holds at offset `at`."""
-        return types.uintp(_i64(struct + at)[0])
-
-    @numba.njit(inline="always")
     def is_ours(model: int, actuator: int) -> bool:
         return (
-            _i32(array(model, dyntype_at))[actuator] == user_dynamics
-            and _i64(model + nuser_at)[0] >= user_size
-            and _f64(array(model, user_at))[actuator * _i64(model + nuser_at)[0]] == SIGNATURE
-            and _i32(array(model, biastype_at))[actuator] == user_bias
-            and _i32(array(model, actnum_at))[actuator] == act_size
+            i32(array(model, dyntype_at))[actuator] == user_dynamics
+            and i64(model + nuser_at)[0] >= user_size
+            and f64(array(model, user_at))[actuator * i64(model + nuser_at)[0]] == SIGNATURE
+            and i32(array(model, biastype_at))[actuator] == user_bias
+            and i32(array(model, actnum_at))[actuator] == act_size
         )
 
     @numba.njit(inline="always")
     def is_disabled(model: int, actuator: int) -> bool:
-        group = _i32(array(model, group_at))[actuator]
-        return 0 <= group < groups and (_i32(model + disableactuator_at)[0] >> group) & 1 == 1
+        group = i32(array(model, group_at))[actuator]
+        return 0 <= group < groups and (i32(model + disableactuator_at)[0] >> group) & 1 == 1
 
     @numba.njit(inline="always")
     def command(model: int, data: int, actuator: int) -> float:
-        """The control as the engine would use it: zero where it is not a number, clamped where it is limited."""
-        control = _i32(array(model, ctrladr_at))[actuator]
-        value = _f64(array(data, ctrl_at))[control]
-        if not abs(value) <= largest:
-            return 0.0
-        if _u8(array(model, ctrllimited_at))[control] and not _i32(model + disableflags_at)[0] & no_clamp:
-            limits = _f64(array(model, ctrlrange_at))
+        """The control as the engine would use it: zero if any is not a number, clamped where it is limited."""
+        controls = f64(array(data, ctrl_at))
+        for other in range(i64(model + nu_at)[0]):
+            if not abs(controls[other]) <= largest:
+                return 0.0
+        control = i32(array(model, ctrladr_at))[actuator]
+        value = controls[control]
+        if u8(array(model, ctrllimited_at))[control] and not i32(model + disableflags_at)[0] & no_clamp:
+            limits = f64(array(model, ctrlrange_at))
             value = min(max(value, limits[2 * control]), limits[2 * control + 1])
         return value
 
     @numba.cfunc(types.void(types.uintp, types.uintp), nogil=True, error_model="numpy")
     def control(model: int, data: int) -> None:
-        if _i64(model + nuser_at)[0] < user_size:
+        if i64(model + nuser_at)[0] < user_size:
             return  # no actuator of this model can be ours
-        if _i64(data + pbase_at)[0] != 0:
+        if i64(data + pbase_at)[0] != 0:
             return  # stages 2 to 4 of RK4: the force is held over the step
-        for actuator in range(_i64(model + nactuator_at)[0]):
+        for actuator in range(i64(model + nactuator_at)[0]):
             if not is_ours(model, actuator) or is_disabled(model, actuator):
                 continue
-            act = _f64(array(data, act_at) + 8 * _i32(array(model, actadr_at))[actuator])
-            time = _f64(data + time_at)[0]
+            act = f64(array(data, act_at) + 8 * i32(array(model, actadr_at))[actuator])
+            time = f64(data + time_at)[0]
             if time != act[TICK]:  # a step was taken: what was the candidate has happened
                 act[TICK] = time
                 act[COMMITTED_CURRENT] = act[CURRENT]
                 act[COMMITTED_INTEGRAL] = act[INTEGRAL]
                 act[COMMITTED_ERROR] = act[ERROR]
-            user = _f64(array(model, user_at) + 8 * actuator * _i64(model + nuser_at)[0])
+            user = f64(array(model, user_at) + 8 * actuator * i64(model + nuser_at)[0])
             current, integral, error, voltage = loop(
                 user,
-                _f64(model + timestep_at)[0],
+                f64(model + timestep_at)[0],
                 act[COMMITTED_CURRENT],
                 act[COMMITTED_INTEGRAL],
                 act[COMMITTED_ERROR],
                 command(model, data, actuator),
-                _f64(array(data, velocity_at))[_i32(array(model, outadr_at))[actuator]],
+                f64(array(data, velocity_at))[i32(array(model, outadr_at))[actuator]],
             )
             act[CURRENT] = current
             act[INTEGRAL] = integral
@@ -171,8 +154,8 @@ def compiled() -> Callbacks:
     def act_bias(model: int, data: int, actuator: int) -> float:
         if not is_ours(model, actuator):
             return 0.0  # as the engine does when there is no callback
-        user = _f64(array(model, user_at) + 8 * actuator * _i64(model + nuser_at)[0])
-        act = _f64(array(data, act_at) + 8 * _i32(array(model, actadr_at))[actuator])
+        user = f64(array(model, user_at) + 8 * actuator * i64(model + nuser_at)[0])
+        act = f64(array(data, act_at) + 8 * i32(array(model, actadr_at))[actuator])
         return user[TORQUE_CONSTANT] * act[CURRENT]
 
     generic = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)

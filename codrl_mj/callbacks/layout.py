@@ -97,15 +97,22 @@ def offset(struct_name: str, field: str) -> int:
 
 _PROBE = """
 <mujoco>
-  <option timestep="0.0123"><flag clampctrl="disable"/></option>
+  <option timestep="0.0123" actuatorgroupdisable="1 5"><flag clampctrl="disable"/></option>
   <worldbody>
-    <body><joint name="a" axis="1 0 0"/><geom size="1"/></body>
-    <body><joint name="b" axis="0 1 0"/><geom size="1"/></body>
+    <body>
+      <joint name="a" type="slide" user="21 22 23 24 25 26 27 28"/>
+      <geom size="1"/>
+      <body>
+        <joint name="b" type="ball"/>
+        <inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
+      </body>
+      <body/>
+    </body>
   </worldbody>
   <actuator>
     <motor joint="a" ctrllimited="true" ctrlrange="-2 3" group="4"/>
-    <general joint="b" dyntype="user" actdim="3" biastype="user" user="11 12 13"/>
-    <motor joint="b" user="14 15 16"/>
+    <orientation joint="b" kp="1" input="quat"/>
+    <general joint="a" dyntype="user" actdim="7" biastype="user" user="11 12 13 14 15 16 17 18 19"/>
   </actuator>
 </mujoco>
 """
@@ -114,8 +121,9 @@ _PROBE = """
 def check_layout(model_fields: tuple[str, ...], data_fields: tuple[str, ...]) -> None:
     """Compare the computed layout of the given fields with a live model and its data.
 
-    Every listed array must lie where the layout says, and every listed scalar must have its value there. A field that
-    the public bindings do not show (`pbase`) is checked through its neighbour `pstack`.
+    Every listed array must lie where the layout says, and every listed scalar must have its value there; the probe
+    gives every count another value. A field that the public bindings do not show (`pbase`) is checked through its
+    neighbours on both sides.
 
     Args:
         model_fields: fields of mjModel that will be read.
@@ -127,6 +135,7 @@ def check_layout(model_fields: tuple[str, ...], data_fields: tuple[str, ...]) ->
     model = mujoco.MjModel.from_xml_string(_PROBE)
     data = mujoco.MjData(model)
     data.time = 4.56
+    mujoco.mj_fwdPosition(model, data)  # uses the stack: `maxuse_stack` is no longer zero
     for owner, name, fields in ((model, "mjModel", model_fields), (data, "mjData", data_fields)):
         raw: Any = struct(name).from_address(owner._address)
         for field in fields:

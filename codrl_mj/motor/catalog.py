@@ -13,6 +13,8 @@ from codrl_mj.motor.parameters import Actuator, CurrentLoop, Motor
 PAPER: dict[str, Actuator] = {
     # The paper, Experimental Results: gains and arm of each task. R, L, kT, kE are the dataclass defaults.
     "pendulum": Actuator(Motor(), CurrentLoop(kp=1.0, ki=20.0, kd=1e-6)),
+    "mountain_car": Actuator(Motor(), CurrentLoop(kp=1.0, ki=1.0, kd=1e-2)),
+    "mountain_car_continuous": Actuator(Motor(), CurrentLoop(kp=0.1, ki=10.0, kd=1e-3)),
     "acrobot": Actuator(Motor(), CurrentLoop(kp=1.0, ki=10.0, kd=1e-6)),
     "cartpole": Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=4.3, ki=1.0, kd=1e-6, kff=0.6)),
 }

@@ -2,7 +2,7 @@
 
 from codrl_mj.physics.analytic import AnalyticPhysics
 from codrl_mj.physics.base import Physics, Signals, SimulationDivergedError
-from codrl_mj.physics.mjcf import motors, set_actuator
+from codrl_mj.physics.mjcf import hills, install_callbacks, motors, needed_callbacks, set_actuator
 from codrl_mj.physics.mujoco_single import MujocoPhysics
 
 PHYSICS: dict[str, type[AnalyticPhysics] | type[MujocoPhysics]] = {"mujoco": MujocoPhysics, "analytic": AnalyticPhysics}
@@ -15,6 +15,9 @@ __all__ = [
     "Physics",
     "Signals",
     "SimulationDivergedError",
+    "hills",
+    "install_callbacks",
     "motors",
+    "needed_callbacks",
     "set_actuator",
 ]

@@ -101,10 +101,55 @@ class AcrobotDriver:
         return env.state
 
 
+class MountainCarDriver:
+    """`MountainCarEnv`: its step has no duration, but force, gravity and speed limit are attributes.
+
+    One step is v += force - gravity cos(3 x), x += v. With w = v dt for its v, and force and gravity times dt^2, it is
+    a step of any duration dt.
+    """
+
+    speed = 1
+    _strength = "force"
+
+    def __init__(self, gymnasium_id: str) -> None:
+        """Make the Gymnasium environment; remember what it is before it is driven."""
+        self._acceleration = getattr(_unwrapped(gymnasium_id), self._strength)  # m/s^2 per N
+        self._env = _unwrapped("MountainCar-v0")
+        self._gravity, self._max_speed = self._env.gravity, self._env.max_speed
+
+    def __call__(
+        self,
+        state: np.ndarray,
+        force: float,
+        timestep: float,
+        integrator: str,  # noqa: ARG002 - it has one only
+    ) -> np.ndarray:
+        """One `step` to the right with `force` set to the force's effect, of either sign."""
+        env = self._env
+        env.force = force * self._acceleration * timestep**2
+        env.gravity = self._gravity * timestep**2
+        env.max_speed = self._max_speed * timestep
+        env.state = (state[0], state[1] * timestep)
+        env.step(2)
+        return np.array([env.state[0], env.state[1] / timestep])
+
+
+class MountainCarContinuousDriver(MountainCarDriver):
+    """`MountainCarEnv` again, with the `power` of `Continuous_MountainCarEnv`.
+
+    The continuous environment's equations are the same, but written so that they cannot be scaled (its gravity is no
+    attribute), and it rounds its state to float32.
+    """
+
+    _strength = "power"
+
+
 DRIVERS: dict[str, type[Driver]] = {
     "pendulum": PendulumDriver,
     "cartpole": CartPoleDriver,
     "acrobot": AcrobotDriver,
+    "mountain_car": MountainCarDriver,
+    "mountain_car_continuous": MountainCarContinuousDriver,
 }
 """The driver of each task's Gymnasium environment."""
 

@@ -3,8 +3,9 @@
 import mujoco
 import numpy as np
 
+from codrl_mj import callbacks
 from codrl_mj.assets import asset_path
-from codrl_mj.callbacks import ACT_NAMES
+from codrl_mj.callbacks import ACT_NAMES, HILL_NAMES
 from codrl_mj.motor import Actuator, from_vector, to_vector
 from codrl_mj.motor.parameters import PARAMETER_NAMES, SIGNATURE
 from codrl_mj.tasks import Task
@@ -13,7 +14,7 @@ from codrl_mj.tasks import Task
 def set_actuator(target: mujoco.MjsActuator, actuator: Actuator | None, max_force: float | None) -> None:
     """Make an actuator of an `MjSpec` one of our motors, or an ideal one.
 
-    Call `codrl_mj.callbacks.install()` before simulating a model that holds our motors.
+    Call `install_callbacks` before simulating a model that holds our motors.
 
     Args:
         target: the actuator, with its joint transmission set; its gear, dynamics, gain, bias, range and user data are
@@ -45,7 +46,8 @@ def motors(model: mujoco.MjModel) -> dict[int, Actuator]:
 
     Raises:
         ValueError: an actuator carries our signature but not our layout, or a parameter out of bounds; or it uses
-            MuJoCo's actuator delay, which the callback does not see.
+            MuJoCo's actuator delay, which the callback does not see, a gain, which would add to the motor's torque, or
+            limits of its activations, which are the motor's state.
     """
     found = {}
     for index in range(model.nactuator):
@@ -58,6 +60,9 @@ def motors(model: mujoco.MjModel) -> dict[int, Actuator]:
             "biastype": (model.actuator_biastype[index], mujoco.mjtBias.mjBIAS_USER, 'biastype="user"'),
             "actdim": (model.actuator_actnum[index], len(ACT_NAMES), f'actdim="{len(ACT_NAMES)}"'),
             "delay": (model.actuator_delay[index], 0.0, 'delay="0"'),
+            "gaintype": (model.actuator_gaintype[index], mujoco.mjtGain.mjGAIN_FIXED, 'gaintype="fixed"'),
+            "gainprm": (model.actuator_gainprm[index, 0], 0.0, 'gainprm="0"'),
+            "actlimited": (model.actuator_actlimited[index], False, 'actlimited="false"'),
         }
         for field, (value, wanted, remedy) in expected.items():
             if value != wanted:
@@ -70,6 +75,50 @@ def motors(model: mujoco.MjModel) -> dict[int, Actuator]:
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
     return found
+
+
+def hills(model: mujoco.MjModel) -> list[int]:
+    """The joints of a compiled model that run over one of our hills (see `codrl_mj.callbacks.hill`).
+
+    Raises:
+        ValueError: a joint carries our signature but not our layout.
+    """
+    found = []
+    for index in range(model.njnt):
+        user = model.jnt_user[index]
+        if len(user) == 0 or user[0] != SIGNATURE:
+            continue
+        name = model.joint(index).name or f"joint {index}"
+        if len(user) < len(HILL_NAMES):
+            raise ValueError(f"{name}: user = {list(user)}: a hill of codrl_mj needs {', '.join(HILL_NAMES)}")
+        if model.jnt_type[index] != mujoco.mjtJoint.mjJNT_SLIDE or list(model.jnt_axis[index]) != [1.0, 0.0, 0.0]:
+            raise ValueError(f'{name}: a hill of codrl_mj needs type="slide" and axis="1 0 0"')
+        found.append(index)
+    return found
+
+
+def needed_callbacks(model: mujoco.MjModel) -> tuple[str, ...]:
+    """The parts of our callbacks that a compiled model needs, as `codrl_mj.callbacks.install` takes them.
+
+    Raises:
+        ValueError: an actuator or joint carries our signature but not our layout.
+    """
+    return tuple(part for part, found in (("motor", motors(model)), ("hill", hills(model))) if found)
+
+
+def install_callbacks(model: mujoco.MjModel) -> None:
+    """Install those of our callbacks that the model needs, which may be none.
+
+    Args:
+        model: any MuJoCo model.
+
+    Raises:
+        ValueError: an actuator or joint carries our signature but not our layout.
+        CallbackInUseError: one of them is somebody else's; nothing was changed.
+    """
+    parts = needed_callbacks(model)
+    if parts:
+        callbacks.install(*parts)
 
 
 def task_model(task: Task, actuator: Actuator | None, timestep: float) -> mujoco.MjModel:

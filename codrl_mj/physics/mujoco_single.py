@@ -10,7 +10,7 @@ from codrl_mj.callbacks.kernels import CURRENT, VOLTAGE
 from codrl_mj.motor import Actuator
 from codrl_mj.physics.base import Signals, check_finite, ideal_signals, motor_signals
 from codrl_mj.physics.constrain import compiled_constrain
-from codrl_mj.physics.mjcf import task_model
+from codrl_mj.physics.mjcf import needed_callbacks, task_model
 from codrl_mj.tasks import Task
 
 
@@ -23,7 +23,7 @@ class MujocoPhysics:
     """
 
     def __init__(self, task: Task, actuator: Actuator | None, inner_steps: int, integrator: str) -> None:
-        """Compile the model and install the callbacks if there is a motor."""
+        """Compile the model and install the callbacks that it needs."""
         self.task = task
         self.actuator = actuator
         self.inner_steps = inner_steps
@@ -39,8 +39,12 @@ class MujocoPhysics:
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
         self._ctrl, self._act = self.data.ctrl, self.data.act
         self._constrain = compiled_constrain(self.task.constrain) if self.task.constrain is not None else None
-        if self.actuator is not None:
-            callbacks.install()
+        self._callbacks = needed_callbacks(self.model)
+        self._install()
+
+    def _install(self) -> None:
+        if self._callbacks:
+            callbacks.install(*self._callbacks)
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the views, which a copy takes of its own data."""
@@ -63,8 +67,7 @@ class MujocoPhysics:
 
     def reset(self, state: np.ndarray) -> None:
         """Start an episode from `state`, with the motor at rest."""
-        if self.actuator is not None:
-            callbacks.install()  # raises if somebody replaced ours since the last episode
+        self._install()  # raises if somebody replaced ours since the last episode
         mujoco.mj_resetData(self.model, self.data)
         self._write_state(state)
         self.state = self._read_state()
@@ -75,6 +78,7 @@ class MujocoPhysics:
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
+        mujoco.mj_passive(self.model, self.data)  # where there is a hill, its callback puts the car on it
 
     def step(self, desired_force: float) -> Signals:
         """Advance by one environment step, with the desired force (at most the task's `max_force`) held over it.

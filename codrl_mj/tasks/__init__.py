@@ -2,10 +2,11 @@
 
 import difflib
 
-from codrl_mj.tasks import acrobot, cartpole, pendulum
+from codrl_mj.tasks import acrobot, cartpole, mountain_car, mountain_car_continuous, pendulum
 from codrl_mj.tasks.base import Task
 
-TASKS: dict[str, Task] = {module.TASK.name: module.TASK for module in (pendulum, cartpole, acrobot)}
+_MODULES = (pendulum, cartpole, acrobot, mountain_car, mountain_car_continuous)
+TASKS: dict[str, Task] = {module.TASK.name: module.TASK for module in _MODULES}
 """Every task by its name on the command line."""
 
 

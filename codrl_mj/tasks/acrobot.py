@@ -2,8 +2,8 @@
 
 ## Description
 
-Two links (1 kg, 1 m each, centre of mass in the middle, 1 kg m^2 about it) hang from a fixed shoulder under a gravity of
-9.8 m/s^2. The actuator turns the elbow between them. These are Gymnasium's default ("book") dynamics, without its
+Two links (1 kg, 1 m each, centre of mass in the middle, 1 kg m^2 about it) hang from a fixed shoulder under a gravity
+of 9.8 m/s^2. The actuator turns the elbow between them. These are Gymnasium's default ("book") dynamics, without its
 torque noise.
 
 ## Observation space

@@ -1,0 +1,129 @@
+"""MountainCar: rock a weak car out of a valley, pushing left, right or not at all. Gymnasium's MountainCar-v0.
+
+## Description
+
+A car drives on a hill of the shape sin(3 x). Its acceleration along x is 0.001 F - 0.0025 cos(3 x), in m/s^2 with F in
+N: a car of 1/0.001 = 1000 kg. The force does not suffice to drive up from the valley; the car has to rock. Renders show
+the hill that Gymnasium draws, to scale: its height is 0.55 + 0.45 sin(3 x), in m.
+
+## Observation space
+
+`Box([-1.2, -0.07], [0.6, 0.07], (2,), float32)`
+
+| index | observation | min | max | unit |
+| --- | --- | --- | --- | --- |
+| 0 | position x along the horizontal | -1.2 | 0.6 | m |
+| 1 | velocity v | -0.07 | 0.07 | m/s |
+
+The bounds are kept after every integration step: the speed is limited before it moves the car, the position afterwards,
+and the left wall stops the car.
+
+## Action space
+
+`Discrete(3)`: the desired force is -1, 0 or 1 N.
+
+## Reward
+
+-1 a step.
+
+## Start
+
+x uniform in [-0.6, -0.4] m, v = 0. `reset(options={"low": ..., "high": ...})` sets the bounds of x.
+
+## End
+
+At the end of a step x >= 0.5 m with v >= 0. Truncated after 200 steps (200 s).
+
+## Arguments
+
+Those of `codrl_mj.envs.ActuatedEnv`. The task has no options of its own (Gymnasium's `goal_velocity` is 0 here). An
+environment step of 1 s is one semi-implicit Euler step (Gymnasium's) when the actuator is ideal, and twenty of 0.05 s
+with a motor, the paper's choice.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.classic_control import utils
+
+from codrl_mj.tasks.base import Task
+
+# Gymnasium's MountainCar-v0 and, but for the goal, its MountainCarContinuous-v0
+FORCE = 1.0  # N
+MIN_POSITION, MAX_POSITION = -1.2, 0.6  # m
+MAX_SPEED = 0.07  # m/s
+GOAL = 0.5  # m
+
+
+class Options(NamedTuple):
+    """MountainCar has no options."""
+
+
+def initial(generator: np.random.Generator, options: dict[str, Any] | None) -> np.ndarray:
+    """Draw the position uniformly from (-0.6, -0.4), or from the reset options' `low` and `high`; at rest."""
+    low, high = utils.maybe_parse_reset_bounds(options, -0.6, -0.4)
+    return np.array([generator.uniform(low=low, high=high), 0.0])
+
+
+def desired_force(action: np.ndarray) -> np.ndarray:
+    """Actions 0, 1, 2 ask for -1, 0, 1 N."""
+    return FORCE * (action - 1.0)
+
+
+def constrain(state: np.ndarray, timestep: float) -> np.ndarray:
+    """Limit the speed, by which the car then moves; keep the position between the walls; stop at the left one."""
+    bounded = state.copy()
+    for row in bounded:
+        excess = row[1] - MAX_SPEED if row[1] > MAX_SPEED else row[1] + MAX_SPEED if row[1] < -MAX_SPEED else 0.0
+        if excess != 0.0:
+            row[0] -= excess * timestep
+            row[1] = MAX_SPEED if excess > 0.0 else -MAX_SPEED
+        if row[0] > MAX_POSITION:
+            row[0] = MAX_POSITION
+        elif row[0] <= MIN_POSITION:
+            row[0] = MIN_POSITION
+            if row[1] < 0.0:
+                row[1] = 0.0
+    return bounded
+
+
+def observation(state: np.ndarray) -> np.ndarray:
+    """The state as float32."""
+    return state.astype(np.float32)
+
+
+def terminated(state: np.ndarray) -> np.ndarray:
+    """The car is at the flag or beyond, and not rolling back."""
+    return (state[..., 0] >= GOAL) & (state[..., 1] >= 0.0)
+
+
+def reward(state: np.ndarray, force: np.ndarray, next_state: np.ndarray, options: Options) -> np.ndarray:
+    """-1 a step."""
+    return np.full(next_state.shape[:-1], -1.0)
+
+
+_LOW, _HIGH = np.array([[MIN_POSITION, -MAX_SPEED], [MAX_POSITION, MAX_SPEED]], dtype=np.float32)
+
+TASK = Task(
+    name="mountain_car",
+    gymnasium_id="MountainCar-v0",
+    asset="mountain_car.xml",
+    step_duration=1.0,
+    motor_inner_steps=20,
+    max_force=FORCE,
+    render_fps=30,
+    integrators=("semi-implicit",),
+    state_names=("x [m]", "x_dot [m/s]"),
+    qpos=(0,),
+    qvel=(1,),
+    action_space=spaces.Discrete(3),
+    observation_space=spaces.Box(_LOW, _HIGH, dtype=np.float32),
+    options=Options,
+    initial=initial,
+    desired_force=desired_force,
+    observation=observation,
+    reward=reward,
+    terminated=terminated,
+    constrain=constrain,
+)

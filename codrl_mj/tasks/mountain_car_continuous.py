@@ -1,0 +1,81 @@
+"""MountainCarContinuous: rock a weak car out of a valley with little effort. Gymnasium's MountainCarContinuous-v0.
+
+## Description
+
+The car and the hill of `codrl_mj.tasks.mountain_car`, with a stronger motor: its acceleration along x is
+0.0015 F - 0.0025 cos(3 x), in m/s^2 with F in N: a car of 1/0.0015 = 666.7 kg.
+
+## Observation space
+
+`Box([-1.2, -0.07], [0.6, 0.07], (2,), float32)`: position x [m] and velocity v [m/s], as for `mountain_car`. Gymnasium
+rounds its state to float32 in every step; here the state is float64 and only the observation is rounded.
+
+## Action space
+
+`Box(-1, 1, (1,), float32)`: the desired force [N]; it saturates at +-1.
+
+## Reward
+
+100 for the step that ends at the goal, minus 0.1 F^2 for the force F [N] delivered in the step: the motor's at the end
+of it, which need not be the desired one. (Gymnasium charges for the action. With an ideal actuator that is the same,
+unless an action lies outside the action space: Gymnasium then charges for more than it delivers.)
+
+## Start
+
+x uniform in [-0.6, -0.4] m, v = 0. `reset(options={"low": ..., "high": ...})` sets the bounds of x.
+
+## End
+
+At the end of a step x >= 0.45 m with v >= 0. Truncated after 999 steps (999 s).
+
+## Arguments
+
+Those of `codrl_mj.envs.ActuatedEnv`. The task has no options of its own (Gymnasium's `goal_velocity` is 0 here). An
+environment step of 1 s is one semi-implicit Euler step (Gymnasium's) when the actuator is ideal, and twenty of 0.05 s
+with a motor, the paper's choice.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+
+from codrl_mj.tasks import mountain_car
+
+# Gymnasium's MountainCarContinuous-v0
+FORCE = 1.0  # N
+GOAL = 0.45  # m
+
+
+class Options(NamedTuple):
+    """MountainCarContinuous has no options."""
+
+
+def desired_force(action: np.ndarray) -> np.ndarray:
+    """The action as a force [N], saturated."""
+    return np.clip(action[..., 0].astype(np.float64), -FORCE, FORCE)
+
+
+def terminated(state: np.ndarray) -> np.ndarray:
+    """The car is at the flag or beyond, and not rolling back."""
+    return (state[..., 0] >= GOAL) & (state[..., 1] >= 0.0)
+
+
+def reward(state: np.ndarray, force: np.ndarray, next_state: np.ndarray, options: Options) -> np.ndarray:
+    """100 at the goal, minus the square of the force delivered."""
+    return 100.0 * terminated(next_state) - 0.1 * force**2
+
+
+TASK = dataclasses.replace(
+    mountain_car.TASK,
+    name="mountain_car_continuous",
+    gymnasium_id="MountainCarContinuous-v0",
+    asset="mountain_car_continuous.xml",
+    max_force=FORCE,
+    action_space=spaces.Box(-FORCE, FORCE, (1,), np.float32),
+    options=Options,
+    desired_force=desired_force,
+    reward=reward,
+    terminated=terminated,
+)
