@@ -11,8 +11,8 @@ hypothesis.settings.load_profile("deterministic")
 
 
 def _remove_callbacks():
-    mujoco.set_mjcb_control(None)
-    mujoco.set_mjcb_act_bias(None)
+    for name in ("control", "act_bias", "act_gain", "act_dyn", "passive"):
+        getattr(mujoco, f"set_mjcb_{name}")(None)
 
 
 @pytest.fixture
@@ -24,9 +24,6 @@ def bare_engine():
 
 
 @pytest.fixture
-def installed():
-    """MuJoCo with our callbacks during the test, and without any after it."""
-    _remove_callbacks()
+def installed(bare_engine):
+    """MuJoCo with our motors' callbacks during the test, and without any after it."""
     callbacks.install()
-    yield
-    _remove_callbacks()

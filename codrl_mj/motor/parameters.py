@@ -105,8 +105,9 @@ class CurrentLoop:
         _check(self, "max_voltage", above=0.0)
         if not isinstance(self.bemf_compensation, bool):
             raise ValueError(f"CurrentLoop.bemf_compensation = {self.bemf_compensation!r}: must be True or False")
-        if isinstance(self.substeps, bool) or not isinstance(self.substeps, int) or self.substeps < 1:
+        if isinstance(self.substeps, bool) or not isinstance(self.substeps, numbers.Integral) or self.substeps < 1:
             raise ValueError(f"CurrentLoop.substeps = {self.substeps!r}: must be an integer >= 1")
+        object.__setattr__(self, "substeps", int(self.substeps))
 
 
 @dataclasses.dataclass(frozen=True)

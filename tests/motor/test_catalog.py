@@ -78,5 +78,5 @@ def test_resolve_takes_every_way_to_write_an_actuator():
 
 @pytest.mark.parametrize("value", [3, 1.5, ["paper"], Motor()])
 def test_resolve_refuses_anything_else(value):
-    with pytest.raises(ValueError, match="actuator = .*must be a name .*, an Actuator or a mapping"):
+    with pytest.raises(ValueError, match=r"actuator = .*must be a name .*, an Actuator or a mapping"):
         resolve(value, "cartpole")

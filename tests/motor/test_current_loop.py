@@ -164,8 +164,8 @@ def test_compensation_makes_the_unsaturated_current_independent_of_speed(actuato
 
 # -- each feature's wiring ----------------------------------------------------------------------------------
 # A state, and the one-step voltage or current with the feature on and off, worked out by hand from
-# R = 2, L = 0.5, kT = 0.5, kE = 0.25, kP = 3, dt = 0.1; i = 1, I = 0.5, e_old = 0.25, torque 1 (i_ref = 2, e = 1), w = 4.
-# Plain P loop with compensation: u = 3 + 1 = 4; i' = 1 + (4 - 1 - 2)/0.5*0.1 = 1.2.
+# R = 2, L = 0.5, kT = 0.5, kE = 0.25, kP = 3, dt = 0.1; i = 1, I = 0.5, e_old = 0.25, torque 1 (i_ref = 2, e = 1),
+# w = 4. Plain P loop with compensation: u = 3 + 1 = 4; i' = 1 + (4 - 1 - 2)/0.5*0.1 = 1.2.
 
 FEATURES = {
     # name: (field changes, expected u, expected i')

@@ -62,6 +62,11 @@ def test_substeps_must_be_an_integer_of_at_least_one(value):
     assert _refusal(CurrentLoop, "substeps", value) == f"CurrentLoop.substeps = {value!r}: must be an integer >= 1"
 
 
+def test_substeps_may_be_any_kind_of_integer_and_are_stored_as_an_int():
+    assert type(CurrentLoop(substeps=np.int64(3)).substeps) is int
+    assert CurrentLoop(substeps=np.int64(3)) == CurrentLoop(substeps=3)
+
+
 @pytest.mark.parametrize("value", [0, 1, 1.0, "yes", None], ids=repr)
 def test_bemf_compensation_must_be_a_bool(value):
     message = _refusal(CurrentLoop, "bemf_compensation", value)
