@@ -16,7 +16,7 @@ def writing(path: Path) -> Iterator[Path]:
     The folder is made if it is missing. The temporary name keeps the suffix, which some encoders go by.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
     os.close(handle)
     temporary = Path(name)
     try:
