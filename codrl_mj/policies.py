@@ -114,10 +114,16 @@ def load_policy(folder: Path) -> Any:
             net_arch=description["net_arch"],
             activation_fn=getattr(nn, description["activation"]),
         )
-        policy.load_state_dict(load_file(weights))
+    except (ArithmeticError, AssertionError, AttributeError, LookupError, TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{folder / _DESCRIPTION} does not describe a policy: {error!r}") from None
+    try:
+        tensors = load_file(weights)
+        policy.load_state_dict(tensors)
     except SafetensorError as error:
         raise ValueError(f"{weights} is truncated or not a safetensors file: {error}") from None
-    except (KeyError, TypeError, RuntimeError) as error:
+    except RuntimeError as error:
         raise ValueError(f"{weights} and {_DESCRIPTION} do not belong together: {error}") from None
+    if not all(tensor.isfinite().all() for tensor in tensors.values()):
+        raise ValueError(f"{weights} holds weights that are not finite numbers")
     policy.set_training_mode(False)
     return policy
