@@ -309,7 +309,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         return verb.run()
     except (ValueError, OSError, RuntimeError, ArithmeticError) as error:
-        print(f"codrl-mj: error: {error}", file=sys.stderr)
+        print(f"codrl-mj: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except ModuleNotFoundError as error:
         print(

@@ -6,7 +6,11 @@ from typing import Any, Literal
 
 @dataclasses.dataclass(frozen=True)
 class EnvConfig:
-    """Arguments of an environment other than task, actuator and rendering; None leaves the task's default."""
+    """Arguments of an environment other than task, actuator and rendering; None leaves the task's default.
+
+    Raises:
+        ValueError: `max_episode_steps` is out of bounds; the environment checks the rest.
+    """
 
     physics: Literal["mujoco", "analytic"] = "mujoco"
     """`mujoco`, or `analytic`: Gymnasium's own equations."""
@@ -15,11 +19,17 @@ class EnvConfig:
     inner_steps: int | None = None
     """Integration steps per environment step; the default is the paper's inner loop with a motor and 1 without."""
     max_episode_steps: int | None = None
-    """Time limit [environment steps]; the default is Gymnasium's."""
+    """Time limit [environment steps], >= 1; the default is Gymnasium's."""
     center_radius: float | None = None
     """CartPole: distance from the centre [m] beyond which a step earns nothing. The paper trains with 0.1."""
     allow_unstable: bool = False
     """Build the environment even if the current loop is unstable."""
+
+    def __post_init__(self) -> None:
+        """Validate what the environment itself does not see."""
+        limit = self.max_episode_steps
+        if limit is not None and (isinstance(limit, bool) or not isinstance(limit, int) or limit < 1):
+            raise ValueError(f"max_episode_steps = {limit!r}: must be an integer >= 1")
 
     def as_arguments(self) -> dict[str, Any]:
         """The keyword arguments for `gymnasium.make`, without those left at the task's default."""

@@ -69,7 +69,13 @@ class RandomPolicy:
     """Chooses uniformly from a task's action space."""
 
     def __init__(self, task: str, seed: int = 0) -> None:
-        """Seed a private copy of the action space."""
+        """Seed a private copy of the action space.
+
+        Raises:
+            ValueError: unknown task, or a seed below 0.
+        """
+        if seed < 0:
+            raise ValueError(f"seed = {seed}: must be >= 0")
         self._space = copy.deepcopy(find_task(task).action_space)
         self._space.seed(seed)
 
@@ -116,10 +122,12 @@ def run_episodes(
         The episodes, in the order of their seeds.
 
     Raises:
-        ValueError: `episodes` is below 1.
+        ValueError: `episodes` is below 1, or `seed` below 0.
     """
     if episodes < 1:
         raise ValueError(f"episodes = {episodes}: must be >= 1")
+    if seed < 0:
+        raise ValueError(f"seed = {seed}: must be >= 0")
     envs = [make() for _ in range(episodes)]
     cores: list[ActuatedEnv] = [env.unwrapped for env in envs]  # type: ignore[misc]
     observations = [[env.reset(seed=seed + index)[0]] for index, env in enumerate(envs)]

@@ -21,6 +21,7 @@ _DPI = 100
 _TITLE_HEIGHT = 40  # px
 _HEADER_HEIGHT, _PLOT_HEIGHT, _TIME_HEIGHT = 24, 120, 26  # px, the strip's legend, plot and time axis
 _AXIS_WIDTH, _MARGIN = 62, 10  # px, left and right of the plot
+_MIN_WIDTH, _MIN_HEIGHT = 160, 80  # px
 _WINDOW_STEPS = 150  # environment steps that the strip shows at a time
 _MAX_FPS = 30
 _DESIRED, _ACTUAL, _SATURATED = "#0072B2", "#D55E00", "#CC79A7"  # told apart by colour-blind eyes (Okabe and Ito)
@@ -50,13 +51,13 @@ def film(
     pretty: bool = False,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Write a video of episodes side by side, in the time of the simulation.
+    """Write a video of episodes side by side, at the task's frame rate (CartPole: the time of the simulation).
 
     Args:
         panels: one or more episodes of the same task, side by side; a shorter one stands still at its end.
         out: the file to make; its suffix chooses the format (`.mp4`: H.264; `.gif`).
-        width: width of one panel [px], even.
-        height: height of one panel's scene [px], even.
+        width: width of one panel [px], even, >= 160.
+        height: height of one panel's scene [px], even, >= 80.
         camera: a camera of the model.
         pretty: shadows, reflections and multisampling.
         on_frame: called with (frames written, frames in all).
@@ -65,7 +66,7 @@ def film(
         `out`.
 
     Raises:
-        ValueError: no panel, unknown format, odd size or unknown camera.
+        ValueError: no panel, unknown format, odd or too small a size, or unknown camera.
         RenderingUnavailableError: no OpenGL context can be made here; the message has the remedy.
     """
     import imageio
@@ -77,6 +78,9 @@ def film(
     for name, size in (("width", width), ("height", height)):
         if size % 2:
             raise ValueError(f"{name} = {size}: must be even, as video encoders need it [px]")
+    for name, size, least in (("width", width, _MIN_WIDTH), ("height", height, _MIN_HEIGHT)):
+        if size < least:
+            raise ValueError(f"{name} = {size}: must be >= {least} [px], for the title and the strip")
     drawn = [_DrawnPanel(panel, width, height, camera, pretty, _end(panels)) for panel in panels]
     stride = max(1, round(drawn[0].rate / _MAX_FPS))
     last = max(len(panel.episode.reward) for panel in panels)

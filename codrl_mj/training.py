@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import importlib.metadata
+import shutil
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -34,7 +35,7 @@ class TrainConfig:
     ppo: PPOConfig = PPOConfig()
     """The agent's settings."""
     seed: int = 0
-    """Seed of weights, actions and environments, >= 0."""
+    """Seed of weights, actions and environments, from 0 to 2**32 - 1."""
     total_steps: int = 200_000
     """Environment steps in all, >= 1; rounded up to whole rollouts."""
     num_envs: int = 8
@@ -46,9 +47,15 @@ class TrainConfig:
         """Validate, and replace the actuator by the `Actuator` (or None) that it stands for."""
         find_task(self.task)
         object.__setattr__(self, "actuator", resolve(self.actuator, self.task))
-        for name, least in (("seed", 0), ("total_steps", 1), ("num_envs", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be >= {least}")
+        for name, kind in (("ppo", PPOConfig), ("env", EnvConfig)):
+            if not isinstance(getattr(self, name), kind):
+                raise ValueError(f"TrainConfig.{name} = {getattr(self, name)!r}: must be a {kind.__name__}")
+        for name, least, most in (("seed", 0, 2**32 - 1), ("total_steps", 1, None), ("num_envs", 1, None)):
+            value = getattr(self, name)
+            whole = isinstance(value, int) and not isinstance(value, bool)
+            if not whole or value < least or (most is not None and value > most):
+                bound = f">= {least}" if most is None else f"from {least} to {most}"
+                raise ValueError(f"TrainConfig.{name} = {value!r}: must be an integer {bound}")
 
     def as_mapping(self) -> dict[str, Any]:
         """The configuration as JSON-serialisable values; `from_mapping` reads it."""
@@ -67,7 +74,7 @@ class TrainConfig:
             values["env"] = EnvConfig(**values["env"])
             return cls(**values)
         except (KeyError, TypeError) as error:
-            raise ValueError(f"not a training configuration: {error}") from None
+            raise ValueError(f"not a training configuration: {error!r}") from None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,7 +100,11 @@ def load_config(run: Path) -> TrainConfig:
         FileNotFoundError: the folder is no run folder.
         ValueError: its configuration is damaged.
     """
-    return TrainConfig.from_mapping(read_json(run / _CONFIG, "run configuration")["train"])
+    content = read_json(run / _CONFIG, "run configuration")
+    try:
+        return TrainConfig.from_mapping(content["train"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{run / _CONFIG}: not a run configuration: {error}") from None
 
 
 def train(config: TrainConfig, out: Path, on_progress: Callable[[Progress], None] | None = None) -> Path:
@@ -111,6 +122,8 @@ def train(config: TrainConfig, out: Path, on_progress: Callable[[Progress], None
     Raises:
         FileExistsError: `out` exists; nothing in it was touched.
         ValueError: the configuration cannot be trained, for instance because the actuator is unstable.
+
+    Whatever is raised, Ctrl-C included, no run folder is left.
     """
     if out.exists():
         raise FileExistsError(f"run folder {out} exists already: choose another --out, or delete it to train anew")
@@ -147,12 +160,18 @@ def train(config: TrainConfig, out: Path, on_progress: Callable[[Progress], None
             if on_progress is not None:
                 on_progress(history[-1])
 
-    write_json(out / _CONFIG, {"train": config.as_mapping(), "versions": _versions()})
-    model.learn(config.total_steps, callback=Report())
-    envs.close()
-    _write_progress(out / _PROGRESS, history)
-    _draw_learning_curve(out / _CURVE, config, history)
-    save_policy(model, out)
+    out.mkdir(parents=True)
+    try:
+        write_json(out / _CONFIG, {"train": config.as_mapping(), "versions": _versions()})
+        model.learn(config.total_steps, callback=Report())
+        _write_progress(out / _PROGRESS, history)
+        _draw_learning_curve(out / _CURVE, config, history)
+        save_policy(model, out)
+    except BaseException:
+        shutil.rmtree(out, ignore_errors=True)
+        raise
+    finally:
+        envs.close()
     return out
 
 

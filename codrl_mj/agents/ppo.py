@@ -1,6 +1,9 @@
 """PPO (Stable-Baselines3) with settings that suit CartPole through a motor."""
 
 import dataclasses
+import math
+import numbers
+from collections.abc import Callable
 from typing import Any
 
 
@@ -38,17 +41,36 @@ class PPOConfig:
 
     def __post_init__(self) -> None:
         """Validate."""
-        positive = ("learning_rate", "gamma", "clip_range", "target_kl", "epochs")
-        bounds = {name: (getattr(self, name) > 0, "> 0") for name in positive}
-        bounds["rollout_steps"] = (self.rollout_steps >= 2, ">= 2")
-        bounds["batch_size"] = (self.batch_size >= 2, ">= 2")
-        bounds["gamma"] = (0 < self.gamma <= 1, "in (0, 1]")
-        bounds["gae_lambda"] = (0 <= self.gae_lambda <= 1, "in [0, 1]")
-        bounds["entropy_coefficient"] = (self.entropy_coefficient >= 0, ">= 0")
-        bounds["hidden"] = (all(units >= 1 for units in self.hidden), "positive layer sizes")
+        finite = math.isfinite
+        bounds: dict[str, tuple[Callable[[Any], bool], str]] = {
+            "learning_rate": (lambda value: _is_number(value) and finite(value) and value > 0, "a finite number > 0"),
+            "rollout_steps": (lambda value: _is_integer(value) and value >= 2, "an integer >= 2"),
+            "batch_size": (lambda value: _is_integer(value) and value >= 2, "an integer >= 2"),
+            "epochs": (lambda value: _is_integer(value) and value >= 1, "an integer >= 1"),
+            "gamma": (lambda value: _is_number(value) and 0 < value <= 1, "a number in (0, 1]"),
+            "gae_lambda": (lambda value: _is_number(value) and 0 <= value <= 1, "a number in [0, 1]"),
+            "clip_range": (lambda value: _is_number(value) and value > 0, "a number > 0"),
+            "entropy_coefficient": (
+                lambda value: _is_number(value) and finite(value) and value >= 0,
+                "a finite number >= 0",
+            ),
+            "target_kl": (lambda value: _is_number(value) and value > 0, "a number > 0"),
+            "hidden": (
+                lambda value: isinstance(value, tuple) and all(_is_integer(units) and units >= 1 for units in value),
+                "a tuple of integers >= 1",
+            ),
+        }
         for name, (holds, bound) in bounds.items():
-            if not holds:
-                raise ValueError(f"PPOConfig.{name} = {getattr(self, name)}: must be {bound}")
+            if not holds(value := getattr(self, name)):
+                raise ValueError(f"PPOConfig.{name} = {value!r}: must be {bound}")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)
+
+
+def _is_integer(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
 
 
 def make_ppo(config: PPOConfig, env: Any, seed: int) -> Any:
