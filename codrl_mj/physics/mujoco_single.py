@@ -38,7 +38,7 @@ class MujocoPhysics:
         """Take the views that a step uses, and make sure that the callbacks are there."""
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
         self._ctrl, self._act = self.data.ctrl, self.data.act
-        self._constrain = compiled_constrain(self.task.constrain) if self.task.constrain is not None else None
+        self._constrain = compiled_constrain(self.task)
         self._callbacks = needed_callbacks(self.model)
         self._install()
 
@@ -61,15 +61,12 @@ class MujocoPhysics:
         state[self._qvel_order] = self._qvel
         return state
 
-    def _write_state(self, state: np.ndarray) -> None:
-        self._qpos[:] = state[self._qpos_order]
-        self._qvel[:] = state[self._qvel_order]
-
     def reset(self, state: np.ndarray) -> None:
         """Start an episode from `state`, with the motor at rest."""
         self._install()  # raises if somebody replaced ours since the last episode
         mujoco.mj_resetData(self.model, self.data)
-        self._write_state(state)
+        self._qpos[:] = state[self._qpos_order]
+        self._qvel[:] = state[self._qvel_order]
         self.state = self._read_state()
 
     def show(self, state: np.ndarray) -> None:
@@ -91,13 +88,14 @@ class MujocoPhysics:
         self._ctrl[0] = desired_force * arm
         if self._explicit or self._constrain is not None:
             timestep = model.opt.timestep
+            rows = self._qpos[np.newaxis], self._qvel[np.newaxis]
             for _ in range(self.inner_steps):
-                moved = self._qpos + timestep * self._qvel
+                moved = self._qpos + timestep * self._qvel if self._explicit else None
                 mujoco.mj_step(model, data)
-                if self._explicit:
+                if moved is not None:
                     self._qpos[:] = moved
                 if self._constrain is not None:
-                    self._write_state(self._constrain(self._read_state()[np.newaxis], timestep)[0])
+                    self._constrain(*rows, timestep)
         else:
             mujoco.mj_step(model, data, self.inner_steps)
         self.state = self._read_state()

@@ -85,9 +85,9 @@ def constrain(state: np.ndarray, timestep: float) -> np.ndarray:
     for row in bounded:
         for angle in range(2):
             if row[angle] > math.pi:
-                row[angle] -= turn * math.ceil((row[angle] - math.pi) / turn)
+                row[angle] -= turn * np.ceil((row[angle] - math.pi) / turn)
             elif row[angle] < -math.pi:
-                row[angle] += turn * math.ceil((-math.pi - row[angle]) / turn)
+                row[angle] += turn * np.ceil((-math.pi - row[angle]) / turn)
         for speed, limit in ((2, MAX_SPEED_1), (3, MAX_SPEED_2)):
             if row[speed] > limit:
                 row[speed] = limit
