@@ -62,18 +62,24 @@ class Physics(Protocol):
 
 
 class SimulationDivergedError(ArithmeticError):
-    """A simulation left the finite numbers."""
+    """A simulation left the finite numbers, or the range in which MuJoCo trusts its own."""
+
+
+LARGEST = 1e10
+"""Largest magnitude of a state entry: MuJoCo's `mjMAXVAL`, beyond which it warns and discards forces. A diverging motor
+need not reach infinity there."""
 
 
 def check_finite(task: Task, state: np.ndarray, time: float) -> None:
-    """Raise if `state` is not finite, saying which entry of which task and when.
+    """Raise if `state` is not finite or beyond `LARGEST`, saying which entry of which task and when.
 
     Raises:
         SimulationDivergedError: as it says.
     """
-    if np.isfinite(state).all():
+    fine = np.abs(state) <= LARGEST
+    if fine.all():
         return
-    broken = ", ".join(f"{n} = {v}" for n, v in zip(task.state_names, state, strict=True) if not np.isfinite(v))
+    broken = ", ".join(f"{n} = {v:g}" for n, v, ok in zip(task.state_names, state, fine, strict=True) if not ok)
     raise SimulationDivergedError(
         f"{task.name}: the simulation diverged at t = {time:g} s: {broken}. Reset the environment; if this repeats, "
         "shorten the integration step (inner_steps) or lower the gains"
