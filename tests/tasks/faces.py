@@ -1,0 +1,44 @@
+"""Our environments beside Gymnasium's, for comparison."""
+
+import gymnasium as gym
+import numpy as np
+
+import codrl_mj  # noqa: F401 - registers the environments
+from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.tasks import TASKS
+
+NEW = ("pendulum", "acrobot", "mountain_car", "mountain_car_continuous")
+WITH_HILL = ("mountain_car", "mountain_car_continuous")
+
+SPEED_LIMITED = {  # task -> (least, largest) state to draw from, a little beyond the bounds that a step keeps
+    "pendulum": ([-10.0, -8.5], [10.0, 8.5]),
+    "cartpole": ([-2.5, -3.0, -0.3, -3.0], [2.5, 3.0, 0.3, 3.0]),
+    "acrobot": ([-np.pi, -np.pi, -4 * np.pi, -9 * np.pi], [np.pi, np.pi, 4 * np.pi, 9 * np.pi]),
+    "mountain_car": ([-1.25, -0.075], [0.65, 0.075]),
+    "mountain_car_continuous": ([-1.25, -0.075], [0.65, 0.075]),
+}
+
+
+def ours(task, **arguments):
+    """Our environment of a task, with its time limit."""
+    return gym.make(ENVIRONMENTS[task].env_id, disable_env_checker=True, **arguments)
+
+
+def gymnasiums(task):
+    """The Gymnasium environment that the task rebuilds, with its time limit."""
+    return gym.make(TASKS[task].gymnasium_id, disable_env_checker=True)
+
+
+def actions(task, seed, count, dtype=np.float64):
+    """Random actions of a task; continuous ones drawn in float64, and rounded if `dtype` is float32."""
+    generator = np.random.default_rng(seed)
+    space = TASKS[task].action_space
+    if isinstance(space, gym.spaces.Discrete):
+        return [int(action) for action in generator.integers(space.n, size=count)]
+    return list(generator.uniform(space.low, space.high, size=(count, 1)).astype(dtype))
+
+
+def random_states(task, seed, count):
+    """States all over the task's state space, shape (count, n)."""
+    low, high = SPEED_LIMITED[task]
+    return np.random.default_rng(seed).uniform(low, high, size=(count, len(low)))
