@@ -1,0 +1,195 @@
+"""Images: what they show, and what is said where there are none."""
+
+import os
+import subprocess
+import sys
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+
+from codrl_mj.physics import PHYSICS
+from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.tasks import TASKS
+
+every_task = pytest.mark.parametrize("task", TASKS)
+every_physics = pytest.mark.parametrize("physics", PHYSICS)
+
+
+@pytest.fixture
+def make(request):
+    """Makes small rendering environments and closes them after the test."""
+    made = []
+
+    def make(task="cartpole", **options):
+        view = {"render_mode": "rgb_array", "width": 120, "height": 90}
+        made.append(gymnasium.make(ENVIRONMENTS[task].env_id, **{**view, **options}))
+        return made[-1]
+
+    yield make
+    for env in made:
+        env.close()
+
+
+@every_task
+@every_physics
+def test_an_image_has_its_size_and_something_on_it(make, task, physics):
+    env = make(task, physics=physics, width=100, height=60)
+    env.reset(seed=0)
+    image = env.render()
+    assert image.shape == (60, 100, 3)
+    assert image.dtype == np.uint8
+    assert image.std() > 5.0
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 20
+
+
+@every_task
+@every_physics
+def test_the_image_follows_the_state(make, task, physics):
+    env = make(task, physics=physics)
+    env.reset(seed=0)
+    first = env.render()
+    np.testing.assert_array_equal(env.render(), first)  # nothing happened
+    for _ in range(10):
+        env.step(env.action_space.sample())
+    later = env.render()
+    assert np.any(np.abs(first.astype(int) - later).max(axis=2) > 30)
+    env.reset(seed=0)
+    np.testing.assert_array_equal(env.render(), first)
+
+
+@every_task
+def test_both_physics_draw_the_same_picture_of_the_same_state(make, task):
+    images = []
+    for physics in PHYSICS:
+        env = make(task, physics=physics)
+        env.reset(seed=3)
+        images.append(env.render())
+    np.testing.assert_array_equal(*images)
+
+
+@every_task
+def test_images_are_separate_arrays(make, task):
+    env = make(task)
+    env.reset(seed=0)
+    first = env.render()
+    kept = first.copy()
+    env.step(env.action_space.sample())
+    second = env.render()
+    assert not np.shares_memory(first, second)
+    np.testing.assert_array_equal(first, kept)
+
+
+@every_task
+@every_physics
+def test_rendering_changes_nothing_in_the_episode(make, task, physics):
+    watched, alone = make(task, physics=physics), make(task, physics=physics)
+    watched.reset(seed=1)
+    alone.reset(seed=1)
+    watched.action_space.seed(0)
+    for _ in range(20):
+        action = watched.action_space.sample()
+        watched.render()
+        found, expected = watched.step(action), alone.step(action)
+        np.testing.assert_array_equal(found[0], expected[0])
+        np.testing.assert_array_equal(list(found[4].values()), list(expected[4].values()))
+    np.testing.assert_array_equal(watched.unwrapped.state, alone.unwrapped.state)
+
+
+def test_two_environments_render_alternately_without_mixing(make):
+    one, two = make("cartpole"), make("cartpole", physics="analytic")
+    apart = []
+    for env, seed in ((one, 1), (two, 2)):
+        env.reset(seed=seed)
+        apart.append(env.render())
+    assert np.any(apart[0] != apart[1])
+    for _ in range(3):
+        for env, image in zip((one, two), apart, strict=True):
+            np.testing.assert_array_equal(env.render(), image)
+
+
+def test_an_environment_renders_again_after_close(make):
+    env = make()
+    env.reset(seed=0)
+    first = env.render()
+    env.unwrapped.close()
+    env.unwrapped.close()
+    np.testing.assert_array_equal(env.render(), first)
+
+
+def test_cameras_and_prettiness_make_different_images(make):
+    images = []
+    for options in ({}, {"camera": "close"}, {"pretty": True}):
+        env = make(**options)
+        env.reset(seed=0)
+        images.append(env.render())
+    assert np.any(images[0] != images[1])
+    assert np.any(images[0] != images[2])
+
+
+def test_without_a_render_mode_there_is_a_warning_and_no_image(make):
+    env = make(render_mode=None).unwrapped
+    env.reset(seed=0)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert env.render() is None
+    assert "render_mode='rgb_array'" in str(caught[0].message)
+
+
+@every_task
+def test_the_frame_rate_is_gymnasiums(task):
+    ours, theirs = gymnasium.make(ENVIRONMENTS[task].env_id), gymnasium.make(TASKS[task].gymnasium_id)
+    assert ours.unwrapped.metadata["render_fps"] == theirs.metadata["render_fps"]
+
+
+# -- in processes of their own ------------------------------------------------------------------------------
+
+HEADLESS = {
+    name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL")
+}
+
+LOOK = """
+import gymnasium, codrl_mj
+env = gymnasium.make("codrl_mj/CartPole-v0", actuator="ideal", render_mode="rgb_array", width=64, height=48)
+env.reset(seed=0)
+"""
+
+
+def _run(program, **environment):
+    return subprocess.run(
+        [sys.executable, "-c", program], env={**HEADLESS, **environment}, capture_output=True, text=True, timeout=120
+    )
+
+
+def test_an_environment_left_open_at_exit_says_nothing():
+    done = _run(LOOK + "print(env.render().shape)")
+    assert done.stdout.strip() == "(48, 64, 3)"
+    assert done.stderr == ""
+    assert done.returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("before", "environment", "backend"),
+    [
+        ("", {"MUJOCO_GL": "glfw"}, "glfw"),
+        ("import mujoco\n", {}, "not set"),
+    ],
+    ids=["a backend that needs a display", "mujoco imported first"],
+)
+def test_where_there_can_be_no_image_the_error_says_what_to_do(before, environment, backend):
+    program = f"""{before}{LOOK}
+from codrl_mj.physics.offscreen import RenderingUnavailableError
+try:
+    env.render()
+except RenderingUnavailableError as error:
+    print(error)
+print(env.step(1)[1])
+"""
+    done = _run(program, **environment)
+    assert f"MUJOCO_GL is {backend}" in done.stdout
+    assert "set MUJOCO_GL=egl before mujoco is first imported" in done.stdout
+    assert "apt-get install libegl1" in done.stdout
+    assert done.stdout.endswith("1.0\n")  # the environment itself goes on
+    assert "Traceback" not in done.stderr
+    assert done.returncode == 0
