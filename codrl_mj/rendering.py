@@ -81,25 +81,27 @@ def film(
     for name, size, least in (("width", width, _MIN_WIDTH), ("height", height, _MIN_HEIGHT)):
         if size < least:
             raise ValueError(f"{name} = {size}: must be >= {least} [px], for the title and the strip")
-    drawn = [_DrawnPanel(panel, width, height, camera, pretty, _end(panels)) for panel in panels]
-    stride = max(1, round(drawn[0].rate / _MAX_FPS))
-    last = max(len(panel.episode.reward) for panel in panels)
-    instants = [*range(0, last, stride), last]
-    fps = drawn[0].rate / stride
-    options: dict[str, Any] = (
-        {"codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-        if out.suffix == ".mp4"
-        else {"loop": 0}
-    )
+    drawn: list[_DrawnPanel] = []
     try:
-        with writing(out) as temporary, imageio.get_writer(temporary, fps=fps, **options) as writer:
+        for panel in panels:
+            drawn.append(_DrawnPanel(panel, width, height, camera, pretty, _end(panels)))  # noqa: PERF401 - may raise
+        stride = max(1, round(drawn[0].rate / _MAX_FPS))
+        last = max(len(panel.episode.reward) for panel in panels)
+        instants = [*range(0, last, stride), last]
+        fps = drawn[0].rate / stride
+        options: dict[str, Any] = (
+            {"fps": fps, "codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+            if out.suffix == ".mp4"
+            else {"duration": 1000 / fps, "loop": 0}  # ms
+        )
+        with writing(out) as temporary, imageio.get_writer(temporary, **options) as writer:
             for count, instant in enumerate(instants, 1):
-                writer.append_data(np.hstack([panel.frame(instant) for panel in drawn]))
+                writer.append_data(np.hstack([drawing.frame(instant) for drawing in drawn]))
                 if on_frame is not None:
                     on_frame(count, len(instants))
     finally:
-        for panel in drawn:
-            panel.close()
+        for drawing in drawn:
+            drawing.close()
     return out
 
 

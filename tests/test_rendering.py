@@ -1,0 +1,289 @@
+"""Films: the right format, size and length, the right content, and no file when something fails."""
+
+import contextlib
+
+import imageio
+import numpy as np
+import pytest
+from PIL import Image
+
+from codrl_mj import TASKS, Actuator, Motor, named_actuator
+from codrl_mj.evaluation import Episode, RandomPolicy, make_env, run_episodes
+from codrl_mj.physics.offscreen import OffscreenRenderer
+from codrl_mj.rendering import Panel, film
+
+WIDTH, HEIGHT = 200, 120
+FRAME_HEIGHT = 40 + HEIGHT + 24 + 120 + 26  # title, scene, and the strip's legend, plot and time axis
+PLOT_TOP = 40 + HEIGHT + 24
+DESIRED, ACTUAL, SATURATED = (0, 114, 178), (213, 94, 0), (204, 121, 167)
+SIGNALS = ("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated")
+
+
+def played(task="cartpole", actuator="weaker", steps=20, seed=1):
+    """A panel with an episode of random actions of at most `steps` steps."""
+    resolved = named_actuator(actuator, task)
+    make = lambda: make_env(task, resolved, max_episode_steps=steps)  # noqa: E731
+    (episode,) = run_episodes(RandomPolicy(task, seed), make, 1, seed)
+    return Panel(f"{task} on {actuator}", task, resolved, episode)
+
+
+def made_up(desired, actual, *, saturated=False, arm=1.0, steps=40, terminated=False, states=None):
+    """A panel with a cart-pole episode of constant signals."""
+    values = (desired, actual, actual, desired, 0.0, saturated)
+    signals = {name: np.full(steps, value) for name, value in zip(SIGNALS, values, strict=True)}
+    states = np.zeros((steps + 1, 4)) if states is None else states
+    episode = Episode(
+        0.02 * np.arange(1, steps + 1), states, states, np.zeros(steps), np.ones(steps), signals, terminated
+    )
+    return Panel("made up", "cartpole", Actuator(Motor(arm_radius=arm)), episode)
+
+
+def filmed(monkeypatch, tmp_path, panels, **options):
+    """The frames as they go to the encoder, without any encoding."""
+    frames = []
+
+    class Recorder:
+        def append_data(self, frame):
+            frames.append(frame)
+
+    monkeypatch.setattr(imageio, "get_writer", lambda *_, **__: contextlib.nullcontext(Recorder()))
+    film(panels, tmp_path / "film.mp4", WIDTH, HEIGHT, **options)
+    return frames
+
+
+def rows_with(image, colour):
+    """Rows of the strip's plot in which a pixel is nearly of the colour."""
+    plot = image[PLOT_TOP : PLOT_TOP + 120].astype(int)
+    return np.flatnonzero((np.abs(plot - colour).max(axis=-1) < 40).any(axis=1))
+
+
+# -- the file -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_an_mp4_is_h264_of_the_stated_size_rate_and_length(tmp_path, count):
+    reports = []
+    out = film(
+        [played(seed=seed) for seed in range(count)],
+        tmp_path / "a" / "film.mp4",
+        WIDTH,
+        HEIGHT,
+        on_frame=lambda *counts: reports.append(counts),
+    )
+    with imageio.get_reader(out) as reader:
+        about = reader.get_meta_data()
+        frames = list(reader.iter_data())
+    assert out == tmp_path / "a" / "film.mp4"
+    assert about["codec"] == "h264"
+    assert about["pix_fmt"].startswith("yuv420p")
+    assert about["size"] == (count * WIDTH, FRAME_HEIGHT)
+    assert about["fps"] == 25.0  # CartPole's 50 steps a second, every second one
+    assert len(frames) == 11  # steps 0, 2, ..., 20
+    assert reports == [(index + 1, 11) for index in range(11)]
+    for frame in frames:
+        assert frame.shape == (FRAME_HEIGHT, count * WIDTH, 3)
+        assert frame[40 : 40 + HEIGHT].mean() > 60  # the scene is not black
+        assert frame[40 : 40 + HEIGHT].std() > 3  # nor of one colour
+    assert all(np.abs(frame.astype(int) - frames[0]).max() > 30 for frame in frames[1:])
+
+
+def test_a_gif_is_of_the_stated_size_rate_and_length_and_repeats(tmp_path):
+    out = film([played()], tmp_path / "film.gif", WIDTH, HEIGHT)
+    with Image.open(out) as image:
+        assert image.format == "GIF"
+        assert image.size == (WIDTH, FRAME_HEIGHT)
+        assert image.n_frames == 11
+        assert image.info["duration"] == 40  # ms: 25 frames a second
+        assert image.info["loop"] == 0
+
+
+@pytest.mark.parametrize("task", list(TASKS))
+def test_every_task_can_be_filmed_at_its_frame_rate(tmp_path, task):
+    out = film([played(task, "paper", steps=4)], tmp_path / "film.mp4", WIDTH, HEIGHT)
+    rate = TASKS[task].render_fps
+    with imageio.get_reader(out) as reader:
+        assert reader.get_meta_data()["fps"] == (rate if rate <= 30 else rate / 2)
+        assert reader.count_frames() == (5 if rate <= 30 else 3)
+
+
+def test_an_existing_film_is_replaced(tmp_path):
+    out = tmp_path / "film.gif"
+    out.write_text("old")
+    film([played(steps=2)], out, WIDTH, HEIGHT)
+    assert out.read_bytes().startswith(b"GIF89a")
+    assert list(tmp_path.iterdir()) == [out]
+
+
+# -- the content --------------------------------------------------------------------------------------------
+
+
+def test_the_last_step_is_always_shown(monkeypatch, tmp_path):
+    assert len(filmed(monkeypatch, tmp_path, [made_up(1.0, 0.5, steps=7)])) == 5  # steps 0, 2, 4, 6, 7
+    assert len(filmed(monkeypatch, tmp_path, [made_up(1.0, 0.5, steps=1)])) == 2
+
+
+@pytest.mark.parametrize(("desired", "actual", "arm"), [(8.0, -4.0, 1.0), (-8.0, 8.0 / 3, 0.15)])
+def test_the_strip_draws_desired_and_actual_at_their_heights(monkeypatch, tmp_path, desired, actual, arm):
+    frame = filmed(monkeypatch, tmp_path, [made_up(desired, actual, arm=arm)])[-1]
+    limit = 1.15 * abs(desired)  # the plot spans minus to plus this, over 120 px
+    for value, colour in ((desired, DESIRED), (actual, ACTUAL)):
+        rows = rows_with(frame, colour)
+        assert len(rows) in (1, 2, 3, 4), colour
+        assert rows.mean() == pytest.approx(59.5 * (1 - value / limit), abs=1.5)
+
+
+def test_the_strip_shows_no_future(monkeypatch, tmp_path):
+    frames = filmed(monkeypatch, tmp_path, [made_up(8.0, -4.0)])
+    coloured = [
+        int((np.abs(frame[PLOT_TOP : PLOT_TOP + 120].astype(int) - ACTUAL).max(axis=-1) < 40).any(axis=0).sum())
+        for frame in frames
+    ]
+    assert coloured[0] <= 1
+    assert coloured == sorted(coloured)
+    assert coloured[-1] > 0.9 * (WIDTH - 62 - 10)
+    assert coloured[len(coloured) // 2] == pytest.approx(coloured[-1] / 2, rel=0.1)
+
+
+def test_a_long_episodes_strip_slides(monkeypatch, tmp_path):
+    steps = 400
+    panel = made_up(8.0, -4.0, steps=steps)
+    panel.episode.signals["actual_force"][: steps // 2] = 4.0
+    frames = filmed(monkeypatch, tmp_path, [panel])
+    early, late = rows_with(frames[50], ACTUAL).mean(), rows_with(frames[-1], ACTUAL).mean()
+    assert early < 50  # above the axis
+    assert late > 70  # below it: the first half has left the window
+
+
+@pytest.mark.parametrize("saturated", [True, False])
+def test_saturation_is_marked(monkeypatch, tmp_path, saturated):
+    frame = filmed(monkeypatch, tmp_path, [made_up(8.0, -4.0, saturated=saturated)])[-1]
+    pale = 0.3 * np.array(SATURATED) + 0.7 * 255
+    marked = (np.abs(frame[PLOT_TOP : PLOT_TOP + 120] - pale).max(axis=-1) < 12).mean()
+    assert (marked > 0.3) if saturated else (marked == 0.0)
+
+
+def test_the_scene_shows_the_states(monkeypatch, tmp_path):
+    states = np.zeros((3, 4))
+    states[2, 0] = 1.5  # the cart is elsewhere
+    panels = [made_up(1.0, 1.0, steps=2, states=entries) for entries in (states, np.zeros((3, 4)))]
+    first, last = filmed(monkeypatch, tmp_path, panels)
+    scene = slice(40, 40 + HEIGHT - 40)  # without the line at the end
+    assert np.abs(first[scene, :WIDTH].astype(int) - last[scene, :WIDTH]).max() > 50
+    np.testing.assert_array_equal(first[scene, WIDTH:], last[scene, WIDTH:])
+    np.testing.assert_array_equal(first[scene, :WIDTH], first[scene, WIDTH:])
+
+
+def test_a_shorter_episode_stands_still_and_is_marked_as_over(monkeypatch, tmp_path):
+    short, long = made_up(1.0, 0.5, steps=10, terminated=True), made_up(1.0, 0.5, steps=40)
+    frames = filmed(monkeypatch, tmp_path, [short, long])
+    scenes = [frame[40 : 40 + HEIGHT, :WIDTH] for frame in frames]
+    assert len(frames) == 21
+    for scene in scenes[6:]:
+        np.testing.assert_array_equal(scene, scenes[5])
+    assert not np.array_equal(scenes[4], scenes[5])
+    red = np.abs(scenes[5][-40:].astype(int) - (0xB0, 0x3A, 0x2E)).max(axis=-1) < 60
+    assert red.any()  # it says when it ended
+    np.testing.assert_array_equal(frames[1][40 : 40 + HEIGHT, :WIDTH], frames[1][40 : 40 + HEIGHT, WIDTH:])
+
+
+def test_filming_leaves_the_episode_alone(tmp_path):
+    panel = played(steps=5)
+    before = {name: values.copy() for name, values in panel.episode.signals.items()}
+    state = panel.episode.state.copy()
+    film([panel], tmp_path / "film.gif", WIDTH, HEIGHT)
+    np.testing.assert_array_equal(panel.episode.state, state)
+    for name, values in before.items():
+        np.testing.assert_array_equal(panel.episode.signals[name], values)
+
+
+def test_the_ideal_actuator_can_be_filmed(monkeypatch, tmp_path):
+    frames = filmed(monkeypatch, tmp_path, [played(actuator="ideal", steps=6)])
+    assert len(rows_with(frames[-1], ACTUAL)) > 0
+
+
+# -- errors -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("film.avi", {}, r"unknown format '\.avi'.*\.mp4, \.gif"),
+        ("film", {}, "unknown format ''"),
+        ("film.MP4", {}, r"unknown format '\.MP4'"),
+        ("film.mp4", {"width": 201}, "width = 201: must be even"),
+        ("film.mp4", {"height": 121}, "height = 121: must be even"),
+        ("film.mp4", {"width": 64}, "width = 64: must be >= 160"),
+        ("film.mp4", {"width": -200}, "width = -200: must be >= 160"),
+        ("film.mp4", {"height": 0}, "height = 0: must be >= 80"),
+        ("film.mp4", {"width": 100_000}, "width = 100000: must be an integer from 1 to"),
+        ("film.mp4", {"camera": "clos"}, "did you mean 'close'"),
+        ("film.mp4", {"camera": "drone"}, "cameras are fixed, close"),
+    ],
+)
+def test_bad_arguments_are_named_and_nothing_is_written(tmp_path, name, options, message):
+    with pytest.raises(ValueError, match=message):
+        film([made_up(1.0, 1.0)], tmp_path / "new" / name, **({"width": WIDTH, "height": HEIGHT} | options))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_film_of_nothing_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="at least one episode"):
+        film([], tmp_path / "film.mp4")
+    assert list(tmp_path.iterdir()) == []
+
+
+def fail_after(count, error, function=None):
+    """A function that raises `error` at its call number `count`."""
+    calls = iter(range(count))
+
+    def failing(*arguments, **options):
+        if next(calls, None) is None:
+            raise error
+        return function(*arguments, **options) if function is not None else None
+
+    return failing
+
+
+@pytest.mark.parametrize(
+    ("where", "suffix", "existing"),
+    [
+        ("renderer", ".mp4", False),
+        ("writer", ".mp4", True),
+        ("writer", ".gif", False),
+        ("interrupt", ".mp4", False),
+        ("interrupt", ".gif", True),
+    ],
+)
+def test_a_failure_midway_leaves_no_file_and_frees_the_contexts(tmp_path, monkeypatch, suffix, existing, where):
+    out, on_frame, made, closed = tmp_path / f"film{suffix}", None, [], []
+    if existing:
+        out.write_text("old")
+    make, close = OffscreenRenderer.__init__, OffscreenRenderer.close
+    monkeypatch.setattr(OffscreenRenderer, "__init__", lambda self, *a, **o: made.append(self) or make(self, *a, **o))
+    monkeypatch.setattr(OffscreenRenderer, "close", lambda self: closed.append(self) or close(self))
+    error = KeyboardInterrupt() if where == "interrupt" else OSError(28, "No space left on device")
+    if where == "renderer":
+        monkeypatch.setattr(OffscreenRenderer, "render", fail_after(7, error, OffscreenRenderer.render))
+    elif where == "interrupt":
+        on_frame = fail_after(3, error)
+    else:
+        get_writer = imageio.get_writer
+
+        def failing_writer(*arguments, **options):
+            writer = get_writer(*arguments, **options)
+            monkeypatch.setattr(writer, "append_data", fail_after(4, error, writer.append_data))
+            return writer
+
+        monkeypatch.setattr(imageio, "get_writer", failing_writer)
+    with pytest.raises(type(error)):
+        film([made_up(1.0, 1.0), made_up(1.0, 1.0)], out, WIDTH, HEIGHT, on_frame=on_frame)
+    assert [path.read_text() for path in tmp_path.iterdir()] == (["old"] if existing else [])
+    assert len(made) == 2
+    assert all(renderer in closed for renderer in made)
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(OSError, match="file"):
+        film([made_up(1.0, 1.0)], tmp_path / "file" / "film.mp4", WIDTH, HEIGHT)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
