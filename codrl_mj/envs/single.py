@@ -1,16 +1,16 @@
 """One environment, as Gymnasium knows it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
 
-from codrl_mj.motor import Actuator, check_stable, resolve
-from codrl_mj.physics import PHYSICS, MujocoPhysics, Physics
-from codrl_mj.physics.base import check_integrator, inner_step_count
+from codrl_mj.envs.setup import Setup
+from codrl_mj.motor import Actuator
+from codrl_mj.physics import MujocoPhysics
 from codrl_mj.physics.offscreen import OffscreenRenderer
-from codrl_mj.tasks import Task, find_task
+from codrl_mj.tasks import Task
 
 
 class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
@@ -21,7 +21,8 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
     environment is a drop-in for Gymnasium's.
 
     Every step's `info` has `desired_force`, `actual_force` [N or N*m], `current`, `reference_current` [A], `voltage`
-    [V] (NaN where the actuator is ideal) and `saturated` (bool), each at the end of the step.
+    [V] and `saturated` (bool), each at the end of the step. Currents and voltage are NaN where the actuator is ideal;
+    desired force and reference current are NaN where the agent commands the voltage.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - as Gymnasium has it
@@ -35,6 +36,9 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
         inner_steps: int | None = None,
         timestep: float | None = None,
         allow_unstable: bool = False,
+        action: str = "force",
+        levels: Sequence[float] | None = None,
+        observe_actuator: bool = False,
         render_mode: str | None = None,
         width: int = 480,
         height: int = 480,
@@ -54,6 +58,10 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
                 one without.
             timestep: instead of `inner_steps`, the integration step [s], which must divide the environment step.
             allow_unstable: build the environment even if the current loop is unstable.
+            action: what the agent commands: the desired `force` (the paper), the reference `current` [A], or the raw
+                terminal `voltage` [V] past the controller (end to end).
+            levels: for discrete tasks with `action="current"` or `"voltage"`: the commands that actions choose from.
+            observe_actuator: append measured and reference current [A] to the observation.
             render_mode: None or `rgb_array`.
             width: width of rendered images [px].
             height: height of rendered images [px].
@@ -65,25 +73,38 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
             ValueError: an argument is unknown or out of bounds, or the current loop is unstable; the message names it.
             CallbackInUseError: another library's MuJoCo callback is installed.
         """
-        self.task: Task = find_task(task)
-        self.actuator: Actuator | None = resolve(actuator, self.task.name)
-        self.options = _options(self.task, options)
-        self.inner_steps = inner_step_count(self.task, self.actuator, inner_steps, timestep)
-        self.integrator = check_integrator(self.task, integrator)
-        if self.actuator is not None and not allow_unstable:
-            check_stable(self.actuator, self.task.step_duration / self.inner_steps)
-        if physics not in PHYSICS:
-            raise ValueError(f"physics = {physics!r}: must be one of {', '.join(PHYSICS)}")
+        self.setup = Setup.build(
+            task,
+            actuator,
+            integrator=integrator,
+            inner_steps=inner_steps,
+            timestep=timestep,
+            allow_unstable=allow_unstable,
+            action=action,
+            levels=levels,
+            observe_actuator=observe_actuator,
+            **options,
+        )
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode = {render_mode!r}: must be None or 'rgb_array'")
-        self.physics: Physics = PHYSICS[physics](self.task, self.actuator, self.inner_steps, self.integrator)
+        self.physics = self.setup.simulate(physics)
         self.render_mode = render_mode
-        self.metadata = {**self.metadata, "render_fps": self.task.render_fps}
+        self.metadata = {**self.metadata, "render_fps": self.setup.task.render_fps}
         self._view = {"width": width, "height": height, "camera": camera, "pretty": pretty}
         self._renderer: OffscreenRenderer | None = None
         self._drawn: MujocoPhysics | None = None
-        self.action_space = self.task.action_space
-        self.observation_space = self.task.observation_space
+        self.action_space = self.setup.action_space
+        self.observation_space = self.setup.observation_space
+
+    @property
+    def task(self) -> Task:
+        """The task."""
+        return self.setup.task
+
+    @property
+    def actuator(self) -> Actuator | None:
+        """The actuator; None is the ideal one."""
+        return self.setup.actuator
 
     @property
     def model(self) -> Any:
@@ -115,8 +136,8 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
             options: Gymnasium's reset options for the task (CartPole: the bounds `low` and `high`).
         """
         super().reset(seed=seed)
-        self.physics.reset(self.task.initial(self.np_random, options))
-        return self.task.observation(self.physics.state), {}
+        self.physics.reset(self.setup.task.initial(self.np_random, options))
+        return self.setup.observation(self.physics.state, None), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advance by one environment step.
@@ -129,13 +150,13 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
             ValueError: the action is not in the action space, or not a number.
             SimulationDivergedError: the simulation left the finite numbers.
         """
-        desired_force = float(self.task.desired_force(self.task.check_action(action)))
-        state = self.physics.state
-        signals = self.physics.step(desired_force)
-        next_state = self.physics.state
-        reward = self.task.reward(state, np.asarray(signals.actual_force), next_state, self.options)
-        terminated = bool(self.task.terminated(next_state))
-        return self.task.observation(next_state), float(reward), terminated, False, signals._asdict()
+        setup, physics = self.setup, self.physics
+        force = setup.force(action)
+        before = physics.state
+        signals = setup.signals(physics.step(force))
+        after = physics.state
+        observation, reward = setup.observation(after, signals), setup.reward(before, signals, after)
+        return observation, reward, setup.terminated(after), False, signals._asdict()
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """The present state as an image, shape (height, width, 3), uint8; None if there is no render mode.
@@ -148,7 +169,9 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
             return None
         if self._drawn is None:  # the analytic physics is drawn with the task's ideal model
             own = self.physics
-            self._drawn = own if isinstance(own, MujocoPhysics) else MujocoPhysics(self.task, None, 1, self.integrator)
+            self._drawn = (
+                own if isinstance(own, MujocoPhysics) else MujocoPhysics(self.task, None, 1, self.setup.integrator)
+            )
             self._renderer = OffscreenRenderer(self._drawn.model, **self._view)  # type: ignore[arg-type]
         assert self._renderer is not None
         self._drawn.show(self.physics.state)
@@ -163,18 +186,3 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the renderer, which a copy makes anew."""
         return self.__dict__ | {"_renderer": None, "_drawn": None}
-
-
-def _options(task: Task, given: Mapping[str, float]) -> Any:
-    """The task's options, checked.
-
-    Raises:
-        ValueError: unknown option, or one that is not a number > 0.
-    """
-    known = task.options._fields
-    for name, value in given.items():
-        if name not in known:
-            raise ValueError(f"unknown option {name!r} of {task.name}: it has {', '.join(known) or 'none'}")
-        if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
-            raise ValueError(f"{name} = {value!r}: must be a number > 0")
-    return task.options(**{name: float(value) for name, value in given.items()})

@@ -5,7 +5,7 @@ from codrl_mj.physics.base import Physics, Signals, SimulationDivergedError
 from codrl_mj.physics.mjcf import hills, install_callbacks, motors, needed_callbacks, set_actuator
 from codrl_mj.physics.mujoco_single import MujocoPhysics
 
-PHYSICS: dict[str, type[AnalyticPhysics] | type[MujocoPhysics]] = {"mujoco": MujocoPhysics, "analytic": AnalyticPhysics}
+PHYSICS = ("mujoco", "analytic")
 """The physics that an environment can be built on."""
 
 __all__ = [

@@ -47,8 +47,9 @@ def motor_signals(actuator: Actuator, desired_force: float, current: float, volt
 class Physics(Protocol):
     """One simulation of one task."""
 
-    state: np.ndarray
-    """The mechanical state in the task's order, shape (n,), float64; a new array after every step."""
+    @property
+    def state(self) -> np.ndarray:
+        """The mechanical state in the task's order, shape (n,), float64; not changed by later steps."""
 
     def reset(self, state: np.ndarray) -> None:
         """Start an episode from `state`, with the motor at rest: no current, no integral, no past error."""
@@ -76,6 +77,8 @@ def check_finite(task: Task, state: np.ndarray, time: float) -> None:
     Raises:
         SimulationDivergedError: as it says.
     """
+    if state @ state <= LARGEST:  # the quick answer; false for NaN too
+        return
     fine = np.abs(state) <= LARGEST
     if fine.all():
         return

@@ -121,13 +121,15 @@ def install_callbacks(model: mujoco.MjModel) -> None:
         callbacks.install(*parts)
 
 
-def task_model(task: Task, actuator: Actuator | None, timestep: float) -> mujoco.MjModel:
-    """Compile a task's model with the given actuator and integration step.
+def task_model(
+    task: Task, actuator: Actuator | None, timestep: float, max_force: float | None = None
+) -> mujoco.MjModel:
+    """Compile a task's model with the given actuator, integration step and force limit (the task's by default).
 
     A diverging simulation is left to diverge, so that it can be reported, instead of being reset by the engine.
     """
     spec = mujoco.MjSpec.from_file(str(asset_path(task.asset)))
     spec.option.timestep = timestep
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    set_actuator(spec.actuator("motor"), actuator, task.max_force)
+    set_actuator(spec.actuator("motor"), actuator, task.max_force if max_force is None else max_force)
     return spec.compile()

@@ -22,15 +22,30 @@ class MujocoPhysics:
     has bounds (`Task.constrain`), the state is put back inside them after every integration step.
     """
 
-    def __init__(self, task: Task, actuator: Actuator | None, inner_steps: int, integrator: str) -> None:
-        """Compile the model and install the callbacks that it needs."""
+    def __init__(
+        self,
+        task: Task,
+        actuator: Actuator | None,
+        inner_steps: int,
+        integrator: str,
+        max_force: float | None = None,
+    ) -> None:
+        """Compile the model and install the callbacks that it needs.
+
+        Args:
+            task: the task.
+            actuator: motor and current loop; None is the ideal actuator.
+            inner_steps: integration steps per environment step.
+            integrator: one of the task's integrators.
+            max_force: limit of the desired force [N] or torque [N*m]; None is the task's.
+        """
         self.task = task
         self.actuator = actuator
         self.inner_steps = inner_steps
         self._explicit = integrator == "euler"
-        self.model = task_model(task, actuator, task.step_duration / inner_steps)
+        self.model = task_model(task, actuator, task.step_duration / inner_steps, max_force)
         self.data = mujoco.MjData(self.model)
-        self._qpos_order, self._qvel_order = list(task.qpos), list(task.qvel)
+        self._qpos_order, self._qvel_order = _progression(task.qpos), _progression(task.qvel)
         self._bind()
         self.reset(np.zeros(len(task.state_names)))
 
@@ -55,7 +70,9 @@ class MujocoPhysics:
         self.__dict__.update(state)
         self._bind()
 
-    def _read_state(self) -> np.ndarray:
+    @property
+    def state(self) -> np.ndarray:
+        """The mechanical state in the task's order, shape (n,), float64, as MuJoCo's data have it now; a new array."""
         state = np.empty(len(self.task.state_names))
         state[self._qpos_order] = self._qpos
         state[self._qvel_order] = self._qvel
@@ -67,7 +84,6 @@ class MujocoPhysics:
         mujoco.mj_resetData(self.model, self.data)
         self._qpos[:] = state[self._qpos_order]
         self._qvel[:] = state[self._qvel_order]
-        self.state = self._read_state()
 
     def show(self, state: np.ndarray) -> None:
         """Bring the body poses up to date with `state`, for drawing; the motor and the episode are left alone."""
@@ -78,7 +94,7 @@ class MujocoPhysics:
         mujoco.mj_passive(self.model, self.data)  # where there is a hill, its callback puts the car on it
 
     def step(self, desired_force: float) -> Signals:
-        """Advance by one environment step, with the desired force (at most the task's `max_force`) held over it.
+        """Advance by one environment step, with the desired force (at most `max_force`) held over it.
 
         Raises:
             SimulationDivergedError: the state is no longer finite.
@@ -98,12 +114,17 @@ class MujocoPhysics:
                     self._constrain(*rows, timestep)
         else:
             mujoco.mj_step(model, data, self.inner_steps)
-        self.state = self._read_state()
         check_finite(self.task, self.state, data.time)
         if self.actuator is None:
             return ideal_signals(desired_force)
         current, voltage = float(self._act[CURRENT]), float(self._act[VOLTAGE])
         return motor_signals(self.actuator, desired_force, current, voltage)
+
+
+def _progression(entries: tuple[int, ...]) -> slice:
+    """The slice that selects `entries`, an arithmetic progression; numpy takes a fraction of a list's time for it."""
+    stride = entries[1] - entries[0] if len(entries) > 1 else 1
+    return slice(entries[0], entries[-1] + 1, stride)
 
 
 _VIEWS = ("_qpos", "_qvel", "_ctrl", "_act", "_constrain")

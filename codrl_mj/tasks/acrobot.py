@@ -128,6 +128,7 @@ TASK = Task(
     qpos=(0, 1),
     qvel=(2, 3),
     action_space=spaces.Discrete(3),
+    observation_names=("cos_angle_1", "sin_angle_1", "cos_angle_2", "sin_angle_2", "velocity_1", "velocity_2"),
     observation_space=spaces.Box(-_HIGH, _HIGH, dtype=np.float32),
     options=Options,
     initial=initial,

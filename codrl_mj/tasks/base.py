@@ -37,11 +37,13 @@ class Task:
     state_names: tuple[str, ...]
     """Names of the state's entries, with units."""
     qpos: tuple[int, ...]
-    """Which state entries are MuJoCo's `qpos`, in order."""
+    """Which state entries are MuJoCo's `qpos`, in order; an arithmetic progression, as is `qvel`."""
     qvel: tuple[int, ...]
     """Which state entries are MuJoCo's `qvel`, in order."""
     action_space: spaces.Space[Any]
     """The action space, Gymnasium's."""
+    observation_names: tuple[str, ...]
+    """Names of the observation's entries."""
     observation_space: spaces.Box
     """The observation space, Gymnasium's."""
     options: type[Any]

@@ -13,6 +13,7 @@ from codrl_mj.tasks.base import Task
 
 # Gymnasium's CartPole-v1
 FORCE = 10.0  # N
+FORCES = np.array([-FORCE, FORCE])
 X_LIMIT = 2.4  # m
 ANGLE_LIMIT = 12 * 2 * np.pi / 360  # rad
 
@@ -32,7 +33,7 @@ def initial(generator: np.random.Generator, options: dict[str, Any] | None) -> n
 
 def desired_force(action: np.ndarray) -> np.ndarray:
     """Push left at action 0, right at action 1 [N]."""
-    return np.where(action == 1, FORCE, -FORCE)
+    return FORCES[action]
 
 
 def observation(state: np.ndarray) -> np.ndarray:
@@ -65,6 +66,7 @@ TASK = Task(
     qpos=(0, 2),
     qvel=(1, 3),
     action_space=spaces.Discrete(2),
+    observation_names=("cart_position", "cart_velocity", "pole_angle", "pole_velocity"),
     observation_space=spaces.Box(-_HIGH, _HIGH, dtype=np.float32),
     options=Options,
     initial=initial,

@@ -118,6 +118,7 @@ TASK = Task(
     qpos=(0,),
     qvel=(1,),
     action_space=spaces.Discrete(3),
+    observation_names=("position", "velocity"),
     observation_space=spaces.Box(_LOW, _HIGH, dtype=np.float32),
     options=Options,
     initial=initial,

@@ -115,6 +115,7 @@ TASK = Task(
     qpos=(0,),
     qvel=(1,),
     action_space=spaces.Box(-MAX_TORQUE, MAX_TORQUE, (1,), np.float32),
+    observation_names=("cos_angle", "sin_angle", "angular_velocity"),
     observation_space=spaces.Box(-_HIGH, _HIGH, dtype=np.float32),
     options=Options,
     initial=initial,

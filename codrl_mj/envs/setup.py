@@ -1,0 +1,246 @@
+"""A task made ready: its actuator, its options, and what the agent commands and sees. Shared by every face."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from codrl_mj.motor import Actuator, CurrentLoop, check_stable, resolve
+from codrl_mj.physics import PHYSICS, AnalyticPhysics, MujocoPhysics, Physics, Signals
+from codrl_mj.physics.base import check_integrator, inner_step_count
+from codrl_mj.tasks import Task, find_task
+
+COMMANDS = ("force", "current", "voltage")
+"""What an agent's action can stand for."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Setup:
+    """A task, its actuator and its interface to the agent; made by `build`."""
+
+    task: Task
+    """The task."""
+    actuator: Actuator | None
+    """What stands between desired and delivered force; None is the ideal actuator."""
+    options: Any
+    """The task's options."""
+    inner_steps: int
+    """Integration steps per environment step."""
+    integrator: str
+    """One of the task's integrators."""
+    command: str
+    """What an action stands for: one of `COMMANDS`."""
+    levels: np.ndarray | None
+    """Commands [A or V] that a discrete task's actions choose from; None where the action is the command."""
+    observe_actuator: bool
+    """Whether the observation ends with measured and reference current."""
+
+    @classmethod
+    def build(
+        cls,
+        task: str,
+        actuator: str | Actuator | Mapping[str, Any] | None = "paper",
+        integrator: str | None = None,
+        inner_steps: int | None = None,
+        timestep: float | None = None,
+        allow_unstable: bool = False,
+        action: str = "force",
+        levels: Sequence[float] | None = None,
+        observe_actuator: bool = False,
+        **options: float,
+    ) -> "Setup":
+        """Resolve and check the arguments of an environment; `codrl_mj.envs.ActuatedEnv` says what they are.
+
+        Raises:
+            ValueError: an argument is unknown, out of bounds, or does not go with another; or the loop is unstable.
+        """
+        definition = find_task(task)
+        resolved = resolve(actuator, definition.name)
+        count = inner_step_count(definition, resolved, inner_steps, timestep)
+        if resolved is None and observe_actuator:
+            raise ValueError("observe_actuator=True: the ideal actuator has no current to observe; choose another")
+        setup = cls(
+            task=definition,
+            actuator=resolved,
+            options=_options(definition, options),
+            inner_steps=count,
+            integrator=check_integrator(definition, integrator),
+            command=action,
+            levels=_levels(definition, resolved, action, levels),
+            observe_actuator=observe_actuator,
+        )
+        if setup.physical_actuator is not None and not allow_unstable:
+            check_stable(setup.physical_actuator, definition.step_duration / count)
+        return setup
+
+    def simulate(self, physics: str) -> Physics:
+        """A new simulation on the given physics.
+
+        Raises:
+            ValueError: unknown physics.
+            CallbackInUseError: another library's MuJoCo callback is installed.
+        """
+        arguments = self.task, self.physical_actuator, self.inner_steps, self.integrator
+        if physics == "mujoco":
+            return MujocoPhysics(*arguments, max_force=self.max_force)
+        if physics == "analytic":
+            return AnalyticPhysics(*arguments)
+        raise ValueError(f"physics = {physics!r}: must be one of {', '.join(PHYSICS)}")
+
+    @property
+    def physical_actuator(self) -> Actuator | None:
+        """The actuator to simulate.
+
+        For voltage commands the controller hands the command through: with no feedback, a feed-forward gain of 1 V/A
+        and no back-EMF compensation, the terminal voltage in volts is the reference current in amperes.
+        """
+        if self.actuator is None or self.command != "voltage":
+            return self.actuator
+        loop = self.actuator.controller
+        through = CurrentLoop(
+            kp=0.0, kff=1.0, bemf_compensation=False, max_voltage=loop.max_voltage, substeps=loop.substeps
+        )
+        return dataclasses.replace(self.actuator, controller=through)
+
+    @property
+    def max_force(self) -> float:
+        """Largest force [N] or torque [N*m] that the physics is asked for."""
+        if self.command == "voltage":
+            assert self.actuator is not None
+            return self.actuator.controller.max_voltage * self._force_per_ampere
+        return self.task.max_force
+
+    @property
+    def _force_per_ampere(self) -> float:
+        if self.actuator is None:
+            return 1.0
+        return self.actuator.motor.torque_constant / self.actuator.motor.arm_radius
+
+    @property
+    def action_space(self) -> spaces.Space[Any]:
+        """The agent's actions: the task's, or a table's indices, or a box of currents [A] or voltages [V]."""
+        if self.levels is not None:
+            return spaces.Discrete(len(self.levels))
+        if self.command == "force":
+            return self.task.action_space
+        limit = np.float32(self.max_force / self._force_per_ampere)
+        return spaces.Box(-limit, limit, (1,), np.float32)
+
+    @property
+    def observation_space(self) -> spaces.Box:
+        """The task's observation space; with `observe_actuator` two unbounded entries more."""
+        space = self.task.observation_space
+        if not self.observe_actuator:
+            return space
+        low, high = (np.append(bound, [inf, inf]) for bound, inf in ((space.low, -np.inf), (space.high, np.inf)))
+        return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+
+    @property
+    def observation_names(self) -> tuple[str, ...]:
+        """Names of the observation's entries."""
+        extra = ("current", "reference_current") if self.observe_actuator else ()
+        return (*self.task.observation_names, *extra)
+
+    def force(self, action: Any) -> float:
+        """The force [N] or torque [N*m] that the physics is to ask the actuator for.
+
+        Args:
+            action: an element of the action space; a box's saturates.
+
+        Raises:
+            ValueError: the action is no element, or not a number.
+        """
+        if self.command == "force":
+            return float(self.task.desired_force(self.task.check_action(action)))
+        space = self.action_space
+        if self.levels is not None:
+            if not space.contains(action):
+                raise ValueError(f"action = {action!r}: not in {space}")
+            return float(self.levels[int(action)]) * self._force_per_ampere
+        array = np.asarray(action)
+        if array.shape != space.shape or array.dtype.kind != "f" or np.isnan(array).any():
+            raise ValueError(f"action = {action!r}: not in {space}")
+        limit = self.max_force / self._force_per_ampere
+        return float(np.clip(array[0], -limit, limit)) * self._force_per_ampere
+
+    def signals(self, signals: Signals) -> Signals:
+        """The signals as the agent's command defines them: a voltage command desires no force and no current."""
+        if self.command != "voltage":
+            return signals
+        return signals._replace(desired_force=np.nan, reference_current=np.nan)
+
+    def observation(self, state: np.ndarray, signals: Signals | None) -> np.ndarray:
+        """What the agent sees.
+
+        Args:
+            state: the mechanical state, shape (n,).
+            signals: of the step that led there; None at the start, where both currents are 0.
+
+        Returns:
+            Shape (k,), float32; the currents in A, the reference NaN-free (0 under voltage commands).
+        """
+        seen = self.task.observation(state)
+        if not self.observe_actuator:
+            return seen
+        if signals is None:
+            return np.append(seen, np.zeros(2, np.float32))
+        reference = 0.0 if self.command == "voltage" else signals.reference_current
+        return np.append(seen, np.array([signals.current, reference], np.float32))
+
+    def reward(self, before: np.ndarray, signals: Signals, after: np.ndarray) -> float:
+        """The task's reward of a step that led from one state to another."""
+        return float(self.task.reward(before, np.asarray(signals.actual_force), after, self.options))
+
+    def terminated(self, state: np.ndarray) -> bool:
+        """Whether the task ends the episode in this state."""
+        return bool(self.task.terminated(state))
+
+
+def _options(task: Task, given: Mapping[str, float]) -> Any:
+    """The task's options, checked.
+
+    Raises:
+        ValueError: unknown option, or one that is not a number > 0.
+    """
+    known = task.options._fields
+    for name, value in given.items():
+        if name not in known:
+            raise ValueError(f"unknown option {name!r} of {task.name}: it has {', '.join(known) or 'none'}")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
+            raise ValueError(f"{name} = {value!r}: must be a number > 0")
+    return task.options(**{name: float(value) for name, value in given.items()})
+
+
+def _levels(task: Task, actuator: Actuator | None, action: str, levels: Sequence[float] | None) -> np.ndarray | None:
+    """The table of levels, checked against the kind of command and the task's action space.
+
+    Raises:
+        ValueError: an unknown command, one that the actuator or the task cannot take, or a missing or invalid table.
+    """
+    if action not in COMMANDS:
+        raise ValueError(f"action = {action!r}: must be one of {', '.join(COMMANDS)}")
+    if action == "force":
+        if levels is not None:
+            raise ValueError(f"levels = {levels!r}: only for action='current' and action='voltage'")
+        return None
+    if actuator is None:
+        raise ValueError(f"action = {action!r}: the ideal actuator has no {action} to command; choose another actuator")
+    limit = actuator.controller.max_voltage
+    if action == "voltage" and not np.isfinite(limit):
+        raise ValueError("action = 'voltage': needs a finite controller.max_voltage, it is inf")
+    if isinstance(task.action_space, spaces.Box):
+        if levels is not None:
+            raise ValueError(f"levels = {levels!r}: only for tasks with discrete actions; {task.name}'s are continuous")
+        return None
+    if action == "current":
+        limit = task.max_force * actuator.motor.arm_radius / actuator.motor.torque_constant
+    unit = "A" if action == "current" else "V"
+    table = np.asarray([] if levels is None else levels, dtype=np.float64)
+    if table.ndim != 1 or len(table) < 2 or not (np.abs(table) <= limit).all():
+        raise ValueError(
+            f"levels = {levels!r}: {task.name} has discrete actions, so action={action!r} needs two or more levels "
+            f"within +-{limit:g} {unit}, such as levels=({-limit:g}, 0, {limit:g})"
+        )
+    return table

@@ -1,0 +1,183 @@
+"""The tasks as dm_control environments: `suite.load("pendulum", "gym")`.
+
+The same dynamics, rewards and ends as the Gymnasium environments, with observations by name. The simulation itself is
+`codrl_mj.physics.MujocoPhysics`; this module gives it dm_control's interface. Needs the extra `dm-control`.
+"""
+
+import collections
+import copy
+import threading
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from dm_control import mujoco as dm_mujoco
+from dm_control.mujoco import wrapper
+from dm_control.rl import control
+from dm_env import specs
+from gymnasium import spaces
+
+from codrl_mj.envs.setup import Setup
+from codrl_mj.motor import Actuator
+from codrl_mj.physics import MujocoPhysics, Signals
+from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.tasks import TASKS
+
+TASK_NAME = "gym"
+ALL_TASKS = tuple((name, TASK_NAME) for name in TASKS)
+"""Every (domain, task) that `load` knows."""
+
+
+class Physics(dm_mujoco.Physics):
+    """dm_control's physics around one of our simulations; a `step` is one whole environment step."""
+
+    simulation: MujocoPhysics
+    """Our simulation, which owns model and data."""
+    desired_force: float = 0.0
+    """Force [N] or torque [N*m] that the next step asks the actuator for."""
+    signals: Signals | None = None
+    """What the actuator did in the last step; None before the first."""
+
+    @classmethod
+    def of(cls, simulation: MujocoPhysics) -> "Physics":
+        """The physics of a simulation, sharing its model and data."""
+        physics = cls(wrapper.MjData(simulation.data))
+        physics.simulation = simulation
+        return physics
+
+    def step(self, nstep: int = 1) -> None:
+        """Advance by one environment step under `desired_force`.
+
+        Args:
+            nstep: must be the simulation's integration steps per environment step: bounds, explicit integration and the
+                motor are part of each.
+
+        Raises:
+            ValueError: it is not.
+            PhysicsError: the engine warned that the state is invalid.
+            SimulationDivergedError: the state is no longer finite.
+        """
+        if nstep != self.simulation.inner_steps:
+            raise ValueError(f"nstep = {nstep}: must be the task's {self.simulation.inner_steps} integration steps")
+        with self.check_invalid_state():
+            self.signals = self.simulation.step(self.desired_force)
+
+    def copy(self, share_model: bool = False) -> "Physics":
+        """An independent copy, motor included; the model is always copied too."""
+        del share_model
+        return copy.deepcopy(self)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in ("simulation", "desired_force", "signals")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self._contexts_lock = threading.Lock()
+        self._warnings_cause_exception = True
+        self.__dict__.update(state)
+        # attaching runs a forward pass with the actuation disabled, which must not be seen by the copy
+        before = copy.copy(self.simulation.data)
+        self._reload_from_data(wrapper.MjData(self.simulation.data))
+        np.copyto(self.simulation.data.ctrl, before.ctrl)
+
+
+class GymTask(control.Task):
+    """One of our tasks under dm_control's task interface."""
+
+    def __init__(self, setup: Setup, random: np.random.Generator) -> None:
+        """Wrap a set-up task.
+
+        Args:
+            setup: task, actuator, options and spaces.
+            random: draws the initial states.
+        """
+        self.setup = setup
+        self.random = random
+        self._before: np.ndarray = np.zeros(0)
+
+    def initialize_episode(self, physics: Physics) -> None:
+        """Draw the initial state; the motor is at rest."""
+        physics.simulation.reset(self.setup.task.initial(self.random, None))
+        physics.signals = None
+        self._before = physics.simulation.state
+
+    def before_step(self, action: Any, physics: Physics) -> None:
+        """Turn the action into the desired force.
+
+        Raises:
+            ValueError: the action is not of the action spec.
+        """
+        if isinstance(self.setup.action_space, spaces.Discrete):
+            action = int(action)
+        self._before = physics.simulation.state
+        physics.desired_force = self.setup.force(action)
+
+    def after_step(self, physics: Physics) -> None:
+        """Nothing is left to do."""
+
+    def action_spec(self, physics: Physics) -> specs.Array:
+        """The action space as a dm_env spec."""
+        del physics
+        space = self.setup.action_space
+        if isinstance(space, spaces.Discrete):
+            return specs.DiscreteArray(int(space.n), name="action")
+        assert isinstance(space, spaces.Box)
+        return specs.BoundedArray(space.shape, space.dtype, space.low, space.high, name="action")
+
+    def get_observation(self, physics: Physics) -> dict[str, np.ndarray]:
+        """The observation's entries by name, each of shape (1,), float64."""
+        values = self.setup.observation(physics.simulation.state, physics.signals)
+        names = self.setup.observation_names
+        return collections.OrderedDict(
+            (name, np.array([value], dtype=np.float64)) for name, value in zip(names, values, strict=True)
+        )
+
+    def get_reward(self, physics: Physics) -> float:
+        """The task's reward of the last step."""
+        assert physics.signals is not None
+        return self.setup.reward(self._before, physics.signals, physics.simulation.state)
+
+    def get_termination(self, physics: Physics) -> float | None:
+        """0 (no future) where the task ends the episode, else None."""
+        return 0.0 if self.setup.terminated(physics.simulation.state) else None
+
+
+def load(
+    domain_name: str,
+    task_name: str = TASK_NAME,
+    actuator: str | Actuator | Mapping[str, Any] | None = "paper",
+    task_kwargs: Mapping[str, Any] | None = None,
+    environment_kwargs: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> control.Environment:
+    """A task as a dm_control environment.
+
+    Args:
+        domain_name: task name, such as `pendulum`.
+        task_name: `gym`.
+        actuator: as for `codrl_mj.envs.ActuatedEnv`.
+        task_kwargs: `random`: a seed or a `numpy.random.Generator` for the initial states.
+        environment_kwargs: arguments of `dm_control.rl.control.Environment`, such as `flat_observation`.
+        **options: `integrator`, `inner_steps`, `timestep`, `allow_unstable` and the task's own options, as for
+            `codrl_mj.envs.ActuatedEnv`.
+
+    Returns:
+        The environment. An episode ends with discount 0 where the task says so and with discount 1 at the time limit.
+
+    Raises:
+        ValueError: unknown domain or task, or arguments out of bounds.
+    """
+    if task_name != TASK_NAME:
+        raise ValueError(f"task_name = {task_name!r}: every domain has one task, {TASK_NAME!r}")
+    setup = Setup.build(domain_name, actuator, **options)
+    simulation = setup.simulate("mujoco")
+    assert isinstance(simulation, MujocoPhysics)
+    random = np.random.default_rng((task_kwargs or {}).get("random"))
+    limit = ENVIRONMENTS[setup.task.name].max_episode_steps
+    return control.Environment(
+        Physics.of(simulation),
+        GymTask(setup, random),
+        time_limit=limit * setup.task.step_duration,
+        n_sub_steps=setup.inner_steps,
+        legacy_step=False,
+        **(environment_kwargs or {}),
+    )
