@@ -166,10 +166,10 @@ class Setup:
         return float(np.clip(array[0], -limit, limit)) * self._force_per_ampere
 
     def signals(self, signals: Signals) -> Signals:
-        """The signals as the agent's command defines them: a voltage command desires no force and no current."""
+        """The signals as the agent's command defines them: a voltage asks for whatever force follows."""
         if self.command != "voltage":
             return signals
-        return signals._replace(desired_force=np.nan, reference_current=np.nan)
+        return signals._replace(desired_force=signals.actual_force, reference_current=signals.current)
 
     def observation(self, state: np.ndarray, signals: Signals | None) -> np.ndarray:
         """What the agent sees.
@@ -179,15 +179,13 @@ class Setup:
             signals: of the step that led there; None at the start, where both currents are 0.
 
         Returns:
-            Shape (k,), float32; the currents in A, the reference NaN-free (0 under voltage commands).
+            Shape (k,), float32; the currents in A.
         """
         seen = self.task.observation(state)
         if not self.observe_actuator:
             return seen
-        if signals is None:
-            return np.append(seen, np.zeros(2, np.float32))
-        reference = 0.0 if self.command == "voltage" else signals.reference_current
-        return np.append(seen, np.array([signals.current, reference], np.float32))
+        currents = (0.0, 0.0) if signals is None else (signals.current, signals.reference_current)
+        return np.append(seen, np.array(currents, np.float32))
 
     def reward(self, before: np.ndarray, signals: Signals, after: np.ndarray) -> float:
         """The task's reward of a step that led from one state to another."""

@@ -21,8 +21,8 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
     environment is a drop-in for Gymnasium's.
 
     Every step's `info` has `desired_force`, `actual_force` [N or N*m], `current`, `reference_current` [A], `voltage`
-    [V] and `saturated` (bool), each at the end of the step. Currents and voltage are NaN where the actuator is ideal;
-    desired force and reference current are NaN where the agent commands the voltage.
+    [V] and `saturated` (bool), each at the end of the step. Currents and voltage are 0 where the actuator is ideal;
+    where the agent commands the voltage, what is delivered is what is desired.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - as Gymnasium has it

@@ -17,18 +17,18 @@ class Signals(NamedTuple):
     actual_force: float
     """Force delivered [N], or torque [N*m]."""
     current: float
-    """Motor current [A]; NaN for the ideal actuator, which has none."""
+    """Motor current [A]; 0 for the ideal actuator, which has none."""
     reference_current: float
-    """Current asked for [A]; NaN for the ideal actuator."""
+    """Current asked for [A]; 0 for the ideal actuator."""
     voltage: float
-    """Terminal voltage [V]; NaN for the ideal actuator."""
+    """Terminal voltage [V]; 0 for the ideal actuator."""
     saturated: bool
     """Whether the voltage was at its limit."""
 
 
 def ideal_signals(desired_force: float) -> Signals:
     """The signals of an ideal actuator: it delivers what is desired, and has no current and no voltage."""
-    return Signals(desired_force, desired_force, math.nan, math.nan, math.nan, False)
+    return Signals(desired_force, desired_force, 0.0, 0.0, 0.0, False)
 
 
 def motor_signals(actuator: Actuator, desired_force: float, current: float, voltage: float) -> Signals:

@@ -77,5 +77,5 @@ def test_divergence_names_every_broken_entry_and_the_time(task, bad):
 def test_the_ideal_actuator_delivers_what_is_desired_and_has_no_current():
     signals = ideal_signals(3.0)
     assert signals.desired_force == signals.actual_force == 3.0
-    assert np.isnan([signals.current, signals.reference_current, signals.voltage]).all()
+    assert signals.current == signals.reference_current == signals.voltage == 0.0
     assert signals.saturated is False
