@@ -131,12 +131,13 @@ def test_a_disabled_group_silences_one_motor_of_several():
         assert np.any(act != 0.0) == (name != "second")
 
 
-def test_a_bad_control_anywhere_counts_as_zero_everywhere_as_in_the_engine(tmp_path, monkeypatch):
+@pytest.mark.parametrize("index", [0, 1, -1])
+def test_a_bad_control_anywhere_counts_as_zero_everywhere_as_in_the_engine(index, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # the engine writes a log
     model = _model()
     inputs = controls(40, model.nu)
     zeroed = inputs.copy()
-    inputs[20:30, 0] = np.nan
+    inputs[20:30, index] = np.nan
     zeroed[20:30] = 0.0
     np.testing.assert_array_equal(trajectory(model, inputs), trajectory(model, zeroed))
 
