@@ -19,7 +19,7 @@ BAD = {
     "task like none": ({"task": "xyz"}, "unknown task 'xyz': Known tasks: "),
     "actuator": ({"actuator": "papr"}, "unknown actuator 'papr': did you mean 'paper'"),
     "actuator type": ({"actuator": 3.0}, r"actuator = 3.0: must be a name"),
-    "actuator field": ({"actuator": {"motor": {"resistence": 1}}}, "motor.resistence; did you mean motor.resistance?"),
+    "actuator field": ({"actuator": {"motor": {"resistanze": 1}}}, "motor.resistanze; did you mean motor.resistance?"),
     "actuator value": ({"actuator": {"motor": {"resistance": -1.0}}}, "Motor.resistance = -1: must be > 0"),
     "physics": ({"physics": "bullet"}, "physics = 'bullet': must be one of mujoco, analytic"),
     "integrator": ({"integrator": "rk45"}, "integrator = 'rk45': cartpole has euler, semi-implicit"),

@@ -109,7 +109,7 @@ def test_a_mapping_in_place_of_a_part_is_refused_with_the_remedy(field, kind):
     ("mapping", "wrong", "suggested"),
     [
         ({"motr": {}}, "motr", "motor"),
-        ({"controler": {}}, "controler", "controller"),
+        ({"controllr": {}}, "controllr", "controller"),
         ({"motor": {"inductanse": 0.1}}, "motor.inductanse", "motor.inductance"),
         ({"motor": {"arm_radus": 0.1}, "controller": {}}, "motor.arm_radus", "motor.arm_radius"),
         ({"controller": {"max_volts": 5.0}}, "controller.max_volts", "controller.max_voltage"),
