@@ -8,7 +8,7 @@ import pytest
 
 from codrl_mj import TASKS
 from codrl_mj.motor.parameters import BACK_EMF_CONSTANT, INDUCTANCE, MAX_VOLTAGE, TORQUE_CONSTANT
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, mujoco_single
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError, mujoco_single
 from codrl_mj.validation import Check, validate
 from codrl_mj.validation.checks import STATE_BOUNDS
 
@@ -128,7 +128,7 @@ def test_a_motor_off_by_a_hundredth_fails_the_checks_with_a_motor(monkeypatch, t
 
 @pytest.mark.parametrize("task", list(TASKS))
 @pytest.mark.parametrize(
-    ("parameter", "factor"), [(BACK_EMF_CONSTANT, -0.1), (MAX_VOLTAGE, 0.99)], ids=["back-EMF sign", "voltage limit"]
+    ("parameter", "factor"), [(BACK_EMF_CONSTANT, -1.0), (MAX_VOLTAGE, 0.99)], ids=["back-EMF sign", "voltage limit"]
 )
 def test_a_wrong_back_emf_or_voltage_limit_fails_the_checks_of_the_starved_motor(monkeypatch, task, parameter, factor):
     make = AnalyticPhysics.__init__
@@ -204,6 +204,22 @@ def test_one_nan_among_good_samples_fails_the_check(monkeypatch, at):
     assert math.isnan(first.worst)
     assert not first.passed
     assert "x [m] from" in first.where
+
+
+def test_a_run_that_diverges_is_a_failed_check_that_says_so(monkeypatch):
+    step, calls = MujocoPhysics.step, iter(range(1, 10**6))
+    last = len(TASKS["cartpole"].integrators) * SAMPLES
+
+    def diverging(self, desired_force):
+        if next(calls) == last + 5:
+            raise SimulationDivergedError("it diverged")
+        return step(self, desired_force)
+
+    monkeypatch.setattr(MujocoPhysics, "step", diverging)
+    checks = validate("cartpole", SAMPLES, RUNS)
+    assert [check.passed for check in checks] == [True, True, False, True, True, True, True, True, True, True]
+    assert checks[2].worst == math.inf
+    assert checks[2].where == "step 5 of seed 0: it diverged"
 
 
 # -- arguments ----------------------------------------------------------------------------------------------

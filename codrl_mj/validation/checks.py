@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from codrl_mj.motor import Actuator, named_actuator
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Physics
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Physics, SimulationDivergedError
 from codrl_mj.physics.base import inner_step_count
 from codrl_mj.tasks import Task, find_task
 
@@ -118,11 +118,13 @@ def episodes(task: Task, actuator: str, integrator: str, steps: int, seeds: rang
         actuator: a named actuator, or `starved`: the paper's with 0.5 V and nothing against its back-EMF, both of which
             the loop of the others hides.
         integrator: one of the task's integrators.
-        steps: environment steps of each run; the task's ends are ignored.
+        steps: environment steps of each run; the task's ends are ignored, and a divergence fails.
         seeds: one run each.
     """
     resolved = _starved(task) if actuator == STARVED else named_actuator(actuator, task.name)
     mujoco, analytic = (_build(kind, task, resolved, integrator) for kind in (MujocoPhysics, AnalyticPhysics))
+    oracle = f"Gymnasium {task.gymnasium_id}" + (" and the motor in Python" if resolved else "")
+    name = f"{steps} steps, {integrator}, {actuator} actuator"
     worst, where = 0.0, ""
     for seed in seeds:
         generator = np.random.default_rng(seed)
@@ -131,14 +133,16 @@ def episodes(task: Task, actuator: str, integrator: str, steps: int, seeds: rang
         for physics in (mujoco, analytic):
             physics.reset(initial)
         for index, force in enumerate(forces):
-            delivered = [physics.step(float(force)).actual_force for physics in (mujoco, analytic)]
+            try:
+                delivered = [physics.step(float(force)).actual_force for physics in (mujoco, analytic)]
+            except SimulationDivergedError as error:
+                where = f"step {index + 1} of seed {seed}: {error}"
+                return Check(name, oracle, steps * len(seeds), math.inf, 1e-9, where)
             difference, entry = _difference(task, mujoco.state, analytic.state)
             if not (gap := abs(delivered[0] - delivered[1]) / task.max_force) <= difference:
                 difference, entry = gap, "force"
             if _is_worse(difference, worst):
                 worst, where = difference, f"{entry} at step {index + 1} of seed {seed}"
-    oracle = f"Gymnasium {task.gymnasium_id}" + (" and the motor in Python" if resolved else "")
-    name = f"{steps} steps, {integrator}, {actuator} actuator"
     return Check(name, oracle, steps * len(seeds), worst, 1e-9, where)
 
 
