@@ -200,7 +200,7 @@ class Evaluate:
 
 @dataclasses.dataclass(frozen=True)
 class Render:
-    """Film one episode: the scene, and a strip of desired and actual torque below it.
+    """Film one episode: the scene, and a strip of desired and actual torque and the voltage below it.
 
     Example: codrl-mj render runs/cartpole-ppo-weaker-0 --out balance.mp4, or codrl-mj render cartpole (random actions).
     """
@@ -212,7 +212,9 @@ class Render:
     seed: int = 0
     """Seed of the episode."""
     out: Path = Path("episode.mp4")
-    """File to write: .mp4 (H.264) or .gif."""
+    """File to write: .mp4 (H.264) or .gif; without a suffix, a folder of PNG frames."""
+    trajectory: Path | None = None
+    """File for the episode itself, .npz: time, state, observation, action, reward and every actuator signal."""
     width: int = 640
     """Width [px], even."""
     height: int = 480
@@ -226,7 +228,7 @@ class Render:
 
     def run(self) -> int:
         """Run the episode and film it."""
-        from codrl_mj.evaluation import RandomPolicy, make_env, run_episodes
+        from codrl_mj.evaluation import RandomPolicy, make_env, run_episodes, save_episode
         from codrl_mj.policies import load_policy
         from codrl_mj.rendering import Panel, film
         from codrl_mj.terminal import progress_bar
@@ -254,6 +256,9 @@ class Render:
                 lambda done, total: bar.update(row, completed=done, total=total),
             )
         print(f"wrote {self.out}")
+        if self.trajectory is not None:
+            save_episode(episode, self.trajectory)
+            print(f"wrote {self.trajectory}")
         return 0
 
 

@@ -2,14 +2,18 @@
 
 import copy
 import dataclasses
+import zipfile
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
 
 from codrl_mj.envs import ActuatedEnv
+from codrl_mj.files import writing
 from codrl_mj.motor import Actuator
+from codrl_mj.physics import Signals
 from codrl_mj.policies import Policy
 from codrl_mj.registration import ENVIRONMENTS
 from codrl_mj.tasks import find_task
@@ -89,6 +93,44 @@ class RandomPolicy:
         return np.array([self._space.sample() for _ in observation]), None
 
 
+def save_episode(episode: Episode, path: Path) -> None:
+    """Write an episode as a compressed NumPy archive, whole or not at all.
+
+    Args:
+        episode: the episode.
+        path: `.npz` file; its arrays are named as the fields of `Episode`, the signals by their own names.
+
+    Raises:
+        ValueError: another suffix.
+    """
+    if path.suffix != ".npz":
+        raise ValueError(f"trajectory {path}: the suffix must be .npz")
+    arrays: dict[str, Any] = {field: getattr(episode, field) for field in (*_ARRAYS, "terminated")}
+    with writing(path) as temporary:
+        np.savez_compressed(temporary, **arrays, **episode.signals)  # type: ignore[arg-type]
+
+
+def load_episode(path: Path) -> Episode:
+    """Read an episode that `save_episode` wrote; nothing is unpickled.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is not such an archive.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return Episode(
+                **{field: archive[field] for field in _ARRAYS},
+                signals={name: archive[name] for name in Signals._fields},
+                terminated=bool(archive["terminated"]),
+            )
+    except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path} is not the trajectory of an episode: {error}") from None
+
+
+_ARRAYS = ("time", "state", "observation", "action", "reward")
+
+
 def make_env(task: str, actuator: str | Actuator | Mapping[str, Any] | None, **options: Any) -> gymnasium.Env[Any, Any]:
     """One environment of a task by the task's name, through Gymnasium's registry.
 
@@ -155,7 +197,6 @@ def run_episodes(
             on_step(len(running), len(ended))
     for env in envs:
         env.close()
-    signals = ("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated")
     return [
         Episode(
             time=cores[index].task.step_duration * np.arange(1, len(rewards[index]) + 1),
@@ -163,7 +204,7 @@ def run_episodes(
             observation=np.array(observations[index]),
             action=np.array(actions[index]),
             reward=np.array(rewards[index]),
-            signals={name: np.array([info[name] for info in infos[index]]) for name in signals},
+            signals={name: np.array([info[name] for info in infos[index]]) for name in Signals._fields},
             terminated=ended[index],
         )
         for index in range(episodes)

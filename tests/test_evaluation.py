@@ -1,13 +1,24 @@
 """Evaluation: episodes are those of single stepping, and their numbers are those of a direct calculation."""
 
+import functools
 import math
+import pickle
 
 import gymnasium
 import numpy as np
 import pytest
 
 from codrl_mj import TASKS, Actuator, CurrentLoop, Motor, named_actuator
-from codrl_mj.evaluation import Episode, RandomPolicy, bootstrap_mean, make_env, run_episodes, summarize
+from codrl_mj.evaluation import (
+    Episode,
+    RandomPolicy,
+    bootstrap_mean,
+    load_episode,
+    make_env,
+    run_episodes,
+    save_episode,
+    summarize,
+)
 
 SIGNALS = ("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated")
 
@@ -256,3 +267,38 @@ def test_a_random_policy_needs_a_known_task_and_a_seed():
         RandomPolicy("cartpol")
     with pytest.raises(ValueError, match="seed = -1"):
         RandomPolicy("cartpole", -1)
+
+
+# -- trajectories -------------------------------------------------------------------------------------------
+
+
+def test_a_saved_episode_is_read_back_exactly(tmp_path):
+    make = functools.partial(make_env, "pendulum", "weaker", max_episode_steps=7)
+    (episode,) = run_episodes(RandomPolicy("pendulum"), make, 1)
+    save_episode(episode, tmp_path / "new" / "swing.npz")
+    again = load_episode(tmp_path / "new" / "swing.npz")
+    for field in ("time", "state", "observation", "action", "reward"):
+        np.testing.assert_array_equal(getattr(again, field), getattr(episode, field))
+        assert getattr(again, field).dtype == getattr(episode, field).dtype
+    assert again.signals.keys() == episode.signals.keys()
+    for name, values in episode.signals.items():
+        np.testing.assert_array_equal(again.signals[name], values)
+    assert again.terminated is episode.terminated is False
+
+
+def test_what_is_no_trajectory_is_refused(tmp_path):
+    make = functools.partial(make_env, "pendulum", "ideal", max_episode_steps=2)
+    (episode,) = run_episodes(RandomPolicy("pendulum"), make, 1)
+    with pytest.raises(ValueError, match=r"swing\.csv: the suffix must be \.npz"):
+        save_episode(episode, tmp_path / "swing.csv")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(FileNotFoundError, match=r"swing\.npz"):
+        load_episode(tmp_path / "swing.npz")
+    save_episode(episode, tmp_path / "swing.npz")
+    whole = (tmp_path / "swing.npz").read_bytes()
+    np.savez(tmp_path / "other.npz", time=np.zeros(3))
+    (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "pickle.npz").write_bytes(pickle.dumps({"time": 1}))
+    for name in ("other.npz", "cut.npz", "pickle.npz"):
+        with pytest.raises(ValueError, match=name):
+            load_episode(tmp_path / name)

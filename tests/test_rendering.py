@@ -13,9 +13,9 @@ from codrl_mj.physics.offscreen import OffscreenRenderer
 from codrl_mj.rendering import Panel, film
 
 WIDTH, HEIGHT = 200, 120
-FRAME_HEIGHT = 40 + HEIGHT + 24 + 120 + 26  # title, scene, and the strip's legend, plot and time axis
+FRAME_HEIGHT = 40 + HEIGHT + 24 + 120 + 8 + 60 + 26  # title, scene, and the strip's legend, plots and time axis
 PLOT_TOP = 40 + HEIGHT + 24
-DESIRED, ACTUAL, SATURATED = (0, 114, 178), (213, 94, 0), (204, 121, 167)
+DESIRED, ACTUAL, SATURATED, VOLTAGE = (0, 114, 178), (213, 94, 0), (204, 121, 167), (0, 158, 115)
 SIGNALS = ("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated")
 
 
@@ -106,6 +106,19 @@ def test_every_task_can_be_filmed_at_its_frame_rate(tmp_path, task):
         assert reader.count_frames() == (5 if rate <= 30 else 3)
 
 
+def test_without_a_suffix_the_frames_are_pngs(tmp_path):
+    out = film([made_up(1.0, 0.5, steps=8)], tmp_path / "new" / "frames", WIDTH, HEIGHT)
+    frames = sorted(out.iterdir())
+    assert [frame.name for frame in frames] == [f"frame_{index:05d}.png" for index in range(5)]
+    for frame in frames:
+        with Image.open(frame) as image:
+            assert (image.format, image.size, image.mode) == ("PNG", (WIDTH, FRAME_HEIGHT), "RGB")
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["frames"]
+    with pytest.raises(FileExistsError, match="frames exists already"):
+        film([made_up(1.0, 0.5, steps=8)], out, WIDTH, HEIGHT)
+    assert sorted(out.iterdir()) == frames
+
+
 def test_an_existing_film_is_replaced(tmp_path):
     out = tmp_path / "film.gif"
     out.write_text("old")
@@ -130,6 +143,23 @@ def test_the_strip_draws_desired_and_actual_at_their_heights(monkeypatch, tmp_pa
         rows = rows_with(frame, colour)
         assert len(rows) in (1, 2, 3, 4), colour
         assert rows.mean() == pytest.approx(59.5 * (1 - value / limit), abs=1.5)
+
+
+@pytest.mark.parametrize(("volts", "limit_shown"), [(22.0, True), (5.0, False)])
+def test_the_strip_draws_the_voltage_at_its_height_and_a_limit_that_is_near(monkeypatch, tmp_path, volts, limit_shown):
+    panel = made_up(1.0, 0.5)
+    panel.episode.signals["voltage"][:] = volts
+    frame = filmed(monkeypatch, tmp_path, [panel])[-1]
+    plot = frame[PLOT_TOP + 128 : PLOT_TOP + 188, 62 : WIDTH - 12].astype(int)
+    span = 1.2 * volts  # the plot spans minus to plus this, over 60 px
+
+    def rows(colour):
+        return np.flatnonzero((np.abs(plot - colour).max(axis=-1) < 40).mean(axis=1) > 0.3)
+
+    assert rows(VOLTAGE).mean() == pytest.approx(29.5 * (1 - volts / span), abs=1.5)
+    limits = 29.5 * (1 - np.array([24.0, -24.0]) / span)
+    found = rows(SATURATED)
+    assert (np.abs(found[:, None] - limits) < 1.5).any(axis=0).all() if limit_shown else len(found) == 0
 
 
 def test_the_strip_shows_no_future(monkeypatch, tmp_path):
@@ -207,8 +237,7 @@ def test_the_ideal_actuator_can_be_filmed(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
-        ("film.avi", {}, r"unknown format '\.avi'.*\.mp4, \.gif"),
-        ("film", {}, "unknown format ''"),
+        ("film.avi", {}, r"unknown format '\.avi'.*\.mp4, \.gif.*folder of PNG"),
         ("film.MP4", {}, r"unknown format '\.MP4'"),
         ("film.mp4", {"width": 201}, "width = 201: must be even"),
         ("film.mp4", {"height": 121}, "height = 121: must be even"),

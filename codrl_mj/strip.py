@@ -1,0 +1,132 @@
+"""The strip under a film's scene: desired and actual torque, and the voltage, over time; and its lines of text."""
+
+from typing import Any
+
+import numpy as np
+
+from codrl_mj.evaluation import Episode
+from codrl_mj.motor import Actuator
+
+_DPI = 100
+HEADER_HEIGHT, TORQUE_HEIGHT, GAP, VOLTAGE_HEIGHT, TIME_HEIGHT = 24, 120, 8, 60, 26  # px, from top to bottom
+PLOT_HEIGHT = TORQUE_HEIGHT + GAP + VOLTAGE_HEIGHT
+AXIS_WIDTH, MARGIN = 62, 10  # px, left and right of the plots
+DESIRED, ACTUAL, VOLTAGE, SATURATED = "#0072B2", "#D55E00", "#009E73", "#CC79A7"  # colour-blind safe (Okabe and Ito)
+
+
+def draw_text(text: str, width: int, height: int, colour: str = "#22313F") -> np.ndarray:
+    """One line of bold text, centred.
+
+    Returns:
+        Image, shape (height, width, 3), uint8.
+    """
+    figure = _figure(width, height)
+    figure.text(0.5, 0.5, text, ha="center", va="center", fontsize=12, color=colour, weight="bold")
+    return _pixels(figure)
+
+
+def pixels_per_second(width: int, window: float) -> float:
+    """Scale of the time axis where a frame `width` px wide shows `window` seconds."""
+    return (width - AXIS_WIDTH - MARGIN) / window
+
+
+def draw_strip(
+    episode: Episode, actuator: Actuator | None, width: int, window: float, end: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw an episode's signals once, so that frames can be cut from them.
+
+    Args:
+        episode: the episode.
+        actuator: what it ran on; without a motor the strip shows forces, and no voltage.
+        width: width of a frame [px].
+        window: the span of time that a frame shows [s].
+        end: time at the right end of the whole strip [s].
+
+    Returns:
+        The strip's frame, `width` wide (legend and vertical axes), and its whole content below the legend, on which a
+        second is `pixels_per_second(width, window)` wide.
+    """
+    body = PLOT_HEIGHT + TIME_HEIGHT
+    frame = _figure(width, HEADER_HEIGHT + body)
+    content = _figure(round(pixels_per_second(width, window) * end), body)
+    lines = []
+    for bottom, height, plot, label in (
+        (TIME_HEIGHT + VOLTAGE_HEIGHT + GAP, TORQUE_HEIGHT, _plot_torque, "torque [N·m]" if actuator else "force [N]"),
+        (TIME_HEIGHT, VOLTAGE_HEIGHT, _plot_voltage, "u [V]"),
+    ):
+        total = HEADER_HEIGHT + body
+        axis = frame.add_axes((AXIS_WIDTH / width, bottom / total, 1e-6, height / total))
+        axes = content.add_axes((0, bottom / body, 1, height / body))
+        lines += plot(episode, actuator, axes)
+        _share_axis(axis, axes, label, end, window)
+    content.axes[0].set_xticks([])
+    frame.legend(handles=lines, loc="upper right", ncols=4, fontsize=8, frameon=False, borderaxespad=0.2)
+    return _pixels(frame), _pixels(content)
+
+
+def _figure(width: int, height: int) -> Any:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _pixels(figure: Any) -> np.ndarray:
+    figure.canvas.draw()
+    return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
+
+
+def _share_axis(axis: Any, axes: Any, label: str, end: float, window: float) -> None:
+    """Give the vertical axis of `axes` to `axis`, and the horizontal one some six ticks a window."""
+    from matplotlib.ticker import MaxNLocator, MultipleLocator
+
+    for each in (axis, axes):
+        each.set_ylim(axes.get_ylim())
+        each.tick_params(labelsize=8)
+        each.spines[["top", "right"]].set_visible(False)
+    axis.set_ylabel(label, fontsize=9)
+    axis.set_xticks([])
+    axes.set(yticks=[], xlim=(0, end))
+    axes.spines["left"].set_visible(False)
+    axes.xaxis.set_major_locator(MultipleLocator(float(np.diff(MaxNLocator(6).tick_values(0, window))[0])))
+    axes.xaxis.set_major_formatter(lambda time, _: f"{time:g} s" if time else "")  # the edge would cut a label at 0
+
+
+def _edges(episode: Episode) -> np.ndarray:
+    return np.concatenate([[0.0], episode.time])
+
+
+def _plot_torque(episode: Episode, actuator: Actuator | None, axes: Any) -> list[Any]:
+    """Plot desired and actual torque (force, where there is no motor), and where the voltage was at its limit."""
+    arm = 1.0 if actuator is None else actuator.motor.arm_radius
+    desired, actual = episode.signals["desired_force"] * arm, episode.signals["actual_force"] * arm
+    limit = 1.15 * max(np.abs(desired).max(), np.abs(actual).max(), 1e-9)
+    axes.set_ylim(-limit, limit)
+    axes.axhline(0, color="0.85", linewidth=0.8)
+    lines = [
+        axes.stairs(values, _edges(episode), baseline=None, color=colour, linewidth=line, label=label)
+        for values, colour, label, line in ((desired, DESIRED, "desired", 1.0), (actual, ACTUAL, "actual", 2.0))
+    ]
+    if episode.signals["saturated"].any():
+        band = np.where(episode.signals["saturated"], limit, -limit)
+        options = {"baseline": -limit, "fill": True, "color": SATURATED, "alpha": 0.3}
+        lines.append(axes.stairs(band, _edges(episode), label="saturated", **options))
+    return lines
+
+
+def _plot_voltage(episode: Episode, actuator: Actuator | None, axes: Any) -> list[Any]:
+    """Plot the terminal voltage, and its limit where it comes near."""
+    if actuator is None:
+        axes.set_ylim(-1, 1)
+        axes.text(0.02, 0, "an ideal actuator has no voltage", va="center", fontsize=8, color="0.5")
+        return []
+    voltage, limit = episode.signals["voltage"], actuator.controller.max_voltage
+    span = 1.2 * max(np.abs(voltage).max(), 1e-9)
+    axes.set_ylim(-span, span)
+    axes.axhline(0, color="0.85", linewidth=0.8)
+    if limit < span:
+        for side in (-limit, limit):
+            axes.axhline(side, color=SATURATED, linewidth=1.0, linestyle="--")
+    return [axes.stairs(voltage, _edges(episode), baseline=None, color=VOLTAGE, linewidth=1.6, label="voltage")]
