@@ -46,7 +46,18 @@ def _optional(kind: type) -> Any:
     return dataclasses.make_dataclass(f"{kind.__name__}Fields", fields, frozen=True)
 
 
+def _unchecked(kind: type) -> Any:
+    """The dataclass without its validation, which the verb makes up for: an error while parsing looks like a bug."""
+    docs = _field_docs(kind)
+    fields = [
+        (field.name, Annotated[field.type, tyro.conf.arg(help=docs[field.name])], field.default)
+        for field in dataclasses.fields(kind)
+    ]
+    return dataclasses.make_dataclass(f"{kind.__name__}Fields", fields, frozen=True)
+
+
 _MotorFields, _LoopFields = _optional(Motor), _optional(CurrentLoop)
+_PPOFields, _EnvFields = _unchecked(PPOConfig), _unchecked(EnvConfig)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,9 +133,9 @@ class Train:
     """Environments side by side."""
     out: Path | None = None
     """Run folder to make; the default is runs/TASK-ppo-ACTUATOR-SEED."""
-    ppo: PPOConfig = PPOConfig()
+    ppo: _PPOFields = _PPOFields()  # type: ignore[valid-type]
     """The agent."""
-    env: EnvConfig = EnvConfig()
+    env: _EnvFields = _EnvFields()  # type: ignore[valid-type]
     """The environment."""
 
     def run(self) -> int:
@@ -133,7 +144,8 @@ class Train:
         from codrl_mj.training import TrainConfig
 
         actuator = _actuator(self.actuator_name, self.actuator_fields, self.task)
-        config = TrainConfig(self.task, actuator, self.ppo, self.seed, self.total_steps, self.num_envs, self.env)
+        ppo, env = PPOConfig(**vars(self.ppo)), EnvConfig(**vars(self.env))
+        config = TrainConfig(self.task, actuator, ppo, self.seed, self.total_steps, self.num_envs, env)
         out = self.out or Path("runs") / f"{self.task}-ppo-{self.actuator_name}-{self.seed}"
         train_with_bars({f"PPO on {self.task}": (config, out)})
         print(f"wrote {out}: see {out / 'learning_curve.png'}; next: codrl-mj evaluate {out}")
@@ -162,7 +174,7 @@ class Evaluate:
     """Sample the actions instead of taking the most likely ones."""
     out: Path | None = None
     """JSON file for the result."""
-    env: EnvConfig = EnvConfig()
+    env: _EnvFields = _EnvFields()  # type: ignore[valid-type]
     """The environment."""
 
     def run(self) -> int:
@@ -175,11 +187,12 @@ class Evaluate:
         trained = load_config(self.run_folder)
         actuator = _actuator(self.actuator_name, self.actuator_fields, trained.task, trained.actuator)  # type: ignore[arg-type]
         policy = load_policy(self.run_folder)
+        options = EnvConfig(**vars(self.env)).as_arguments()
         with progress_bar("{task.completed}/{task.total} episodes") as bar:
             row = bar.add_task("evaluating", total=self.episodes)
             episodes = run_episodes(
                 policy,
-                lambda: make_env(trained.task, actuator, **self.env.as_arguments()),
+                lambda: make_env(trained.task, actuator, **options),
                 self.episodes,
                 self.seed,
                 not self.stochastic,
@@ -223,7 +236,7 @@ class Render:
     """A camera of the model: fixed or close."""
     pretty: bool = False
     """Shadows, reflections and multisampling: slower."""
-    env: EnvConfig = EnvConfig()
+    env: _EnvFields = _EnvFields()  # type: ignore[valid-type]
     """The environment."""
 
     def run(self) -> int:
@@ -242,7 +255,8 @@ class Render:
             trained = load_config(Path(self.subject))
             task, policy, name = trained.task, load_policy(Path(self.subject)), self.actuator_name
             actuator = _actuator(name, self.actuator_fields, task, trained.actuator)  # type: ignore[arg-type]
-        (episode,) = run_episodes(policy, lambda: make_env(task, actuator, **self.env.as_arguments()), 1, self.seed)
+        options = EnvConfig(**vars(self.env)).as_arguments()
+        (episode,) = run_episodes(policy, lambda: make_env(task, actuator, **options), 1, self.seed)
         panel = Panel(f"{Path(self.subject).name} on {name}: return {episode.total:.0f}", task, actuator, episode)
         with progress_bar("{task.completed}/{task.total} frames") as bar:
             row = bar.add_task("filming", total=None)

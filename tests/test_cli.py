@@ -1,0 +1,399 @@
+"""The command line: it teaches, it does what it says, and bad input costs one line and leaves nothing."""
+
+import dataclasses
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio
+import numpy as np
+import pytest
+
+from codrl_mj import TASKS, CurrentLoop, Motor
+from codrl_mj.agents import PPOConfig
+from codrl_mj.cli import main
+from codrl_mj.env_config import EnvConfig
+from codrl_mj.evaluation import make_env, run_episodes
+from codrl_mj.motor import NAMED, named_actuator
+from codrl_mj.policies import load_policy
+from codrl_mj.training import load_config
+from codrl_mj.validation import Check
+
+PROGRAM = Path(sys.executable).with_name("codrl-mj")
+TINY = ["--total-steps", "500", "--num-envs", "2", "--ppo.rollout-steps", "256", "--ppo.batch-size", "64"]
+TINY += ["--ppo.epochs", "1", "--ppo.hidden", "8"]
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    """Every test runs in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A tiny run of CartPole through the actuator `weaker`."""
+    out = tmp_path_factory.mktemp("trained") / "run"
+    assert main(["train", "cartpole", "--actuator", "weaker", *TINY, "--out", str(out)]) == 0
+    return out
+
+
+def command(line, **options):
+    arguments = [str(PROGRAM), *line.split()]
+    return subprocess.run(arguments, capture_output=True, text=True, timeout=120, check=False, **options)
+
+
+def helped(capsys, *verb):
+    """The help text as one line, without its frame."""
+    with pytest.raises(SystemExit) as done:
+        main([*verb, "--help"])
+    assert done.value.code == 0
+    return " ".join(capsys.readouterr().out.translate(str.maketrans("│╭╮╰╯─", "      ")).split())
+
+
+def refused(capsys, *arguments):
+    """The one line that bad input costs; nothing is written."""
+    before = sorted(Path.cwd().rglob("*"))
+    assert main(list(arguments)) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("codrl-mj: error: ")
+    assert error.count("\n") == 1
+    assert "Traceback" not in error
+    assert sorted(Path.cwd().rglob("*")) == before
+    return error
+
+
+# -- help ---------------------------------------------------------------------------------------------------
+
+
+def test_the_help_lists_every_verb_with_an_example(capsys):
+    text = helped(capsys)
+    for verb in ("train", "evaluate", "render", "validate"):
+        assert f"• {verb}" in text
+        assert f"Example: codrl-mj {verb}" in text
+
+
+@pytest.mark.parametrize("verb", ["train", "evaluate", "render"])
+def test_the_help_explains_every_named_actuator_and_every_field_with_its_unit(capsys, verb):
+    text = helped(capsys, verb)
+    for name, (description, _) in NAMED.items():
+        assert f"{name}: {description}" in text
+    for part, kind in (("motor", Motor), ("controller", CurrentLoop)):
+        for field in dataclasses.fields(kind):
+            assert f"--actuator.{part}.{field.name.replace('_', '-')}" in text
+    for unit in ("[ohm]", "[H]", "[N*m/A]", "[V*s/rad]", "[m]", "[V/A]", "[V/(A*s)]", "[V*s/A]", "[1/s]", "[s]"):
+        assert unit in text
+    for field in dataclasses.fields(EnvConfig):
+        assert f"--env.{field.name.replace('_', '-')}" in text
+    assert "--seed" in text
+    assert "--out" in text
+
+
+def test_the_help_shows_the_defaults_that_training_in_python_has(capsys):
+    text = helped(capsys, "train")
+    for field in dataclasses.fields(PPOConfig):
+        flag = text.partition(f"--ppo.{field.name.replace('_', '-')} ")[2].partition(" --")[0]
+        default = " ".join(map(str, field.default)) if isinstance(field.default, tuple) else str(field.default)
+        assert f"(default: {default})" in flag
+
+
+@pytest.mark.parametrize("verb", ["train", "validate"])
+def test_the_help_lists_every_task(capsys, verb):
+    assert "{" + ",".join(TASKS) + "}" in helped(capsys, verb)
+
+
+def test_the_examples_in_the_help_are_understood(capsys):
+    train, evaluate, render, validate = (helped(capsys, verb) for verb in ("train", "evaluate", "render", "validate"))
+    assert "codrl-mj train cartpole --actuator weaker --env.center-radius 0.1 --out runs/through-weaker" in train
+    assert "codrl-mj evaluate runs/cartpole-ppo-ideal-0 --actuator weaker --episodes 100" in evaluate
+    assert "codrl-mj render runs/cartpole-ppo-weaker-0 --out balance.mp4" in render
+    assert "codrl-mj validate cartpole" in validate
+    # the examples' flags parse: what is missing is the run folder
+    for line in (
+        "evaluate runs/cartpole-ppo-ideal-0 --actuator weaker --episodes 100",
+        "render runs/cartpole-ppo-weaker-0 --out balance.mp4",
+    ):
+        assert "no run configuration at runs/cartpole-ppo-" in refused(capsys, *line.split())
+
+
+# -- train, evaluate, render --------------------------------------------------------------------------------
+
+
+def test_training_leaves_a_run_folder_and_says_what_is_next(capsys, tmp_path):
+    assert main(["train", "cartpole", "--actuator", "ideal", "--seed", "3", *TINY]) == 0
+    out = tmp_path / "runs" / "cartpole-ppo-ideal-3"
+    assert load_config(out).actuator is None
+    assert (load_config(out).seed, load_config(out).total_steps, load_config(out).num_envs) == (3, 500, 2)
+    assert load_config(out).ppo.hidden == (8,)
+    assert "next: codrl-mj evaluate runs/cartpole-ppo-ideal-3" in capsys.readouterr().out
+
+
+def test_fields_are_set_over_the_named_actuator(tmp_path):
+    flags = "--actuator weaker --actuator.controller.kp 0.3 --actuator.motor.inductance 0.07 --env.center-radius 0.1"
+    more = "--actuator.controller.max-voltage inf --actuator.controller.bemf-compensation False --env.inner-steps 2"
+    assert main(["train", "cartpole", *flags.split(), *more.split(), *TINY, "--out", "run"]) == 0
+    config = json.loads((tmp_path / "run" / "config.json").read_text())["train"]
+    weaker = named_actuator("weaker", "cartpole").as_mapping()
+    assert config["actuator"]["controller"] == weaker["controller"] | {
+        "kp": 0.3,
+        "max_voltage": math.inf,
+        "bemf_compensation": False,
+    }
+    assert config["actuator"]["motor"] == weaker["motor"] | {"inductance": 0.07}
+    assert config["env"]["center_radius"] == 0.1
+    assert config["env"]["inner_steps"] == 2
+
+
+def test_evaluation_is_that_of_the_package(capsys, trained, tmp_path):
+    assert main(["evaluate", str(trained), "--episodes", "7", "--seed", "5", "--out", "a/result.json"]) == 0
+    result = json.loads((tmp_path / "a" / "result.json").read_text())
+    make = lambda: make_env("cartpole", "weaker")  # noqa: E731
+    totals = [episode.total for episode in run_episodes(load_policy(trained), make, 7, seed=5)]
+    assert result["returns"][0] == pytest.approx(np.mean(totals), rel=1e-12)
+    assert result["returns"] == result["length"]  # 1 a step
+    assert result["episodes"] == 7
+    text = capsys.readouterr().out
+    assert f"{np.mean(totals):.1f}" in text
+    assert f"{result['tracking_rms']:.3f} N·m" in text
+
+
+def test_a_policy_is_evaluated_on_any_actuator(trained, tmp_path):
+    for name in ("as-trained", "weaker", "ideal", "paper"):
+        assert main(["evaluate", str(trained), "--episodes", "4", "--actuator", name, "--out", f"{name}.json"]) == 0
+    results = {path.stem: json.loads(path.read_text()) for path in tmp_path.glob("*.json")}
+    assert results["as-trained"] == results["weaker"]
+    assert results["ideal"]["tracking_rms"] == 0.0
+    assert results["ideal"]["peak_voltage"] is None
+    assert 0 < results["paper"]["tracking_rms"] < results["weaker"]["tracking_rms"]
+
+
+def test_a_field_can_be_changed_on_the_actuator_trained_on(trained, tmp_path):
+    line = ["evaluate", str(trained), "--episodes", "4", "--out"]
+    assert main([*line, "starved.json", "--actuator.controller.max-voltage", "0.2"]) == 0
+    starved = json.loads((tmp_path / "starved.json").read_text())
+    assert starved["peak_voltage"] == 0.2
+    assert starved["saturated_percent"] > 50
+
+
+def test_sampled_actions_differ_from_the_most_likely(trained, tmp_path):
+    assert main(["evaluate", str(trained), "--episodes", "5", "--out", "likely.json"]) == 0
+    assert main(["evaluate", str(trained), "--episodes", "5", "--stochastic", "--out", "sampled.json"]) == 0
+    assert (tmp_path / "likely.json").read_text() != (tmp_path / "sampled.json").read_text()
+
+
+def test_a_run_can_be_filmed(capsys, trained, tmp_path):
+    assert main(["render", str(trained), "--out", "film.mp4", "--width", "200", "--height", "120"]) == 0
+    with imageio.get_reader(tmp_path / "film.mp4") as reader:
+        assert reader.get_meta_data()["codec"] == "h264"
+        assert reader.get_meta_data()["size"][0] == 200
+    assert "wrote film.mp4" in capsys.readouterr().out
+
+
+def test_a_task_can_be_filmed_with_random_actions_through_the_papers_motor(tmp_path):
+    line = "render pendulum --env.max-episode-steps 3 --out film.gif --width 200 --height 120 --seed 2 --camera fixed"
+    assert main(line.split()) == 0
+    assert (tmp_path / "film.gif").read_bytes().startswith(b"GIF89a")
+
+
+# -- exit status --------------------------------------------------------------------------------------------
+
+
+def test_validation_exits_with_0_when_all_checks_pass(capsys):
+    assert main(["validate", "pendulum", "--samples", "20", "--runs", "1"]) == 0
+    text = capsys.readouterr().out
+    assert text.count("passed") == 5
+    assert "FAILED" not in text
+
+
+@pytest.mark.parametrize("worst", [1.0, math.nan])
+def test_validation_exits_with_1_when_a_check_fails(capsys, monkeypatch, worst):
+    checks = [Check("good", "oracle", 1, 0.0, 1e-12, "here"), Check("bad", "oracle", 1, worst, 1e-12, "theta")]
+    monkeypatch.setattr("codrl_mj.validation.validate", lambda *_: checks)
+    assert main(["validate", "cartpole"]) == 1
+    text = capsys.readouterr().out
+    assert "FAILED at theta" in text
+    assert text.count("passed") == 1
+
+
+def test_ctrl_c_exits_with_130_and_leaves_nothing(monkeypatch, tmp_path):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("codrl_mj.training.save_policy", interrupted)
+    assert main(["train", "cartpole", *TINY, "--out", "run"]) == 130
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "line", ["", "fly cartpole", "train", "train cartpoll", "train cartpole --seed two", "train cartpole --typo"]
+)
+def test_a_line_that_cannot_be_parsed_exits_with_2(capsys, line):
+    with pytest.raises(SystemExit) as done:
+        main(line.split())
+    assert done.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_a_missing_extra_is_named(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "safetensors", None)
+    monkeypatch.setitem(sys.modules, "safetensors.torch", None)
+    assert "codrl-mj[all]" in refused(capsys, "train", "cartpole", *TINY, "--out", "run")
+
+
+# -- bad input ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ("--actuator weakr", "did you mean 'weaker'"),
+        ("--actuator.motor.inductance -0.1", "Motor.inductance = -0.1: must be > 0"),
+        ("--actuator.motor.inductance nan", "Motor.inductance = nan: must be a finite number > 0"),
+        ("--actuator.controller.substeps 0", "CurrentLoop.substeps = 0"),
+        ("--actuator.controller.kp 100", "spectral radius"),
+        ("--actuator ideal --actuator.controller.kp 1", "ideal has no motor"),
+        ("--env.inner-steps 0", "inner_steps = 0"),
+        ("--env.integrator rk4", "integrator = 'rk4'"),
+        ("--env.max-episode-steps 0", "max_episode_steps = 0"),
+        ("--env.center-radius nan", "center_radius = nan"),
+        ("--seed -1", "seed = -1"),
+    ],
+)
+@pytest.mark.parametrize("verb", ["train", "evaluate", "render"])
+def test_a_bad_actuator_environment_or_seed_is_refused(capsys, trained, verb, flags, expected):
+    first = {"train": ["train", "cartpole"], "evaluate": ["evaluate", str(trained)], "render": ["render", str(trained)]}
+    assert expected in refused(capsys, *first[verb], *flags.split())
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ("--total-steps 0", "total_steps = 0"),
+        ("--num-envs 0", "num_envs = 0"),
+        ("--num-envs 3", "multiple of num_envs = 3"),
+        ("--ppo.gamma 1.5", "PPOConfig.gamma = 1.5"),
+        ("--ppo.learning-rate inf", "PPOConfig.learning_rate = inf"),
+        ("--ppo.batch-size 100", "multiple of batch_size = 100"),
+    ],
+)
+def test_bad_training_settings_are_refused(capsys, flags, expected):
+    assert expected in refused(capsys, "train", "cartpole", *flags.split(), "--out", "runs/run")
+
+
+def test_an_option_of_another_task_is_refused(capsys):
+    assert "center_radius" in refused(capsys, "train", "pendulum", "--env.center-radius", "0.1")
+
+
+def test_an_existing_run_folder_is_refused(capsys, trained):
+    before = {path.name: path.read_bytes() for path in trained.iterdir()}
+    assert "exists already" in refused(capsys, "train", "cartpole", *TINY, "--out", str(trained))
+    assert {path.name: path.read_bytes() for path in trained.iterdir()} == before
+
+
+@pytest.mark.parametrize("verb", ["evaluate", "render"])
+def test_a_missing_run_folder_is_named(capsys, verb):
+    assert "nowhere/config.json" in refused(capsys, verb, "nowhere")
+
+
+@pytest.mark.parametrize("verb", ["evaluate", "render"])
+@pytest.mark.parametrize(
+    ("file", "content"),
+    [
+        ("policy.json", b"{}"),
+        ("policy.json", b'{"format": "codrl'),
+        ("policy.safetensors", b"PK\x03\x04 not tensors"),
+        ("policy.safetensors", None),
+        ("config.json", b"[]"),
+        ("config.json", b"{"),
+    ],
+)
+def test_a_foreign_file_in_the_run_folder_is_named(capsys, trained, tmp_path, verb, file, content):
+    run = tmp_path / "foreign"
+    run.mkdir()
+    for path in trained.iterdir():
+        (run / path.name).write_bytes(path.read_bytes())
+    (run / file).unlink()
+    if content is not None:
+        (run / file).write_bytes(content)
+    assert file in refused(capsys, verb, str(run))
+
+
+def test_a_policy_for_another_task_is_refused(capsys, trained, tmp_path):
+    assert main(["train", "pendulum", *TINY, "--out", "pendulum"]) == 0
+    capsys.readouterr()
+    for name in ("policy.json", "policy.safetensors"):
+        (tmp_path / "pendulum" / name).write_bytes((trained / name).read_bytes())
+    assert "observation shape" in refused(capsys, "evaluate", "pendulum")
+
+
+def test_zero_episodes_are_refused(capsys, trained):
+    assert "episodes = 0" in refused(capsys, "evaluate", str(trained), "--episodes", "0", "--out", "result.json")
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ("--camera drone", "cameras are fixed, close"),
+        ("--width 641", "width = 641: must be even"),
+        ("--height 0", "height = 0: must be >= 80"),
+        ("--out film.avi", "unknown format '.avi'"),
+    ],
+)
+def test_bad_film_settings_are_refused(capsys, flags, expected):
+    line = ["render", "cartpole", "--env.max-episode-steps", "2", *flags.split()]
+    assert expected in refused(capsys, *line)
+
+
+@pytest.mark.parametrize("verb", ["render", "evaluate", "train"])
+def test_an_output_that_cannot_be_written_is_named(capsys, trained, tmp_path, verb):
+    (tmp_path / "file").write_text("in the way")
+    lines = {
+        "render": ["render", "cartpole", "--env.max-episode-steps", "2", "--out", "file/film.mp4"],
+        "evaluate": ["evaluate", str(trained), "--episodes", "1", "--out", "file/result.json"],
+        "train": ["train", "cartpole", *TINY, "--out", "file/run"],
+    }
+    assert "file" in refused(capsys, *lines[verb])
+
+
+def test_a_verb_is_no_task_and_an_unknown_subject_is_no_run(capsys):
+    assert "cartpol/config.json" in refused(capsys, "render", "cartpol")
+
+
+# -- as a program -------------------------------------------------------------------------------------------
+
+
+def test_the_program_trains_and_renders(tmp_path):
+    for line in (
+        "train cartpole --actuator weaker --out run " + " ".join(TINY),
+        "render run --out film.mp4 --width 160 --height 80 --env.max-episode-steps 2",
+    ):
+        done = command(line, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert done.stderr == ""
+        assert "wrote" in done.stdout
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["film.mp4", "run"]
+
+
+def test_the_program_refuses_bad_input_with_status_2_and_one_line(tmp_path):
+    done = command("train cartpole --actuator weakr", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.startswith("codrl-mj: error: unknown actuator 'weakr'")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("code", ["import codrl_mj", "import codrl_mj.cli; codrl_mj.cli.main(['--help'])"])
+def test_neither_the_import_nor_the_help_loads_anything_heavy(code):
+    check = f"""
+import sys
+try:
+    {code}
+except SystemExit:
+    pass
+heavy = "torch", "mujoco", "numba", "stable_baselines3", "scipy", "matplotlib", "imageio", "dm_control", "rich.progress"
+print("loaded:", [name for name in heavy if name in sys.modules])
+"""
+    done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.splitlines()[-1] == "loaded: []"
