@@ -18,6 +18,12 @@ class EnvConfig:
     """One of the task's integrators (CartPole: `euler` or `semi-implicit`); the default is Gymnasium's."""
     inner_steps: int | None = None
     """Integration steps per environment step; the default is the paper's inner loop with a motor and 1 without."""
+    action: Literal["force", "current", "voltage"] = "force"
+    """What the agent commands: the desired force, the reference current, or the voltage past the controller."""
+    levels: tuple[float, ...] | None = None
+    """Discrete tasks that command a current [A] or a voltage [V]: the levels that the actions choose from."""
+    observe_actuator: bool = False
+    """Whether the agent also observes measured and reference current [A]."""
     max_episode_steps: int | None = None
     """Time limit [environment steps], >= 1; the default is Gymnasium's."""
     center_radius: float | None = None
@@ -27,9 +33,16 @@ class EnvConfig:
 
     def __post_init__(self) -> None:
         """Validate what the environment itself does not see."""
+        if self.levels is not None:
+            object.__setattr__(self, "levels", tuple(self.levels))  # JSON has lists
         limit = self.max_episode_steps
         if limit is not None and (isinstance(limit, bool) or not isinstance(limit, int) or limit < 1):
             raise ValueError(f"max_episode_steps = {limit!r}: must be an integer >= 1")
+
+    def seen_as(self, trained: "EnvConfig") -> "EnvConfig":
+        """This environment with the actions and observations of another: those that a policy was trained with."""
+        interface = {name: getattr(trained, name) for name in ("action", "levels", "observe_actuator")}
+        return dataclasses.replace(self, **interface)
 
     def as_arguments(self) -> dict[str, Any]:
         """The keyword arguments for `gymnasium.make`, without those left at the task's default."""

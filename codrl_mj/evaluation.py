@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
+from gymnasium import spaces
 
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.files import writing
@@ -70,17 +71,21 @@ class Episode:
 
 
 class RandomPolicy:
-    """Chooses uniformly from a task's action space."""
+    """Chooses uniformly from an action space."""
 
-    def __init__(self, task: str, seed: int = 0) -> None:
+    def __init__(self, actions: str | spaces.Space[Any], seed: int = 0) -> None:
         """Seed a private copy of the action space.
+
+        Args:
+            actions: the space, or the name of the task whose space it is.
+            seed: of the choices.
 
         Raises:
             ValueError: unknown task, or a seed below 0.
         """
         if seed < 0:
             raise ValueError(f"seed = {seed}: must be >= 0")
-        self._space = copy.deepcopy(find_task(task).action_space)
+        self._space = copy.deepcopy(find_task(actions).action_space if isinstance(actions, str) else actions)
         self._space.seed(seed)
 
     def predict(

@@ -9,7 +9,7 @@ import numpy as np
 from codrl_mj.envs.setup import Setup
 from codrl_mj.motor import Actuator
 from codrl_mj.physics import MujocoPhysics
-from codrl_mj.physics.offscreen import OffscreenRenderer
+from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
 from codrl_mj.tasks import Task
 
 
@@ -93,6 +93,8 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
         self._view = {"width": width, "height": height, "camera": camera, "pretty": pretty}
         self._renderer: OffscreenRenderer | None = None
         self._drawn: MujocoPhysics | None = None
+        if render_mode is not None:
+            check_view(self._scene().model, width, height, camera)
         self.action_space = self.setup.action_space
         self.observation_space = self.setup.observation_space
 
@@ -167,15 +169,19 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
         if self.render_mode is None:
             gymnasium.logger.warn("render() without a render mode: pass render_mode='rgb_array' when making it")
             return None
-        if self._drawn is None:  # the analytic physics is drawn with the task's ideal model
-            own = self.physics
-            self._drawn = (
-                own if isinstance(own, MujocoPhysics) else MujocoPhysics(self.task, None, 1, self.setup.integrator)
-            )
-            self._renderer = OffscreenRenderer(self._drawn.model, **self._view)  # type: ignore[arg-type]
-        assert self._renderer is not None
-        self._drawn.show(self.physics.state)
-        return self._renderer.render(self._drawn.data)
+        scene = self._scene()
+        if self._renderer is None:
+            self._renderer = OffscreenRenderer(scene.model, **self._view)  # type: ignore[arg-type]
+        scene.show(self.physics.state)
+        return self._renderer.render(scene.data)
+
+    def _scene(self) -> MujocoPhysics:
+        """What is drawn: the simulation itself, or the task's ideal model where the physics is analytic."""
+        if isinstance(self.physics, MujocoPhysics):
+            return self.physics
+        if self._drawn is None:
+            self._drawn = MujocoPhysics(self.task, None, 1, self.setup.integrator)
+        return self._drawn
 
     def close(self) -> None:
         """Free the OpenGL context."""

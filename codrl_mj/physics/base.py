@@ -1,6 +1,7 @@
 """The small interface behind which a task is simulated."""
 
 import math
+import numbers
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -115,9 +116,9 @@ def inner_step_count(task: Task, actuator: Actuator | None, inner_steps: int | N
         return count
     if inner_steps is None:
         return 1 if actuator is None else task.motor_inner_steps
-    if isinstance(inner_steps, bool) or not isinstance(inner_steps, int) or inner_steps < 1:
+    if isinstance(inner_steps, bool) or not isinstance(inner_steps, numbers.Integral) or inner_steps < 1:
         raise ValueError(f"inner_steps = {inner_steps!r}: must be an integer >= 1")
-    return inner_steps
+    return int(inner_steps)
 
 
 def check_integrator(task: Task, integrator: str | None) -> str:

@@ -3,9 +3,9 @@
 import atexit
 import difflib
 import functools
+import numbers
 import os
 import weakref
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -59,14 +59,13 @@ class OffscreenRenderer:
             ValueError: unknown camera, or a size out of bounds.
             RenderingUnavailableError: no OpenGL context can be made.
         """
-        _check_size("width", width, model.vis.global_.offwidth)
-        _check_size("height", height, model.vis.global_.offheight)
-        self._camera = _check_camera(model, camera)
+        check_view(model, width, height, camera)
+        self._camera = camera
         self._pretty = pretty
         model.vis.quality.offsamples = 8 if pretty else 0
         model.vis.quality.shadowsize = 4096 if pretty else 0
         try:
-            self._renderer = mujoco.Renderer(model, height=height, width=width)
+            self._renderer = mujoco.Renderer(model, height=int(height), width=int(width))
         except Exception as error:  # each backend raises its own kind, most of them not exported
             raise RenderingUnavailableError(_no_context(error)) from error
         _open.add(self)
@@ -95,18 +94,23 @@ class OffscreenRenderer:
         self.close()
 
 
-def _check_size(name: str, value: Any, largest: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= largest:
-        raise ValueError(f"{name} = {value!r}: must be an integer from 1 to {largest} [px]")
+def check_view(model: mujoco.MjModel, width: int, height: int, camera: str) -> None:
+    """Check that a model can be drawn so, without making an OpenGL context; the arguments are `OffscreenRenderer`'s.
 
-
-def _check_camera(model: mujoco.MjModel, camera: str) -> str:
+    Raises:
+        ValueError: unknown camera, or a size out of bounds.
+    """
+    for name, value, largest in (
+        ("width", width, model.vis.global_.offwidth),
+        ("height", height, model.vis.global_.offheight),
+    ):
+        if isinstance(value, bool) or not isinstance(value, numbers.Integral) or not 1 <= value <= largest:
+            raise ValueError(f"{name} = {value!r}: must be an integer from 1 to {largest} [px]")
     names = [model.camera(index).name for index in range(model.ncam)]
     if camera not in names:
         near = difflib.get_close_matches(str(camera), names, n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
         raise ValueError(f"camera = {camera!r}: {hint}The model's cameras are {', '.join(names) or 'none'}")
-    return camera
 
 
 def _no_context(error: Exception) -> str:
