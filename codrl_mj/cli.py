@@ -187,7 +187,7 @@ class Evaluate:
         trained = load_config(self.run_folder)
         actuator = _actuator(self.actuator_name, self.actuator_fields, trained.task, trained.actuator)  # type: ignore[arg-type]
         policy = load_policy(self.run_folder)
-        options = EnvConfig(**vars(self.env)).as_arguments()
+        options = EnvConfig(**vars(self.env)).seen_as(trained.env).as_arguments()
         with progress_bar("{task.completed}/{task.total} episodes") as bar:
             row = bar.add_task("evaluating", total=self.episodes)
             episodes = run_episodes(
@@ -242,20 +242,21 @@ class Render:
     def run(self) -> int:
         """Run the episode and film it."""
         from codrl_mj.evaluation import RandomPolicy, make_env, run_episodes, save_episode
-        from codrl_mj.policies import load_policy
+        from codrl_mj.policies import Policy, load_policy
         from codrl_mj.rendering import Panel, film
         from codrl_mj.terminal import progress_bar
         from codrl_mj.training import load_config
 
         if self.subject in ENVIRONMENTS:
-            task, policy = self.subject, RandomPolicy(self.subject, self.seed)
-            name = "paper" if self.actuator_name == _AS_TRAINED else self.actuator_name
+            task, name = self.subject, "paper" if self.actuator_name == _AS_TRAINED else self.actuator_name
             actuator = _actuator(name, self.actuator_fields, task)
+            options = EnvConfig(**vars(self.env)).as_arguments()
+            policy: Policy = RandomPolicy(make_env(task, actuator, **options).action_space, self.seed)
         else:
             trained = load_config(Path(self.subject))
             task, policy, name = trained.task, load_policy(Path(self.subject)), self.actuator_name
             actuator = _actuator(name, self.actuator_fields, task, trained.actuator)  # type: ignore[arg-type]
-        options = EnvConfig(**vars(self.env)).as_arguments()
+            options = EnvConfig(**vars(self.env)).seen_as(trained.env).as_arguments()
         (episode,) = run_episodes(policy, lambda: make_env(task, actuator, **options), 1, self.seed)
         panel = Panel(f"{Path(self.subject).name} on {name}: return {episode.total:.0f}", task, actuator, episode)
         with progress_bar("{task.completed}/{task.total} frames") as bar:

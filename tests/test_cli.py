@@ -177,6 +177,16 @@ def test_a_field_can_be_changed_on_the_actuator_trained_on(trained, tmp_path):
     assert starved["saturated_percent"] > 50
 
 
+def test_commands_and_observations_are_those_of_the_training(capsys, tmp_path):
+    levels = ["--env.action", "voltage", "--env.levels", "-3", "3", "--env.observe-actuator"]
+    assert main(["train", "cartpole", "--actuator", "paper", *levels, *TINY, "--out", "volts"]) == 0
+    assert main(["evaluate", "volts", "--episodes", "2", "--out", "result.json"]) == 0
+    assert json.loads((tmp_path / "result.json").read_text())["peak_voltage"] == 3.0
+    film = ["--out", "film.gif", "--width", "200", "--height", "120", "--env.max-episode-steps", "2"]
+    assert main(["render", "volts", *film]) == 0
+    assert main(["render", "cartpole", *levels, *film]) == 0
+
+
 def test_sampled_actions_differ_from_the_most_likely(trained, tmp_path):
     assert main(["evaluate", str(trained), "--episodes", "5", "--out", "likely.json"]) == 0
     assert main(["evaluate", str(trained), "--episodes", "5", "--stochastic", "--out", "sampled.json"]) == 0
