@@ -163,7 +163,8 @@ class Setup:
         if array.shape != space.shape or array.dtype.kind != "f" or np.isnan(array).any():
             raise ValueError(f"action = {action!r}: not in {space}")
         limit = self.max_force / self._force_per_ampere
-        return float(np.clip(array[0], -limit, limit)) * self._force_per_ampere
+        command = min(max(float(array[0]), -limit), limit)  # in float64: a float32 bound may lie beyond the limit
+        return command * self._force_per_ampere
 
     def signals(self, signals: Signals) -> Signals:
         """The signals as the agent's command defines them: a voltage asks for whatever force follows."""
@@ -235,10 +236,13 @@ def _levels(task: Task, actuator: Actuator | None, action: str, levels: Sequence
     if action == "current":
         limit = task.max_force * actuator.motor.arm_radius / actuator.motor.torque_constant
     unit = "A" if action == "current" else "V"
-    table = np.asarray([] if levels is None else levels, dtype=np.float64)
+    try:
+        table = np.array([] if levels is None else levels, dtype=np.float64)  # a copy
+    except (TypeError, ValueError):
+        table = np.array([np.nan])
     if table.ndim != 1 or len(table) < 2 or not (np.abs(table) <= limit).all():
         raise ValueError(
             f"levels = {levels!r}: {task.name} has discrete actions, so action={action!r} needs two or more levels "
-            f"within +-{limit:g} {unit}, such as levels=({-limit:g}, 0, {limit:g})"
+            f"within +-{limit!r} {unit}, such as levels=({-limit!r}, 0, {limit!r})"
         )
     return table

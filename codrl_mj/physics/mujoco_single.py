@@ -62,12 +62,13 @@ class MujocoPhysics:
             callbacks.install(*self._callbacks)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but the views, which a copy takes of its own data."""
+        """Everything but the views and the model, which a copy takes of its own data."""
         return {name: value for name, value in self.__dict__.items() if name not in _VIEWS}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore, in this or another process."""
         self.__dict__.update(state)
+        self.model = self.data.model  # the one model of the copy: whoever changes either changes the simulation
         self._bind()
 
     @property
@@ -127,4 +128,4 @@ def _progression(entries: tuple[int, ...]) -> slice:
     return slice(entries[0], entries[-1] + 1, stride)
 
 
-_VIEWS = ("_qpos", "_qvel", "_ctrl", "_act", "_constrain")
+_VIEWS = ("model", "_qpos", "_qvel", "_ctrl", "_act", "_constrain")
