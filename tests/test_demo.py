@@ -1,0 +1,74 @@
+"""The demonstration runs from start to end, and does not repeat what is done."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio
+import pytest
+
+from codrl_mj.policies import load_policy
+from codrl_mj.training import load_config
+
+DEMO = Path(__file__).parents[1] / "scripts" / "demo.py"
+RUNS = ("ideal-seed4", "weaker-seed4")
+
+
+def demonstrate(out, total_steps=2048):
+    options = ["--out", str(out), "--seed", "4", "--total-steps", str(total_steps), "--episodes", "2"]
+    done = subprocess.run(
+        [sys.executable, str(DEMO), *options], capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def demonstrated(tmp_path_factory):
+    """The folder of a demonstration that found a run that was killed, and what was printed."""
+    out = tmp_path_factory.mktemp("demo") / "out"
+    (out / RUNS[0]).mkdir(parents=True)
+    (out / RUNS[0] / "config.json").write_text("{")  # what a killed run left
+    (out / RUNS[1]).mkdir()
+    return out, demonstrate(out)
+
+
+def test_it_leaves_two_runs_and_a_film(demonstrated):
+    out, _ = demonstrated
+    assert {path.name for path in out.iterdir()} == {*RUNS, "side_by_side.mp4"}
+    ideal, weaker = (load_config(out / run) for run in RUNS)
+    assert ideal.actuator is None
+    assert weaker.actuator.controller.kp == 0.2
+    assert ideal.ppo == weaker.ppo
+    assert ideal.seed == weaker.seed == 4
+    for run in RUNS:
+        load_policy(out / run)
+        assert (out / run / "learning_curve.png").is_file()
+    with imageio.get_reader(out / "side_by_side.mp4") as reader:
+        assert reader.get_meta_data()["codec"] == "h264"
+        width, height = reader.get_meta_data()["size"]
+    assert width == 2 * 480
+    assert height > 360
+
+
+def test_it_prints_the_validation_and_all_four_results_and_where_to_look(demonstrated):
+    out, text = demonstrated
+    assert "FAILED" not in text
+    assert text.count("passed") == 10
+    for trained in ("ideal", "weaker"):
+        for deployed in ("ideal", "weaker"):
+            assert f"trained on {trained}, run on {deployed}" in text
+        assert str(out / f"{trained}-seed4" / "learning_curve.png") in text.replace("\n", "")
+    assert f"Open {out / 'side_by_side.mp4'}" in text
+
+
+def test_a_second_run_reuses_the_trainings(demonstrated):
+    out, _ = demonstrated
+    weights = [out / run / "policy.safetensors" for run in RUNS]
+    before = [path.stat().st_mtime_ns for path in weights]
+    (out / "side_by_side.mp4").unlink()
+    text = demonstrate(out)
+    assert text.count("is trained already") == 2
+    assert [path.stat().st_mtime_ns for path in weights] == before
+    assert (out / "side_by_side.mp4").is_file()
