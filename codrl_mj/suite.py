@@ -6,10 +6,12 @@ The same dynamics, rewards and ends as the Gymnasium environments, with observat
 
 import collections
 import copy
+import operator
 import threading
 from collections.abc import Mapping
 from typing import Any
 
+import mujoco
 import numpy as np
 from dm_control import mujoco as dm_mujoco
 from dm_control.mujoco import wrapper
@@ -23,6 +25,8 @@ from codrl_mj.physics import MujocoPhysics, Signals
 from codrl_mj.registration import ENVIRONMENTS
 from codrl_mj.tasks import TASKS
 
+_FULL_STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
+
 TASK_NAME = "gym"
 ALL_TASKS = tuple((name, TASK_NAME) for name in TASKS)
 """Every (domain, task) that `load` knows."""
@@ -31,6 +35,7 @@ ALL_TASKS = tuple((name, TASK_NAME) for name in TASKS)
 class Physics(dm_mujoco.Physics):
     """dm_control's physics around one of our simulations; a `step` is one whole environment step."""
 
+    legacy_step: bool = False
     simulation: MujocoPhysics
     """Our simulation, which owns model and data."""
     desired_force: float = 0.0
@@ -62,6 +67,44 @@ class Physics(dm_mujoco.Physics):
         with self.check_invalid_state():
             self.signals = self.simulation.step(self.desired_force)
 
+    def get_state(self, sig: int | None = None) -> np.ndarray:
+        """The state to continue from: time, positions, velocities and motors.
+
+        Without the time, which dm_control leaves out, a motor would not know whether its last tick has passed.
+
+        Args:
+            sig: which parts, as a sum of `mujoco.mjtState`.
+        """
+        return super().get_state(_FULL_STATE if sig is None else sig)
+
+    def set_state(self, physics_state: np.ndarray, sig: int | None = None) -> None:
+        """Restore what `get_state` returned.
+
+        Args:
+            physics_state: the state.
+            sig: which parts it holds, as a sum of `mujoco.mjtState`.
+
+        Raises:
+            ValueError: the state has not the size of these parts.
+        """
+        sig = _FULL_STATE if sig is None else sig
+        expected = (mujoco.mj_stateSize(self.model.ptr, sig),)
+        if np.shape(physics_state) != expected:
+            raise ValueError(f"physics_state has shape {np.shape(physics_state)}, must be {expected}")
+        super().set_state(physics_state, sig)
+
+    def state(self) -> np.ndarray:
+        """The same as `get_state()`."""
+        return self.get_state()
+
+    def render(self, *arguments: Any, **options: Any) -> np.ndarray:
+        """The present state as an image, as `dm_control.mujoco.Physics.render`.
+
+        A step leaves the engine's body poses where its last integration step began; the image does not lag.
+        """
+        self.simulation.show(self.simulation.state)
+        return super().render(*arguments, **options)
+
     def copy(self, share_model: bool = False) -> "Physics":
         """An independent copy, motor included; the model is always copied too."""
         del share_model
@@ -74,10 +117,7 @@ class Physics(dm_mujoco.Physics):
         self._contexts_lock = threading.Lock()
         self._warnings_cause_exception = True
         self.__dict__.update(state)
-        # attaching runs a forward pass with the actuation disabled, which must not be seen by the copy
-        before = copy.copy(self.simulation.data)
         self._reload_from_data(wrapper.MjData(self.simulation.data))
-        np.copyto(self.simulation.data.ctrl, before.ctrl)
 
 
 class GymTask(control.Task):
@@ -107,12 +147,17 @@ class GymTask(control.Task):
             ValueError: the action is not of the action spec.
         """
         if isinstance(self.setup.action_space, spaces.Discrete):
-            action = int(action)
+            try:
+                action = operator.index(action)
+            except TypeError:
+                raise ValueError(f"action = {action!r}: not in {self.setup.action_space}") from None
         self._before = physics.simulation.state
         physics.desired_force = self.setup.force(action)
 
     def after_step(self, physics: Physics) -> None:
-        """Nothing is left to do."""
+        """Express what the actuator did as the command defines it."""
+        assert physics.signals is not None
+        physics.signals = self.setup.signals(physics.signals)
 
     def action_spec(self, physics: Physics) -> specs.Array:
         """The action space as a dm_env spec."""
@@ -157,22 +202,27 @@ def load(
         actuator: as for `codrl_mj.envs.ActuatedEnv`.
         task_kwargs: `random`: a seed or a `numpy.random.Generator` for the initial states.
         environment_kwargs: arguments of `dm_control.rl.control.Environment`, such as `flat_observation`.
-        **options: `integrator`, `inner_steps`, `timestep`, `allow_unstable` and the task's own options, as for
-            `codrl_mj.envs.ActuatedEnv`.
+        **options: `integrator`, `inner_steps`, `timestep`, `allow_unstable`, `action`, `levels`, `observe_actuator` and
+            the task's own options, as for `codrl_mj.envs.ActuatedEnv`.
 
     Returns:
-        The environment. An episode ends with discount 0 where the task says so and with discount 1 at the time limit.
+        The environment. An episode ends with discount 0 where the task says so and with discount 1 at the time limit,
+        which is Gymnasium's number of steps; a last step that is both has discount 1, as everywhere in dm_control.
 
     Raises:
         ValueError: unknown domain or task, or arguments out of bounds.
     """
     if task_name != TASK_NAME:
         raise ValueError(f"task_name = {task_name!r}: every domain has one task, {TASK_NAME!r}")
+    given = task_kwargs or {}
+    if given.keys() - {"random"}:
+        raise ValueError(f"task_kwargs = {dict(given)!r}: may only hold 'random'")
     setup = Setup.build(domain_name, actuator, **options)
     simulation = setup.simulate("mujoco")
     assert isinstance(simulation, MujocoPhysics)
-    random = np.random.default_rng((task_kwargs or {}).get("random"))
-    limit = ENVIRONMENTS[setup.task.name].max_episode_steps
+    random = np.random.default_rng(given.get("random"))
+    # half a step less: dm_control divides by the step, and a rounded-up quotient would allow one step more
+    limit = ENVIRONMENTS[setup.task.name].max_episode_steps - 0.5
     return control.Environment(
         Physics.of(simulation),
         GymTask(setup, random),
