@@ -3,7 +3,6 @@
 The oracle of every check is the analytic physics: an unmodified Gymnasium environment driven through its attributes.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterator
 
@@ -13,6 +12,7 @@ from codrl_mj.motor import Actuator, named_actuator
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Physics, SimulationDivergedError
 from codrl_mj.physics.base import inner_step_count
 from codrl_mj.tasks import Task, find_task
+from codrl_mj.validation.outcome import Check
 
 STATE_BOUNDS: dict[str, tuple[float, ...]] = {
     # beyond what an episode can reach: all angles, and speeds of a falling pole
@@ -34,29 +34,6 @@ RUN_STEPS: dict[str, int] = {
     "mountain_car_continuous": 500,
 }
 """Environment steps of each whole run."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Check:
-    """The outcome of one check."""
-
-    name: str
-    """What was compared."""
-    oracle: str
-    """What it was compared with."""
-    samples: int
-    """How many steps were compared."""
-    worst: float
-    """Largest difference found, each state entry measured against max(1, its size)."""
-    tolerance: float
-    """Largest difference allowed."""
-    where: str
-    """Where the largest difference was found."""
-
-    @property
-    def passed(self) -> bool:
-        """Whether the port is right as far as this check sees; a NaN is a failure."""
-        return bool(self.worst <= self.tolerance)
 
 
 def _difference(task: Task, ours: np.ndarray, oracle: np.ndarray) -> tuple[float, str]:
