@@ -245,7 +245,7 @@ def test_the_ideal_actuator_can_be_filmed(monkeypatch, tmp_path):
         ("film.mp4", {"width": -200}, "width = -200: must be >= 160"),
         ("film.mp4", {"height": 0}, "height = 0: must be >= 80"),
         ("film.mp4", {"width": 100_000}, "width = 100000: must be an integer from 1 to"),
-        ("film.mp4", {"camera": "clos"}, "did you mean 'close'"),
+        ("film.mp4", {"camera": "close-up"}, "did you mean 'close'"),
         ("film.mp4", {"camera": "drone"}, "cameras are fixed, close"),
     ],
 )
