@@ -3,6 +3,7 @@
 The oracle of every check is the analytic physics: an unmodified Gymnasium environment driven through its attributes.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterator
 
