@@ -67,10 +67,15 @@ class Options(NamedTuple):
     """Acrobot has no options."""
 
 
-def initial(generator: np.random.Generator, options: dict[str, Any] | None) -> np.ndarray:
-    """Draw the four entries uniformly from (-0.1, 0.1), or from the reset options' `low` and `high`, as float32."""
+def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
+    """The four entries lie in (-0.1, 0.1), or within the reset options' `low` and `high`."""
     low, high = utils.maybe_parse_reset_bounds(options, -0.1, 0.1)
-    return generator.uniform(low=low, high=high, size=(4,)).astype(np.float32).astype(np.float64)
+    return np.full(4, low), np.full(4, high)
+
+
+def initial_state(draws: np.ndarray) -> np.ndarray:
+    """The draws as float32, as Gymnasium has them."""
+    return draws.astype(np.float32).astype(np.float64)
 
 
 def desired_force(action: np.ndarray) -> np.ndarray:
@@ -131,7 +136,8 @@ TASK = Task(
     observation_names=("cos_angle_1", "sin_angle_1", "cos_angle_2", "sin_angle_2", "velocity_1", "velocity_2"),
     observation_space=spaces.Box(-_HIGH, _HIGH, dtype=np.float32),
     options=Options,
-    initial=initial,
+    initial_bounds=initial_bounds,
+    initial_state=initial_state,
     desired_force=desired_force,
     observation=observation,
     reward=reward,

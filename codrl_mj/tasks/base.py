@@ -48,8 +48,10 @@ class Task:
     """The observation space, Gymnasium's."""
     options: type[Any]
     """The task's options: a `NamedTuple` class whose fields all have defaults."""
-    initial: Callable[[np.random.Generator, dict[str, Any] | None], np.ndarray]
-    """(generator, reset options) -> one initial state, shape (n,); draws what Gymnasium draws."""
+    initial_bounds: Callable[[dict[str, Any] | None], tuple[np.ndarray, np.ndarray]]
+    """(reset options) -> lower and upper bounds, shape (k,) each, of the k numbers that Gymnasium draws at a reset."""
+    initial_state: Callable[[np.ndarray], np.ndarray]
+    """(numbers drawn uniformly within those bounds (N, k), or one draw (k,)) -> initial states (N, n), or one."""
     desired_force: Callable[[np.ndarray], np.ndarray]
     """(actions (N, *action shape), or one action) -> desired forces (N,), or one; a `Box`'s actions saturate."""
     observation: Callable[[np.ndarray], np.ndarray]
@@ -62,6 +64,10 @@ class Task:
     """(states (N, n) as integrated, integration step [s]) -> states within the bounds that Gymnasium's `step` keeps:
     speed limits, walls, wrapped angles. Applied after every integration step; None where there are no bounds. Plain
     Python on purpose: `codrl_mj.physics.constrain` compiles it. Must let NaN through."""
+
+    def initial(self, generator: np.random.Generator, options: dict[str, Any] | None) -> np.ndarray:
+        """One initial state, shape (n,): the state that Gymnasium's environment draws from the same generator."""
+        return self.initial_state(generator.uniform(*self.initial_bounds(options)))
 
     def check_action(self, action: Any) -> np.ndarray:
         """One action as an array, checked.

@@ -25,10 +25,15 @@ class Options(NamedTuple):
     """Distance from the centre [m] beyond which a step earns nothing; the paper uses 0.1."""
 
 
-def initial(generator: np.random.Generator, options: dict[str, Any] | None) -> np.ndarray:
-    """Draw the four state entries uniformly from (-0.05, 0.05), or from the reset options' `low` and `high`."""
+def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
+    """The four entries lie in (-0.05, 0.05), or within the reset options' `low` and `high`."""
     low, high = utils.maybe_parse_reset_bounds(options, -0.05, 0.05)
-    return generator.uniform(low=low, high=high, size=(4,))
+    return np.full(4, low), np.full(4, high)
+
+
+def initial_state(draws: np.ndarray) -> np.ndarray:
+    """The draws themselves."""
+    return draws
 
 
 def desired_force(action: np.ndarray) -> np.ndarray:
@@ -69,7 +74,8 @@ TASK = Task(
     observation_names=("cart_position", "cart_velocity", "pole_angle", "pole_velocity"),
     observation_space=spaces.Box(-_HIGH, _HIGH, dtype=np.float32),
     options=Options,
-    initial=initial,
+    initial_bounds=initial_bounds,
+    initial_state=initial_state,
     desired_force=desired_force,
     observation=observation,
     reward=reward,

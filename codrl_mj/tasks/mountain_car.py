@@ -60,10 +60,15 @@ class Options(NamedTuple):
     """MountainCar has no options."""
 
 
-def initial(generator: np.random.Generator, options: dict[str, Any] | None) -> np.ndarray:
-    """Draw the position uniformly from (-0.6, -0.4), or from the reset options' `low` and `high`; at rest."""
+def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
+    """The position lies in (-0.6, -0.4), or within the reset options' `low` and `high`."""
     low, high = utils.maybe_parse_reset_bounds(options, -0.6, -0.4)
-    return np.array([generator.uniform(low=low, high=high), 0.0])
+    return np.array([low]), np.array([high])
+
+
+def initial_state(draws: np.ndarray) -> np.ndarray:
+    """The position drawn, at rest."""
+    return np.concatenate([draws, np.zeros_like(draws)], axis=-1)
 
 
 def desired_force(action: np.ndarray) -> np.ndarray:
@@ -121,7 +126,8 @@ TASK = Task(
     observation_names=("position", "velocity"),
     observation_space=spaces.Box(_LOW, _HIGH, dtype=np.float32),
     options=Options,
-    initial=initial,
+    initial_bounds=initial_bounds,
+    initial_state=initial_state,
     desired_force=desired_force,
     observation=observation,
     reward=reward,

@@ -60,11 +60,16 @@ class Options(NamedTuple):
     """Pendulum has no options."""
 
 
-def initial(generator: np.random.Generator, options: dict[str, Any] | None) -> np.ndarray:
-    """Draw angle and speed uniformly within +-pi and +-1, or within the reset options' `x_init` and `y_init`."""
+def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
+    """Angle and speed lie within +-pi and +-1, or within the reset options' `x_init` and `y_init`."""
     given = options or {}
     high = np.array([utils.verify_number_and_cast(given.get(*entry)) for entry in (("x_init", np.pi), ("y_init", 1.0))])
-    return generator.uniform(low=-high, high=high)
+    return -high, high
+
+
+def initial_state(draws: np.ndarray) -> np.ndarray:
+    """The draws themselves."""
+    return draws
 
 
 def desired_force(action: np.ndarray) -> np.ndarray:
@@ -118,7 +123,8 @@ TASK = Task(
     observation_names=("cos_angle", "sin_angle", "angular_velocity"),
     observation_space=spaces.Box(-_HIGH, _HIGH, dtype=np.float32),
     options=Options,
-    initial=initial,
+    initial_bounds=initial_bounds,
+    initial_state=initial_state,
     desired_force=desired_force,
     observation=observation,
     reward=reward,
