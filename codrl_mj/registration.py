@@ -31,6 +31,7 @@ def register_envs() -> None:
             register(
                 id=env_id,
                 entry_point="codrl_mj.envs:ActuatedEnv",
+                vector_entry_point="codrl_mj.envs:ActuatedVectorEnv",
                 kwargs={"task": task},
                 max_episode_steps=max_episode_steps,
                 reward_threshold=reward_threshold,

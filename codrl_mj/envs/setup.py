@@ -166,6 +166,37 @@ class Setup:
         command = min(max(float(array[0]), -limit), limit)  # in float64: a float32 bound may lie beyond the limit
         return command * self._force_per_ampere
 
+    def forces(self, actions: Any) -> np.ndarray:
+        """What `force` does, for a batch.
+
+        Args:
+            actions: a batch of elements of the action space, shape (N, ...).
+
+        Returns:
+            Shape (N,), float64.
+
+        Raises:
+            ValueError: wrong shape or type, or a row that is no element; the message has its index.
+        """
+        space, array = self.action_space, np.asarray(actions)
+        discrete = isinstance(space, spaces.Discrete)
+        kinds = "iu" if discrete else "f"
+        if array.ndim != 1 + len(space.shape or ()) or array.shape[1:] != space.shape or array.dtype.kind not in kinds:
+            raise ValueError(
+                f"actions of shape {array.shape} and type {array.dtype}: must be a batch of elements of {space}, with "
+                f"one row an environment"
+            )
+        wrong = (array < 0) | (array >= space.n) if isinstance(space, spaces.Discrete) else np.isnan(array[:, 0])
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            raise ValueError(f"actions[{row}] = {array[row]}: not in {space} (environment {row})")
+        if self.command == "force":
+            return np.asarray(self.task.desired_force(array), dtype=np.float64)
+        if self.levels is not None:
+            return self.levels[array] * self._force_per_ampere
+        limit = self.max_force / self._force_per_ampere
+        return np.clip(array[:, 0].astype(np.float64), -limit, limit) * self._force_per_ampere
+
     def signals(self, signals: Signals) -> Signals:
         """The signals as the agent's command defines them: a voltage asks for whatever force follows."""
         if self.command != "voltage":
@@ -176,21 +207,27 @@ class Setup:
         """What the agent sees.
 
         Args:
-            state: the mechanical state, shape (n,).
+            state: the mechanical state, shape (n,); or a batch of them, (N, n).
             signals: of the step that led there; None at the start, where both currents are 0.
 
         Returns:
-            Shape (k,), float32; the currents in A.
+            Shape (k,), or (N, k), float32; the currents in A.
         """
         seen = self.task.observation(state)
         if not self.observe_actuator:
             return seen
-        currents = (0.0, 0.0) if signals is None else (signals.current, signals.reference_current)
-        return np.append(seen, np.array(currents, np.float32))
+        currents = np.zeros((*seen.shape[:-1], 2), np.float32)
+        if signals is not None:
+            currents[..., 0], currents[..., 1] = signals.current, signals.reference_current
+        return np.concatenate([seen, currents], axis=-1)
 
     def reward(self, before: np.ndarray, signals: Signals, after: np.ndarray) -> float:
         """The task's reward of a step that led from one state to another."""
-        return float(self.task.reward(before, np.asarray(signals.actual_force), after, self.options))
+        return float(self.rewards(before, signals, after))
+
+    def rewards(self, before: np.ndarray, signals: Signals, after: np.ndarray) -> np.ndarray:
+        """The same for a batch: states (N, n), signals and rewards (N,)."""
+        return np.asarray(self.task.reward(before, np.asarray(signals.actual_force), after, self.options))
 
     def terminated(self, state: np.ndarray) -> bool:
         """Whether the task ends the episode in this state."""

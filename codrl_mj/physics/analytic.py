@@ -77,7 +77,7 @@ class AcrobotDriver:
     """`AcrobotEnv`: the torques to choose from and the time step are attributes."""
 
     speed = 3
-    _LARGEST = 1e6  # N*m
+    _LARGEST = 400.0  # N*m*s^2
 
     def __init__(self, gymnasium_id: str) -> None:
         """Make the Gymnasium environment."""
@@ -91,7 +91,7 @@ class AcrobotDriver:
         integrator: str,  # noqa: ARG002 - it has one only
     ) -> np.ndarray:
         """One `step` with the torque as the only one to choose from."""
-        if not abs(force) < self._LARGEST:  # Gymnasium wraps angles turn by turn: it would not come back
+        if not abs(force) * timestep**2 < self._LARGEST:  # Gymnasium wraps angles turn by turn: it would not come back
             return np.full(4, np.nan)
         env = self._env
         env.AVAIL_TORQUE = [force]

@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numba
 import numpy as np
 
+from codrl_mj.physics.base import LARGEST
 from codrl_mj.tasks import Task
 
 Keep = Callable[[np.ndarray, np.ndarray, float], None]
@@ -18,7 +19,8 @@ def compiled_constrain(task: Task) -> Keep | None:
         task: the task.
 
     Returns:
-        (qpos (N, nq), qvel (N, nv), integration step [s]) -> nothing; None for a task without bounds.
+        (qpos (N, nq), qvel (N, nv), integration step [s]) -> nothing; None for a task without bounds. A state beyond
+        `LARGEST` becomes NaN in all its entries, to be noticed: within its bounds it would look like any other.
     """
     return None if task.constrain is None else _compiled(task.constrain, task.qpos, task.qvel)
 
@@ -28,7 +30,7 @@ def _compiled(
     constrain: Callable[[np.ndarray, float], np.ndarray], positions: tuple[int, ...], velocities: tuple[int, ...]
 ) -> Keep:
     bounded = numba.njit(nogil=True, error_model="numpy")(constrain)
-    array = numba.types.Array(numba.float64, 2, "C")
+    array = numba.types.Array(numba.float64, 2, "A")  # a batch's are views of its state rows
 
     @numba.njit(numba.void(array, array, numba.float64), nogil=True, error_model="numpy")
     def keep(qpos: np.ndarray, qvel: np.ndarray, timestep: float) -> None:
@@ -38,6 +40,11 @@ def _compiled(
                 state[row, positions[entry]] = qpos[row, entry]
             for entry in range(len(velocities)):
                 state[row, velocities[entry]] = qvel[row, entry]
+            lost = False
+            for entry in range(state.shape[1]):
+                lost |= not abs(state[row, entry]) <= LARGEST
+            if lost:
+                state[row] = np.nan
         state = bounded(state, timestep)
         for row in range(len(qpos)):
             for entry in range(len(positions)):

@@ -1,0 +1,325 @@
+"""Thousands of environments as one, on MuJoCo's batched simulation: Gymnasium's `VectorEnv`."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from codrl_mj.envs.setup import Setup
+from codrl_mj.motor import Actuator
+from codrl_mj.physics import Signals
+from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
+from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
+from codrl_mj.physics.streams import Streams
+from codrl_mj.tasks import Task
+
+Array = np.ndarray
+
+
+class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
+    """N environments that step together, each bit for bit an `ActuatedEnv` with a time limit.
+
+    Made by `gymnasium.make_vec(id, num_envs=N, vectorization_mode="vector_entry_point")`. No Python runs for a single
+    environment: states, motors, generators and bookkeeping are arrays.
+
+    Infos are arrays of shape (N,) with Gymnasium's masks (`_current` says which rows have a `current`). After a step in
+    `SAME_STEP` mode, `final_obs` and `final_info` hold what the episodes that ended saw last.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - as Gymnasium has it
+
+    def __init__(
+        self,
+        num_envs: int,
+        task: str,
+        actuator: str | Actuator | Mapping[str, Any] | Sequence[Actuator] | None = "paper",
+        max_episode_steps: int | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        num_threads: int = 0,
+        physics: str = "mujoco",
+        render_mode: str | None = None,
+        width: int = 480,
+        height: int = 480,
+        camera: str = "fixed",
+        pretty: bool = False,
+        **arguments: Any,
+    ) -> None:
+        """Build the environments.
+
+        Args:
+            num_envs: how many, >= 1.
+            task: the task's name.
+            actuator: as for `ActuatedEnv`; or a sequence of N `Actuator`s, one for each environment.
+            max_episode_steps: time limit of each environment [steps]; None for none.
+            autoreset_mode: when an environment whose episode ended is reset: in the `NEXT_STEP`, in the `SAME_STEP`, or
+                by the caller (`DISABLED`), with `reset(options={"reset_mask": ...})`.
+            num_threads: threads of the engine; 0 uses every CPU. Results do not depend on it.
+            physics: `mujoco`; the analytic physics steps one Gymnasium environment at a time and cannot be batched.
+            render_mode: None or `rgb_array`: `render` then draws the first environment.
+            width: width of rendered images [px].
+            height: height of rendered images [px].
+            camera: a camera of the model.
+            pretty: shadows, reflections and multisampling.
+            **arguments: the other arguments of `ActuatedEnv`.
+
+        Raises:
+            ValueError: an argument is unknown or out of bounds, or a current loop is unstable; the message names it.
+            CallbackInUseError: another library's MuJoCo callback is installed.
+        """
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
+            raise ValueError(f"num_envs = {num_envs!r}: must be an integer >= 1")
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise ValueError(f"max_episode_steps = {max_episode_steps}: must be >= 1")
+        if isinstance(num_threads, bool) or not isinstance(num_threads, int | np.integer) or num_threads < 0:
+            raise ValueError(f"num_threads = {num_threads!r}: must be an integer >= 0 (0: every CPU)")
+        if physics != "mujoco":
+            raise ValueError(
+                f"physics = {physics!r}: a vector environment needs 'mujoco'; the analytic physics steps one Gymnasium "
+                "environment at a time: use vectorization_mode='sync' for it"
+            )
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode = {render_mode!r}: must be None or 'rgb_array'")
+        self.num_envs = int(num_envs)
+        self.setup, actuators = _set_up(self.num_envs, task, actuator, arguments)
+        self.physics = MujocoBatchPhysics(
+            self.setup.task,
+            actuators,
+            self.setup.inner_steps,
+            self.setup.integrator,
+            self.num_envs,
+            self.setup.max_force,
+            int(num_threads),
+        )
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {
+            **self.metadata,
+            "render_fps": self.setup.task.render_fps,
+            "autoreset_mode": self.autoreset_mode,
+        }
+        self.render_mode = render_mode
+        self.max_episode_steps = max_episode_steps
+        self.single_action_space = self.setup.action_space
+        self.single_observation_space = self.setup.observation_space
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self._streams = Streams(self.num_envs)
+        self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
+        self._ended = np.zeros(self.num_envs, dtype=bool)
+        self._observations: Array = np.zeros(self.observation_space.shape or (), dtype=np.float32)
+        self._view = {"width": width, "height": height, "camera": camera, "pretty": pretty}
+        if render_mode is not None:
+            check_view(self.physics.model, width, height, camera)
+        self._renderer: OffscreenRenderer | None = None
+
+    @property
+    def task(self) -> Task:
+        """The task."""
+        return self.setup.task
+
+    @property
+    def state(self) -> Array:
+        """Mechanical states, shape (N, n), float64, in Gymnasium's order."""
+        return self.physics.state
+
+    @property  # type: ignore[misc]
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
+        """The environments' generators."""
+        return tuple(self._streams.generators)
+
+    def reset(  # type: ignore[override]
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Start episodes, in every environment or in those of `options["reset_mask"]`.
+
+        Args:
+            seed: of the first environment, the others counting up from it; or one for each (None leaves a generator).
+            options: Gymnasium's reset options for the task, and `reset_mask`: shape (N,), bool, with a True in it.
+
+        Raises:
+            ValueError: wrong number of seeds, or a mask of wrong shape or type.
+        """
+        options = dict(options or {})
+        mask = options.pop("reset_mask", np.ones(self.num_envs, dtype=bool))
+        if not isinstance(mask, np.ndarray) or mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
+            raise ValueError(
+                f"reset_mask = {mask!r}: must be a bool array of shape ({self.num_envs},) with a True in it"
+            )
+        seeds: Sequence[int | None]
+        if seed is None or isinstance(seed, int | np.integer):
+            seeds = [None if seed is None else int(seed) + index for index in range(self.num_envs)]
+        else:
+            seeds = seed
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"seed: {len(seeds)} seeds for {self.num_envs} environments: there must be one for each")
+        rows = np.flatnonzero(mask)
+        chosen = [seeds[row] for row in rows.tolist()]
+        if any(one is not None for one in chosen):
+            self._streams.seed(rows, chosen)
+        self._restart(rows, options or None)
+        return self._observations.copy(), {}
+
+    def _restart(self, rows: Array, options: dict[str, Any] | None) -> None:
+        """Start episodes in some environments; their observations are in `_observations` then."""
+        low, high = self.setup.task.initial_bounds(options)
+        draws = low + (high - low) * self._streams.random(rows, len(low))
+        states = self.setup.task.initial_state(draws)
+        self.physics.reset(rows, states)
+        self._observations[rows] = self.setup.observation(states, None)
+        self._elapsed[rows] = 0
+        self._ended[rows] = False
+
+    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        """Advance every environment by one step.
+
+        Args:
+            actions: shape (N, ...).
+
+        Returns:
+            Observations (N, k) float32, rewards (N,) float64, terminations and truncations (N,) bool, infos.
+
+        Raises:
+            ValueError: actions of wrong shape or type, or one that is not in the action space: the message names the
+                environment, and none was stepped.
+            SimulationDivergedError: a simulation left the finite numbers; the message names the environment.
+            RuntimeError: in `DISABLED` mode, an environment whose episode ended was not reset.
+        """
+        forces = self.setup.forces(actions)
+        if len(forces) != self.num_envs:
+            raise ValueError(
+                f"actions: {len(forces)} rows for {self.num_envs} environments: there must be one for each"
+            )
+        if self.autoreset_mode == AutoresetMode.DISABLED and self._ended.any():
+            row = int(np.argmax(self._ended))
+            raise RuntimeError(
+                f"environment {row} has ended and was not reset: "
+                "call reset(options={'reset_mask': terminated | truncated})"
+            )
+        stepping = ~self._ended  # in NEXT_STEP mode, environments that ended are reset instead
+        before = self.physics.state
+        signals = self.setup.signals(self.physics.step(forces))
+        after = self.physics.state
+        self.physics.check_finite(after, stepping)
+        self._elapsed += 1
+        rewards = np.where(stepping, self.setup.rewards(before, signals, after), 0.0)
+        terminated = np.asarray(self.setup.task.terminated(after)) & stepping
+        limit = np.inf if self.max_episode_steps is None else self.max_episode_steps
+        truncated = (self._elapsed >= limit) & stepping
+        self._observations = self.setup.observation(after, signals)
+        infos = _infos(signals, stepping)
+        if not stepping.all():
+            self._restart(np.flatnonzero(~stepping), None)
+        self._ended = terminated | truncated
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and self._ended.any():
+            infos = self._finish(infos)
+        return self._observations.copy(), rewards, terminated, truncated, infos
+
+    def _finish(self, infos: dict[str, Any]) -> dict[str, Any]:
+        """Reset the environments that ended; what they saw last goes into the infos, as in Gymnasium."""
+        ended, rows = self._ended.copy(), np.flatnonzero(self._ended)
+        final_obs = np.full(self.num_envs, None, dtype=object)
+        for row in rows:
+            final_obs[row] = self._observations[row].copy()
+        names = [name for name in infos if not name.startswith("_")]
+        final: dict[str, Any] = {}
+        remaining: dict[str, Any] = {}
+        for name in names:
+            final[name], final[f"_{name}"] = np.where(ended, infos[name], np.zeros((), infos[name].dtype)), ended.copy()
+            if not ended.all():
+                kept = np.where(ended, np.zeros((), infos[name].dtype), infos[name])
+                remaining[name], remaining[f"_{name}"] = kept, ~ended
+        self._restart(rows, None)
+        return {
+            "final_obs": final_obs,
+            "_final_obs": ended.copy(),
+            "final_info": final,
+            "_final_info": ended.copy(),
+            **remaining,
+        }
+
+    def snapshot(self) -> dict[str, Array]:
+        """Everything that the future depends on, as plain arrays: simulations, motors, generators, bookkeeping."""
+        return {
+            "physics": self.physics.snapshot(),
+            "streams": self._streams.state(),
+            "elapsed": self._elapsed.copy(),
+            "ended": self._ended.copy(),
+            "observations": self._observations.copy(),
+        }
+
+    def restore(self, snapshot: Mapping[str, Array]) -> None:
+        """Continue from what `snapshot` returned, bit for bit.
+
+        Raises:
+            ValueError: the snapshot is of another number of environments, or of another task.
+        """
+        for name, value in self.snapshot().items():
+            if name not in snapshot or snapshot[name].shape != value.shape:
+                found = "missing" if name not in snapshot else f"of shape {snapshot[name].shape}"
+                raise ValueError(f"snapshot[{name!r}] is {found}: must be of shape {value.shape}")
+        self.physics.restore(snapshot["physics"])
+        self._streams.set_state(snapshot["streams"])
+        self._elapsed[:], self._ended[:] = snapshot["elapsed"], snapshot["ended"]
+        self._observations[:] = snapshot["observations"]
+
+    def render(self) -> Array | None:  # type: ignore[override]
+        """The first environment as an image, shape (height, width, 3), uint8; None if there is no render mode."""
+        if self.render_mode is None:
+            gymnasium.logger.warn("render() without a render mode: pass render_mode='rgb_array' when making it")
+            return None
+        if self._renderer is None:
+            self._renderer = OffscreenRenderer(self.physics.model, **self._view)  # type: ignore[arg-type]
+            self._data = mujoco.MjData(self.physics.model)
+        self.physics.show(0, self._data)
+        return self._renderer.render(self._data)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Free the OpenGL context."""
+        del kwargs
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+
+def _set_up(
+    num_envs: int, task: str, actuator: Any, arguments: Mapping[str, Any]
+) -> tuple[Setup, list[Actuator] | None]:
+    """The set-up shared by all environments, and the actuators to simulate.
+
+    Raises:
+        ValueError: an argument is out of bounds, or the actuators are not one for each environment.
+    """
+    if not isinstance(actuator, Sequence) or isinstance(actuator, str):
+        setup = Setup.build(task, actuator, **arguments)
+        physical = setup.physical_actuator
+        return setup, None if physical is None else [physical] * num_envs
+    if len(actuator) != num_envs:
+        raise ValueError(f"actuator: {len(actuator)} actuators for {num_envs} environments: there must be one for each")
+    if arguments.get("action", "force") != "force":
+        raise ValueError(f"action = {arguments['action']!r}: with an actuator for each environment only 'force'")
+    setups: dict[Actuator, Setup] = {}
+    for index, one in enumerate(actuator):
+        if not isinstance(one, Actuator):
+            raise ValueError(f"actuator[{index}] = {one!r}: must be an Actuator; the ideal one cannot be among others")
+        if one not in setups:
+            try:
+                setups[one] = Setup.build(task, one, **arguments)
+            except ValueError as error:
+                raise ValueError(f"actuator[{index}]: {error}") from None
+    return dataclasses.replace(setups[actuator[0]]), list(actuator)
+
+
+def _infos(signals: Signals, stepping: Array) -> dict[str, Any]:
+    """The signals as Gymnasium's vector infos: zero, and masked, where an environment was reset instead of stepped."""
+    if not stepping.any():
+        return {}
+    every = stepping.all()
+    infos: dict[str, Any] = {}
+    for name, values in signals._asdict().items():
+        infos[name] = values if every else np.where(stepping, values, np.zeros((), values.dtype))
+        infos[f"_{name}"] = stepping.copy()
+    return infos

@@ -1,0 +1,168 @@
+"""Many simulations of a task in MuJoCo at once, on the engine's own thread pool."""
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from codrl_mj.callbacks.kernels import CURRENT, VOLTAGE
+from codrl_mj.motor import Actuator, to_vector
+from codrl_mj.physics.base import LARGEST, Signals, SimulationDivergedError
+from codrl_mj.physics.constrain import compiled_constrain
+from codrl_mj.physics.mjcf import install_callbacks, task_model
+from codrl_mj.tasks import Task
+
+
+class MujocoBatchPhysics:
+    """N simulations of one task, bit for bit those of N `MujocoPhysics`; states and signals are arrays.
+
+    Every simulation has its own actuator: parameters are per-simulation model fields.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        actuators: Sequence[Actuator] | None,
+        inner_steps: int,
+        integrator: str,
+        num_envs: int,
+        max_force: float | None = None,
+        num_threads: int = 0,
+    ) -> None:
+        """Compile the model and make the batch.
+
+        Args:
+            task: the task.
+            actuators: one for each simulation, or None for ideal actuators.
+            inner_steps: integration steps per environment step.
+            integrator: one of the task's integrators.
+            num_envs: number of simulations, >= 1.
+            max_force: limit of the desired force [N] or torque [N*m]; None is the task's.
+            num_threads: threads of the engine; 0 uses every CPU.
+        """
+        self.task = task
+        self.inner_steps = inner_steps
+        self.max_force = task.max_force if max_force is None else max_force
+        self._explicit = integrator == "euler"
+        self.model = task_model(task, actuators[0] if actuators else None, task.step_duration / inner_steps, max_force)
+        install_callbacks(self.model)
+        self._batch = Batch(self.model, num_envs, num_threads)
+        self._keep = compiled_constrain(task)
+        self._rest = self._batch.state[0].copy()  # a simulation just reset, motor at rest
+        self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
+        self._ctrl, self._act = self._batch.bind("ctrl"), self._batch.bind("act")
+        self.motorised = actuators is not None
+        self._arm = self._torque_constant = self._limit = np.ones(num_envs)
+        if actuators is not None:
+            self._arm, self._torque_constant, self._limit = (np.empty(num_envs) for _ in range(3))
+            self.set_actuators(np.arange(num_envs), actuators)
+
+    def set_actuators(self, rows: np.ndarray, actuators: Sequence[Actuator]) -> None:
+        """Give some simulations other motors; to be followed by a reset of them."""
+        user, gear, limits = (
+            self._batch.expand(field) for field in ("actuator_user", "actuator_gear", "actuator_ctrlrange")
+        )
+        arm = np.array([actuator.motor.arm_radius for actuator in actuators])
+        user[rows, 0] = np.array([to_vector(actuator) for actuator in actuators])
+        gear[rows, 0, 0] = 1.0 / arm
+        limits[rows, 0] = np.stack([-self.max_force * arm, self.max_force * arm], axis=-1)
+        self._arm[rows] = arm
+        self._torque_constant[rows] = [actuator.motor.torque_constant for actuator in actuators]
+        self._limit[rows] = [actuator.controller.max_voltage for actuator in actuators]
+
+    @property
+    def state(self) -> np.ndarray:
+        """Mechanical states in the task's order, shape (N, n), float64; a new array."""
+        state = np.empty((len(self._qpos), len(self.task.state_names)))
+        for column, entry in enumerate(self.task.qpos):
+            state[:, entry] = self._qpos[:, column]
+        for column, entry in enumerate(self.task.qvel):
+            state[:, entry] = self._qvel[:, column]
+        return state
+
+    def reset(self, rows: np.ndarray, states: np.ndarray) -> None:
+        """Start episodes of some simulations, with their motors at rest.
+
+        Args:
+            rows: indices, shape (m,).
+            states: initial states in the task's order, shape (m, n).
+
+        Raises:
+            CallbackInUseError: another library's MuJoCo callback was installed in the meantime.
+        """
+        install_callbacks(self.model)
+        self._batch.state[rows] = self._rest
+        self._qpos[rows] = states[:, list(self.task.qpos)]
+        self._qvel[rows] = states[:, list(self.task.qvel)]
+
+    def step(self, desired_force: np.ndarray) -> Signals:
+        """Advance every simulation by one environment step.
+
+        Args:
+            desired_force: held over the step, shape (N,), at most `max_force`.
+
+        Returns:
+            The signals, each an array of shape (N,).
+        """
+        timestep = self.model.opt.timestep
+        self._ctrl[:, 0] = desired_force * self._arm
+        if self._explicit or self._keep is not None:
+            for _ in range(self.inner_steps):
+                moved = self._qpos + timestep * self._qvel if self._explicit else None
+                self._batch.step()
+                if moved is not None:
+                    self._qpos[:] = moved
+                if self._keep is not None:
+                    self._keep(self._qpos, self._qvel, timestep)
+        else:
+            self._batch.step(nstep=self.inner_steps)
+        if not self.motorised:
+            nothing = np.zeros(len(desired_force))
+            return Signals(desired_force, desired_force.copy(), nothing, nothing.copy(), nothing.copy(), nothing > 0)  # type: ignore[arg-type]
+        current, voltage = self._act[:, CURRENT].copy(), self._act[:, VOLTAGE].copy()
+        return Signals(
+            desired_force=desired_force,  # type: ignore[arg-type]
+            actual_force=self._torque_constant * current / self._arm,
+            current=current,  # type: ignore[arg-type]
+            reference_current=desired_force * self._arm / self._torque_constant,  # type: ignore[arg-type]
+            voltage=voltage,  # type: ignore[arg-type]
+            saturated=np.abs(voltage) >= self._limit,  # type: ignore[arg-type]
+        )
+
+    def check_finite(self, states: np.ndarray, rows: np.ndarray) -> None:
+        """Raise if a state among `rows` (a mask, shape (N,)) left the finite numbers, naming the simulation.
+
+        Raises:
+            SimulationDivergedError: as it says.
+        """
+        fine = np.abs(states) <= LARGEST
+        if fine.all():
+            return
+        broken = np.flatnonzero(~fine.all(axis=1) & rows)
+        if len(broken) == 0:
+            return
+        first = broken[0]
+        entry = self.task.state_names[int(np.argmin(fine[first]))]
+        value = states[first][np.argmin(fine[first])]
+        raise SimulationDivergedError(
+            f"{self.task.name}: {len(broken)} of {len(states)} simulations diverged; environment {first} at "
+            f"t = {self._batch.bind('time')[first]:g} s: {entry} = {value:g}. Reset them; if this repeats, shorten the "
+            "integration step (inner_steps) or lower the gains"
+        )
+
+    def snapshot(self) -> np.ndarray:
+        """The whole state of every simulation, motor included, shape (N, k), float64."""
+        return self._batch.state.copy()
+
+    def restore(self, snapshot: np.ndarray) -> None:
+        """Continue from what `snapshot` returned."""
+        self._batch.state[:] = snapshot
+
+    def show(self, index: int, data: mujoco.MjData) -> None:
+        """Bring `data`, of this model, to the pose of one simulation, for drawing."""
+        data.qpos[:] = self._qpos[index]
+        mujoco.mj_kinematics(self.model, data)
+        mujoco.mj_comPos(self.model, data)
+        mujoco.mj_camlight(self.model, data)
+        mujoco.mj_passive(self.model, data)

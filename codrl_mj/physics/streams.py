@@ -1,0 +1,102 @@
+"""Many NumPy generators drawn from at once, each exactly as if it were alone."""
+
+import ctypes
+from collections.abc import Sequence
+from typing import Any
+
+import numba
+import numpy as np
+from gymnasium.utils import seeding
+
+WORDS = 6
+"""Numbers that hold one generator's state: PCG64's state and increment (two words each), and its spare 32 bits."""
+_LOW = 2**64 - 1
+
+
+class Streams:
+    """N independent `numpy.random.Generator`s; stream i draws what the i-th generator alone would draw.
+
+    The draws are NumPy's own: its `next_double` is called on each generator's state from compiled code.
+    """
+
+    def __init__(self, size: int) -> None:
+        """Make `size` generators with seeds from the operating system."""
+        self.generators = [seeding.np_random(None)[0] for _ in range(size)]
+        self._bind()
+
+    def _bind(self) -> None:
+        interfaces = [generator.bit_generator.ctypes for generator in self.generators]
+        self._addresses = np.array([interface.state_address for interface in interfaces], dtype=np.uintp)
+        self._fill = _filler(ctypes.cast(interfaces[0].next_double, ctypes.c_void_p).value)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"generators": self.generators}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._bind()
+
+    def seed(self, rows: np.ndarray, seeds: Sequence[int | None]) -> None:
+        """Seed some streams as Gymnasium seeds an environment; None leaves a stream as it is.
+
+        Args:
+            rows: indices of streams, shape (m,).
+            seeds: one for each.
+        """
+        for row, seed in zip(rows, seeds, strict=True):
+            if seed is not None:
+                self.generators[row] = seeding.np_random(seed)[0]
+        self._bind()
+
+    def random(self, rows: np.ndarray, count: int) -> np.ndarray:
+        """The next `count` numbers in [0, 1) of each of some streams.
+
+        Args:
+            rows: indices of streams, shape (m,), without repetition.
+            count: numbers from each stream.
+
+        Returns:
+            Shape (m, count), float64.
+        """
+        drawn = np.empty((len(rows), count))
+        self._fill(self._addresses[rows], drawn)
+        return drawn
+
+    def state(self) -> np.ndarray:
+        """Where every stream stands, shape (N, 6), uint64."""
+        words = np.empty((len(self.generators), WORDS), dtype=np.uint64)
+        for row, generator in zip(words, self.generators, strict=True):
+            pcg: Any = generator.bit_generator.state
+            state, increment = pcg["state"]["state"], pcg["state"]["inc"]
+            row[:4] = state >> 64, state & _LOW, increment >> 64, increment & _LOW
+            row[4:] = pcg["has_uint32"], pcg["uinteger"]
+        return words
+
+    def set_state(self, words: np.ndarray) -> None:
+        """Continue from what `state` returned."""
+        for row, generator in zip(words.tolist(), self.generators, strict=True):
+            generator.bit_generator.state = {
+                "bit_generator": "PCG64",
+                "state": {"state": row[0] << 64 | row[1], "inc": row[2] << 64 | row[3]},
+                "has_uint32": row[4],
+                "uinteger": row[5],
+            }
+
+
+_fillers: dict[int, Any] = {}
+
+
+def _filler(next_double: int | None) -> Any:
+    """A compiled function that fills rows from the generators at the given addresses."""
+    assert next_double is not None
+    if next_double not in _fillers:
+        draw = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_size_t)(next_double)
+
+        @numba.njit("void(uintp[::1], float64[:,::1])")
+        def fill(addresses: np.ndarray, drawn: np.ndarray) -> None:
+            for row in range(len(addresses)):
+                for column in range(drawn.shape[1]):
+                    drawn[row, column] = draw(addresses[row])
+
+        _fillers[next_double] = fill
+    return _fillers[next_double]

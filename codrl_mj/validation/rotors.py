@@ -1,0 +1,116 @@
+"""Small MuJoCo models of motors on a bench, ours and MuJoCo's own, and a way to drive them."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from codrl_mj.callbacks.kernels import ACT_NAMES, CURRENT
+from codrl_mj.motor import Actuator, CurrentLoop, Motor
+from codrl_mj.physics import install_callbacks, set_actuator
+
+
+@dataclasses.dataclass(frozen=True)
+class Load:
+    """What a motor turns."""
+
+    name: str
+    """Its name in reports."""
+    inertia: float
+    """About the joint's axis, without the eccentric mass [kg*m^2]."""
+    eccentric: bool = False
+    """Whether 0.5 kg hang 0.2 m off the axis, under gravity."""
+
+
+HELD = Load("held speed", 1e15)
+"""Turns as fast as at the start, whatever the torque: 1 N*m over 100 s changes 1e-13 rad/s. At rest: a locked rotor."""
+FREE = Load("free spinning", 0.02)
+"""A rotor and nothing else."""
+SWINGING = Load("swinging load", 0.02, eccentric=True)
+"""A rotor with a bob, under gravity."""
+
+
+class Record(NamedTuple):
+    """What was seen after each step, shape (steps, motors)."""
+
+    angle: np.ndarray
+    """Joint angles [rad]."""
+    speed: np.ndarray
+    """Joint speeds [rad/s]."""
+    current: np.ndarray
+    """Motor currents [A]."""
+    torque: np.ndarray
+    """Torques that the engine applied to the joints *during* the step [N*m], its `qfrc_actuator`."""
+
+
+def _spec(count: int, load: Load, timestep: float, integrator: str) -> mujoco.MjSpec:
+    spec = mujoco.MjSpec()
+    spec.option.timestep = timestep
+    spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    for index in range(count):
+        body = spec.worldbody.add_body(name=f"rotor{index}")
+        body.explicitinertial = True
+        body.mass, body.inertia = 0.5, [0.01, 0.01, 0.01]
+        body.ipos = [0.0, 0.0, -0.2 if load.eccentric else 0.0]
+        body.add_joint(name=f"hinge{index}", axis=[0, 1, 0], armature=load.inertia)
+    return spec
+
+
+def motors_on(
+    load: Load, actuators: Sequence[Actuator], timestep: float, integrator: str = "Euler"
+) -> mujoco.MjModel:
+    """Our motors, each on a rotor of its own, and the callbacks that run them installed."""
+    spec = _spec(len(actuators), load, timestep, integrator)
+    for index, actuator in enumerate(actuators):
+        driver = spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=f"hinge{index}")
+        set_actuator(driver, actuator, None)
+    model = spec.compile()
+    install_callbacks(model)
+    return model
+
+
+def native_motor_on(load: Load, motor: Motor, timestep: float, integrator: str = "Euler") -> mujoco.MjModel:
+    """MuJoCo's `<dcmotor>` of the same winding, its control the terminal voltage [V]."""
+    spec = _spec(1, load, timestep, integrator)
+    driver = spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target="hinge0")
+    driver.set_to_dcmotor(
+        motorconst=[motor.torque_constant, motor.back_emf_constant],
+        resistance=motor.resistance,
+        inductance=[motor.inductance, 0.0],
+        ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_VOLTAGE),
+    )
+    return spec.compile()
+
+
+def driven_by_voltage(motor: Motor, substeps: int = 1) -> Actuator:
+    """A motor of ours whose control is its terminal voltage: a feed-forward of kT*i_ref, which is the control."""
+    return Actuator(
+        motor,
+        CurrentLoop(
+            kp=0.0, kff=motor.torque_constant, max_voltage=math.inf, bemf_compensation=False, substeps=substeps
+        ),
+    )
+
+
+def drive(model: mujoco.MjModel, controls: np.ndarray, speeds: np.ndarray | None = None) -> Record:
+    """Run a model from rest.
+
+    Args:
+        model: one of this module's.
+        controls: control of every motor at every step, shape (steps,) for all alike or (steps, motors).
+        speeds: joint speeds [rad/s] set before each step, shape (steps,); None leaves them to the engine.
+    """
+    data = mujoco.MjData(model)
+    entry = CURRENT if model.na == model.nactuator * len(ACT_NAMES) else 0
+    currents = np.asarray(model.actuator_actadr) + entry
+    rows = np.empty((len(controls), 4, model.nv))
+    for row, control, speed in zip(rows, controls, controls if speeds is None else speeds, strict=True):
+        data.ctrl[:] = control
+        if speeds is not None:
+            data.qvel[:] = speed
+        mujoco.mj_step(model, data)
+        row[0], row[1], row[2], row[3] = data.qpos, data.qvel, data.act[currents], data.qfrc_actuator
+    return Record(*rows.swapaxes(0, 1))
