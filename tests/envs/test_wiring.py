@@ -1,0 +1,83 @@
+"""Every parameter of the actuator matters to the task: on/off pairs, each side against the chain by hand.
+
+The oracle is the reference motor (`tests.reference`) and Gymnasium's own step: a wire that is missing in the
+environment makes one side of its pair leave the oracle, and both sides alike.
+"""
+
+import numpy as np
+import pytest
+
+from codrl_mj.envs import ActuatedEnv
+from codrl_mj.physics import PHYSICS
+from codrl_mj.physics.analytic import DRIVERS
+from codrl_mj.tasks import TASKS
+from tests.callbacks.models import FULL, changed
+from tests.reference import MotorSimulation
+
+SPEED = {"pendulum": 1, "cartpole": 1, "acrobot": 3, "mountain_car": 1, "mountain_car_continuous": 1}
+STEPS = {"pendulum": 60, "cartpole": 40, "acrobot": 15, "mountain_car": 30, "mountain_car_continuous": 30}
+SUPPLY = {"pendulum": 4.0, "cartpole": 10.0, "acrobot": 2.0, "mountain_car": 0.6, "mountain_car_continuous": 0.6}
+"""A supply that saturates at times, by task [V]."""
+
+OFF = {  # feature -> the change that takes it away, and what else both sides of the pair have
+    "back_emf_constant": ({"back_emf_constant": 0.0}, {"bemf_compensation": False}),
+    "bemf_compensation": ({"bemf_compensation": False}, {"back_emf_constant": 2.0}),
+    "max_voltage": ({"max_voltage": np.inf}, {}),
+    "kp": ({"kp": 0.0}, {}),
+    "ki": ({"ki": 0.0}, {}),
+    "kd": ({"kd": 0.0}, {"kd": 0.02}),
+    "kff": ({"kff": 0.0}, {}),
+    "integral_leak": ({"integral_leak": 0.0}, {"integral_leak": 5.0}),
+    "derivative_time_constant": ({"derivative_time_constant": 0.0}, {"kd": 0.03, "derivative_time_constant": 0.05}),
+    "substeps": ({"substeps": 1}, {}),
+    "arm_radius": ({"arm_radius": 1.0}, {}),
+    "torque_constant": ({"torque_constant": 1.0}, {}),
+    "resistance": ({"resistance": 1.0}, {}),
+    "inductance": ({"inductance": 0.3}, {}),
+}
+
+
+def _episode(task, physics, actuator):
+    """States and forces of an episode under random actions, as the environment and as the oracle have them."""
+    env, driver = ActuatedEnv(task, actuator=actuator, physics=physics), DRIVERS[task](TASKS[task].gymnasium_id)
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    motor, state = MotorSimulation(actuator), env.state
+    dt = env.task.step_duration / env.task.motor_inner_steps
+    found, expected = [], []
+    for _ in range(STEPS[task]):
+        action = env.action_space.sample()
+        info = env.step(action)[-1]
+        desired = float(env.task.desired_force(np.asarray(action)))
+        for _ in range(env.task.motor_inner_steps):
+            delivered = motor.step(dt, desired, state[SPEED[task]])
+            state = np.array(driver(state, delivered, dt, env.setup.integrator))
+        found.append([*env.state, info["actual_force"], info["current"], info["voltage"]])
+        expected.append([*state, delivered, motor.current, motor.voltage])
+    return np.array(found), np.array(expected)
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("physics", PHYSICS)
+@pytest.mark.parametrize("feature", OFF)
+def test_a_feature_matters_and_is_what_it_should_be_with_and_without(task, physics, feature):
+    without, both = OFF[feature]
+    with_it = changed(FULL, **{"inductance": 0.2, "max_voltage": SUPPLY[task], **both})
+    runs = []
+    for actuator in (with_it, changed(with_it, **without)):
+        found, expected = _episode(task, physics, actuator)
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+        runs.append(found)
+    size = len(TASKS[task].state_names)
+    differences = np.abs(runs[0] - runs[1])
+    assert differences[:, size].max() > 1e-3  # the force
+    assert differences[:, :size].max() > 1e-7  # and the motion
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_pairs_saturate_at_times(task):
+    """Guards the pair of the supply, and that of the compensation, which saturation alone leaves incomplete."""
+    actuator = changed(FULL, inductance=0.2, max_voltage=SUPPLY[task])
+    voltages = np.abs(_episode(task, "mujoco", actuator)[0][:, -1])
+    assert (voltages == SUPPLY[task]).any()
+    assert (voltages < SUPPLY[task]).any()
