@@ -24,6 +24,7 @@ _PUBLIC = {
     "spectral_radius": "codrl_mj.motor",
     "named_actuator": "codrl_mj.motor",
     "TASKS": "codrl_mj.tasks",
+    "make_sb3_vec_env": "codrl_mj.envs.sb3",
     "motors": "codrl_mj.physics",
     "set_actuator": "codrl_mj.physics",
 }

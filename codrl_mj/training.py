@@ -15,6 +15,7 @@ from codrl_mj.evaluation import make_env
 from codrl_mj.files import read_json, write_json, writing
 from codrl_mj.motor import Actuator, resolve
 from codrl_mj.policies import save_policy
+from codrl_mj.registration import ENVIRONMENTS
 from codrl_mj.tasks import find_task
 
 _CONFIG, _PROGRESS, _CURVE = "config.json", "progress.csv", "learning_curve.png"
@@ -129,12 +130,9 @@ def train(config: TrainConfig, out: Path, on_progress: Callable[[Progress], None
         raise FileExistsError(f"run folder {out} exists already: choose another --out, or delete it to train anew")
     import torch
     from stable_baselines3.common.callbacks import BaseCallback
-    from stable_baselines3.common.monitor import Monitor
-    from stable_baselines3.common.vec_env import DummyVecEnv
 
     torch.set_num_threads(1)  # networks this small run several times slower on two
-    make = lambda: Monitor(make_env(config.task, config.actuator, **config.env.as_arguments()))  # noqa: E731
-    envs = DummyVecEnv([make] * config.num_envs)
+    envs = _make_envs(config)
     envs.seed(config.seed)
     model = make_ppo(config.ppo, envs, config.seed)
     history: list[Progress] = []
@@ -173,6 +171,20 @@ def train(config: TrainConfig, out: Path, on_progress: Callable[[Progress], None
     finally:
         envs.close()
     return out
+
+
+def _make_envs(config: TrainConfig) -> Any:
+    """The environments as one Stable-Baselines3 `VecEnv`: batched, or one by one where the physics cannot be."""
+    arguments = config.env.as_arguments()
+    if config.env.physics == "mujoco":
+        from codrl_mj.envs.sb3 import make_sb3_vec_env
+
+        env_id = ENVIRONMENTS[config.task].env_id
+        return make_sb3_vec_env(env_id, config.num_envs, actuator=config.actuator, **arguments)
+    from stable_baselines3.common.monitor import Monitor
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    return DummyVecEnv([lambda: Monitor(make_env(config.task, config.actuator, **arguments))] * config.num_envs)
 
 
 def _versions() -> dict[str, str]:

@@ -111,6 +111,7 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
         self._ended = np.zeros(self.num_envs, dtype=bool)
         self._observations: Array = np.zeros(self.observation_space.shape or (), dtype=np.float32)
+        self.signals: Signals | None = None  # of the last step, each an array of shape (N,)
         self._view = {"width": width, "height": height, "camera": camera, "pretty": pretty}
         if render_mode is not None:
             check_view(self.physics.model, width, height, camera)
@@ -209,6 +210,7 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         terminated = np.asarray(self.setup.task.terminated(after)) & stepping
         limit = np.inf if self.max_episode_steps is None else self.max_episode_steps
         truncated = (self._elapsed >= limit) & stepping
+        self.signals = signals
         self._observations = self.setup.observation(after, signals)
         infos = _infos(signals, stepping)
         if not stepping.all():

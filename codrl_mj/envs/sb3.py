@@ -1,0 +1,129 @@
+"""The vector environment as Stable-Baselines3 knows it."""
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.vec_env import VecEnv
+
+from codrl_mj.envs.vector import ActuatedVectorEnv
+from codrl_mj.physics import Signals
+from codrl_mj.registration import ENVIRONMENTS
+
+_TASKS = {registered.env_id: task for task, registered in ENVIRONMENTS.items()}
+
+
+class ActuatedVecEnv(VecEnv):
+    """N environments as one Stable-Baselines3 `VecEnv`, without a Python object for each.
+
+    Infos are empty but for the environments whose episode ended: `terminal_observation`, `TimeLimit.truncated` and
+    `episode` (return, length and time, as Stable-Baselines3's `Monitor` has them). What the actuators did in the last
+    step is in `signals`, as arrays.
+    """
+
+    def __init__(self, env: ActuatedVectorEnv) -> None:
+        """Wrap a vector environment in `SAME_STEP` mode."""
+        self.env = env
+        self._actions: np.ndarray | None = None
+        self._returns = np.zeros(env.num_envs)
+        self._lengths = np.zeros(env.num_envs, dtype=np.int64)
+        self._start = time.time()
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+
+    def reset(self) -> np.ndarray:
+        """Start an episode in every environment, with the seeds given to `seed` since the last reset."""
+        observations, _ = self.env.reset(seed=self._seeds)
+        self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        self._reset_seeds()
+        self._reset_options()
+        self._returns[:], self._lengths[:] = 0.0, 0
+        return observations
+
+    @property
+    def signals(self) -> Signals | None:
+        """The actuators' signals of the last step, each an array of shape (N,); None before the first."""
+        return self.env.signals
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Take the actions of the next step."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:  # type: ignore[override]
+        """Step every environment; those whose episode ends start another at once."""
+        assert self._actions is not None, "step_async comes first"
+        observations, rewards, terminated, truncated, infos = self.env.step(self._actions)
+        self._returns += rewards
+        self._lengths += 1
+        ended = terminated | truncated
+        outcomes: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for row in np.flatnonzero(ended).tolist():
+            outcomes[row] = {
+                "terminal_observation": infos["final_obs"][row],
+                "TimeLimit.truncated": bool(truncated[row] and not terminated[row]),
+                "episode": {
+                    "r": round(float(self._returns[row]), 6),
+                    "l": int(self._lengths[row]),
+                    "t": round(time.time() - self._start, 6),
+                },
+            }
+        self._returns[ended], self._lengths[ended] = 0.0, 0
+        return observations, rewards.astype(np.float32), ended, outcomes
+
+    def close(self) -> None:
+        """Close the environments."""
+        self.env.close()
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """An image of the first environment; nothing of the others."""
+        return [self.env.render(), *[None] * (self.num_envs - 1)]
+
+    def render(self, mode: str | None = None) -> np.ndarray | None:
+        """An image of the first environment."""
+        del mode
+        return self.env.render()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """The attribute of the vector environment, once for each of the environments asked for."""
+        return [getattr(self.env, attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute of the vector environment, which all its environments share.
+
+        Raises:
+            ValueError: only some of the environments were named.
+        """
+        if len(list(self._get_indices(indices))) != self.num_envs:
+            raise ValueError(f"set_attr({attr_name!r}): the environments share it; it can only be set for all of them")
+        setattr(self.env, attr_name, value)
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        """Call a method of the vector environment once; its result stands for each of the environments asked for."""
+        result = getattr(self.env, method_name)(*method_args, **method_kwargs)
+        return [result for _ in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """Whether the environments record episodes, as `Monitor` does; no other wrapper is there."""
+        from stable_baselines3.common.monitor import Monitor
+
+        return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]
+
+
+def make_sb3_vec_env(env_id: str, num_envs: int = 64, **arguments: Any) -> ActuatedVecEnv:
+    """Many environments as one Stable-Baselines3 `VecEnv`.
+
+    Args:
+        env_id: Gymnasium id, such as `codrl_mj/Pendulum-v0`.
+        num_envs: how many, >= 1.
+        **arguments: as for `codrl_mj.envs.ActuatedVectorEnv`; the time limit is Gymnasium's unless given.
+
+    Raises:
+        ValueError: unknown id, or an argument out of bounds.
+    """
+    if env_id not in _TASKS:
+        raise ValueError(f"env_id = {env_id!r}: must be one of {', '.join(_TASKS)}")
+    task = _TASKS[env_id]
+    limit = {"max_episode_steps": ENVIRONMENTS[task].max_episode_steps}
+    mode = AutoresetMode.SAME_STEP
+    return ActuatedVecEnv(ActuatedVectorEnv(num_envs, task, autoreset_mode=mode, **(limit | arguments)))
