@@ -5,9 +5,12 @@
 
 import argparse
 import importlib
+import inspect
+import re
 import sys
 from pathlib import Path
 
+from codrl_mj.envs import ActuatedEnv
 from codrl_mj.files import writing
 from codrl_mj.motor import named_actuator
 from codrl_mj.registration import ENVIRONMENTS
@@ -16,11 +19,52 @@ from codrl_mj.tasks import TASKS
 FOLDER = Path(__file__).parent.parent / "docs" / "environments"
 
 
+def _title(task_name: str) -> str:
+    """What a page is called: the environment's id without our namespace."""
+    return ENVIRONMENTS[task_name].env_id.removeprefix("codrl_mj/")
+
+
+def _documentation(task_name: str) -> tuple[str, str]:
+    """The first line of a task's documentation, and the rest."""
+    documented = (importlib.import_module(f"codrl_mj.tasks.{task_name}").__doc__ or "").strip()
+    summary, _, body = documented.partition("\n\n")
+    return summary, body
+
+
+def _space(space: object) -> str:
+    """A space on one line, without numpy's padding."""
+    return re.sub(r"\s+", " ", str(space)).replace("[ ", "[").replace(" ]", "]")
+
+
+def common_arguments() -> str:
+    """The arguments of every environment but `task`, as a table: name, default, meaning.
+
+    Raises:
+        ValueError: the signature of `ActuatedEnv` and the arguments that it documents differ.
+    """
+    documented = inspect.cleandoc(ActuatedEnv.__init__.__doc__ or "").partition("Args:\n")[2].partition("\n\n")[0]
+    entries = re.findall(r"^    (\**\w+): (.*(?:\n {8}.*)*)", documented, re.MULTILINE)
+    meanings = {name.lstrip("*"): " ".join(text.split()) for name, text in entries}
+    parameters = {
+        name: parameter
+        for name, parameter in inspect.signature(ActuatedEnv.__init__).parameters.items()
+        if name not in ("self", "task")
+    }
+    if meanings.keys() - {"task"} != parameters.keys():
+        raise ValueError(f"ActuatedEnv documents {', '.join(meanings)} but takes {', '.join(parameters)}")
+    rows = [
+        f"| `{name}` | `{parameter.default!r}` | {meanings[name]} |"
+        for name, parameter in parameters.items()
+        if parameter.kind is not parameter.VAR_KEYWORD  # the tasks' own options, which each page has
+    ]
+    return "| argument | default | meaning |\n| --- | --- | --- |\n" + "\n".join(rows)
+
+
 def page(task_name: str) -> str:
     """The Markdown page of one environment."""
     task, registered = TASKS[task_name], ENVIRONMENTS[task_name]
-    documented = (importlib.import_module(f"codrl_mj.tasks.{task_name}").__doc__ or "").strip()
-    summary, _, body = documented.partition("\n\n")
+    summary, body = _documentation(task_name)
+    own = task.options()._asdict().items()
     actuator = named_actuator("paper", task_name)
     assert actuator is not None
     motor, loop = actuator.motor, actuator.controller
@@ -28,22 +72,43 @@ def page(task_name: str) -> str:
         "make it": f'`gymnasium.make("{registered.env_id}")`, on the command line `{task_name}`',
         "rebuilds": f"Gymnasium's `{task.gymnasium_id}`",
         "model": f"`assets/{task.asset}`",
-        "action space": f"`{task.action_space}`",
-        "observation space": f"`{task.observation_space}`",
+        "action space": f"`{_space(task.action_space)}`",
+        "observation space": f"`{_space(task.observation_space)}`",
         "observation names": ", ".join(f"`{name}`" for name in task.observation_names),
         "state": ", ".join(task.state_names),
         "environment step": f"{task.step_duration:g} s",
         "integration steps in it": f"{task.motor_inner_steps} with a motor, 1 without",
         "integrators": ", ".join(f"`{name}`" for name in task.integrators),
-        "options of its own": ", ".join(f"`{name}`" for name in task.options._fields) or "none",
+        "options of its own": ", ".join(f"`{name}` (default {value:g})" for name, value in own) or "none",
         "time limit": f"{registered.max_episode_steps} steps",
+        "solved at": "not defined"
+        if registered.reward_threshold is None
+        else f"a return of {registered.reward_threshold:g}",
         "`paper` actuator": f"R {motor.resistance:g} Ω, L {motor.inductance:g} H, kT {motor.torque_constant:g} N·m/A, "
         f"kE {motor.back_emf_constant:g} V·s/rad, arm {motor.arm_radius:g}; kP {loop.kp:g}, kI {loop.ki:g}, "
         f"kD {loop.kd:g}, kFF {loop.kff:g}, {loop.max_voltage:g} V",
     }
     rows = "\n".join(f"| {name} | {value} |" for name, value in facts.items())
-    title = registered.env_id.removeprefix("codrl_mj/")
-    return f"# {title}\n\n{summary}\n\n| | |\n| --- | --- |\n{rows}\n\n{body}\n"
+    return (
+        f"# {_title(task_name)}\n\n{summary}\n\n| | |\n| --- | --- |\n{rows}\n\n{body}\n\n"
+        f"## Arguments of every environment\n\n{common_arguments()}\n"
+    )
+
+
+def index() -> str:
+    """The Markdown page that lists the environments."""
+    rows = "\n".join(
+        f"| [{_title(name)}]({name}.md) | {_documentation(name)[0].partition(': ')[2]} |" for name in TASKS
+    )
+    return (
+        f"# Environments\n\nWritten by `make docs` from the code; edit the docstrings in `codrl_mj/tasks/`.\n\n"
+        f"| environment | task |\n| --- | --- |\n{rows}\n"
+    )
+
+
+def pages() -> dict[str, str]:
+    """Every page by its file name."""
+    return {"README.md": index()} | {f"{name}.md": page(name) for name in TASKS}
 
 
 def main() -> int:
@@ -51,10 +116,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=FOLDER, help="folder for the pages")
     options = parser.parse_args()
-    for task_name in TASKS:
-        with writing(options.out / f"{task_name}.md") as temporary:
-            temporary.write_text(page(task_name))
-        print(f"wrote {options.out / f'{task_name}.md'}")
+    for name, text in pages().items():
+        with writing(options.out / name) as temporary:
+            temporary.write_text(text)
+        print(f"wrote {options.out / name}")
     return 0
 
 

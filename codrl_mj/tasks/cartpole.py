@@ -1,6 +1,47 @@
 """CartPole: keep a pole upright on a cart that is pushed left or right. Gymnasium's CartPole-v1.
 
-The paper's option: no reward while the cart is farther than `center_radius` from the centre (it uses 0.1 m).
+## Description
+
+A cart (1 kg) slides on a track without friction under a gravity of 9.8 m/s^2; a uniform pole (0.1 kg, 1 m long) stands
+on it, on a hinge without friction. The actuator pushes the cart.
+
+## Observation space
+
+`Box` of shape (4,), float32
+
+| index | observation | min | max | unit |
+| --- | --- | --- | --- | --- |
+| 0 | position x of the cart, positive to the right | -4.8 | 4.8 | m |
+| 1 | velocity of the cart | -inf | inf | m/s |
+| 2 | angle theta of the pole, 0 upright, positive leaning right | -0.4189 (24 deg) | 0.4189 (24 deg) | rad |
+| 3 | angular velocity of the pole | -inf | inf | rad/s |
+
+The bounds are twice those at which an episode ends. The observation is the state, rounded to float32.
+
+## Action space
+
+`Discrete(2)`: the desired force on the cart is -10 N (to the left) or 10 N (to the right).
+
+## Reward
+
+1 a step, the last one included. With `center_radius` a step that ends farther than that from the centre of the track
+earns 0, and the episode goes on.
+
+## Start
+
+All four state entries uniform in [-0.05, 0.05] (m, m/s, rad, rad/s). `reset(options={"low": ..., "high": ...})` sets
+the bounds.
+
+## End
+
+The cart is more than 2.4 m from the centre, or the pole leans by more than 12 degrees. Truncated after 500 steps
+(10 s).
+
+## Arguments
+
+Those of `codrl_mj.envs.ActuatedEnv`, and one of its own: `center_radius` [m], > 0, no limit by default; the paper
+trains with 0.1. (Gymnasium's `sutton_barto_reward` is not offered.) One integration step an environment step, with and
+without a motor (the paper's choice). Two integrators: `euler` (explicit, Gymnasium's default) and `semi-implicit`.
 """
 
 from typing import Any, NamedTuple

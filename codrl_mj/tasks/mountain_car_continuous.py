@@ -7,8 +7,15 @@ The car and the hill of `codrl_mj.tasks.mountain_car`, with a stronger motor: it
 
 ## Observation space
 
-`Box([-1.2, -0.07], [0.6, 0.07], (2,), float32)`: position x [m] and velocity v [m/s], as for `mountain_car`. Gymnasium
-rounds its state to float32 in every step; here the state is float64 and only the observation is rounded.
+`Box([-1.2, -0.07], [0.6, 0.07], (2,), float32)`
+
+| index | observation | min | max | unit |
+| --- | --- | --- | --- | --- |
+| 0 | position x along the horizontal | -1.2 | 0.6 | m |
+| 1 | velocity v | -0.07 | 0.07 | m/s |
+
+The bounds are kept as in `mountain_car`. Gymnasium rounds its state to float32 in every step; here the state is float64
+and only the observation is rounded.
 
 ## Action space
 

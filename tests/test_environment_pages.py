@@ -1,0 +1,155 @@
+"""The environments' pages: that they are what the code says, and that what they say is what the code does."""
+
+import importlib.util
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+from codrl_mj.envs import ActuatedEnv
+from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.tasks import TASKS
+
+ROOT = Path(__file__).parent.parent
+FOLDER = ROOT / "docs" / "environments"
+SECTIONS = ("Description", "Observation space", "Action space", "Reward", "Start", "End", "Arguments")
+
+every_task = pytest.mark.parametrize("task", TASKS)
+
+
+def _generator():
+    spec = importlib.util.spec_from_file_location("environment_pages", ROOT / "scripts" / "environment_pages.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def _section(task, title):
+    page = (FOLDER / f"{task}.md").read_text()
+    return re.search(rf"^## {title}\n\n(.*?)(?=^## |\Z)", page, re.MULTILINE | re.DOTALL)[1]
+
+
+def _table(text):
+    """The cells of the rows of the first Markdown table, without its head."""
+    rows = [line for line in text.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in row.strip("|").split("|")] for row in rows[2:]]
+
+
+# -- the pages are the code's -------------------------------------------------------------------------------
+
+
+def test_the_pages_are_what_the_code_says_and_there_are_no_others():
+    pages = _generator().pages()
+    assert pages.keys() == {"README.md"} | {f"{task}.md" for task in TASKS}
+    assert {path.name for path in FOLDER.iterdir()} == pages.keys()
+    for name, text in pages.items():
+        assert (FOLDER / name).read_text() == text, f"docs/environments/{name} is stale: run make docs"
+
+
+def test_make_docs_writes_them(tmp_path):
+    command = [sys.executable, str(ROOT / "scripts" / "environment_pages.py"), "--out", str(tmp_path)]
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    for path in FOLDER.iterdir():
+        assert (tmp_path / path.name).read_text() == path.read_text()
+    assert re.search(r"^docs: .*\n\t.*scripts/environment_pages\.py$", (ROOT / "Makefile").read_text(), re.MULTILINE)
+
+
+def test_the_index_links_to_every_page():
+    links = re.findall(r"\[(.*?)\]\((.*?)\)", (FOLDER / "README.md").read_text())
+    assert dict(links) == {
+        env_id.removeprefix("codrl_mj/"): f"{task}.md" for task, (env_id, *_) in ENVIRONMENTS.items()
+    }
+
+
+def test_an_argument_that_nobody_documents_is_noticed(monkeypatch):
+    module = _generator()
+
+    def fewer(self, task, actuator="paper"):  # noqa: D417
+        """Build.
+
+        Args:
+            task: the task.
+        """
+
+    monkeypatch.setattr(module.ActuatedEnv, "__init__", fewer)
+    with pytest.raises(ValueError, match="ActuatedEnv documents task but takes actuator"):
+        module.common_arguments()
+
+
+# -- what they say is what the code does --------------------------------------------------------------------
+
+
+@every_task
+def test_every_page_has_the_same_sections(task):
+    titles = re.findall(r"^## (.*)$", (FOLDER / f"{task}.md").read_text(), re.MULTILINE)
+    assert titles == [*SECTIONS, "Arguments of every environment"]
+
+
+@every_task
+def test_every_argument_is_in_the_page_with_its_default_and_the_tasks_own_options_too(task):
+    rows = {row[0].strip("`"): row[1].strip("`") for row in _table(_section(task, "Arguments of every environment"))}
+    parameters = dict(list(inspect.signature(ActuatedEnv).parameters.items())[1:])  # without the task
+    parameters.pop("options")
+    assert rows == {name: repr(parameter.default) for name, parameter in parameters.items()}
+    (own,) = (row[1] for row in _table((FOLDER / f"{task}.md").read_text()) if row[0] == "options of its own")
+    assert re.findall(r"`(\w+)`", own) == list(TASKS[task].options._fields)
+    for option in TASKS[task].options._fields:
+        assert f"`{option}`" in _section(task, "Arguments")
+
+
+def _number(text):
+    text = re.sub(r"\(.*\)", "", text).strip()
+    return float(text.removesuffix("pi")) * np.pi if text.endswith("pi") else float(text)
+
+
+@every_task
+def test_the_observation_table_is_the_space(task):
+    rows, space = _table(_section(task, "Observation space")), TASKS[task].observation_space
+    assert [int(row[0]) for row in rows] == list(range(space.shape[0]))
+    np.testing.assert_allclose([_number(row[2]) for row in rows], space.low, rtol=1e-4)
+    np.testing.assert_allclose([_number(row[3]) for row in rows], space.high, rtol=1e-4)
+    assert all(len(row) == 5 for row in rows)
+
+
+@every_task
+def test_the_action_space_is_named(task):
+    space = TASKS[task].action_space
+    text = _section(task, "Action space")
+    if isinstance(space, gymnasium.spaces.Discrete):
+        assert f"`Discrete({space.n})`" in text
+        forces = TASKS[task].desired_force(np.arange(space.n))
+        assert all(re.search(rf"(?<![\d.]){force:g}(?![\d.])", text) for force in forces)
+    else:
+        assert f"`Box({space.low[0]:g}, {space.high[0]:g}, (1,), float32)`" in text
+    facts = {row[0]: row[1] for row in _table((FOLDER / f"{task}.md").read_text())}
+    assert facts["action space"] == f"`{space}`"
+    assert np.prod(TASKS[task].observation_space.shape) == facts["observation names"].count("`") / 2
+
+
+@every_task
+def test_the_time_limit_is_the_registered_one_and_gymnasiums(task):
+    ours, theirs = gymnasium.spec(ENVIRONMENTS[task].env_id), gymnasium.spec(TASKS[task].gymnasium_id)
+    assert ours.max_episode_steps == theirs.max_episode_steps == ENVIRONMENTS[task].max_episode_steps
+    assert ours.reward_threshold == theirs.reward_threshold == ENVIRONMENTS[task].reward_threshold
+    steps, seconds = re.search(r"[Tt]runcated after (\d+) steps\s\(([\d.]+) s\)", _section(task, "End")).groups()
+    assert int(steps) == ours.max_episode_steps
+    assert float(seconds) == pytest.approx(int(steps) * TASKS[task].step_duration)
+    facts = {row[0]: row[1] for row in _table((FOLDER / f"{task}.md").read_text())}
+    assert facts["time limit"] == f"{steps} steps"
+    if theirs.reward_threshold is not None:
+        assert facts["solved at"] == f"a return of {theirs.reward_threshold:g}"
+
+
+@every_task
+def test_the_integration_steps_are_those_of_the_environment(task):
+    facts = {row[0]: row[1] for row in _table((FOLDER / f"{task}.md").read_text())}
+    with_motor, without = map(int, re.findall(r"\d+", facts["integration steps in it"]))
+    for actuator, count in (("paper", with_motor), ("ideal", without)):
+        env = ActuatedEnv(task, actuator)
+        assert env.physics.inner_steps == count
+        assert env.model.opt.timestep == pytest.approx(float(facts["environment step"].split()[0]) / count)
