@@ -1,6 +1,7 @@
 """Who imports whom: read from the source, so that a cycle or a shortcut fails here."""
 
 import ast
+import re
 import sys
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -109,5 +110,5 @@ def test_nothing_hides_an_import_behind_type_checking():
 def test_only_callbacks_touch_raw_memory():
     for path in EVERY_FILE:
         if "callbacks" not in path.parts:
-            assert "_address" not in path.read_text(), path
+            assert not re.search(r"\._address\b", path.read_text()), path  # of mjModel and mjData
             assert "llvmlite" not in path.read_text(), path
