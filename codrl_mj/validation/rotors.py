@@ -25,12 +25,15 @@ class Load:
     """Whether 0.5 kg hang 0.2 m off the axis, under gravity."""
 
 
-HELD = Load("held speed", 1e15)
-"""Turns as fast as at the start, whatever the torque: 1 N*m over 100 s changes 1e-13 rad/s. At rest: a locked rotor."""
-FREE = Load("free spinning", 0.02)
+HELD = Load("locked rotor", 1e15)
+"""Keeps its speed, whatever the torque: 1 N*m over 100 s changes it by 1e-13 rad/s."""
+FREE = Load("free spinning", 0.2)
 """A rotor and nothing else."""
-SWINGING = Load("swinging load", 0.02, eccentric=True)
+SWINGING = Load("swinging load", 0.2, eccentric=True)
 """A rotor with a bob, under gravity."""
+
+
+_BODY_INERTIA = 0.01  # kg*m^2, part of the load's
 
 
 class Record(NamedTuple):
@@ -53,15 +56,13 @@ def _spec(count: int, load: Load, timestep: float, integrator: str) -> mujoco.Mj
     for index in range(count):
         body = spec.worldbody.add_body(name=f"rotor{index}")
         body.explicitinertial = True
-        body.mass, body.inertia = 0.5, [0.01, 0.01, 0.01]
+        body.mass, body.inertia = 0.5, [_BODY_INERTIA] * 3
         body.ipos = [0.0, 0.0, -0.2 if load.eccentric else 0.0]
-        body.add_joint(name=f"hinge{index}", axis=[0, 1, 0], armature=load.inertia)
+        body.add_joint(name=f"hinge{index}", axis=[0, 1, 0], armature=load.inertia - _BODY_INERTIA)
     return spec
 
 
-def motors_on(
-    load: Load, actuators: Sequence[Actuator], timestep: float, integrator: str = "Euler"
-) -> mujoco.MjModel:
+def motors_on(load: Load, actuators: Sequence[Actuator], timestep: float, integrator: str = "Euler") -> mujoco.MjModel:
     """Our motors, each on a rotor of its own, and the callbacks that run them installed."""
     spec = _spec(len(actuators), load, timestep, integrator)
     for index, actuator in enumerate(actuators):

@@ -1,0 +1,48 @@
+"""The motor as it runs inside MuJoCo, callbacks and all, against oracles that are not ours.
+
+`motor_analogue` has the closed form, `motor_sampled` scipy and python-control, `motor_native` MuJoCo's own `<dcmotor>`,
+`motor_gem` gym-electric-motor, `motor_constants` a datasheet's numbers. Torques are read where the engine applies them.
+"""
+
+from collections.abc import Iterator
+
+from codrl_mj.motor import Motor
+from codrl_mj.validation.motor_analogue import analogue_checks
+from codrl_mj.validation.motor_constants import constants_checks, voltage_limit_check
+from codrl_mj.validation.motor_gem import available, gem_check
+from codrl_mj.validation.motor_loops import Loop, standard_loops
+from codrl_mj.validation.motor_native import MOTORS, native_checks
+from codrl_mj.validation.motor_sampled import sampled_checks
+from codrl_mj.validation.outcome import Check
+
+
+def checks(task_name: str | None = None, quick: bool = False) -> Iterator[Check]:
+    """The checks of the motor.
+
+    Args:
+        task_name: check the loop of this task alone; None checks every task's, and a loop with every feature.
+        quick: fewer frequencies, steps and step sizes.
+
+    Raises:
+        KeyError: no such task.
+    """
+    loops = standard_loops()
+    yield from checks_of(loops if task_name is None else {task_name: loops[task_name]}, quick)
+    yield from native_checks(MOTORS, quick)
+    if available():
+        yield gem_check(Motor(), quick)
+
+
+def checks_of(loops: dict[str, Loop], quick: bool = False) -> Iterator[Check]:
+    """Those checks that apply to any motors, such as a user's own: all but the comparisons with fixed motors.
+
+    Args:
+        loops: motors under their current loops, by name.
+        quick: fewer frequencies, steps and step sizes.
+    """
+    yield from analogue_checks(loops, quick)
+    yield from sampled_checks(loops, quick)
+    limit = voltage_limit_check(loops)
+    if limit is not None:
+        yield limit
+    yield from constants_checks({name: loop.actuator.motor for name, loop in loops.items()})

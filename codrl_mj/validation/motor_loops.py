@@ -1,0 +1,57 @@
+"""The current loops that are checked, and a way to run one in MuJoCo on a rotor at a held speed."""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from codrl_mj.motor import Actuator, CurrentLoop, Motor
+from codrl_mj.motor.catalog import PAPER
+from codrl_mj.tasks import TASKS
+from codrl_mj.validation.rotors import HELD, Record, drive, motors_on
+
+
+class Loop(NamedTuple):
+    """A motor under its current loop, and the step at which it is sampled."""
+
+    actuator: Actuator
+    """Motor and gains."""
+    timestep: float
+    """Mechanical step [s]."""
+
+
+EVERY_FEATURE = Loop(
+    Actuator(
+        Motor(resistance=1.2, inductance=0.05, torque_constant=0.8, back_emf_constant=0.7, arm_radius=0.5),
+        CurrentLoop(
+            kp=2.0,
+            ki=5.0,
+            kd=1e-3,
+            kff=0.4,
+            bemf_compensation=False,
+            substeps=2,
+            integral_leak=0.3,
+            derivative_time_constant=0.01,
+        ),
+    ),
+    0.01,
+)
+"""A loop in which every parameter counts; nothing hides its back-EMF."""
+
+
+def standard_loops() -> dict[str, Loop]:
+    """The paper's loop of each task at the task's inner step, and one with every feature."""
+    paper = {task.name: Loop(PAPER[task.name], task.step_duration / task.motor_inner_steps) for task in TASKS.values()}
+    return {**paper, "every feature": EVERY_FEATURE}
+
+
+def unlimited(loop: Loop, substeps: int) -> Actuator:
+    """The loop's actuator at infinite voltage, where it is linear, and with so many electrical substeps."""
+    controller = dataclasses.replace(loop.actuator.controller, max_voltage=math.inf, substeps=substeps)
+    return dataclasses.replace(loop.actuator, controller=controller)
+
+
+def run(actuator: Actuator, timestep: float, torques: np.ndarray, speeds: np.ndarray) -> Record:
+    """Drive one motor in MuJoCo with desired joint torques at joint speeds."""
+    return drive(motors_on(HELD, [actuator], timestep), torques * actuator.motor.arm_radius, speeds)

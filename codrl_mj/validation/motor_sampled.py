@@ -1,0 +1,196 @@
+"""The current loop inside MuJoCo against linear systems theory, as scipy and python-control have it.
+
+Each oracle is built from the loop's equations (the paper, Algorithm 1 and appendix) by another library and in another
+form; nothing of `codrl_mj.motor.current_loop` is in them.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import control
+import numpy as np
+from scipy import signal
+
+from codrl_mj.motor import Actuator
+from codrl_mj.validation.motor_loops import Loop, run, unlimited
+from codrl_mj.validation.outcome import Check, Curve, Plot
+from codrl_mj.validation.rotors import HELD, drive, motors_on
+from codrl_mj.validation.worst import worst_of
+
+# -- The sampled loop as a state-space system ----------------------------------------------------------------
+
+
+def sampled_system(actuator: Actuator, timestep: float) -> Any:
+    """The loop sampled at its electrical step: inputs (i_ref, shaft speed), output the next current; a `dlti`."""
+    motor, loop = actuator.motor, actuator.controller
+    dt = timestep / loop.substeps
+    current, integral, past, reference, speed = np.eye(5)  # each signal as a row over (i, I, e_past, i_ref, omega)
+    error = reference - current
+    integral = (integral + dt * error) / (1 + loop.integral_leak * dt)
+    derivative = (error - past) / (dt + loop.derivative_time_constant)
+    back_emf = motor.back_emf_constant * speed
+    voltage = loop.kp * error + loop.ki * integral + loop.kd * derivative + loop.kff * reference
+    voltage = voltage + loop.bemf_compensation * back_emf
+    current = current + dt / motor.inductance * (voltage - back_emf - motor.resistance * current)
+    rows = np.array([current, integral, error - loop.derivative_time_constant * derivative])
+    return signal.dlti(rows[:, :3], rows[:, 3:], current[:3], current[3:], dt=dt)
+
+
+def _state_space_check(loops: Mapping[str, Loop], steps: int) -> Check:
+    """Random desired torques and speeds: equal to rounding, which a stable loop does not amplify; tolerance 1e-10."""
+    found, plots = [], []
+    for name, loop in loops.items():
+        generator = np.random.default_rng(0)
+        torques = np.repeat(generator.uniform(-1.0, 1.0, steps // 5), 5)
+        speeds = generator.uniform(-3.0, 3.0, len(torques))
+        substeps = loop.actuator.controller.substeps
+        actuator = unlimited(loop, substeps)
+        motor = actuator.motor
+        measured = run(actuator, loop.timestep, torques, speeds).torque[:, 0]
+        references = torques * motor.arm_radius / motor.torque_constant
+        inputs = np.column_stack([references, speeds / motor.arm_radius]).repeat(substeps, axis=0)
+        _, currents, _ = signal.dlsim(sampled_system(actuator, loop.timestep), inputs)
+        oracle = currents[substeps - 1 :: substeps, 0] * motor.torque_constant / motor.arm_radius
+        errors = np.abs(measured - oracle)
+        found.append((float(errors.max()), f"{name}, step {int(errors.argmax()) + 1} of {len(torques)}"))
+        time = np.arange(1, 61) * loop.timestep
+        lines = (("desired", torques, False), ("MuJoCo", measured, False), ("scipy.signal.dlsim", oracle, True))
+        curves = tuple(Curve(label, time, line[:60], reference) for label, line, reference in lines)
+        plots.append(Plot(f"Torque under random commands and speeds, {name}", "time [s]", "torque [N m]", curves))
+    worst, where = worst_of(found)
+    return Check(
+        "sampled loop, random torques and speeds",
+        "the sampled loop as a state-space system (scipy.signal.dlsim)",
+        steps * len(loops),
+        worst,
+        1e-10,
+        where,
+        group="motor",
+        unit="N m",
+        plots=tuple(plots[-1:]),
+    )
+
+
+# -- The sampled loop as blocks -------------------------------------------------------------------------------
+
+
+def closed_loop(actuator: Actuator, timestep: float) -> Any:
+    """python-control's system from desired torque to kT times the current at the step's start, sampled at `timestep`.
+
+    The winding is python-control's forward-Euler sampling of 1/(L s + R), the integral its backward-difference
+    sampling of 1/(s + leak), both as Algorithm 1 has them. The blocks are joined as state-space systems: transfer
+    functions of poles close to 1 lose digits when their polynomials are multiplied.
+    """
+    motor, loop = actuator.motor, actuator.controller
+    dt, filtering = timestep, loop.derivative_time_constant  # one electrical step
+    circuit = control.tf([1.0], [motor.inductance, motor.resistance])
+    winding = control.ss(control.sample_system(circuit, dt, method="euler"))
+    pid = control.ss([], [], [], loop.kp, dt)
+    if loop.ki > 0:  # a block with no gain would add its pole and nothing else
+        leaky = control.tf([1.0], [1.0, loop.integral_leak])
+        pid = pid + loop.ki * control.ss(control.sample_system(leaky, dt, method="backward_diff"))
+    if loop.kd > 0:
+        pid = pid + loop.kd * control.ss(control.tf([1.0, -1.0], [dt + filtering, -filtering], dt))
+    return control.feedback(pid * winding, 1) + loop.kff * control.feedback(winding, pid)
+
+
+def _step_response_check(loops: Mapping[str, Loop]) -> Check:
+    """Equal to rounding; tolerance 1e-10 of the 1 N m desired."""
+    found, plots, samples = [], [], 0
+    for name, loop in loops.items():
+        step, actuator = _electrical(loop)
+        steps = max(40, round(2.0 / step))
+        time = np.arange(1, steps + 1) * step
+        measured = run(actuator, step, np.ones(steps), np.zeros(steps)).torque[:, 0]
+        response = control.step_response(closed_loop(actuator, step), np.arange(steps + 1) * step)
+        oracle = np.ravel(response.outputs)[1:]  # the torque of a step is that of the current at its end
+        errors = np.abs(measured - oracle)
+        samples += steps
+        found.append((float(errors.max()), f"{name}, at t = {time[errors.argmax()]:.3g} s"))
+        curves = (Curve("MuJoCo", time, measured), Curve("python-control", time, oracle, reference=True))
+        plots.append(Plot(f"Step response, {name}", "time [s]", "torque for 1 N m desired [N m]", curves))
+    worst, where = worst_of(found)
+    oracle_name = "python-control, step_response of the discrete loop"
+    return Check(
+        "step response", oracle_name, samples, worst, 1e-10, where, group="motor", unit="N m", plots=tuple(plots)
+    )
+
+
+def _frequency_response_checks(loops: Mapping[str, Loop], frequencies: int) -> Iterator[Check]:
+    """Magnitude and phase of desired -> actual torque, from sines driven through MuJoCo, one motor a frequency.
+
+    A sampled loop has an exact frequency response, so what is left is the transient, waited out until it is 1e-10 of
+    the amplitude, and the least-squares fit's rounding: 1e-6 dB and 1e-5 degrees, far within the 0.1 dB and 0.5 degrees
+    at which an engineer would call two Bode plots equal. A gain off by 0.1 % shows some 1e-3 dB; a step of delay shows
+    up to 180 degrees.
+    """
+    quantities = (("magnitude", "dB", 1e-6), ("phase", "deg", 1e-5))
+    found: tuple[list[tuple[float, str]], ...] = ([], [])
+    curves: tuple[list[Curve], ...] = ([], [])
+    for name, loop in loops.items():
+        step, actuator = _electrical(loop)
+        nyquist = 0.5 / step
+        tested = np.geomspace(0.005 * nyquist, 0.97 * nyquist, frequencies)
+        system = closed_loop(actuator, step)
+        rotation = np.exp(2j * np.pi * tested * step)
+        oracle = system(rotation) * rotation  # the torque of a step is that of the current at its end
+        ratio = _measured_response(actuator, step, tested, np.abs(control.poles(system)).max()) / oracle
+        for index, of in enumerate((_decibels, _degrees)):
+            error = np.abs(of(ratio))
+            at = tested[int(np.argmax(error))]
+            found[index].append((float(error.max()), f"{name}, {at:.3g} Hz ({at / nyquist:.3g} of Nyquist)"))
+            curves[index].append(Curve(f"{name}, MuJoCo", tested, of(ratio * oracle)))
+            curves[index].append(Curve(f"{name}, python-control", tested, of(oracle), reference=True))
+    for (quantity, unit, tolerance), errors, lines in zip(quantities, found, curves, strict=True):
+        worst, where = worst_of(errors)
+        title = f"Frequency response, desired to actual torque: {quantity}"
+        yield Check(
+            f"frequency response, {quantity}",
+            "python-control, the discrete loop's frequency response",
+            frequencies * len(loops),
+            worst,
+            tolerance,
+            where,
+            group="motor",
+            unit=unit,
+            plots=(Plot(title, "frequency [Hz]", f"{quantity} [{unit}]", tuple(lines), x_log=True),),
+        )
+
+
+def _electrical(loop: Loop) -> tuple[float, Actuator]:
+    """The loop at its electrical step: the step, and the actuator with one of them to a mechanical step."""
+    return loop.timestep / loop.actuator.controller.substeps, unlimited(loop, 1)
+
+
+def _decibels(response: np.ndarray) -> np.ndarray:
+    return 20 * np.log10(np.abs(response))
+
+
+def _degrees(response: np.ndarray) -> np.ndarray:
+    return np.angle(response, deg=True)
+
+
+def _measured_response(actuator: Actuator, step: float, frequencies: np.ndarray, slowest: float) -> np.ndarray:
+    """Complex amplitudes of the torques in MuJoCo under cosines of 1 N m; the slowest pole says how long to wait."""
+    settle = math.ceil(math.log(1e-10) / math.log(min(max(slowest, 0.5), 0.9999)))
+    phases = 2 * np.pi * frequencies * step * np.arange(settle + 1200)[:, np.newaxis]
+    model = motors_on(HELD, [actuator] * len(frequencies), step)
+    torque = drive(model, np.cos(phases) * actuator.motor.arm_radius, np.zeros(len(phases))).torque
+    amplitudes = []
+    for phase, values in zip(phases[settle:].T, torque[settle:].T, strict=True):
+        (cosine, sine), *_ = np.linalg.lstsq(np.column_stack([np.cos(phase), np.sin(phase)]), values, rcond=None)
+        amplitudes.append(cosine - 1j * sine)
+    return np.array(amplitudes)
+
+
+def sampled_checks(loops: Mapping[str, Loop], quick: bool) -> Iterator[Check]:
+    """All checks of the sampled loop, each over all the given loops.
+
+    Args:
+        loops: by name.
+        quick: fewer frequencies and steps.
+    """
+    yield _state_space_check(loops, 200 if quick else 1000)
+    yield _step_response_check(loops)
+    yield from _frequency_response_checks(loops, 8 if quick else 24)

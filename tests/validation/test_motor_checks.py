@@ -1,0 +1,229 @@
+"""The checks of the motor pass, and every one of them fails when the motor is made wrong."""
+
+import ast
+import dataclasses
+import math
+from pathlib import Path
+
+import control
+import mujoco
+import numpy as np
+import pytest
+from scipy import integrate, signal
+
+from codrl_mj.motor import Actuator, CurrentLoop, Motor
+from codrl_mj.motor.parameters import (
+    BACK_EMF_CONSTANT,
+    INDUCTANCE,
+    KD,
+    KFF,
+    KI,
+    KP,
+    MAX_VOLTAGE,
+    RESISTANCE,
+    SUBSTEPS,
+    TORQUE_CONSTANT,
+)
+from codrl_mj.validation import motor, motor_gem, motor_native, rotors
+from codrl_mj.validation.motor_analogue import closed_form
+from codrl_mj.validation.motor_loops import EVERY_FEATURE, Loop, standard_loops
+from codrl_mj.validation.motor_sampled import closed_loop, sampled_system
+from tests.reference import of_actuator
+
+pytestmark = pytest.mark.usefixtures("bare_engine")
+
+SMALL = {"small": motor_native.MOTORS["small"]}
+ORDER, LIMIT = "closed form, order in the substeps", "closed form, limit of small substeps"
+SAMPLED, STEP = "sampled loop, random torques and speeds", "step response"
+MAGNITUDE, PHASE = "frequency response, magnitude", "frequency response, phase"
+VOLTAGE = "stall torque at the voltage limit"
+LINE, NO_LOAD = "torque-speed line and power, stall to regeneration", "no-load speed and current"
+MAP, SUB = "native <dcmotor>, same map", "native <dcmotor>, Euler, order in the substeps"
+FAST, RK4 = "native <dcmotor>, implicitfast, order in the step", "RK4, locked rotor"
+GEM = "gym-electric-motor, order in the step"
+LOOP = {ORDER, LIMIT, SAMPLED, STEP, MAGNITUDE, PHASE}
+NATIVE = {MAP, SUB, FAST}
+EVERY = LOOP | {VOLTAGE, LINE, NO_LOAD, RK4, GEM} | NATIVE
+
+
+def outcomes():
+    """All checks with a few loops and motors only, by name."""
+    checks = [*motor.checks_of({"every feature": EVERY_FEATURE}, quick=True)]
+    checks += motor_native.native_checks(SMALL, quick=True)
+    checks.append(motor_gem.gem_check(Motor(), quick=True))
+    return {check.name: check for check in checks}
+
+
+def failed():
+    return {name for name, check in outcomes().items() if not check.passed}
+
+
+def mutate(monkeypatch, change):
+    """Every model with our motors is made wrong: `change(user data, gear)`, rows by motor, in place."""
+    install = rotors.install_callbacks
+
+    def wrong(model):
+        install(model)
+        change(model.actuator_user, model.actuator_gear)
+
+    monkeypatch.setattr(rotors, "install_callbacks", wrong)
+
+
+def scaled(entry, factor):
+    def change(user, _):
+        user[:, entry] *= factor
+
+    return change
+
+
+def swapped(user, _):
+    user[:, [KP, KI]] = user[:, [KI, KP]]
+
+
+def longer_gear(_, gear):
+    gear *= 1.01
+
+
+def one_substep(user, _):
+    user[:, SUBSTEPS] = 1
+
+
+MUTATIONS = {
+    "inductance + 0.1 %": (scaled(INDUCTANCE, 1.001), LOOP | {MAP, SUB}),
+    "resistance + 1 %": (scaled(RESISTANCE, 1.01), EVERY - {NO_LOAD}),
+    "torque constant + 1 %": (scaled(TORQUE_CONSTANT, 1.01), {VOLTAGE, LINE} | NATIVE | {GEM}),
+    "back-EMF reversed": (scaled(BACK_EMF_CONSTANT, -1), {ORDER, LIMIT, SAMPLED, LINE, NO_LOAD, GEM} | NATIVE),
+    "kp and ki swapped": (swapped, LOOP),
+    "kp + 0.1 %": (scaled(KP, 1.001), LOOP),
+    "ki + 1 %": (scaled(KI, 1.01), LOOP),
+    "kd doubled": (scaled(KD, 2.0), LOOP),
+    "kff + 0.1 %": (scaled(KFF, 1.001), LOOP | NATIVE | {RK4, GEM}),
+    "voltage limit - 1 %": (scaled(MAX_VOLTAGE, 0.99), {VOLTAGE}),
+    "gear + 1 %": (longer_gear, LOOP - {PHASE} | {VOLTAGE, LINE, NO_LOAD, GEM} | NATIVE),
+    "substeps ignored": (one_substep, {ORDER, LIMIT, SAMPLED, SUB}),
+}
+"""Name -> (what is wrong, checks that must see it; others may)."""
+
+
+def test_every_check_passes_and_can_be_looked_at(installed):
+    checks = list(motor.checks(quick=True))
+    assert {check.name for check in checks} == EVERY
+    assert len(checks) == len(EVERY)
+    for check in checks:
+        assert check.passed, check
+        assert check.group == "motor"
+        assert check.where
+        assert 0 <= check.worst <= check.tolerance
+        for plot in check.plots:
+            assert "[" in plot.x_label
+            assert "[" in plot.y_label
+            assert all(len(curve.x) == len(curve.y) > 2 for curve in plot.curves)
+    assert {check.name for check in checks if not check.plots} == {LIMIT, VOLTAGE, NO_LOAD}
+
+
+@pytest.mark.parametrize("mutation", MUTATIONS)
+def test_a_wrong_motor_fails(monkeypatch, mutation):
+    change, seen_by = MUTATIONS[mutation]
+    mutate(monkeypatch, change)
+    assert seen_by <= failed()
+
+
+def test_every_check_is_failed_by_some_mutation():
+    assert set().union(*(seen_by for _, seen_by in MUTATIONS.values())) == EVERY
+
+
+def test_a_command_that_is_a_step_late_fails(monkeypatch):
+    step, waiting = mujoco.mj_step, {}
+
+    def late(model, data):
+        command, waiting[id(data)] = waiting.get(id(data), np.zeros_like(data.ctrl)), data.ctrl.copy()
+        data.ctrl[:] = command
+        step(model, data)
+
+    monkeypatch.setattr(rotors.mujoco, "mj_step", late)
+    # the native motor's command is late as well: what is compared with it does not notice
+    assert failed() >= {SAMPLED, STEP, PHASE, LIMIT}
+
+
+def test_a_task_has_its_own_loop_checked():
+    checks = list(motor.checks("cartpole", quick=True))
+    assert {check.name for check in checks} == EVERY
+    assert next(check for check in checks if check.name == SAMPLED).where.startswith("cartpole")
+
+
+def test_a_motor_that_never_saturates_and_one_without_back_emf_have_their_own_checks():
+    quiet = Actuator(Motor(back_emf_constant=0.0), CurrentLoop(max_voltage=math.inf))
+    names = {check.name: check for check in motor.checks_of({"mine": Loop(quiet, 0.01)}, quick=True)}
+    assert names.keys() == LOOP | {LINE}
+    assert all(check.passed for check in names.values())
+
+
+def test_a_stiff_motor_passes_at_its_own_substeps():
+    stiff = Actuator(
+        Motor(resistance=0.5, inductance=2e-4, torque_constant=0.05, back_emf_constant=0.05, arm_radius=0.02),
+        CurrentLoop(kp=0.5, ki=800.0, substeps=40),
+    )
+    for check in motor.checks_of({"mine": Loop(stiff, 0.01)}, quick=True):
+        assert check.passed, check
+
+
+# -- the oracles --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [*standard_loops()])
+def test_the_sampled_oracles_are_the_papers_equations(name):
+    """State space, blocks and the equations in plain Python are one system."""
+    actuator, timestep = standard_loops()[name]
+    m, c = actuator.motor, dataclasses.replace(actuator.controller, substeps=1)
+    actuator = Actuator(m, c)
+    step = of_actuator(Actuator(dataclasses.replace(m, arm_radius=1.0), c))
+    state, currents = (0.0, 0.0, 0.0), []
+    for _ in range(50):
+        *state, _, _ = step(timestep, *state, m.torque_constant, 0.0)
+        currents.append(state[0])
+    _, sampled, _ = signal.dlsim(sampled_system(actuator, timestep), np.tile([1.0, 0.0], (50, 1)))
+    np.testing.assert_allclose(sampled[:, 0], currents, rtol=0, atol=1e-12)
+    blocks = control.step_response(closed_loop(actuator, timestep), np.arange(51) * timestep)
+    np.testing.assert_allclose(np.ravel(blocks.outputs)[1:], currents, rtol=0, atol=1e-10)
+
+
+def test_the_closed_form_solves_the_circuits_equations():
+    """Against scipy's integrator, on the loop without a derivative."""
+    actuator = Actuator(Motor(inductance=0.05, back_emf_constant=0.7), CurrentLoop(kp=2, ki=5, bemf_compensation=False))
+
+    def derivative(_, state):
+        current, integral = state
+        voltage = 2.0 * (1.0 - current) + 5.0 * integral
+        return [(voltage - 0.7 * 0.4 - current) / 0.05, 1.0 - current]
+
+    times = 0.02 * np.arange(1, 41)
+    solved = integrate.solve_ivp(derivative, (0, times[-1]), [0, 0], "DOP853", times, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        closed_form(actuator, 0.02, np.ones(40), 0.4),
+        solved.y[0],
+        rtol=0,
+        atol=1e-8,  # of its interpolation
+    )
+
+
+def test_the_oracles_use_none_of_our_mathematics():
+    """Only the parameters' names are taken from the motor: not one of its functions."""
+    classes = {"Motor", "CurrentLoop", "Actuator", "PAPER"}
+    for path in Path(motor.__file__).parent.glob("motor*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module.startswith("codrl_mj.motor"):
+                assert {alias.name for alias in node.names} <= classes, path
+
+
+def test_the_native_motor_is_wrong_under_rk4_and_ours_is_not():
+    check = motor_native.rk4_check(quick=True)
+    ours, native = check.plots[0].curves
+    assert ours.y.max() < 1e-12
+    assert native.y[0] > 0.02
+    assert native.y[-1] > 0.3
+
+
+def test_without_gym_electric_motor_its_check_is_left_out(monkeypatch):
+    monkeypatch.setattr(motor, "checks_of", lambda *_: iter(()))
+    monkeypatch.setattr(motor, "available", lambda: False)
+    assert {check.name for check in motor.checks(quick=True)} == NATIVE | {RK4}
