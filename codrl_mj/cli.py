@@ -203,7 +203,7 @@ class Evaluate:
         if self.out is not None:
             from codrl_mj.files import write_json
 
-            write_json(self.out, dataclasses.asdict(evaluation))
+            write_json(self.out, evaluation.as_mapping())
             print(f"wrote {self.out}")
         return 0
 

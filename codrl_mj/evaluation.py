@@ -237,6 +237,10 @@ class Evaluation:
     peak_voltage: float | None
     """Largest absolute voltage [V]; None for the ideal actuator."""
 
+    def as_mapping(self) -> dict[str, Any]:
+        """The evaluation as JSON-serialisable values; intervals as mappings of `mean`, `low` and `high`."""
+        return {name: value._asdict() if isinstance(value, Interval) else value for name, value in vars(self).items()}
+
 
 def summarize(task: str, actuator: Actuator | None, episodes: list[Episode]) -> Evaluation:
     """Reduce episodes on one actuator to an `Evaluation`.

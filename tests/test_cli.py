@@ -151,7 +151,7 @@ def test_evaluation_is_that_of_the_package(capsys, trained, tmp_path):
     result = json.loads((tmp_path / "a" / "result.json").read_text())
     make = lambda: make_env("cartpole", "weaker")  # noqa: E731
     totals = [episode.total for episode in run_episodes(load_policy(trained), make, 7, seed=5)]
-    assert result["returns"][0] == pytest.approx(np.mean(totals), rel=1e-12)
+    assert result["returns"]["mean"] == pytest.approx(np.mean(totals), rel=1e-12)
     assert result["returns"] == result["length"]  # 1 a step
     assert result["episodes"] == 7
     text = capsys.readouterr().out
