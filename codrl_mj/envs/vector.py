@@ -116,6 +116,7 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         if render_mode is not None:
             check_view(self.physics.model, width, height, camera)
         self._renderer: OffscreenRenderer | None = None
+        self._data: mujoco.MjData | None = None  # what is drawn
 
     @property
     def task(self) -> Task:
@@ -267,6 +268,10 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         self._streams.set_state(snapshot["streams"])
         self._elapsed[:], self._ended[:] = snapshot["elapsed"], snapshot["ended"]
         self._observations[:] = snapshot["observations"]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the renderer, which a copy makes anew."""
+        return self.__dict__ | {"_renderer": None, "_data": None}
 
     def render(self) -> Array | None:  # type: ignore[override]
         """The first environment as an image, shape (height, width, 3), uint8; None if there is no render mode."""

@@ -1,6 +1,7 @@
 """Many simulations of a task in MuJoCo at once, on the engine's own thread pool."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -46,23 +47,48 @@ class MujocoBatchPhysics:
         self.max_force = task.max_force if max_force is None else max_force
         self._explicit = integrator == "euler"
         self.model = task_model(task, actuators[0] if actuators else None, task.step_duration / inner_steps, max_force)
-        install_callbacks(self.model)
-        self._batch = Batch(self.model, num_envs, num_threads)
-        self._keep = compiled_constrain(task)
+        self._size = num_envs, num_threads
+        self._fields: dict[str, np.ndarray] = {}
+        self._make_batch()
         self._rest = self._batch.state[0].copy()  # a simulation just reset, motor at rest
-        self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
-        self._ctrl, self._act = self._batch.bind("ctrl"), self._batch.bind("act")
         self.motorised = actuators is not None
         self._arm = self._torque_constant = self._limit = np.ones(num_envs)
         if actuators is not None:
             self._arm, self._torque_constant, self._limit = (np.empty(num_envs) for _ in range(3))
             self.set_actuators(np.arange(num_envs), actuators)
 
+    def _make_batch(self) -> None:
+        """Make the engine's batch, and take the views that a step uses."""
+        install_callbacks(self.model)
+        self._batch = Batch(self.model, *self._size)
+        self._keep = compiled_constrain(self.task)
+        self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
+        self._ctrl, self._act = self._batch.bind("ctrl"), self._batch.bind("act")
+
+    def field(self, name: str) -> np.ndarray:
+        """A field of the model with a value for each simulation, shape (N, ...): live, to be written to."""
+        if name not in self._fields:
+            self._fields[name] = self._batch.expand(name)
+        return self._fields[name]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the engine's batch, of which a copy needs the rows and fields."""
+        kept = {name: value for name, value in self.__dict__.items() if name not in _ENGINE}
+        return kept | {"rows": self.snapshot(), "_fields": {name: field.copy() for name, field in self._fields.items()}}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore, in this or another process."""
+        kept = dict(state)
+        rows, fields = kept.pop("rows"), kept.pop("_fields")
+        self.__dict__.update(kept, _fields={})
+        self._make_batch()
+        for name, values in fields.items():
+            self.field(name)[:] = values
+        self.restore(rows)
+
     def set_actuators(self, rows: np.ndarray, actuators: Sequence[Actuator]) -> None:
         """Give some simulations other motors; to be followed by a reset of them."""
-        user, gear, limits = (
-            self._batch.expand(field) for field in ("actuator_user", "actuator_gear", "actuator_ctrlrange")
-        )
+        user, gear, limits = map(self.field, ("actuator_user", "actuator_gear", "actuator_ctrlrange"))
         arm = np.array([actuator.motor.arm_radius for actuator in actuators])
         user[rows, 0] = np.array([to_vector(actuator) for actuator in actuators])
         gear[rows, 0, 0] = 1.0 / arm
@@ -166,3 +192,6 @@ class MujocoBatchPhysics:
         mujoco.mj_comPos(self.model, data)
         mujoco.mj_camlight(self.model, data)
         mujoco.mj_passive(self.model, data)
+
+
+_ENGINE = ("_batch", "_keep", "_qpos", "_qvel", "_ctrl", "_act")
