@@ -16,14 +16,16 @@ ALLOWED = {
     "assets": set(),
     "motor": set(),
     "files": set(),
+    "distributions": set(),
     "tasks": set(),
     "callbacks": {"motor"},
     "physics": {"assets", "motor", "callbacks", "tasks"},
-    "envs": {"tasks", "physics", "motor", "registration"},
+    "envs": {"tasks", "physics", "motor", "distributions", "registration"},
 }
 FOREIGN = {
     # layer: what it may import besides the standard library
     "motor": {"numpy"},
+    "distributions": {"numpy"},
     "assets": set(),
     "registration": {"gymnasium"},
     "tasks": {"numpy", "numba", "gymnasium"},

@@ -3,7 +3,7 @@
 from codrl_mj.motor.catalog import NAMED, named_actuator, resolve
 from codrl_mj.motor.current_loop import advance
 from codrl_mj.motor.parameters import Actuator, CurrentLoop, Motor, from_vector, to_vector
-from codrl_mj.motor.stability import check_stable, closed_loop_matrix, spectral_radius
+from codrl_mj.motor.stability import check_stable, closed_loop_matrix, spectral_radii, spectral_radius
 
 __all__ = [
     "NAMED",
@@ -16,6 +16,7 @@ __all__ = [
     "from_vector",
     "named_actuator",
     "resolve",
+    "spectral_radii",
     "spectral_radius",
     "to_vector",
 ]

@@ -1,11 +1,12 @@
 """Stability of the discrete closed loop of controller and winding, without the mechanics."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
 from codrl_mj.motor.current_loop import advance
-from codrl_mj.motor.parameters import Actuator, to_vector
+from codrl_mj.motor.parameters import KD, KI, MAX_VOLTAGE, SUBSTEPS, Actuator, to_vector
 
 
 def closed_loop_matrix(actuator: Actuator, timestep: float) -> np.ndarray:
@@ -31,6 +32,46 @@ def closed_loop_matrix(actuator: Actuator, timestep: float) -> np.ndarray:
     return np.array(columns).T[states]
 
 
+class _Unlimited:
+    """A voltage limit that no voltage reaches, be it a number or an array: it compares as neither above nor below."""
+
+    def __neg__(self) -> "_Unlimited":
+        return self
+
+    def __lt__(self, other: object) -> bool:
+        return False
+
+    def __gt__(self, other: object) -> bool:
+        return False
+
+
+def spectral_radii(vectors: np.ndarray, timestep: float) -> np.ndarray:
+    """`spectral_radius` of many actuators at once.
+
+    Args:
+        vectors: parameter vectors, shape (m, p), as `codrl_mj.motor.to_vector` makes them.
+        timestep: mechanical step [s].
+
+    Returns:
+        Shape (m,); the radius of each does not depend on the others, to the last bit.
+    """
+    substeps = vectors[:, SUBSTEPS]
+    columns: list[Any] = list(vectors.T)
+    columns[SUBSTEPS], columns[MAX_VOLTAGE] = 1, _Unlimited()
+    current, integral, error = np.eye(3)[:, :, np.newaxis]  # all states of all actuators at once: (state, actuator)
+    with np.errstate(all="ignore"):
+        after = advance(columns, timestep / substeps, current, integral, error, 0.0, 0.0)[:3]  # type: ignore[arg-type]
+        matrices = np.stack([np.broadcast_to(entry, (3, len(vectors))) for entry in after])  # (to, from, actuator)
+        # what no gain reads is no part of the loop: 0 instead of the eigenvalue of a state of its own
+        read = np.stack([np.ones(len(vectors), dtype=bool), vectors[:, KI] > 0, vectors[:, KD] > 0])
+        matrices = np.moveaxis(np.where(read[:, np.newaxis] & read, matrices, 0.0), 2, 0)
+        finite = np.isfinite(matrices).all(axis=(1, 2))
+        values = np.linalg.eigvals(np.where(finite[:, np.newaxis, np.newaxis], matrices, 0.0))
+        radii = np.abs(values.astype(np.complex128)).max(axis=1)
+        radii = np.where(finite, radii, np.inf)
+        return radii**substeps  # a power of the matrix itself would overflow into NaN
+
+
 def spectral_radius(actuator: Actuator, timestep: float) -> float:
     """Largest absolute eigenvalue of the closed loop over one mechanical step: below 1 the loop is stable.
 
@@ -38,11 +79,7 @@ def spectral_radius(actuator: Actuator, timestep: float) -> float:
         actuator: motor and gains.
         timestep: mechanical step [s].
     """
-    substeps = actuator.controller.substeps
-    one = dataclasses.replace(actuator, controller=dataclasses.replace(actuator.controller, substeps=1))
-    radius = np.abs(np.linalg.eigvals(closed_loop_matrix(one, timestep / substeps))).max()
-    with np.errstate(over="ignore", under="ignore"):  # a power of the matrix itself would overflow into NaN
-        return float(radius**substeps)
+    return float(spectral_radii(np.array([to_vector(actuator)]), timestep)[0])
 
 
 def check_stable(actuator: Actuator, timestep: float) -> None:

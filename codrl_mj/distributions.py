@@ -1,0 +1,126 @@
+"""Distributions of a number, as pure functions of draws in [0, 1): a draw gives the same value wherever it is made."""
+
+import dataclasses
+import math
+import numbers
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+
+def _check_bounds(distribution: Any, least: float | None) -> None:
+    """Store `low` and `high` of a frozen distribution as floats, or raise `ValueError` naming value and bound."""
+    kind = type(distribution).__name__
+    for field in ("low", "high"):
+        value = getattr(distribution, field)
+        fine = isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+        if not fine or (least is not None and not value > least):
+            bound = "" if least is None else f" > {least:g}"
+            raise ValueError(f"{kind}.{field} = {value!r}: must be a finite number{bound}")
+        object.__setattr__(distribution, field, float(value))
+    if not distribution.low <= distribution.high:
+        raise ValueError(f"{kind}.high = {distribution.high:g}: must be >= low = {distribution.low:g}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Uniform:
+    """Every number from `low` to `high` alike.
+
+    Raises:
+        ValueError: a bound is not a finite number, or high < low.
+    """
+
+    low: float
+    """Smallest value, in the field's unit."""
+    high: float
+    """Largest value, >= low."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        _check_bounds(self, None)
+
+    def transform(self, draws: np.ndarray) -> np.ndarray:
+        """The values low + (high - low) u.
+
+        Args:
+            draws: numbers u in [0, 1), shape (m,), contiguous.
+        """
+        return np.minimum(self.low + (self.high - self.low) * draws, self.high)
+
+    @property
+    def extremes(self) -> tuple[float, ...]:
+        """Values whose being allowed means that all are."""
+        return self.low, self.high
+
+
+@dataclasses.dataclass(frozen=True)
+class LogUniform:
+    """Every ratio alike: the logarithm is uniform from that of `low` to that of `high`.
+
+    Raises:
+        ValueError: a bound is not a finite number > 0, or high < low.
+    """
+
+    low: float
+    """Smallest value, > 0, in the field's unit."""
+    high: float
+    """Largest value, >= low."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        _check_bounds(self, 0.0)
+
+    def transform(self, draws: np.ndarray) -> np.ndarray:
+        """The values exp(log(low) + (log(high) - log(low)) u), within the bounds.
+
+        Args:
+            draws: numbers u in [0, 1), shape (m,), contiguous.
+        """
+        low, high = math.log(self.low), math.log(self.high)
+        return np.clip(np.exp(low + (high - low) * draws), self.low, self.high)
+
+    @property
+    def extremes(self) -> tuple[float, ...]:
+        """Values whose being allowed means that all are."""
+        return self.low, self.high
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """One of some values, each as likely as another.
+
+    Raises:
+        ValueError: no values, or one that is not a number.
+    """
+
+    values: Sequence[float]
+    """The values, in the field's unit; named twice, one is twice as likely."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        given = self.values
+        if not isinstance(given, Sequence | np.ndarray) or isinstance(given, str) or len(given) == 0:
+            raise ValueError(f"Choice.values = {given!r}: must be a sequence of one or more numbers")
+        for value in given:
+            if not isinstance(value, numbers.Real | np.bool_) or math.isnan(value):
+                raise ValueError(f"Choice.values = {given!r}: {value!r} must be a number")
+        object.__setattr__(self, "values", tuple(np.asarray(value).item() for value in given))
+
+    def transform(self, draws: np.ndarray) -> np.ndarray:
+        """The values at floor(n u), as floats.
+
+        Args:
+            draws: numbers u in [0, 1), shape (m,).
+        """
+        table = np.array(self.values, dtype=np.float64)
+        return table[np.minimum((len(table) * draws).astype(np.int64), len(table) - 1)]
+
+    @property
+    def extremes(self) -> tuple[float, ...]:
+        """Values whose being allowed means that all are."""
+        return tuple(self.values)
+
+
+Distribution = Uniform | LogUniform | Choice
+"""What a field can be drawn from."""
