@@ -16,15 +16,17 @@ ALLOWED = {
     "assets": set(),
     "motor": set(),
     "files": set(),
+    "disturbances": {"motor"},
     "distributions": set(),
     "tasks": set(),
     "callbacks": {"motor"},
-    "physics": {"assets", "motor", "callbacks", "tasks"},
-    "envs": {"tasks", "physics", "motor", "distributions", "registration"},
+    "physics": {"assets", "motor", "disturbances", "callbacks", "tasks"},
+    "envs": {"tasks", "physics", "motor", "disturbances", "distributions", "registration"},
 }
 FOREIGN = {
     # layer: what it may import besides the standard library
     "motor": {"numpy"},
+    "disturbances": {"numpy"},
     "distributions": {"numpy"},
     "assets": set(),
     "registration": {"gymnasium"},

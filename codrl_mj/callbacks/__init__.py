@@ -2,7 +2,16 @@
 
 from codrl_mj.callbacks.hill import HILL_NAMES
 from codrl_mj.callbacks.install import CallbackInUseError, install, installed, uninstall
-from codrl_mj.callbacks.kernels import ACT_NAMES
+from codrl_mj.callbacks.kernels import ACT_NAMES, IMPERFECT_ACT_NAMES
 from codrl_mj.callbacks.layout import LayoutError
 
-__all__ = ["ACT_NAMES", "HILL_NAMES", "CallbackInUseError", "LayoutError", "install", "installed", "uninstall"]
+__all__ = [
+    "ACT_NAMES",
+    "HILL_NAMES",
+    "IMPERFECT_ACT_NAMES",
+    "CallbackInUseError",
+    "LayoutError",
+    "install",
+    "installed",
+    "uninstall",
+]

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import mujoco
 
 from codrl_mj.callbacks.hill import compiled_hill
-from codrl_mj.callbacks.kernels import compiled
+from codrl_mj.callbacks.kernels import compiled, compiled_imperfect
 
 
 class _Part(NamedTuple):
@@ -21,6 +21,7 @@ class _Part(NamedTuple):
 
 _PARTS = {
     "motor": _Part(("control", "act_bias"), compiled, "actuator='ideal' or physics='analytic'"),
+    "imperfect_motor": _Part(("control", "act_bias"), compiled_imperfect, "without imperfections"),
     "hill": _Part(("passive",), compiled_hill, "physics='analytic'"),
 }
 
@@ -33,9 +34,22 @@ def _present(name: str) -> Any:
     return getattr(mujoco, f"get_mjcb_{name}")()
 
 
-def _is_ours(part: _Part, name: str) -> bool:
-    was_compiled = part.compile.cache_info().currsize  # type: ignore[attr-defined]
-    return bool(was_compiled) and _present(name) is getattr(part.compile(), name)
+_PRESENT: dict[str, str] = {}
+"""The part that each of MuJoCo's callbacks was last set from."""
+
+
+def _is_of(part: str, name: str) -> bool:
+    """Whether the callback is the part's."""
+    return _PRESENT.get(name) == part and _present(name) is getattr(_PARTS[part].compile(), name)
+
+
+def _is_ours(name: str) -> bool:
+    return any(_is_of(part, name) for part in _PARTS)
+
+
+def _serves(part: str, name: str) -> bool:
+    """Whether the callback does what the part's would do: the imperfect motors' serves every motor."""
+    return _is_of(part, name) or (part == "motor" and _is_of("imperfect_motor", name))
 
 
 def installed(*parts: str) -> bool:
@@ -44,7 +58,7 @@ def installed(*parts: str) -> bool:
     Args:
         *parts: as for `install`.
     """
-    return all(_is_ours(part, name) for part in _chosen(parts) for name in part.names)
+    return all(_serves(part, name) for part in _chosen(parts) for name in _PARTS[part].names)
 
 
 def install(*parts: str) -> None:
@@ -55,7 +69,8 @@ def install(*parts: str) -> None:
     without them. A process in which no model has a hill need not pay for the hill's callback.
 
     Args:
-        *parts: `motor` (`mjcb_control` and `mjcb_act_bias`), `hill` (`mjcb_passive`) or both; none means `motor`.
+        *parts: `motor` (`mjcb_control` and `mjcb_act_bias`), `imperfect_motor` (the same two, for motors with imperfect
+            sensors or supplies as well), `hill` (`mjcb_passive`), or several; none means `motor`.
 
     Raises:
         ValueError: no such part.
@@ -64,28 +79,29 @@ def install(*parts: str) -> None:
     """
     chosen = _chosen(parts)
     for part in chosen:
-        for name in part.names:
-            if _present(name) is not None and not _is_ours(part, name):
+        for name in _PARTS[part].names:
+            if _present(name) is not None and not _is_ours(name):
                 raise CallbackInUseError(
                     f"mujoco.mjcb_{name} is already set, to {_present(name)!r}: refusing to replace it. Remove it with "
-                    f"mujoco.set_mjcb_{name}(None) first, or build the environment with {part.remedy}, which "
+                    f"mujoco.set_mjcb_{name}(None) first, or build the environment with {_PARTS[part].remedy}, which "
                     "needs no such callback"
                 )
-    pointers = {name: getattr(part.compile(), name) for part in chosen for name in part.names}
-    for name, pointer in pointers.items():
+    missing = [(part, name) for part in chosen for name in _PARTS[part].names if not _serves(part, name)]
+    pointers = [(part, name, getattr(_PARTS[part].compile(), name)) for part, name in missing]
+    for part, name, pointer in pointers:
         getattr(mujoco, f"set_mjcb_{name}")(pointer)
+        _PRESENT[name] = part
 
 
 def uninstall() -> None:
     """Remove all our callbacks; anybody else's stay where they are."""
-    for part in _PARTS.values():
-        for name in part.names:
-            if _is_ours(part, name):
-                getattr(mujoco, f"set_mjcb_{name}")(None)
+    for name in {name for part in _PARTS.values() for name in part.names}:
+        if _is_ours(name):
+            getattr(mujoco, f"set_mjcb_{name}")(None)
 
 
-def _chosen(names: tuple[str, ...]) -> list[_Part]:
+def _chosen(names: tuple[str, ...]) -> tuple[str, ...]:
     for name in names:
         if name not in _PARTS:
             raise ValueError(f"callbacks {name!r}: must be one of {', '.join(_PARTS)}")
-    return [_PARTS[name] for name in names or ("motor",)]
+    return names or ("motor",)

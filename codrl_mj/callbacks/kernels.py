@@ -11,11 +11,21 @@ from typing import Any, NamedTuple
 import mujoco
 import numba
 from numba import types
+from numba.extending import register_jitable
 
 from codrl_mj.callbacks.layout import check_layout, offset
 from codrl_mj.callbacks.memory import array, f64, i32, i64, u8
-from codrl_mj.motor.current_loop import advance
-from codrl_mj.motor.parameters import PARAMETER_NAMES, SIGNATURE, TORQUE_CONSTANT
+from codrl_mj.motor import noise
+from codrl_mj.motor.current_loop import advance, advance_imperfect, electrical_step
+from codrl_mj.motor.parameters import (
+    CURRENT_BIAS,
+    CURRENT_NOISE,
+    IMPERFECTION_NAMES,
+    PARAMETER_NAMES,
+    SIGNATURE,
+    SUPPLY_RESISTANCE,
+    TORQUE_CONSTANT,
+)
 
 ACT_NAMES = (
     "tick",
@@ -30,6 +40,14 @@ ACT_NAMES = (
 """What the `act` entries of one of our actuators hold, in order: the time of the tick [s], the state at the tick, the
 state one step later (the candidate), and the voltage between them."""
 TICK, COMMITTED_CURRENT, COMMITTED_INTEGRAL, COMMITTED_ERROR, CURRENT, INTEGRAL, ERROR, VOLTAGE = range(len(ACT_NAMES))
+
+IMPERFECT_ACT_NAMES = (*ACT_NAMES, "noise_key", "available_voltage")
+"""The same for an actuator whose sensor or supply is imperfect: also the key of the sensor's noise, written at a reset
+and only read here, and the voltage that was available. Its number of entries is what such an actuator is known by."""
+NOISE_KEY, AVAILABLE_VOLTAGE = len(ACT_NAMES), len(ACT_NAMES) + 1
+
+for _function in (noise.philox, noise.unit, noise.standard_normal, electrical_step):
+    register_jitable(_function)  # compiled code may call them; they stay what they are
 
 MODEL_FIELDS = (
     "nu",
@@ -65,9 +83,37 @@ class Callbacks(NamedTuple):
     """The numba objects that own the machine code: they must live as long as the pointers."""
 
 
+def _nothing(*arguments: Any) -> tuple[float, float, float, float, float]:  # noqa: ARG001 - in the place of another
+    return 0.0, 0.0, 0.0, 0.0, 0.0
+
+
 @functools.cache
 def compiled() -> Callbacks:
-    """Compile the callbacks on first use (about a second) and keep them for the life of the process.
+    """The callbacks for motors with perfect sensors and supplies; others are left alone, as foreign ones are.
+
+    Compiled on first use (about a second) and kept for the life of the process.
+
+    Raises:
+        LayoutError: the installed MuJoCo's memory is not laid out as its introspection says.
+    """
+    return _compile(False)
+
+
+@functools.cache
+def compiled_imperfect() -> Callbacks:
+    """The callbacks for every motor of ours, those with imperfect sensors or supplies included.
+
+    Raises:
+        LayoutError: as for `compiled`.
+    """
+    return _compile(True)
+
+
+def _compile(imperfect: bool) -> Callbacks:
+    """Compile the callbacks. Leaving out what few models need saves as much time as the rest takes.
+
+    Args:
+        imperfect: for imperfect sensors and supplies too.
 
     Raises:
         LayoutError: the installed MuJoCo's memory is not laid out as its introspection says.
@@ -88,7 +134,17 @@ def compiled() -> Callbacks:
     user_dynamics, user_bias = int(mujoco.mjtDyn.mjDYN_USER), int(mujoco.mjtBias.mjBIAS_USER)
     no_clamp, groups, largest = int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL), mujoco.mjNGROUP, mujoco.mjMAXVAL
     act_size, user_size = len(ACT_NAMES), len(PARAMETER_NAMES)
+    imperfect_act_size, imperfect_user_size = len(IMPERFECT_ACT_NAMES), user_size + len(IMPERFECTION_NAMES)
     loop = numba.njit(inline="always")(advance)
+    imperfect_loop = numba.njit(advance_imperfect if imperfect else _nothing)
+
+    @numba.njit(inline="always")
+    def is_imperfect(model: int, actuator: int) -> bool:
+        return (
+            imperfect
+            and i32(array(model, actnum_at))[actuator] == imperfect_act_size
+            and i64(model + nuser_at)[0] >= imperfect_user_size
+        )
 
     @numba.njit(inline="always")
     def is_ours(model: int, actuator: int) -> bool:
@@ -97,7 +153,7 @@ def compiled() -> Callbacks:
             and i64(model + nuser_at)[0] >= user_size
             and f64(array(model, user_at))[actuator * i64(model + nuser_at)[0]] == SIGNATURE
             and i32(array(model, biastype_at))[actuator] == user_bias
-            and i32(array(model, actnum_at))[actuator] == act_size
+            and (i32(array(model, actnum_at))[actuator] == act_size or is_imperfect(model, actuator))
         )
 
     @numba.njit(inline="always")
@@ -136,15 +192,28 @@ def compiled() -> Callbacks:
                 act[COMMITTED_INTEGRAL] = act[INTEGRAL]
                 act[COMMITTED_ERROR] = act[ERROR]
             user = f64(array(model, user_at) + 8 * actuator * i64(model + nuser_at)[0])
-            current, integral, error, voltage = loop(
-                user,
-                f64(model + timestep_at)[0],
-                act[COMMITTED_CURRENT],
-                act[COMMITTED_INTEGRAL],
-                act[COMMITTED_ERROR],
-                command(model, data, actuator),
-                f64(array(data, velocity_at))[i32(array(model, outadr_at))[actuator]],
-            )
+            timestep = f64(model + timestep_at)[0]
+            torque = command(model, data, actuator)
+            speed = f64(array(data, velocity_at))[i32(array(model, outadr_at))[actuator]]
+            i, total, last = act[COMMITTED_CURRENT], act[COMMITTED_INTEGRAL], act[COMMITTED_ERROR]
+            if is_imperfect(model, actuator):
+                current, integral, error, voltage, available = imperfect_loop(
+                    user,
+                    timestep,
+                    i,
+                    total,
+                    last,
+                    torque,
+                    speed,
+                    user[CURRENT_BIAS],
+                    user[CURRENT_NOISE],
+                    user[SUPPLY_RESISTANCE],
+                    act[NOISE_KEY],
+                    time,
+                )
+                act[AVAILABLE_VOLTAGE] = available
+            else:
+                current, integral, error, voltage = loop(user, timestep, i, total, last, torque, speed)
             act[CURRENT] = current
             act[INTEGRAL] = integral
             act[ERROR] = error

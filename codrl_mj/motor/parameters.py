@@ -194,6 +194,13 @@ PARAMETER_NAMES = ("signature", *_MOTOR_FIELDS, *_LOOP_FIELDS)
     DERIVATIVE_TIME_CONSTANT,
 ) = range(len(PARAMETER_NAMES))
 
+IMPERFECTION_NAMES = ("current_bias", "current_noise", "supply_resistance")
+"""Names of what follows the parameter vector in the `user` data of an actuator with an imperfect sensor or supply."""
+
+CURRENT_BIAS, CURRENT_NOISE, SUPPLY_RESISTANCE = range(
+    len(PARAMETER_NAMES), len(PARAMETER_NAMES) + len(IMPERFECTION_NAMES)
+)
+
 
 def to_vector(actuator: Actuator) -> list[float]:
     """The actuator as a parameter vector: the MJCF actuator's `user` data, entries as in `PARAMETER_NAMES`."""
