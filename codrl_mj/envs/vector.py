@@ -187,7 +187,8 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         Raises:
             ValueError: actions of wrong shape or type, or one that is not in the action space: the message names the
                 environment, and none was stepped.
-            SimulationDivergedError: a simulation left the finite numbers; the message names the environment.
+            SimulationDivergedError: a simulation left the finite numbers; the message names the environment. All were
+                stepped; once it is reset, by `reset(options={"reset_mask": ...})`, they can go on.
             RuntimeError: in `DISABLED` mode, an environment whose episode ended was not reset.
         """
         forces = self.setup.forces(actions)
@@ -205,8 +206,8 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         before = self.physics.state
         signals = self.setup.signals(self.physics.step(forces))
         after = self.physics.state
-        self.physics.check_finite(after, stepping)
         self._elapsed += 1
+        self.physics.check_finite(after, stepping)
         rewards = np.where(stepping, self.setup.rewards(before, signals, after), 0.0)
         terminated = np.asarray(self.setup.task.terminated(after)) & stepping
         limit = np.inf if self.max_episode_steps is None else self.max_episode_steps
