@@ -1,0 +1,218 @@
+"""The Stable-Baselines3 face is `DummyVecEnv` of single environments in `Monitor`s, bit for bit."""
+
+import pickle
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecMonitor, VecNormalize
+
+import codrl_mj
+from codrl_mj.envs.sb3 import ActuatedVecEnv
+from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.tasks import TASKS
+from tests.envs.vectors import random_actions
+
+every_task = pytest.mark.parametrize("task", TASKS)
+
+
+def batched(task, num_envs, **arguments):
+    return codrl_mj.make_sb3_vec_env(ENVIRONMENTS[task].env_id, num_envs, **arguments)
+
+
+def looped(task, num_envs, **arguments):
+    make = ENVIRONMENTS[task].env_id
+    return DummyVecEnv([lambda: Monitor(gymnasium.make(make, disable_env_checker=True, **arguments))] * num_envs)
+
+
+def sampled(env, steps, seed=0):
+    """Batches of actions, as SB3's algorithms pass them: within the bounds."""
+    generator = np.random.default_rng(seed)
+    batches = [random_actions(env.env, generator) for _ in range(steps)]
+    space = env.action_space
+    return [batch if hasattr(space, "n") else np.clip(batch, space.low, space.high) for batch in batches]
+
+
+@every_task
+@pytest.mark.parametrize("actuator", ["ideal", "weaker"])
+def test_steps_are_those_of_dummy_environments(task, actuator):
+    arguments = {"actuator": actuator, "max_episode_steps": 17}
+    ours, theirs = batched(task, 5, **arguments), looped(task, 5, **arguments)
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    for env in (ours, theirs):
+        env.seed(3)
+    np.testing.assert_array_equal(ours.reset(), theirs.reset())
+    assert ours.reset_infos == [{}] * 5
+    ends = 0
+    for actions in sampled(ours, 60):
+        (seen, rewards, dones, infos), (expected, *other) = ours.step(actions), theirs.step(actions)
+        np.testing.assert_array_equal(seen, expected)
+        assert seen.dtype == expected.dtype == np.float32
+        np.testing.assert_array_equal(rewards, other[0])
+        assert rewards.dtype == other[0].dtype == np.float32
+        np.testing.assert_array_equal(dones, other[1])
+        assert dones.dtype == other[1].dtype == bool
+        for row, (info, his) in enumerate(zip(infos, other[2], strict=True)):
+            if not dones[row]:
+                assert info == {}
+                continue
+            ends += 1
+            assert info.keys() == {"terminal_observation", "TimeLimit.truncated", "episode"}
+            np.testing.assert_array_equal(info["terminal_observation"], his["terminal_observation"])
+            assert info["TimeLimit.truncated"] is his["TimeLimit.truncated"]
+            assert info["episode"]["r"] == his["episode"]["r"]
+            assert info["episode"]["l"] == his["episode"]["l"]
+            assert info["episode"]["t"] >= 0
+    assert ends >= 15
+    # a reset in the middle starts the records anew, with other states
+    np.testing.assert_array_equal(ours.reset(), theirs.reset())
+    for actions in sampled(ours, 20, seed=1):
+        (*_, infos), (*_, his) = ours.step(actions), theirs.step(actions)
+        assert [info.get("episode", {}).get("l") for info in infos] == [
+            info.get("episode", {}).get("l") for info in his
+        ]
+
+
+@pytest.mark.parametrize("task", ["pendulum", "cartpole"])
+def test_ppo_has_the_same_weights_bit_for_bit(task):
+    torch.set_num_threads(1)
+    weights = []
+    for make in (batched, looped):
+        env = make(task, 3, actuator="weaker", max_episode_steps=20)
+        env.seed(0)
+        model = PPO("MlpPolicy", env, seed=0, n_steps=32, batch_size=48, n_epochs=2, device="cpu")
+        model.learn(300)
+        weights.append(model.policy.state_dict())
+        assert model.ep_info_buffer
+    for name, value in weights[0].items():
+        assert torch.equal(value, weights[1][name]), name
+
+
+def test_the_wrappers_of_stable_baselines_work_on_it():
+    runs = []
+    for make in (batched, looped):
+        env = VecNormalize(VecMonitor(VecCheckNan(make("pendulum", 3, max_episode_steps=9), raise_exception=True)))
+        env.seed(1)
+        found = [env.reset()]
+        returns = []
+        for actions in sampled(batched("pendulum", 3), 40):
+            observations, rewards, dones, infos = env.step(actions)
+            found += [observations, rewards, dones.astype(float)]
+            returns += [(info["episode"]["r"], info["episode"]["l"]) for info in infos if "episode" in info]
+        runs.append((found, returns))
+    for one, other in zip(runs[0][0], runs[1][0], strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert runs[0][1] == runs[1][1]
+    assert len(runs[0][1]) == 12
+
+
+def test_evaluation_by_stable_baselines_gives_the_same_returns():
+    results = []
+    for make in (batched, looped):
+        env = make("cartpole", 4)
+        env.seed(0)
+        model = PPO("MlpPolicy", env, seed=0, device="cpu")
+        results.append(evaluate_policy(model, env, n_eval_episodes=10, return_episode_rewards=True))
+    assert results[0] == results[1]
+    assert len(results[0][0]) == 10
+
+
+def test_seeds_count_up_and_are_used_once():
+    env = batched("cartpole", 3)
+    assert list(env.seed(5)) == [5, 6, 7]
+    first = env.reset()
+    single = gymnasium.make(ENVIRONMENTS["cartpole"].env_id)
+    for row in range(3):
+        np.testing.assert_array_equal(first[row], single.reset(seed=5 + row)[0])
+    second = env.reset()
+    assert not np.array_equal(first, second)
+    np.testing.assert_array_equal(second[2], single.reset()[0])
+
+
+def test_attributes_and_methods():
+    env = batched("pendulum", 3)
+    env.reset()
+    assert env.get_attr("max_episode_steps") == [200] * 3
+    assert env.get_attr("task", indices=[1]) == [TASKS["pendulum"]]
+    assert env.get_attr("task", indices=2) == [TASKS["pendulum"]]
+    env.set_attr("max_episode_steps", 2)
+    actions = np.zeros((3, 1), np.float32)
+    assert [env.step(actions)[2].tolist() for _ in range(2)] == [[False] * 3, [True] * 3]
+    with pytest.raises(ValueError, match="the environments share it"):
+        env.set_attr("max_episode_steps", 9, indices=[0])
+    with pytest.raises(AttributeError):
+        env.get_attr("nothing")
+    (snapshot,) = env.env_method("snapshot", indices=1)
+    env.step(actions)
+    env.env_method("restore", snapshot)
+    np.testing.assert_array_equal(env.env.snapshot()["physics"], snapshot["physics"])
+    assert len(env.env_method("snapshot")) == 3
+    assert env.env_is_wrapped(Monitor) == [True] * 3
+    assert env.env_is_wrapped(gymnasium.wrappers.TimeLimit, indices=[0, 1]) == [False] * 2
+
+
+def test_signals_of_the_last_step_are_arrays():
+    env = batched("cartpole", 4, actuator="weaker")
+    env.reset()
+    env.step(np.array([0, 1, 0, 1]))
+    assert env.signals is not None
+    np.testing.assert_array_equal(env.signals.desired_force, [-10.0, 10.0, -10.0, 10.0])
+    assert env.signals.current.shape == (4,)
+
+
+def test_rendering_shows_the_first_environment():
+    env = batched("pendulum", 2, render_mode="rgb_array", width=64, height=48)
+    env.seed(0)
+    env.reset()
+    image = env.render()
+    assert image.shape == (48, 64, 3)
+    images = env.get_images()
+    np.testing.assert_array_equal(images[0], image)
+    assert images[1] is None
+    assert env.render_mode == "rgb_array"
+    env.close()
+    assert batched("pendulum", 2).render_mode is None
+
+
+def test_a_pickled_one_continues():
+    env = batched("acrobot", 3, max_episode_steps=6)
+    env.seed(0)
+    env.reset()
+    batches = sampled(env, 15)
+    for actions in batches[:4]:
+        env.step(actions)
+    twin = pickle.loads(pickle.dumps(env))
+    for actions in batches[4:]:
+        one, other = env.step(actions), twin.step(actions)
+        for index in range(3):
+            np.testing.assert_array_equal(one[index], other[index])
+        assert [info.get("episode", {}).get("r") for info in one[3]] == [
+            info.get("episode", {}).get("r") for info in other[3]
+        ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"env_id": "Pendulum-v1"}, "env_id = 'Pendulum-v1': must be one of codrl_mj/Pendulum-v0"),
+        ({"env_id": "codrl_mj/Pendulum-v0", "num_envs": 0}, "num_envs = 0"),
+        ({"env_id": "codrl_mj/Pendulum-v0", "physics": "analytic"}, "physics = 'analytic'"),
+    ],
+)
+def test_bad_arguments_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        codrl_mj.make_sb3_vec_env(**arguments)
+
+
+def test_it_is_a_vec_env_of_the_registered_limit():
+    env = batched("pendulum", 2)
+    assert isinstance(env, ActuatedVecEnv)
+    assert env.num_envs == 2
+    env.reset()
+    dones = [env.step(np.zeros((2, 1), np.float32))[2].any() for _ in range(200)]
+    assert dones == [False] * 199 + [True]
