@@ -1,0 +1,139 @@
+"""Energy: what the supply gives is in the copper, in the winding's field, or in the moving masses.
+
+Three balances, each over a run with the motor in the loop, on MuJoCo and on Gymnasium's dynamics:
+
+- electrical: integral of u*i = integral of R*i^2 + L*i^2/2 + integral of kE*omega*i;
+- mechanical: the work of the shaft = change of kinetic and potential energy (no task has friction);
+- whole: integral of u*i = integral of R*i^2 + L*i^2/2 + change of kinetic and potential energy, which holds only
+  if what the back-EMF takes from the winding is what the shaft gives to the load: kE = kT, and one gear both ways. That
+  gear may be a wrong one, which is for the first two to see.
+
+A step of finite size balances only nearly: the residuals must vanish at the integrator's order, which is first for the
+Euler variants and for everything that the winding, which takes Euler steps, is part of. The mechanical balance under
+RK4 is of fourth order, because the work of a force held over a step is known exactly. It is checked without the motor,
+whose torques at one time depend on the step at first order, so that runs of two steps do not see the same forces.
+
+One balance holds at any step: an Euler step of the winding, times the mean current, is the identity
+(u - kE*omega - R*i) (i + i') dt/2 = L (i'^2 - i^2)/2. It is checked to rounding over whole episodes of the named
+actuators, bounds, walls and saturation included.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from codrl_mj.motor import Actuator, named_actuator
+from codrl_mj.motor.catalog import PAPER
+from codrl_mj.physics import SimulationDivergedError
+from codrl_mj.tasks import TASKS, Task
+from codrl_mj.validation.convergence import PHYSICS, analogue
+from codrl_mj.validation.free_runs import RUNS, commands
+from codrl_mj.validation.ledger import Ledger, keep
+from codrl_mj.validation.order import TOLERANCE, Family, order_check
+from codrl_mj.validation.outcome import Check, Curve, Plot
+from codrl_mj.validation.worst import worst_of
+
+ACTUATORS = ("paper", "weak", "weaker", "open_loop")
+"""Whose runs are balanced step by step."""
+
+_ENERGY = "MuJoCo's kinetic and potential energy (and Gymnasium's hill)"
+BALANCES = {
+    "electrical": "integral of u i = copper loss + L i^2/2 + integral of kE omega i",
+    "mechanical": f"the shaft's work = change of {_ENERGY}",
+    "whole": f"integral of u i = copper loss + L i^2/2 + change of {_ENERGY}",
+}
+"""Residuals of a `Ledger`, and what each balances."""
+
+
+def _identity_check(task: Task, quick: bool) -> Check:
+    """Tolerance 1e-13 of the energy supplied: the rounding of some ten operations a step."""
+    steps, found, samples = (20 if quick else 100), [], 0
+    for name in ACTUATORS:
+        actuator = named_actuator(name, task.name)
+        assert actuator is not None
+        generator = np.random.default_rng(5)
+        forces = task.max_force * generator.choice([-1.0, 1.0], steps)
+        start = task.initial(generator, None)
+        for label, kind in PHYSICS:
+            where = f"{name} actuator, {label}"
+            samples += steps * task.motor_inner_steps
+            try:
+                ledger = keep(kind, task, actuator, start, forces, task.motor_inner_steps, task.integrators[0], 1)
+            except SimulationDivergedError as error:
+                found.append((math.inf, f"{where}: {error}"))
+            else:
+                found.append((ledger.identity, where))
+    worst, where = worst_of(found)
+    oracle = "identity of one Euler step of the RL circuit"
+    return Check("winding, step by step", oracle, samples, worst, 1e-13, where, group="energy", task=task.name)
+
+
+def _balance_plot(task: Task, integrator: str, ledger: Ledger) -> Plot:
+    flows = {
+        "supplied: integral of u i": ledger.supplied,
+        "copper loss": ledger.copper,
+        "magnetic energy": ledger.magnetic,
+        "kinetic + potential energy": ledger.mechanical,
+        "residual": ledger.whole_residual,
+    }
+    curves = tuple(Curve(label, ledger.time, values) for label, values in flows.items())
+    title = f"{task.name} in MuJoCo, {integrator}: energy since the start, at the coarsest step"
+    return Plot(title, "time [s]", "energy [J]", curves)
+
+
+def _kept(task: Task, integrator: str, actuator: Actuator | None, counts: np.ndarray) -> dict[str, list[Ledger]]:
+    """Ledgers of the task's free run at every number of inner steps, all at the times of the coarsest."""
+    start, forces = np.array(RUNS[task.name].start), commands(task)[: RUNS[task.name].balanced_steps]
+    return {
+        label: [keep(kind, task, actuator, start, forces, int(count), integrator, int(counts[0])) for count in counts]
+        for label, kind in PHYSICS
+    }
+
+
+def _order_checks(task: Task, integrator: str, quick: bool) -> Iterator[Check]:
+    actuator = analogue(PAPER[task.name])
+    resolved = task.step_duration / (actuator.motor.electrical_time_constant / 25)
+    counts = 2 ** (math.ceil(math.log2(max(resolved, 64))) + np.arange(4 if quick else 5))
+    ledgers = _kept(task, integrator, actuator, counts)
+    ideal_counts = 2 ** np.arange(3, 7)  # finer ones reach rounding
+    for balance, oracle in BALANCES.items():
+        exact = (balance, integrator) == ("mechanical", "rk4")
+        kept, steps = (_kept(task, integrator, None, ideal_counts), ideal_counts) if exact else (ledgers, counts)
+        families = []
+        for label, of_steps in kept.items():
+            residuals = [float(np.abs(getattr(ledger, f"{balance}_residual")).max()) for ledger in of_steps]
+            families.append(Family(label, task.step_duration / steps, np.array(residuals)))
+        title = f"{task.name}, {integrator}: {balance} balance"
+        plot = Plot(title, "integration step [s]", "largest residual of the run [J]", ())
+        name = f"order, {balance} balance, {integrator}"
+        check = order_check(name, oracle, families, 4.0 if exact else 1.0, plot, "energy", task.name)
+        if balance == "whole":
+            over_time = _balance_plot(task, integrator, ledgers["MuJoCo"][0])
+            check = dataclasses.replace(check, plots=(*check.plots, over_time))
+        yield check
+
+
+def _diverged(task: Task, integrator: str, error: SimulationDivergedError) -> Check:
+    name = f"order of the balances, {integrator}"
+    return Check(name, "energy", 0, math.inf, TOLERANCE, str(error), group="energy", task=task.name, unit="slope")
+
+
+def checks(task_name: str | None, quick: bool = False) -> Iterator[Check]:
+    """The checks of energy.
+
+    Args:
+        task_name: the task; None checks all tasks.
+        quick: shorter runs, fewer and coarser steps.
+
+    Raises:
+        KeyError: no such task.
+    """
+    for task in TASKS.values() if task_name is None else [TASKS[task_name]]:
+        yield _identity_check(task, quick)
+        for integrator in task.integrators:
+            try:
+                yield from _order_checks(task, integrator, quick)
+            except SimulationDivergedError as error:
+                yield _diverged(task, integrator, error)

@@ -1,0 +1,71 @@
+"""Ways to make the simulation of a task wrong, for the tests of the checks that must notice."""
+
+import numpy as np
+
+from codrl_mj.physics import MujocoPhysics
+
+
+def wrong_model(monkeypatch, change):
+    """Every task's MuJoCo model has the change made to it once it was accepted: `change(model)`."""
+    make = MujocoPhysics.__init__
+
+    def make_wrong(self, *arguments, **options):
+        make(self, *arguments, **options)
+        change(self.model)
+
+    monkeypatch.setattr(MujocoPhysics, "__init__", make_wrong)
+
+
+def scaled_motor(entry, factor):
+    """A change that scales one parameter of the motor, where there is one."""
+
+    def change(model):
+        if model.nuser_actuator:
+            model.actuator_user[:, entry] *= factor
+
+    return change
+
+
+def scaled(field, factor):
+    """A change that scales an array of the model."""
+
+    def change(model):
+        getattr(model, field)[:] *= factor
+
+    return change
+
+
+def late_force(monkeypatch):
+    """MuJoCo gets every command one environment step late."""
+    step, reset = MujocoPhysics.step, MujocoPhysics.reset
+
+    def late(self, desired_force):
+        force, self.waiting = self.waiting, desired_force
+        return step(self, force)
+
+    def forget(self, *arguments):
+        self.waiting = 0.0
+        reset(self, *arguments)
+
+    monkeypatch.setattr(MujocoPhysics, "step", late)
+    monkeypatch.setattr(MujocoPhysics, "reset", forget)
+
+
+def failed(checks):
+    """Names of the checks that failed."""
+    return {check.name for check in checks if not check.passed}
+
+
+def looks_complete(check, group, task):
+    """Whether a check says all that a report shows: where, unit, and plots with labelled units."""
+    assert check.group == group
+    assert check.task == task
+    assert check.where
+    assert check.samples > 0
+    for plot in check.plots:
+        assert plot.title
+        assert "[" in plot.x_label
+        assert "[" in plot.y_label
+        assert all(len(curve.x) == len(curve.y) > 2 for curve in plot.curves)
+        assert all(np.isfinite(curve.y).all() for curve in plot.curves)
+    return True

@@ -1,0 +1,163 @@
+"""The checks of convergence pass, and every one of them fails when the physics are made wrong."""
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+
+from codrl_mj import TASKS
+from codrl_mj.motor.catalog import PAPER
+from codrl_mj.motor.parameters import BACK_EMF_CONSTANT, INDUCTANCE, RESISTANCE, TORQUE_CONSTANT
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics
+from codrl_mj.validation import convergence
+from codrl_mj.validation.continuous import Solution, gymnasium_equations, solve
+from codrl_mj.validation.free_runs import RUNS, commands
+from tests.reference import cartpole_accelerations
+from tests.validation.mutations import failed, late_force, looks_complete, scaled, scaled_motor, wrong_model
+
+pytestmark = pytest.mark.usefixtures("bare_engine")
+
+RATE = "rate in the loop's bandwidth"
+
+
+def ideal(task):
+    return {f"order, {integrator}, ideal actuator" for integrator in TASKS[task].integrators}
+
+
+def with_motor(task):
+    return {f"order, {integrator}, motor in the loop" for integrator in TASKS[task].integrators}
+
+
+def failures(task):
+    return failed(convergence.checks(task, quick=True))
+
+
+@pytest.mark.parametrize("task", list(TASKS))
+def test_every_check_passes_and_can_be_looked_at(task):
+    checks = list(convergence.checks(task, quick=True))
+    assert {check.name for check in checks} == ideal(task) | with_motor(task) | {RATE}
+    for check in checks:
+        assert check.passed, check
+        assert looks_complete(check, "convergence", task)
+        assert check.unit == "slope"
+        assert check.plots[0].curves[-1].reference
+
+
+def test_all_tasks_are_checked_at_once(monkeypatch):
+    monkeypatch.setattr(convergence, "solve", lambda *_: Solution(np.zeros(0), np.zeros(0)))
+    monkeypatch.setattr(convergence, "_order_check", lambda task, *_: task.name)
+    monkeypatch.setattr(convergence, "_bandwidth_check", lambda task, *_: task.name)
+    assert set(convergence.checks(None, quick=True)) == set(TASKS)
+
+
+# -- it can fail --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("task", list(TASKS))
+def test_a_mass_off_by_a_hundredth_fails_every_check(monkeypatch, task):
+    wrong_model(monkeypatch, scaled("body_mass", 1.01))
+    assert failures(task) == ideal(task) | with_motor(task) | {RATE}
+
+
+@pytest.mark.parametrize("task", ["pendulum", "acrobot"])
+def test_a_gear_off_by_a_hundredth_fails_every_check_of_its_motor(monkeypatch, task):
+    wrong_model(monkeypatch, scaled("actuator_gear", 1.01))
+    assert failures(task) >= with_motor(task) | {RATE}
+
+
+@pytest.mark.parametrize(
+    ("parameter", "factor"),
+    [(INDUCTANCE, 1.05), (RESISTANCE, 1.05), (TORQUE_CONSTANT, 1.05), (BACK_EMF_CONSTANT, -1.0)],
+    ids=["inductance", "resistance", "torque constant", "back-EMF sign"],
+)
+def test_a_wrong_motor_fails_the_check_with_the_motor(monkeypatch, parameter, factor):
+    wrong_model(monkeypatch, scaled_motor(parameter, factor))
+    assert with_motor("pendulum") <= failures("pendulum") <= with_motor("pendulum") | {RATE}
+
+
+def test_an_euler_step_in_place_of_rk4_fails_the_ideal_check(monkeypatch):
+    def euler(model):
+        model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+
+    wrong_model(monkeypatch, euler)
+    assert ideal("acrobot") <= failures("acrobot")
+
+
+@pytest.mark.parametrize("task", ["pendulum", "mountain_car"])
+def test_a_force_that_is_a_step_late_fails_every_check(monkeypatch, task):
+    late_force(monkeypatch)
+    assert failures(task) == ideal(task) | with_motor(task) | {RATE}
+
+
+def test_a_wrong_force_on_the_analytic_physics_fails_every_check(monkeypatch):
+    step = AnalyticPhysics.step
+    monkeypatch.setattr(AnalyticPhysics, "step", lambda self, force: step(self, 1.01 * force))
+    assert ideal("cartpole") | with_motor("cartpole") <= failures("cartpole")
+
+
+def test_a_run_that_diverges_is_a_failed_check(monkeypatch):
+    wrong_model(monkeypatch, scaled("actuator_gear", 1e9))
+    assert failures("pendulum") == ideal("pendulum") | with_motor("pendulum") | {RATE}
+
+
+# -- the oracle ---------------------------------------------------------------------------------------------
+
+
+def test_the_oracle_is_the_installed_gymnasium(monkeypatch):
+    """A change of Gymnasium's own equations moves the oracle and the analytic physics: MuJoCo is what then differs."""
+    make = gymnasium.envs.classic_control.CartPoleEnv.__init__
+
+    def lighter(self, *arguments, **options):
+        make(self, *arguments, **options)
+        self.gravity *= 0.99
+
+    monkeypatch.setattr(gymnasium.envs.classic_control.CartPoleEnv, "__init__", lighter)
+    checks = [check for check in convergence.checks("cartpole", quick=True) if "ideal" in check.name]
+    assert checks
+    for check in checks:
+        assert not check.passed
+        assert check.where.startswith("MuJoCo")
+
+
+def test_the_equations_are_the_textbooks():
+    generator = np.random.default_rng(0)
+    pendulum, cartpole = (gymnasium_equations(TASKS[name]) for name in ("pendulum", "cartpole"))
+    car = gymnasium_equations(TASKS["mountain_car_continuous"])
+    for _ in range(20):
+        angle, speed, force = generator.uniform(-2, 2, 3)
+        expected = [speed, 15.0 * np.sin(angle) + 3.0 * force]
+        np.testing.assert_allclose(pendulum(np.array([angle, speed]), force), expected, rtol=0, atol=1e-11)
+        accelerations = cartpole_accelerations(angle, speed, force)
+        expected = [0.1, accelerations[0], speed, accelerations[1]]
+        np.testing.assert_allclose(cartpole(np.array([0.0, 0.1, angle, speed]), force), expected, rtol=0, atol=1e-11)
+        x, v = generator.uniform(-0.9, 0.3), generator.uniform(-0.02, 0.02)
+        expected = [v, 0.0015 * force / 2 - 0.0025 * np.cos(3 * x)]
+        np.testing.assert_allclose(car(np.array([x, v]), force / 2), expected, rtol=0, atol=1e-14)
+
+
+def test_acrobots_equations_are_the_limit_of_its_steps():
+    task = TASKS["acrobot"]
+    equations, state = gymnasium_equations(task), np.array([0.3, -0.7, 0.9, -1.1])
+    physics = AnalyticPhysics(task, None, 2000, "rk4")
+    physics.inner_steps = 1
+    physics.reset(state)
+    physics.step(1.0)
+    np.testing.assert_allclose((physics.state - state) / 1e-4, equations(state, 1.0), rtol=0, atol=2e-3)
+
+
+@pytest.mark.parametrize("motor", [False, True], ids=["ideal", "motor"])
+@pytest.mark.parametrize("task", [task for task in TASKS if TASKS[task].constrain is not None])
+def test_the_runs_stay_away_from_every_bound(task, motor):
+    """Solution and coarsest run, at every integration step of it."""
+    definition, start = TASKS[task], np.array(RUNS[task].start)
+    actuator = convergence.analogue(PAPER[task]) if motor else None
+    states = [*solve(definition, start, commands(definition), actuator).states]
+    keep, kept = definition.constrain, []
+    physics = MujocoPhysics(definition, actuator, 128, definition.integrators[0])
+    physics._constrain = lambda qpos, qvel, _: kept.append((*qpos[0], *qvel[0]))
+    physics.reset(start)
+    for force in commands(definition):
+        physics.step(force)
+    assert len(kept) == 128 * RUNS[task].steps
+    states = np.array(states + kept)
+    np.testing.assert_array_equal(keep(states, definition.step_duration / 16), states)

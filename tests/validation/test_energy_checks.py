@@ -1,0 +1,162 @@
+"""The energy balances close, and every one of them fails when the physics are made wrong."""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+import pytest
+
+from codrl_mj import TASKS
+from codrl_mj.motor.catalog import PAPER
+from codrl_mj.motor.parameters import BACK_EMF_CONSTANT, INDUCTANCE, RESISTANCE, TORQUE_CONSTANT
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError
+from codrl_mj.validation import energy
+from codrl_mj.validation.ledger import HILL_TASKS, Meter, hill_potential, keep
+from tests.validation.mutations import failed, looks_complete, scaled, scaled_motor, wrong_model
+
+pytestmark = pytest.mark.usefixtures("bare_engine")
+
+STEPS = "winding, step by step"
+
+
+def orders(task, *balances):
+    return {f"order, {balance} balance, {name}" for balance in balances for name in TASKS[task].integrators}
+
+
+def failures(task):
+    return failed(energy.checks(task, quick=True))
+
+
+@pytest.mark.parametrize("task", list(TASKS))
+def test_every_check_passes_and_can_be_looked_at(task):
+    checks = list(energy.checks(task, quick=True))
+    assert {check.name for check in checks} == {STEPS} | orders(task, "electrical", "mechanical", "whole")
+    for check in checks:
+        assert check.passed, check
+        assert looks_complete(check, "energy", task)
+    whole = next(check for check in checks if "whole" in check.name)
+    assert whole.plots[1].y_label == "energy [J]"
+
+
+# -- it can fail --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("parameter", [INDUCTANCE, RESISTANCE], ids=["inductance", "resistance"])
+def test_a_wrong_winding_fails_the_electrical_and_the_whole_balance(monkeypatch, parameter):
+    wrong_model(monkeypatch, scaled_motor(parameter, 1.01))
+    assert failures("pendulum") == {STEPS} | orders("pendulum", "electrical", "whole")
+
+
+@pytest.mark.parametrize("task", ["pendulum", "mountain_car"])
+def test_a_back_emf_of_the_wrong_sign_fails_the_electrical_and_the_whole_balance(monkeypatch, task):
+    wrong_model(monkeypatch, scaled_motor(BACK_EMF_CONSTANT, -1.0))
+    assert failures(task) >= {STEPS} | orders(task, "electrical", "whole")
+
+
+def test_a_torque_constant_that_is_not_the_back_emf_constant_fails_the_whole_balance(monkeypatch):
+    wrong_model(monkeypatch, scaled_motor(TORQUE_CONSTANT, 1.02))
+    assert failures("pendulum") == orders("pendulum", "mechanical", "whole")
+
+
+def test_a_wrong_gear_fails_all_but_the_whole_balance(monkeypatch):
+    """Speed and torque are both off: the energy is that of another gear, and none is lost."""
+    wrong_model(monkeypatch, scaled("actuator_gear", 1.02))
+    assert failures("pendulum") == {STEPS} | orders("pendulum", "electrical", "mechanical")
+
+
+@pytest.mark.parametrize("task", ["pendulum", "acrobot"])
+def test_a_wrong_mass_fails_the_mechanical_balance(monkeypatch, task):
+    wrong_model(monkeypatch, scaled("body_mass", 1.05))
+    assert failures(task) >= orders(task, "mechanical")
+
+
+@pytest.mark.parametrize("task", HILL_TASKS)
+def test_a_steeper_hill_fails_the_mechanical_balance(monkeypatch, task):
+    def steeper(model):
+        model.jnt_user[0, 1] *= 1.02
+
+    wrong_model(monkeypatch, steeper)
+    assert failures(task) >= orders(task, "mechanical")
+
+
+def test_friction_that_nobody_asked_for_fails_the_mechanical_and_the_whole_balance(monkeypatch):
+    def rusty(model):
+        model.dof_damping[:] = 0.05
+
+    wrong_model(monkeypatch, rusty)
+    assert failures("pendulum") == orders("pendulum", "mechanical", "whole")
+
+
+def test_an_euler_step_in_place_of_rk4_fails_the_mechanical_balance(monkeypatch):
+    def euler(model):
+        model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+
+    wrong_model(monkeypatch, euler)
+    assert failures("acrobot") >= orders("acrobot", "mechanical")
+
+
+def test_a_wrong_force_on_the_analytic_physics_fails(monkeypatch):
+    """It delivers what it says it delivers, but 2 % more acts."""
+    make = AnalyticPhysics.__init__
+
+    def stronger(self, *arguments, **options):
+        make(self, *arguments, **options)
+        drive = self._driver
+
+        class Stronger:
+            speed = drive.speed
+
+            def __call__(self, state, force, timestep, integrator):
+                return drive(state, 1.02 * force, timestep, integrator)
+
+        self._driver = Stronger()
+
+    monkeypatch.setattr(AnalyticPhysics, "__init__", stronger)
+    checks = {check.name: check for check in energy.checks("pendulum", quick=True) if not check.passed}
+    assert checks.keys() == orders("pendulum", "mechanical", "whole")
+    assert all(check.where.startswith("analytic") for check in checks.values())
+
+
+def test_a_run_that_diverges_is_a_failed_check(monkeypatch):
+    def diverge(self, force):
+        raise SimulationDivergedError("it diverged")
+
+    monkeypatch.setattr(MujocoPhysics, "step", diverge)
+    checks = list(energy.checks("pendulum", quick=True))
+    assert len(checks) == 2
+    assert all(not check.passed and "it diverged" in check.where for check in checks)
+
+
+# -- the ledger ---------------------------------------------------------------------------------------------
+
+
+def test_the_meter_reads_textbook_energies():
+    generator = np.random.default_rng(0)
+    pendulum, cartpole = Meter(TASKS["pendulum"]), Meter(TASKS["cartpole"])
+    for _ in range(10):
+        x, v, angle, speed = generator.uniform(-2, 2, 4)
+        expected = speed**2 / 6 + 5 * np.cos(angle)  # a rod of 1 kg and 1 m: I = 1/3
+        assert pendulum(np.array([angle, speed])) == pytest.approx(expected, abs=1e-4)  # 1e-5 kg*m^2 about its length
+        kinetic = 0.55 * v**2 + 0.05 * v * speed * np.cos(angle) + (0.1 * 1.0 / 3) * speed**2 / 2
+        difference = cartpole(np.array([x, v, angle, speed])) - cartpole(np.zeros(4))
+        assert difference == pytest.approx(kinetic + 0.1 * 9.8 * 0.5 * (np.cos(angle) - 1), abs=1e-12)
+
+
+@pytest.mark.parametrize("task", HILL_TASKS)
+def test_the_hills_potential_is_the_integral_of_gymnasiums_force(task):
+    potential = hill_potential(TASKS[task], 2.0)
+    x = np.linspace(-1.0, 0.4, 29)
+    expected = 2.0 * 0.0025 / 3 * np.sin(3 * x)
+    measured = potential(x)
+    np.testing.assert_allclose(measured - measured[0], expected - expected[0], rtol=0, atol=1e-14)
+
+
+def test_a_loaded_spring_of_a_motor_pays_for_everything():
+    """Signs: a motor that accelerates a load draws more than it heats; what it gives back is negative."""
+    task = TASKS["mountain_car"]
+    actuator = dataclasses.replace(PAPER["mountain_car"])
+    ledger = keep(MujocoPhysics, task, actuator, np.array([-0.5, 0.0]), np.ones(20), 20, "semi-implicit", 20)
+    assert ledger.supplied[-1] > ledger.copper[-1] > 0
+    assert ledger.magnetic[-1] > 0
+    assert ledger.shaft[-1] > 0
+    assert abs(ledger.whole_residual[-1]) < 0.05 * ledger.supplied[-1]

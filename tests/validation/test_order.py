@@ -1,0 +1,62 @@
+"""Slopes are fitted with honest intervals, and a check of an order fails on what is not of that order."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import optimize
+
+from codrl_mj.validation.order import Family, fit_slope, order_check
+from codrl_mj.validation.outcome import Plot
+from codrl_mj.validation.worst import worst_of
+
+STEPS = 0.1 / 2.0 ** np.arange(5)
+PLOT = Plot("title", "step [s]", "error [m]", ())
+
+
+def check(errors, promised):
+    return order_check("name", "oracle", [Family("family", STEPS, np.asarray(errors))], promised, PLOT, "group", "task")
+
+
+@pytest.mark.parametrize("order", [1.0, 4.0, -1.0])
+def test_a_pure_power_has_its_exponent_and_no_interval(order):
+    slope = fit_slope(STEPS, 3.0 * STEPS**order)
+    assert slope.value == pytest.approx(order)
+    assert slope.half_width < 1e-10
+    assert check(3.0 * STEPS**order, order).passed
+
+
+def test_the_interval_is_that_of_scipys_curve_fit():
+    errors = STEPS * np.array([1.1, 0.9, 1.05, 0.97, 1.2])
+    _, covariance = optimize.curve_fit(lambda x, a, b: a * x + b, np.log(STEPS), np.log(errors))
+    assert fit_slope(STEPS, errors).half_width == pytest.approx(3.182446 * math.sqrt(covariance[0, 0]), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "errors",
+    [STEPS**2, STEPS + 0.02, np.full(5, 1e-3), [*STEPS[:4], math.nan], [*STEPS[:4], 0.0], [*STEPS[:4], math.inf]],
+    ids=["another order", "an offset", "constant", "nan", "zero", "infinite"],
+)
+def test_what_is_not_of_the_promised_order_fails(errors):
+    assert not check(errors, 1.0).passed
+
+
+def test_a_scattered_fit_fails_though_its_slope_is_right():
+    errors = STEPS * np.array([1.0, 1.5, 0.6, 1.5, 1.0])
+    assert fit_slope(STEPS, errors).value == pytest.approx(1.0, abs=0.1)
+    assert not check(errors, 1.0).passed
+
+
+def test_the_promised_slope_is_drawn_beside_the_errors():
+    (plot,) = check(2 * STEPS, 1.0).plots
+    assert plot.x_log
+    assert plot.y_log
+    measured, promise = plot.curves
+    assert promise.reference
+    assert not measured.reference
+    np.testing.assert_allclose(promise.y, measured.y)
+
+
+def test_the_worst_is_the_largest_and_a_nan_is_larger_than_anything():
+    assert worst_of([(1.0, "a"), (3.0, "b"), (2.0, "c")]) == (3.0, "b")
+    assert worst_of([(math.inf, "a"), (math.nan, "b"), (2.0, "c")])[1] == "b"
