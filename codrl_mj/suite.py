@@ -133,10 +133,12 @@ class GymTask(control.Task):
         self.setup = setup
         self.random = random
         self._before: np.ndarray = np.zeros(0)
+        self.randomization: dict[str, Any] = {}  # what was drawn for the episode
 
     def initialize_episode(self, physics: Physics) -> None:
         """Draw the initial state; the motor is at rest."""
-        physics.simulation.reset(self.setup.task.initial(self.random, None))
+        _, info = self.setup.start(physics.simulation, self.random, None)
+        self.randomization = info.get("randomization", {})
         physics.signals = None
         self._before = physics.simulation.state
 
@@ -202,8 +204,9 @@ def load(
         actuator: as for `codrl_mj.envs.ActuatedEnv`.
         task_kwargs: `random`: a seed or a `numpy.random.Generator` for the initial states.
         environment_kwargs: arguments of `dm_control.rl.control.Environment`, such as `flat_observation`.
-        **options: `integrator`, `inner_steps`, `timestep`, `allow_unstable`, `action`, `levels`, `observe_actuator` and
-            the task's own options, as for `codrl_mj.envs.ActuatedEnv`.
+        **options: `integrator`, `inner_steps`, `timestep`, `allow_unstable`, `action`, `levels`, `observe_actuator`,
+            `randomize` and the task's own options, as for `codrl_mj.envs.ActuatedEnv`. What was drawn for an episode is
+            in the attribute `randomization` of the environment's task.
 
     Returns:
         The environment. An episode ends with discount 0 where the task says so and with discount 1 at the time limit,

@@ -46,6 +46,11 @@ class ActuatedVecEnv(VecEnv):
         """The actuators' signals of the last step, each an array of shape (N,); None before the first."""
         return self.env.signals
 
+    @property
+    def randomization(self) -> dict[str, np.ndarray]:
+        """What the present episodes were drawn with, each an array of shape (N,); empty if nothing is randomised."""
+        return self.env.randomization
+
     def step_async(self, actions: np.ndarray) -> None:
         """Take the actions of the next step."""
         self._actions = actions

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from codrl_mj.distributions import Distribution
+from codrl_mj.envs.randomization import Randomization, nominal_parameters
 from codrl_mj.motor import Actuator, CurrentLoop, check_stable, resolve
 from codrl_mj.physics import PHYSICS, AnalyticPhysics, MujocoPhysics, Physics, Signals
 from codrl_mj.physics.base import check_integrator, inner_step_count
@@ -36,6 +38,8 @@ class Setup:
     """Commands [A or V] that a discrete task's actions choose from; None where the action is the command."""
     observe_actuator: bool
     """Whether the observation ends with measured and reference current."""
+    randomization: Randomization | None = None
+    """What is drawn at every reset; None if nothing is."""
 
     @classmethod
     def build(
@@ -49,6 +53,7 @@ class Setup:
         action: str = "force",
         levels: Sequence[float] | None = None,
         observe_actuator: bool = False,
+        randomize: Mapping[str, Distribution] | None = None,
         **options: float,
     ) -> "Setup":
         """Resolve and check the arguments of an environment; `codrl_mj.envs.ActuatedEnv` says what they are.
@@ -61,6 +66,10 @@ class Setup:
         count = inner_step_count(definition, resolved, inner_steps, timestep)
         if resolved is None and observe_actuator:
             raise ValueError("observe_actuator=True: the ideal actuator has no current to observe; choose another")
+        timestep = definition.step_duration / count
+        randomization = None
+        if randomize is not None:
+            randomization = Randomization.build(randomize, definition.name, resolved, action, timestep, allow_unstable)
         setup = cls(
             task=definition,
             actuator=resolved,
@@ -70,9 +79,11 @@ class Setup:
             command=action,
             levels=_levels(definition, resolved, action, levels),
             observe_actuator=observe_actuator,
+            randomization=randomization,
         )
-        if setup.physical_actuator is not None and not allow_unstable:
-            check_stable(setup.physical_actuator, definition.step_duration / count)
+        drawn = randomization is not None and randomization.draws_actuator  # then every draw is checked
+        if setup.physical_actuator is not None and not allow_unstable and not drawn:
+            check_stable(setup.physical_actuator, timestep)
         return setup
 
     def simulate(self, physics: str) -> Physics:
@@ -86,8 +97,47 @@ class Setup:
         if physics == "mujoco":
             return MujocoPhysics(*arguments, max_force=self.max_force)
         if physics == "analytic":
+            if self.randomization is not None and self.randomization.variation is not None:
+                names = ", ".join(self.randomization.variation.names)
+                raise ValueError(
+                    f"physics = 'analytic': cannot draw {names}: Gymnasium's environments share no names for masses, "
+                    "lengths and gravity, and have no damping; use physics='mujoco'"
+                )
             return AnalyticPhysics(*arguments)
         raise ValueError(f"physics = {physics!r}: must be one of {', '.join(PHYSICS)}")
+
+    def start(
+        self, physics: Physics, generator: np.random.Generator, options: dict[str, Any] | None
+    ) -> tuple[Actuator | None, dict[str, Any]]:
+        """Start an episode: draw the initial state and then, if anything is randomised, actuator and model.
+
+        Args:
+            physics: what `simulate` returned.
+            generator: draws both.
+            options: reset options of the task.
+
+        Returns:
+            The episode's actuator, and what `info` says of the draw; empty if nothing is randomised.
+
+        Raises:
+            ValueError: no stable current loop was drawn.
+        """
+        initial = self.task.initial(generator, options)
+        actuator, info = self.actuator, {}
+        if self.randomization is not None:
+            physical = self.physical_actuator
+            nominal, arms = nominal_parameters([] if physical is None else [physical])
+            values, rejected = self.randomization.draw(
+                lambda rows, count: generator.random((len(rows), count)), nominal, arms
+            )
+            if self.randomization.draws_actuator and actuator is not None and physical is not None:
+                actuator = self.randomization.actuator(actuator, values[0])
+                physics.set_actuator(self.randomization.actuator(physical, values[0]))
+            if isinstance(physics, MujocoPhysics) and self.randomization.variation is not None:
+                physics.set_model(self.randomization.model_fields(values, drawn=True))
+            info = {"randomization": self.randomization.report(values[0], rejected[0])}
+        physics.reset(initial)
+        return actuator, info
 
     @property
     def physical_actuator(self) -> Actuator | None:

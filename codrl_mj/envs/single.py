@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from codrl_mj.distributions import Distribution
 from codrl_mj.envs.setup import Setup
 from codrl_mj.motor import Actuator
 from codrl_mj.physics import MujocoPhysics
@@ -39,6 +40,7 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
         action: str = "force",
         levels: Sequence[float] | None = None,
         observe_actuator: bool = False,
+        randomize: Mapping[str, Distribution] | None = None,
         render_mode: str | None = None,
         width: int = 480,
         height: int = 480,
@@ -62,6 +64,10 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
                 terminal `voltage` [V] past the controller (end to end).
             levels: for discrete tasks with `action="current"` or `"voltage"`: the commands that actions choose from.
             observe_actuator: append measured and reference current [A] to the observation.
+            randomize: what to draw at every reset, after the initial state: names of fields of the actuator
+                (`motor.inductance`, `controller.kp`) and the model (`model.mass.BODY`, `model.length.BODY`,
+                `model.gravity`, `model.damping.JOINT`), each with a `Uniform`, `LogUniform` or `Choice`. What was drawn
+                is in the reset's `info["randomization"]`.
             render_mode: None or `rgb_array`.
             width: width of rendered images [px].
             height: height of rendered images [px].
@@ -83,11 +89,13 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
             action=action,
             levels=levels,
             observe_actuator=observe_actuator,
+            randomize=randomize,
             **options,
         )
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode = {render_mode!r}: must be None or 'rgb_array'")
         self.physics = self.setup.simulate(physics)
+        self._actuator = self.setup.actuator
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.setup.task.render_fps}
         self._view = {"width": width, "height": height, "camera": camera, "pretty": pretty}
@@ -105,8 +113,8 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
 
     @property
     def actuator(self) -> Actuator | None:
-        """The actuator; None is the ideal one."""
-        return self.setup.actuator
+        """The actuator, of the present episode where it is drawn; None is the ideal one."""
+        return self._actuator
 
     @property
     def model(self) -> Any:
@@ -138,8 +146,8 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
             options: Gymnasium's reset options for the task (CartPole: the bounds `low` and `high`).
         """
         super().reset(seed=seed)
-        self.physics.reset(self.setup.task.initial(self.np_random, options))
-        return self.setup.observation(self.physics.state, None), {}
+        self._actuator, info = self.setup.start(self.physics, self.np_random, options)
+        return self.setup.observation(self.physics.state, None), info
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advance by one environment step.

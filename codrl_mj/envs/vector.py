@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from codrl_mj.envs.draws import Draws
 from codrl_mj.envs.setup import Setup
 from codrl_mj.motor import Actuator
 from codrl_mj.physics import Signals
@@ -108,6 +109,9 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._streams = Streams(self.num_envs)
+        self._draws = None
+        if self.setup.randomization is not None:
+            self._draws = Draws(self.setup.randomization, self.physics, actuators or [])
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
         self._ended = np.zeros(self.num_envs, dtype=bool)
         self._observations: Array = np.zeros(self.observation_space.shape or (), dtype=np.float32)
@@ -127,6 +131,11 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
     def state(self) -> Array:
         """Mechanical states, shape (N, n), float64, in Gymnasium's order."""
         return self.physics.state
+
+    @property
+    def randomization(self) -> dict[str, Array]:
+        """What the present episodes were drawn with: shape (N,) for every field, and how many sets were `rejected`."""
+        return {} if self._draws is None else self._draws.present()
 
     @property  # type: ignore[misc]
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
@@ -162,18 +171,24 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         chosen = [seeds[row] for row in rows.tolist()]
         if any(one is not None for one in chosen):
             self._streams.seed(rows, chosen)
-        self._restart(rows, options or None)
-        return self._observations.copy(), {}
+        infos = self._restart(rows, options or None)
+        return self._observations.copy(), infos
 
-    def _restart(self, rows: Array, options: dict[str, Any] | None) -> None:
-        """Start episodes in some environments; their observations are in `_observations` then."""
+    def _restart(self, rows: Array, options: dict[str, Any] | None) -> dict[str, Any]:
+        """Start episodes in some environments; their observations are in `_observations` then.
+
+        Returns:
+            The infos of the reset: what was drawn.
+        """
         low, high = self.setup.task.initial_bounds(options)
         draws = low + (high - low) * self._streams.random(rows, len(low))
         states = self.setup.task.initial_state(draws)
+        infos = {} if self._draws is None else self._draws.draw(self._streams, rows)
         self.physics.reset(rows, states)
         self._observations[rows] = self.setup.observation(states, None)
         self._elapsed[rows] = 0
         self._ended[rows] = False
+        return infos
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Advance every environment by one step.
@@ -216,7 +231,7 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         self._observations = self.setup.observation(after, signals)
         infos = _infos(signals, stepping)
         if not stepping.all():
-            self._restart(np.flatnonzero(~stepping), None)
+            infos |= self._restart(np.flatnonzero(~stepping), None)
         self._ended = terminated | truncated
         if self.autoreset_mode == AutoresetMode.SAME_STEP and self._ended.any():
             infos = self._finish(infos)
@@ -236,13 +251,14 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
             if not ended.all():
                 kept = np.where(ended, np.zeros((), infos[name].dtype), infos[name])
                 remaining[name], remaining[f"_{name}"] = kept, ~ended
-        self._restart(rows, None)
+        drawn = self._restart(rows, None)
         return {
             "final_obs": final_obs,
             "_final_obs": ended.copy(),
             "final_info": final,
             "_final_info": ended.copy(),
             **remaining,
+            **drawn,
         }
 
     def snapshot(self) -> dict[str, Array]:
@@ -253,7 +269,7 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
             "elapsed": self._elapsed.copy(),
             "ended": self._ended.copy(),
             "observations": self._observations.copy(),
-        }
+        } | ({} if self._draws is None else self._draws.snapshot())
 
     def restore(self, snapshot: Mapping[str, Array]) -> None:
         """Continue from what `snapshot` returned, bit for bit.
@@ -265,6 +281,8 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
             if name not in snapshot or snapshot[name].shape != value.shape:
                 found = "missing" if name not in snapshot else f"of shape {snapshot[name].shape}"
                 raise ValueError(f"snapshot[{name!r}] is {found}: must be of shape {value.shape}")
+        if self._draws is not None:
+            self._draws.restore(snapshot)
         self.physics.restore(snapshot["physics"])
         self._streams.set_state(snapshot["streams"])
         self._elapsed[:], self._ended[:] = snapshot["elapsed"], snapshot["ended"]
@@ -282,6 +300,8 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         if self._renderer is None:
             self._renderer = OffscreenRenderer(self.physics.model, **self._view)  # type: ignore[arg-type]
             self._data = mujoco.MjData(self.physics.model)
+        if self._draws is not None:
+            self._draws.show(0)
         self.physics.show(0, self._data)
         return self._renderer.render(self._data)
 

@@ -168,6 +168,12 @@ class AnalyticPhysics:
         self._parameters = None if actuator is None else to_vector(actuator)
         self.reset(np.zeros(len(task.state_names)))
 
+    def set_actuator(self, actuator: Actuator) -> None:
+        """Exchange the motor for another; to be followed by a reset. An ideal actuator cannot be exchanged."""
+        assert self.actuator is not None
+        self.actuator = actuator
+        self._parameters = to_vector(actuator)
+
     def reset(self, state: np.ndarray) -> None:
         """Start an episode from `state`, with the motor at rest."""
         self.state = np.array(state, dtype=np.float64)

@@ -52,6 +52,9 @@ class Physics(Protocol):
     def state(self) -> np.ndarray:
         """The mechanical state in the task's order, shape (n,), float64; not changed by later steps."""
 
+    def set_actuator(self, actuator: Actuator) -> None:
+        """Exchange the motor for another; to be followed by a reset. An ideal actuator cannot be exchanged."""
+
     def reset(self, state: np.ndarray) -> None:
         """Start an episode from `state`, with the motor at rest: no current, no integral, no past error."""
 

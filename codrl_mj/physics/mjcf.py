@@ -122,14 +122,17 @@ def install_callbacks(model: mujoco.MjModel) -> None:
 
 
 def task_model(
-    task: Task, actuator: Actuator | None, timestep: float, max_force: float | None = None
+    task: Task, actuator: Actuator | None, timestep: float, max_force: float | None = None, explicit: bool = False
 ) -> mujoco.MjModel:
     """Compile a task's model with the given actuator, integration step and force limit (the task's by default).
 
-    A diverging simulation is left to diverge, so that it can be reported, instead of being reset by the engine.
+    A diverging simulation is left to diverge, so that it can be reported, instead of being reset by the engine. Where
+    the Euler integrator is made `explicit`, joint damping is explicit too.
     """
     spec = mujoco.MjSpec.from_file(str(asset_path(task.asset)))
     spec.option.timestep = timestep
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    if explicit:
+        spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     set_actuator(spec.actuator("motor"), actuator, task.max_force if max_force is None else max_force)
     return spec.compile()

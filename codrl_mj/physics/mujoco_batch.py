@@ -1,6 +1,6 @@
 """Many simulations of a task in MuJoCo at once, on the engine's own thread pool."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -9,6 +9,7 @@ from mujoco.batch import Batch
 
 from codrl_mj.callbacks.kernels import CURRENT, VOLTAGE
 from codrl_mj.motor import Actuator, to_vector
+from codrl_mj.motor.parameters import MAX_VOLTAGE, TORQUE_CONSTANT
 from codrl_mj.physics.base import LARGEST, Signals, SimulationDivergedError
 from codrl_mj.physics.constrain import compiled_constrain
 from codrl_mj.physics.mjcf import install_callbacks, task_model
@@ -46,8 +47,12 @@ class MujocoBatchPhysics:
         self.inner_steps = inner_steps
         self.max_force = task.max_force if max_force is None else max_force
         self._explicit = integrator == "euler"
-        self.model = task_model(task, actuators[0] if actuators else None, task.step_duration / inner_steps, max_force)
+        self.model = task_model(
+            task, actuators[0] if actuators else None, task.step_duration / inner_steps, max_force, self._explicit
+        )
+        self.num_envs = num_envs
         self._size = num_envs, num_threads
+        self._varied = False  # whether the models differ in more than their actuators
         self._fields: dict[str, np.ndarray] = {}
         self._make_batch()
         self._rest = self._batch.state[0].copy()  # a simulation just reset, motor at rest
@@ -84,18 +89,42 @@ class MujocoBatchPhysics:
         self._make_batch()
         for name, values in fields.items():
             self.field(name)[:] = values
+        if self._varied:
+            self._batch.set_const()
         self.restore(rows)
 
     def set_actuators(self, rows: np.ndarray, actuators: Sequence[Actuator]) -> None:
         """Give some simulations other motors; to be followed by a reset of them."""
+        vectors = np.array([to_vector(actuator) for actuator in actuators])
+        self.set_parameters(rows, vectors, np.array([actuator.motor.arm_radius for actuator in actuators]))
+
+    def set_parameters(self, rows: np.ndarray, vectors: np.ndarray, arms: np.ndarray) -> None:
+        """Do what `set_actuators` does, with actuators as arrays.
+
+        Args:
+            rows: indices of simulations, shape (m,).
+            vectors: parameter vectors, shape (m, p), as `codrl_mj.motor.to_vector` makes them.
+            arms: arms [m], shape (m,).
+        """
         user, gear, limits = map(self.field, ("actuator_user", "actuator_gear", "actuator_ctrlrange"))
-        arm = np.array([actuator.motor.arm_radius for actuator in actuators])
-        user[rows, 0] = np.array([to_vector(actuator) for actuator in actuators])
-        gear[rows, 0, 0] = 1.0 / arm
-        limits[rows, 0] = np.stack([-self.max_force * arm, self.max_force * arm], axis=-1)
-        self._arm[rows] = arm
-        self._torque_constant[rows] = [actuator.motor.torque_constant for actuator in actuators]
-        self._limit[rows] = [actuator.controller.max_voltage for actuator in actuators]
+        user[rows, 0, : vectors.shape[1]] = vectors
+        gear[rows, 0, 0] = 1.0 / arms
+        limits[rows, 0] = np.stack([-self.max_force * arms, self.max_force * arms], axis=-1)
+        self._arm[rows] = arms
+        self._torque_constant[rows] = vectors[:, TORQUE_CONSTANT]
+        self._limit[rows] = vectors[:, MAX_VOLTAGE]
+
+    def set_model(self, rows: np.ndarray, fields: Mapping[str, np.ndarray]) -> None:
+        """Change fields of the models of some simulations; to be followed by a reset of them.
+
+        Args:
+            rows: indices of simulations, shape (m,).
+            fields: as `codrl_mj.physics.variation.Variation.fields` returns them, for m simulations.
+        """
+        for name, values in fields.items():
+            self.field(name)[rows] = values
+        self._varied = True
+        self._batch.set_const(rows)
 
     @property
     def state(self) -> np.ndarray:

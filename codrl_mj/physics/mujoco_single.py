@@ -1,5 +1,6 @@
 """One simulation of a task in MuJoCo, the motor in the control callback."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
@@ -7,10 +8,11 @@ import numpy as np
 
 from codrl_mj import callbacks
 from codrl_mj.callbacks.kernels import CURRENT, VOLTAGE
-from codrl_mj.motor import Actuator
+from codrl_mj.motor import Actuator, to_vector
 from codrl_mj.physics.base import Signals, check_finite, ideal_signals, motor_signals
 from codrl_mj.physics.constrain import compiled_constrain
 from codrl_mj.physics.mjcf import needed_callbacks, task_model
+from codrl_mj.physics.variation import write_fields
 from codrl_mj.tasks import Task
 
 
@@ -43,7 +45,8 @@ class MujocoPhysics:
         self.actuator = actuator
         self.inner_steps = inner_steps
         self._explicit = integrator == "euler"
-        self.model = task_model(task, actuator, task.step_duration / inner_steps, max_force)
+        self._max_force = task.max_force if max_force is None else max_force
+        self.model = task_model(task, actuator, task.step_duration / inner_steps, max_force, self._explicit)
         self.data = mujoco.MjData(self.model)
         self._qpos_order, self._qvel_order = _progression(task.qpos), _progression(task.qvel)
         self._bind()
@@ -85,6 +88,25 @@ class MujocoPhysics:
         mujoco.mj_resetData(self.model, self.data)
         self._qpos[:] = state[self._qpos_order]
         self._qvel[:] = state[self._qvel_order]
+
+    def set_actuator(self, actuator: Actuator) -> None:
+        """Exchange the motor for another; to be followed by a reset. An ideal actuator cannot be exchanged."""
+        assert self.actuator is not None
+        arm = actuator.motor.arm_radius
+        vector = to_vector(actuator)
+        self.model.actuator_user[0, : len(vector)] = vector
+        self.model.actuator_gear[0, 0] = 1.0 / arm
+        self.model.actuator_ctrlrange[0] = -self._max_force * arm, self._max_force * arm
+        self.actuator = actuator
+
+    def set_model(self, fields: Mapping[str, np.ndarray]) -> None:
+        """Change fields of the model; to be followed by a reset.
+
+        Args:
+            fields: as `codrl_mj.physics.variation.Variation.fields` returns them, for one simulation.
+        """
+        write_fields(self.model, fields)
+        mujoco.mj_setConst(self.model, self.data)
 
     def show(self, state: np.ndarray) -> None:
         """Bring the body poses up to date with `state`, for drawing; the motor and the episode are left alone."""

@@ -1,0 +1,84 @@
+"""What the environments of a vector environment are drawn with."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from codrl_mj.envs.randomization import Randomization, nominal_parameters
+from codrl_mj.motor import Actuator
+from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
+from codrl_mj.physics.streams import Streams
+from codrl_mj.physics.variation import write_fields
+
+
+class Draws:
+    """The drawn values of N environments, as arrays, and their way into the simulations."""
+
+    def __init__(
+        self, randomization: Randomization, physics: MujocoBatchPhysics, actuators: Sequence[Actuator]
+    ) -> None:
+        """Begin with nothing drawn.
+
+        Args:
+            randomization: what is drawn.
+            physics: the N simulations.
+            actuators: the nominal actuator of each; none if they are ideal.
+        """
+        self._randomization = randomization
+        self._physics = physics
+        count = physics.num_envs
+        self._nominal, self._arms = nominal_parameters(actuators, count)
+        self._values = np.full((count, len(randomization.names)), np.nan)
+        self._rejected = np.zeros(count, dtype=np.int64)
+
+    def draw(self, streams: Streams, rows: np.ndarray) -> dict[str, Any]:
+        """Draw anew for some environments, whose simulations are to be reset afterwards.
+
+        Args:
+            streams: their generators.
+            rows: their indices, shape (m,).
+
+        Returns:
+            Their infos, in Gymnasium's form.
+
+        Raises:
+            ValueError: no stable current loop was drawn.
+        """
+        self._values[rows], self._rejected[rows] = self._randomization.draw(
+            lambda pending, count: streams.random(rows[pending], count), self._nominal[rows], self._arms[rows]
+        )
+        self._apply(rows)
+        return self._randomization.reports(rows, self._values, self._rejected)
+
+    def _apply(self, rows: np.ndarray) -> None:
+        """Write the values of some environments into their simulations."""
+        values = self._values[rows]
+        if self._randomization.draws_actuator:
+            self._physics.set_parameters(
+                rows, *self._randomization.parameters(self._nominal[rows], self._arms[rows], values)
+            )
+        if self._randomization.variation is not None:
+            self._physics.set_model(rows, self._randomization.model_fields(values))
+
+    def present(self) -> dict[str, np.ndarray]:
+        """The values in use by name, and the number of rejected sets, each of shape (N,); NaN before a reset."""
+        columns = dict(zip(self._randomization.names, self._values.T.copy(), strict=True))
+        return columns | {"rejected": self._rejected.copy()}
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """What `restore` needs."""
+        return {"drawn": self._values.copy(), "rejected": self._rejected.copy()}
+
+    def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
+        """Bring back the values, and the simulations to them; to be followed by a restoring of the simulations."""
+        self._values[:], self._rejected[:] = snapshot["drawn"], snapshot["rejected"]
+        rows = np.flatnonzero(~np.isnan(self._values).any(axis=1))
+        if len(rows):
+            self._apply(rows)
+
+    def show(self, row: int) -> None:
+        """Give the model that is drawn the lengths of one environment."""
+        fields = self._randomization.model_fields(self._values[[row]], drawn=True)
+        if not np.isnan(self._values[row]).any():
+            write_fields(self._physics.model, fields)
