@@ -241,16 +241,16 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         """Reset the environments that ended; what they saw last goes into the infos, as in Gymnasium."""
         ended, rows = self._ended.copy(), np.flatnonzero(self._ended)
         final_obs = np.full(self.num_envs, None, dtype=object)
-        for row in rows:
-            final_obs[row] = self._observations[row].copy()
-        names = [name for name in infos if not name.startswith("_")]
+        for row, seen in zip(rows.tolist(), self._observations[rows], strict=True):
+            final_obs[row] = seen
         final: dict[str, Any] = {}
         remaining: dict[str, Any] = {}
-        for name in names:
-            final[name], final[f"_{name}"] = np.where(ended, infos[name], np.zeros((), infos[name].dtype)), ended.copy()
-            if not ended.all():
-                kept = np.where(ended, np.zeros((), infos[name].dtype), infos[name])
-                remaining[name], remaining[f"_{name}"] = kept, ~ended
+        for name in [name for name in infos if not name.startswith("_")]:
+            final[name], final[f"_{name}"] = np.zeros_like(infos[name]), ended.copy()
+            final[name][rows] = infos[name][rows]
+            if len(rows) < self.num_envs:
+                remaining[name], remaining[f"_{name}"] = infos[name].copy(), ~ended
+                remaining[name][rows] = 0
         drawn = self._restart(rows, None)
         return {
             "final_obs": final_obs,

@@ -7,12 +7,13 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from codrl_mj import callbacks
 from codrl_mj.callbacks.kernels import CURRENT, VOLTAGE
 from codrl_mj.motor import Actuator, to_vector
 from codrl_mj.motor.parameters import MAX_VOLTAGE, TORQUE_CONSTANT
 from codrl_mj.physics.base import LARGEST, Signals, SimulationDivergedError
 from codrl_mj.physics.constrain import compiled_constrain
-from codrl_mj.physics.mjcf import install_callbacks, task_model
+from codrl_mj.physics.mjcf import needed_callbacks, task_model
 from codrl_mj.tasks import Task
 
 
@@ -64,11 +65,16 @@ class MujocoBatchPhysics:
 
     def _make_batch(self) -> None:
         """Make the engine's batch, and take the views that a step uses."""
-        install_callbacks(self.model)
+        self._callbacks = needed_callbacks(self.model)
+        self._install()
         self._batch = Batch(self.model, *self._size)
         self._keep = compiled_constrain(self.task)
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._ctrl, self._act = self._batch.bind("ctrl"), self._batch.bind("act")
+
+    def _install(self) -> None:
+        if self._callbacks:
+            callbacks.install(*self._callbacks)
 
     def field(self, name: str) -> np.ndarray:
         """A field of the model with a value for each simulation, shape (N, ...): live, to be written to."""
@@ -146,7 +152,7 @@ class MujocoBatchPhysics:
         Raises:
             CallbackInUseError: another library's MuJoCo callback was installed in the meantime.
         """
-        install_callbacks(self.model)
+        self._install()  # raises if somebody replaced ours since the last episodes
         self._batch.state[rows] = self._rest
         self._qpos[rows] = states[:, list(self.task.qpos)]
         self._qvel[rows] = states[:, list(self.task.qvel)]
