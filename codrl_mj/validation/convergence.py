@@ -66,10 +66,10 @@ def _order_check(task: Task, integrator: str, actuator: Actuator | None, solutio
     if promised == 4.0:
         counts = 2 ** np.arange(2, 6 if quick else 7)
     elif actuator is None:
-        counts = 2 ** np.arange(4, 8 if quick else 9)
+        counts = 2 ** (np.arange(3, 7) if quick else np.arange(4, 9))
     else:  # a quarter of the winding's time constant, and shorter
         resolved = task.step_duration / (actuator.motor.electrical_time_constant / 4)
-        counts = 2 ** (math.ceil(math.log2(max(resolved, 4))) + np.arange(1, 5 if quick else 6))
+        counts = 2 ** (math.ceil(math.log2(max(resolved, 4))) + (np.arange(0, 4) if quick else np.arange(1, 6)))
     families = []
     for label, kind in PHYSICS:
         errors = [_error(_states(kind, task, actuator, int(count), integrator), solution) for count in counts]
@@ -85,19 +85,18 @@ def _order_check(task: Task, integrator: str, actuator: Actuator | None, solutio
 
 def _bandwidth_check(task: Task, quick: bool) -> Check:
     """The lag is resolved by two integration steps at every bandwidth; both runs take the same steps."""
-    lags = task.step_duration / 2 ** np.arange(4, 8 if quick else 9)  # tau [s]
-    integrator, arm = task.integrators[0], PAPER[task.name].motor.arm_radius
-    families = []
-    for label, kind in PHYSICS:
-        errors = []
-        for lag in lags:
-            motor = Motor(arm_radius=arm)
-            kp = motor.inductance / lag
-            loop = CurrentLoop(kp=kp, ki=kp * motor.resistance / motor.inductance, max_voltage=math.inf)
-            count = round(2 * task.step_duration / lag)
-            ideal = _states(AnalyticPhysics, task, None, count, integrator)
-            errors.append(_error(_states(kind, task, Actuator(motor, loop), count, integrator), ideal))
-        families.append(Family(label, 1 / (2 * np.pi * lags), np.array(errors)))
+    lags = task.step_duration / 2 ** (np.arange(3, 7) if quick else np.arange(4, 9))  # tau [s]
+    integrator, motor = task.integrators[0], Motor(arm_radius=PAPER[task.name].motor.arm_radius)
+    errors: tuple[list[float], ...] = ([], [])
+    for lag in lags:
+        count = round(2 * task.step_duration / lag)
+        kp = motor.inductance / lag
+        loop = CurrentLoop(kp=kp, ki=kp * motor.resistance / motor.inductance, max_voltage=math.inf)
+        ideal = _states(AnalyticPhysics, task, None, count, integrator)
+        for found, (_, kind) in zip(errors, PHYSICS, strict=True):
+            found.append(_error(_states(kind, task, Actuator(motor, loop), count, integrator), ideal))
+    bandwidth = 1 / (2 * np.pi * lags)
+    families = [Family(label, bandwidth, np.array(found)) for found, (label, _) in zip(errors, PHYSICS, strict=True)]
     plot = Plot(
         f"{task.name}: the actuated task approaches the ideal one",
         "bandwidth of the current loop [Hz]",

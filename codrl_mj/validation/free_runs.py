@@ -20,14 +20,14 @@ class FreeRun(NamedTuple):
 
 RUNS: dict[str, FreeRun] = {
     # swings below 8 rad/s
-    "pendulum": FreeRun((2.0, 0.5), 20, 10),
+    "pendulum": FreeRun((2.0, 0.5), 20, 8),
     # the pole falls to about a right angle
-    "cartpole": FreeRun((0.1, -0.2, 0.1, 0.3), 40, 20),
+    "cartpole": FreeRun((0.1, -0.2, 0.1, 0.3), 30, 10),
     # a large swing, angles within half a turn, speeds below 4 pi
     "acrobot": FreeRun((2.0, 0.5, 0.0, 0.0), 7, 5),
     # between the walls, below 0.07 m/s
-    "mountain_car": FreeRun((-0.5, 0.02), 12, 3),
-    "mountain_car_continuous": FreeRun((-0.5, 0.02), 12, 3),
+    "mountain_car": FreeRun((-0.5, 0.02), 12, 2),
+    "mountain_car_continuous": FreeRun((-0.5, 0.02), 12, 2),
 }
 """One run for each task."""
 
