@@ -79,7 +79,7 @@ def _balance_plot(task: Task, integrator: str, ledger: Ledger) -> Plot:
         "residual": ledger.whole_residual,
     }
     curves = tuple(Curve(label, ledger.time, values) for label, values in flows.items())
-    title = f"{task.name} in MuJoCo, {integrator}: energy since the start, at the coarsest step"
+    title = f"{task.name} in MuJoCo, {integrator}: energy at the coarsest step"
     return Plot(title, "time [s]", "energy [J]", curves)
 
 

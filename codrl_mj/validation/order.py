@@ -79,8 +79,8 @@ def order_check(
     where = f"{family.label}: slope {slopes[worst]}, errors {family.errors[0]:.2g} to {family.errors[-1]:.2g}"
     curves = [Curve(f"{f.label}: {slope}", f.steps, f.errors) for f, slope in zip(families, slopes, strict=True)]
     first = families[0]
-    promise = first.errors[-1] * (first.steps / first.steps[-1]) ** promised
-    curves.append(Curve(f"order {abs(promised):g}", first.steps, promise, reference=True))
+    guide = 0.5 * first.errors[-1] * (first.steps / first.steps[-1]) ** promised  # beside the errors, not upon them
+    curves.append(Curve(f"slope {promised:g}, as promised", first.steps, guide, reference=True))
     return Check(
         name,
         oracle,
