@@ -134,13 +134,15 @@ _FIELDS = {
 
 def _along(model: mujoco.MjModel) -> dict[int, int]:
     """Geoms with a length along their body's z axis, each with the entry of its size that is half that length."""
-    entries = {mujoco.mjtGeom.mjGEOM_CAPSULE: 1, mujoco.mjtGeom.mjGEOM_CYLINDER: 1, mujoco.mjtGeom.mjGEOM_BOX: 2}
+    kinds = mujoco.mjtGeom
+    entries = {int(kinds.mjGEOM_CAPSULE): 1, int(kinds.mjGEOM_CYLINDER): 1, int(kinds.mjGEOM_BOX): 2}
     found = {}
     for geom in range(model.ngeom):
         matrix = np.empty(9)
         mujoco.mju_quat2Mat(matrix, model.geom_quat[geom])
-        if model.geom_type[geom] in entries and abs(matrix[8]) > 1.0 - 1e-9:
-            found[geom] = entries[model.geom_type[geom]]
+        kind = int(model.geom_type[geom])
+        if kind in entries and abs(matrix[8]) > 1.0 - 1e-9:
+            found[geom] = entries[kind]
     return found
 
 
