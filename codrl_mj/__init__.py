@@ -20,6 +20,7 @@ __version__ = "0.1.0"
 _PUBLIC = {
     "Actuator": "codrl_mj.motor",
     "CurrentLoop": "codrl_mj.motor",
+    "Disturbances": "codrl_mj.disturbances",
     "Motor": "codrl_mj.motor",
     "spectral_radius": "codrl_mj.motor",
     "named_actuator": "codrl_mj.motor",

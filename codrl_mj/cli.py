@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from codrl_mj.agents.ppo import PPOConfig
+from codrl_mj.disturbances import Disturbances
 from codrl_mj.env_config import EnvConfig
 from codrl_mj.motor import NAMED, Actuator, CurrentLoop, Motor
 from codrl_mj.registration import ENVIRONMENTS
@@ -46,18 +47,34 @@ def _optional(kind: type) -> Any:
     return dataclasses.make_dataclass(f"{kind.__name__}Fields", fields, frozen=True)
 
 
-def _unchecked(kind: type) -> Any:
-    """The dataclass without its validation, which the verb makes up for: an error while parsing looks like a bug."""
+def _unchecked(kind: type, **nested: Any) -> Any:
+    """The dataclass without its validation, which the verb makes up for: an error while parsing looks like a bug.
+
+    Args:
+        kind: the dataclass.
+        **nested: fields that are dataclasses, and what takes their place.
+    """
     docs = _field_docs(kind)
     fields = [
         (field.name, Annotated[field.type, tyro.conf.arg(help=docs[field.name])], field.default)
+        if field.name not in nested
+        else (field.name, nested[field.name], nested[field.name]())
         for field in dataclasses.fields(kind)
     ]
     return dataclasses.make_dataclass(f"{kind.__name__}Fields", fields, frozen=True)
 
 
 _MotorFields, _LoopFields = _optional(Motor), _optional(CurrentLoop)
-_PPOFields, _EnvFields = _unchecked(PPOConfig), _unchecked(EnvConfig)
+_PPOFields, _EnvFields = _unchecked(PPOConfig), _unchecked(EnvConfig, disturbances=_unchecked(Disturbances))
+
+
+def _environment(fields: Any) -> EnvConfig:
+    """The environment's arguments that the flags describe.
+
+    Raises:
+        ValueError: a value is out of bounds.
+    """
+    return EnvConfig(**vars(fields) | {"disturbances": Disturbances(**vars(fields.disturbances))})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,7 +161,7 @@ class Train:
         from codrl_mj.training import TrainConfig
 
         actuator = _actuator(self.actuator_name, self.actuator_fields, self.task)
-        ppo, env = PPOConfig(**vars(self.ppo)), EnvConfig(**vars(self.env))
+        ppo, env = PPOConfig(**vars(self.ppo)), _environment(self.env)
         config = TrainConfig(self.task, actuator, ppo, self.seed, self.total_steps, self.num_envs, env)
         out = self.out or Path("runs") / f"{self.task}-ppo-{self.actuator_name}-{self.seed}"
         train_with_bars({f"PPO on {self.task}": (config, out)})
@@ -187,7 +204,7 @@ class Evaluate:
         trained = load_config(self.run_folder)
         actuator = _actuator(self.actuator_name, self.actuator_fields, trained.task, trained.actuator)  # type: ignore[arg-type]
         policy = load_policy(self.run_folder)
-        options = EnvConfig(**vars(self.env)).seen_as(trained.env).as_arguments()
+        options = _environment(self.env).seen_as(trained.env).as_arguments()
         with progress_bar("{task.completed}/{task.total} episodes") as bar:
             row = bar.add_task("evaluating", total=self.episodes)
             episodes = run_episodes(
@@ -250,13 +267,13 @@ class Render:
         if self.subject in ENVIRONMENTS:
             task, name = self.subject, "paper" if self.actuator_name == _AS_TRAINED else self.actuator_name
             actuator = _actuator(name, self.actuator_fields, task)
-            options = EnvConfig(**vars(self.env)).as_arguments()
+            options = _environment(self.env).as_arguments()
             policy: Policy = RandomPolicy(make_env(task, actuator, **options).action_space, self.seed)
         else:
             trained = load_config(Path(self.subject))
             task, policy, name = trained.task, load_policy(Path(self.subject)), self.actuator_name
             actuator = _actuator(name, self.actuator_fields, task, trained.actuator)  # type: ignore[arg-type]
-            options = EnvConfig(**vars(self.env)).seen_as(trained.env).as_arguments()
+            options = _environment(self.env).seen_as(trained.env).as_arguments()
         (episode,) = run_episodes(policy, lambda: make_env(task, actuator, **options), 1, self.seed)
         panel = Panel(f"{Path(self.subject).name} on {name}: return {episode.total:.0f}", task, actuator, episode)
         with progress_bar("{task.completed}/{task.total} frames") as bar:

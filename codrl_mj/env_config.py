@@ -3,13 +3,15 @@
 import dataclasses
 from typing import Any, Literal
 
+from codrl_mj.disturbances import OFF, Disturbances, resolve_disturbances
+
 
 @dataclasses.dataclass(frozen=True)
 class EnvConfig:
     """Arguments of an environment other than task, actuator and rendering; None leaves the task's default.
 
     Raises:
-        ValueError: `max_episode_steps` is out of bounds; the environment checks the rest.
+        ValueError: `max_episode_steps` or a disturbance is out of bounds; the environment checks the rest.
     """
 
     physics: Literal["mujoco", "analytic"] = "mujoco"
@@ -30,11 +32,14 @@ class EnvConfig:
     """CartPole: distance from the centre [m] beyond which a step earns nothing. The paper trains with 0.1."""
     allow_unstable: bool = False
     """Build the environment even if the current loop is unstable."""
+    disturbances: Disturbances = OFF
+    """Imperfections of drive, sensor, supply and joint, and load pulses; each is off at 0."""
 
     def __post_init__(self) -> None:
         """Validate what the environment itself does not see."""
         if self.levels is not None:
             object.__setattr__(self, "levels", tuple(self.levels))  # JSON has lists
+        object.__setattr__(self, "disturbances", resolve_disturbances(self.disturbances))  # JSON has mappings
         limit = self.max_episode_steps
         if limit is not None and (isinstance(limit, bool) or not isinstance(limit, int) or limit < 1):
             raise ValueError(f"max_episode_steps = {limit!r}: must be an integer >= 1")
@@ -46,4 +51,5 @@ class EnvConfig:
 
     def as_arguments(self) -> dict[str, Any]:
         """The keyword arguments for `gymnasium.make`, without those left at the task's default."""
-        return {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
+        arguments = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {name: value for name, value in arguments.items() if value is not None and value != OFF}

@@ -42,6 +42,8 @@ class Physics(dm_mujoco.Physics):
     """Force [N] or torque [N*m] that the next step asks the actuator for."""
     signals: Signals | None = None
     """What the actuator did in the last step; None before the first."""
+    delivered: Signals | None = None
+    """The same as the simulation has it, whatever the agent commands."""
 
     @classmethod
     def of(cls, simulation: MujocoPhysics) -> "Physics":
@@ -68,14 +70,16 @@ class Physics(dm_mujoco.Physics):
             self.signals = self.simulation.step(self.desired_force)
 
     def get_state(self, sig: int | None = None) -> np.ndarray:
-        """The state to continue from: time, positions, velocities and motors.
+        """The state to continue from: time, positions, velocities and motors, and commands and loads on their way.
 
         Without the time, which dm_control leaves out, a motor would not know whether its last tick has passed.
 
         Args:
             sig: which parts, as a sum of `mujoco.mjtState`.
         """
-        return super().get_state(_FULL_STATE if sig is None else sig)
+        if sig is not None:
+            return super().get_state(sig)
+        return np.concatenate([super().get_state(_FULL_STATE), self.simulation.memory])
 
     def set_state(self, physics_state: np.ndarray, sig: int | None = None) -> None:
         """Restore what `get_state` returned.
@@ -87,11 +91,13 @@ class Physics(dm_mujoco.Physics):
         Raises:
             ValueError: the state has not the size of these parts.
         """
-        sig = _FULL_STATE if sig is None else sig
-        expected = (mujoco.mj_stateSize(self.model.ptr, sig),)
+        size = mujoco.mj_stateSize(self.model.ptr, _FULL_STATE if sig is None else sig)
+        expected = (size + (len(self.simulation.memory) if sig is None else 0),)
         if np.shape(physics_state) != expected:
             raise ValueError(f"physics_state has shape {np.shape(physics_state)}, must be {expected}")
-        super().set_state(physics_state, sig)
+        super().set_state(physics_state[:size], _FULL_STATE if sig is None else sig)
+        if sig is None:
+            self.simulation.memory[:] = physics_state[size:]
 
     def state(self) -> np.ndarray:
         """The same as `get_state()`."""
@@ -111,7 +117,7 @@ class Physics(dm_mujoco.Physics):
         return copy.deepcopy(self)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in ("simulation", "desired_force", "signals")}
+        return {name: getattr(self, name) for name in ("simulation", "desired_force", "signals", "delivered")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self._contexts_lock = threading.Lock()
@@ -139,7 +145,7 @@ class GymTask(control.Task):
         """Draw the initial state; the motor is at rest."""
         _, info = self.setup.start(physics.simulation, self.random, None)
         self.randomization = info.get("randomization", {})
-        physics.signals = None
+        physics.signals = physics.delivered = None
         self._before = physics.simulation.state
 
     def before_step(self, action: Any, physics: Physics) -> None:
@@ -159,6 +165,7 @@ class GymTask(control.Task):
     def after_step(self, physics: Physics) -> None:
         """Express what the actuator did as the command defines it."""
         assert physics.signals is not None
+        physics.delivered = physics.signals
         physics.signals = self.setup.signals(physics.signals)
 
     def action_spec(self, physics: Physics) -> specs.Array:
@@ -172,7 +179,8 @@ class GymTask(control.Task):
 
     def get_observation(self, physics: Physics) -> dict[str, np.ndarray]:
         """The observation's entries by name, each of shape (1,), float64."""
-        values = self.setup.observation(physics.simulation.state, physics.signals)
+        seen = physics.signals if not self.setup.senses else self.setup.seen(physics.simulation, physics.delivered)
+        values = self.setup.observation(physics.simulation.state, seen)
         names = self.setup.observation_names
         return collections.OrderedDict(
             (name, np.array([value], dtype=np.float64)) for name, value in zip(names, values, strict=True)
@@ -205,8 +213,8 @@ def load(
         task_kwargs: `random`: a seed or a `numpy.random.Generator` for the initial states.
         environment_kwargs: arguments of `dm_control.rl.control.Environment`, such as `flat_observation`.
         **options: `integrator`, `inner_steps`, `timestep`, `allow_unstable`, `action`, `levels`, `observe_actuator`,
-            `randomize` and the task's own options, as for `codrl_mj.envs.ActuatedEnv`. What was drawn for an episode is
-            in the attribute `randomization` of the environment's task.
+            `randomize`, `disturbances` and the task's own options, as for `codrl_mj.envs.ActuatedEnv`. What was drawn
+            for an episode is in the attribute `randomization` of the environment's task.
 
     Returns:
         The environment. An episode ends with discount 0 where the task says so and with discount 1 at the time limit,

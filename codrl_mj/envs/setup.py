@@ -1,17 +1,19 @@
 """A task made ready: its actuator, its options, and what the agent commands and sees. Shared by every face."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.distributions import Distribution
+from codrl_mj.disturbances import OFF, Disturbances, resolve_disturbances
 from codrl_mj.envs.randomization import Randomization, nominal_parameters
 from codrl_mj.motor import Actuator, CurrentLoop, check_stable, resolve
+from codrl_mj.motor.noise import LARGEST_KEY
 from codrl_mj.physics import PHYSICS, AnalyticPhysics, MujocoPhysics, Physics, Signals
-from codrl_mj.physics.base import check_integrator, inner_step_count
+from codrl_mj.physics.base import check_integrator, ideal_signals, inner_step_count
 from codrl_mj.tasks import Task, find_task
 
 COMMANDS = ("force", "current", "voltage")
@@ -40,6 +42,8 @@ class Setup:
     """Whether the observation ends with measured and reference current."""
     randomization: Randomization | None = None
     """What is drawn at every reset; None if nothing is."""
+    disturbances: Disturbances = OFF
+    """Imperfections of drive, sensor, supply and joint, and load pulses."""
 
     @classmethod
     def build(
@@ -54,6 +58,7 @@ class Setup:
         levels: Sequence[float] | None = None,
         observe_actuator: bool = False,
         randomize: Mapping[str, Distribution] | None = None,
+        disturbances: Disturbances | Mapping[str, Any] | None = None,
         **options: float,
     ) -> "Setup":
         """Resolve and check the arguments of an environment; `codrl_mj.envs.ActuatedEnv` says what they are.
@@ -80,7 +85,13 @@ class Setup:
             levels=_levels(definition, resolved, action, levels),
             observe_actuator=observe_actuator,
             randomization=randomization,
+            disturbances=_disturbances(disturbances, resolved, timestep, allow_unstable),
         )
+        if setup.disturbances.joint_damping and any("model.damping." in name for name in randomize or ()):
+            raise ValueError(
+                f"disturbances: joint_damping = {setup.disturbances.joint_damping:g}: give either it or a distribution "
+                "of the joint's model.damping, not both"
+            )
         drawn = randomization is not None and randomization.draws_actuator  # then every draw is checked
         if setup.physical_actuator is not None and not allow_unstable and not drawn:
             check_stable(setup.physical_actuator, timestep)
@@ -95,7 +106,7 @@ class Setup:
         """
         arguments = self.task, self.physical_actuator, self.inner_steps, self.integrator
         if physics == "mujoco":
-            return MujocoPhysics(*arguments, max_force=self.max_force)
+            return MujocoPhysics(*arguments, max_force=self.max_force, disturbances=self.disturbances)
         if physics == "analytic":
             if self.randomization is not None and self.randomization.variation is not None:
                 names = ", ".join(self.randomization.variation.names)
@@ -103,13 +114,15 @@ class Setup:
                     f"physics = 'analytic': cannot draw {names}: Gymnasium's environments share no names for masses, "
                     "lengths and gravity, and have no damping; use physics='mujoco'"
                 )
-            return AnalyticPhysics(*arguments)
+            return AnalyticPhysics(*arguments, max_force=self.max_force, disturbances=self.disturbances)
         raise ValueError(f"physics = {physics!r}: must be one of {', '.join(PHYSICS)}")
 
     def start(
         self, physics: Physics, generator: np.random.Generator, options: dict[str, Any] | None
     ) -> tuple[Actuator | None, dict[str, Any]]:
         """Start an episode: draw the initial state and then, if anything is randomised, actuator and model.
+
+        Disturbances that are random draw the key of their numbers last.
 
         Args:
             physics: what `simulate` returned.
@@ -136,8 +149,39 @@ class Setup:
             if isinstance(physics, MujocoPhysics) and self.randomization.variation is not None:
                 physics.set_model(self.randomization.model_fields(values, drawn=True))
             info = {"randomization": self.randomization.report(values[0], rejected[0])}
-        physics.reset(initial)
+        physics.reset(initial, float(self.keys(lambda count: generator.random((1, count)))[0]))
         return actuator, info
+
+    def keys(self, random: Callable[[int], np.ndarray]) -> np.ndarray:
+        """Keys of the random numbers of episodes' disturbances, shape (m,), float64; 0 where none is needed.
+
+        Args:
+            random: (numbers for each of m episodes) -> numbers uniform in [0, 1), shape (m, count).
+        """
+        if not self.disturbances.random:
+            return np.zeros(1)
+        return random(1)[:, 0] * LARGEST_KEY  # a multiple of 2**-53 times 2**53: a whole number, exactly
+
+    @property
+    def senses(self) -> bool:
+        """Whether the agent observes a current that is not the real one."""
+        return self.observe_actuator and self.disturbances.of_sensor
+
+    def seen(self, physics: Any, signals: Signals | None, rows: np.ndarray | None = None) -> Signals | None:
+        """What the agent can see of the actuator's signals: its sensor's current instead of the current.
+
+        Args:
+            physics: of which the signals are.
+            signals: of the step that ended, or None at the start of an episode.
+            rows: at the start, simulations of a batch that are meant.
+        """
+        if not self.senses:
+            return None if signals is None else self.signals(signals)
+        if signals is None and rows is None:
+            return self.signals(physics.sensed(ideal_signals(0.0)))
+        if signals is None:
+            return self.signals(physics.sensed(Signals(*[np.zeros(len(rows))] * 6), rows))  # type: ignore[arg-type]
+        return self.signals(physics.sensed(signals))
 
     @property
     def physical_actuator(self) -> Actuator | None:
@@ -282,6 +326,32 @@ class Setup:
     def terminated(self, state: np.ndarray) -> bool:
         """Whether the task ends the episode in this state."""
         return bool(self.task.terminated(state))
+
+
+def _disturbances(
+    given: Disturbances | Mapping[str, Any] | None, actuator: Actuator | None, timestep: float, allow_unstable: bool
+) -> Disturbances:
+    """The disturbances, checked against the actuator.
+
+    Raises:
+        ValueError: a field is unknown or out of bounds, or needs a motor, or the supply makes a saturated motor's
+            current oscillate from step to step.
+    """
+    disturbances = resolve_disturbances(given)
+    if actuator is None and disturbances.of_motor:
+        names = ("current_noise", "current_bias", "supply_resistance")
+        on = ", ".join(f"{name} = {getattr(disturbances, name):g}" for name in names if getattr(disturbances, name))
+        raise ValueError(f"disturbances: {on}: the ideal actuator has no current sensor and no supply; choose another")
+    if actuator is not None and disturbances.supply_resistance and not allow_unstable:
+        motor, substeps = actuator.motor, actuator.controller.substeps
+        bound = 2.0 * motor.inductance * substeps / timestep - motor.resistance
+        if not disturbances.supply_resistance < bound:
+            raise ValueError(
+                f"disturbances: supply_resistance = {disturbances.supply_resistance:g}: must be < 2*L/dt - R = "
+                f"{bound:g} ohm at an electrical step of {timestep / substeps:g} s, or a saturated motor's current "
+                "oscillates from step to step. Raise controller.substeps, or pass allow_unstable=True"
+            )
+    return disturbances
 
 
 def _options(task: Task, given: Mapping[str, float]) -> Any:

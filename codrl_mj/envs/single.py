@@ -7,6 +7,7 @@ import gymnasium
 import numpy as np
 
 from codrl_mj.distributions import Distribution
+from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.setup import Setup
 from codrl_mj.motor import Actuator
 from codrl_mj.physics import MujocoPhysics
@@ -41,6 +42,7 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
         levels: Sequence[float] | None = None,
         observe_actuator: bool = False,
         randomize: Mapping[str, Distribution] | None = None,
+        disturbances: Disturbances | Mapping[str, Any] | None = None,
         render_mode: str | None = None,
         width: int = 480,
         height: int = 480,
@@ -68,6 +70,9 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
                 (`motor.inductance`, `controller.kp`) and the model (`model.mass.BODY`, `model.length.BODY`,
                 `model.gravity`, `model.damping.JOINT`), each with a `Uniform`, `LogUniform` or `Choice`. What was drawn
                 is in the reset's `info["randomization"]`.
+            disturbances: a `Disturbances`, or a mapping of its fields: delayed, coarse and slow commands, a noisy and
+                biased current sensor, a sagging supply, load pulses, joint friction and damping. With
+                `observe_actuator` the agent sees the sensor's current.
             render_mode: None or `rgb_array`.
             width: width of rendered images [px].
             height: height of rendered images [px].
@@ -90,6 +95,7 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
             levels=levels,
             observe_actuator=observe_actuator,
             randomize=randomize,
+            disturbances=disturbances,
             **options,
         )
         if render_mode not in (None, *self.metadata["render_modes"]):
@@ -147,7 +153,7 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
         """
         super().reset(seed=seed)
         self._actuator, info = self.setup.start(self.physics, self.np_random, options)
-        return self.setup.observation(self.physics.state, None), info
+        return self.setup.observation(self.physics.state, self.setup.seen(self.physics, None)), info
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advance by one environment step.
@@ -163,9 +169,11 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
         setup, physics = self.setup, self.physics
         force = setup.force(action)
         before = physics.state
-        signals = setup.signals(physics.step(force))
+        delivered = physics.step(force)
+        signals = setup.signals(delivered)
+        seen = setup.seen(physics, delivered) if setup.senses else signals
         after = physics.state
-        observation, reward = setup.observation(after, signals), setup.reward(before, signals, after)
+        observation, reward = setup.observation(after, seen), setup.reward(before, signals, after)
         return observation, reward, setup.terminated(after), False, signals._asdict()
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]

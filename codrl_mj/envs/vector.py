@@ -95,6 +95,7 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
             self.num_envs,
             self.setup.max_force,
             int(num_threads),
+            self.setup.disturbances,
         )
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {
@@ -184,8 +185,8 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         draws = low + (high - low) * self._streams.random(rows, len(low))
         states = self.setup.task.initial_state(draws)
         infos = {} if self._draws is None else self._draws.draw(self._streams, rows)
-        self.physics.reset(rows, states)
-        self._observations[rows] = self.setup.observation(states, None)
+        self.physics.reset(rows, states, self.setup.keys(lambda count: self._streams.random(rows, count)))
+        self._observations[rows] = self.setup.observation(states, self.setup.seen(self.physics, None, rows))
         self._elapsed[rows] = 0
         self._ended[rows] = False
         return infos
@@ -219,7 +220,9 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
             )
         stepping = ~self._ended  # in NEXT_STEP mode, environments that ended are reset instead
         before = self.physics.state
-        signals = self.setup.signals(self.physics.step(forces))
+        delivered = self.physics.step(forces)
+        signals = self.setup.signals(delivered)
+        seen = self.setup.seen(self.physics, delivered) if self.setup.senses else signals
         after = self.physics.state
         self._elapsed += 1
         self.physics.check_finite(after, stepping)
@@ -228,7 +231,7 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         limit = np.inf if self.max_episode_steps is None else self.max_episode_steps
         truncated = (self._elapsed >= limit) & stepping
         self.signals = signals
-        self._observations = self.setup.observation(after, signals)
+        self._observations = self.setup.observation(after, seen)
         infos = _infos(signals, stepping)
         if not stepping.all():
             infos |= self._restart(np.flatnonzero(~stepping), None)
@@ -263,13 +266,16 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
 
     def snapshot(self) -> dict[str, Array]:
         """Everything that the future depends on, as plain arrays: simulations, motors, generators, bookkeeping."""
-        return {
+        everything = {
             "physics": self.physics.snapshot(),
             "streams": self._streams.state(),
             "elapsed": self._elapsed.copy(),
             "ended": self._ended.copy(),
             "observations": self._observations.copy(),
-        } | ({} if self._draws is None else self._draws.snapshot())
+        }
+        if self.physics.memory.size:
+            everything["disturbances"] = self.physics.memory.copy()
+        return everything | ({} if self._draws is None else self._draws.snapshot())
 
     def restore(self, snapshot: Mapping[str, Array]) -> None:
         """Continue from what `snapshot` returned, bit for bit.
@@ -287,6 +293,8 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         self._streams.set_state(snapshot["streams"])
         self._elapsed[:], self._ended[:] = snapshot["elapsed"], snapshot["ended"]
         self._observations[:] = snapshot["observations"]
+        if self.physics.memory.size:
+            self.physics.memory[:] = snapshot["disturbances"]
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the renderer, which a copy makes anew."""

@@ -5,8 +5,10 @@ from typing import Any, Protocol
 import gymnasium
 import numpy as np
 
-from codrl_mj.motor import Actuator, advance, to_vector
+from codrl_mj.disturbances import OFF, Disturbances
+from codrl_mj.motor import Actuator, advance, advance_imperfect, to_vector
 from codrl_mj.physics.base import Signals, check_finite, ideal_signals, motor_signals
+from codrl_mj.physics.disturber import disturber, sensed
 from codrl_mj.tasks import Task
 
 
@@ -157,8 +159,33 @@ DRIVERS: dict[str, type[Driver]] = {
 class AnalyticPhysics:
     """A task on Gymnasium's own equations. See `codrl_mj.physics.base.Physics`."""
 
-    def __init__(self, task: Task, actuator: Actuator | None, inner_steps: int, integrator: str) -> None:
-        """Make the Gymnasium environment."""
+    def __init__(
+        self,
+        task: Task,
+        actuator: Actuator | None,
+        inner_steps: int,
+        integrator: str,
+        max_force: float | None = None,
+        disturbances: Disturbances = OFF,
+    ) -> None:
+        """Make the Gymnasium environment.
+
+        Args:
+            task: the task.
+            actuator: motor and current loop; None is the ideal actuator.
+            inner_steps: integration steps per environment step.
+            integrator: one of the task's integrators.
+            max_force: limit of a quantised force [N] or torque [N*m]; None is the task's.
+            disturbances: imperfections of drive, sensor and supply, and load pulses.
+
+        Raises:
+            ValueError: the disturbances include friction or damping, which Gymnasium's equations have no place for.
+        """
+        if disturbances.of_joint:
+            raise ValueError(
+                f"joint_damping = {disturbances.joint_damping:g} and joint_friction = "
+                f"{disturbances.joint_friction:g}: Gymnasium's equations have neither; use physics='mujoco'"
+            )
         self.task = task
         self.actuator = actuator
         self.inner_steps = inner_steps
@@ -166,19 +193,30 @@ class AnalyticPhysics:
         self._timestep = task.step_duration / inner_steps
         self._driver = DRIVERS[task.name](task.gymnasium_id)
         self._parameters = None if actuator is None else to_vector(actuator)
+        self._disturbances = disturbances
+        limit = task.max_force if max_force is None else max_force
+        self._disturber = disturber(disturbances, self._timestep, limit, 1)
         self.reset(np.zeros(len(task.state_names)))
+
+    def reset(self, state: np.ndarray, key: float = 0.0) -> None:
+        """Start an episode from `state`, with the motor at rest.
+
+        Args:
+            state: the mechanical state.
+            key: of the random numbers of the episode's disturbances.
+        """
+        self.state = np.array(state, dtype=np.float64)
+        self._loop = (0.0, 0.0, 0.0)  # current, integral, previous error
+        self._time = 0.0
+        self._key = key
+        if self._disturber is not None:
+            self._disturber.reset(0, key)
 
     def set_actuator(self, actuator: Actuator) -> None:
         """Exchange the motor for another; to be followed by a reset. An ideal actuator cannot be exchanged."""
         assert self.actuator is not None
         self.actuator = actuator
         self._parameters = to_vector(actuator)
-
-    def reset(self, state: np.ndarray) -> None:
-        """Start an episode from `state`, with the motor at rest."""
-        self.state = np.array(state, dtype=np.float64)
-        self._loop = (0.0, 0.0, 0.0)  # current, integral, previous error
-        self._time = 0.0
 
     def step(self, desired_force: float) -> Signals:
         """Advance by one environment step, with the desired force (at most the task's `max_force`) held over it.
@@ -187,23 +225,36 @@ class AnalyticPhysics:
             SimulationDivergedError: the state is no longer finite.
         """
         signals = ideal_signals(desired_force)
+        command = desired_force
         for _ in range(self.inner_steps):
+            if self._disturber is not None:
+                command = float(self._disturber.command(np.array([desired_force]))[0])
+                signals = ideal_signals(desired_force, command)
             if self.actuator is not None:
-                signals = self._motor(self.actuator, desired_force, float(self.state[self._driver.speed]))
-            self.state = self._driver(self.state, signals.actual_force, self._timestep, self._integrator)
+                signals = self._motor(self.actuator, desired_force, command, float(self.state[self._driver.speed]))
+            force = signals.actual_force
+            if self._disturber is not None:
+                force += float(self._disturber.load()[0])
+            self.state = self._driver(self.state, force, self._timestep, self._integrator)
             self._time += self._timestep
         check_finite(self.task, self.state, self._time)
         return signals
 
-    def _motor(self, actuator: Actuator, desired_force: float, speed: float) -> Signals:
+    def sensed(self, signals: Signals) -> Signals:
+        """Signals of the present moment with the current [A] that the sensor measures."""
+        measured = sensed(self._disturbances, [signals.current], [self._key], [self._time], self._timestep)
+        return signals._replace(current=float(measured[0]))
+
+    def _motor(self, actuator: Actuator, desired_force: float, command: float, speed: float) -> Signals:
         """Advance the loop by one integration step."""
-        arm = actuator.motor.arm_radius
-        *loop, voltage = advance(
-            self._parameters,  # type: ignore[arg-type]
-            self._timestep,
-            *self._loop,
-            desired_torque=desired_force * arm,
-            speed=speed / arm,
-        )
+        arm, disturbances = actuator.motor.arm_radius, self._disturbances
+        arguments: Any = (self._parameters, self._timestep, *self._loop, command * arm, speed / arm)
+        available = actuator.controller.max_voltage
+        if disturbances.of_motor:
+            imperfections = disturbances.current_bias, disturbances.current_noise, disturbances.supply_resistance
+            arguments += (*imperfections, self._key, self._time)
+            *loop, voltage, available = advance_imperfect(*arguments)
+        else:
+            *loop, voltage = advance(*arguments)
         self._loop = tuple(loop)  # type: ignore[assignment]
-        return motor_signals(actuator, desired_force, self._loop[0], voltage)
+        return motor_signals(actuator, desired_force, self._loop[0], voltage, command, available)

@@ -20,28 +20,46 @@ class Signals(NamedTuple):
     current: float
     """Motor current [A]; 0 for the ideal actuator, which has none."""
     reference_current: float
-    """Current asked for [A]; 0 for the ideal actuator."""
+    """Current asked of the loop [A], by the command as it arrived; 0 for the ideal actuator."""
     voltage: float
     """Terminal voltage [V]; 0 for the ideal actuator."""
     saturated: bool
     """Whether the voltage was at its limit."""
 
 
-def ideal_signals(desired_force: float) -> Signals:
-    """The signals of an ideal actuator: it delivers what is desired, and has no current and no voltage."""
-    return Signals(desired_force, desired_force, 0.0, 0.0, 0.0, False)
+def ideal_signals(desired_force: float, command: float | None = None) -> Signals:
+    """The signals of an ideal actuator: it delivers the command, and has no current and no voltage."""
+    return Signals(desired_force, desired_force if command is None else command, 0.0, 0.0, 0.0, False)
 
 
-def motor_signals(actuator: Actuator, desired_force: float, current: float, voltage: float) -> Signals:
-    """The signals of a motor that was asked for `desired_force` and has reached `current` under `voltage`."""
+def motor_signals(
+    actuator: Actuator,
+    desired_force: float,
+    current: float,
+    voltage: float,
+    command: float | None = None,
+    available: float | None = None,
+) -> Signals:
+    """The signals of a motor that was asked for `desired_force` and has reached `current` under `voltage`.
+
+    Args:
+        actuator: motor and current loop.
+        desired_force: [N or N*m].
+        current: [A].
+        voltage: [V].
+        command: what has become of the desired force on its way to the motor; None: nothing.
+        available: the voltage limit [V], where it is not the controller's.
+    """
     motor = actuator.motor
+    command = desired_force if command is None else command
+    limit = actuator.controller.max_voltage if available is None else available
     return Signals(
         desired_force=desired_force,
         actual_force=motor.torque_constant * current / motor.arm_radius,
         current=current,
-        reference_current=desired_force * motor.arm_radius / motor.torque_constant,
+        reference_current=command * motor.arm_radius / motor.torque_constant,
         voltage=voltage,
-        saturated=abs(voltage) >= actuator.controller.max_voltage,
+        saturated=abs(voltage) >= limit,
     )
 
 
@@ -55,8 +73,16 @@ class Physics(Protocol):
     def set_actuator(self, actuator: Actuator) -> None:
         """Exchange the motor for another; to be followed by a reset. An ideal actuator cannot be exchanged."""
 
-    def reset(self, state: np.ndarray) -> None:
-        """Start an episode from `state`, with the motor at rest: no current, no integral, no past error."""
+    def reset(self, state: np.ndarray, key: float = 0.0) -> None:
+        """Start an episode from `state`, with the motor at rest: no current, no integral, no past error.
+
+        Args:
+            state: the mechanical state.
+            key: of the random numbers of the episode's disturbances.
+        """
+
+    def sensed(self, signals: Signals) -> Signals:
+        """Signals of the present moment with the current [A] that the sensor measures."""
 
     def step(self, desired_force: float) -> Signals:
         """Advance by one environment step, with the desired force (at most the task's `max_force`) held over it.

@@ -8,11 +8,13 @@ import numpy as np
 from mujoco.batch import Batch
 
 from codrl_mj import callbacks
-from codrl_mj.callbacks.kernels import CURRENT, VOLTAGE
+from codrl_mj.callbacks.kernels import AVAILABLE_VOLTAGE, CURRENT, NOISE_KEY, VOLTAGE
+from codrl_mj.disturbances import OFF, Disturbances
 from codrl_mj.motor import Actuator, to_vector
 from codrl_mj.motor.parameters import MAX_VOLTAGE, TORQUE_CONSTANT
 from codrl_mj.physics.base import LARGEST, Signals, SimulationDivergedError
 from codrl_mj.physics.constrain import compiled_constrain
+from codrl_mj.physics.disturber import disturber, sensed
 from codrl_mj.physics.mjcf import needed_callbacks, task_model
 from codrl_mj.tasks import Task
 
@@ -32,6 +34,7 @@ class MujocoBatchPhysics:
         num_envs: int,
         max_force: float | None = None,
         num_threads: int = 0,
+        disturbances: Disturbances = OFF,
     ) -> None:
         """Compile the model and make the batch.
 
@@ -43,14 +46,17 @@ class MujocoBatchPhysics:
             num_envs: number of simulations, >= 1.
             max_force: limit of the desired force [N] or torque [N*m]; None is the task's.
             num_threads: threads of the engine; 0 uses every CPU.
+            disturbances: imperfections of drive, sensor, supply and joint, and load pulses.
         """
         self.task = task
         self.inner_steps = inner_steps
         self.max_force = task.max_force if max_force is None else max_force
         self._explicit = integrator == "euler"
-        self.model = task_model(
-            task, actuators[0] if actuators else None, task.step_duration / inner_steps, max_force, self._explicit
-        )
+        timestep, first = task.step_duration / inner_steps, actuators[0] if actuators else None
+        self.model = task_model(task, first, timestep, max_force, self._explicit, disturbances)
+        self._disturbances = disturbances
+        self._disturber = disturber(disturbances, timestep, self.max_force, num_envs)
+        self._dof = int(self.model.jnt_dofadr[self.model.actuator("motor").trnid[0]])
         self.num_envs = num_envs
         self._size = num_envs, num_threads
         self._varied = False  # whether the models differ in more than their actuators
@@ -71,6 +77,7 @@ class MujocoBatchPhysics:
         self._keep = compiled_constrain(self.task)
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._ctrl, self._act = self._batch.bind("ctrl"), self._batch.bind("act")
+        self._load = self._batch.bind("qfrc_applied")
 
     def _install(self) -> None:
         if self._callbacks:
@@ -142,12 +149,13 @@ class MujocoBatchPhysics:
             state[:, entry] = self._qvel[:, column]
         return state
 
-    def reset(self, rows: np.ndarray, states: np.ndarray) -> None:
+    def reset(self, rows: np.ndarray, states: np.ndarray, keys: np.ndarray | float = 0.0) -> None:
         """Start episodes of some simulations, with their motors at rest.
 
         Args:
             rows: indices, shape (m,).
             states: initial states in the task's order, shape (m, n).
+            keys: of the random numbers of the episodes' disturbances, shape (m,).
 
         Raises:
             CallbackInUseError: another library's MuJoCo callback was installed in the meantime.
@@ -156,6 +164,10 @@ class MujocoBatchPhysics:
         self._batch.state[rows] = self._rest
         self._qpos[rows] = states[:, list(self.task.qpos)]
         self._qvel[rows] = states[:, list(self.task.qvel)]
+        if self._disturbances.of_motor:
+            self._act[rows, NOISE_KEY] = keys
+        if self._disturber is not None:
+            self._disturber.reset(rows, keys)
 
     def step(self, desired_force: np.ndarray) -> Signals:
         """Advance every simulation by one environment step.
@@ -166,10 +178,35 @@ class MujocoBatchPhysics:
         Returns:
             The signals, each an array of shape (N,).
         """
-        timestep = self.model.opt.timestep
-        self._ctrl[:, 0] = desired_force * self._arm
-        if self._explicit or self._keep is not None:
+        command = desired_force
+        if self._disturber is None:
+            self._ctrl[:, 0] = desired_force * self._arm
+            self._integrate(self.inner_steps)
+        else:
             for _ in range(self.inner_steps):
+                command = self._disturber.command(desired_force)
+                self._load[:, self._dof] = self._disturber.load()
+                self._ctrl[:, 0] = command * self._arm
+                self._integrate(1)
+        if not self.motorised:
+            nothing = np.zeros(len(desired_force))
+            return Signals(desired_force, command.copy(), nothing, nothing.copy(), nothing.copy(), nothing > 0)  # type: ignore[arg-type]
+        current, voltage = self._act[:, CURRENT].copy(), self._act[:, VOLTAGE].copy()
+        limit = self._act[:, AVAILABLE_VOLTAGE] if self._disturbances.of_motor else self._limit
+        return Signals(
+            desired_force=desired_force,  # type: ignore[arg-type]
+            actual_force=self._torque_constant * current / self._arm,
+            current=current,  # type: ignore[arg-type]
+            reference_current=command * self._arm / self._torque_constant,  # type: ignore[arg-type]
+            voltage=voltage,  # type: ignore[arg-type]
+            saturated=np.abs(voltage) >= limit,  # type: ignore[arg-type]
+        )
+
+    def _integrate(self, steps: int) -> None:
+        """Take integration steps."""
+        timestep = self.model.opt.timestep
+        if self._explicit or self._keep is not None:
+            for _ in range(steps):
                 moved = self._qpos + timestep * self._qvel if self._explicit else None
                 self._batch.step()
                 if moved is not None:
@@ -177,19 +214,25 @@ class MujocoBatchPhysics:
                 if self._keep is not None:
                     self._keep(self._qpos, self._qvel, timestep)
         else:
-            self._batch.step(nstep=self.inner_steps)
-        if not self.motorised:
-            nothing = np.zeros(len(desired_force))
-            return Signals(desired_force, desired_force.copy(), nothing, nothing.copy(), nothing.copy(), nothing > 0)  # type: ignore[arg-type]
-        current, voltage = self._act[:, CURRENT].copy(), self._act[:, VOLTAGE].copy()
-        return Signals(
-            desired_force=desired_force,  # type: ignore[arg-type]
-            actual_force=self._torque_constant * current / self._arm,
-            current=current,  # type: ignore[arg-type]
-            reference_current=desired_force * self._arm / self._torque_constant,  # type: ignore[arg-type]
-            voltage=voltage,  # type: ignore[arg-type]
-            saturated=np.abs(voltage) >= self._limit,  # type: ignore[arg-type]
-        )
+            self._batch.step(nstep=steps)
+
+    def sensed(self, signals: Signals, rows: np.ndarray | None = None) -> Signals:
+        """Signals of the present moment with the currents [A] that the sensors measure.
+
+        Args:
+            signals: arrays, of shape (m,).
+            rows: indices of their simulations, shape (m,); None for all.
+        """
+        chosen = slice(None) if rows is None else rows
+        keys = self._act[chosen, NOISE_KEY] if self._disturbances.of_motor else np.zeros(len(self._act))[chosen]
+        times = self._batch.bind("time")[chosen]
+        timestep = self.model.opt.timestep
+        return signals._replace(current=sensed(self._disturbances, signals.current, keys, times, timestep))  # type: ignore[arg-type]
+
+    @property
+    def memory(self) -> np.ndarray:
+        """What the disturbances remember beside the engine's own state, a live array (N, k); (N, 0) if nothing."""
+        return np.empty((self.num_envs, 0)) if self._disturber is None else self._disturber.memory
 
     def check_finite(self, states: np.ndarray, rows: np.ndarray) -> None:
         """Raise if a state among `rows` (a mask, shape (N,)) left the finite numbers, naming the simulation.
@@ -229,4 +272,4 @@ class MujocoBatchPhysics:
         mujoco.mj_passive(self.model, data)
 
 
-_ENGINE = ("_batch", "_keep", "_qpos", "_qvel", "_ctrl", "_act")
+_ENGINE = ("_batch", "_keep", "_qpos", "_qvel", "_ctrl", "_act", "_load")

@@ -7,10 +7,12 @@ import mujoco
 import numpy as np
 
 from codrl_mj import callbacks
-from codrl_mj.callbacks.kernels import CURRENT, VOLTAGE
+from codrl_mj.callbacks.kernels import AVAILABLE_VOLTAGE, CURRENT, NOISE_KEY, VOLTAGE
+from codrl_mj.disturbances import OFF, Disturbances
 from codrl_mj.motor import Actuator, to_vector
 from codrl_mj.physics.base import Signals, check_finite, ideal_signals, motor_signals
 from codrl_mj.physics.constrain import compiled_constrain
+from codrl_mj.physics.disturber import disturber, sensed
 from codrl_mj.physics.mjcf import needed_callbacks, task_model
 from codrl_mj.physics.variation import write_fields
 from codrl_mj.tasks import Task
@@ -31,6 +33,7 @@ class MujocoPhysics:
         inner_steps: int,
         integrator: str,
         max_force: float | None = None,
+        disturbances: Disturbances = OFF,
     ) -> None:
         """Compile the model and install the callbacks that it needs.
 
@@ -40,15 +43,20 @@ class MujocoPhysics:
             inner_steps: integration steps per environment step.
             integrator: one of the task's integrators.
             max_force: limit of the desired force [N] or torque [N*m]; None is the task's.
+            disturbances: imperfections of drive, sensor, supply and joint, and load pulses.
         """
         self.task = task
         self.actuator = actuator
         self.inner_steps = inner_steps
         self._explicit = integrator == "euler"
         self._max_force = task.max_force if max_force is None else max_force
-        self.model = task_model(task, actuator, task.step_duration / inner_steps, max_force, self._explicit)
+        timestep = task.step_duration / inner_steps
+        self.model = task_model(task, actuator, timestep, max_force, self._explicit, disturbances)
         self.data = mujoco.MjData(self.model)
         self._qpos_order, self._qvel_order = _progression(task.qpos), _progression(task.qvel)
+        self._disturbances = disturbances
+        self._disturber = disturber(disturbances, timestep, self._max_force, 1)
+        self._dof = int(self.model.jnt_dofadr[self.model.actuator("motor").trnid[0]])
         self._bind()
         self.reset(np.zeros(len(task.state_names)))
 
@@ -82,12 +90,21 @@ class MujocoPhysics:
         state[self._qvel_order] = self._qvel
         return state
 
-    def reset(self, state: np.ndarray) -> None:
-        """Start an episode from `state`, with the motor at rest."""
+    def reset(self, state: np.ndarray, key: float = 0.0) -> None:
+        """Start an episode from `state`, with the motor at rest.
+
+        Args:
+            state: the mechanical state.
+            key: of the random numbers of the episode's disturbances.
+        """
         self._install()  # raises if somebody replaced ours since the last episode
         mujoco.mj_resetData(self.model, self.data)
         self._qpos[:] = state[self._qpos_order]
         self._qvel[:] = state[self._qvel_order]
+        if self._disturbances.of_motor:
+            self._act[NOISE_KEY] = key
+        if self._disturber is not None:
+            self._disturber.reset(0, key)
 
     def set_actuator(self, actuator: Actuator) -> None:
         """Exchange the motor for another; to be followed by a reset. An ideal actuator cannot be exchanged."""
@@ -122,13 +139,31 @@ class MujocoPhysics:
         Raises:
             SimulationDivergedError: the state is no longer finite.
         """
-        model, data = self.model, self.data
         arm = 1.0 if self.actuator is None else self.actuator.motor.arm_radius
-        self._ctrl[0] = desired_force * arm
+        command = desired_force
+        if self._disturber is None:
+            self._ctrl[0] = desired_force * arm
+            self._integrate(self.inner_steps)
+        else:
+            for _ in range(self.inner_steps):
+                command = float(self._disturber.command(np.array([desired_force]))[0])
+                self.data.qfrc_applied[self._dof] = self._disturber.load()[0]
+                self._ctrl[0] = command * arm
+                self._integrate(1)
+        check_finite(self.task, self.state, self.data.time)
+        if self.actuator is None:
+            return ideal_signals(desired_force, command)
+        current, voltage = float(self._act[CURRENT]), float(self._act[VOLTAGE])
+        available = float(self._act[AVAILABLE_VOLTAGE]) if self._disturbances.of_motor else None
+        return motor_signals(self.actuator, desired_force, current, voltage, command, available)
+
+    def _integrate(self, steps: int) -> None:
+        """Take integration steps."""
+        model, data = self.model, self.data
         if self._explicit or self._constrain is not None:
             timestep = model.opt.timestep
             rows = self._qpos[np.newaxis], self._qvel[np.newaxis]
-            for _ in range(self.inner_steps):
+            for _ in range(steps):
                 moved = self._qpos + timestep * self._qvel if self._explicit else None
                 mujoco.mj_step(model, data)
                 if moved is not None:
@@ -136,12 +171,18 @@ class MujocoPhysics:
                 if self._constrain is not None:
                     self._constrain(*rows, timestep)
         else:
-            mujoco.mj_step(model, data, self.inner_steps)
-        check_finite(self.task, self.state, data.time)
-        if self.actuator is None:
-            return ideal_signals(desired_force)
-        current, voltage = float(self._act[CURRENT]), float(self._act[VOLTAGE])
-        return motor_signals(self.actuator, desired_force, current, voltage)
+            mujoco.mj_step(model, data, steps)
+
+    def sensed(self, signals: Signals) -> Signals:
+        """Signals of the present moment with the current [A] that the sensor measures."""
+        timestep, key = self.model.opt.timestep, self._act[NOISE_KEY] if self._disturbances.of_motor else 0.0
+        measured = sensed(self._disturbances, [signals.current], [key], [self.data.time], timestep)
+        return signals._replace(current=float(measured[0]))
+
+    @property
+    def memory(self) -> np.ndarray:
+        """What the disturbances remember beside the engine's own state, a live array; empty if nothing."""
+        return np.empty(0) if self._disturber is None else self._disturber.memory[0]
 
 
 def _progression(entries: tuple[int, ...]) -> slice:
