@@ -15,7 +15,9 @@ from rich.table import Table
 
 from codrl_mj.evaluation import Evaluation
 from codrl_mj.training import TrainConfig, train
-from codrl_mj.validation import Check
+from codrl_mj.validation import GROUPS, Caught, Certificate, Check
+from codrl_mj.validation.mutations import margin
+from codrl_mj.validation.page import margin_text
 
 
 def console() -> Console:
@@ -109,12 +111,55 @@ def print_evaluations(evaluations: Mapping[str, Evaluation]) -> None:
     console().print(table)
 
 
-def print_checks(checks: Sequence[Check]) -> None:
-    """Print one table, a row for each check."""
-    table = Table(title="MuJoCo against Gymnasium")
-    for column in ("check", "steps", "worst error", "allowed", "verdict"):
-        table.add_column(column, justify="right" if column in ("steps", "worst error", "allowed") else "left")
+def print_checks(checks: Sequence[Check], title: str = "MuJoCo against Gymnasium") -> None:
+    """Print one table, a row for each check, and under it where those that failed did so."""
+    table = Table(title=title, title_justify="left")
+    for column in ("check", "samples", "worst", "allowed", "margin", "unit", "verdict"):
+        justify = "right" if column in ("samples", "worst", "allowed", "margin") else "left"
+        table.add_column(column, justify=justify, no_wrap=column in ("worst", "allowed", "verdict"))  # type: ignore[arg-type]
     for check in checks:
-        verdict = "[green]passed" if check.passed else f"[red]FAILED at {check.where}"
-        table.add_row(check.name, f"{check.samples:,}", f"{check.worst:.1e}", f"{check.tolerance:.0e}", verdict)
+        verdict = "[green]passed" if check.passed else "[red]FAILED"
+        numbers = f"{check.samples:,}", f"{check.worst:.1e}", f"{check.tolerance:.0e}", margin_text(check)
+        table.add_row(check.name, *numbers, check.unit, verdict)
     console().print(table)
+    for check in checks:
+        if not check.passed:
+            place = f"{check.name}, against {check.oracle}: FAILED at {check.where}"
+            console().print(place, style="red", markup=False, highlight=False)
+
+
+def print_certificate(certificate: Certificate) -> None:
+    """Print a table for each group and task, what was not checked, and the verdict."""
+    for group, description in GROUPS.items():
+        checks = [check for check in certificate.checks if check.group == group]
+        for task in dict.fromkeys(check.task for check in checks):
+            title = f"{group}, {task}" if task else f"{group}: {description}"
+            print_checks([check for check in checks if check.task == task], title)
+    for skip in certificate.skipped:
+        console().print(f"not checked: {skip.group}, {skip.name}: {skip.reason}", markup=False, highlight=False)
+    passed = sum(check.passed for check in certificate.checks)
+    verdict = "[green]passed" if certificate.passed else "[red]FAILED"
+    form = " (the quick form)" if certificate.quick else ""
+    console().print(
+        f"{verdict}: {passed} of {len(certificate.checks)} checks of {certificate.subject}{form}, "
+        f"in {certificate.seconds:.0f} s",
+        highlight=False,
+    )
+
+
+def print_mutations(caught: Sequence[Caught], blind: Sequence[Check]) -> None:
+    """Print one table, a row for each fault made on purpose, and the checks that none of them fails."""
+    table = Table(title="Faults made on purpose", title_justify="left")
+    for column in ("fault", "in", "failed", "clearest check", "worst", "allowed", "beyond"):
+        justify = "right" if column in ("failed", "worst", "allowed", "beyond") else "left"
+        table.add_column(column, justify=justify)  # type: ignore[arg-type]
+    for outcome in caught:
+        check = outcome.clearest
+        shown = ["[red]MISSED", "", "", ""]
+        if check is not None:
+            numbers = f"{check.worst:.1e}", f"{check.tolerance:.0e}", f"{margin(check):.1e}"
+            shown = [f"{check.group}: {check.name}", *numbers]
+        table.add_row(outcome.mutation, outcome.task or "the motor", f"{len(outcome.failed)} of {outcome.made}", *shown)
+    console().print(table)
+    for check in blind:
+        console().print(f"no fault fails {check.group}, {check.task}: {check.name}", style="red", markup=False)

@@ -1,169 +1,179 @@
-"""Cross-validation passes, and would not if anything were wrong: every mutation of the model fails a named check."""
+"""The certificate: what it checks passes, every check can fail, and verdict, files and refusals are what they say."""
 
+import json
 import math
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 
 from codrl_mj import TASKS
-from codrl_mj.motor.parameters import BACK_EMF_CONSTANT, INDUCTANCE, MAX_VOLTAGE, TORQUE_CONSTANT
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError, mujoco_single
-from codrl_mj.validation import Check, validate
-from codrl_mj.validation.checks import STATE_BOUNDS
+from codrl_mj.cli import main
+from codrl_mj.physics import MujocoPhysics, SimulationDivergedError
+from codrl_mj.validation import (
+    GROUPS,
+    MUTATIONS,
+    Caught,
+    Certificate,
+    Check,
+    Curve,
+    Plot,
+    Skipped,
+    dynamics,
+    execution,
+    page,
+    trajectories,
+    try_mutations,
+    validate,
+    validate_model,
+)
+from codrl_mj.validation.compare import Worst, differences
+from codrl_mj.validation.growth import Growth, lyapunov_exponent
+from codrl_mj.validation.mutations import edited, margin, unfailed, wrong_callback
+from codrl_mj.validation.svg_plot import svg
+from tests.callbacks.models import FULL, add_motor, changed, rotor, rotor_spec
 
-SAMPLES, RUNS = 20, 1
-ACTUATORS = ("ideal", "paper", "weaker", "starved")
-HILLS = ("mountain_car", "mountain_car_continuous")
+OWN = ("dynamics", "trajectories", "execution")
 
 
-def failures(task):
-    """What the names of the failed checks begin with or end with: `one step`, or the actuator of a whole run."""
-    failed = set()
-    for check in validate(task, SAMPLES, RUNS):
-        if not check.passed:
-            failed.add("one step" if check.name.startswith("one step") else check.name.split()[-2])
-    return failed
+@pytest.fixture(scope="module")
+def certificate():
+    """The quick form of the whole certificate."""
+    return validate(quick=True)
 
 
-def mutate(monkeypatch, change):
-    """Every model is built with the change made to it."""
-    build = mujoco_single.task_model
-
-    def build_wrong(*arguments, **options):
-        model = build(*arguments, **options)
-        change(model)
-        return model
-
-    monkeypatch.setattr(mujoco_single, "task_model", build_wrong)
+def one_check(**fields):
+    return Check(
+        **({"name": "name", "oracle": "oracle", "samples": 1, "worst": 0.0, "tolerance": 1.0, "where": ""} | fields)
+    )
 
 
 # -- it passes ----------------------------------------------------------------------------------------------
 
 
-def test_every_task_can_be_validated():
-    assert set(STATE_BOUNDS) == set(TASKS)
+def test_the_quick_certificate_passes(certificate):
+    failed = [(check.group, check.task, check.name, check.worst) for check in certificate.checks if not check.passed]
+    assert failed == []
+    assert certificate.passed
+    assert certificate.quick
 
 
-@pytest.mark.parametrize("task", list(TASKS))
-def test_every_check_passes_and_says_what_it_compared(task):
-    arrived = []
-    checks = validate(task, samples=200, runs=2, on_check=arrived.append)
-    integrators = TASKS[task].integrators
-    assert [check.passed for check in checks] == [True] * 5 * len(integrators)
-    assert checks == arrived
-    for check in checks:
-        assert TASKS[task].gymnasium_id in check.oracle
-        assert 0 < check.worst <= check.tolerance
+def test_every_task_and_group_is_in_it_and_every_check_says_what_it_compared(certificate):
+    assert {check.group for check in certificate.checks} == set(GROUPS)
+    for task in TASKS:
+        assert set(GROUPS) - {"motor"} <= {check.group for check in certificate.checks if check.task == task}
+    keys = [(check.group, check.task, check.name) for check in certificate.checks]
+    assert len(set(keys)) == len(keys)
+    for check in certificate.checks:
+        assert check.oracle
         assert check.where
-        assert any(integrator in check.name for integrator in integrators)
-        whole_run = not check.name.startswith("one step")
-        assert check.tolerance == (1e-9 if whole_run else 1e-12)
-        assert check.samples == (2 * int(check.name.split()[0]) if whole_run else 200)
+        assert check.samples > 0
+        assert check.unit
+
+
+def test_tolerances_are_those_promised(certificate):
+    for check in certificate.checks:
+        if check.group == "dynamics":
+            assert check.tolerance == 1e-12
+        if check.group == "trajectories" and "rounding" not in check.name:
+            assert check.tolerance == 1e-9
+        if check.group == "execution":
+            assert check.tolerance == 0.0
+        if "order" in check.name:
+            assert check.tolerance <= 0.1
+
+
+def test_the_whole_form_has_the_same_checks_with_more_samples(certificate):
+    quick = {
+        check.name: check.samples
+        for check in certificate.checks
+        if (check.group, check.task) == ("dynamics", "cartpole")
+    }
+    whole = {check.name: check.samples for check in validate("cartpole", groups=["dynamics"]).checks}
+    assert whole.keys() == quick.keys()
+    assert all(whole[name] > quick[name] for name in whole)
 
 
 def test_validation_repeats_itself():
-    assert validate("cartpole", SAMPLES, RUNS) == validate("cartpole", SAMPLES, RUNS)
+    first, second = (validate("cartpole", quick=True, groups=["dynamics"]).checks for _ in range(2))
+    assert first == second
+
+
+def test_outcomes_arrive_as_they_are_made():
+    arrived, parts = [], []
+    result = validate(
+        ["cartpole", "pendulum"],
+        quick=True,
+        groups=["execution", "dynamics"],
+        on_check=arrived.append,
+        on_part=lambda *part: parts.append(part),
+    )
+    assert arrived == list(result.checks)
+    assert [name for _, _, name in parts] == [
+        "dynamics, cartpole",
+        "dynamics, pendulum",
+        "execution, cartpole",
+        "execution, pendulum",
+        "done",
+    ]
+    assert parts[-1][:2] == (4, 4)
 
 
 # -- it can fail --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("task", list(TASKS))
-def test_a_mass_off_by_a_thousandth_fails_every_check(monkeypatch, task):
-    def heavier(model):
-        model.body_mass[-1] *= 1.001
-
-    mutate(monkeypatch, heavier)
-    assert failures(task) == {"one step", *ACTUATORS}
+@pytest.fixture(scope="module")
+def caught():
+    """What every fault does on one task, and on the motor."""
+    return try_mutations("pendulum")
 
 
-@pytest.mark.parametrize("task", [task for task in TASKS if task not in HILLS])
-def test_gravity_off_by_a_thousandth_fails_every_check(monkeypatch, task):
-    def heavier(model):
-        model.opt.gravity[2] *= 1.001
-
-    mutate(monkeypatch, heavier)
-    assert failures(task) == {"one step", *ACTUATORS}
-
-
-@pytest.mark.parametrize("task", HILLS)
-@pytest.mark.parametrize("entry", [1, 2], ids=["gravity", "wavenumber"])
-def test_a_hill_off_by_a_thousandth_fails_every_check(monkeypatch, task, entry):
-    def steeper(model):
-        model.jnt_user[0, entry] *= 1.001
-
-    mutate(monkeypatch, steeper)
-    assert failures(task) == {"one step", *ACTUATORS}
+def test_every_fault_is_caught_in_every_task_and_far_beyond_the_tolerance(caught):
+    made = {mutation.name for mutation in MUTATIONS if "pendulum" in mutation.tasks}
+    assert {outcome.mutation for outcome in caught} == made
+    assert len(made) >= len(MUTATIONS) - 1
+    assert [(outcome.mutation, outcome.task) for outcome in caught if not outcome.failed] == []
+    assert min(margin(outcome.clearest) for outcome in caught) > 5
 
 
-@pytest.mark.parametrize("task", list(TASKS))
-def test_a_gear_off_by_a_hundredth_fails_every_check(monkeypatch, task):
-    def longer(model):
-        model.actuator_gear[0, 0] *= 1.01
-
-    mutate(monkeypatch, longer)
-    assert failures(task) == {"one step", *ACTUATORS}
+def test_every_check_is_failed_by_some_fault(certificate, caught):
+    checks = [check for check in certificate.checks if check.task in ("pendulum", "")]
+    assert [(check.group, check.task, check.name) for check in unfailed(checks, caught)] == []
 
 
-@pytest.mark.parametrize("task", list(TASKS))
-def test_a_time_step_off_by_a_thousandth_fails_every_check(monkeypatch, task):
-    def slower(model):
-        model.opt.timestep *= 1.001
-
-    mutate(monkeypatch, slower)
-    assert failures(task) == {"one step", *ACTUATORS}
+@pytest.mark.slow
+def test_every_check_of_every_task_is_failed_by_some_fault(certificate):
+    outcomes = try_mutations()
+    assert [(outcome.mutation, outcome.task) for outcome in outcomes if not outcome.failed] == []
+    assert unfailed(certificate.checks, outcomes) == []
 
 
-@pytest.mark.parametrize("task", list(TASKS))
-@pytest.mark.parametrize("parameter", [INDUCTANCE, TORQUE_CONSTANT], ids=["inductance", "torque constant"])
-def test_a_motor_off_by_a_hundredth_fails_the_checks_with_a_motor(monkeypatch, task, parameter):
-    def wrong(model):
-        if model.nuser_actuator:
-            model.actuator_user[0, parameter] *= 1.01
-
-    mutate(monkeypatch, wrong)
-    assert failures(task) == {"paper", "weaker", "starved"}
+def test_faults_are_undone(caught):
+    assert validate("cartpole", quick=True, groups=OWN).passed
 
 
-@pytest.mark.parametrize("task", list(TASKS))
-@pytest.mark.parametrize(
-    ("parameter", "factor"), [(BACK_EMF_CONSTANT, -1.0), (MAX_VOLTAGE, 0.99)], ids=["back-EMF sign", "voltage limit"]
-)
-def test_a_wrong_back_emf_or_voltage_limit_fails_the_checks_of_the_starved_motor(monkeypatch, task, parameter, factor):
-    make = AnalyticPhysics.__init__
-
-    def make_wrong(self, *arguments, **options):
-        make(self, *arguments, **options)
-        if self._parameters is not None:
-            self._parameters[parameter] *= factor
-
-    monkeypatch.setattr(AnalyticPhysics, "__init__", make_wrong)
-    # the loop of the others cancels the back-EMF, unless the cart is so fast that 24 V do not suffice
-    assert failures(task) - ({"paper", "weaker"} if task == "cartpole" else set()) == {"starved"}
-
-
-@pytest.mark.parametrize("task", list(TASKS))
-def test_a_command_that_is_a_step_late_fails_every_check(monkeypatch, task):
+def test_a_fault_is_undone_after_an_error():
+    fault = next(mutation for mutation in MUTATIONS if mutation.name == "a stale command")
     step = MujocoPhysics.step
 
-    def late(self, desired_force):
-        force, self.waiting = getattr(self, "waiting", 0.0), desired_force
-        return step(self, force)
+    def fail():
+        with fault.apply():
+            assert MujocoPhysics.step is not step
+            raise KeyError
 
-    monkeypatch.setattr(MujocoPhysics, "step", late)
-    assert failures(task) == {"one step", *ACTUATORS}
+    with pytest.raises(KeyError):
+        fail()
+    assert MujocoPhysics.step is step
 
 
-def test_the_wrong_integrator_fails_the_checks_of_the_other(monkeypatch):
-    make = MujocoPhysics.__init__
-
-    def always_explicit(self, task, actuator, inner_steps, integrator):
-        make(self, task, actuator, inner_steps, "euler")
-
-    monkeypatch.setattr(MujocoPhysics, "__init__", always_explicit)
-    outcome = {check.name: check.passed for check in validate("cartpole", SAMPLES, RUNS)}
-    assert all(passed == ("semi-implicit" not in name) for name, passed in outcome.items())
+def test_an_edit_whose_text_is_gone_is_an_error_and_not_a_passed_test():
+    with pytest.raises(ValueError, match="occurs 0 times"):
+        edited(sys.modules["codrl_mj.motor.current_loop"], [("no such text", "")])
 
 
 def test_the_oracle_is_the_installed_gymnasium(monkeypatch):
@@ -175,7 +185,9 @@ def test_the_oracle_is_the_installed_gymnasium(monkeypatch):
         return outcome
 
     monkeypatch.setattr(gymnasium.envs.classic_control.CartPoleEnv, "step", shifted)
-    assert failures("cartpole") == {"one step", *ACTUATORS}
+    assert not any(
+        check.passed for check in validate("cartpole", quick=True, groups=["dynamics", "trajectories"]).checks
+    )
 
 
 # -- numbers that are none ----------------------------------------------------------------------------------
@@ -186,10 +198,20 @@ def test_the_oracle_is_the_installed_gymnasium(monkeypatch):
     [(0.0, True), (1e-12, True), (1.0001e-12, False), (math.inf, False), (math.nan, False)],
 )
 def test_a_check_passes_up_to_its_tolerance_and_never_on_nan(worst, passed):
-    assert Check("name", "oracle", 1, worst, 1e-12, "where").passed is passed
+    check = one_check(worst=worst, tolerance=1e-12)
+    assert check.passed is passed
+    assert (margin(check) > 1) is not passed
 
 
-@pytest.mark.parametrize("at", [1, 7, SAMPLES])
+def test_the_worst_is_the_largest_and_a_nan_stays():
+    worst = Worst()
+    for difference, where in ((0.5, "a"), (0.2, "b"), (math.nan, "c"), (7.0, "d")):
+        worst.see(difference, where)
+    assert math.isnan(worst.value)
+    assert worst.where == "c"
+
+
+@pytest.mark.parametrize("at", [1, 7, 200])
 def test_one_nan_among_good_samples_fails_the_check(monkeypatch, at):
     step, calls = MujocoPhysics.step, iter(range(1, 10**6))
 
@@ -200,37 +222,340 @@ def test_one_nan_among_good_samples_fails_the_check(monkeypatch, at):
         return signals
 
     monkeypatch.setattr(MujocoPhysics, "step", broken)
-    first = validate("cartpole", SAMPLES, RUNS)[0]
-    assert math.isnan(first.worst)
-    assert not first.passed
-    assert "x [m] from" in first.where
+    check = dynamics.one_step(TASKS["cartpole"], "euler", 200)
+    assert math.isnan(check.worst)
+    assert not check.passed
+    assert "x [m] from" in check.where
 
 
 def test_a_run_that_diverges_is_a_failed_check_that_says_so(monkeypatch):
     step, calls = MujocoPhysics.step, iter(range(1, 10**6))
-    last = len(TASKS["cartpole"].integrators) * SAMPLES
 
     def diverging(self, desired_force):
-        if next(calls) == last + 5:
+        if next(calls) == 5:
             raise SimulationDivergedError("it diverged")
         return step(self, desired_force)
 
     monkeypatch.setattr(MujocoPhysics, "step", diverging)
-    checks = validate("cartpole", SAMPLES, RUNS)
-    assert [check.passed for check in checks] == [True, True, False, True, True, True, True, True, True, True]
-    assert checks[2].worst == math.inf
-    assert checks[2].where == "step 5 of seed 0: it diverged"
+    for check in trajectories.episodes(TASKS["cartpole"], "ideal", "euler", range(1), 20):
+        assert check.worst == math.inf
+        assert check.where == "step 5 of seed 0: it diverged"
 
 
-# -- arguments ----------------------------------------------------------------------------------------------
+def test_a_group_that_breaks_down_is_a_failed_check(monkeypatch):
+    def broken(task, quick):
+        raise ZeroDivisionError("by zero")
+        yield
+
+    monkeypatch.setattr(dynamics, "checks", broken)
+    (check,) = validate("cartpole", groups=["dynamics"]).checks
+    assert not check.passed
+    assert "ZeroDivisionError" in check.where
 
 
-@pytest.mark.parametrize(("options", "named"), [({"samples": 0}, "samples = 0"), ({"runs": -1}, "runs = -1")])
-def test_counts_below_one_are_refused(options, named):
-    with pytest.raises(ValueError, match=named):
-        validate("cartpole", **options)
+def test_a_missing_library_is_said_and_not_passed_over(monkeypatch):
+    def needing(task, quick):
+        raise ModuleNotFoundError("No module named 'control'")
+        yield
+
+    monkeypatch.setattr(dynamics, "checks", needing)
+    result = validate("cartpole", groups=["dynamics"])
+    assert not result.passed
+    assert "No module named 'control'" in result.skipped[0].reason
+
+
+def test_no_checks_are_no_certificate():
+    assert not Certificate("nothing", (), (), False, 0.0).passed
+
+
+# -- how it measures ----------------------------------------------------------------------------------------
+
+
+def test_angles_are_compared_on_the_circle_only_where_both_were_wrapped():
+    acrobot = TASKS["acrobot"]
+    ours, oracle = np.array([np.pi, 0.0, 1.0, 0.0]), np.array([-np.pi, 0.0, 1.0, 0.0])
+    assert differences(acrobot, ours, oracle).max() < 1e-15
+    ours[0] = 3 * np.pi  # not wrapped at all: that is no rounding error
+    assert differences(acrobot, ours, oracle).max() > 1
+    assert differences(TASKS["pendulum"], np.array([np.pi, 0.0]), np.array([-np.pi, 0.0])).max() > 1
+
+
+def test_the_growth_near_an_unstable_equilibrium_is_its_eigenvalue():
+    """A pendulum upright: the semi-implicit map's larger eigenvalue, by hand."""
+    from codrl_mj.physics import AnalyticPhysics
+
+    task = TASKS["pendulum"]
+    run = AnalyticPhysics(task, None, 1, "semi-implicit")
+    growth = Growth(task, run, seed=0)
+    for _ in range(100):
+        run.step(0.0)
+        growth.follow(0.0)
+    pull = 15.0 * task.step_duration  # 3 g / 2 l of Gymnasium's rod
+    matrix = np.array([[1 + pull * task.step_duration, task.step_duration], [pull, 1.0]])
+    expected = math.log(np.abs(np.linalg.eigvals(matrix)).max()) / task.step_duration
+    assert lyapunov_exponent(np.array(growth.logarithms)[20:], task.step_duration) == pytest.approx(expected, rel=1e-3)
+    assert growth.rounding[-1] > 1e-16 * math.exp(expected * 4.0)
+
+
+def test_the_grid_reaches_the_bounds_and_the_edges_lie_on_them():
+    for name, task in TASKS.items():
+        states = dynamics.grid(task, 5)
+        assert len(states) == 5 ** len(task.state_names)
+        assert states.max(axis=0).tolist() == list(dynamics.STATE_BOUNDS[name])
+    assert {-1.2, 0.6} <= set(dynamics.EDGES["mountain_car"][0])
+    assert math.pi in dynamics.EDGES["acrobot"][0]
+
+
+def test_bits_are_compared_and_not_values():
+    assert execution.differing(np.array([0.0]), np.array([-0.0])).tolist() == [True]
+    assert execution.differing(np.array([np.nan]), np.array([np.nan])).tolist() == [False]
+
+
+# -- a model of one's own -----------------------------------------------------------------------------------
+
+TWO_MOTORS = """
+<mujoco><option timestep="0.005"/><worldbody><geom type="plane" size="5 5 .1"/>
+<body pos="0 0 1"><joint name="a" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 .5" size=".05"/>
+<body pos="0 0 .5"><joint name="b" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 .4" size=".04"/></body></body>
+<body pos="1 0 0.2"><freejoint/><geom type="box" size=".1 .1 .1"/></body></worldbody><actuator>
+<general name="left" joint="a" gear="10" dyntype="user" actdim="8" gainprm="0" biastype="user" ctrllimited="true"
+ ctrlrange="-1 1" user="2507.00268 1 0.1 1 1 4.3 1 1e-6 0.6 24 1 1 0 0"/>
+<position name="foreign" joint="a" kp="1"/>
+<general name="right" joint="b" gear="5" dyntype="user" actdim="8" gainprm="0" biastype="user" ctrllimited="true"
+ ctrlrange="-1 1" user="2507.00268 1 0.1 1 1 4.3 1 1e-6 0.6 2 0 4 0.1 0.01"/>
+</actuator></mujoco>
+"""
+
+
+def test_a_model_of_ones_own_passes_what_applies_and_is_told_what_does_not():
+    result = validate_model(mujoco.MjModel.from_xml_string(TWO_MOTORS), "two motors", quick=True)
+    assert result.passed
+    names = {check.name for check in result.checks}
+    assert {"stable: left", "stable: right", "steps: left", "steps: right"} <= names
+    assert {"batched, 1 thread", "batched, 2 threads", "copied", "restored", "forward passes"} <= names
+    assert {skip.group for skip in result.skipped} >= {"dynamics", "trajectories", "convergence", "energy"}
+    assert any("foreign" in skip.name and "not motors" in skip.reason for skip in result.skipped)
+    assert all(check.task == "two motors" for check in result.checks)
+
+
+def test_every_check_of_a_model_can_fail():
+    model, failed = rotor(), set()
+    with wrong_callback((), (("voltage - back_emf -", "voltage + back_emf -"),)):
+        failed |= {check.name for check in validate_model(model, quick=True).checks if not check.passed}
+    for mutation in MUTATIONS:
+        if mutation.name in ("a motor that runs in every forward pass", "a current that simulations share"):
+            with mutation.apply():
+                failed |= {check.name for check in validate_model(model, quick=True).checks if not check.passed}
+    unstable = rotor(changed(FULL, kp=1000.0))
+    failed |= {check.name for check in validate_model(unstable, quick=True).checks if not check.passed}
+    assert failed == {check.name for check in validate_model(model, quick=True).checks}
+
+
+def test_a_motor_that_never_runs_is_said():
+    spec = rotor_spec()
+    add_motor(spec, "hinge", FULL, name="off", group=3)
+    spec.option.disableactuator = 1 << 3
+    result = validate_model(spec.compile(), quick=True)
+    assert result.passed
+    assert [skip.name for skip in result.skipped if "disabled" in skip.reason] == ["steps: off"]
+
+
+def test_the_users_model_is_left_as_it_was():
+    model = rotor()
+    flags = model.opt.disableflags
+    validate_model(model, quick=True)
+    assert model.opt.disableflags == flags
+
+
+# -- bad input ----------------------------------------------------------------------------------------------
 
 
 def test_an_unknown_task_is_refused_with_the_nearest():
     with pytest.raises(ValueError, match="did you mean 'acrobot'"):
         validate("acrobat")
+
+
+def test_an_unknown_group_is_refused():
+    with pytest.raises(ValueError, match=r"'dynamic'.*dynamics, trajectories"):
+        validate("acrobot", groups=["dynamic"])
+
+
+def test_a_model_without_a_motor_is_refused():
+    model = mujoco.MjModel.from_xml_string("<mujoco><worldbody/></mujoco>")
+    with pytest.raises(ValueError, match=r"no motor of codrl_mj among its 0 actuators.*set_actuator"):
+        validate_model(model)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["acrobat"], "unknown task 'acrobat': did you mean 'acrobot'?"),
+        (["--model", "nowhere.xml"], "no model at nowhere.xml"),
+        (["--model", "broken.xml"], "broken.xml: MuJoCo cannot compile this model: "),
+        (["--model", "bare.xml"], "no motor of codrl_mj"),
+        (["--model", "bare.xml", "cartpole"], "--model"),
+        (["cartpole", "--out", "bare.xml"], "cannot write to bare.xml"),
+        (["cartpole", "--out", "bare.xml/certificate"], "bare.xml is not a folder"),
+    ],
+)
+def test_bad_input_costs_one_line_and_leaves_nothing(capsys, monkeypatch, tmp_path, arguments, expected):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bare.xml").write_text("<mujoco><worldbody/></mujoco>")
+    (tmp_path / "broken.xml").write_text("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>")
+    assert main(["validate", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert expected in error
+    assert error.count("\n") == 1
+    assert "Traceback" not in error
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bare.xml", "broken.xml"]
+
+
+# -- the files ----------------------------------------------------------------------------------------------
+
+
+class Page(HTMLParser):
+    """Checks that elements close in order, and collects what a browser would fetch."""
+
+    VOID = ("meta", "br", "link", "img", "input", "hr")
+
+    def __init__(self, text):
+        """Parse at once."""
+        super().__init__()
+        self.open, self.fetched, self.ids, self.targets, self.words = [], [], [], [], []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attributes):
+        if tag not in self.VOID:
+            self.open.append(tag)
+        for name, value in attributes:
+            if name == "id":
+                self.ids.append(value)
+            if name in ("src", "href", "xlink:href", "data"):
+                (self.targets if value.startswith("#") else self.fetched).append(value)
+        assert tag not in ("script", "link", "img", "iframe", "object")
+
+    def handle_startendtag(self, tag, attributes):
+        self.handle_starttag(tag, attributes)
+        if tag not in self.VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+
+BAD = one_check(name="b <i>", group="motor", worst=math.nan, where="x < y & z", unit="A", task="")
+SAMPLE = Certificate("sample", (one_check(task="pendulum"), BAD), (Skipped("s", "why", "motor"),), True, 1.0)
+
+
+def test_the_page_is_well_formed_self_contained_and_has_everything(certificate, caught):
+    text = page.html(certificate, caught)
+    parsed = Page(text)
+    assert parsed.fetched == []
+    assert re.findall(r"url\(|@import|https?://", text) == []
+    assert {target[1:] for target in parsed.targets} <= set(parsed.ids)
+    assert set(GROUPS) <= set(parsed.ids)
+    words = " ".join(parsed.words)
+    for check in certificate.checks:
+        assert check.name in words
+    for outcome in caught:
+        assert outcome.mutation in words
+    assert text.count('class="plot"') == sum(len(check.plots) for check in certificate.checks) > 20
+    assert "✓ passed" in words
+    assert "prefers-color-scheme: dark" in text
+    assert len(text) < 10_000_000
+
+
+def test_a_failure_is_on_top_and_not_by_colour_alone():
+    words = " ".join(" ".join(Page(page.html(SAMPLE)).words).split())
+    assert words.index("✗ FAILED: 1 of 2 checks") < words.index("Contents")
+    assert "b <i>" in words
+    assert "x < y & z" in words
+    assert words.count("✗ FAILED") == 2
+
+
+def test_plots_have_their_labels_with_units(certificate):
+    for check in certificate.checks:
+        for plot in check.plots:
+            drawn = svg(plot)
+            Page(drawn)
+            assert "[" in plot.x_label, plot.title
+            assert "[" in plot.y_label, plot.title
+            assert drawn.count("<path class") >= len(plot.curves)
+
+
+@pytest.mark.parametrize("y", [[0.0, 0.0], [np.nan, np.inf], [1.0, 1.0], [-3.0, 1e300], [1e-300, 1.0]])
+@pytest.mark.parametrize("log", [False, True])
+def test_any_numbers_can_be_drawn(y, log):
+    drawn = svg(Plot("t", "x [s]", "y [1]", (Curve("c", np.array([0.0, 1.0]), np.array(y)),), log, log))
+    Page(drawn)
+    assert "nan" not in drawn
+
+
+def test_the_json_holds_the_verdict_and_every_number(tmp_path):
+    json_file, html_file = page.write(SAMPLE, tmp_path / "new" / "folder", [Caught("m", "", (BAD,), 2)])
+    content = json.loads(json_file.read_text())
+    assert content["verdict"] == "FAILED"
+    assert [check["passed"] for check in content["checks"]] == [True, False]
+    assert content["checks"][1]["worst"] == "nan"
+    assert content["versions"]["mujoco"] == mujoco.__version__
+    assert content["skipped"][0]["reason"] == "why"
+    assert content["mutations"][0]["failed"] == ["motor: b <i>"]
+    assert content["failed by no mutation"] == ["dynamics: pendulum: name"]
+    assert sorted(path.name for path in html_file.parent.iterdir()) == ["certificate.html", "certificate.json"]
+
+
+def test_a_certificate_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    page.write(SAMPLE, tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    monkeypatch.setattr(page, "html", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        page.write(SAMPLE, tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+# -- the command line ---------------------------------------------------------------------------------------
+
+
+def test_the_command_prints_writes_and_exits_with_0(capsys, tmp_path):
+    (tmp_path / "robot.xml").write_text(TWO_MOTORS)
+    out = tmp_path / "out"
+    assert main(["validate", "--model", str(tmp_path / "robot.xml"), "--quick", "--out", str(out)]) == 0
+    text = capsys.readouterr().out
+    assert "steps: left" in text
+    assert "not checked: dynamics" in text
+    assert "passed: 9 of 9 checks" in text
+    assert (out / "certificate.html").is_file()
+    assert json.loads((out / "certificate.json").read_text())["verdict"] == "passed"
+
+
+@pytest.mark.parametrize("worst", [1.0, math.nan])
+def test_the_command_exits_with_1_when_a_check_fails_and_still_writes(capsys, monkeypatch, tmp_path, worst):
+    bad = one_check(name="bad", worst=worst, tolerance=1e-12, where="theta", task="cartpole")
+    wrong = Certificate("cartpole", (one_check(name="good", task="cartpole"), bad), (), False, 1.0)
+    monkeypatch.setattr("codrl_mj.validation.validate", lambda *_, **__: wrong)
+    assert main(["validate", "cartpole", "--out", str(tmp_path)]) == 1
+    text = capsys.readouterr().out
+    assert "bad, against oracle: FAILED at theta" in text
+    assert "FAILED: 1 of 2 checks" in text
+    assert json.loads((tmp_path / "certificate.json").read_text())["verdict"] == "FAILED"
+
+
+@pytest.mark.parametrize(("missed", "status"), [(False, 0), (True, 1)])
+def test_a_fault_that_is_missed_fails_the_command(capsys, monkeypatch, missed, status):
+    good, failed = one_check(task="cartpole"), one_check(task="cartpole", worst=7.0)
+    monkeypatch.setattr("codrl_mj.validation.validate", lambda *_, **__: Certificate("c", (good,), (), False, 1.0))
+    outcomes = [Caught("fault", "cartpole", (failed,), 1)] + [Caught("other", "cartpole", (), 1)] * missed
+    monkeypatch.setattr("codrl_mj.validation.try_mutations", lambda *_, **__: outcomes)
+    assert main(["validate", "cartpole", "--mutations"]) == status
+    assert ("MISSED" in capsys.readouterr().out) is missed
+
+
+def test_importing_the_certificate_needs_none_of_the_oracles_libraries():
+    code = "import sys, codrl_mj.terminal; print([n for n in ('control', 'scipy', 'jinja2') if n in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert "control" not in done.stdout
+    assert "jinja2" not in done.stdout or "scipy" in done.stdout

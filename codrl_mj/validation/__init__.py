@@ -1,6 +1,20 @@
-"""Cross-validation of the MuJoCo port against dynamics that are not ours."""
+"""The certificate that the port is right: named checks against oracles that are not ours, and faults that fail them."""
 
-from codrl_mj.validation.checks import validate
-from codrl_mj.validation.outcome import Check, Curve, Plot
+from codrl_mj.validation.certificate import GROUPS, Certificate, validate, validate_model
+from codrl_mj.validation.mutations import MUTATIONS, Caught, Mutation, try_mutations
+from codrl_mj.validation.outcome import Check, Curve, Plot, Skipped
 
-__all__ = ["Check", "Curve", "Plot", "validate"]
+__all__ = [
+    "GROUPS",
+    "MUTATIONS",
+    "Caught",
+    "Certificate",
+    "Check",
+    "Curve",
+    "Mutation",
+    "Plot",
+    "Skipped",
+    "try_mutations",
+    "validate",
+    "validate_model",
+]

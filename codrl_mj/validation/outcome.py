@@ -66,3 +66,17 @@ class Check:
     def passed(self) -> bool:
         """Whether the port is right as far as this check sees; a NaN is a failure."""
         return bool(self.worst <= self.tolerance)
+
+
+@dataclasses.dataclass(frozen=True)
+class Skipped:
+    """A check that was not made."""
+
+    name: str
+    """What was not compared."""
+    reason: str
+    """Why it does not apply, or what it needs."""
+    group: str = ""
+    """Which part of the certificate."""
+    task: str = ""
+    """The task or model."""

@@ -1,0 +1,216 @@
+"""The certificate: all groups of checks over all tasks, or over a user's own model, and what they found."""
+
+import dataclasses
+import importlib
+import importlib.metadata
+import importlib.util
+import math
+import platform
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import mujoco
+
+from codrl_mj.physics import SimulationDivergedError
+from codrl_mj.tasks import TASKS, find_task
+from codrl_mj.validation import own_model
+from codrl_mj.validation.outcome import Check, Skipped
+
+GROUPS: dict[str, str] = {
+    "dynamics": "Accelerations and single steps against the installed Gymnasium",
+    "trajectories": "Whole runs against the installed Gymnasium, and what chaos makes of rounding",
+    "convergence": "Ever smaller steps, ever faster loops: the order at which the solutions converge",
+    "motor": "The motor and its current loop against closed forms and other people's motors",
+    "energy": "Every joule that goes in comes out",
+    "execution": "Batched, copied, restored, looked at: the same bits",
+}
+"""The parts of the certificate, in order, with what they are."""
+
+WITHOUT_TASK = ("motor",)
+"""Groups that are run once, whatever the tasks."""
+
+PACKAGES = ("codrl-mj", "mujoco", "gymnasium", "numpy", "scipy", "numba", "control", "gym-electric-motor")
+
+
+@dataclasses.dataclass(frozen=True)
+class Certificate:
+    """What was checked, what was found, and with which software."""
+
+    subject: str
+    """What was checked: tasks, or a model."""
+    checks: tuple[Check, ...]
+    """In the order of `GROUPS`."""
+    skipped: tuple[Skipped, ...]
+    """What was not checked, and why."""
+    quick: bool
+    """Whether it is the quick form: fewer states, runs and step sizes."""
+    seconds: float
+    """How long it took [s]."""
+
+    @property
+    def passed(self) -> bool:
+        """Whether every check passed, and there was one."""
+        return bool(self.checks) and all(check.passed for check in self.checks)
+
+    def as_mapping(self) -> dict[str, Any]:
+        """Everything but the plots, for JSON; infinities and NaN as text."""
+        return {
+            "format": "codrl_mj certificate 1",
+            "subject": self.subject,
+            "verdict": "passed" if self.passed else "FAILED",
+            "quick": self.quick,
+            "seconds": round(self.seconds, 1),
+            "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            "versions": versions(),
+            "checks": [_check_mapping(check) for check in self.checks],
+            "skipped": [dataclasses.asdict(skip) for skip in self.skipped],
+        }
+
+
+def _check_mapping(check: Check) -> dict[str, Any]:
+    fields = {field.name: getattr(check, field.name) for field in dataclasses.fields(check) if field.name != "plots"}
+    for name, value in fields.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            fields[name] = str(value)
+    return fields | {"samples": int(check.samples), "passed": check.passed}
+
+
+def versions() -> dict[str, str]:
+    """The versions of everything that a verdict depends on."""
+    found = {"Python": platform.python_version(), "platform": platform.platform(terse=True)}
+    for package in PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+@dataclasses.dataclass(frozen=True)
+class _Part:
+    """Checks that are made together."""
+
+    group: str
+    task: str
+    run: Callable[[], Iterator[Check | Skipped]]
+
+
+def _checks(group: str, task: str | None, quick: bool) -> Iterator[Check]:
+    """The checks of a group's module, which is imported here: some need libraries that nothing else does."""
+    yield from importlib.import_module(f"codrl_mj.validation.{group}").checks(task, quick)
+
+
+Progress = Callable[[int, int, str], None]
+"""(parts done, parts in all, the part that begins) -> nothing."""
+
+
+def _outcomes(part: _Part) -> Iterator[Check | Skipped]:
+    """The outcomes of a part; a simulation that breaks down is a failed check, a missing library a skipped one."""
+    try:
+        yield from part.run()
+    except ModuleNotFoundError as error:
+        yield Skipped("the rest of the group", f"{error}: pip install 'codrl-mj[validate]'", part.group, part.task)
+    except (ArithmeticError, SimulationDivergedError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        yield Check("runs to its end", "itself", 1, math.inf, 0.0, reason, part.group, part.task, "")
+
+
+def _certify(
+    subject: str,
+    parts: Sequence[_Part],
+    skipped: Sequence[Skipped],
+    quick: bool,
+    on_check: Callable[[Check], None] | None,
+    on_part: Progress | None,
+) -> Certificate:
+    started = time.perf_counter()
+    found: list[Check] = []
+    skips = list(skipped)
+    for index, part in enumerate(parts):
+        if on_part is not None:
+            on_part(index, len(parts), f"{part.group}, {part.task}" if part.task else part.group)
+        for outcome in _outcomes(part):
+            if isinstance(outcome, Skipped):
+                skips.append(outcome)
+                continue
+            found.append(outcome)
+            if on_check is not None:
+                on_check(outcome)
+    if on_part is not None:
+        on_part(len(parts), len(parts), "done")
+    return Certificate(subject, tuple(found), tuple(skips), quick, time.perf_counter() - started)
+
+
+def validate(
+    tasks: str | Sequence[str] | None = None,
+    *,
+    quick: bool = False,
+    groups: Sequence[str] | None = None,
+    on_check: Callable[[Check], None] | None = None,
+    on_part: Progress | None = None,
+) -> Certificate:
+    """Check that the port is right.
+
+    Args:
+        tasks: a task, several, or None for all of them.
+        quick: fewer states, runs and step sizes: seconds instead of minutes.
+        groups: some of `GROUPS`; None for all of them.
+        on_check: called with each outcome as it arrives.
+        on_part: called as each group and task begins.
+
+    Raises:
+        ValueError: an unknown task or group.
+    """
+    names = [tasks] if isinstance(tasks, str) else list(tasks or TASKS)
+    for name in names:
+        find_task(name)
+    chosen = list(GROUPS) if groups is None else list(groups)
+    for group in chosen:
+        if group not in GROUPS:
+            raise ValueError(f"unknown group of checks {group!r}: must be one of {', '.join(GROUPS)}")
+    parts = [
+        _Part(group, task or "", lambda group=group, task=task: _checks(group, task, quick))  # type: ignore[misc]
+        for group in GROUPS
+        if group in chosen
+        for task in ([None] if group in WITHOUT_TASK else dict.fromkeys(names))
+    ]
+    subject = "all tasks" if len(set(names)) == len(TASKS) else ", ".join(dict.fromkeys(names))
+    missing = [] if importlib.util.find_spec("gym_electric_motor") or "motor" not in chosen else [_NO_GEM]
+    return _certify(subject, parts, missing, quick, on_check, on_part)
+
+
+_NO_GEM = Skipped(
+    "the motor against gym-electric-motor's permanently excited DC motor",
+    "gym-electric-motor is not installed",
+    "motor",
+)
+
+
+def validate_model(
+    model: mujoco.MjModel,
+    name: str = "model",
+    *,
+    quick: bool = False,
+    on_check: Callable[[Check], None] | None = None,
+    on_part: Progress | None = None,
+) -> Certificate:
+    """Put a model of your own, with any number of our motors, through the checks that apply to it.
+
+    Args:
+        model: a compiled model; it is not changed.
+        name: its name in the certificate.
+        quick: fewer simulations and steps.
+        on_check: called with each outcome as it arrives.
+        on_part: called as each part begins.
+
+    Raises:
+        ValueError: the model has no motor of ours, or one that is not as it should be.
+        CallbackInUseError: another library's MuJoCo callback is installed where ours has to go.
+    """
+    subject = own_model.prepare(model)
+    parts = [
+        _Part(group, name, lambda run=run: run(subject, name, quick))  # type: ignore[misc]
+        for group, run in own_model.PARTS.items()
+    ]
+    return _certify(name, parts, own_model.skipped(subject, name), quick, on_check, on_part)

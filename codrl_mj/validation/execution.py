@@ -1,0 +1,216 @@
+"""However it is executed, a simulation is the same, bit for bit: batched, copied, restored, pickled, reset, looked at.
+
+The oracle is a plain loop over `mj_step`. A tolerance would hide a leak between simulations, so there is none: what is
+counted is the number of 64-bit floats that differ.
+"""
+
+import copy
+import pickle
+from collections.abc import Callable, Iterator
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from codrl_mj.motor import named_actuator
+from codrl_mj.physics import MujocoPhysics, install_callbacks, motors
+from codrl_mj.physics.base import inner_step_count
+from codrl_mj.tasks import Task, find_task
+from codrl_mj.validation.compare import Worst
+from codrl_mj.validation.outcome import Check
+
+UNIT = "64-bit floats that differ"
+SERIAL = "a loop over mj_step"
+STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
+"""What a state vector of a task holds: time, positions, velocities and activations, the motor's among them."""
+FULL_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+"""The same for a user's model, whose contacts also need the solver's warm start."""
+THREADS = (1, 2)
+
+
+def commands(model: mujoco.MjModel, steps: int, seed: int) -> np.ndarray:
+    """Random controls, each held for five steps, within the control ranges or +-1: shape (steps, nu)."""
+    limited = model.actuator_ctrllimited.astype(bool)
+    low = np.where(limited, model.actuator_ctrlrange[:, 0], -1.0)
+    high = np.where(limited, model.actuator_ctrlrange[:, 1], 1.0)
+    drawn = np.random.default_rng(seed).uniform(low, high, (steps // 5 + 1, model.nu))
+    return np.repeat(drawn, 5, axis=0)[:steps]
+
+
+def _state(data: mujoco.MjData) -> np.ndarray:
+    return np.concatenate([[data.time], data.qpos, data.qvel, data.act])
+
+
+def _advance(model: mujoco.MjModel, data: mujoco.MjData, controls: np.ndarray) -> np.ndarray:
+    """The states after each step under the given controls."""
+    states = []
+    for control in controls:
+        data.ctrl[:] = control
+        mujoco.mj_step(model, data)
+        states.append(_state(data))
+    return np.array(states)
+
+
+def differing(ours: np.ndarray, oracle: np.ndarray) -> np.ndarray:
+    """Where two float64 arrays are not the same bits."""
+    ours, oracle = (np.ascontiguousarray(array, dtype=np.float64).view(np.uint64) for array in (ours, oracle))
+    return ours != oracle
+
+
+def _check(name: str, oracle_name: str, ours: np.ndarray, oracle: np.ndarray, task: str) -> Check:
+    """Compare states of shape (steps, n) or (steps, simulations, n)."""
+    unequal = differing(ours, oracle)
+    worst = Worst()
+    if unequal.any():
+        first = int(np.argmax(unequal.reshape(len(unequal), -1).any(axis=1)))
+        worst.see(float(unequal.sum()), f"the first of them at step {first + 1} of {len(unequal)}")
+    count = int(unequal.size)
+    return Check(name, oracle_name, count, worst.value, 0.0, worst.where, "execution", task, UNIT)
+
+
+def batched(model: mujoco.MjModel, threads: int, simulations: int, steps: int, task: str = "") -> Check:
+    """A batch, each simulation under commands of its own, against one simulation after the other."""
+    inputs = np.stack([commands(model, steps, seed) for seed in range(simulations)], axis=1)
+    batch = Batch(model, nsim=simulations, nthread=threads)
+    bound = batch.bind("ctrl").reshape(simulations, -1)
+    fields = [batch.bind(name).reshape(simulations, -1) for name in ("time", "qpos", "qvel", "act")]
+    ours = []
+    for control in inputs:
+        bound[:] = control
+        batch.step()
+        ours.append(np.concatenate(fields, axis=1))
+    serial = [_advance(model, mujoco.MjData(model), inputs[:, each]) for each in range(simulations)]
+    name = f"batched, {threads} thread{'s' if threads > 1 else ''}"
+    return _check(name, SERIAL, np.array(ours), np.stack(serial, axis=1), task)
+
+
+def copied(model: mujoco.MjModel, steps: int, task: str = "") -> Check:
+    """A copy of `MjData` made half-way, against the original."""
+    inputs = commands(model, 2 * steps, seed=0)
+    original = mujoco.MjData(model)
+    _advance(model, original, inputs[:steps])
+    twin = copy.copy(original)
+    ours = _advance(model, twin, inputs[steps:])
+    return _check("copied", "the original", ours, _advance(model, original, inputs[steps:]), task)
+
+
+def restored(model: mujoco.MjModel, steps: int, task: str = "", state: mujoco.mjtState | None = None) -> Check:
+    """A state vector taken half-way and put into a new `MjData`, against the run it was taken from."""
+    kind = STATE if state is None else state
+    inputs = commands(model, 2 * steps, seed=1)
+    original, fresh = mujoco.MjData(model), mujoco.MjData(model)
+    _advance(model, original, inputs[:steps])
+    vector = np.empty(mujoco.mj_stateSize(model, kind))
+    mujoco.mj_getState(model, original, vector, kind)
+    mujoco.mj_setState(model, fresh, vector, kind)
+    ours = _advance(model, fresh, inputs[steps:])
+    return _check("restored", "the run it was taken from", ours, _advance(model, original, inputs[steps:]), task)
+
+
+def forward_passes(model: mujoco.MjModel, steps: int, task: str = "") -> Check:
+    """Between any two steps, three forward passes leave the activations, the motors' state, as one does."""
+    inputs = commands(model, steps, seed=2)
+    data = mujoco.MjData(model)
+    once, often = [], []
+    for control in inputs:
+        data.ctrl[:] = control
+        looked_at = copy.copy(data)
+        mujoco.mj_forward(model, looked_at)
+        once.append(looked_at.act.copy())
+        for _ in range(2):
+            mujoco.mj_forward(model, looked_at)
+        often.append(looked_at.act.copy())
+        mujoco.mj_step(model, data)
+    return _check("forward passes", "one forward pass", np.array(often), np.array(once), task)
+
+
+def model_checks(
+    model: mujoco.MjModel, task: str = "", quick: bool = False, state: mujoco.mjtState | None = None
+) -> Iterator[Check]:
+    """The checks that any model can be put through; its motors' callbacks must be installed.
+
+    Args:
+        model: any model.
+        task: its name in the certificate.
+        quick: fewer simulations and steps.
+        state: what a state vector holds; None means `STATE`.
+    """
+    simulations, steps = (6, 40) if quick else (32, 200)
+    for threads in THREADS:
+        yield batched(model, threads, simulations, steps, task)
+    yield copied(model, steps, task)
+    yield restored(model, steps, task, state)
+    yield forward_passes(model, steps, task)
+
+
+# -- with a task's bounds and integrator around it ----------------------------------------------------------
+
+
+def _episode(physics: MujocoPhysics, forces: np.ndarray) -> np.ndarray:
+    """The motor's and the mechanical state after each environment step."""
+    states = []
+    for force in forces.tolist():
+        physics.step(force)
+        states.append(np.concatenate([physics.state, physics.data.act]))
+    return np.array(states)
+
+
+def _simulation(task: Task, integrator: str, seed: int, steps: int) -> tuple[MujocoPhysics, np.ndarray, np.ndarray]:
+    generator = np.random.default_rng(seed)
+    actuator = named_actuator("paper", task.name)
+    physics = MujocoPhysics(task, actuator, inner_step_count(task, actuator, None, None), integrator)
+    initial = task.initial(generator, None)
+    physics.reset(initial)
+    return physics, initial, task.max_force * generator.uniform(-1.0, 1.0, steps)
+
+
+def pickled(task: Task, integrator: str, steps: int) -> Check:
+    """A simulation pickled and unpickled half-way, against the original."""
+    physics, _, forces = _simulation(task, integrator, 3, 2 * steps)
+    _episode(physics, forces[:steps])
+    twin = pickle.loads(pickle.dumps(physics))
+    ours, oracle = (_episode(each, forces[steps:]) for each in (twin, physics))
+    return _check(f"pickled, {integrator}", "the original", ours, oracle, task.name)
+
+
+def repeated(task: Task, integrator: str, steps: int) -> Check:
+    """A second episode after a reset, against the first."""
+    physics, initial, forces = _simulation(task, integrator, 4, steps)
+    oracle = _episode(physics, forces)
+    physics.reset(initial)
+    return _check(f"repeated, {integrator}", "the first episode", _episode(physics, forces), oracle, task.name)
+
+
+def looked_at(task: Task, integrator: str, steps: int) -> Check:
+    """An episode with a forward pass after every environment step, as a viewer makes them, against one without."""
+    physics, initial, forces = _simulation(task, integrator, 5, steps)
+    oracle = _episode(physics, forces)
+    physics.reset(initial)
+    states = []
+    for force in forces.tolist():
+        physics.step(force)
+        states.append(np.concatenate([physics.state, physics.data.act]))
+        mujoco.mj_forward(physics.model, physics.data)
+    return _check(f"looked at, {integrator}", "an episode that nobody looks at", np.array(states), oracle, task.name)
+
+
+TASK_CHECKS: tuple[Callable[[Task, str, int], Check], ...] = (pickled, repeated, looked_at)
+
+
+def checks(task_name: str | None, quick: bool = False) -> Iterator[Check]:
+    """The checks of this group.
+
+    Args:
+        task_name: the task; None has no checks.
+        quick: fewer simulations and steps.
+    """
+    if task_name is None:
+        return
+    task = find_task(task_name)
+    physics, _, _ = _simulation(task, task.integrators[0], 0, 1)
+    assert motors(physics.model)
+    install_callbacks(physics.model)
+    yield from model_checks(physics.model, task.name, quick)
+    for integrator in task.integrators:
+        for check in TASK_CHECKS:
+            yield check(task, integrator, 30 if quick else 200)

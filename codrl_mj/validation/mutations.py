@@ -1,0 +1,353 @@
+"""The certificate put to the test: faults that somebody could have made, each of which must fail a named check.
+
+A fault is made in a model, in the package's own source text (an edit, compiled anew), or in how a simulation is driven,
+and is undone when the `with` block ends.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import importlib
+import inspect
+import math
+import sys
+import types
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from codrl_mj import callbacks
+from codrl_mj.callbacks import kernels
+from codrl_mj.motor import current_loop
+from codrl_mj.physics import MujocoPhysics, constrain, mjcf
+from codrl_mj.tasks import TASKS
+from codrl_mj.validation.certificate import WITHOUT_TASK, validate
+from codrl_mj.validation.outcome import Check
+
+Fault = contextlib.AbstractContextManager[None]
+
+
+@contextlib.contextmanager
+def _everywhere(name: str, original: Any, wrong: Any) -> Iterator[None]:
+    """Replace `original` by `wrong` in every module of the package that knows it as `name`."""
+    modules = [module for key, module in sys.modules.items() if key.startswith("codrl_mj")]
+    holders = [module for module in modules if getattr(module, name, None) is original]
+    for module in holders:
+        setattr(module, name, wrong)
+    try:
+        yield
+    finally:
+        for module in holders:
+            setattr(module, name, original)
+
+
+@contextlib.contextmanager
+def _method(owner: type, name: str, wrong: Callable[..., Any]) -> Iterator[None]:
+    original = getattr(owner, name)
+    setattr(owner, name, wrong)
+    try:
+        yield
+    finally:
+        setattr(owner, name, original)
+
+
+# -- in a model ---------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def wrong_model(change: Callable[[mujoco.MjModel], None]) -> Iterator[None]:
+    """Every task's model is compiled with the change made to it."""
+    build = mjcf.task_model
+
+    def build_wrong(*arguments: Any, **options: Any) -> mujoco.MjModel:
+        model = build(*arguments, **options)
+        change(model)
+        return model
+
+    with _everywhere("task_model", build, build_wrong):
+        yield
+
+
+def _heavier(model: mujoco.MjModel) -> None:
+    model.body_mass[-1] *= 1.001
+
+
+def _stronger_gravity(model: mujoco.MjModel) -> None:
+    model.opt.gravity[2] *= 1.001
+    if model.nuser_jnt:
+        model.jnt_user[0, 1] *= 1.001  # the hill's
+
+
+def _longer_gear(model: mujoco.MjModel) -> None:
+    model.actuator_gear[0, 0] *= 1.01
+
+
+def _slower_clock(model: mujoco.MjModel) -> None:
+    model.opt.timestep *= 1.001
+
+
+def _tighter_range(model: mujoco.MjModel) -> None:
+    model.actuator_ctrlrange[0] *= 0.99
+
+
+# -- in the source text -------------------------------------------------------------------------------------
+
+Edit = tuple[str, str]
+"""(text that occurs once, text to put there)."""
+
+
+def edited(module: types.ModuleType, edits: Sequence[Edit]) -> types.ModuleType:
+    """A module made anew from another's source text, with the edits made.
+
+    Args:
+        module: a module; it stays what it is.
+        edits: each must occur in the source exactly once.
+
+    Raises:
+        ValueError: a text does not occur exactly once: the source has changed, and the mutation must follow.
+    """
+    source = inspect.getsource(module)
+    for old, new in edits:
+        if source.count(old) != 1:
+            raise ValueError(f"{module.__name__}: {old!r} occurs {source.count(old)} times, must occur once")
+        source = source.replace(old, new)
+    wrong = types.ModuleType(module.__name__)
+    exec(compile(source, f"<mutation of {module.__name__}>", "exec"), vars(wrong))
+    return wrong
+
+
+_HIDDEN = np.zeros(1)
+"""Memory that no simulation owns."""
+
+
+@functools.cache
+def _wrong_loop(edits: tuple[Edit, ...]) -> types.ModuleType:
+    return edited(current_loop, edits)
+
+
+@functools.cache
+def _wrong_callbacks(callback_edits: tuple[Edit, ...], loop_edits: tuple[Edit, ...]) -> Callable[[], Any]:
+    sys.modules[current_loop.__name__] = _wrong_loop(loop_edits)  # what the callbacks' source imports
+    try:
+        wrong = edited(kernels, callback_edits)
+    finally:
+        sys.modules[current_loop.__name__] = current_loop
+    wrong.HIDDEN = _HIDDEN.ctypes.data  # type: ignore[attr-defined]
+    return wrong.compiled
+
+
+@contextlib.contextmanager
+def wrong_callback(callback_edits: tuple[Edit, ...] = (), loop_edits: tuple[Edit, ...] = ()) -> Iterator[None]:
+    """MuJoCo runs a callback that was compiled from edited source."""
+    parts = importlib.import_module("codrl_mj.callbacks.install")._PARTS  # the package's `install` is the function
+    part = parts["motor"]
+    callbacks.uninstall()
+    parts["motor"] = part._replace(compile=_wrong_callbacks(callback_edits, loop_edits))
+    try:
+        yield
+    finally:
+        callbacks.uninstall()
+        parts["motor"] = part
+
+
+@contextlib.contextmanager
+def wrong_loop_everywhere(*loop_edits: Edit) -> Iterator[None]:
+    """The callback and the plain-Python loop share the fault: comparing the two cannot show it."""
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(wrong_callback((), loop_edits))
+        for name, right in vars(current_loop).items():
+            if getattr(right, "__module__", "") == current_loop.__name__:
+                wrong = getattr(_wrong_loop(loop_edits), name)
+                stack.enter_context(_everywhere(name, right, wrong))
+        yield
+
+
+_BACK_EMF: Edit = ("voltage - back_emf -", "voltage + back_emf -")
+_GAINS: Edit = (
+    "parameters[KP] * error + parameters[KI] * integral",
+    "parameters[KI] * error + parameters[KP] * integral",
+)
+_RESISTANCE: Edit = ("- parameters[RESISTANCE] * current", "- 1.01 * parameters[RESISTANCE] * current")
+_VOLTAGE_LIMIT: Edit = ("voltage = min(max(voltage, -", "voltage = 0.99 * min(max(voltage / 0.99, -")
+_LATE_FORCE: Edit = ("user[TORQUE_CONSTANT] * act[CURRENT]", "user[TORQUE_CONSTANT] * act[COMMITTED_CURRENT]")
+_EVERY_PASS: Edit = ("if time != act[TICK]:", "if True:")
+_EVERY_STAGE: Edit = ("if i64(data + pbase_at)[0] != 0:", "if False:")
+_KEPT = "            act[CURRENT] = current\n"
+_SHARED_CURRENT: tuple[Edit, ...] = (
+    ("act[COMMITTED_CURRENT] = act[CURRENT]\n", "act[COMMITTED_CURRENT] = f64(HIDDEN)[0]\n"),
+    (_KEPT, f"{_KEPT}            f64(HIDDEN)[0] = current\n"),
+)
+
+
+# -- in how a simulation is driven --------------------------------------------------------------------------
+
+
+def _stale_command() -> Fault:
+    step = MujocoPhysics.step
+
+    def late(self: Any, desired_force: float) -> Any:
+        force, self.waiting = getattr(self, "waiting", 0.0), desired_force
+        return step(self, force)
+
+    return _method(MujocoPhysics, "step", late)
+
+
+def _no_bounds() -> Fault:
+    return _everywhere("compiled_constrain", constrain.compiled_constrain, lambda _: None)
+
+
+def _other_integrator() -> Fault:
+    make = MujocoPhysics.__init__
+
+    def explicit(self: Any, task: Any, actuator: Any, inner_steps: int, integrator: str, *more: Any) -> None:
+        make(self, task, actuator, inner_steps, "semi-implicit" if integrator == "euler" else "euler", *more)
+
+    return _method(MujocoPhysics, "__init__", explicit)
+
+
+def _warm_reset() -> Fault:
+    reset = MujocoPhysics.reset
+
+    def warm(self: Any, state: np.ndarray) -> None:
+        motor = self.data.act.copy()
+        reset(self, state)
+        self.data.act[:] = motor
+
+    return _method(MujocoPhysics, "reset", warm)
+
+
+# -- the list -----------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Mutation:
+    """A fault on purpose."""
+
+    name: str
+    """What is wrong."""
+    apply: Callable[[], Fault]
+    """Makes it, for the length of a `with` block."""
+    groups: tuple[str, ...]
+    """The groups of checks that it is shown to."""
+    tasks: tuple[str, ...] = tuple(TASKS)
+    """The tasks in which it is a fault."""
+
+
+_PHYSICS = ("dynamics", "trajectories")
+_LOOP = ("trajectories", "motor")
+_UNEQUAL_GAINS = tuple(task for task in TASKS if task != "mountain_car")  # whose kp = ki
+_BOUNDED = tuple(name for name, task in TASKS.items() if task.constrain is not None)
+_RUNGE_KUTTA = tuple(name for name, task in TASKS.items() if "rk4" in task.integrators)
+
+
+def _in_model(name: str, change: Callable[[mujoco.MjModel], None], *groups: str) -> Mutation:
+    return Mutation(name, lambda: wrong_model(change), (*_PHYSICS, *groups))
+
+
+def _in_loop(name: str, edit: Edit, groups: tuple[str, ...] = _LOOP, tasks: tuple[str, ...] = tuple(TASKS)) -> Mutation:
+    return Mutation(f"{name}, in the callback", lambda: wrong_callback((), (edit,)), groups, tasks)
+
+
+MUTATIONS: tuple[Mutation, ...] = (
+    _in_model("a mass off by 0.1 %", _heavier, "convergence", "energy"),
+    _in_model("gravity, or the hill, off by 0.1 %", _stronger_gravity),
+    _in_model("a gear off by 1 %", _longer_gear, "convergence", "energy"),
+    _in_model("a time step off by 0.1 %", _slower_clock, "convergence", "energy"),
+    _in_model("a wrong clip: the force limit 1 % low", _tighter_range),
+    _in_loop("a wrong clip: the voltage limit 1 % low", _VOLTAGE_LIMIT),
+    _in_loop("a winding resistance off by 1 %", _RESISTANCE, (*_LOOP, "energy")),
+    _in_loop("the sign of the back-EMF", _BACK_EMF, (*_LOOP, "energy")),
+    Mutation("the sign of the back-EMF, everywhere", lambda: wrong_loop_everywhere(_BACK_EMF), ("motor", "energy")),
+    _in_loop("kp and ki swapped", _GAINS, _LOOP, _UNEQUAL_GAINS),
+    Mutation("kp and ki swapped, everywhere", lambda: wrong_loop_everywhere(_GAINS), ("motor", "convergence")),
+    Mutation("a force one step late", lambda: wrong_callback((_LATE_FORCE,)), (*_LOOP, "convergence", "energy")),
+    Mutation("a stale command", _stale_command, (*_PHYSICS, "convergence")),
+    Mutation("bounds that are not kept", _no_bounds, _PHYSICS, _BOUNDED),
+    Mutation("the other Euler integrator", _other_integrator, _PHYSICS),
+    Mutation(
+        "a motor that runs in every Runge-Kutta stage",
+        lambda: wrong_callback((_EVERY_STAGE,)),
+        ("trajectories",),
+        _RUNGE_KUTTA,
+    ),
+    Mutation("a motor that runs in every forward pass", lambda: wrong_callback((_EVERY_PASS,)), ("execution",)),
+    Mutation("a current that simulations share", lambda: wrong_callback(_SHARED_CURRENT), ("execution",)),
+    Mutation("a reset that leaves the motor running", _warm_reset, ("execution",)),
+)
+"""Every fault, and which groups are shown it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Caught:
+    """What a mutation did to the certificate."""
+
+    mutation: str
+    """Its name."""
+    task: str
+    """The task it was made in; empty for checks that need none."""
+    failed: tuple[Check, ...]
+    """The checks that failed."""
+    made: int
+    """How many checks it was shown to."""
+
+    @property
+    def clearest(self) -> Check | None:
+        """The failed check that is farthest beyond its tolerance, a NaN being infinitely far; None if none failed."""
+        return max(self.failed, key=margin, default=None)
+
+
+def margin(check: Check) -> float:
+    """How many times its tolerance a check's worst case is; above 1 it fails."""
+    if math.isnan(check.worst):
+        return math.inf
+    if check.tolerance == 0.0:
+        return 0.0 if check.worst == 0.0 else math.inf
+    return check.worst / check.tolerance
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """A fault may well overflow: that is what its checks are to say, and no warning besides."""
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore", RuntimeWarning)
+        yield
+
+
+def try_mutations(
+    tasks: str | Sequence[str] | None = None,
+    mutations: Sequence[Mutation] = MUTATIONS,
+    on_part: Callable[[int, int, str], None] | None = None,
+) -> list[Caught]:
+    """Make each fault in turn and see which checks of the quick certificate fail.
+
+    Args:
+        tasks: a task, several, or None for all of them.
+        mutations: the faults.
+        on_part: called as each begins, with (done, in all, name).
+    """
+    names = [tasks] if isinstance(tasks, str) else list(tasks or TASKS)
+    results = []
+    for index, mutation in enumerate(mutations):
+        if on_part is not None:
+            on_part(index, len(mutations), mutation.name)
+        affected = [name for name in names if name in mutation.tasks]
+        if not affected:
+            continue
+        with mutation.apply(), _quiet():
+            certificate = validate(affected, quick=True, groups=mutation.groups)
+        for task in ([""] if set(WITHOUT_TASK) & set(mutation.groups) else []) + affected:
+            made = [check for check in certificate.checks if check.task == task]
+            failed = tuple(check for check in made if not check.passed)
+            results.append(Caught(mutation.name, task, failed, len(made)))
+    if on_part is not None:
+        on_part(len(mutations), len(mutations), "done")
+    return results
+
+
+def unfailed(checks: Sequence[Check], caught: Sequence[Caught]) -> list[Check]:
+    """The checks that no mutation fails: they show nothing, and should go."""
+    seen = {(check.group, check.task, check.name) for outcome in caught for check in outcome.failed}
+    return [check for check in checks if (check.group, check.task, check.name) not in seen]
