@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: install demo test lint bench docs clean
+.PHONY: install demo test lint bench soak docs clean
 
 install: $(STAMP)
 
@@ -25,8 +25,12 @@ lint: $(STAMP)
 	@$(BIN)/mypy
 	@$(BIN)/codespell
 
-bench: $(STAMP)
+bench: $(STAMP)  ## speed beside other libraries, which are installed for it
+	@$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[bench]"
 	@$(BIN)/python scripts/benchmark.py
+
+soak: $(STAMP)  ## a million steps: memory, threads, episodes
+	@$(BIN)/python scripts/soak.py
 
 docs: $(STAMP)  ## write docs/environments/ anew from the code
 	@$(BIN)/python scripts/environment_pages.py

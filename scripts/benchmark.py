@@ -1,157 +1,195 @@
-"""Speed of the motor in the loop, beside what it is built on; every ratio is measured side by side in this one run.
+"""Speed of our environments beside others'; everything is measured side by side in this one run.
 
-Each pair alternates: A, B, A, B, ... with many steps a turn; the table has the median of the ratios, turn by turn, with
-their range.
+The members of a group take turns: A, B, C, A, B, C, ... with many steps a turn; the table has the median of the ratios
+to the group's first member, turn by turn, with their range. Libraries that are not installed are skipped.
 """
 
 import codrl_mj  # isort: skip - before mujoco, which chooses its OpenGL platform when it is imported
 
 import argparse
+import os
+import platform
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import benchmark_subjects as subjects
 import gymnasium
 import mujoco
 import numpy as np
+from benchmark_subjects import Subject
 from rich.table import Table
 
-from codrl_mj import callbacks
-from codrl_mj.env_config import EnvConfig
-from codrl_mj.evaluation import make_env
 from codrl_mj.files import write_json
-from codrl_mj.motor import named_actuator
-from codrl_mj.physics.mjcf import install_callbacks, task_model
-from codrl_mj.physics.offscreen import OffscreenRenderer
+from codrl_mj.registration import ENVIRONMENTS
 from codrl_mj.tasks import TASKS
-from codrl_mj.terminal import console, progress_bar
+from codrl_mj.terminal import console
 
-Turn = Callable[[int], None]
-
-
-def engine(task: str, with_callbacks: bool) -> Turn:
-    """`mj_step` of the task's model; without our callbacks its motor is dead weight, and a hill is flat."""
-    definition = TASKS[task]
-    timestep = definition.step_duration / definition.motor_inner_steps
-    model = task_model(definition, named_actuator("paper", task), timestep)
-    data = mujoco.MjData(model)
-
-    def turn(steps: int) -> None:
-        callbacks.uninstall()
-        if with_callbacks:
-            install_callbacks(model)
-        mujoco.mj_resetData(model, data)
-        data.qpos[:] = 0.3  # in motion in both cases: at rest, a step is cheaper
-        data.qvel[:] = 0.1
-        data.ctrl[:] = model.actuator_ctrlrange[0, 1] / 2
-        mujoco.mj_step(model, data, steps)
-
-    return turn
+Makers = list[Callable[[], Subject]]
+NUM_ENVS = 1024
+ENVPOOL = {  # of its dm_control swing-ups Pendulum's alone: a thousand of the others take minutes to make
+    "pendulum": ("Pendulum-v1", "PendulumSwingup-v1"),
+    "cartpole": ("CartPole-v1",),
+    "acrobot": ("Acrobot-v1",),
+    "mountain_car": ("MountainCar-v0",),
+    "mountain_car_continuous": ("MountainCarContinuous-v0",),
+}
+DM_CONTROL = {"pendulum": "swingup", "cartpole": "swingup", "acrobot": "swingup"}
 
 
-def environment(make: Callable[[], "gymnasium.Env[object, object]"]) -> Turn:
-    """Steps of a Gymnasium environment under precomputed random actions, with resets."""
-    env = make()
-    env.action_space.seed(0)
-    actions = [env.action_space.sample() for _ in range(1000)]
-
-    def turn(steps: int) -> None:
-        env.reset(seed=0)  # which installs our callbacks where the environment is ours
-        for index in range(steps):
-            _, _, terminated, truncated, _ = env.step(actions[index % 1000])
-            if terminated or truncated:
-                env.reset()
-
-    return turn
-
-
-def drawing(task: str, fast: bool) -> Turn:
-    """Frames of 480 x 480 of the task's scene, with our fast visual settings or with MuJoCo's defaults."""
-    model = task_model(TASKS[task], None, TASKS[task].step_duration)
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    if fast:
-        ours = OffscreenRenderer(model)
-
-        def turn(frames: int) -> None:
-            for _ in range(frames):
-                ours.render(data)
-
-        return turn
-    model.vis.quality.shadowsize, model.vis.quality.offsamples = 4096, 4  # MuJoCo's defaults
-    theirs = mujoco.Renderer(model, 480, 480)
-
-    def default_turn(frames: int) -> None:
-        for _ in range(frames):
-            theirs.update_scene(data, "fixed")
-            theirs.render()
-
-    return default_turn
+def groups(quick: bool) -> dict[str, Makers]:
+    """What is compared with what; the first of a group is what the others are divided by."""
+    found: dict[str, Makers] = {}
+    for task in TASKS:
+        found[f"engine: {task}"] = [partial(subjects.engine, task, False), partial(subjects.engine, task, True)]
+    for task, definition in TASKS.items():
+        members: Makers = [partial(subjects.theirs, definition.gymnasium_id)]
+        members += [partial(subjects.ours, task, actuator) for actuator in ("paper", "ideal")]
+        if task == "cartpole":
+            members.append(partial(subjects.theirs, "InvertedPendulum-v5"))
+        if task in DM_CONTROL:
+            members.append(partial(subjects.dm_control, task, DM_CONTROL[task]))
+        if task == "pendulum":
+            members.append(subjects.electric_motor)
+        found[f"single: {task}"] = members
+    for task in TASKS:
+        members = [partial(subjects.raw_batch, task, NUM_ENVS, 1, apart) for apart in (False, True)]
+        members += [partial(subjects.vector, task, NUM_ENVS, 1, actuator) for actuator in ("paper", "ideal")]
+        members += [partial(subjects.envpool, name, NUM_ENVS, 1) for name in ENVPOOL[task]]
+        found[f"vector: {task}"] = members
+    sizes = [(num_envs, threads) for num_envs in (1024, 1, 64, 16384) for threads in (1, 2)]
+    found["sizes: pendulum"] = [partial(subjects.vector, "pendulum", *size) for size in sizes]
+    if not quick:
+        for task in ("cartpole", "mountain_car"):
+            found[f"drawing: {task}"] = [partial(subjects.drawing, task, fast) for fast in (False, True)]
+    return found
 
 
-def compare(first: Turn, second: Turn, turns: int, steps: int) -> dict[str, list[float]]:
-    """Time two alternatives in turn; `ratio` is the first's speed over the second's: (median, least, most)."""
-    seconds = np.empty((turns, 2))
-    for turn in (first, second):
-        turn(steps)  # warm-up
-    for row in seconds:
-        for column, turn in enumerate((first, second)):
-            start = time.perf_counter()
-            turn(steps)
-            row[column] = time.perf_counter() - start
-    ratio = seconds[:, 1] / seconds[:, 0]
-    speeds = np.median(steps / seconds, axis=0)
+def build(makers: Makers) -> list[Subject]:
+    """The members of a group that can be had here; the others are named, with the reason."""
+    members = []
+    for make in makers:
+        try:
+            members.append(make())
+        except Exception as error:  # a missing library, or one that does not work with the others installed
+            arguments = ", ".join(map(str, getattr(make, "args", ())))
+            name = getattr(make, "func", make).__name__
+            console().print(f"skipped: {name} {arguments}: {type(error).__name__}: {error}", markup=False)
+    return members
+
+
+def seconds(member: Subject, calls: int) -> float:
+    """The time that some calls take."""
+    member.prepare()
+    start = time.perf_counter()
+    member.run(calls)
+    return time.perf_counter() - start
+
+
+def measure(members: list[Subject], turns: int, turn_duration: float) -> dict[str, dict[str, list[float]]]:
+    """Time the members in turn.
+
+    Returns:
+        By name: steps per second, and their ratio to the first member's: (median, least, most) each.
+    """
+    calls = []
+    for member in members:
+        count = 1
+        while (taken := seconds(member, count)) < turn_duration / 4 and count < 1_000_000:
+            count *= 4
+        calls.append(max(1, round(count * turn_duration / taken)))
+    speeds = np.empty((turns, len(members)))
+    for turn in range(turns):
+        for column, member in enumerate(members):
+            speeds[turn, column] = calls[column] * member.per_call / seconds(member, calls[column])
+    ratios = speeds / speeds[:, :1]
     return {
-        "steps_per_second": [float(speed) for speed in speeds],
-        "ratio": [float(np.median(ratio)), float(ratio.min()), float(ratio.max())],
+        member.name: {
+            "steps_per_second": _spread(speeds[:, column]),
+            "ratio": _spread(ratios[:, column]),
+        }
+        for column, member in enumerate(members)
     }
+
+
+def _spread(values: np.ndarray) -> list[float]:
+    return [float(np.median(values)), float(values.min()), float(values.max())]
+
+
+def memory() -> dict[str, float]:
+    """Resident memory of a Pendulum environment with its motor in a batch [bytes], from the growth at N = 16384."""
+    page, num_envs = os.sysconf("SC_PAGE_SIZE"), 16384
+
+    def resident() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * page
+
+    before = resident()
+    env = gymnasium.make_vec(ENVIRONMENTS["pendulum"].env_id, num_envs, "vector_entry_point")
+    env.reset(seed=0)
+    env.step(np.zeros((num_envs, 1), np.float32))
+    return {"bytes_per_environment": (resident() - before) / num_envs}
+
+
+def learning(quick: bool) -> dict[str, dict[str, float]]:
+    """PPO's environment steps per second, and the share of the time that stepping takes."""
+    found = {}
+    for num_envs, ours in ((8, False), (64, True), (256, True)):
+        name, train = subjects.ppo(num_envs, ours)
+        train(2048)  # warm-up
+        steps = 4096 if quick else 20480
+        start = time.perf_counter()
+        share = train(steps)
+        found[name] = {
+            "steps_per_second": steps / (time.perf_counter() - start),
+            "share_in_environment": share,
+        }
+    return found
+
+
+def report(title: str, results: dict[str, dict[str, list[float]]]) -> None:
+    """Print a group's table."""
+    table = Table(title=title, title_justify="left")
+    for column in ("", "steps/s", "ratio to the first"):
+        table.add_column(column, justify="right" if column else "left")
+    for name, numbers in results.items():
+        ratio = "{:.2f} ({:.2f} to {:.2f})".format(*numbers["ratio"])
+        table.add_row(name, f"{numbers['steps_per_second'][0]:,.0f}", ratio)
+    console().print(table)
 
 
 def main() -> int:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--turns", type=int, default=25, help="turns of each of the two in a pair")
+    parser.add_argument("--quick", action="store_true", help="under a minute, and less exact")
+    parser.add_argument("--only", default="", help="only groups whose name contains this, such as 'vector'")
+    parser.add_argument("--turns", type=int, help="turns of each member of a group")
     parser.add_argument("--out", type=Path, help="JSON file for the results")
     options = parser.parse_args()
-
-    pairs: dict[str, tuple[Turn, Turn, int]] = {}
-    for task in TASKS:
-        pairs[f"mj_step of {task}: with our callbacks / bare"] = engine(task, True), engine(task, False), 20_000
-    for task, definition in TASKS.items():
-        name = definition.gymnasium_id
-        ours = environment(lambda task=task: make_env(task, "paper", **EnvConfig().as_arguments()))  # type: ignore[misc]
-        theirs = environment(lambda name=name: gymnasium.make(name, disable_env_checker=True))  # type: ignore[misc]
-        pairs[f"{task} with motor / Gymnasium {name}"] = ours, theirs, 2_000
-
-    for task in TASKS:
-        name = f"frames of {task}: our settings / MuJoCo's defaults"
-        pairs[name] = drawing(task, fast=True), drawing(task, fast=False), 10
-
-    results = {}
-    table = Table(title=f"speed ratios, {options.turns} alternating turns: median (least to most)")
-    for column in ("first / second", "first, 1/s", "second, 1/s", "ratio"):
-        table.add_column(column, justify="left" if column == "first / second" else "right")
-    with progress_bar("{task.completed}/{task.total}") as bar:
-        for name, (first, second, steps) in bar.track(pairs.items(), description="measuring"):
-            results[name] = compare(first, second, options.turns, steps)
-            speeds, ratio = results[name]["steps_per_second"], results[name]["ratio"]
-            table.add_row(
-                name,
-                *(f"{speed:,.0f}" for speed in speeds),
-                "{:.2f} ({:.2f} to {:.2f})".format(*ratio),
-            )
-    console().print(table)
+    turns = options.turns or (5 if options.quick else 11)
+    if turns < 1:
+        parser.error(f"--turns {turns}: must be >= 1")
+    turn_duration = 0.02 if options.quick else 0.1  # s
+    gymnasium.logger.min_level = gymnasium.logger.ERROR
+    results: dict[str, Any] = {}
+    if options.only in "memory":
+        results["memory"] = memory()  # first: later, freed memory would hide the growth
+        console().print("memory: {bytes_per_environment:,.0f} bytes an environment".format(**results["memory"]))
+    for title, makers in groups(options.quick).items():
+        if options.only in title:
+            results[title] = measure(build(makers), turns, turn_duration)
+            report(f"{title}, {turns} alternating turns: median (least to most)", results[title])
+    if options.only in "learning":
+        results["learning"] = learning(options.quick)
+        for name, numbers in results["learning"].items():
+            text = f"PPO, {name}: {numbers['steps_per_second']:,.0f} steps/s"
+            console().print(f"{text}, {numbers['share_in_environment']:.1%} of the time in the environment")
     if options.out is not None:
-        write_json(
-            options.out,
-            {
-                "codrl_mj": codrl_mj.__version__,
-                "mujoco": mujoco.__version__,
-                "turns": options.turns,
-                "results": results,
-            },
-        )
+        versions = {"codrl_mj": codrl_mj.__version__, "mujoco": mujoco.__version__, "gymnasium": gymnasium.__version__}
+        machine = {"cpus": os.cpu_count(), "platform": platform.platform()}
+        write_json(options.out, {"versions": versions, "machine": machine, "turns": turns, "results": results})
     return 0
 
 

@@ -1,0 +1,230 @@
+"""What the benchmark times: our simulations, and those of other libraries."""
+
+import codrl_mj  # isort: skip - before mujoco, which chooses its OpenGL platform when it is imported
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from codrl_mj import callbacks
+from codrl_mj.motor import named_actuator
+from codrl_mj.physics.mjcf import install_callbacks, task_model
+from codrl_mj.physics.offscreen import OffscreenRenderer
+from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.tasks import TASKS
+
+ACTIONS = 1000
+"""Actions drawn beforehand."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Subject:
+    """Something that takes steps."""
+
+    name: str
+    """Its name in the table."""
+    run: Callable[[int], None]
+    """Makes the given number of calls; what is timed."""
+    prepare: Callable[[], Any] = lambda: None
+    """Called before each turn, not timed."""
+    per_call: int = 1
+    """Environment steps (or frames) in one call."""
+
+
+def engine(task: str, with_callbacks: bool) -> Subject:
+    """`mj_step` of the task's model; without our callbacks its motor is dead weight, and a hill is flat."""
+    definition = TASKS[task]
+    model = task_model(
+        definition, named_actuator("paper", task), definition.step_duration / definition.motor_inner_steps
+    )
+    data = mujoco.MjData(model)
+
+    def prepare() -> None:
+        callbacks.uninstall()
+        if with_callbacks:
+            install_callbacks(model)
+        mujoco.mj_resetData(model, data)
+        data.qpos[:] = 0.3  # in motion in both cases: at rest, a step is cheaper
+        data.qvel[:] = 0.1
+        data.ctrl[:] = model.actuator_ctrlrange[0, 1] / 2
+
+    name = "mj_step with our callbacks" if with_callbacks else "mj_step, bare"
+    return Subject(name, lambda calls: mujoco.mj_step(model, data, calls), prepare)
+
+
+def single(name: str, env: Any) -> Subject:
+    """Steps of a Gymnasium environment under random actions, with resets."""
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(ACTIONS)]
+
+    def run(calls: int) -> None:
+        for index in range(calls):
+            _, _, terminated, truncated, _ = env.step(actions[index % ACTIONS])
+            if terminated or truncated:
+                env.reset()
+
+    return Subject(name, run, lambda: env.reset(seed=0))  # a reset installs our callbacks where the environment is ours
+
+
+def ours(task: str, actuator: str) -> Subject:
+    """Our environment through `gym.make`."""
+    env = gymnasium.make(ENVIRONMENTS[task].env_id, actuator=actuator, disable_env_checker=True)
+    return single(f"ours, actuator {actuator!r}", env)
+
+
+def theirs(env_id: str) -> Subject:
+    """A Gymnasium environment."""
+    return single(f"Gymnasium {env_id}", gymnasium.make(env_id, disable_env_checker=True))
+
+
+def dm_control(domain: str, task: str) -> Subject:
+    """A task of dm_control's suite."""
+    from dm_control import suite
+
+    env = suite.load(domain, task, task_kwargs={"random": 0})
+    spec, generator = env.action_spec(), np.random.default_rng(0)
+    actions = generator.uniform(spec.minimum, spec.maximum, (ACTIONS, *spec.shape))
+
+    def run(calls: int) -> None:
+        for index in range(calls):
+            if env.step(actions[index % ACTIONS]).last():
+                env.reset()
+
+    def prepare() -> None:
+        callbacks.uninstall()
+        env.reset()
+
+    return Subject(f"dm_control {domain} {task}", run, prepare)
+
+
+def electric_motor() -> Subject:
+    """gym-electric-motor's permanently excited DC motor under current control: a motor, and no mechanics of a task."""
+    import gym_electric_motor
+
+    return single("gym-electric-motor Cont-CC-PermExDc-v0", gym_electric_motor.make("Cont-CC-PermExDc-v0"))
+
+
+def batched(name: str, env: Any) -> Subject:
+    """Steps of a vector environment of any library under random actions."""
+    generator, space = np.random.default_rng(0), env.unwrapped
+    count = getattr(space, "num_envs", None) or len(env)
+    one = getattr(env, "single_action_space", env.action_space)
+    if isinstance(one, gymnasium.spaces.Discrete):
+        actions = list(generator.integers(one.n, size=(20, count)))
+    else:
+        actions = list(generator.uniform(one.low, one.high, (20, count, *one.shape)).astype(one.dtype))
+
+    def run(calls: int) -> None:
+        for index in range(calls):
+            env.step(actions[index % 20])
+
+    return Subject(name, run, env.reset, per_call=count)
+
+
+def vector(task: str, num_envs: int, threads: int, actuator: str = "paper") -> Subject:
+    """Our vector environment."""
+    env = gymnasium.make_vec(
+        ENVIRONMENTS[task].env_id, num_envs, "vector_entry_point", num_threads=threads, actuator=actuator
+    )
+    return batched(f"ours, N = {num_envs}, threads = {threads}, actuator {actuator!r}", env)
+
+
+def raw_batch(task: str, num_envs: int, threads: int, calls_apart: bool) -> Subject:
+    """`Batch.step` of the same model with its motor: all inner steps of an environment step in one call, or apart."""
+    env: Any = gymnasium.make_vec(ENVIRONMENTS[task].env_id, num_envs, "vector_entry_point", num_threads=threads)
+    env.reset(seed=0)
+    env.step(np.zeros(env.action_space.shape, env.action_space.dtype))
+    physics = env.unwrapped.physics
+    batch, start, inner_steps = Batch(physics.model, num_envs, threads), physics.snapshot(), physics.inner_steps
+
+    def prepare() -> None:
+        install_callbacks(physics.model)
+        batch.state[:] = start
+
+    def run(calls: int) -> None:
+        for _ in range(calls):
+            if calls_apart:
+                for _ in range(inner_steps):
+                    batch.step()
+            else:
+                batch.step(nstep=inner_steps)
+
+    name = f"Batch.step x {inner_steps}" if calls_apart else f"Batch.step(nstep={inner_steps})"
+    return Subject(f"{name}, N = {num_envs}, threads = {threads}", run, prepare, per_call=num_envs)
+
+
+def envpool(env_id: str, num_envs: int, threads: int) -> Subject:
+    """An environment of EnvPool."""
+    import envpool as library
+
+    env = library.make(env_id, env_type="gymnasium", num_envs=num_envs, num_threads=threads, seed=0)
+    return batched(f"EnvPool {env_id}, N = {num_envs}, threads = {threads}", env)
+
+
+def drawing(task: str, fast: bool) -> Subject:
+    """Frames of 480 x 480 of the task's scene, with our fast visual settings or with MuJoCo's defaults."""
+    model = task_model(TASKS[task], None, TASKS[task].step_duration)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    if fast:
+        renderer = OffscreenRenderer(model)
+
+        def run(frames: int) -> None:
+            for _ in range(frames):
+                renderer.render(data)
+
+        return Subject("frames with our settings", run)
+    model.vis.quality.shadowsize, model.vis.quality.offsamples = 4096, 4  # MuJoCo's defaults
+    default = mujoco.Renderer(model, 480, 480)
+
+    def run_default(frames: int) -> None:
+        for _ in range(frames):
+            default.update_scene(data, "fixed")
+            default.render()
+
+    return Subject("frames with MuJoCo's defaults", run_default)
+
+
+class Stopwatch:
+    """Sums the time spent in a `VecEnv`'s steps."""
+
+    def __init__(self, env: Any) -> None:
+        """Time the steps of `env` from now on."""
+        self.seconds = 0.0
+        self._step_wait = env.step_wait
+        env.step_wait = self._timed
+
+    def _timed(self) -> Any:
+        start = time.perf_counter()
+        result = self._step_wait()
+        self.seconds += time.perf_counter() - start
+        return result
+
+
+def ppo(num_envs: int, batched_ours: bool) -> tuple[str, Callable[[int], float]]:
+    """Stable-Baselines3's PPO on Pendulum; the function trains for some steps and returns the environment's share."""
+    import torch
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    torch.set_num_threads(1)
+    if batched_ours:
+        env: Any = codrl_mj.make_sb3_vec_env(ENVIRONMENTS["pendulum"].env_id, num_envs)
+    else:
+        env = DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")] * num_envs)
+    watch = Stopwatch(env)
+    model = PPO("MlpPolicy", env, n_steps=2048 // num_envs, batch_size=256, n_epochs=10, seed=0, device="cpu")
+
+    def train(steps: int) -> float:
+        watch.seconds, start = 0.0, time.perf_counter()
+        model.learn(steps)
+        return watch.seconds / (time.perf_counter() - start)
+
+    name = "ours, motor, N = " if batched_ours else "Gymnasium Pendulum-v1 in DummyVecEnv, N = "
+    return f"{name}{num_envs}", train

@@ -1,0 +1,142 @@
+"""A million environment steps over actuators that all differ: no growth of memory, no dependence on threads.
+
+Two vector environments with the same random stable actuators, one stepped on one thread and one on two, take the same
+random actions. Whatever they return must be equal bit for bit, each episode that ends must be accounted for in the
+infos, and memory may not grow after the first tenth.
+"""
+
+import codrl_mj  # isort: skip - before mujoco, which chooses its OpenGL platform when it is imported
+
+import argparse
+import hashlib
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Discrete
+from gymnasium.vector import AutoresetMode
+
+from codrl_mj import Actuator, CurrentLoop, Motor, spectral_radius
+from codrl_mj.envs import ActuatedVectorEnv
+from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.tasks import TASKS, find_task
+from codrl_mj.terminal import console
+
+GROWTH = 4 * 2**20
+"""Largest growth of resident memory after the first tenth [bytes]: 4 MiB, less than 5 bytes a step."""
+
+
+def resident() -> int:
+    """Resident memory of this process [bytes]."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def stable_actuators(task: str, count: int, generator: np.random.Generator) -> tuple[list[Actuator], int]:
+    """Random actuators, those with unstable loops drawn again; and how many were."""
+    definition, rejected = find_task(task), 0
+    found: list[Actuator] = []
+    step = definition.step_duration / definition.motor_inner_steps
+    while len(found) < count:
+        resistance, inductance, constant, arm = np.exp(generator.uniform(np.log(0.3), np.log(3.0), 4)).tolist()
+        kp, ki, voltage = np.exp(generator.uniform(np.log(0.3), np.log(30.0), 3)).tolist()
+        motor = Motor(resistance, 0.3 * inductance, constant, constant, arm_radius=arm)
+        actuator = Actuator(motor, CurrentLoop(kp=kp, ki=ki, max_voltage=voltage))
+        if spectral_radius(actuator, step) < 1.0:
+            found.append(actuator)
+        else:
+            rejected += 1
+    return found, rejected
+
+
+def digest(results: tuple[Any, ...]) -> bytes:
+    """A checksum of what a step returned, infos included."""
+    checksum = hashlib.blake2b(digest_size=8)
+    *arrays, infos = results
+    for array in arrays:
+        checksum.update(array.tobytes())
+    for name in sorted(infos):
+        if isinstance(infos[name], np.ndarray) and infos[name].dtype != object:
+            checksum.update(infos[name].tobytes())
+    return checksum.digest()
+
+
+def soak(task: str, num_envs: int, steps: int) -> int:
+    """Step both environments; print what was found.
+
+    Returns:
+        0, or 1 if something was wrong.
+    """
+    generator = np.random.default_rng(0)
+    actuators, rejected = stable_actuators(task, num_envs, generator)
+    console().print(f"{task}: {num_envs} actuators; {rejected} unstable draws rejected and drawn again")
+    limit = ENVIRONMENTS[task].max_episode_steps
+    arguments: dict[str, Any] = {"max_episode_steps": limit, "autoreset_mode": AutoresetMode.SAME_STEP}
+    envs = [ActuatedVectorEnv(num_envs, task, actuators, num_threads=threads, **arguments) for threads in (1, 2)]
+    for env in envs:
+        env.reset(seed=0)
+    space = envs[0].single_action_space
+    lengths = np.zeros(num_envs, dtype=np.int64)
+    ended = truncations = finished_steps = differing = missing = 0
+    base, start = 0, time.perf_counter()
+    for step in range(1, steps + 1):
+        if isinstance(space, Discrete):
+            actions = generator.integers(space.n, size=num_envs)
+        else:
+            actions = generator.uniform(space.low, space.high, (num_envs, 1)).astype(np.float32)  # type: ignore[attr-defined]
+        one, other = (env.step(actions) for env in envs)
+        differing += digest(one) != digest(other)
+        _, _, terminated, truncated, infos = one
+        ends = terminated | truncated
+        lengths += 1
+        missing += int((lengths > limit).sum()) + int((truncated & (lengths != limit)).sum())
+        if ends.any():
+            missing += int((infos["_final_obs"] != ends).sum() + (infos["final_info"]["_current"] != ends).sum())
+            missing += sum(not np.isfinite(seen).all() for seen in infos["final_obs"][ends])
+        ended += int(ends.sum())
+        truncations += int(truncated.sum())
+        finished_steps += int(lengths[ends].sum())
+        lengths[ends] = 0
+        if step == max(1, steps // 10):
+            base = resident()
+        if step % max(1, steps // 10) == 0:
+            rate = 2 * step * num_envs / (time.perf_counter() - start)
+            growth = (resident() - base) / 2**20
+            console().print(
+                f"{step * num_envs:>10,} steps on 1 and on 2 threads, {rate:,.0f} steps/s; {ended:,} episodes "
+                f"({truncations:,} to the limit); memory {growth:+.1f} MiB since the first tenth"
+            )
+    missing += abs(finished_steps + int(lengths.sum()) - steps * num_envs)
+    same_end = all(np.array_equal(envs[0].snapshot()[name], value) for name, value in envs[1].snapshot().items())
+    growth = resident() - base
+    verdicts = {
+        f"memory grew by {growth / 2**20:.1f} MiB, must be <= {GROWTH / 2**20:.0f}": growth <= GROWTH,
+        f"steps that differ between 1 and 2 threads: {differing}": differing == 0,
+        "physics, generators and counters are equal at the end": same_end,
+        f"episodes or steps unaccounted for: {missing}": missing == 0,
+    }
+    for verdict, fine in verdicts.items():
+        console().print(f"{'ok  ' if fine else 'FAIL'} {verdict}")
+    return 0 if all(verdicts.values()) else 1
+
+
+def main() -> int:
+    """Run the soak."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", choices=list(TASKS), default="cartpole")
+    parser.add_argument("--num-envs", type=int, default=1024)
+    parser.add_argument(
+        "--steps", type=int, default=1_000_000, help="environment steps in all, on each of 1 and 2 threads"
+    )
+    options = parser.parse_args()
+    for name in ("num_envs", "steps"):
+        if getattr(options, name) < 1:
+            parser.error(f"--{name.replace('_', '-')} {getattr(options, name)}: must be >= 1")
+    console().print(f"codrl_mj {codrl_mj.__version__}, {os.cpu_count()} CPUs")
+    return soak(options.task, options.num_envs, -(-options.steps // options.num_envs))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
