@@ -9,7 +9,7 @@ import numpy as np
 
 from codrl_mj.distributions import Choice, Distribution
 from codrl_mj.motor import Actuator, CurrentLoop, Motor, spectral_radii, to_vector
-from codrl_mj.motor.parameters import PARAMETER_NAMES
+from codrl_mj.motor.parameters import INDUCTANCE, PARAMETER_NAMES, RESISTANCE, SUBSTEPS
 from codrl_mj.physics.variation import Variation, variable
 
 LIMIT = 1000
@@ -34,6 +34,8 @@ class Randomization:
     """Whether unstable loops are kept."""
     variation: Variation | None
     """What the drawn model fields do; None if there are none."""
+    supply_resistance: float = 0.0
+    """Resistance [ohm] of the supply, for which a drawn winding must not be too fast either."""
 
     @classmethod
     def build(
@@ -44,6 +46,7 @@ class Randomization:
         command: str,
         timestep: float,
         allow_unstable: bool,
+        supply_resistance: float = 0.0,
     ) -> "Randomization":
         """Check the distributions against the fields that they are for.
 
@@ -54,6 +57,7 @@ class Randomization:
             command: what an action stands for.
             timestep: integration step [s].
             allow_unstable: keep unstable loops.
+            supply_resistance: of the supply [ohm].
 
         Raises:
             ValueError: an unknown field (the nearest is suggested), one that cannot be drawn here, or impossible
@@ -74,7 +78,8 @@ class Randomization:
             except ValueError as error:
                 raise ValueError(f"randomize[{name!r}] = {distribution}: {error}") from None
         model = [name for name in randomize if name.startswith("model.")]
-        return cls(dict(randomize), timestep, allow_unstable, Variation(task, model) if model else None)
+        variation = Variation(task, model) if model else None
+        return cls(dict(randomize), timestep, allow_unstable, variation, supply_resistance)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -113,6 +118,9 @@ class Randomization:
                 return values, rejected
             drawn, _ = self.parameters(vectors[pending], arms[pending], values[pending])
             radii = spectral_radii(drawn, self.timestep)
+            if self.supply_resistance:  # under a saturated voltage the current is fed back through the supply
+                pole = (drawn[:, RESISTANCE] + self.supply_resistance) * self.timestep
+                radii = np.maximum(radii, np.abs(1.0 - pole / (drawn[:, INDUCTANCE] * drawn[:, SUBSTEPS])))
             unstable = ~(radii < 1.0)
             if not unstable.any():
                 return values, rejected

@@ -72,9 +72,12 @@ class Setup:
         if resolved is None and observe_actuator:
             raise ValueError("observe_actuator=True: the ideal actuator has no current to observe; choose another")
         timestep = definition.step_duration / count
+        described = _disturbances(disturbances, resolved, timestep, allow_unstable)
         randomization = None
         if randomize is not None:
-            randomization = Randomization.build(randomize, definition.name, resolved, action, timestep, allow_unstable)
+            randomization = Randomization.build(
+                randomize, definition.name, resolved, action, timestep, allow_unstable, described.supply_resistance
+            )
         setup = cls(
             task=definition,
             actuator=resolved,
@@ -85,7 +88,7 @@ class Setup:
             levels=_levels(definition, resolved, action, levels),
             observe_actuator=observe_actuator,
             randomization=randomization,
-            disturbances=_disturbances(disturbances, resolved, timestep, allow_unstable),
+            disturbances=described,
         )
         if setup.disturbances.joint_damping and any("model.damping." in name for name in randomize or ()):
             raise ValueError(

@@ -45,6 +45,17 @@ def scales(task):
     return dict.fromkeys((*MODEL[task], "model.gravity"), Uniform(0.6, 1.7))
 
 
+DISTURBED = {
+    "command_delay": 0.03,
+    "current_noise": 0.1,
+    "supply_resistance": 2.0,
+    "pulse_force": 1.0,
+    "pulse_duration": 0.05,
+    "pulse_interval": 0.1,
+    "joint_friction": 0.2,
+}
+
+
 def everything(task):
     """All that the tests draw of a task."""
     return DRIVE | scales(task) | {f"model.damping.{JOINT.get(task, 'slider')}": Uniform(0.0, 0.3)}
@@ -122,6 +133,7 @@ def test_drawn_episodes_are_those_of_single_environments(task, mode):
         {"action": "voltage", "levels": (-9.0, 9.0), "randomize": {"motor.inductance": Uniform(0.05, 0.2)}},
         {"integrator": "semi-implicit", "randomize": everything("cartpole"), "observe_actuator": True},
         {"inner_steps": 4, "randomize": everything("cartpole")},
+        {"disturbances": DISTURBED, "randomize": DRIVE | scales("cartpole")},
     ],
     ids=str,
 )
@@ -376,6 +388,16 @@ def test_unstable_draws_are_rejected_whole_and_counted():
     for row in range(0, 300, 50):
         first = _recount(row, 1)[0]
         np.testing.assert_allclose([infos[name][row] for name in (*randomize, "rejected")], first, rtol=1e-14)
+
+
+def test_a_winding_too_fast_for_its_supply_is_rejected():
+    nominal = Actuator(controller=CurrentLoop(kp=0.5))
+    arguments = {"actuator": nominal, "randomize": {"motor.inductance": Uniform(0.02, 0.2)}}
+    for ohms, least in ((0.0, 0.02), (7.0, 0.08)):  # (R + 7) * 0.02 < 2 L
+        env = batched("cartpole", 500, disturbances={"supply_resistance": ohms}, **arguments)
+        drawn = env.reset(seed=0)[1]["randomization"]
+        assert least < drawn["motor.inductance"].min() < least + 0.005
+        assert drawn["rejected"].any() == (ohms > 0)
 
 
 def test_unstable_draws_are_kept_on_request():
