@@ -1,6 +1,7 @@
 """The checks that apply to a user's own model with any number of our motors."""
 
 import copy
+import dataclasses
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -143,6 +144,22 @@ def _motor(model: mujoco.MjModel, name: str, quick: bool) -> Iterator[Check | Sk
             yield Skipped(f"steps: {motor}", "its actuator group is disabled: it never runs", "motor", name)
     yield from stability(model, name)
     yield from motor_steps(model, name, 200 if quick else 2000)
+    yield from _alone(model, name, quick)
+
+
+def _alone(model: mujoco.MjModel, name: str, quick: bool) -> Iterator[Check | Skipped]:
+    """The model's motors, each on a rotor of its own, against python-control's discrete model of the loop."""
+    from codrl_mj.validation.motor_loops import Loop
+    from codrl_mj.validation.motor_sampled import sampled_checks  # needs scipy and python-control
+
+    loops = {}
+    for motor, actuator in _names(model).values():
+        if spectral_radius(actuator, model.opt.timestep) < 1.0:
+            loops[motor] = Loop(actuator, model.opt.timestep)
+        else:
+            yield Skipped(f"responses of {motor}", "its loop is unstable: it has none", "motor", name)
+    for check in sampled_checks(loops, quick) if loops else ():
+        yield dataclasses.replace(check, task=name)
 
 
 def _execution(model: mujoco.MjModel, name: str, quick: bool) -> Iterator[Check | Skipped]:
