@@ -103,9 +103,10 @@ def constrain(state: np.ndarray, timestep: float) -> np.ndarray:
 
 def observation(state: np.ndarray) -> np.ndarray:
     """Cosines and sines of the angles, and the speeds, as float32."""
-    theta1, theta2, speed1, speed2 = (state[..., entry] for entry in range(4))
-    entries = [np.cos(theta1), np.sin(theta1), np.cos(theta2), np.sin(theta2), speed1, speed2]
-    return np.stack(entries, axis=-1).astype(np.float32)
+    angles = state[..., :2]
+    seen = np.empty((*state.shape[:-1], 6), np.float32)
+    seen[..., 0:4:2], seen[..., 1:4:2], seen[..., 4:] = np.cos(angles), np.sin(angles), state[..., 2:]
+    return seen
 
 
 def terminated(state: np.ndarray) -> np.ndarray:

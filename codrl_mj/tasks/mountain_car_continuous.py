@@ -61,7 +61,7 @@ class Options(NamedTuple):
 
 def desired_force(action: np.ndarray) -> np.ndarray:
     """The action as a force [N], saturated."""
-    return np.clip(action[..., 0].astype(np.float64), -FORCE, FORCE)
+    return np.minimum(np.maximum(action[..., 0].astype(np.float64), -FORCE), FORCE)
 
 
 def terminated(state: np.ndarray) -> np.ndarray:

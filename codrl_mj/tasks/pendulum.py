@@ -74,7 +74,7 @@ def initial_state(draws: np.ndarray) -> np.ndarray:
 
 def desired_force(action: np.ndarray) -> np.ndarray:
     """The action as a torque [N*m], saturated."""
-    return np.clip(action[..., 0].astype(np.float64), -MAX_TORQUE, MAX_TORQUE)
+    return np.minimum(np.maximum(action[..., 0].astype(np.float64), -MAX_TORQUE), MAX_TORQUE)
 
 
 def constrain(state: np.ndarray, timestep: float) -> np.ndarray:
