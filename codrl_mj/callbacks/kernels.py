@@ -41,10 +41,11 @@ ACT_NAMES = (
 state one step later (the candidate), and the voltage between them."""
 TICK, COMMITTED_CURRENT, COMMITTED_INTEGRAL, COMMITTED_ERROR, CURRENT, INTEGRAL, ERROR, VOLTAGE = range(len(ACT_NAMES))
 
-IMPERFECT_ACT_NAMES = (*ACT_NAMES, "noise_key", "available_voltage")
-"""The same for an actuator whose sensor or supply is imperfect: also the key of the sensor's noise, written at a reset
-and only read here, and the voltage that was available. Its number of entries is what such an actuator is known by."""
-NOISE_KEY, AVAILABLE_VOLTAGE = len(ACT_NAMES), len(ACT_NAMES) + 1
+IMPERFECT_ACT_NAMES = (*ACT_NAMES, "available_voltage", "noise_key")
+"""The same for an actuator whose sensor or supply is imperfect: also the voltage that was available, and the key of the
+sensor's noise, written at a reset and only read here. Its number of entries is what such an actuator is known by. The
+last one must be finite: the engine multiplies it by the actuator's gain, 0."""
+AVAILABLE_VOLTAGE, NOISE_KEY = len(ACT_NAMES), len(ACT_NAMES) + 1
 
 for _function in (noise.philox, noise.unit, noise.standard_normal, electrical_step):
     register_jitable(_function)  # compiled code may call them; they stay what they are

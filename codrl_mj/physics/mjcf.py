@@ -76,10 +76,12 @@ def motors(model: mujoco.MjModel) -> dict[int, Actuator]:
         name = model.actuator(index).name or f"actuator {index}"
         act_size = len(IMPERFECT_ACT_NAMES if _is_imperfect(model, index) else ACT_NAMES)
         user_size = len(PARAMETER_NAMES) + len(IMPERFECTION_NAMES)
-        if _is_imperfect(model, index) and not (len(user) >= user_size and np.isfinite(user[:user_size]).all()):
+        if _is_imperfect(model, index) and not (
+            len(user) >= user_size and np.isfinite(user[len(PARAMETER_NAMES) : user_size]).all()
+        ):
             raise ValueError(
                 f"{name}: user = {list(user)}: a motor of codrl_mj with {len(IMPERFECT_ACT_NAMES)} activations needs "
-                f"{user_size} finite numbers, the last of them {', '.join(IMPERFECTION_NAMES)}"
+                f"{user_size} numbers, the last of them {', '.join(IMPERFECTION_NAMES)}, finite"
             )
         expected = {
             "dyntype": (model.actuator_dyntype[index], mujoco.mjtDyn.mjDYN_USER, 'dyntype="user"'),

@@ -1,0 +1,120 @@
+"""The command's way: delay against interpolation, quantiser and rate limiter by their properties."""
+
+import gymnasium
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from codrl_mj.disturbances import Disturbances
+from codrl_mj.disturbances.command import quantised, rate_limited, whole_and_fraction
+from codrl_mj.physics.disturber import Disturber
+
+commands = st.lists(st.floats(-10, 10), min_size=1, max_size=30)
+
+
+def _arrivals(disturbances, timestep, given_commands, limit=10.0):
+    disturber = Disturber(disturbances, timestep, limit, 1)
+    return np.array([disturber.command(np.array([command]))[0] for command in given_commands])
+
+
+@given(commands, st.floats(0.0, 0.2))
+@settings(max_examples=60, deadline=None)
+def test_a_delayed_command_is_the_interpolation_of_the_commands(values, delay):
+    timestep, count = 0.01, len(values)
+    steps = np.arange(-40, count)
+    padded = np.concatenate([np.zeros(40), values])
+    expected = np.interp(np.arange(count) - delay / timestep, steps, padded)
+    arrived = _arrivals(Disturbances(command_delay=delay), timestep, values)
+    np.testing.assert_allclose(arrived, expected, rtol=0, atol=1e-7)  # 1e-9 of a step is rounded to none
+
+
+@pytest.mark.parametrize("delay", [0.02, 0.06, 0.3])
+def test_whole_steps_shift_without_rounding(delay):
+    values, steps = np.sin(np.arange(40.0)), round(delay / 0.02)
+    arrived = _arrivals(Disturbances(command_delay=delay), 0.02, values)
+    np.testing.assert_array_equal(arrived, np.concatenate([np.zeros(steps), values])[:40])
+    assert whole_and_fraction(delay, 0.02) == (steps, 0.0)
+
+
+@pytest.mark.parametrize("physics", ["mujoco", "analytic"])
+@pytest.mark.parametrize("actuator", ["ideal", "paper"])
+def test_a_delayed_environment_is_one_that_is_told_everything_later(physics, actuator):
+    arguments = {"physics": physics, "actuator": actuator}
+    delayed = gymnasium.make("codrl_mj/Pendulum-v0", disturbances={"command_delay": 0.1}, **arguments)
+    plain = gymnasium.make("codrl_mj/Pendulum-v0", **arguments)
+    delayed.reset(seed=0)
+    plain.reset(seed=0)
+    actions = np.random.default_rng(0).uniform(-2, 2, (50, 1)).astype(np.float32)
+    late = np.concatenate([np.zeros((2, 1), np.float32), actions])
+    for action, earlier in zip(actions, late, strict=False):
+        ours, theirs = delayed.step(action), plain.step(earlier)
+        np.testing.assert_array_equal(delayed.unwrapped.state, plain.unwrapped.state)
+        assert ours[4]["desired_force"] == action[0]
+        assert ours[4]["actual_force"] == theirs[4]["actual_force"]
+        assert ours[4]["reference_current"] == theirs[4]["reference_current"]
+
+
+def test_the_delay_counts_integration_steps_within_an_environment_step():
+    env = gymnasium.make(
+        "codrl_mj/MountainCar-v0", actuator="ideal", inner_steps=20, disturbances={"command_delay": 0.5}
+    )
+    half = gymnasium.make("codrl_mj/MountainCar-v0", actuator="ideal", inner_steps=20)
+    env.reset(seed=1)
+    half.reset(seed=1)
+    env.step(2)
+    physics = half.unwrapped.physics
+    for index in range(20):
+        physics._ctrl[0] = float(index >= 10)
+        physics._integrate(1)
+    np.testing.assert_array_equal(env.unwrapped.state, half.unwrapped.state)
+
+
+@given(st.floats(-1e3, 1e3), st.floats(1e-3, 10), st.floats(0.1, 2e3))
+def test_a_quantised_command_is_the_nearest_multiple_within_the_limit(command, quantum, limit):
+    value = quantised(np.array([command]), quantum, limit)[0]
+    clipped = np.clip(command, -limit, limit)
+    assert abs(value) <= limit
+    if abs(value) < limit:
+        assert value / quantum == pytest.approx(round(value / quantum), abs=1e-6)
+        assert abs(value - command) <= quantum / 2 * (1 + 1e-9) + 1e-12 * abs(command)
+    else:
+        assert abs(clipped - value) <= quantum
+    assert quantised(np.array([-command]), quantum, limit)[0] == -value
+
+
+def test_half_way_goes_to_the_even_multiple():
+    np.testing.assert_array_equal(quantised(np.array([0.25, 0.75, -0.25, 1.25]), 0.5, 9.0), [0.0, 1.0, 0.0, 1.0])
+
+
+@given(commands, st.floats(1e-3, 5))
+def test_a_rate_limited_command_moves_towards_its_target_and_never_faster(values, change):
+    last = 0.0
+    for target in values:
+        value = rate_limited(np.array([target]), np.array([last]), change)[0]
+        assert abs(value - last) <= change * (1 + 1e-12) + 1e-12
+        if abs(target - last) <= change:
+            assert value == pytest.approx(target, abs=1e-12)
+        else:
+            assert value == last + np.sign(target - last) * change
+        last = value
+
+
+def test_the_rate_is_per_second():
+    arrived = _arrivals(Disturbances(command_rate=50.0), 0.02, [10.0] * 12)
+    np.testing.assert_allclose(arrived, np.minimum(np.arange(1, 13) * 1.0, 10.0), rtol=1e-12)
+
+
+def test_delay_comes_before_the_quantiser_and_the_quantiser_before_the_rate_limit():
+    arrived = _arrivals(Disturbances(command_delay=0.01, command_quantum=1.0, command_rate=30.0), 0.02, [1.4, 1.4, 4.0])
+    # interpolated: 0.7, 1.4, 2.7; quantised: 1, 1, 3; at most 0.6 a step
+    np.testing.assert_allclose(arrived, [0.6, 1.0, 1.6], rtol=1e-12)
+
+
+def test_many_are_disturbed_as_one():
+    disturbances = Disturbances(command_delay=0.013, command_quantum=0.3, command_rate=100.0)
+    values = np.random.default_rng(0).uniform(-10, 10, (30, 17))
+    many = Disturber(disturbances, 0.01, 10.0, 17)
+    together = np.array([many.command(row) for row in values])
+    alone = np.stack([_arrivals(disturbances, 0.01, column) for column in values.T], axis=1)
+    np.testing.assert_array_equal(together, alone)

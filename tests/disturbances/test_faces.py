@@ -1,0 +1,186 @@
+"""Disturbances in every environment: alike in one and in many, on both physics, after a copy, and nothing when off."""
+
+import copy
+import pickle
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import codrl_mj
+from codrl_mj.callbacks import ACT_NAMES, IMPERFECT_ACT_NAMES, install, installed
+from codrl_mj.envs.vector import ActuatedVectorEnv
+from codrl_mj.registration import ENVIRONMENTS
+from tests.disturbances.everything import ALL, MOST
+
+WEAK = {"controller": {"kp": 1.0, "ki": 0.5, "max_voltage": 3.0}}
+SIGNALS = ("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated")
+
+
+def _vector(task, num_envs=4, mode=AutoresetMode.NEXT_STEP, disturbances=ALL, **arguments):
+    arguments = {"max_episode_steps": 12, "observe_actuator": True, "actuator": WEAK, **arguments}
+    return ActuatedVectorEnv(num_envs, task, autoreset_mode=mode, disturbances=disturbances, **arguments)
+
+
+def _single(task, disturbances=ALL, **arguments):
+    arguments = {"max_episode_steps": 12, "observe_actuator": True, "actuator": WEAK, **arguments}
+    env_id = ENVIRONMENTS[task].env_id
+    return gymnasium.make(env_id, disturbances=disturbances, disable_env_checker=True, **arguments)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize("task", ENVIRONMENTS)
+def test_many_are_as_one_bit_for_bit(task, mode, threads):
+    ours = _vector(task, mode=mode, num_threads=threads)
+    theirs = SyncVectorEnv([lambda: _single(task)] * 4, autoreset_mode=mode)
+    np.testing.assert_array_equal(ours.reset(seed=7)[0], theirs.reset(seed=7)[0])
+    ours.action_space.seed(0)
+    for _ in range(30):
+        actions = ours.action_space.sample()
+        got, expected = ours.step(actions), theirs.step(actions)
+        for mine, reference in zip(got[:4], expected[:4], strict=True):
+            np.testing.assert_array_equal(mine, reference)
+        for name in {*SIGNALS} & {*expected[4]}:
+            np.testing.assert_array_equal(got[4][name], expected[4][name])
+
+
+@pytest.mark.parametrize("task", ENVIRONMENTS)
+def test_both_physics_agree_with_everything_that_both_have(task):
+    mujoco, analytic = _single(task, MOST), _single(task, MOST, physics="analytic")
+    np.testing.assert_array_equal(mujoco.reset(seed=1)[0], analytic.reset(seed=1)[0])
+    mujoco.action_space.seed(0)
+    for _ in range(12):
+        action = mujoco.action_space.sample()
+        ours, theirs = mujoco.step(action), analytic.step(action)
+        np.testing.assert_allclose(mujoco.unwrapped.state, analytic.unwrapped.state, rtol=0, atol=1e-9)
+        for name in SIGNALS:
+            assert ours[4][name] == pytest.approx(theirs[4][name], abs=1e-9), name
+        if ours[2]:
+            break
+
+
+@pytest.mark.parametrize("task", ENVIRONMENTS)
+def test_copies_and_restored_snapshots_go_on_alike(task):
+    env = _vector(task)
+    env.reset(seed=2)
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(30)]
+    for action in actions[:7]:
+        env.step(action)
+    others = [copy.deepcopy(env), pickle.loads(pickle.dumps(env)), _vector(task)]
+    others[2].reset(seed=9)
+    others[2].restore(env.snapshot())
+    for action in actions[7:]:
+        expected = env.step(action)
+        for other in others:
+            for mine, reference in zip(other.step(action)[:4], expected[:4], strict=True):
+                np.testing.assert_array_equal(mine, reference)
+
+
+@pytest.mark.parametrize("physics", ["mujoco", "analytic"])
+def test_a_copy_of_a_single_environment_goes_on_alike(physics):
+    env = _single("cartpole", MOST, physics=physics)
+    env.reset(seed=0)
+    for action in (1, 0, 0):
+        env.step(action)
+    others = [copy.deepcopy(env.unwrapped), pickle.loads(pickle.dumps(env.unwrapped))]
+    for action in (0, 1, 1, 0, 1):
+        expected = env.step(action)
+        for other in others:
+            np.testing.assert_array_equal(other.step(action)[0], expected[0])
+
+
+def test_dm_control_saves_commands_and_loads_with_the_state():
+    suite = pytest.importorskip("codrl_mj.suite")
+    arguments = {"actuator": WEAK, "disturbances": ALL, "observe_actuator": True}
+    env, other = (suite.load("pendulum", task_kwargs={"random": 5}, **arguments) for _ in range(2))
+    gym = _single("pendulum", max_episode_steps=200)
+    gym.reset(seed=5)
+    env.reset()
+    other.reset()
+    actions = np.random.default_rng(0).uniform(-2, 2, (20, 1)).astype(np.float32)
+    for action in actions[:9]:
+        env.step(action)
+    other.physics.set_state(env.physics.get_state())
+    for action in actions[9:]:
+        ours, theirs = env.step(action), other.step(action)
+        for name, value in ours.observation.items():
+            np.testing.assert_array_equal(theirs.observation[name], value)
+    with pytest.raises(ValueError, match="physics_state has shape"):
+        env.physics.set_state(env.physics.get_state()[:-1])
+
+
+def test_stable_baselines_gets_them_too():
+    pytest.importorskip("stable_baselines3")
+    envs = codrl_mj.make_sb3_vec_env(
+        "codrl_mj/Pendulum-v0", 3, disturbances=codrl_mj.Disturbances(**ALL), observe_actuator=True, actuator=WEAK
+    )
+    reference = _vector("pendulum", 3, AutoresetMode.SAME_STEP, max_episode_steps=200)
+    envs.seed(4)
+    np.testing.assert_array_equal(envs.reset(), reference.reset(seed=4)[0])
+    for value in (1.0, -2.0, 0.5):
+        action = np.full((3, 1), value, np.float32)
+        np.testing.assert_array_equal(envs.step(action)[0], reference.step(action)[0])
+
+
+@pytest.mark.parametrize("task", ENVIRONMENTS)
+def test_seeds_draw_the_same_initial_states_with_disturbances_and_without(task):
+    disturbed, plain = _single(task), _single(task, None)
+    disturbed.reset(seed=11)
+    plain.reset(seed=11)
+    np.testing.assert_array_equal(disturbed.unwrapped.state, plain.unwrapped.state)
+
+
+@pytest.mark.parametrize("physics", ["mujoco", "analytic"])
+@pytest.mark.parametrize("task", ENVIRONMENTS)
+def test_off_is_bit_for_bit_as_without(task, physics):
+    off, plain = _single(task, {}, physics=physics), _single(task, None, physics=physics)
+    off.reset(seed=1)
+    plain.reset(seed=1)
+    off.action_space.seed(0)
+    for _ in range(12):
+        action = off.action_space.sample()
+        ours, theirs = off.step(action), plain.step(action)
+        np.testing.assert_array_equal(ours[0], theirs[0])
+        assert ours[1:] == theirs[1:]
+    off.reset()
+    plain.reset()  # nothing was drawn for a key in between
+    np.testing.assert_array_equal(off.unwrapped.state, plain.unwrapped.state)
+    if physics == "mujoco":
+        assert off.unwrapped.model.na == len(ACT_NAMES)
+        assert off.unwrapped.physics._disturber is None
+
+
+EACH = [{name: MOST[name]} for name in MOST if "pulse" not in name]
+EACH += [{name: MOST[name] for name in MOST if "pulse" in name}, {"joint_damping": 0.1}, {"joint_friction": 0.1}]
+
+
+@pytest.mark.parametrize("disturbances", EACH, ids=lambda one: next(iter(one)))
+def test_each_alone_changes_what_happens(disturbances):
+    disturbed, plain = _single("pendulum", disturbances), _single("pendulum", None)
+    disturbed.reset(seed=1)
+    plain.reset(seed=1)
+    for value in np.linspace(-1.7, 1.9, 12, dtype=np.float32):
+        disturbed.step(np.array([value]))
+        plain.step(np.array([value]))
+    assert np.abs(disturbed.unwrapped.state - plain.unwrapped.state).max() > 1e-6
+
+
+def test_the_callbacks_for_imperfect_motors_serve_the_others_without_changing_a_bit():
+    def run():
+        env = _single("acrobot", None)
+        env.reset(seed=0)
+        return [env.step(action % 3)[0] for action in range(10)]
+
+    before = run()
+    imperfect = _single("acrobot")
+    imperfect.reset(seed=0)
+    assert installed("imperfect_motor")
+    np.testing.assert_array_equal(run(), before)
+    assert installed("motor")
+    install("motor")
+    assert installed("imperfect_motor")
+    assert imperfect.unwrapped.model.na == len(IMPERFECT_ACT_NAMES)
+    imperfect.step(0)

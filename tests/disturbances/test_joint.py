@@ -1,0 +1,103 @@
+"""Damping and friction of the joint, against scipy's integration of the equations of motion."""
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from codrl_mj.disturbances import Disturbances
+from codrl_mj.physics import MujocoPhysics
+from codrl_mj.tasks import TASKS
+
+START = np.array([2.0, 1.0])
+
+
+def _pendulum(inner_steps, torque, **disturbances):
+    physics = MujocoPhysics(TASKS["pendulum"], None, inner_steps, "semi-implicit", None, Disturbances(**disturbances))
+    physics.reset(START)
+    for _ in range(10):
+        physics.step(torque)
+    return physics.state
+
+
+def _solved(torque, damping=0.0, friction=0.0):
+    """Gymnasium's pendulum: th'' = 3 g/(2 l) sin(th) + 3/(m l^2) u with g = 10, l = m = 1."""
+
+    def rate(_, state):
+        load = torque - damping * state[1] - friction * np.sign(state[1])
+        return [state[1], 15.0 * np.sin(state[0]) + 3.0 * load]
+
+    solution = solve_ivp(rate, (0, 0.5), START, rtol=1e-10, atol=1e-12)
+    assert (solution.y[1] > 0.1).all()
+    return solution.y[:, -1]
+
+
+def test_damping_is_a_torque_against_the_speed():
+    expected = _solved(0.5, damping=0.4)
+    coarse, fine = (np.abs(_pendulum(steps, 0.5, joint_damping=0.4) - expected).max() for steps in (250, 500))
+    assert fine < 1e-3
+    assert coarse / fine == pytest.approx(2.0, rel=0.1)  # of first order, as the integrator is
+    assert np.abs(_solved(0.5) - expected).max() > 0.1
+
+
+def test_friction_is_a_constant_torque_against_the_motion():
+    expected = _solved(0.5, friction=0.3)
+    assert np.abs(_pendulum(1000, 0.5, joint_friction=0.3) - expected).max() < 2e-3
+    assert np.abs(_solved(0.5) - expected).max() > 0.1
+
+
+@pytest.mark.parametrize(("torque", "sticks"), [(0.9, True), (-0.9, True), (1.4, False)])
+def test_friction_holds_what_does_not_exceed_it(torque, sticks):
+    physics = MujocoPhysics(TASKS["pendulum"], None, 10, "semi-implicit", None, Disturbances(joint_friction=1.0))
+    physics.reset(np.array([np.pi, 0.0]))
+    for _ in range(40):
+        physics.step(torque)
+    moved = abs(physics.state[0] - np.pi) > 0.01
+    assert moved != sticks
+
+
+def test_the_solver_is_off_without_friction_and_starts_from_nothing_with_it():
+    flags = {
+        name: gymnasium.make("codrl_mj/Pendulum-v0", disturbances=disturbances).unwrapped.model.opt.disableflags
+        for name, disturbances in {
+            "none": None,
+            "damping": {"joint_damping": 1.0},
+            "friction": {"joint_friction": 1.0},
+        }.items()
+    }
+    constraint = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    assert flags["none"] & constraint
+    assert flags["damping"] == flags["none"]
+    assert not flags["friction"] & constraint
+    assert flags["friction"] & int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
+
+
+def test_the_explicit_integrator_stays_explicit():
+    """CartPole: positions move by the old velocity, and damping is that of the old velocity: a force like any other."""
+    damping, cartpole = 2.0, TASKS["cartpole"]
+    damped = MujocoPhysics(cartpole, None, 1, "euler", 1e6, Disturbances(joint_damping=damping))
+    plain = MujocoPhysics(cartpole, None, 1, "euler", 1e6)
+    generator = np.random.default_rng(0)
+    for _ in range(50):
+        state, force = generator.normal(size=4), generator.normal() * 10
+        damped.reset(state)
+        plain.reset(state)
+        damped.step(force)
+        plain.step(force - damping * state[1])
+        np.testing.assert_allclose(damped.state, plain.state, rtol=1e-12, atol=1e-12)
+    rubbed = MujocoPhysics(cartpole, None, 1, "euler", None, Disturbances(joint_damping=1.0, joint_friction=1.0))
+    rubbed.reset(state)
+    rubbed.step(3.0)
+    np.testing.assert_array_equal(rubbed.state[[0, 2]], state[[0, 2]] + 0.02 * state[[1, 3]])
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_only_the_actuated_joint_is_rubbed(task):
+    physics = MujocoPhysics(
+        TASKS[task], None, 1, TASKS[task].integrators[0], None, Disturbances(joint_damping=0.5, joint_friction=0.25)
+    )
+    actuated = physics.model.actuator("motor").trnid[0]
+    expected = np.where(np.arange(physics.model.nv) == actuated, 1.0, 0.0)
+    np.testing.assert_array_equal(physics.model.dof_damping, 0.5 * expected)
+    np.testing.assert_array_equal(physics.model.dof_frictionloss, 0.25 * expected)

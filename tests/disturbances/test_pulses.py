@@ -1,0 +1,87 @@
+"""Load pulses: when they come, how large they are, what they do."""
+
+import gymnasium
+import numpy as np
+import pytest
+from scipy import stats
+
+from codrl_mj.disturbances import Disturbances
+from codrl_mj.disturbances.pulses import START
+from codrl_mj.motor.noise import LARGEST_KEY
+from codrl_mj.physics.disturber import Disturber
+
+FORCE, DURATION, INTERVAL = 2.0, 0.33, 0.8
+PULSES = Disturbances(pulse_force=FORCE, pulse_duration=DURATION, pulse_interval=INTERVAL)
+
+
+def _loads(timestep, steps, simulations, seed=0):
+    """Loads (steps, simulations), and when the present or next pulse starts, before each step."""
+    disturber = Disturber(PULSES, timestep, 10.0, simulations)
+    keys = np.floor(np.random.default_rng(seed).random(simulations) * LARGEST_KEY)
+    disturber.reset(np.arange(simulations), keys)
+    loads, starts = [], []
+    for _ in range(steps):
+        loads.append(disturber.load())
+        starts.append(disturber.memory[:, -4 + START].copy())
+    return np.array(loads), np.array(starts)
+
+
+def test_pulses_cover_their_share_of_time_in_both_directions():
+    simulations, duration = 200, 100.0
+    loads, _ = _loads(0.05, round(duration / 0.05), simulations)
+    assert np.abs(loads).max() == FORCE
+    busy = np.abs(loads).mean() / FORCE
+    cycles = simulations * duration / (DURATION + INTERVAL)
+    assert busy == pytest.approx(DURATION / (DURATION + INTERVAL), rel=5 / np.sqrt(cycles))
+    assert abs(loads.mean()) < 5 * FORCE * DURATION / (DURATION + INTERVAL) / np.sqrt(cycles)
+
+
+def test_the_time_between_pulses_is_exponential():
+    _, starts = _loads(0.05, 2000, 50)
+    waits = [starts[0]]
+    for row in starts.T:
+        distinct = np.unique(row)
+        waits.append(np.diff(distinct) - DURATION)
+    waits = np.concatenate(waits)
+    assert stats.kstest(waits, "expon", args=(0, INTERVAL)).pvalue > 1e-3
+
+
+def test_environments_and_keys_differ():
+    loads, _ = _loads(0.05, 400, 40)
+    other, _ = _loads(0.05, 400, 40, seed=1)
+    assert len(np.unique(loads, axis=1).T) == 40
+    assert not (loads == other).all(axis=0).any()
+
+
+def test_the_impulse_does_not_depend_on_the_integration_step():
+    coarse, _ = _loads(0.5, 100, 10)  # a step longer than a pulse, and with several pulses in it
+    fine, _ = _loads(0.01, 5000, 10)
+    np.testing.assert_allclose(coarse, fine.reshape(100, 50, 10).mean(axis=1), atol=1e-10)
+
+
+def test_a_lone_pulse_is_a_force_times_its_duration():
+    disturber = Disturber(Disturbances(pulse_force=3.0, pulse_duration=0.07, pulse_interval=40.0), 0.02, 1.0, 1)
+    disturber.reset(0, 5.0)
+    loads = np.array([disturber.load()[0] for _ in range(4000)])
+    (first,) = np.flatnonzero(np.diff((loads != 0).astype(int)) == 1)[:1]
+    assert abs(loads[first : first + 8].sum() * 0.02) == pytest.approx(3.0 * 0.07, rel=1e-9)
+
+
+@pytest.mark.parametrize("physics", ["mujoco", "analytic"])
+@pytest.mark.parametrize("task", ["Pendulum", "CartPole", "Acrobot", "MountainCar", "MountainCarContinuous"])
+def test_a_pulse_that_never_ends_is_a_force_like_the_actuators(task, physics):
+    force = {"Pendulum": 1.5, "CartPole": 10.0, "Acrobot": 1.0}.get(task, 0.5)
+    endless = {"pulse_force": force, "pulse_duration": 1e9, "pulse_interval": 1e-12}
+
+    def run(actual, disturbances=None):
+        env = gymnasium.make(f"codrl_mj/{task}-v0", actuator="ideal", physics=physics, disturbances=disturbances)
+        env.reset(seed=3)
+        for _ in range(10):
+            env.unwrapped.physics.step(actual)
+        return env.unwrapped.state
+
+    loaded = run(0.0, endless)
+    forward, backward = run(force), run(-force)
+    errors = [np.abs(loaded - other).max() for other in (forward, backward)]
+    assert min(errors) < 1e-9
+    assert max(errors) > 1e-3

@@ -1,0 +1,165 @@
+"""Sensor noise and bias, and the sagging supply."""
+
+import copy
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+from scipy import stats
+
+from codrl_mj.callbacks.kernels import IMPERFECT_ACT_NAMES, VOLTAGE
+from codrl_mj.motor.noise import LOAD_STREAM, SENSOR_STREAM, philox, standard_normal
+
+STILL = {"motor": {"back_emf_constant": 0.0}, "controller": {"kp": 1.0, "max_voltage": float("inf")}}
+
+
+@pytest.mark.parametrize(
+    ("counter", "key", "expected"),
+    [  # the authors' known answers (Random123, kat_vectors, philox4x32 10)
+        ([0] * 4, 0, [0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8]),
+        ([0xFFFFFFFF] * 4, 2**64 - 1, [0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD]),
+        (
+            [0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344],
+            0x299F31D0A4093822,
+            [0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1],
+        ),
+    ],
+)
+def test_philox_gives_the_known_answers(counter, key, expected):
+    assert list(philox(*counter, key)) == expected
+
+
+def test_the_noise_is_standard_normal_and_white():
+    numbers = np.array([standard_normal(12345.0, step, 0) for step in range(6000)])
+    assert stats.kstest(numbers, "norm").pvalue > 1e-3
+    for lag in (1, 2, 7):
+        assert abs(np.corrcoef(numbers[lag:], numbers[:-lag])[0, 1]) < 4 / np.sqrt(len(numbers))
+    others = [
+        np.array([standard_normal(12346.0, step, 0) for step in range(2000)]),
+        np.array([standard_normal(12345.0, step, 1) for step in range(2000)]),
+    ]
+    for other in others:
+        assert abs(np.corrcoef(numbers[:2000], other)[0, 1]) < 4 / np.sqrt(2000)
+    assert SENSOR_STREAM != LOAD_STREAM
+
+
+def test_the_controller_of_every_environment_has_its_own_white_noise():
+    envs, steps, deviation = 100, 100, 0.25
+    disturbances = {"current_noise": deviation, "current_bias": 0.125}
+    env = gymnasium.make_vec(
+        "codrl_mj/Pendulum-v0", envs, "vector_entry_point", actuator=STILL, disturbances=disturbances
+    )
+    env.reset(seed=0)
+    current, noise = np.zeros(envs), []
+    for _ in range(steps):
+        infos = env.step(np.full((envs, 1), 1.5, np.float32))[4]
+        noise.append(1.5 - current - infos["voltage"])  # u = kp*(i_ref - (i + error)) with kp = 1
+        current = infos["current"]
+    noise = np.array(noise)
+    assert noise.mean() == pytest.approx(0.125, abs=4 * deviation / np.sqrt(noise.size))
+    assert noise.std() == pytest.approx(deviation, rel=4 / np.sqrt(2 * noise.size))
+    assert stats.kstest((noise.ravel() - 0.125) / deviation, "norm").pvalue > 1e-3
+    assert np.abs(np.corrcoef(noise.T)[np.triu_indices(envs, 1)]).max() < 6 / np.sqrt(steps)
+    assert abs(np.corrcoef(noise[1:].ravel(), noise[:-1].ravel())[0, 1]) < 4 / np.sqrt(noise.size)
+
+
+@pytest.mark.parametrize("task", ["Pendulum", "Acrobot"])
+def test_the_noise_of_a_tick_is_the_same_for_whoever_computes_it(task):
+    env = gymnasium.make(f"codrl_mj/{task}-v0", disturbances={"current_noise": 0.5}).unwrapped
+    env.reset(seed=4)
+    env.action_space.seed(0)
+    env.step(env.action_space.sample())
+    model, data = env.model, env.data
+    mujoco.mj_forward(model, data)
+    act = data.act.copy()
+    assert len(act) == len(IMPERFECT_ACT_NAMES)
+    twin = copy.copy(data)
+    for other in (data, twin):
+        mujoco.mj_forward(model, other)
+        np.testing.assert_array_equal(other.act, act)
+    full = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    saved = np.empty(mujoco.mj_stateSize(model, full))
+    mujoco.mj_getState(model, data, saved, full)
+    mujoco.mj_step(model, data)
+    fresh = mujoco.MjData(model)
+    mujoco.mj_setState(model, fresh, saved, full)
+    fresh.ctrl[:] = data.ctrl
+    mujoco.mj_step(model, fresh)
+    np.testing.assert_array_equal(fresh.act, data.act)
+    mujoco.mj_forward(model, data)
+    assert data.act[VOLTAGE] != act[VOLTAGE]
+
+
+def test_episodes_and_seeds_have_their_own_noise_and_seeds_repeat():
+    def voltages(*seeds):
+        env = gymnasium.make("codrl_mj/Pendulum-v0", disturbances={"current_noise": 0.5})
+        found = []
+        for seed in seeds:
+            env.reset(seed=seed)
+            found.append([env.step(np.zeros(1, np.float32))[4]["voltage"] for _ in range(3)])
+        return found
+
+    first, second, third = voltages(0, None, 1)
+    assert voltages(0, None)[0] == first
+    assert len({*first, *second, *third}) == 9
+
+
+@pytest.mark.parametrize("physics", ["mujoco", "analytic"])
+def test_a_bias_shifts_the_steady_current_by_the_closed_form(physics):
+    kp, bias = 1.0, 0.3
+    arguments = {"physics": physics, "observe_actuator": True}
+    env = gymnasium.make("codrl_mj/Pendulum-v0", actuator=STILL, disturbances={"current_bias": bias}, **arguments)
+    start = env.reset(seed=0)[0]
+    for _ in range(60):
+        observation, *_, info = env.step(np.array([1.5], np.float32))
+    assert info["current"] == pytest.approx(kp * (1.5 - bias) / (1.0 + kp), rel=1e-9)  # kp*(i_ref - i - b) = R*i
+    assert start[-2] == np.float32(bias)
+    assert observation[-2] == pytest.approx(info["current"] + bias, rel=1e-6)
+
+    integral = {"motor": {"back_emf_constant": 0.0}, "controller": {"kp": 1.0, "ki": 5.0}}
+    env = gymnasium.make("codrl_mj/Pendulum-v0", actuator=integral, disturbances={"current_bias": bias}, **arguments)
+    env.reset(seed=0)
+    for _ in range(150):
+        info = env.step(np.array([1.5], np.float32))[4]
+    assert info["current"] == pytest.approx(1.5 - bias, rel=1e-9)  # the integral makes the *measured* current right
+
+
+@pytest.mark.parametrize("physics", ["mujoco", "analytic"])
+def test_a_noisy_observation_is_what_the_controller_measures_next(physics):
+    disturbances = {"current_noise": 0.2, "current_bias": 0.1}
+    arguments = {"physics": physics, "actuator": STILL, "observe_actuator": True, "disturbances": disturbances}
+    env = gymnasium.make("codrl_mj/Pendulum-v0", **arguments)
+    measured = env.reset(seed=0)[0][-2]
+    for _ in range(20):
+        observation, *_, info = env.step(np.array([1.5], np.float32))
+        assert info["voltage"] == pytest.approx(1.5 - measured, abs=1e-6)  # kp = 1
+        measured = observation[-2]
+
+
+@pytest.mark.parametrize("physics", ["mujoco", "analytic"])
+@pytest.mark.parametrize(("supply", "substeps"), [(0.0, 1), (0.5, 1), (8.0, 4)])
+def test_a_sagging_supply_stalls_the_motor_at_the_closed_form(physics, supply, substeps):
+    motor = {"resistance": 1.5, "torque_constant": 0.1, "back_emf_constant": 0.0}
+    actuator = {"motor": motor, "controller": {"kp": 1.0, "max_voltage": 5.0, "substeps": substeps}}
+    arguments = {"physics": physics, "actuator": actuator, "disturbances": {"supply_resistance": supply}}
+    env = gymnasium.make("codrl_mj/Pendulum-v0", **arguments)
+    env.reset(seed=0)
+    for _ in range(80):
+        info = env.step(np.array([-2.0], np.float32))[4]
+    assert info["current"] == pytest.approx(-5.0 / (1.5 + supply), rel=1e-9)
+    assert info["voltage"] == pytest.approx(-5.0 * 1.5 / (1.5 + supply), rel=1e-9)
+    assert info["saturated"]
+
+
+def test_a_supply_that_is_spent_gives_no_voltage_and_no_other_sign():
+    env = gymnasium.make(
+        "codrl_mj/Pendulum-v0",
+        actuator={"controller": {"max_voltage": 1.0}},
+        disturbances={"supply_resistance": 100.0},
+        allow_unstable=True,
+    )
+    env.reset(seed=0)
+    voltages = [env.step(np.array([2.0], np.float32))[4]["voltage"] for _ in range(20)]
+    assert max(np.abs(voltages)) <= 1.0
+    assert 0.0 in voltages
