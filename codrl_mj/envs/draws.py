@@ -8,6 +8,7 @@ import numpy as np
 from codrl_mj.envs.randomization import Randomization, nominal_parameters
 from codrl_mj.motor import Actuator
 from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
+from codrl_mj.physics.screen import stability_radii
 from codrl_mj.physics.streams import Streams
 from codrl_mj.physics.variation import write_fields
 
@@ -46,7 +47,10 @@ class Draws:
             ValueError: no stable current loop was drawn.
         """
         self._values[rows], self._rejected[rows] = self._randomization.draw(
-            lambda pending, count: streams.random(rows[pending], count), self._nominal[rows], self._arms[rows]
+            lambda pending, count: streams.random(rows[pending], count),
+            self._nominal[rows],
+            self._arms[rows],
+            stability_radii,
         )
         self._apply(rows)
         return self._randomization.reports(rows, self._values, self._rejected)

@@ -92,7 +92,11 @@ class Randomization:
         return any(not name.startswith("model.") for name in self.distributions)
 
     def draw(
-        self, random: Callable[[np.ndarray, int], np.ndarray], vectors: np.ndarray, arms: np.ndarray
+        self,
+        random: Callable[[np.ndarray, int], np.ndarray],
+        vectors: np.ndarray,
+        arms: np.ndarray,
+        radii_of: Callable[[np.ndarray, float], np.ndarray] = spectral_radii,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Draw the fields of some environments; whole sets are redrawn until the current loop is stable.
 
@@ -100,6 +104,7 @@ class Randomization:
             random: (positions in `vectors`, count) -> the next `count` numbers in [0, 1) of each of their generators.
             vectors: nominal parameter vectors, shape (m, p); p = 0 for ideal actuators.
             arms: nominal arms [m], shape (m,).
+            radii_of: `spectral_radii`, or what is below 1 exactly where they are.
 
         Returns:
             Values (m, k), and how many sets were rejected before, (m,).
@@ -117,7 +122,7 @@ class Randomization:
             if self.allow_unstable or not self.draws_actuator:
                 return values, rejected
             drawn, _ = self.parameters(vectors[pending], arms[pending], values[pending])
-            radii = spectral_radii(drawn, self.timestep)
+            radii = radii_of(drawn, self.timestep)
             if self.supply_resistance:  # under a saturated voltage the current is fed back through the supply
                 pole = (drawn[:, RESISTANCE] + self.supply_resistance) * self.timestep
                 radii = np.maximum(radii, np.abs(1.0 - pole / (drawn[:, INDUCTANCE] * drawn[:, SUBSTEPS])))

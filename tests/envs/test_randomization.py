@@ -15,6 +15,7 @@ from codrl_mj import Choice, LogUniform, Uniform
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.motor import Actuator, CurrentLoop, spectral_radius, to_vector
 from codrl_mj.motor.stability import spectral_radii
+from codrl_mj.physics.screen import stability_radii
 from codrl_mj.tasks import TASKS
 from tests.envs.vectors import MODES, assert_equal_episodes, assert_same, batched, looped, random_actions
 from tests.tasks.faces import actions, gymnasiums, random_states
@@ -437,6 +438,23 @@ def test_the_radius_of_one_is_that_among_many():
     for size in (1, 2, 7, 100):
         parts = [spectral_radii(vectors[start : start + size], 0.05) for start in range(0, 300, size)]
         np.testing.assert_array_equal(np.concatenate(parts), radii)
+
+
+def test_the_quick_proof_of_stability_and_the_radius_agree():
+    generator = np.random.default_rng(1)
+    vectors = np.array([to_vector(Actuator())] * 20000)
+    vectors[:, 1:3] = np.exp(generator.uniform(-3.0, 1.0, (20000, 2)))
+    vectors[:, 5:8] = np.exp(generator.uniform(-9.0, 4.0, (20000, 3))) * (1.0, 1.0, 1e-3)
+    vectors[generator.random(20000) < 0.3, 6] = 0.0
+    vectors[generator.random(20000) < 0.3, 7] = 0.0
+    vectors[:, 11] = generator.integers(1, 4, 20000)
+    vectors[:, 12:14] = generator.choice([0.0, 1.0], (20000, 2)) * (10.0, 0.01)
+    radii, quick = spectral_radii(vectors, 0.02), stability_radii(vectors, 0.02)
+    np.testing.assert_array_equal(radii < 1.0, quick < 1.0)
+    assert 0.02 < (radii >= 1.0).mean() < 0.9
+    assert (quick == 0.0).sum() > 0.8 * (radii < 1.0).sum()  # it is what saves the time
+    edge = np.array([to_vector(Actuator(controller=CurrentLoop(kp=kp))) for kp in 9.0 + np.linspace(-1e-9, 1e-9, 401)])
+    np.testing.assert_array_equal(spectral_radii(edge, 0.02) < 1.0, stability_radii(edge, 0.02) < 1.0)
 
 
 # -- saved and restored -------------------------------------------------------------------------------------
