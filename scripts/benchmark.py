@@ -168,7 +168,7 @@ def main() -> int:
     parser.add_argument("--turns", type=int, help="turns of each member of a group")
     parser.add_argument("--out", type=Path, help="JSON file for the results")
     options = parser.parse_args()
-    turns = options.turns or (5 if options.quick else 11)
+    turns = (5 if options.quick else 11) if options.turns is None else options.turns
     if turns < 1:
         parser.error(f"--turns {turns}: must be >= 1")
     turn_duration = 0.02 if options.quick else 0.1  # s
