@@ -133,9 +133,10 @@ class Randomization:
             rejected[pending] += 1
             if rejected[pending[0]] == LIMIT:
                 last = {name: float(value) for name, value in zip(self.names, values[pending[0]], strict=True)}
+                last_radius = spectral_radii(drawn[unstable][:1], self.timestep)[0]
                 raise ValueError(
                     f"randomize: {LIMIT} draws in a row have an unstable current loop at a step of "
-                    f"{self.timestep:g} s; the last was {last} with spectral radius {radii[unstable][0]:.4g}, must be "
+                    f"{self.timestep:g} s; the last was {last} with spectral radius {last_radius:.4g}, must be "
                     "< 1. Narrow the bounds, shorten the step, or pass allow_unstable=True"
                 )
 

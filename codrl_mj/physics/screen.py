@@ -1,4 +1,4 @@
-"""Quick proof that a current loop is stable, for many actuators at once: it saves most of the eigenvalues."""
+"""Quick proof that a current loop is stable, or is not, for many at once: it saves nearly all of the eigenvalues."""
 
 import functools
 from typing import Any
@@ -12,11 +12,11 @@ from codrl_mj.motor.parameters import KD, KI, MAX_VOLTAGE, SUBSTEPS
 from codrl_mj.motor.stability import spectral_radii
 
 MARGIN = 1e-9
-"""What Jury's conditions must be fulfilled by, relative to their terms: far above the rounding of either method."""
+"""By how much, relative to their terms, Jury's conditions must hold or not: far above the rounding of either method."""
 
 
 def stability_radii(vectors: np.ndarray, timestep: float) -> np.ndarray:
-    """`codrl_mj.motor.stability.spectral_radii`, with 0 instead of the radii of loops that are clearly stable.
+    """`codrl_mj.motor.stability.spectral_radii`, with 0 and infinity instead of the radii of clear cases.
 
     Args:
         vectors: parameter vectors, shape (m, p).
@@ -25,8 +25,8 @@ def stability_radii(vectors: np.ndarray, timestep: float) -> np.ndarray:
     Returns:
         Shape (m,): below 1 exactly where the spectral radii are.
     """
-    radii = np.zeros(len(vectors))
-    doubtful = ~_compiled()(np.ascontiguousarray(vectors), timestep)
+    radii = _compiled()(np.ascontiguousarray(vectors), timestep)
+    doubtful = np.isnan(radii)
     if doubtful.any():
         radii[doubtful] = spectral_radii(vectors[doubtful], timestep)
     return radii
@@ -37,9 +37,9 @@ def _compiled() -> Any:
     """Compile on first use, in about a second; the matrix is that of `codrl_mj.motor.stability`, read off the loop."""
     loop = numba.njit(advance)
 
-    @numba.njit("boolean[::1](float64[:,::1], float64)", error_model="numpy")
-    def clearly_stable(vectors: np.ndarray, timestep: float) -> np.ndarray:
-        clear = np.zeros(len(vectors), dtype=np.bool_)
+    @numba.njit("float64[::1](float64[:,::1], float64)", error_model="numpy")
+    def judge(vectors: np.ndarray, timestep: float) -> np.ndarray:
+        radii = np.empty(len(vectors))
         matrix = np.empty((3, 3))
         for row in range(len(vectors)):
             parameters = vectors[row].copy()
@@ -60,12 +60,9 @@ def _compiled() -> Any:
             one = (a * e - b * d) + (a * i - c * g) + (e * i - f * h)
             zero = -(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
             margin = MARGIN * (1.0 + abs(two) + abs(one) + abs(zero)) ** 2
-            clear[row] = (
-                1.0 + two + one + zero > margin
-                and 1.0 - two + one - zero > margin
-                and 1.0 - abs(zero) > margin
-                and 1.0 - zero * zero - abs(one - zero * two) > margin
-            )
-        return clear
+            least = min(1.0 + two + one + zero, 1.0 - two + one - zero, 1.0 - abs(zero))
+            least = min(least, 1.0 - zero * zero - abs(one - zero * two)) if least > margin else least
+            radii[row] = 0.0 if least > margin else np.inf if least < -margin else np.nan
+        return radii
 
-    return clearly_stable
+    return judge

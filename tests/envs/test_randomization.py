@@ -452,7 +452,7 @@ def test_the_quick_proof_of_stability_and_the_radius_agree():
     radii, quick = spectral_radii(vectors, 0.02), stability_radii(vectors, 0.02)
     np.testing.assert_array_equal(radii < 1.0, quick < 1.0)
     assert 0.02 < (radii >= 1.0).mean() < 0.9
-    assert (quick == 0.0).sum() > 0.8 * (radii < 1.0).sum()  # it is what saves the time
+    assert np.isin(quick, (0.0, np.inf)).mean() > 0.8  # it is what saves the time
     edge = np.array([to_vector(Actuator(controller=CurrentLoop(kp=kp))) for kp in 9.0 + np.linspace(-1e-9, 1e-9, 401)])
     np.testing.assert_array_equal(spectral_radii(edge, 0.02) < 1.0, stability_radii(edge, 0.02) < 1.0)
 
