@@ -311,9 +311,18 @@ def margin(check: Check) -> float:
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
     """A fault may well overflow: that is what its checks are to say, and no warning besides."""
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore", RuntimeWarning)
-        yield
+    handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(_ignore)
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore", RuntimeWarning)
+            yield
+    finally:
+        mujoco.set_mju_user_warning(handler)
+
+
+def _ignore(message: str) -> None:
+    """Take the place of the engine's own handler, which prints and writes a file."""
 
 
 def try_mutations(

@@ -37,10 +37,14 @@ class _Axis:
 
     def ticks(self) -> list[tuple[float, str]]:
         """Positions in pixels, with labels."""
-        if self.log and self.high - self.low > 0.9:
+        if self.log and self.high - self.low > 2.2:
             decades = range(math.ceil(self.low), math.floor(self.high) + 1)
             stride = max(1, math.ceil(len(decades) / 7))
             marks = [(10.0**power, _power(power)) for power in decades if power % stride == 0]
+        elif self.log and self.high - self.low > 0.6:
+            powers = range(math.floor(self.low), math.ceil(self.high))
+            every = [step * 10.0**power for power in powers for step in (1, 2, 5)]
+            marks = [(value, f"{value:.3g}") for value in every if self.low <= math.log10(value) <= self.high]
         elif self.log:
             low, high = 10**self.low, 10**self.high
             marks = [(value, f"{value:.3g}") for value in _round_numbers(low, high)]
@@ -88,8 +92,10 @@ def _path(x: np.ndarray, y: np.ndarray) -> str:
 
 
 def style(index: int, curve: Curve) -> tuple[str, str]:
-    """CSS class and dashes of a line: results are solid and coloured, references grey and dashed."""
-    return ("ref", DASHES[1 + index % (len(DASHES) - 1)]) if curve.reference else (f"line c{index % 6}", "")
+    """CSS class and dashes of a line: references are grey, results coloured, and dashed where they may hide another."""
+    if curve.reference:
+        return "ref", DASHES[1 + index % (len(DASHES) - 1)]
+    return f"line c{index % 6}", "11 9" if index % 2 else ""
 
 
 def svg(plot: Plot) -> str:
@@ -128,8 +134,8 @@ def svg(plot: Plot) -> str:
     parts.append(
         f'<text class="label" x="{middle}" y="{HEIGHT - 12}" text-anchor="middle">{_text(plot.x_label)}</text>'
     )
-    centre = (TOP + HEIGHT - BOTTOM) / 2
-    turned = f'transform="translate(20 {centre}) rotate(-90)"'
+    size = min(17.0, 1.85 * HEIGHT / max(1, len(plot.y_label)))  # a long label is smaller, and never cut off
+    turned = f'transform="translate(20 {HEIGHT / 2}) rotate(-90)" style="font-size: {size:.1f}px"'
     parts.append(f'<text class="label" {turned} text-anchor="middle">{_text(plot.y_label)}</text>')
     title = f"{plot.title}: {plot.y_label} over {plot.x_label}"
     box = f'viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{_text(title)}"'
