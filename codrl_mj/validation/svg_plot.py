@@ -8,7 +8,7 @@ import numpy as np
 from codrl_mj.validation.outcome import Curve, Plot
 
 WIDTH, HEIGHT = 640, 360
-LEFT, RIGHT, TOP, BOTTOM = 84, 14, 14, 60
+LEFT, RIGHT, TOP, BOTTOM = 108, 14, 14, 60
 DASHES = ("", "7 4", "2 3", "9 3 2 3", "16 5")
 POINTS = 400
 """Most points of a line: more than there are pixels show nothing."""
