@@ -212,8 +212,7 @@ def _compile(imperfect: bool) -> Callbacks:
                     act[NOISE_KEY],
                     time,
                 )
-                # finite even without a limit: the engine multiplies the last activation by the gain, 0
-                act[AVAILABLE_VOLTAGE] = min(available, largest)
+                act[AVAILABLE_VOLTAGE] = available
             else:
                 current, integral, error, voltage = loop(user, timestep, i, total, last, torque, speed)
             act[CURRENT] = current
