@@ -58,7 +58,8 @@ class Disturber:
             Shape (N,); a new array.
         """
         disturbances, history = self.disturbances, self.memory[:, : self._length]
-        history[:, 1:] = history[:, :-1].copy()
+        if self._length > 1:
+            history[:, 1:] = history[:, :-1].copy()
         history[:, 0] = desired
         command = delayed(history, self._fraction)
         if disturbances.command_quantum:

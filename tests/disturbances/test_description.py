@@ -4,9 +4,11 @@ import dataclasses
 import json
 
 import gymnasium
+import numpy as np
 import pytest
 
 import codrl_mj
+from codrl_mj.cli import main
 from codrl_mj.disturbances import OFF, Disturbances, resolve_disturbances
 from codrl_mj.env_config import EnvConfig
 from tests.disturbances.everything import ALL
@@ -81,3 +83,19 @@ def test_a_configuration_survives_json():
     assert EnvConfig(**json.loads(json.dumps(dataclasses.asdict(config)))) == config
     assert config.as_arguments()["disturbances"] == Disturbances(**ALL)
     assert "disturbances" not in EnvConfig().as_arguments()
+
+
+def test_the_command_line_takes_them_and_refuses_in_one_line(capsys, tmp_path):
+    line = ["render", "pendulum", "--env.max-episode-steps", "3", "--width", "200", "--height", "120"]
+    trajectories = []
+    for name, flags in {"plain": [], "late": ["--env.disturbances.command-delay", "0.05"]}.items():
+        files = ["--out", str(tmp_path / f"{name}.gif"), "--trajectory", str(tmp_path / f"{name}.npz")]
+        assert main([*line, *files, *flags]) == 0
+        trajectories.append(np.load(tmp_path / f"{name}.npz"))
+    plain, late = trajectories
+    np.testing.assert_array_equal(plain["action"], late["action"])
+    assert late["reference_current"][0] == 0.0
+    np.testing.assert_allclose(late["reference_current"][1:], plain["reference_current"][:-1], rtol=1e-12)
+    capsys.readouterr()
+    assert main([*line, "--env.disturbances.command-delay", "-1"]) == 2
+    assert "Disturbances.command_delay = -1: must be a finite number >= 0" in capsys.readouterr().err
