@@ -184,3 +184,14 @@ def test_the_callbacks_for_imperfect_motors_serve_the_others_without_changing_a_
     assert installed("imperfect_motor")
     assert imperfect.unwrapped.model.na == len(IMPERFECT_ACT_NAMES)
     imperfect.step(0)
+
+
+def test_drawn_motors_and_disturbances_go_together_bit_for_bit():
+    randomize = {"motor.inductance": codrl_mj.Uniform(0.08, 0.12), "model.gravity": codrl_mj.Uniform(0.9, 1.1)}
+    ours = _vector("acrobot", randomize=randomize)
+    theirs = SyncVectorEnv([lambda: _single("acrobot", randomize=randomize)] * 4)
+    np.testing.assert_array_equal(ours.reset(seed=7)[0], theirs.reset(seed=7)[0])
+    for step in range(25):
+        actions = np.arange(step, step + 4) % 3
+        for mine, reference in zip(ours.step(actions)[:4], theirs.step(actions)[:4], strict=True):
+            np.testing.assert_array_equal(mine, reference)
