@@ -57,8 +57,11 @@ def main() -> int:
     for actuator, (config, out) in runs.items():
         if finished(out, config):
             print(f"     {out} is trained already (delete it to train anew)")
+        elif (out / "policy.json").is_file():
+            print(f"demo: {out} holds a run with other settings: choose another --out, or delete it", file=sys.stderr)
+            return 2
         else:
-            shutil.rmtree(out, ignore_errors=True)  # what a run that was stopped left behind
+            shutil.rmtree(out, ignore_errors=True)  # what a run that was killed left behind
             waiting[f"trained on {actuator}"] = (config, out)
     if waiting:
         train_with_bars(waiting)
