@@ -1,8 +1,9 @@
-"""A million environment steps over actuators that all differ: no growth of memory, no dependence on threads.
+"""A million environment steps over randomised actuators: no growth of memory, no dependence on threads.
 
-Two vector environments with the same random stable actuators, one stepped on one thread and one on two, take the same
-random actions. Whatever they return must be equal bit for bit, each episode that ends must be accounted for in the
-infos, and memory may not grow after the first tenth.
+Two vector environments whose actuators are drawn anew for every episode, one stepped on one thread and one on two, take
+the same random actions. Whatever they return must be equal bit for bit, each episode that ends and each unstable draw
+must be accounted for in the infos, no unstable actuator may be let through, and memory may not grow after the first
+tenth.
 """
 
 import codrl_mj  # isort: skip - before mujoco, which chooses its OpenGL platform when it is imported
@@ -19,10 +20,10 @@ import numpy as np
 from gymnasium.spaces import Discrete
 from gymnasium.vector import AutoresetMode
 
-from codrl_mj import Actuator, CurrentLoop, Motor, spectral_radius
+from codrl_mj import Actuator, LogUniform, named_actuator, spectral_radius
 from codrl_mj.envs import ActuatedVectorEnv
 from codrl_mj.registration import ENVIRONMENTS
-from codrl_mj.tasks import TASKS, find_task
+from codrl_mj.tasks import TASKS
 from codrl_mj.terminal import console
 
 GROWTH = 4 * 2**20
@@ -34,21 +35,34 @@ def resident() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def stable_actuators(task: str, count: int, generator: np.random.Generator) -> tuple[list[Actuator], int]:
-    """Random actuators, those with unstable loops drawn again; and how many were."""
-    definition, rejected = find_task(task), 0
-    found: list[Actuator] = []
-    step = definition.step_duration / definition.motor_inner_steps
-    while len(found) < count:
-        resistance, inductance, constant, arm = np.exp(generator.uniform(np.log(0.3), np.log(3.0), 4)).tolist()
-        kp, ki, voltage = np.exp(generator.uniform(np.log(0.3), np.log(30.0), 3)).tolist()
-        motor = Motor(resistance, 0.3 * inductance, constant, constant, arm_radius=arm)
-        actuator = Actuator(motor, CurrentLoop(kp=kp, ki=ki, max_voltage=voltage))
-        if spectral_radius(actuator, step) < 1.0:
-            found.append(actuator)
-        else:
-            rejected += 1
-    return found, rejected
+RANDOMIZE = {
+    # wide enough that a fifth or so of the draws are unstable at the tasks' steps
+    "motor.resistance": LogUniform(0.3, 3.0),
+    "motor.inductance": LogUniform(0.1, 1.0),
+    "motor.torque_constant": LogUniform(0.3, 3.0),
+    "controller.kp": LogUniform(0.3, 30.0),
+    "controller.ki": LogUniform(0.3, 30.0),
+    "controller.max_voltage": LogUniform(1.0, 30.0),
+}
+"""What is drawn anew for every episode."""
+
+
+def unstable(env: ActuatedVectorEnv) -> int:
+    """How many of the actuators in use have an unstable loop, each judged by itself."""
+    drawn = env.randomization
+    assert drawn is not None
+    count = 0
+    for row in range(env.num_envs):
+        parts: dict[str, dict[str, float]] = {"motor": {}, "controller": {}}
+        for name in RANDOMIZE:
+            part, field = name.split(".")
+            parts[part][field] = float(drawn[name][row])
+        nominal = named_actuator("paper", env.task.name)
+        assert nominal is not None
+        mapping = nominal.as_mapping()
+        actuator = Actuator.from_mapping({part: mapping[part] | parts[part] for part in mapping})
+        count += spectral_radius(actuator, env.task.step_duration / env.setup.inner_steps) >= 1.0
+    return count
 
 
 def digest(results: tuple[Any, ...]) -> bytes:
@@ -57,9 +71,10 @@ def digest(results: tuple[Any, ...]) -> bytes:
     *arrays, infos = results
     for array in arrays:
         checksum.update(array.tobytes())
-    for name in sorted(infos):
-        if isinstance(infos[name], np.ndarray) and infos[name].dtype != object:
-            checksum.update(infos[name].tobytes())
+    for group in (infos, infos.get("randomization", {}), infos.get("final_info", {})):
+        for name in sorted(group):
+            if isinstance(group[name], np.ndarray) and group[name].dtype != object:
+                checksum.update(group[name].tobytes())
     return checksum.digest()
 
 
@@ -70,13 +85,13 @@ def soak(task: str, num_envs: int, steps: int) -> int:
         0, or 1 if something was wrong.
     """
     generator = np.random.default_rng(0)
-    actuators, rejected = stable_actuators(task, num_envs, generator)
-    console().print(f"{task}: {num_envs} actuators; {rejected} unstable draws rejected and drawn again")
     limit = ENVIRONMENTS[task].max_episode_steps
     arguments: dict[str, Any] = {"max_episode_steps": limit, "autoreset_mode": AutoresetMode.SAME_STEP}
-    envs = [ActuatedVectorEnv(num_envs, task, actuators, num_threads=threads, **arguments) for threads in (1, 2)]
-    for env in envs:
-        env.reset(seed=0)
+    arguments["randomize"] = RANDOMIZE
+    envs = [ActuatedVectorEnv(num_envs, task, num_threads=threads, **arguments) for threads in (1, 2)]
+    first, _ = (env.reset(seed=0)[1] for env in envs)
+    rejected = int(first["randomization"]["rejected"].sum())
+    draws, let_through = num_envs, unstable(envs[0])
     space = envs[0].single_action_space
     lengths = np.zeros(num_envs, dtype=np.int64)
     ended = truncations = finished_steps = differing = missing = 0
@@ -95,6 +110,9 @@ def soak(task: str, num_envs: int, steps: int) -> int:
         if ends.any():
             missing += int((infos["_final_obs"] != ends).sum() + (infos["final_info"]["_current"] != ends).sum())
             missing += sum(not np.isfinite(seen).all() for seen in infos["final_obs"][ends])
+            missing += int((infos["_randomization"] != ends).sum())
+            rejected += int(infos["randomization"]["rejected"][ends].sum())
+            draws += int(ends.sum())
         ended += int(ends.sum())
         truncations += int(truncated.sum())
         finished_steps += int(lengths[ends].sum())
@@ -102,6 +120,7 @@ def soak(task: str, num_envs: int, steps: int) -> int:
         if step == max(1, steps // 10):
             base = resident()
         if step % max(1, steps // 10) == 0:
+            let_through += unstable(envs[0])
             rate = 2 * step * num_envs / (time.perf_counter() - start)
             growth = (resident() - base) / 2**20
             console().print(
@@ -116,6 +135,8 @@ def soak(task: str, num_envs: int, steps: int) -> int:
         f"steps that differ between 1 and 2 threads: {differing}": differing == 0,
         "physics, generators and counters are equal at the end": same_end,
         f"episodes or steps unaccounted for: {missing}": missing == 0,
+        f"unstable actuators let through: {let_through} ({draws:,} drawn, {rejected:,} more rejected)": let_through == 0
+        and rejected > 0,
     }
     for verdict, fine in verdicts.items():
         console().print(f"{'ok  ' if fine else 'FAIL'} {verdict}")
