@@ -31,6 +31,7 @@ _PUBLIC = {
     "make_sb3_vec_env": "codrl_mj.envs.sb3",
     "motors": "codrl_mj.physics",
     "set_actuator": "codrl_mj.physics",
+    "install_callbacks": "codrl_mj.physics",
 }
 
 __all__ = ["__version__", *_PUBLIC]
