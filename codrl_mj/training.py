@@ -1,9 +1,9 @@
 """Training runs: from a configuration to a run folder."""
 
+import contextlib
 import csv
 import dataclasses
 import importlib.metadata
-import shutil
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any
 from codrl_mj.agents import PPOConfig, make_ppo
 from codrl_mj.env_config import EnvConfig
 from codrl_mj.evaluation import make_env
-from codrl_mj.files import read_json, write_json, writing
+from codrl_mj.files import read_json, write_json, writing, writing_folder
 from codrl_mj.motor import Actuator, resolve
 from codrl_mj.policies import save_policy
 from codrl_mj.registration import ENVIRONMENTS
@@ -124,7 +124,7 @@ def train(config: TrainConfig, out: Path, on_progress: Callable[[Progress], None
         FileExistsError: `out` exists; nothing in it was touched.
         ValueError: the configuration cannot be trained, for instance because the actuator is unstable.
 
-    Whatever is raised, Ctrl-C included, no run folder is left.
+    The run folder appears when the run is finished: one that is stopped, however, leaves none.
     """
     if out.exists():
         raise FileExistsError(f"run folder {out} exists already: choose another --out, or delete it to train anew")
@@ -158,18 +158,12 @@ def train(config: TrainConfig, out: Path, on_progress: Callable[[Progress], None
             if on_progress is not None:
                 on_progress(history[-1])
 
-    out.mkdir(parents=True)
-    try:
-        write_json(out / _CONFIG, {"train": config.as_mapping(), "versions": _versions()})
+    with contextlib.closing(envs), writing_folder(out) as folder:
+        write_json(folder / _CONFIG, {"train": config.as_mapping(), "versions": _versions()})
         model.learn(config.total_steps, callback=Report())
-        _write_progress(out / _PROGRESS, history)
-        _draw_learning_curve(out / _CURVE, config, history)
-        save_policy(model, out)
-    except BaseException:
-        shutil.rmtree(out, ignore_errors=True)
-        raise
-    finally:
-        envs.close()
+        _write_progress(folder / _PROGRESS, history)
+        _draw_learning_curve(folder / _CURVE, config, history)
+        save_policy(model, folder)
     return out
 
 
