@@ -216,13 +216,18 @@ class Setup:
         return self.actuator.motor.torque_constant / self.actuator.motor.arm_radius
 
     @property
+    def _command_limit(self) -> float:
+        """Largest current [A] or voltage [V] that the agent can command, in float64: a float32 bound may lie beyond."""
+        return self.max_force / self._force_per_ampere
+
+    @property
     def action_space(self) -> spaces.Space[Any]:
         """The agent's actions: the task's, or a table's indices, or a box of currents [A] or voltages [V]."""
         if self.levels is not None:
             return spaces.Discrete(len(self.levels))
         if self.command == "force":
             return self.task.action_space
-        limit = np.float32(self.max_force / self._force_per_ampere)
+        limit = np.float32(self._command_limit)
         return spaces.Box(-limit, limit, (1,), np.float32)
 
     @property
@@ -259,9 +264,8 @@ class Setup:
         array = np.asarray(action)
         if array.shape != space.shape or array.dtype.kind != "f" or np.isnan(array).any():
             raise ValueError(f"action = {action!r}: not in {space}")
-        limit = self.max_force / self._force_per_ampere
-        command = min(max(float(array[0]), -limit), limit)  # in float64: a float32 bound may lie beyond the limit
-        return command * self._force_per_ampere
+        limit = self._command_limit
+        return min(max(float(array[0]), -limit), limit) * self._force_per_ampere
 
     def forces(self, actions: Any) -> np.ndarray:
         """What `force` does, for a batch.
@@ -291,7 +295,7 @@ class Setup:
             return np.asarray(self.task.desired_force(array), dtype=np.float64)
         if self.levels is not None:
             return self.levels[array] * self._force_per_ampere
-        limit = self.max_force / self._force_per_ampere
+        limit = self._command_limit
         return np.clip(array[:, 0].astype(np.float64), -limit, limit) * self._force_per_ampere
 
     def signals(self, signals: Signals) -> Signals:
