@@ -7,7 +7,7 @@ import numpy as np
 
 from codrl_mj.disturbances import OFF, Disturbances
 from codrl_mj.motor import Actuator, advance, advance_imperfect, to_vector
-from codrl_mj.physics.base import Signals, check_finite, ideal_signals, motor_signals
+from codrl_mj.physics.base import TRACE_NAMES, Signals, check_finite, ideal_signals, motor_signals
 from codrl_mj.physics.disturber import disturber, sensed
 from codrl_mj.tasks import Task
 
@@ -196,6 +196,7 @@ class AnalyticPhysics:
         self._disturbances = disturbances
         limit = task.max_force if max_force is None else max_force
         self._disturber = disturber(disturbances, self._timestep, limit, 1)
+        self.trace = np.zeros((inner_steps, len(TRACE_NAMES)))
         self.reset(np.zeros(len(task.state_names)))
 
     def reset(self, state: np.ndarray, key: float = 0.0) -> None:
@@ -226,7 +227,7 @@ class AnalyticPhysics:
         """
         signals = ideal_signals(desired_force)
         command = desired_force
-        for _ in range(self.inner_steps):
+        for row in self.trace:
             if self._disturber is not None:
                 command = float(self._disturber.command(np.array([desired_force]))[0])
                 signals = ideal_signals(desired_force, command)
@@ -237,6 +238,8 @@ class AnalyticPhysics:
                 force += float(self._disturber.load()[0])
             self.state = self._driver(self.state, force, self._timestep, self._integrator)
             self._time += self._timestep
+            speed = self.state[self._driver.speed]
+            row[:] = command, signals.actual_force, signals.current, signals.voltage, speed
         check_finite(self.task, self.state, self._time)
         return signals
 

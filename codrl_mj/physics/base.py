@@ -27,6 +27,13 @@ class Signals(NamedTuple):
     """Whether the voltage was at its limit."""
 
 
+TRACE_NAMES = ("desired_force", "actual_force", "current", "voltage", "speed")
+"""Columns of `Physics.trace`: the force [N or N*m] asked of the actuator (after what disturbs commands on their way) and
+delivered in an integration step, the current [A] at its end, the voltage [V] of its last electrical step (both 0 for
+the ideal actuator), and the velocity of the actuated joint [m/s or rad/s] at its end."""
+TRACE_DESIRED_FORCE, TRACE_ACTUAL_FORCE, TRACE_CURRENT, TRACE_VOLTAGE, TRACE_SPEED = range(len(TRACE_NAMES))
+
+
 def ideal_signals(desired_force: float, command: float | None = None) -> Signals:
     """The signals of an ideal actuator: it delivers the command, and has no current and no voltage."""
     return Signals(desired_force, desired_force if command is None else command, 0.0, 0.0, 0.0, False)
@@ -65,6 +72,10 @@ def motor_signals(
 
 class Physics(Protocol):
     """One simulation of one task."""
+
+    trace: np.ndarray
+    """What the actuator did in each integration step of the last environment step, shape (inner_steps, 5), float64;
+    columns as in `TRACE_NAMES`. A live array: the next step overwrites it."""
 
     @property
     def state(self) -> np.ndarray:

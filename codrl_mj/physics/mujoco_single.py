@@ -10,7 +10,7 @@ from codrl_mj import callbacks
 from codrl_mj.callbacks.kernels import AVAILABLE_VOLTAGE, CURRENT, NOISE_KEY, VOLTAGE
 from codrl_mj.disturbances import OFF, Disturbances
 from codrl_mj.motor import Actuator, to_vector
-from codrl_mj.physics.base import Signals, check_finite, ideal_signals, motor_signals
+from codrl_mj.physics.base import TRACE_NAMES, Signals, check_finite, ideal_signals, motor_signals
 from codrl_mj.physics.constrain import compiled_constrain
 from codrl_mj.physics.disturber import disturber, sensed
 from codrl_mj.physics.mjcf import needed_callbacks, task_model
@@ -56,6 +56,7 @@ class MujocoPhysics:
         self._qpos_order, self._qvel_order = _progression(task.qpos), _progression(task.qvel)
         self._disturbances = disturbances
         self._disturber = disturber(disturbances, timestep, self._max_force, 1)
+        self.trace = np.zeros((inner_steps, len(TRACE_NAMES)))
         self._dof = int(self.model.jnt_dofadr[self.model.actuator("motor").trnid[0]])
         self._bind()
         self.reset(np.zeros(len(task.state_names)))
@@ -139,17 +140,23 @@ class MujocoPhysics:
         Raises:
             SimulationDivergedError: the state is no longer finite.
         """
-        arm = 1.0 if self.actuator is None else self.actuator.motor.arm_radius
         command = desired_force
-        if self._disturber is None:
-            self._ctrl[0] = desired_force * arm
-            self._integrate(self.inner_steps)
-        else:
-            for _ in range(self.inner_steps):
+        arm, torque_constant = 1.0, 0.0
+        if self.actuator is not None:
+            arm, torque_constant = self.actuator.motor.arm_radius, self.actuator.motor.torque_constant
+        self._ctrl[0] = command * arm
+        for row in self.trace:
+            if self._disturber is not None:
                 command = float(self._disturber.command(np.array([desired_force]))[0])
                 self.data.qfrc_applied[self._dof] = self._disturber.load()[0]
                 self._ctrl[0] = command * arm
-                self._integrate(1)
+            self._integrate()
+            if self.actuator is None:
+                row[:] = command, command, 0.0, 0.0, self._qvel[self._dof]
+            else:
+                current = self._act[CURRENT]
+                force = torque_constant * current / arm
+                row[:] = command, force, current, self._act[VOLTAGE], self._qvel[self._dof]
         check_finite(self.task, self.state, self.data.time)
         if self.actuator is None:
             return ideal_signals(desired_force, command)
@@ -157,21 +164,15 @@ class MujocoPhysics:
         available = float(self._act[AVAILABLE_VOLTAGE]) if self._disturbances.of_motor else None
         return motor_signals(self.actuator, desired_force, current, voltage, command, available)
 
-    def _integrate(self, steps: int) -> None:
-        """Take integration steps."""
-        model, data = self.model, self.data
-        if self._explicit or self._constrain is not None:
-            timestep = model.opt.timestep
-            rows = self._qpos[np.newaxis], self._qvel[np.newaxis]
-            for _ in range(steps):
-                moved = self._qpos + timestep * self._qvel if self._explicit else None
-                mujoco.mj_step(model, data)
-                if moved is not None:
-                    self._qpos[:] = moved
-                if self._constrain is not None:
-                    self._constrain(*rows, timestep)
-        else:
-            mujoco.mj_step(model, data, steps)
+    def _integrate(self) -> None:
+        """Take an integration step."""
+        timestep = self.model.opt.timestep
+        moved = self._qpos + timestep * self._qvel if self._explicit else None
+        mujoco.mj_step(self.model, self.data)
+        if moved is not None:
+            self._qpos[:] = moved
+        if self._constrain is not None:
+            self._constrain(self._qpos[np.newaxis], self._qvel[np.newaxis], timestep)
 
     def sensed(self, signals: Signals) -> Signals:
         """Signals of the present moment with the current [A] that the sensor measures."""

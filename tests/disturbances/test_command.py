@@ -1,6 +1,7 @@
 """The command's way: delay against interpolation, quantiser and rate limiter by their properties."""
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -65,8 +66,8 @@ def test_the_delay_counts_integration_steps_within_an_environment_step():
     env.step(2)
     physics = half.unwrapped.physics
     for index in range(20):
-        physics._ctrl[0] = float(index >= 10)
-        physics._integrate(1)
+        physics.data.ctrl[0] = float(index >= 10)
+        mujoco.mj_step(physics.model, physics.data)
     np.testing.assert_array_equal(env.unwrapped.state, half.unwrapped.state)
 
 

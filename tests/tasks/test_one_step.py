@@ -112,10 +112,10 @@ def test_the_random_states_reach_every_bound(task):
 )
 def test_walls(task, inner_steps, state, expected):
     definition = TASKS[task]
-    physics = MujocoPhysics(definition, None, inner_steps, "semi-implicit")
+    one = dataclasses.replace(definition, step_duration=definition.step_duration / inner_steps)
+    physics = MujocoPhysics(one, None, 1, "semi-implicit")
     physics.reset(np.array(state))
     for _ in range(inner_steps):
-        physics.inner_steps = 1
         physics.step(np.sign(state[1]) * definition.max_force)
         if physics.state[0] == expected[0]:
             break
