@@ -248,6 +248,25 @@ class AnalyticPhysics:
         measured = sensed(self._disturbances, [signals.current], [self._key], [self._time], self._timestep)
         return signals._replace(current=float(measured[0]))
 
+    def snapshot(self) -> np.ndarray:
+        """State, motor, time and key as a vector, shape (k,), float64.
+
+        `memory` and what `set_actuator` changed are not in it. Gymnasium's environment remembers nothing else.
+        """
+        return np.array([*self.state, *self._loop, self._time, self._key], dtype=np.float64)
+
+    def restore(self, snapshot: np.ndarray) -> None:
+        """Continue from what `snapshot` returned."""
+        size = len(self.task.state_names)
+        self.state = snapshot[:size].copy()
+        *loop, self._time, self._key = snapshot[size:].tolist()
+        self._loop = tuple(loop)
+
+    @property
+    def memory(self) -> np.ndarray:
+        """What the disturbances remember, a live array; empty if nothing."""
+        return np.empty(0) if self._disturber is None else self._disturber.memory[0]
+
     def _motor(self, actuator: Actuator, desired_force: float, command: float, speed: float) -> Signals:
         """Advance the loop by one integration step."""
         arm, disturbances = actuator.motor.arm_radius, self._disturbances

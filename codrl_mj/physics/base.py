@@ -95,6 +95,16 @@ class Physics(Protocol):
     def sensed(self, signals: Signals) -> Signals:
         """Signals of the present moment with the current [A] that the sensor measures."""
 
+    def snapshot(self) -> np.ndarray:
+        """Simulation and motor as a vector, shape (k,), float64; `memory` and exchanged parameters are not in it."""
+
+    def restore(self, snapshot: np.ndarray) -> None:
+        """Continue from what `snapshot` returned."""
+
+    @property
+    def memory(self) -> np.ndarray:
+        """What the disturbances remember beside, a live array; empty if nothing."""
+
     def step(self, desired_force: float) -> Signals:
         """Advance by one environment step, with the desired force (at most the task's `max_force`) held over it.
 

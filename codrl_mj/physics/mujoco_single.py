@@ -180,6 +180,19 @@ class MujocoPhysics:
         measured = sensed(self._disturbances, [signals.current], [key], [self.data.time], timestep)
         return signals._replace(current=float(measured[0]))
 
+    def snapshot(self) -> np.ndarray:
+        """Simulation and motor as the engine's state vector (`mjSTATE_INTEGRATION`), shape (k,), float64.
+
+        `memory` and what `set_actuator` and `set_model` changed are not in it.
+        """
+        vector = np.empty(mujoco.mj_stateSize(self.model, _STATE))
+        mujoco.mj_getState(self.model, self.data, vector, _STATE)
+        return vector
+
+    def restore(self, snapshot: np.ndarray) -> None:
+        """Continue from what `snapshot` returned."""
+        mujoco.mj_setState(self.model, self.data, snapshot, _STATE)
+
     @property
     def memory(self) -> np.ndarray:
         """What the disturbances remember beside the engine's own state, a live array; empty if nothing."""
@@ -192,4 +205,5 @@ def _progression(entries: tuple[int, ...]) -> slice:
     return slice(entries[0], entries[-1] + 1, stride)
 
 
+_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _VIEWS = ("model", "_qpos", "_qvel", "_ctrl", "_act", "_constrain")

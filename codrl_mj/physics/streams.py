@@ -66,21 +66,38 @@ class Streams:
         """Where every stream stands, shape (N, 6), uint64."""
         words = np.empty((len(self.generators), WORDS), dtype=np.uint64)
         for row, generator in zip(words, self.generators, strict=True):
-            pcg: Any = generator.bit_generator.state
-            state, increment = pcg["state"]["state"], pcg["state"]["inc"]
-            row[:4] = state >> 64, state & _LOW, increment >> 64, increment & _LOW
-            row[4:] = pcg["has_uint32"], pcg["uinteger"]
+            row[:] = words_of(generator)
         return words
 
     def set_state(self, words: np.ndarray) -> None:
         """Continue from what `state` returned."""
-        for row, generator in zip(words.tolist(), self.generators, strict=True):
-            generator.bit_generator.state = {
-                "bit_generator": "PCG64",
-                "state": {"state": row[0] << 64 | row[1], "inc": row[2] << 64 | row[3]},
-                "has_uint32": row[4],
-                "uinteger": row[5],
-            }
+        for row, generator in zip(words, self.generators, strict=True):
+            set_words(generator, row)
+
+
+def words_of(generator: np.random.Generator) -> np.ndarray:
+    """Where a generator stands, shape (6,), uint64.
+
+    Raises:
+        ValueError: it is no PCG64, as Gymnasium's are.
+    """
+    pcg: Any = generator.bit_generator.state
+    if pcg["bit_generator"] != "PCG64":
+        raise ValueError(f"np_random is a {pcg['bit_generator']}: must be a PCG64, as Gymnasium's reset makes it")
+    state, increment = pcg["state"]["state"], pcg["state"]["inc"]
+    words = [state >> 64, state & _LOW, increment >> 64, increment & _LOW, pcg["has_uint32"], pcg["uinteger"]]
+    return np.array(words, dtype=np.uint64)
+
+
+def set_words(generator: np.random.Generator, words: np.ndarray) -> None:
+    """Let a PCG64 generator continue from what `words_of` returned."""
+    row = words.tolist()
+    generator.bit_generator.state = {
+        "bit_generator": "PCG64",
+        "state": {"state": row[0] << 64 | row[1], "inc": row[2] << 64 | row[3]},
+        "has_uint32": row[4],
+        "uinteger": row[5],
+    }
 
 
 _fillers: dict[int, Any] = {}
