@@ -150,6 +150,17 @@ class Randomization:
                 vectors[:, PARAMETER_NAMES.index(name.partition(".")[2])] = column
         return vectors, arms
 
+    def nominal_values(self, actuator: Actuator | None) -> np.ndarray:
+        """The values, shape (k,), with which actuator and model are as they are before the first draw."""
+        vectors, arms = nominal_parameters([] if actuator is None else [actuator])
+        values = []
+        for name in self.names:
+            if name.startswith("model."):
+                values.append(0.0 if name.startswith("model.damping.") else 1.0)
+            else:
+                values.append(arms[0] if name == _ARM else vectors[0, PARAMETER_NAMES.index(name.partition(".")[2])])
+        return np.array(values)
+
     def model_fields(self, values: np.ndarray, drawn: bool = False) -> dict[str, np.ndarray]:
         """The drawn fields of the model; see `Variation.fields`."""
         if self.variation is None:

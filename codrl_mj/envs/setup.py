@@ -146,14 +146,29 @@ class Setup:
             values, rejected = self.randomization.draw(
                 lambda rows, count: generator.random((len(rows), count)), nominal, arms
             )
-            if self.randomization.draws_actuator and actuator is not None and physical is not None:
-                actuator = self.randomization.actuator(actuator, values[0])
-                physics.set_actuator(self.randomization.actuator(physical, values[0]))
-            if isinstance(physics, MujocoPhysics) and self.randomization.variation is not None:
-                physics.set_model(self.randomization.model_fields(values, drawn=True))
+            actuator = self.vary(physics, values[0])
             info = {"randomization": self.randomization.report(values[0], rejected[0])}
         physics.reset(initial, float(self.keys(lambda count: generator.random((1, count)))[0]))
         return actuator, info
+
+    def vary(self, physics: Physics, values: np.ndarray) -> Actuator | None:
+        """Give a simulation what was drawn; to be followed by a reset, or a restoring of its state.
+
+        Args:
+            physics: what `simulate` returned.
+            values: of the fields that are randomised, shape (k,).
+
+        Returns:
+            The actuator with these values.
+        """
+        randomization, actuator, physical = self.randomization, self.actuator, self.physical_actuator
+        assert randomization is not None
+        if randomization.draws_actuator and actuator is not None and physical is not None:
+            actuator = randomization.actuator(actuator, values)
+            physics.set_actuator(randomization.actuator(physical, values))
+        if isinstance(physics, MujocoPhysics) and randomization.variation is not None:
+            physics.set_model(randomization.model_fields(values[np.newaxis], drawn=True))
+        return actuator
 
     def keys(self, random: Callable[[int], np.ndarray]) -> np.ndarray:
         """Keys of the random numbers of episodes' disturbances, shape (m,), float64; 0 where none is needed.

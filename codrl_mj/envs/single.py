@@ -5,13 +5,16 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.utils import seeding
 
 from codrl_mj.distributions import Distribution
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.setup import Setup
+from codrl_mj.envs.snapshots import check_snapshot
 from codrl_mj.motor import Actuator
 from codrl_mj.physics import MujocoPhysics
 from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
+from codrl_mj.physics.streams import set_words, words_of
 from codrl_mj.tasks import Task
 
 
@@ -102,6 +105,7 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
             raise ValueError(f"render_mode = {render_mode!r}: must be None or 'rgb_array'")
         self.physics = self.setup.simulate(physics)
         self._actuator = self.setup.actuator
+        self._randomization: dict[str, Any] = {}
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.setup.task.render_fps}
         self._view = {"width": width, "height": height, "camera": camera, "pretty": pretty}
@@ -153,6 +157,7 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
         """
         super().reset(seed=seed)
         self._actuator, info = self.setup.start(self.physics, self.np_random, options)
+        self._randomization = info.get("randomization", {})
         return self.setup.observation(self.physics.state, self.setup.seen(self.physics, None)), info
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -175,6 +180,53 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
         after = physics.state
         observation, reward = setup.observation(after, seen), setup.reward(before, signals, after)
         return observation, reward, setup.terminated(after), False, signals._asdict()
+
+    @property
+    def randomization(self) -> dict[str, Any]:
+        """What the present episode was drawn with, as in the reset's info; empty if nothing was drawn."""
+        return dict(self._randomization)
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Everything that the future depends on, as plain arrays: simulation, motor, generator, what was drawn.
+
+        The generators of the spaces, and what wrappers count, are theirs.
+        """
+        everything = {
+            "task": np.frombuffer(self.task.name.encode(), dtype=np.uint8).copy(),
+            "physics": self.physics.snapshot(),
+            "generator": words_of(self.np_random),
+        }
+        if self.physics.memory.size:
+            everything["disturbances"] = self.physics.memory.copy()
+        if self.setup.randomization is not None:
+            drawn = [self._randomization.get(name, np.nan) for name in self.setup.randomization.names]
+            everything["drawn"] = np.array(drawn, dtype=np.float64)
+            everything["rejected"] = np.array(self._randomization.get("rejected", 0))
+        return everything
+
+    def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
+        """Continue from what `snapshot` returned, bit for bit, in an environment made with the same arguments.
+
+        Raises:
+            ValueError: the snapshot is of another task, or of arguments that need other entries or shapes; nothing was
+                changed.
+        """
+        expected = self.snapshot()
+        check_snapshot(snapshot, expected)
+        if not np.array_equal(snapshot["task"], expected["task"]):
+            raise ValueError(f"snapshot['task'] is of {bytes(snapshot['task'])!r}: must be of {self.task.name!r}")
+        randomization = self.setup.randomization
+        if randomization is not None:
+            values, drawn = snapshot["drawn"], not np.isnan(snapshot["drawn"]).any()
+            self._randomization = randomization.report(values, int(snapshot["rejected"])) if drawn else {}
+            self._actuator = self.setup.vary(
+                self.physics, values if drawn else randomization.nominal_values(self.setup.actuator)
+            )
+        self.physics.restore(snapshot["physics"])
+        self.physics.memory[:] = snapshot.get("disturbances", 0.0)
+        generator, _ = seeding.np_random(0)
+        set_words(generator, snapshot["generator"])
+        self.np_random = generator
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """The present state as an image, shape (height, width, 3), uint8; None if there is no render mode.

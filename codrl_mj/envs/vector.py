@@ -12,6 +12,7 @@ from gymnasium.vector.utils import batch_space
 
 from codrl_mj.envs.draws import Draws
 from codrl_mj.envs.setup import Setup
+from codrl_mj.envs.snapshots import check_snapshot
 from codrl_mj.motor import Actuator
 from codrl_mj.physics import Signals
 from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
@@ -283,16 +284,14 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         Raises:
             ValueError: the snapshot is of another number of environments, or of another task.
         """
-        for name, value in self.snapshot().items():
-            if name not in snapshot or snapshot[name].shape != value.shape:
-                found = "missing" if name not in snapshot else f"of shape {snapshot[name].shape}"
-                raise ValueError(f"snapshot[{name!r}] is {found}: must be of shape {value.shape}")
+        check_snapshot(snapshot, self.snapshot())
         if self._draws is not None:
             self._draws.restore(snapshot)
         self.physics.restore(snapshot["physics"])
         self._streams.set_state(snapshot["streams"])
         self._elapsed[:], self._ended[:] = snapshot["elapsed"], snapshot["ended"]
         self._observations[:] = snapshot["observations"]
+        self.signals = None  # of a step that was not this one's past
         if self.physics.memory.size:
             self.physics.memory[:] = snapshot["disturbances"]
 
