@@ -73,10 +73,7 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
             ValueError: an argument is unknown or out of bounds, or a current loop is unstable; the message names it.
             CallbackInUseError: another library's MuJoCo callback is installed.
         """
-        if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
-            raise ValueError(f"num_envs = {num_envs!r}: must be an integer >= 1")
-        if max_episode_steps is not None and max_episode_steps < 1:
-            raise ValueError(f"max_episode_steps = {max_episode_steps}: must be >= 1")
+        check_counts(num_envs, max_episode_steps)
         if isinstance(num_threads, bool) or not isinstance(num_threads, int | np.integer) or num_threads < 0:
             raise ValueError(f"num_threads = {num_threads!r}: must be an integer >= 0 (0: every CPU)")
         if physics != "mujoco":
@@ -318,6 +315,18 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
+
+
+def check_counts(num_envs: int, max_episode_steps: int | None) -> None:
+    """Refuse impossible numbers of environments and steps.
+
+    Raises:
+        ValueError: either is no integer >= 1.
+    """
+    if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
+        raise ValueError(f"num_envs = {num_envs!r}: must be an integer >= 1")
+    if max_episode_steps is not None and max_episode_steps < 1:
+        raise ValueError(f"max_episode_steps = {max_episode_steps}: must be >= 1")
 
 
 def _set_up(
