@@ -239,7 +239,7 @@ class AnalyticPhysics:
             self.state = self._driver(self.state, force, self._timestep, self._integrator)
             self._time += self._timestep
             speed = self.state[self._driver.speed]
-            row[:] = command, signals.actual_force, signals.current, signals.voltage, speed
+            row[:] = command, signals.actual_force, signals.current, signals.voltage, speed, signals.saturated
         check_finite(self.task, self.state, self._time)
         return signals
 

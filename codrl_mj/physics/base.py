@@ -27,11 +27,19 @@ class Signals(NamedTuple):
     """Whether the voltage was at its limit."""
 
 
-TRACE_NAMES = ("desired_force", "actual_force", "current", "voltage", "speed")
-"""Columns of `Physics.trace`: the force [N or N*m] asked of the actuator (after what disturbs commands on their way) and
-delivered in an integration step, the current [A] at its end, the voltage [V] of its last electrical step (both 0 for
-the ideal actuator), and the velocity of the actuated joint [m/s or rad/s] at its end."""
-TRACE_DESIRED_FORCE, TRACE_ACTUAL_FORCE, TRACE_CURRENT, TRACE_VOLTAGE, TRACE_SPEED = range(len(TRACE_NAMES))
+TRACE_NAMES = ("desired_force", "actual_force", "current", "voltage", "speed", "saturated")
+"""Columns of `Physics.trace`: the force [N or N*m] asked of the actuator (after whatever disturbs commands on their way)
+and delivered in an integration step, the current [A] at its end, the voltage [V] of its last electrical step (both 0 for
+the ideal actuator), the velocity of the actuated joint [m/s or rad/s] at its end, and 1 where that voltage was at its
+limit, else 0."""
+(
+    TRACE_DESIRED_FORCE,
+    TRACE_ACTUAL_FORCE,
+    TRACE_CURRENT,
+    TRACE_VOLTAGE,
+    TRACE_SPEED,
+    TRACE_SATURATED,
+) = range(len(TRACE_NAMES))
 
 
 def ideal_signals(desired_force: float, command: float | None = None) -> Signals:
@@ -74,7 +82,7 @@ class Physics(Protocol):
     """One simulation of one task."""
 
     trace: np.ndarray
-    """What the actuator did in each integration step of the last environment step, shape (inner_steps, 5), float64;
+    """What the actuator did in each integration step of the last environment step, shape (inner_steps, 6), float64;
     columns as in `TRACE_NAMES`. A live array: the next step overwrites it."""
 
     @property

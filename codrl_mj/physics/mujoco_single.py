@@ -141,9 +141,10 @@ class MujocoPhysics:
             SimulationDivergedError: the state is no longer finite.
         """
         command = desired_force
-        arm, torque_constant = 1.0, 0.0
+        arm, torque_constant, available = 1.0, 0.0, np.inf
         if self.actuator is not None:
             arm, torque_constant = self.actuator.motor.arm_radius, self.actuator.motor.torque_constant
+            available = self.actuator.controller.max_voltage
         self._ctrl[0] = command * arm
         for row in self.trace:
             if self._disturber is not None:
@@ -152,16 +153,16 @@ class MujocoPhysics:
                 self._ctrl[0] = command * arm
             self._integrate()
             if self.actuator is None:
-                row[:] = command, command, 0.0, 0.0, self._qvel[self._dof]
+                row[:] = command, command, 0.0, 0.0, self._qvel[self._dof], 0.0
             else:
-                current = self._act[CURRENT]
+                current, voltage = float(self._act[CURRENT]), float(self._act[VOLTAGE])
+                if self._disturbances.of_motor:
+                    available = float(self._act[AVAILABLE_VOLTAGE])
                 force = torque_constant * current / arm
-                row[:] = command, force, current, self._act[VOLTAGE], self._qvel[self._dof]
+                row[:] = command, force, current, voltage, self._qvel[self._dof], abs(voltage) >= available
         check_finite(self.task, self.state, self.data.time)
         if self.actuator is None:
             return ideal_signals(desired_force, command)
-        current, voltage = float(self._act[CURRENT]), float(self._act[VOLTAGE])
-        available = float(self._act[AVAILABLE_VOLTAGE]) if self._disturbances.of_motor else None
         return motor_signals(self.actuator, desired_force, current, voltage, command, available)
 
     def _integrate(self) -> None:

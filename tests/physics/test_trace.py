@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from codrl_mj.disturbances import Disturbances
-from codrl_mj.motor import advance, named_actuator, to_vector
+from codrl_mj.motor import Actuator, CurrentLoop, Motor, advance, named_actuator, to_vector
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics
 from codrl_mj.physics.base import (
     TRACE_ACTUAL_FORCE,
     TRACE_CURRENT,
     TRACE_DESIRED_FORCE,
+    TRACE_SATURATED,
     TRACE_SPEED,
     TRACE_VOLTAGE,
 )
@@ -42,7 +43,7 @@ def test_every_row_follows_from_the_row_before_by_the_loops_own_equations(kind, 
     arm, timestep = actuator.motor.arm_radius, physics.task.step_duration / physics.inner_steps
     loop, speed = (0.0, 0.0, 0.0), speed_at_start
     for force, trace in zip(forces, traces, strict=True):
-        assert trace.shape == (physics.inner_steps, 5)
+        assert trace.shape == (physics.inner_steps, 6)
         for row in trace:
             *loop, voltage = advance(vector, timestep, *loop, force * arm, speed / arm)
             assert row[TRACE_DESIRED_FORCE] == force
@@ -60,6 +61,7 @@ def test_the_last_row_is_what_the_step_says_of_its_end(task, actuator):
     for _ in range(STEPS):
         signals, last = physics.step(0.5 * physics.task.max_force), physics.trace[-1]
         assert (signals.desired_force, signals.actual_force, signals.current, signals.voltage) == tuple(last[:4])
+        assert last[TRACE_SATURATED] == signals.saturated
         assert last[TRACE_SPEED] == physics.data.qvel[physics.model.actuator("motor").trnid[0]]
 
 
@@ -77,3 +79,18 @@ def physics_step(task):
     """The integration step [s] of the physics above."""
     definition = TASKS[task]
     return definition.step_duration / max(3, definition.motor_inner_steps)
+
+
+@pytest.mark.parametrize("kind", [MujocoPhysics, AnalyticPhysics])
+def test_the_integration_steps_are_marked_in_which_the_voltage_is_at_its_sagging_limit(kind):
+    task, limit, supply_resistance = TASKS["cartpole"], 2.0, 0.8
+    actuator = Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=2.0, max_voltage=limit))
+    disturbances = Disturbances(supply_resistance=supply_resistance)
+    physics = kind(task, actuator, 3, "euler", disturbances=disturbances)
+    _, traces = _traces(physics)
+    rows = traces.reshape(-1, traces.shape[-1])
+    before = np.append(0.0, rows[:-1, TRACE_CURRENT])  # the supply sags by the current at the step's start
+    available = limit - supply_resistance * np.abs(before)
+    expected = np.abs(rows[:, TRACE_VOLTAGE]) >= available * (1 - 1e-12)
+    np.testing.assert_array_equal(rows[:, TRACE_SATURATED].astype(bool), expected)
+    assert 0 < expected.sum() < len(expected)
