@@ -28,10 +28,10 @@ class Signals(NamedTuple):
 
 
 TRACE_NAMES = ("desired_force", "actual_force", "current", "voltage", "speed", "saturated")
-"""Columns of `Physics.trace`: the force [N or N*m] asked of the actuator (after whatever disturbs commands on their way)
-and delivered in an integration step, the current [A] at its end, the voltage [V] of its last electrical step (both 0 for
-the ideal actuator), the velocity of the actuated joint [m/s or rad/s] at its end, and 1 where that voltage was at its
-limit, else 0."""
+"""Columns of `Physics.trace`: the force [N or N*m] asked of the actuator (after whatever disturbs commands on their
+way) and delivered in an integration step, the current [A] at its end, the voltage [V] of its last electrical step (both
+0 for the ideal actuator), the velocity of the actuated joint [m/s or rad/s] at its end, and 1 where that voltage was at
+its limit, else 0."""
 (
     TRACE_DESIRED_FORCE,
     TRACE_ACTUAL_FORCE,
