@@ -1,13 +1,15 @@
-"""The vector environment as Stable-Baselines3 knows it."""
+"""The vector environments as Stable-Baselines3 knows them."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
+from codrl_mj.envs.serial import SerialVectorEnv
+from codrl_mj.envs.snapshots import check_snapshot
 from codrl_mj.envs.vector import ActuatedVectorEnv
 from codrl_mj.physics import Signals
 from codrl_mj.registration import ENVIRONMENTS
@@ -16,14 +18,14 @@ _TASKS = {registered.env_id: task for task, registered in ENVIRONMENTS.items()}
 
 
 class ActuatedVecEnv(VecEnv):
-    """N environments as one Stable-Baselines3 `VecEnv`, without a Python object for each.
+    """N environments as one Stable-Baselines3 `VecEnv`; batched in MuJoCo, without a Python object for each.
 
     Infos are empty but for the environments whose episode ended: `terminal_observation`, `TimeLimit.truncated` and
     `episode` (return, length and time, as Stable-Baselines3's `Monitor` has them). What the actuators did in the last
     step is in `signals`, as arrays.
     """
 
-    def __init__(self, env: ActuatedVectorEnv) -> None:
+    def __init__(self, env: ActuatedVectorEnv | SerialVectorEnv) -> None:
         """Wrap a vector environment in `SAME_STEP` mode."""
         self.env = env
         self._actions: np.ndarray | None = None
@@ -76,6 +78,30 @@ class ActuatedVecEnv(VecEnv):
         self._returns[ended], self._lengths[ended] = 0.0, 0
         return observations, rewards.astype(np.float32), ended, outcomes
 
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Everything that the future depends on, as plain arrays: environments, episodes' records, pending seeds.
+
+        The wall-clock time in `episode` goes on from where the environment was made.
+        """
+        return self.env.snapshot() | self._records()
+
+    def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
+        """Continue from what `snapshot` returned, bit for bit, in environments made with the same arguments.
+
+        Raises:
+            ValueError: the snapshot is of another number of environments, another task or other arguments.
+        """
+        own = self._records()
+        check_snapshot(snapshot, self.env.snapshot() | own)
+        self.env.restore({name: values for name, values in snapshot.items() if name not in own})
+        self._returns[:], self._lengths[:] = snapshot["returns"], snapshot["lengths"]
+        self._seeds = [None if seed < 0 else seed for seed in snapshot["seeds"].tolist()]
+        self._actions = None
+
+    def _records(self) -> dict[str, np.ndarray]:
+        seeds = np.array([-1 if seed is None else seed for seed in self._seeds], dtype=np.int64)
+        return {"returns": self._returns.copy(), "lengths": self._lengths.copy(), "seeds": seeds}
+
     def close(self) -> None:
         """Close the environments."""
         self.env.close()
@@ -121,7 +147,8 @@ def make_sb3_vec_env(env_id: str, num_envs: int = 64, **arguments: Any) -> Actua
     Args:
         env_id: Gymnasium id, such as `codrl_mj/Pendulum-v0`.
         num_envs: how many, >= 1.
-        **arguments: as for `codrl_mj.envs.ActuatedVectorEnv`; the time limit is Gymnasium's unless given.
+        **arguments: as for `codrl_mj.envs.ActuatedVectorEnv`; the time limit is Gymnasium's unless given. With
+            `physics="analytic"` the environments are stepped one by one: a `SerialVectorEnv`.
 
     Raises:
         ValueError: unknown id, or an argument out of bounds.
@@ -129,6 +156,7 @@ def make_sb3_vec_env(env_id: str, num_envs: int = 64, **arguments: Any) -> Actua
     if env_id not in _TASKS:
         raise ValueError(f"env_id = {env_id!r}: must be one of {', '.join(_TASKS)}")
     task = _TASKS[env_id]
-    limit = {"max_episode_steps": ENVIRONMENTS[task].max_episode_steps}
-    mode = AutoresetMode.SAME_STEP
-    return ActuatedVecEnv(ActuatedVectorEnv(num_envs, task, autoreset_mode=mode, **(limit | arguments)))
+    arguments = {"max_episode_steps": ENVIRONMENTS[task].max_episode_steps} | arguments
+    if arguments.get("physics") == "analytic":
+        return ActuatedVecEnv(SerialVectorEnv(num_envs, task, **arguments))
+    return ActuatedVecEnv(ActuatedVectorEnv(num_envs, task, autoreset_mode=AutoresetMode.SAME_STEP, **arguments))
