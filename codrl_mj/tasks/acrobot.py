@@ -40,6 +40,8 @@ All four state entries uniform in [-0.1, 0.1] (rad, rad/s), rounded to float32 a
 
 The tip is more than 1 m above the shoulder: -cos(theta1) - cos(theta1 + theta2) > 1. Truncated after 500 steps (100 s).
 
+An episode succeeds if it ends there before the time limit.
+
 ## Arguments
 
 Those of `codrl_mj.envs.ActuatedEnv`. The task has no options of its own. An environment step of 0.2 s is one
@@ -144,4 +146,5 @@ TASK = Task(
     reward=reward,
     terminated=terminated,
     constrain=constrain,
+    goal=terminated,
 )

@@ -64,6 +64,12 @@ class Task:
     """(states (N, n) as integrated, integration step [s]) -> states within the bounds that Gymnasium's `step` keeps:
     speed limits, walls, wrapped angles. Applied after every integration step; None where there are no bounds. Plain
     Python on purpose: `codrl_mj.physics.constrain` compiles it. Must let NaN through."""
+    goal: Callable[[np.ndarray], np.ndarray] | None = None
+    """(states (N, n)) -> whether the task's goal is reached there, (N,) bool. An episode succeeds if it ends at the
+    goal and has been there for `goal_hold`. None where the goal is to last: an episode then succeeds if it is not
+    terminated before the time limit."""
+    goal_hold: float = 0.0
+    """How long an episode that succeeds has been at the goal when it ends [s]."""
 
     def initial(self, generator: np.random.Generator, options: dict[str, Any] | None) -> np.ndarray:
         """One initial state, shape (n,): the state that Gymnasium's environment draws from the same generator."""

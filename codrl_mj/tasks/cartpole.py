@@ -37,6 +37,8 @@ the bounds.
 The cart is more than 2.4 m from the centre, or the pole leans by more than 12 degrees. Truncated after 500 steps
 (10 s).
 
+An episode succeeds if it lasts until the time limit.
+
 ## Arguments
 
 Those of `codrl_mj.envs.ActuatedEnv`, and one of its own: `center_radius` [m], > 0, no limit by default; the paper

@@ -34,6 +34,8 @@ x uniform in [-0.6, -0.4] m, v = 0. `reset(options={"low": ..., "high": ...})` s
 
 At the end of a step x >= 0.5 m with v >= 0. Truncated after 200 steps (200 s).
 
+An episode succeeds if it ends there before the time limit.
+
 ## Arguments
 
 Those of `codrl_mj.envs.ActuatedEnv`. The task has no options of its own (Gymnasium's `goal_velocity` is 0 here). An
@@ -133,4 +135,5 @@ TASK = Task(
     reward=reward,
     terminated=terminated,
     constrain=constrain,
+    goal=terminated,
 )

@@ -35,6 +35,8 @@ x uniform in [-0.6, -0.4] m, v = 0. `reset(options={"low": ..., "high": ...})` s
 
 At the end of a step x >= 0.45 m with v >= 0. Truncated after 999 steps (999 s).
 
+An episode succeeds if it ends there before the time limit.
+
 ## Arguments
 
 Those of `codrl_mj.envs.ActuatedEnv`. The task has no options of its own (Gymnasium's `goal_velocity` is 0 here). An
@@ -85,4 +87,5 @@ TASK = dataclasses.replace(
     desired_force=desired_force,
     reward=reward,
     terminated=terminated,
+    goal=terminated,
 )

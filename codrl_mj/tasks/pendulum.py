@@ -36,6 +36,9 @@ the two bounds, as in Gymnasium.
 
 Never; truncated after 200 steps (10 s).
 
+An episode succeeds if the rod is upright and still over its last second: within 0.1 rad (5.7 degrees) of upright, where
+gravity takes a quarter of the torque, and slower than 0.1 rad/s, which in a second would carry it no farther than that.
+
 ## Arguments
 
 Those of `codrl_mj.envs.ActuatedEnv`. The task has no options of its own (Gymnasium's `g` is the model's gravity here).
@@ -54,6 +57,10 @@ from codrl_mj.tasks.base import Task
 # Gymnasium's Pendulum-v1
 MAX_TORQUE = 2.0  # N*m
 MAX_SPEED = 8.0  # rad/s
+# ours: what counts as upright and still
+GOAL_ANGLE = 0.1  # rad
+GOAL_SPEED = 0.1  # rad/s
+GOAL_HOLD = 1.0  # s
 
 
 class Options(NamedTuple):
@@ -99,9 +106,19 @@ def terminated(state: np.ndarray) -> np.ndarray:
     return np.zeros(state.shape[:-1], dtype=bool)
 
 
+def upright_angle(state: np.ndarray) -> np.ndarray:
+    """The rod's angle from upright [rad], wrapped to [-pi, pi)."""
+    return (state[..., 0] + np.pi) % (2 * np.pi) - np.pi
+
+
+def goal(state: np.ndarray) -> np.ndarray:
+    """The rod is upright and still."""
+    return (np.abs(upright_angle(state)) < GOAL_ANGLE) & (np.abs(state[..., 1]) < GOAL_SPEED)
+
+
 def reward(state: np.ndarray, force: np.ndarray, next_state: np.ndarray, options: Options) -> np.ndarray:
     """Minus the squares of angle, speed and torque: the state's before the step, the torque's delivered in it."""
-    angle, speed = (state[..., 0] + np.pi) % (2 * np.pi) - np.pi, state[..., 1]
+    angle, speed = upright_angle(state), state[..., 1]
     # products: numpy's powers of one number and of an array may differ in the last bit
     return -(angle * angle + 0.1 * (speed * speed) + 0.001 * (force * force))
 
@@ -131,4 +148,6 @@ TASK = Task(
     reward=reward,
     terminated=terminated,
     constrain=constrain,
+    goal=goal,
+    goal_hold=GOAL_HOLD,
 )
