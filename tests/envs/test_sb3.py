@@ -38,9 +38,10 @@ def sampled(env, steps, seed=0):
 
 
 @every_task
+@pytest.mark.parametrize("physics", ["mujoco", "analytic"])
 @pytest.mark.parametrize("actuator", ["ideal", "weaker"])
-def test_steps_are_those_of_dummy_environments(task, actuator):
-    arguments = {"actuator": actuator, "max_episode_steps": 17}
+def test_steps_are_those_of_dummy_environments(task, actuator, physics):
+    arguments = {"actuator": actuator, "physics": physics, "max_episode_steps": 17}
     ours, theirs = batched(task, 5, **arguments), looped(task, 5, **arguments)
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
@@ -201,7 +202,8 @@ def test_a_pickled_one_continues():
     [
         ({"env_id": "Pendulum-v1"}, "env_id = 'Pendulum-v1': must be one of codrl_mj/Pendulum-v0"),
         ({"env_id": "codrl_mj/Pendulum-v0", "num_envs": 0}, "num_envs = 0"),
-        ({"env_id": "codrl_mj/Pendulum-v0", "physics": "analytic"}, "physics = 'analytic'"),
+        ({"env_id": "codrl_mj/Pendulum-v0", "num_envs": 0, "physics": "analytic"}, "num_envs = 0"),
+        ({"env_id": "codrl_mj/Pendulum-v0", "physics": "newton"}, "physics = 'newton'"),
     ],
 )
 def test_bad_arguments_are_refused(arguments, message):
