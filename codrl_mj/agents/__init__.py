@@ -1,5 +1,65 @@
-"""The agents: configurations of Stable-Baselines3's."""
+"""Agents: their settings, and how to make them."""
 
-from codrl_mj.agents.ppo import PPOConfig, make_ppo
+from collections.abc import Mapping
+from typing import Any
 
-__all__ = ["PPOConfig", "make_ppo"]
+from codrl_mj.agents.base import AgentConfig
+from codrl_mj.agents.ddpg import DDPGConfig
+from codrl_mj.agents.dqn import DQNConfig
+from codrl_mj.agents.ppo import PPOConfig
+from codrl_mj.agents.sac import SACConfig
+from codrl_mj.agents.td3 import TD3Config
+from codrl_mj.tasks import Task
+
+AGENTS: dict[str, type[AgentConfig]] = {
+    config.name: config for config in (PPOConfig, DDPGConfig, DQNConfig, TD3Config, SACConfig)
+}
+"""Every agent's settings by the agent's name."""
+
+__all__ = [
+    "AGENTS",
+    "AgentConfig",
+    "DDPGConfig",
+    "DQNConfig",
+    "PPOConfig",
+    "SACConfig",
+    "TD3Config",
+    "agent_from_mapping",
+    "check_fits",
+    "find_agent",
+]
+
+
+def find_agent(name: str) -> type[AgentConfig]:
+    """The settings of an agent by its name.
+
+    Raises:
+        ValueError: unknown agent.
+    """
+    if name not in AGENTS:
+        raise ValueError(f"agent = {name!r}: must be one of {', '.join(AGENTS)}")
+    return AGENTS[name]
+
+
+def agent_from_mapping(mapping: Mapping[str, Any]) -> AgentConfig:
+    """The settings that `AgentConfig.as_mapping` described.
+
+    Raises:
+        ValueError: unknown agent, or a field that is unknown or out of bounds.
+    """
+    settings = dict(mapping)
+    return find_agent(str(settings.pop("name", None))).from_mapping(settings)
+
+
+def check_fits(agent: str, task: Task) -> None:
+    """Raise if an agent cannot act in a task's action space.
+
+    Raises:
+        ValueError: it cannot; the message names the agents that can.
+    """
+    if not isinstance(task.action_space, find_agent(agent).action_spaces):
+        kind = type(task.action_space).__name__
+        fitting = [name for name, config in AGENTS.items() if isinstance(task.action_space, config.action_spaces)]
+        raise ValueError(
+            f"agent = {agent!r}: cannot act in the {kind} actions of {task.name}; agents that can: {', '.join(fitting)}"
+        )

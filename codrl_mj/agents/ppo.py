@@ -1,108 +1,117 @@
-"""PPO (Stable-Baselines3) with settings that suit CartPole through a motor."""
+"""PPO: proximal policy optimisation with clipping, on Stable-Baselines3."""
 
 import dataclasses
-import math
-import numbers
-from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar, Literal
+
+from gymnasium import spaces
+
+from codrl_mj.agents.bounds import choice, flag, integer, real, units
+from codrl_mj.agents.deep import DeepAgentConfig
 
 
 @dataclasses.dataclass(frozen=True)
-class PPOConfig:
+class PPOConfig(DeepAgentConfig):
     """Proximal policy optimisation with clipping, on Stable-Baselines3.
 
     Discount, clip range and network are the paper's; the remaining defaults were chosen so that a run takes a minute on
-    two cores. The paper instead makes 80 full-batch passes over 4000 steps, with separate learning rates.
-
-    Raises:
-        ValueError: a field is out of bounds; the message names field, value and bound.
+    two cores. With `critic_learning_rate`, actor and critic learn apart, as the paper's do.
     """
 
-    learning_rate: float = 1e-3
-    """Adam's step size, > 0, for actor and critic. The paper: 3e-4 and 1e-3."""
-    rollout_steps: int = 2048
+    name: ClassVar[str] = "ppo"
+    action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (spaces.Box, spaces.Discrete)
+
+    learning_rate: float = real(1e-3, above=0)
+    """Adam's step size, > 0: the actor's, and the critic's too unless it has its own. The paper: 3e-4."""
+    critic_learning_rate: float | None = real(None, above=0)
+    """Adam's step size for the critic, > 0: actor and critic then take separate passes over a rollout, and `target_kl`
+    stops the actor's alone. None: one optimiser and one loss for both. The paper: 1e-3."""
+    rollout_steps: int = integer(2048, least=2)
     """Environment steps, over all environments, between two updates, >= 2; a multiple of the environments."""
-    batch_size: int = 256
-    """Minibatch size, >= 2. The paper: the whole rollout of 4000 steps."""
-    epochs: int = 10
+    batch_size: int | None = integer(256, least=2, optional=True)
+    """Minibatch size, >= 2, that divides the rollout. None: the whole rollout, the paper's 4000 steps."""
+    epochs: int = integer(10, least=1)
     """Passes over each rollout, >= 1, unless `target_kl` stops them."""
-    gamma: float = 0.99
+    critic_epochs: int | None = integer(None, least=1)
+    """Passes over each rollout for a critic with its own learning rate, >= 1; None: `epochs`."""
+    gamma: float = real(0.99, above=0, most=1)
     """Discount factor, in (0, 1]. The paper: 0.99."""
-    gae_lambda: float = 0.97
+    gae_lambda: float = real(0.97, least=0, most=1)
     """Generalised advantage estimation's lambda, in [0, 1]. The paper: 0.97."""
-    clip_range: float = 0.2
+    clip_range: float = real(0.2, above=0)
     """Clip range of the probability ratio, > 0. The paper: 0.2."""
-    entropy_coefficient: float = 0.0
+    entropy_coefficient: float = real(0.0, least=0)
     """Weight of the entropy bonus, >= 0."""
-    target_kl: float = 0.03
-    """Passes over a rollout stop when the policy has moved this far [nat], > 0. The paper: 0.01."""
-    hidden: tuple[int, ...] = (64, 64)
-    """Units of the hidden layers of actor and critic (tanh). The paper: 64-64."""
+    target_kl: float | None = real(0.03, above=0, optional=True)
+    """Passes over a rollout stop when the policy has moved 1.5 times this far [nat], > 0; None: never. The paper:
+    0.01."""
+    hidden: tuple[int, ...] = units((64, 64))
+    """Units of the hidden layers of actor and critic, each. The paper: 64-64."""
+    activation: Literal["tanh", "relu"] = choice("tanh", "tanh", "relu")
+    """Activation of the hidden layers. The paper: tanh."""
+    log_std_init: float = real(0.0)
+    """Continuous actions: natural logarithm of the standard deviation at the start."""
+    state_dependent_noise: bool = flag(False)
+    """Continuous actions: explore by noise that is a function of the state, drawn anew every `noise_steps` (Raffin et
+    al., 2021), which moves a system more than independent noise at every step does."""
+    noise_steps: int | None = integer(None, least=1)
+    """Steps between two draws of that noise, >= 1; None: one draw a rollout."""
 
-    def __post_init__(self) -> None:
-        """Validate."""
-        finite = math.isfinite
-        bounds: dict[str, tuple[Callable[[Any], bool], str]] = {
-            "learning_rate": (lambda value: _is_number(value) and finite(value) and value > 0, "a finite number > 0"),
-            "rollout_steps": (lambda value: _is_integer(value) and value >= 2, "an integer >= 2"),
-            "batch_size": (lambda value: _is_integer(value) and value >= 2, "an integer >= 2"),
-            "epochs": (lambda value: _is_integer(value) and value >= 1, "an integer >= 1"),
-            "gamma": (lambda value: _is_number(value) and 0 < value <= 1, "a number in (0, 1]"),
-            "gae_lambda": (lambda value: _is_number(value) and 0 <= value <= 1, "a number in [0, 1]"),
-            "clip_range": (lambda value: _is_number(value) and value > 0, "a number > 0"),
-            "entropy_coefficient": (
-                lambda value: _is_number(value) and finite(value) and value >= 0,
-                "a finite number >= 0",
-            ),
-            "target_kl": (lambda value: _is_number(value) and value > 0, "a number > 0"),
-            "hidden": (
-                lambda value: isinstance(value, tuple) and all(_is_integer(units) and units >= 1 for units in value),
-                "a tuple of integers >= 1",
-            ),
+    def make_model(self, env: Any, seed: int) -> Any:
+        """See `AgentConfig.make_model`.
+
+        Raises:
+            ValueError: the rollout is not a multiple of the environments, or of the minibatch.
+        """
+        from stable_baselines3 import PPO
+
+        from codrl_mj.agents.two_rate_ppo import TwoRatePPO
+
+        batch_size = self.batch_size or self.rollout_steps
+        for name, size in (("num_envs", env.num_envs), ("batch_size", batch_size)):
+            if self.rollout_steps % size:
+                raise ValueError(
+                    f"PPOConfig.rollout_steps = {self.rollout_steps}: must be a multiple of {name} = {size}"
+                )
+        arguments: dict[str, Any] = {
+            "learning_rate": self.learning_rate,
+            "n_steps": self.rollout_steps // env.num_envs,
+            "batch_size": batch_size,
+            "n_epochs": self.epochs,
+            "gamma": self.gamma,
+            "gae_lambda": self.gae_lambda,
+            "clip_range": self.clip_range,
+            "ent_coef": self.entropy_coefficient,
+            "target_kl": self.target_kl,
+            "use_sde": self.state_dependent_noise,
+            "sde_sample_freq": self.noise_steps or -1,
+            "policy_kwargs": self._network(),
+            "seed": seed,
+            "device": "cpu",
         }
-        for name, (holds, bound) in bounds.items():
-            if not holds(value := getattr(self, name)):
-                raise ValueError(f"PPOConfig.{name} = {value!r}: must be {bound}")
+        if self.critic_learning_rate is None:
+            return PPO(self._policy_class(), env, **arguments)
+        return TwoRatePPO(
+            self._policy_class(),
+            env,
+            critic_learning_rate=self.critic_learning_rate,
+            critic_epochs=self.critic_epochs or self.epochs,
+            **arguments,
+        )
 
+    def _policy_class(self) -> Any:
+        from stable_baselines3.common.policies import ActorCriticPolicy
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, numbers.Real) and not isinstance(value, bool)
+        return ActorCriticPolicy
 
+    def _policy_arguments(self) -> dict[str, Any]:
+        return {"use_sde": self.state_dependent_noise, **self._network()}
 
-def _is_integer(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
+    def _network(self) -> dict[str, Any]:
+        from torch import nn
 
-
-def make_ppo(config: PPOConfig, env: Any, seed: int) -> Any:
-    """A Stable-Baselines3 PPO on a vector environment, on the CPU.
-
-    Args:
-        config: the settings.
-        env: a Stable-Baselines3 `VecEnv`.
-        seed: of the weights, the minibatches and the actions.
-
-    Raises:
-        ValueError: the rollout is not a multiple of the environments, or of the minibatch.
-    """
-    from stable_baselines3 import PPO
-    from torch import nn
-
-    for name, size in (("num_envs", env.num_envs), ("batch_size", config.batch_size)):
-        if config.rollout_steps % size:
-            raise ValueError(f"PPOConfig.rollout_steps = {config.rollout_steps}: must be a multiple of {name} = {size}")
-    return PPO(
-        "MlpPolicy",
-        env,
-        learning_rate=config.learning_rate,
-        n_steps=config.rollout_steps // env.num_envs,
-        batch_size=config.batch_size,
-        n_epochs=config.epochs,
-        gamma=config.gamma,
-        gae_lambda=config.gae_lambda,
-        clip_range=config.clip_range,
-        ent_coef=config.entropy_coefficient,
-        target_kl=config.target_kl,
-        policy_kwargs={"net_arch": list(config.hidden), "activation_fn": nn.Tanh},
-        seed=seed,
-        device="cpu",
-    )
+        return {
+            "net_arch": list(self.hidden),
+            "activation_fn": {"tanh": nn.Tanh, "relu": nn.ReLU}[self.activation],
+            "log_std_init": self.log_std_init,
+            **super()._policy_arguments(),
+        }

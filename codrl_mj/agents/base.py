@@ -1,0 +1,71 @@
+"""What every agent's settings have in common."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from gymnasium import spaces
+
+from codrl_mj.agents.bounds import check
+
+
+@dataclasses.dataclass(frozen=True)
+class AgentConfig:
+    """Settings of an agent, and how to make it from them. Subclasses add the fields.
+
+    Raises:
+        ValueError: a field is out of bounds; the message names field, value and bound.
+    """
+
+    name: ClassVar[str]
+    """Name on the command line, such as `ppo`."""
+    action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]]
+    """Kinds of action spaces that the agent can act in."""
+
+    def __post_init__(self) -> None:
+        """Turn lists, which JSON and YAML have, into tuples, and validate."""
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, list):
+                object.__setattr__(self, field.name, tuple(value))
+        check(self)
+
+    def make_model(self, env: Any, seed: int) -> Any:
+        """The agent, ready to learn.
+
+        Args:
+            env: a Stable-Baselines3 `VecEnv`.
+            seed: of weights, minibatches and actions.
+
+        Returns:
+            A Stable-Baselines3 `BaseAlgorithm` on the CPU.
+
+        Raises:
+            ValueError: the settings do not go with the environments.
+        """
+        raise NotImplementedError
+
+    def make_policy(self, observation_space: spaces.Box, action_space: spaces.Space[Any]) -> Any:
+        """The policy of such an agent with fresh weights: what its saved weights are loaded into.
+
+        Returns:
+            A Stable-Baselines3 `BasePolicy` on the CPU, whose `state_dict` has the keys of the agent's own.
+        """
+        raise NotImplementedError
+
+    def as_mapping(self) -> dict[str, Any]:
+        """The settings as JSON-serialisable values, with the agent's `name`."""
+        return {"name": self.name, **dataclasses.asdict(self)}
+
+    @classmethod
+    def from_mapping(cls, mapping: Mapping[str, Any]) -> "AgentConfig":
+        """The settings that `as_mapping` described, `name` left out; missing fields keep their defaults.
+
+        Raises:
+            ValueError: a field is unknown or out of bounds.
+        """
+        known = [field.name for field in dataclasses.fields(cls)]
+        for key in mapping:
+            if key not in known:
+                raise ValueError(f"agent.{key}: {cls.name} has no such setting; it has {', '.join(known)}")
+        return cls(**mapping)

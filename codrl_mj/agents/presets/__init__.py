@@ -1,0 +1,34 @@
+"""Settings that suit an agent to a task, by name: `default`, the paper's own (`paper`), and those mended (`repaired`).
+
+One module an agent. What the numbers gave, in training and in test, is in docs/agents.md.
+"""
+
+from codrl_mj.agents.presets import ddpg, dqn, ppo, sac, td3
+from codrl_mj.agents.presets.preset import Preset
+
+__all__ = ["PRESETS", "SETTINGS", "Preset", "find_preset"]
+
+SETTINGS = ("default", "paper", "repaired")
+"""Names that settings can have: ours, the paper's as printed, and the paper's with what makes it fail changed."""
+
+PRESETS: dict[tuple[str, str], dict[str, Preset]] = {
+    (agent.__name__.rpartition(".")[2], task): named
+    for agent in (ppo, ddpg, dqn, td3, sac)
+    for task, named in agent.PRESETS.items()
+}
+"""(agent, task) -> name of the settings -> the settings."""
+
+
+def find_preset(agent: str, task: str, settings: str = "default") -> Preset:
+    """The settings of that name for an agent on a task.
+
+    Raises:
+        ValueError: there are none; the message names those that exist.
+    """
+    named = PRESETS.get((agent, task), {})
+    if settings not in named:
+        there = "; ".join(f"{other}: {', '.join(names)}" for (other, of), names in PRESETS.items() if of == task)
+        raise ValueError(
+            f"settings = {settings!r}: {agent} on {task} has no such settings; those on {task} are {there or 'none'}"
+        )
+    return named[settings]

@@ -1,0 +1,41 @@
+"""Settings for PPO."""
+
+from codrl_mj.agents.ppo import PPOConfig
+from codrl_mj.agents.presets.preset import Preset
+from codrl_mj.env_config import EnvConfig
+
+PRESETS: dict[str, dict[str, Preset]] = {
+    "cartpole": {
+        "default": Preset(PPOConfig(), total_steps=200_000, num_envs=8),
+        "paper": Preset(
+            PPOConfig(
+                learning_rate=3e-4,
+                critic_learning_rate=1e-3,
+                rollout_steps=4000,
+                batch_size=None,
+                epochs=80,
+                gamma=0.99,
+                gae_lambda=0.97,
+                clip_range=0.2,
+                target_kl=0.01,
+                hidden=(64, 64),
+                activation="tanh",
+            ),
+            total_steps=60 * 4000,
+            env=EnvConfig(max_episode_steps=4000, center_radius=0.1),
+            about=(
+                "As printed. Not printed, and taken from the Keras example of PPO, whose numbers the paper's are: 80 "
+                "passes over the whole rollout for actor and critic each, the actor's stopping at 1.5 times the KL."
+            ),
+        ),
+    },
+    "acrobot": {"default": Preset(PPOConfig(), total_steps=200_000, num_envs=16)},
+    "mountain_car": {"default": Preset(PPOConfig(), total_steps=1_000_000, num_envs=16)},
+    "pendulum": {
+        "default": Preset(
+            PPOConfig(rollout_steps=4096, gamma=0.9, gae_lambda=0.95, target_kl=None), total_steps=200_000, num_envs=16
+        )
+    },
+    "mountain_car_continuous": {"default": Preset(PPOConfig(), total_steps=200_000, num_envs=16)},
+}
+"""Task -> name of the settings -> the settings."""
