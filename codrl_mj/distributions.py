@@ -1,12 +1,24 @@
-"""Distributions of a number, as pure functions of draws in [0, 1): a draw gives the same value wherever it is made."""
+"""Distributions of a number, as pure functions of draws in [0, 1): a draw gives the same value wherever it is made.
+
+`str` writes a distribution as `parse` reads it, exactly: `uniform(0.05, 0.2)`, `loguniform(0.1, 10.0)`, `choice(1, 2)`.
+"""
 
 import dataclasses
+import difflib
 import math
 import numbers
+import re
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+
+
+def _plain(number: Any) -> bool | int | float:
+    """A real number as Python's own bool, int or float."""
+    if isinstance(number, bool | np.bool_):
+        return bool(number)
+    return int(number) if isinstance(number, numbers.Integral) else float(number)
 
 
 def _check_bounds(distribution: Any, least: float | None) -> None:
@@ -40,6 +52,10 @@ class Uniform:
         """Validate."""
         _check_bounds(self, None)
 
+    def __str__(self) -> str:
+        """As `parse` reads it."""
+        return f"uniform({self.low!r}, {self.high!r})"
+
     def transform(self, draws: np.ndarray) -> np.ndarray:
         """The values low + (high - low) u.
 
@@ -70,6 +86,10 @@ class LogUniform:
     def __post_init__(self) -> None:
         """Validate."""
         _check_bounds(self, 0.0)
+
+    def __str__(self) -> str:
+        """As `parse` reads it."""
+        return f"loguniform({self.low!r}, {self.high!r})"
 
     def transform(self, draws: np.ndarray) -> np.ndarray:
         """The values exp(log(low) + (log(high) - log(low)) u), within the bounds.
@@ -105,7 +125,11 @@ class Choice:
         for value in given:
             if not isinstance(value, numbers.Real | np.bool_) or math.isnan(value):
                 raise ValueError(f"Choice.values = {given!r}: {value!r} must be a number")
-        object.__setattr__(self, "values", tuple(np.asarray(value).item() for value in given))
+        object.__setattr__(self, "values", tuple(map(_plain, given)))
+
+    def __str__(self) -> str:
+        """As `parse` reads it."""
+        return f"choice({', '.join(map(repr, self.values))})"
 
     def transform(self, draws: np.ndarray) -> np.ndarray:
         """The values at floor(n u), as floats.
@@ -124,3 +148,49 @@ class Choice:
 
 Distribution = Uniform | LogUniform | Choice
 """What a field can be drawn from."""
+
+_FORMS = {"uniform": "uniform(LOW, HIGH)", "loguniform": "loguniform(LOW, HIGH)", "choice": "choice(VALUE, ...)"}
+
+
+def parse(text: str) -> Distribution:
+    """Read a distribution as `str` writes it; nothing is evaluated.
+
+    Args:
+        text: `uniform(LOW, HIGH)`, `loguniform(LOW, HIGH)` or `choice(VALUE, ...)`. A value is a number, `inf`, `True`
+            or `False`; one without point and exponent is an integer.
+
+    Raises:
+        ValueError: an unknown distribution (the nearest is suggested), the wrong number of values, one that is no
+            number, or impossible bounds; the message has the text.
+    """
+    match = re.fullmatch(r"\s*(\w+)\s*\(([^()]*)\)\s*", text) if isinstance(text, str) else None
+    if match is None:
+        raise ValueError(f"{text!r} is no distribution: must be {_expected()}")
+    kind, inside = match.groups()
+    if kind not in _FORMS:
+        near = difflib.get_close_matches(kind, _FORMS, n=1)
+        hint = f"did you mean {near[0]}? It " if near else "it "
+        raise ValueError(f"{text!r} is no distribution: {hint}must be {_expected()}")
+    values = [_number(text, word.strip()) for word in inside.split(",")] if inside.strip() else []
+    if len(values) != 2 and kind != "choice":
+        raise ValueError(f"{text!r} has {len(values)} values: must be {_FORMS[kind]}")
+    try:
+        if kind == "choice":
+            return Choice(values)
+        return (Uniform if kind == "uniform" else LogUniform)(*values)
+    except ValueError as error:
+        raise ValueError(f"{text!r}: {error}") from None
+
+
+def _expected() -> str:
+    *others, last = _FORMS.values()
+    return f"{', '.join(others)} or {last}"
+
+
+def _number(text: str, word: str) -> bool | int | float:
+    if word in ("True", "False"):
+        return word == "True"
+    try:
+        return int(word) if re.fullmatch(r"[+-]?\d+", word) else float(word)
+    except ValueError:
+        raise ValueError(f"{text!r}: {word!r} must be a number") from None
