@@ -376,16 +376,24 @@ def _disturbances(
     return disturbances
 
 
+class UnknownOptionError(ValueError, TypeError):
+    """A keyword that the environment does not have; a TypeError too, as Python's own is, and as TorchRL expects."""
+
+
 def _options(task: Task, given: Mapping[str, float]) -> Any:
     """The task's options, checked.
 
     Raises:
-        ValueError: unknown option, or one that is not a number > 0.
+        UnknownOptionError: unknown option.
+        ValueError: one that is not a number > 0.
     """
     known = task.options._fields
     for name, value in given.items():
         if name not in known:
-            raise ValueError(f"unknown option {name!r} of {task.name}: it has {', '.join(known) or 'none'}")
+            has = ", ".join(known) or "none"
+            raise UnknownOptionError(
+                f"unknown option {name!r} of {task.name}: it has {has} (unexpected keyword argument {name!r})"
+            )
         if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
             raise ValueError(f"{name} = {value!r}: must be a number > 0")
     return task.options(**{name: float(value) for name, value in given.items()})
