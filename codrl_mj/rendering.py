@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.evaluation import Episode
+from codrl_mj.episodes import Episode
 from codrl_mj.files import writing, writing_folder
 from codrl_mj.motor import Actuator
 from codrl_mj.physics.offscreen import OffscreenRenderer

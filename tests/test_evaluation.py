@@ -1,304 +1,371 @@
-"""Evaluation: episodes are those of single stepping, and their numbers are those of a direct calculation."""
+"""Evaluation: every measure against counting, a closed form, an identity of the equations, or a direct calculation."""
 
 import functools
+import json
 import math
-import pickle
 
-import gymnasium
 import numpy as np
 import pytest
 
-from codrl_mj import TASKS, Actuator, CurrentLoop, Motor, named_actuator
+from codrl_mj import TASKS, Actuator, CurrentLoop, Motor, Uniform, named_actuator
+from codrl_mj.disturbances import Disturbances
+from codrl_mj.env_config import EnvConfig
 from codrl_mj.evaluation import (
+    MEASURES,
     Episode,
     RandomPolicy,
-    bootstrap_mean,
-    load_episode,
+    evaluate,
     make_env,
     run_episodes,
-    save_episode,
     summarize,
 )
+from codrl_mj.physics.base import TRACE_CURRENT, TRACE_SPEED, TRACE_VOLTAGE
 
 SIGNALS = ("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated")
+ELECTRICAL = {
+    "saturated_percent",
+    "peak_voltage",
+    "peak_current",
+    "rms_current",
+    "peak_speed",
+    "energy_drawn",
+    "energy_returned",
+    "copper_loss",
+    "magnetic_energy",
+}
+ACTUATED_VELOCITY = {"pendulum": 1, "cartpole": 1, "acrobot": 3, "mountain_car": 1, "mountain_car_continuous": 1}
 
 
 class Leaner:
     """Pushes the cart to the side to which the pole leans, which balances it for a while only."""
 
-    def __init__(self):
-        """Nothing was asked yet."""
-        self.asked = []
-
-    def predict(self, observation, *, deterministic=False):
-        self.asked.append((len(observation), deterministic))
+    def predict(self, observation, *, deterministic=False):  # noqa: ARG002
         return np.where(observation[:, 2] > 0, 1, 0), None
 
 
-def cartpole(actuator="weaker", **options):
-    return lambda: make_env("cartpole", actuator, **options)
+class Constant:
+    """Always the same action of a box of one number."""
+
+    def __init__(self, action):
+        """Keep the action."""
+        self.action = action
+
+    def predict(self, observation, *, deterministic=False):  # noqa: ARG002
+        return np.full((len(observation), 1), self.action, np.float32), None
 
 
-def assert_same(first, second):
-    """Two episodes are equal in every number."""
-    for name in ("time", "state", "observation", "action", "reward"):
-        np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)
-    for name in SIGNALS:
-        np.testing.assert_array_equal(first.signals[name], second.signals[name], err_msg=name)
-    assert first.terminated == second.terminated
+MOTOR = Actuator()
 
 
-# -- bootstrap ----------------------------------------------------------------------------------------------
+def made_up(task="cartpole", actuator=MOTOR, states=None, rows=(), reward=None, terminated=True, desired=None):
+    """An episode from the little that a measure reads.
 
-
-@pytest.mark.parametrize("spread", [0.1, 1.0, 30.0])
-def test_the_interval_of_many_values_is_the_normal_one(spread):
-    values = np.random.default_rng(1).gamma(4.0, spread, 1000)
-    mean, low, high = bootstrap_mean(values)
-    half = 1.959964 * values.std(ddof=1) / math.sqrt(len(values))
-    assert mean == pytest.approx(math.fsum(values) / 1000, rel=1e-12)
-    assert (high - low) / 2 == pytest.approx(half, rel=0.05)
-    assert (high + low) / 2 == pytest.approx(mean, abs=0.1 * half)
-
-
-def test_the_interval_of_few_values_is_that_of_all_their_resamples():
-    values = np.array([0.0, 1.0, 2.5, 7.0, 20.0])
-    choices = np.stack(np.meshgrid(*[np.arange(5)] * 5), axis=-1).reshape(-1, 5)
-    every_mean = values[choices].mean(axis=1)  # all 5^5 resamples, each equally likely
-    _, low, high = bootstrap_mean(values)
-    # 9999 of them are drawn: the shares below the ends are 2.5 % and 97.5 % within sampling error and ties
-    assert np.mean(every_mean < low) <= 0.030
-    assert np.mean(every_mean <= low) >= 0.020
-    assert np.mean(every_mean < high) <= 0.980
-    assert np.mean(every_mean <= high) >= 0.970
-
-
-@pytest.mark.parametrize("values", [[500.0] * 100, [-3.25], [0.1] * 3], ids=["many", "one", "three"])
-def test_values_without_spread_have_an_interval_without_width(values):
-    mean, low, high = bootstrap_mean(np.array(values))
-    assert low == mean == high == pytest.approx(values[0], rel=1e-15)
-
-
-def test_the_interval_is_the_same_every_time():
-    values = np.random.default_rng(2).normal(size=20)
-    assert bootstrap_mean(values) == bootstrap_mean(values)
-
-
-# -- episodes -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("actuator", ["ideal", "weaker"])
-def test_episodes_are_those_of_stepping_one_environment_at_a_time(actuator):
-    together = run_episodes(Leaner(), cartpole(actuator), episodes=4, seed=10)
-    env = gymnasium.make("codrl_mj/CartPole-v0", actuator=actuator)
-    for index, episode in enumerate(together):
-        policy, rewards, infos = Leaner(), [], []
-        observation, _ = env.reset(seed=10 + index)
-        seen, states, ended = [observation], [env.unwrapped.state], (False, False)
-        while not any(ended):
-            action = int(policy.predict(observation[None])[0][0])
-            observation, reward, *ended, info = env.step(action)
-            seen.append(observation)
-            states.append(env.unwrapped.state)
-            rewards.append(reward)
-            infos.append(info)
-        np.testing.assert_array_equal(episode.observation, seen)
-        np.testing.assert_array_equal(episode.state, states)
-        np.testing.assert_array_equal(episode.reward, rewards)
-        assert episode.terminated is ended[0]
-        assert episode.total == sum(rewards)
-        for name in SIGNALS:
-            np.testing.assert_array_equal(episode.signals[name], [info[name] for info in infos], err_msg=name)
-    assert len({len(episode.reward) for episode in together}) > 1  # they end at different times
-
-
-def test_an_episode_does_not_depend_on_how_many_run_beside_it():
-    five = run_episodes(Leaner(), cartpole(), episodes=5, seed=3)
-    two = run_episodes(Leaner(), cartpole(), episodes=2, seed=3)
-    (last,) = run_episodes(Leaner(), cartpole(), episodes=1, seed=7)
-    assert_same(five[0], two[0])
-    assert_same(five[1], two[1])
-    assert_same(five[4], last)
-    assert not np.array_equal(five[0].state[0], five[1].state[0])
-
-
-@pytest.mark.parametrize("task", list(TASKS))
-@pytest.mark.parametrize("actuator", ["ideal", "paper"])
-def test_an_episodes_arrays_have_the_shapes_that_it_states(task, actuator):
+    The rows are of the trace: actual force, current, voltage, speed, saturated. There is a step for each of them unless
+    states say otherwise; what is desired in a step is by default what is delivered at its end.
+    """
     definition = TASKS[task]
-    make = lambda: make_env(task, actuator, max_episode_steps=6)  # noqa: E731
-    for episode in run_episodes(RandomPolicy(task), make, episodes=2):
-        assert episode.time.shape == episode.reward.shape == (6,)
-        np.testing.assert_allclose(episode.time, [definition.step_duration * (step + 1) for step in range(6)])
-        assert episode.state.shape == (7, len(definition.state_names))
-        assert episode.observation.shape == (7, *definition.observation_space.shape)
-        assert episode.action.shape == (6, *definition.action_space.shape)
-        assert set(episode.signals) == set(SIGNALS)
-        assert all(values.shape == (6,) for values in episode.signals.values())
-        assert episode.signals["saturated"].dtype == bool
-        assert episode.signals["current"].any() == (actuator != "ideal")
-        assert not episode.terminated
+    steps = len(rows) if states is None else len(states) - 1
+    states = np.zeros((steps + 1, len(definition.state_names))) if states is None else np.array(states, dtype=float)
+    trace = np.zeros((steps, 6)) if len(rows) == 0 else np.array([(0.0, *row) for row in rows])
+    inner_steps = len(trace) // steps
+    ends = trace[inner_steps - 1 :: inner_steps]
+    values = (ends[:, 1] if desired is None else np.array(desired, dtype=float), *ends[:, [1, 2, 2, 3, 5]].T)
+    return Episode(
+        time=definition.step_duration * np.arange(1, steps + 1),
+        state=states,
+        observation=states,
+        action=np.zeros(steps),
+        reward=np.ones(steps) if reward is None else np.array(reward),
+        trace=trace,
+        signals=dict(zip(SIGNALS, values, strict=True)),
+        terminated=terminated,
+        actuator=actuator,
+    )
 
 
-def test_an_episode_ends_where_the_task_ends_it_or_the_time_limit_does():
-    (fallen,) = run_episodes(RandomPolicy("cartpole"), cartpole(), episodes=1)
-    assert fallen.terminated
-    assert np.abs(fallen.state[-1, 2]) > 0.209
-    assert np.all(np.abs(fallen.state[:-1, 2]) < 0.2095)
-    (cut,) = run_episodes(Leaner(), cartpole("ideal", max_episode_steps=9), episodes=1)
-    assert not cut.terminated
-    assert len(cut.reward) == 9
+# -- returns, success, time to goal -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("deterministic", [True, False])
-def test_the_policy_is_asked_once_a_step_for_the_episodes_still_running(deterministic):
-    policy = Leaner()
-    episodes = run_episodes(policy, cartpole(), episodes=3, deterministic=deterministic)
-    lengths = [len(episode.reward) for episode in episodes]
-    expected = [sum(step < length for length in lengths) for step in range(max(lengths))]
-    assert policy.asked == [(running, deterministic) for running in expected]
+def test_returns_and_lengths_are_counted():
+    episodes = [
+        made_up(rows=[(0, 0, 0, 0, 0)] * len(rewards), reward=rewards, terminated=over)
+        for rewards, over in (([1.0, 2.0], True), ([0.0], False), ([5.0, 1.0, 4.0], True), ([-7.0], True))
+    ]
+    summary = summarize("cartpole", Actuator(), episodes)
+    assert (summary.task, summary.episodes, summary.terminated) == ("cartpole", 4, 3)
+    assert summary.returns.mean == (3 + 0 + 10 - 7) / 4
+    assert summary.returns.low < summary.returns.mean < summary.returns.high
+    assert summary.returns_median == 1.5
+    assert summary.returns_interquartile_mean == 1.5
+    assert summary.length.mean == 7 / 4
 
 
-def test_progress_counts_running_and_finished_episodes():
-    reports = []
-    run_episodes(Leaner(), cartpole(), episodes=3, on_step=lambda *counts: reports.append(counts))
-    assert all(running + finished == 3 for running, finished in reports)
-    assert [finished for _, finished in reports] == sorted(finished for _, finished in reports)
-    assert reports[-1] == (0, 3)
+def successes(task, *episodes):
+    """Share that succeeds, and the quartiles of the time to the goal, of made-up (states, terminated)."""
+    summary = summarize(task, None, [made_up(task, None, states, terminated=over) for states, over in episodes])
+    assert summary.failure.mean == pytest.approx(1 - summary.success.mean)
+    assert summary.failure[1:] == pytest.approx([1 - summary.success.high, 1 - summary.success.low])
+    return summary.success.mean, summary.time_to_goal
 
 
-@pytest.mark.parametrize(("options", "named"), [({"episodes": 0}, "episodes = 0"), ({"seed": -1}, "seed = -1")])
-def test_bad_counts_and_seeds_are_named(options, named):
-    with pytest.raises(ValueError, match=named):
-        run_episodes(Leaner(), cartpole(), **({"episodes": 1} | options))
+def test_a_pole_succeeds_that_stands_at_the_time_limit():
+    standing, fallen = [[0, 0, 0, 0]] * 4, [[0, 0, 0, 0], [0, 0, 0.3, 0]]
+    assert successes("cartpole", (standing, False), (fallen, True), (fallen, True), (standing, False)) == (0.5, None)
 
 
-# -- summary ------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("task", "goal"), [("mountain_car", 0.5), ("mountain_car_continuous", 0.45)])
+def test_a_car_succeeds_that_reaches_its_flag_when_it_does(task, goal):
+    arrived = [[0, 0.01]] * 7 + [[goal + 0.01, 0.01]]  # 7 s
+    late = [[0, 0.01]] * 9 + [[goal, 0.0]]  # 9 s
+    rolls_back = [[0, 0.01], [goal + 0.01, -0.01]]
+    short = [[0, 0.01]] * 3
+    assert successes(task, (arrived, True), (late, True), (rolls_back, False), (short, False)) == (0.5, (8.0, 7.5, 8.5))
 
 
-def made_up(desired, actual, voltage, saturated, reward):
-    count = len(desired)
-    signals = dict(zip(SIGNALS, map(np.array, (desired, actual, actual, desired, voltage, saturated)), strict=True))
-    return Episode(np.arange(1, count + 1) * 0.02, np.zeros((count + 1, 4)), np.zeros((count + 1, 4)),
-                   np.zeros(count), np.array(reward), signals, True)  # fmt: skip
+def test_an_acrobot_succeeds_that_reaches_the_height_when_it_does():
+    down, up = [0, 0, 0, 0], [math.pi, 0, 1, 0]
+    assert successes("acrobot", ([down, down, up], True), ([down] * 4, False)) == (0.5, (0.4, 0.4, 0.4))
 
+
+def test_a_pendulum_succeeds_that_stays_upright_and_still_for_its_last_second():
+    hanging, upright = [math.pi, 0.0], [2 * math.pi - 0.09, 0.09]
+    share, time = successes("pendulum", ([hanging] * 30 + [upright] * 21, False))
+    assert share == 1.0
+    assert time.median == pytest.approx(30 * 0.05)  # the settling time
+    for states in (
+        [hanging] * 30 + [upright] * 20,  # 0.95 s
+        [upright] * 60 + [[0.0, 0.11]],  # too fast at the end
+        [upright] * 40 + [[0.11, 0.0]] + [upright] * 5,  # swings out within the last second
+        [upright] * 15,  # shorter than a second
+    ):
+        assert successes("pendulum", (states, False)) == (0.0, None)
+    swung = [upright] * 40 + [hanging] + [upright] * 30
+    assert successes("pendulum", (swung, False))[1].median == pytest.approx(41 * 0.05)
+
+
+# -- tracking -----------------------------------------------------------------------------------------------
 
 ARM = 0.25
 
 
-def test_the_summary_is_the_direct_calculation_in_torques_at_the_shaft():
+def test_the_tracking_error_is_that_of_every_integration_step_in_torques_at_the_shaft():
+    actuator = Actuator(Motor(arm_radius=ARM))
     episodes = [
-        made_up([10.0, -10.0], [8.0, -4.0], [1.0, -3.0], [False, True], [1.0, 1.0]),
-        made_up([10.0], [10.0], [2.0], [False], [0.0]),
+        # two environment steps of two integration steps each: 10 N, then -10 N are desired throughout
+        made_up(
+            actuator=actuator,
+            states=np.zeros((3, 4)),
+            rows=[(f, 0, 0, 0, 0) for f in (8.0, 10.0, -4.0, -10.0)],
+            desired=[10.0, -10.0],
+        ),
+        made_up(
+            actuator=actuator, states=np.zeros((2, 4)), rows=[(f, 0, 0, 0, 0) for f in (9.0, 10.0)], desired=[10.0]
+        ),
     ]
-    summary = summarize("cartpole", Actuator(Motor(arm_radius=ARM)), episodes)
-    error = math.sqrt((2.0**2 + 6.0**2 + 0.0) / 3) * ARM  # N*m
+    summary = summarize("cartpole", actuator, episodes)
+    error = math.sqrt((2.0**2 + 6.0**2 + 1.0**2) / 6) * ARM  # N*m; the steps' ends are without error
     assert summary.tracking_rms == pytest.approx(error, rel=1e-12)
     assert summary.tracking_percent == pytest.approx(100 * error / (10.0 * ARM), rel=1e-12)
     assert summary.tracking_max == pytest.approx(6.0 * ARM, rel=1e-12)
-    assert summary.saturated_percent == pytest.approx(100 / 3, rel=1e-12)
-    assert summary.peak_voltage == 3.0
-    assert summary.returns.mean == 1.0
-    assert summary.length.mean == 1.5
-    assert (summary.task, summary.episodes) == ("cartpole", 2)
 
 
 def test_tracking_is_weighed_over_all_steps_and_not_per_episode():
-    nine_bad = made_up([1.0] * 9, [0.0] * 9, [0.0] * 9, [False] * 9, [0.0] * 9)
-    one_good = made_up([1.0], [1.0], [0.0], [True], [0.0])
+    nine_bad = made_up(rows=[(0, 0, 0, 0, 0)] * 9, desired=[1.0] * 9)
+    one_good = made_up(rows=[(1.0, 0, 0, 0, 1)], desired=[1.0])
     summary = summarize("cartpole", Actuator(), [nine_bad, one_good])
     assert summary.tracking_rms == pytest.approx(math.sqrt(0.9), rel=1e-12)
     assert summary.saturated_percent == pytest.approx(10.0, rel=1e-12)
 
 
-def test_a_desired_torque_of_zero_has_no_relative_error():
-    assert summarize("cartpole", Actuator(), [made_up([0.0], [0.5], [0.0], [False], [0.0])]).tracking_percent == 0.0
+def test_a_desired_torque_of_zero_has_no_relative_error_and_no_delay():
+    summary = summarize("cartpole", Actuator(), [made_up(rows=[(0.5, 0, 0, 0, 0)] * 4, desired=[0.0] * 4)])
+    assert (summary.tracking_rms, summary.tracking_percent, summary.tracking_lag) == (0.5, None, None)
 
 
-def test_the_ideal_actuator_tracks_perfectly_and_has_no_voltage():
-    summary = summarize("cartpole", None, run_episodes(Leaner(), cartpole("ideal"), episodes=2))
-    assert (summary.tracking_rms, summary.tracking_percent, summary.tracking_max) == (0.0, 0.0, 0.0)
-    assert summary.saturated_percent == 0.0
-    assert summary.peak_voltage is None
+@pytest.mark.parametrize("delay", [0.0, 0.05, 0.15])
+def test_the_lag_of_an_ideal_actuator_is_the_delay_of_its_commands(delay):
+    env = EnvConfig(disturbances=Disturbances(command_delay=delay))
+    result = evaluate(RandomPolicy("pendulum"), "pendulum", "ideal", env, episodes=5)
+    assert result.tracking_lag == pytest.approx(delay, abs=0.001)  # noise beside the peak: 1/sqrt(1000) steps of 0.05 s
+    assert (result.tracking_rms > 0) == (delay > 0)
+
+
+def test_the_ideal_actuator_tracks_perfectly_and_has_no_motor():
+    result = evaluate(Leaner(), "cartpole", "ideal", episodes=2)
+    assert (result.tracking_rms, result.tracking_percent, result.tracking_max) == (0.0, 0.0, 0.0)
+    assert all(getattr(result, name) is None for name in ELECTRICAL)
+    assert result.mechanical_work.mean > 0
+
+
+def test_a_voltage_that_the_agent_commands_asks_for_no_torque():
+    env = EnvConfig(action="voltage", max_episode_steps=5)
+    result = evaluate(Constant(1.0), "pendulum", "paper", env, episodes=2)
+    assert result.tracking_rms is result.tracking_percent is result.tracking_max is result.tracking_lag is None
+    assert result.peak_voltage == 1.0
+
+
+# -- the motor ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("max_voltage", [0.3, 0.6, 1.0, 24.0])
 def test_the_saturated_share_is_that_of_voltages_at_the_limit(max_voltage):
     weaker = named_actuator("weaker", "cartpole")
     actuator = Actuator(weaker.motor, CurrentLoop(kp=0.2, ki=0.2, kff=0.5, max_voltage=max_voltage))
-    episodes = run_episodes(Leaner(), cartpole(actuator), episodes=3)
-    voltages = np.concatenate([episode.signals["voltage"] for episode in episodes])
+    make = functools.partial(make_env, "cartpole", actuator, inner_steps=2)
+    episodes = run_episodes(Leaner(), make, episodes=3)
+    voltages = np.concatenate([episode.trace[:, TRACE_VOLTAGE] for episode in episodes])
     summary = summarize("cartpole", actuator, episodes)
     assert summary.saturated_percent == pytest.approx(100 * np.mean(np.abs(voltages) == max_voltage), rel=1e-12)
     assert summary.peak_voltage <= max_voltage
     assert (summary.saturated_percent > 0) == (max_voltage <= 1.0)
 
 
-# -- random policy ------------------------------------------------------------------------------------------
+def test_a_stalled_motor_is_measured_as_its_closed_form_says():
+    """No back-EMF, a constant voltage: i(k) = u/R*(1 - q^k) with q = 1 - R*dt/L; every sum below is geometric."""
+    motor, voltage, steps, count = Motor(resistance=2.0, inductance=1.5, back_emf_constant=0.0), 0.5, 6, 20
+    env = EnvConfig(action="voltage", max_episode_steps=steps)
+    result = evaluate(Constant(voltage), "mountain_car_continuous", Actuator(motor), env, episodes=3)
+    dt, n, final = 1.0 / count, steps * count, voltage / motor.resistance
+    q = 1 - motor.resistance * dt / motor.inductance
+    ones, squares = (1 - q**n) / (1 - q), (1 - q ** (2 * n)) / (1 - q**2)
+    drawn = voltage * final * dt * (n - (1 + q) / 2 * ones)
+    heat = motor.resistance * final**2 * dt / 3 * (3 * n - 3 * (1 + q) * ones + (1 + q + q * q) * squares)
+    assert result.energy_drawn.mean == pytest.approx(drawn, rel=1e-12)
+    assert result.energy_returned.mean == 0.0
+    assert result.copper_loss.mean == pytest.approx(heat, rel=1e-12)
+    assert result.magnetic_energy.mean == pytest.approx(motor.inductance / 2 * (final * (1 - q**n)) ** 2, rel=1e-12)
+    assert result.peak_current == pytest.approx(final * (1 - q**n), rel=1e-12)
+    assert result.rms_current == pytest.approx(math.sqrt(heat / motor.resistance / (n * dt)), rel=1e-12)
+    assert (result.peak_voltage, result.saturated_percent) == (voltage, 0.0)
+    # and the motor itself, not its Euler steps: they err by dt/T = 1/15 of the transient
+    time, constant = n * dt, motor.electrical_time_constant
+    transient = voltage * final * constant
+    exact = voltage * final * (time - constant * (1 - math.exp(-time / constant)))
+    assert result.energy_drawn.mean == pytest.approx(exact, abs=transient * dt / constant)
 
 
 @pytest.mark.parametrize("task", list(TASKS))
-def test_the_random_policy_draws_from_the_whole_action_space_and_repeats_with_its_seed(task):
-    space = TASKS[task].action_space
-    draw = lambda seed: RandomPolicy(task, seed).predict(np.zeros((300, 4)))[0]  # noqa: E731
-    actions = draw(0)
-    assert actions.shape == (300, *space.shape)
-    assert all(space.contains(action) for action in actions)
-    np.testing.assert_array_equal(actions, draw(0))
-    assert not np.array_equal(actions, draw(1))
-    if isinstance(space, gymnasium.spaces.Discrete):
-        assert set(actions) == set(range(space.n))
-    else:
-        assert actions.min() < 0.9 * space.low.min()
-        assert actions.max() > 0.9 * space.high.max()
+@pytest.mark.parametrize("actuator", ["paper", "weaker", "open_loop"])
+def test_electrical_energy_balances_to_rounding(task, actuator):
+    """An Euler step of the winding times the mean current: (u - kE*w - R*i)*(i + i')/2*dt = L*(i'^2 - i^2)/2."""
+    resolved = named_actuator(actuator, task)
+    make = functools.partial(make_env, task, resolved, max_episode_steps=60)
+    episodes = run_episodes(RandomPolicy(task), make, episodes=2)
+    result, motor = summarize(task, resolved, episodes), resolved.motor
+    balance = 2 * (result.energy_drawn.mean - result.energy_returned.mean - result.magnetic_energy.mean)
+    for episode in episodes:
+        current = np.append(0.0, episode.trace[:, TRACE_CURRENT])
+        speeds = np.append(episode.state[0, ACTUATED_VELOCITY[task]], episode.trace[:-1, TRACE_SPEED])
+        mean = (current[1:] + current[:-1]) / 2
+        back_emf = motor.back_emf_constant * speeds / motor.arm_radius
+        balance -= np.sum((back_emf + motor.resistance * current[:-1]) * mean) * episode.timestep
+    assert abs(balance) <= 1e-12 * 2 * (result.energy_drawn.mean + result.energy_returned.mean)
 
 
-def test_the_random_policy_leaves_the_tasks_own_space_alone():
-    space = TASKS["cartpole"].action_space
-    space.seed(4)
-    expected = [space.sample() for _ in range(10)]
-    space.seed(4)
-    RandomPolicy("cartpole", 9).predict(np.zeros((10, 4)))
-    assert [space.sample() for _ in range(10)] == expected
+@pytest.mark.parametrize("task", ["pendulum", "acrobot", "mountain_car"])
+def test_the_whole_energy_balance_closes_as_the_steps_shorten(task):
+    """With kE = kT all that is drawn and not returned is heat, field or work, but for Euler's error of first order."""
+    gaps, actuator = [], Actuator(Motor(), CurrentLoop(kp=2.0, ki=2.0))
+    for timestep in (0.005, 0.0025, 0.00125):  # the winding's time constant is 0.1 s
+        env = EnvConfig(inner_steps=round(TASKS[task].step_duration / timestep), max_episode_steps=8)
+        result = evaluate(RandomPolicy(task), task, actuator, env, episodes=3)
+        spent = result.copper_loss.mean + result.magnetic_energy.mean + result.mechanical_work.mean
+        gaps.append(result.energy_drawn.mean - result.energy_returned.mean - spent)
+    coarse, middle, fine = map(abs, gaps)
+    assert coarse / middle == pytest.approx(2.0, abs=0.3)
+    assert middle / fine == pytest.approx(2.0, abs=0.2)
+    assert coarse < 0.1 * spent
 
 
-def test_a_random_policy_needs_a_known_task_and_a_seed():
+def test_work_and_peaks_are_those_of_the_shaft():
+    motor = Motor(arm_radius=0.5, resistance=2.0)
+    rows = [(3.0, 1.0, 6.0, 0.5, 0), (1.0, -4.0, -7.0, -0.8, 1)]  # force, current, voltage, speed, saturated
+    episodes = [made_up(actuator=Actuator(motor), rows=rows)] * 2
+    result = summarize("cartpole", Actuator(motor), episodes)
+    dt = 0.02
+    assert result.mechanical_work.mean == pytest.approx((3.0 * 0.25 + 1.0 * -0.15) * dt, rel=1e-12)
+    assert result.energy_drawn.mean == pytest.approx((6.0 * 0.5 + -7.0 * -1.5) * dt, rel=1e-12)
+    assert result.copper_loss.mean == pytest.approx(2.0 * (1.0 + (1.0 - 4.0 + 16.0)) / 3 * dt, rel=1e-12)
+    assert (result.peak_voltage, result.peak_current, result.saturated_percent) == (7.0, 4.0, 50.0)
+    assert result.peak_speed == pytest.approx(0.8 / 0.5)
+
+
+def test_a_motor_that_brakes_returns_energy():
+    rows = [(0, 2.0, 5.0, 0, 0), (0, 2.0, -3.0, 0, 0)]
+    result = summarize("cartpole", Actuator(), [made_up(rows=rows)])
+    assert result.energy_drawn.mean == pytest.approx(5.0 * 1.0 * 0.02)
+    assert result.energy_returned.mean == pytest.approx(3.0 * 2.0 * 0.02)
+
+
+def test_every_episode_is_measured_with_the_motor_that_was_drawn_for_it():
+    drawn = {"motor.resistance": Uniform(0.5, 3.0), "motor.arm_radius": Uniform(0.5, 2.0)}
+    env = EnvConfig(max_episode_steps=20, randomize=drawn)
+    result = evaluate(RandomPolicy("pendulum"), "pendulum", "weak", env, episodes=3)
+    make = functools.partial(make_env, "pendulum", "weak", randomize=drawn, max_episode_steps=20)
+    episodes = run_episodes(RandomPolicy("pendulum"), make, 3)
+    arms = [episode.actuator.motor.arm_radius for episode in episodes]
+    assert len(set(arms)) == 3
+    errors = [
+        arm * (np.repeat(e.signals["desired_force"], e.inner_steps) - e.trace[:, 1])
+        for arm, e in zip(arms, episodes, strict=True)
+    ]
+    assert result.tracking_max == pytest.approx(np.abs(errors).max(), rel=1e-12)
+    fastest = [max(abs(e.state[0, 1]), np.abs(e.trace[:, TRACE_SPEED]).max()) for e in episodes]
+    assert result.peak_speed == pytest.approx(max(np.array(fastest) / arms), rel=1e-12)
+    motors = [episode.actuator.motor for episode in episodes]
+    heats = [
+        summarize("pendulum", e.actuator, [e]).rms_current ** 2 * motor.resistance * e.time[-1]
+        for e, motor in zip(episodes, motors, strict=True)
+    ]
+    assert result.copper_loss.mean == pytest.approx(np.mean(heats), rel=1e-12)
+
+
+# -- the whole ----------------------------------------------------------------------------------------------
+
+
+def test_an_evaluation_is_the_summary_of_its_episodes_and_says_what_it_was_measured_under():
+    env = EnvConfig(physics="analytic", inner_steps=2, disturbances=Disturbances(current_bias=0.2))
+    result = evaluate(Leaner(), "cartpole", "weaker", env, episodes=3, seed=9)
+    make = functools.partial(make_env, "cartpole", "weaker", **env.as_arguments())
+    actuator = named_actuator("weaker", "cartpole")
+    expected = summarize("cartpole", actuator, run_episodes(Leaner(), make, 3, seed=9))
+    for name in MEASURES:
+        assert getattr(result, name) == getattr(expected, name), name
+    conditions = result.conditions
+    assert Actuator.from_mapping(conditions["actuator"]) == actuator
+    assert EnvConfig(**conditions["env"]) == env
+    assert (conditions["seed"], conditions["deterministic"]) == (9, True)
+
+
+def test_sampled_evaluations_repeat_with_their_seed():
+    from stable_baselines3 import PPO
+
+    policy = PPO("MlpPolicy", make_env("cartpole", "paper"), n_steps=8, batch_size=8, seed=0, device="cpu").policy
+    run = functools.partial(evaluate, policy, "cartpole", "paper", episodes=4, deterministic=False)
+    assert run(seed=3) == run(seed=3)
+    assert run(seed=3).returns != run(seed=4).returns
+    assert run(seed=3).returns != evaluate(policy, "cartpole", "paper", episodes=4, seed=3).returns
+
+
+def test_an_evaluation_is_json_with_a_unit_for_every_measure():
+    result = evaluate(Constant(0.4), "pendulum", "weak", EnvConfig(max_episode_steps=30), episodes=2)
+    mapping = result.as_mapping()
+    assert json.loads(json.dumps(mapping)) == mapping
+    assert mapping["returns"] == {"mean": result.returns.mean, "low": result.returns.low, "high": result.returns.high}
+    assert mapping["units"].keys() == MEASURES.keys() <= mapping.keys()
+    assert mapping["units"]["energy_drawn"] == "J"
+    assert mapping["units"]["tracking_rms"] == "N*m"
+    assert ELECTRICAL | {"tracking_lag", "mechanical_work", "time_to_goal", "success"} < MEASURES.keys()
+    measured = {name for name in MEASURES if mapping[name] is not None}
+    assert measured >= ELECTRICAL
+
+
+def test_bad_arguments_are_named():
     with pytest.raises(ValueError, match="did you mean 'cartpole'"):
-        RandomPolicy("cartpol")
+        evaluate(Leaner(), "cartpol")
+    with pytest.raises(ValueError, match="unknown actuator 'papr'"):
+        evaluate(Leaner(), "cartpole", "papr")
+    with pytest.raises(ValueError, match="episodes = 0"):
+        evaluate(Leaner(), "cartpole", episodes=0)
     with pytest.raises(ValueError, match="seed = -1"):
-        RandomPolicy("cartpole", -1)
-
-
-# -- trajectories -------------------------------------------------------------------------------------------
-
-
-def test_a_saved_episode_is_read_back_exactly(tmp_path):
-    make = functools.partial(make_env, "pendulum", "weaker", max_episode_steps=7)
-    (episode,) = run_episodes(RandomPolicy("pendulum"), make, 1)
-    save_episode(episode, tmp_path / "new" / "swing.npz")
-    again = load_episode(tmp_path / "new" / "swing.npz")
-    for field in ("time", "state", "observation", "action", "reward"):
-        np.testing.assert_array_equal(getattr(again, field), getattr(episode, field))
-        assert getattr(again, field).dtype == getattr(episode, field).dtype
-    assert again.signals.keys() == episode.signals.keys()
-    for name, values in episode.signals.items():
-        np.testing.assert_array_equal(again.signals[name], values)
-    assert again.terminated is episode.terminated is False
-
-
-def test_what_is_no_trajectory_is_refused(tmp_path):
-    make = functools.partial(make_env, "pendulum", "ideal", max_episode_steps=2)
-    (episode,) = run_episodes(RandomPolicy("pendulum"), make, 1)
-    with pytest.raises(ValueError, match=r"swing\.csv: the suffix must be \.npz"):
-        save_episode(episode, tmp_path / "swing.csv")
-    assert list(tmp_path.iterdir()) == []
-    with pytest.raises(FileNotFoundError, match=r"swing\.npz"):
-        load_episode(tmp_path / "swing.npz")
-    save_episode(episode, tmp_path / "swing.npz")
-    whole = (tmp_path / "swing.npz").read_bytes()
-    np.savez(tmp_path / "other.npz", time=np.zeros(3))
-    (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
-    (tmp_path / "pickle.npz").write_bytes(pickle.dumps({"time": 1}))
-    for name in ("other.npz", "cut.npz", "pickle.npz"):
-        with pytest.raises(ValueError, match=name):
-            load_episode(tmp_path / name)
+        evaluate(Leaner(), "cartpole", seed=-1)

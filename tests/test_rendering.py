@@ -32,10 +32,9 @@ def made_up(desired, actual, *, saturated=False, arm=1.0, steps=40, terminated=F
     values = (desired, actual, actual, desired, 0.0, saturated)
     signals = {name: np.full(steps, value) for name, value in zip(SIGNALS, values, strict=True)}
     states = np.zeros((steps + 1, 4)) if states is None else states
-    episode = Episode(
-        0.02 * np.arange(1, steps + 1), states, states, np.zeros(steps), np.ones(steps), signals, terminated
-    )
-    return Panel("made up", "cartpole", Actuator(Motor(arm_radius=arm)), episode)
+    actuator, trace, time = Actuator(Motor(arm_radius=arm)), np.zeros((steps, 6)), 0.02 * np.arange(1, steps + 1)
+    episode = Episode(time, states, states, np.zeros(steps), np.ones(steps), trace, signals, terminated, actuator)
+    return Panel("made up", "cartpole", actuator, episode)
 
 
 def filmed(monkeypatch, tmp_path, panels, **options):

@@ -1,0 +1,190 @@
+"""What episodes are reduced to, as pure functions: means with intervals, rates, delays, energies."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+LEAST_CORRELATION = 0.5
+"""Below this correlation no delay is stated: under a quarter of the variance would be that of a delayed copy."""
+EQUAL_CORRELATION = 0.99
+"""Peaks of at least this share of the highest count as high: a periodic signal has one in every period."""
+
+
+class Interval(NamedTuple):
+    """A mean and its 95 % interval."""
+
+    mean: float
+    low: float
+    high: float
+
+
+class Quartiles(NamedTuple):
+    """The median and the quartiles around it."""
+
+    median: float
+    low: float
+    high: float
+
+
+def bootstrap_mean(values: np.ndarray) -> Interval:
+    """Mean and 95 % percentile-bootstrap interval (scipy, 9999 resamples, fixed seed).
+
+    Args:
+        values: shape (n,), n >= 1.
+    """
+    mean = float(np.mean(values))
+    if np.ptp(values) == 0:  # scipy's bootstrap warns about a sample without spread
+        return Interval(mean, mean, mean)
+    from scipy.stats import bootstrap
+
+    interval = bootstrap((values,), np.mean, method="percentile", rng=0).confidence_interval
+    return Interval(mean, float(interval.low), float(interval.high))
+
+
+def wilson_rate(successes: int, trials: int) -> Interval:
+    """Share of successes, and its 95 % interval by Wilson's score (scipy): good for few trials and shares of 0 or 1.
+
+    Args:
+        successes: from 0 to `trials`.
+        trials: >= 1.
+    """
+    from scipy.stats import binomtest
+
+    interval = binomtest(successes, trials).proportion_ci(confidence_level=0.95, method="wilson")
+    return Interval(successes / trials, float(interval.low), float(interval.high))
+
+
+def interquartile_mean(values: np.ndarray) -> float:
+    """Mean of what is left without the lowest and the highest quarter of the values, each of floor(n/4) values.
+
+    Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice" (2021), recommend it for
+    returns: outliers move it less than the mean, and it uses more of the values than the median.
+
+    Args:
+        values: shape (n,), n >= 1.
+    """
+    from scipy.stats import trim_mean
+
+    return float(trim_mean(values, 0.25))
+
+
+def quartiles(values: np.ndarray) -> Quartiles:
+    """Median and quartiles, linear between values.
+
+    Args:
+        values: shape (n,), n >= 1.
+    """
+    low, median, high = np.percentile(values, [25, 50, 75])
+    return Quartiles(float(median), float(low), float(high))
+
+
+def holds_since(condition: np.ndarray) -> int:
+    """Index from which a condition holds until the end; n if it does not hold at the end.
+
+    Args:
+        condition: bool, shape (n,).
+    """
+    broken = np.flatnonzero(~condition)
+    return int(broken[-1]) + 1 if len(broken) else 0
+
+
+def delay(desired: Sequence[np.ndarray], actual: Sequence[np.ndarray], timestep: float) -> float | None:
+    """Time by which a signal lags behind another [s]: the delay that maximises their normalised cross-correlation.
+
+    c(k) = sum of x(t)*y(t+k) / sqrt(sum of x(t)^2 * sum of y(t+k)^2), over all times t of all episodes at which both
+    exist, where x and y are the desired and the actual signal less their means over everything. Lags run from 0 to half
+    the mean length of an episode. Of peaks as high as the highest (`EQUAL_CORRELATION`) the first is taken, and refined
+    by the parabola through it and its two neighbours.
+
+    Args:
+        desired: one signal for each episode, shape (n,) each.
+        actual: the same for what follows it, of the same shapes.
+        timestep: between samples [s].
+
+    Returns:
+        The delay, >= 0; None where either signal is constant, where even the highest peak is below
+        `LEAST_CORRELATION`, or where there is none.
+    """
+    from scipy.signal import correlate
+
+    reach = int(np.mean([len(signal) for signal in desired]) / 2)
+    every_desired, every_actual = np.concatenate(desired), np.concatenate(actual)
+    if reach < 1 or np.ptp(every_desired) == 0 or np.ptp(every_actual) == 0:
+        return None
+    lags = np.arange(-1, reach + 1)
+    products, desired_squares, actual_squares = np.zeros((3, len(lags)))
+    for signal, following in zip(desired, actual, strict=True):
+        x, y = signal - every_desired.mean(), following - every_actual.mean()
+        here = lags < len(x)
+        shifts = lags[here]
+        products[here] += correlate(y, x, method="fft")[shifts + len(x) - 1]
+        desired_squares[here] += _sums_between(x * x, np.maximum(-shifts, 0), len(x) - np.maximum(shifts, 0))
+        actual_squares[here] += _sums_between(y * y, np.maximum(shifts, 0), len(y) - np.maximum(-shifts, 0))
+    scale = np.sqrt(desired_squares * actual_squares)
+    correlation = np.divide(products, scale, out=np.zeros(len(lags)), where=scale > 0)
+    offsets, heights = _parabolas(correlation)
+    if not len(heights) or heights.max() < max(LEAST_CORRELATION, correlation[-1]):
+        return None
+    peak = int(np.argmax(heights >= EQUAL_CORRELATION * heights.max()))  # the first
+    return max(round(peak + float(offsets[peak]), 9), 0.0) * timestep  # the transform's own rounding is smaller
+
+
+def _parabolas(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Peaks of the parabolas through every sample but the outer ones and its two neighbours, where it is a peak itself.
+
+    Args:
+        samples: shape (n+2,). Nothing before the second counts as higher than it.
+
+    Returns:
+        Where the peak is, relative to the sample [samples], and its height; -inf where there is none. Shape (n,) each.
+    """
+    before, at, after = samples[:-2], samples[1:-1], samples[2:]
+    rises, falls = at >= before, at >= after
+    curvature, slope = before - 2 * at + after, (after - before) / 2
+    offsets = np.divide(-slope, curvature, out=np.zeros(len(at)), where=rises & falls & (curvature < 0))
+    rises[:1] = True
+    return offsets, np.where(rises & falls, at + slope * offsets / 2, -np.inf)
+
+
+def _sums_between(values: np.ndarray, begins: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Sums of values[begin:end]."""
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    return sums[ends] - sums[begins]
+
+
+def electrical_energy(voltage: np.ndarray, current: np.ndarray, timestep: float) -> tuple[float, float]:
+    """Energy that a motor draws from its supply, and energy that it returns [J]: two integrals of u*i, both >= 0.
+
+    The voltage is held over a step, as a digital controller's is, and the current is taken as linear in it: a step's
+    energy is u*(i + i')/2*dt. Steps where it is positive are drawn, the others returned.
+
+    Args:
+        voltage: over each step [V], shape (n,).
+        current: before the first step and after each [A], shape (n+1,).
+        timestep: dt [s].
+    """
+    energies = voltage * (current[1:] + current[:-1]) * (timestep / 2)
+    return float(energies[energies > 0].sum()), float(-energies[energies < 0].sum())
+
+
+def integral_of_square(samples: np.ndarray, timestep: float) -> float:
+    """Integral of the square of what is linear between samples: sum of (i^2 + i*i' + i'^2)/3*dt.
+
+    Args:
+        samples: shape (n+1,).
+        timestep: dt between them [s].
+    """
+    before, after = samples[:-1], samples[1:]
+    return float(np.sum(before * before + before * after + after * after)) * timestep / 3
+
+
+def mechanical_work(force: np.ndarray, speed: np.ndarray, timestep: float) -> float:
+    """Work of a force on what it moves [J]: the force is held over a step, the speed linear in it, F*(v + v')/2*dt.
+
+    Args:
+        force: over each step [N], or torque [N*m], shape (n,).
+        speed: before the first step and after each [m/s], or [rad/s], shape (n+1,).
+        timestep: dt [s].
+    """
+    return float(np.sum(force * (speed[1:] + speed[:-1]))) * timestep / 2

@@ -1,0 +1,90 @@
+"""Results as tables for a terminal of 110 columns. They are built here, and printed by `codrl_mj.terminal`."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from rich import box
+from rich.markup import escape
+from rich.table import Table
+
+from codrl_mj.evaluation import MEASURES, Evaluation
+from codrl_mj.measures import Interval, Quartiles
+
+_COLUMNS = 3  # evaluations side by side
+_NOTHING = "–"
+
+
+def _table(title: str) -> Table:
+    return Table(title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+
+
+def evaluation_tables(evaluations: Mapping[str, Evaluation], details: bool = True) -> list[Table]:
+    """The most telling measures with a row for each evaluation, and then the others with a column for each.
+
+    Args:
+        evaluations: by their names; at least one.
+        details: whether to show the others.
+    """
+    names = list(evaluations) if details else []
+    chunks = [names[begin : begin + _COLUMNS] for begin in range(0, len(names), _COLUMNS)]
+    return [_compact(evaluations), *(_details({name: evaluations[name] for name in chunk}) for chunk in chunks)]
+
+
+_TELLING: dict[str, tuple[str, Callable[[Any], str]]] = {
+    # field: its column's header, and its value as text
+    "success": ("success", lambda value: f"{100 * value.mean:.0f} %"),
+    "returns": ("return", lambda value: "{:.1f} [{:.1f}, {:.1f}]".format(*value)),
+    "time_to_goal": ("time to\ngoal", lambda value: f"{value.median:.1f} s"),
+    "tracking_rms": ("torque\nerror", lambda value: f"{value:.3f} N·m"),
+    "saturated_percent": ("saturated", lambda value: f"{value:.1f} %"),
+    "peak_voltage": ("peak\n|u|", lambda value: f"{value:.1f} V"),
+    "energy_drawn": ("energy\ndrawn", lambda value: f"{_text(value.mean)} J"),
+}
+_SHOWN = ("returns", "failure")  # whole in the first table, or by what is in it
+
+
+def _compact(evaluations: Mapping[str, Evaluation]) -> Table:
+    """A row for each evaluation; measures that none of them has are left out."""
+    counts = sorted({evaluation.episodes for evaluation in evaluations.values()})
+    table = _table(f"{' or '.join(map(str, counts))} episodes a row: means [95 % bootstrap interval]")
+    table.add_column("policy", overflow="fold")
+    shown = {
+        name: as_text
+        for name, (header, as_text) in _TELLING.items()
+        if any(getattr(evaluation, name) is not None for evaluation in evaluations.values())
+    }
+    for name in shown:
+        table.add_column(_TELLING[name][0], justify="right", no_wrap=True)
+    for title, evaluation in evaluations.items():
+        values = {name: getattr(evaluation, name) for name in shown}
+        texts = [_NOTHING if value is None else shown[name](value) for name, value in values.items()]
+        table.add_row(*map(escape, (title, *texts)))
+    return table
+
+
+def _details(evaluations: Mapping[str, Evaluation]) -> Table:
+    """A column for each evaluation, a row for each measure that one of them has and `_compact` does not show whole."""
+    table = _table("mean [95 % interval], or median [quartiles]")
+    table.add_column("measure", no_wrap=True)
+    for title in evaluations:
+        table.add_column(escape(title), justify="right", overflow="fold")
+    ends = [f"{e.terminated} task, {e.episodes - e.terminated} time limit" for e in evaluations.values()]
+    table.add_row("episodes ended by", *ends)
+    for name, field in MEASURES.items():
+        values = [getattr(evaluation, name) for evaluation in evaluations.values()]
+        spread = any(isinstance(value, Interval | Quartiles) for value in values)
+        if name in _SHOWN or (name in _TELLING and not spread) or all(value is None for value in values):
+            continue
+        scale, unit = (100.0, "%") if field.metadata["unit"] == "share" else (1.0, field.metadata["unit"])
+        label = f"{field.metadata['label']} [{unit.replace('*', '·')}]"
+        table.add_row(*map(escape, (label, *(_text(value, scale) for value in values))))
+    return table
+
+
+def _text(value: Any, scale: float = 1.0) -> str:
+    if value is None:
+        return _NOTHING
+    if isinstance(value, Interval | Quartiles):
+        return "{} [{}, {}]".format(*(_text(number, scale) for number in value))
+    number = scale * value
+    return f"{number:.3g}" if abs(number) < 1000 else f"{number:.0f}"
