@@ -14,6 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 from codrl_mj.evaluation import Evaluation
+from codrl_mj.tables import evaluation_tables
 from codrl_mj.training import TrainConfig, train
 from codrl_mj.validation import GROUPS, Caught, Certificate, Check
 from codrl_mj.validation.mutations import margin
@@ -92,23 +93,15 @@ def _train_reporting(name: str, config: TrainConfig, out: Path, reports: Any) ->
     train(config, out, lambda progress: reports.put((name, progress)))
 
 
-def print_evaluations(evaluations: Mapping[str, Evaluation]) -> None:
-    """Print one table, a row for each evaluation by its name."""
-    count = next(iter(evaluations.values())).episodes
-    table = Table(title=f"{count} episodes a row: mean [95 % bootstrap interval]")
-    table.add_column("policy", no_wrap=True)
-    for column in ("return", "torque error", "of desired", "max |u|", "saturated"):
-        table.add_column(column, justify="right")
-    for name, result in evaluations.items():
-        table.add_row(
-            name,
-            "{:.1f} [{:.1f}, {:.1f}]".format(*result.returns),
-            f"{result.tracking_rms:.3f} N·m",
-            f"{result.tracking_percent:.0f} %",
-            "–" if result.peak_voltage is None else f"{result.peak_voltage:.1f} V",
-            f"{result.saturated_percent:.1f} %",
-        )
-    console().print(table)
+def print_evaluations(evaluations: Mapping[str, Evaluation], details: bool = True) -> None:
+    """Print the most telling measures in one table, a row for each evaluation by its name, and the others below it.
+
+    Args:
+        evaluations: by their names; at least one.
+        details: whether to print the others.
+    """
+    for table in evaluation_tables(evaluations, details):
+        console().print(table)
 
 
 def print_checks(checks: Sequence[Check], title: str = "MuJoCo against Gymnasium") -> None:
