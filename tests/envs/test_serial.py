@@ -9,8 +9,7 @@ import pytest
 
 import codrl_mj
 from codrl_mj import Uniform
-from codrl_mj.envs import ActuatedEnv
-from codrl_mj.envs.serial import SerialVectorEnv
+from codrl_mj.envs import ActuatedEnv, SerialVectorEnv
 from codrl_mj.motor import named_actuator
 from codrl_mj.tasks import TASKS
 from tests.envs.snapshots import everything
