@@ -5,6 +5,18 @@ from pathlib import Path
 _PACKAGE = Path(__file__).parent
 
 
+def asset_folder() -> Path:
+    """The folder of the MJCF files.
+
+    Raises:
+        FileNotFoundError: neither the checkout nor the wheel has it.
+    """
+    for folder in (_PACKAGE / "_assets", _PACKAGE.parent / "assets"):
+        if folder.is_dir():
+            return folder
+    raise FileNotFoundError(f"no models beside codrl_mj in {_PACKAGE}: the installation is incomplete")
+
+
 def asset_path(name: str) -> Path:
     """Path of the MJCF file `name`.
 

@@ -1,6 +1,7 @@
 """Trained policies as files that are safe to load: safetensors for the weights, JSON for everything else.
 
-Nothing here unpickles, so a policy from elsewhere can do no more than choose bad actions.
+`load_policy` never unpickles, so a policy from elsewhere can do no more than choose bad actions. `load_sb3_zip` does,
+and says so.
 """
 
 from pathlib import Path
@@ -9,11 +10,11 @@ from typing import Any, Protocol
 import numpy as np
 from gymnasium import spaces
 
+from codrl_mj.agents import AgentConfig, agent_from_mapping
 from codrl_mj.files import read_json, write_json, writing
 
-FORMAT = "codrl_mj policy 1"
+FORMAT = "codrl_mj policy 2"
 _WEIGHTS, _DESCRIPTION = "policy.safetensors", "policy.json"
-_ACTIVATIONS = ("Tanh", "ReLU")
 
 
 class Policy(Protocol):
@@ -43,37 +44,27 @@ def _make_space(described: dict[str, Any]) -> spaces.Space[Any]:
     return spaces.Box(np.array(described["low"], dtype), np.array(described["high"], dtype), dtype=dtype)
 
 
-def save_policy(model: Any, folder: Path) -> None:
-    """Write the policy of a Stable-Baselines3 actor-critic model (PPO, A2C) into `folder`.
+def save_policy(policy: Any, agent: AgentConfig, folder: Path) -> None:
+    """Write a policy into `folder`.
 
     Args:
-        model: the trained model.
+        policy: the Stable-Baselines3 policy of a model that `agent` made.
+        agent: the settings.
         folder: gets `policy.safetensors` and `policy.json`.
 
     Raises:
-        ValueError: the policy is of a kind that cannot be saved this way.
+        ValueError: the spaces are of a kind that cannot be saved.
     """
-    from safetensors.torch import save_file
-    from stable_baselines3.common.policies import ActorCriticPolicy
+    from safetensors.torch import save
 
-    policy = model.policy
-    activation = policy.activation_fn.__name__ if isinstance(policy, ActorCriticPolicy) else None
-    if activation not in _ACTIVATIONS:
-        raise ValueError(
-            f"a {type(policy).__name__} with activation {activation} cannot be saved: it must be an "
-            f"ActorCriticPolicy with one of {', '.join(_ACTIVATIONS)}"
-        )
     description = {
         "format": FORMAT,
-        "algorithm": type(model).__name__,
-        "net_arch": policy.net_arch,
-        "activation": activation,
+        "agent": agent.as_mapping(),
         "observation_space": _describe_space(policy.observation_space),
         "action_space": _describe_space(policy.action_space),
     }
     with writing(folder / _WEIGHTS) as temporary:
-        tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in policy.state_dict().items()}
-        save_file(tensors, temporary)
+        temporary.write_bytes(save({name: tensor.contiguous() for name, tensor in policy.state_dict().items()}))
     write_json(folder / _DESCRIPTION, description)
 
 
@@ -92,8 +83,6 @@ def load_policy(folder: Path) -> Any:
     """
     from safetensors import SafetensorError
     from safetensors.torch import load_file
-    from stable_baselines3.common.policies import ActorCriticPolicy
-    from torch import nn
 
     description = read_json(folder / _DESCRIPTION, "policy description")
     if not isinstance(description, dict) or description.get("format") != FORMAT:
@@ -101,19 +90,10 @@ def load_policy(folder: Path) -> Any:
     weights = folder / _WEIGHTS
     if not weights.is_file():
         raise FileNotFoundError(f"no policy weights at {weights}")
-    if description.get("activation") not in _ACTIVATIONS:
-        raise ValueError(
-            f"{folder / _DESCRIPTION}: activation {description.get('activation')!r} is not one of "
-            f"{', '.join(_ACTIVATIONS)}"
-        )
     try:
-        policy = ActorCriticPolicy(
-            _make_space(description["observation_space"]),  # type: ignore[arg-type]
-            _make_space(description["action_space"]),
-            lr_schedule=lambda _: 0.0,
-            net_arch=description["net_arch"],
-            activation_fn=getattr(nn, description["activation"]),
-        )
+        agent = agent_from_mapping(description["agent"])
+        spaces_ = _make_space(description["observation_space"]), _make_space(description["action_space"])
+        policy = agent.make_policy(*spaces_)  # type: ignore[arg-type]
     except (ArithmeticError, AssertionError, AttributeError, LookupError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{folder / _DESCRIPTION} does not describe a policy: {error!r}") from None
     try:
@@ -125,5 +105,41 @@ def load_policy(folder: Path) -> Any:
         raise ValueError(f"{weights} and {_DESCRIPTION} do not belong together: {error}") from None
     if not all(tensor.isfinite().all() for tensor in tensors.values()):
         raise ValueError(f"{weights} holds weights that are not finite numbers")
+    policy.set_training_mode(False)
+    return policy
+
+
+def load_sb3_zip(path: Path, agent: str, trust: bool) -> Any:
+    """Load the policy of a model that Stable-Baselines3 saved.
+
+    Args:
+        path: the zip file.
+        agent: the algorithm that it was trained with, such as `ppo`; the file does not say.
+        trust: that whoever made the file may execute code on this machine, which loading it allows.
+
+    Returns:
+        The policy (`predict(observations, deterministic=...)`).
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: `trust` is False (the file is not opened), or Stable-Baselines3 has no such agent or cannot read it.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"no model at {path}")
+    if not trust:
+        raise ValueError(
+            f"{path} is a Stable-Baselines3 model: it holds pickled Python objects, and loading it executes whatever "
+            "its author put there. Pass --trust if that author is you, or somebody whose programs you would run"
+        )
+    import stable_baselines3
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+    kind: Any = getattr(stable_baselines3, agent.upper(), None)
+    if not isinstance(kind, type) or not issubclass(kind, BaseAlgorithm):
+        raise ValueError(f"agent = {agent!r}: Stable-Baselines3 has no such agent; name the one that made {path}")
+    try:
+        policy = kind.load(path, device="cpu").policy  # type: ignore[attr-defined]
+    except Exception as error:  # whatever the file's objects raise
+        raise ValueError(f"{path} is not a model of {agent}: {error!r}") from None
     policy.set_training_mode(False)
     return policy

@@ -39,45 +39,67 @@ def progress_bar(*columns: str) -> Progress:
     )
 
 
-def train_with_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> None:
+def train_with_bars(runs: Mapping[str, tuple[TrainConfig, Path]], **options: Any) -> None:
     """Train, showing a bar for each run; several runs go side by side in processes of their own.
 
     Args:
-        runs: description -> (configuration, run folder to make).
+        runs: description -> (configuration, run folder).
+        **options: as for `codrl_mj.training.train`.
 
     Raises:
         Exception: whatever `codrl_mj.training.train` raises, in the first run that fails.
     """
-    columns = "{task.completed:,}/{task.total:,} steps", "return {task.fields[back]:.0f}", "{task.fields[speed]:.0f}/s"
+    columns = (
+        "{task.completed:,}/{task.total:,} {task.fields[unit]}",
+        "return {task.fields[back]:.1f}",
+        "length {task.fields[length]:.0f}",
+        "torque err {task.fields[error]:.2g} N·m",
+        "{task.fields[speed]:.0f}/s",
+    )
     with progress_bar(*columns) as bar:
+        nothing: dict[str, Any] = {"back": math.nan, "length": math.nan, "error": math.nan, "speed": math.nan}
         rows = {
-            name: bar.add_task(name, total=config.total_steps, back=math.nan, speed=math.nan)
+            name: bar.add_task(
+                name,
+                total=config.total_episodes or config.total_steps,
+                unit="episodes" if config.total_episodes else "steps",
+                **nothing,
+            )
             for name, (config, _) in runs.items()
         }
 
         def show(name: str, progress: Any) -> None:
+            config, _ = runs[name]
+            total = config.total_episodes or config.total_steps or 0
             bar.update(
                 rows[name],
-                completed=min(progress.steps, progress.total_steps),
+                completed=min(progress.episodes if config.total_episodes else progress.steps, total),
                 back=progress.mean_return,
+                length=progress.mean_length,
+                error=progress.torque_error,
                 speed=progress.steps_per_second,
             )
 
         if len(runs) == 1:
             ((name, (config, out)),) = runs.items()
-            train(config, out, lambda progress: show(name, progress))
+            train(config, out, lambda progress: show(name, progress), **options)
         else:
-            _train_side_by_side(runs, show)
+            _train_side_by_side(runs, show, options)
 
 
-def _train_side_by_side(runs: Mapping[str, tuple[TrainConfig, Path]], show: Callable[[str, Any], None]) -> None:
+def _train_side_by_side(
+    runs: Mapping[str, tuple[TrainConfig, Path]], show: Callable[[str, Any], None], options: Mapping[str, Any]
+) -> None:
     context = multiprocessing.get_context("spawn")
     with (
         context.Manager() as manager,
         concurrent.futures.ProcessPoolExecutor(len(runs), mp_context=context) as pool,
     ):
         reports = manager.Queue()
-        futures = [pool.submit(_train_reporting, name, config, out, reports) for name, (config, out) in runs.items()]
+        futures = [
+            pool.submit(_train_reporting, name, config, out, reports, dict(options))
+            for name, (config, out) in runs.items()
+        ]
         while not all(future.done() for future in futures):
             try:
                 show(*reports.get(timeout=0.2))
@@ -89,8 +111,8 @@ def _train_side_by_side(runs: Mapping[str, tuple[TrainConfig, Path]], show: Call
             future.result()
 
 
-def _train_reporting(name: str, config: TrainConfig, out: Path, reports: Any) -> None:
-    train(config, out, lambda progress: reports.put((name, progress)))
+def _train_reporting(name: str, config: TrainConfig, out: Path, reports: Any, options: dict[str, Any]) -> None:
+    train(config, out, lambda progress: reports.put((name, progress)), **options)
 
 
 def print_evaluations(evaluations: Mapping[str, Evaluation], details: bool = True) -> None:

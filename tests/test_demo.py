@@ -40,7 +40,7 @@ def test_it_leaves_two_runs_and_a_film(demonstrated):
     ideal, weaker = (load_config(out / run) for run in RUNS)
     assert ideal.actuator is None
     assert weaker.actuator.controller.kp == 0.2
-    assert ideal.ppo == weaker.ppo
+    assert ideal.agent == weaker.agent
     assert ideal.seed == weaker.seed == 4
     for run in RUNS:
         load_policy(out / run)

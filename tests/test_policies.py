@@ -1,5 +1,6 @@
 """Policies as files: they predict what the model predicted, and nothing in them is executed."""
 
+import dataclasses
 import json
 import pickle
 from pathlib import Path
@@ -10,10 +11,10 @@ import pytest
 import torch
 from gymnasium import spaces
 from safetensors.torch import load_file, save_file
-from stable_baselines3 import A2C, DQN, PPO
-from torch import nn
+from stable_baselines3.common.vec_env import DummyVecEnv
 
-from codrl_mj.policies import load_policy, save_policy
+from codrl_mj.agents import AGENTS, PPOConfig
+from codrl_mj.policies import load_policy, load_sb3_zip, save_policy
 
 WEIGHTS, DESCRIPTION = "policy.safetensors", "policy.json"
 
@@ -39,22 +40,26 @@ DISCRETE = spaces.Discrete(3)
 CONTINUOUS = spaces.Box(np.array([-2.0, -1.0], np.float32), np.array([2.0, 0.5], np.float32), dtype=np.float32)
 
 
-def make_model(action_space=DISCRETE, observation_space=BOUNDED, kind=PPO, **policy_kwargs):
+SMALL = PPOConfig(rollout_steps=8, batch_size=8, hidden=(8, 8))
+
+
+def make_model(action_space=DISCRETE, observation_space=BOUNDED, agent=SMALL):
     torch.set_num_threads(1)
-    policy_kwargs = {"net_arch": [8, 8], "activation_fn": nn.Tanh} | policy_kwargs
-    env = Spaces(observation_space, action_space)
-    batches = {"batch_size": 8} if kind is PPO else {}
-    model = kind("MlpPolicy", env, n_steps=8, policy_kwargs=policy_kwargs, device="cpu", seed=3, **batches)
-    with torch.no_grad():  # SB3's initial action layer is nearly zero: make its actions vary
+    model = agent.make_model(DummyVecEnv([lambda: Spaces(observation_space, action_space)]), 3)
+    with torch.no_grad():  # initial weights hardly tell observations apart: make the actions vary
         for parameter in model.policy.parameters():
             parameter.add_(0.5 * torch.randn_like(parameter))
     return model
 
 
+def save(model, folder, agent=SMALL):
+    save_policy(model.policy, agent, folder)
+
+
 @pytest.fixture
 def folder(tmp_path):
     """A folder with a policy."""
-    save_policy(make_model(), tmp_path)
+    save(make_model(), tmp_path)
     return tmp_path
 
 
@@ -73,48 +78,62 @@ def refused(folder, error=ValueError):
 # -- round trip ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("action_space", [DISCRETE, CONTINUOUS], ids=["discrete", "continuous"])
-@pytest.mark.parametrize("activation", [nn.Tanh, nn.ReLU])
-@pytest.mark.parametrize("kind", [PPO, A2C])
-def test_a_loaded_policy_predicts_and_samples_what_the_model_does(tmp_path, action_space, activation, kind):
-    model = make_model(action_space, kind=kind, activation_fn=activation)
-    save_policy(model, tmp_path)
+@pytest.mark.parametrize(
+    ("name", "action_space"),
+    [
+        (name, space)
+        for name, config in AGENTS.items()
+        for space in (DISCRETE, CONTINUOUS)
+        if isinstance(space, config.action_spaces)
+    ],
+    ids=str,
+)
+def test_a_loaded_policy_predicts_and_samples_what_the_model_does(tmp_path, name, action_space):
+    limits = spaces.Box(-HIGH.clip(max=5), HIGH.clip(max=5), dtype=np.float32)  # tiles need bounds
+    agent = AGENTS[name]() if name != "sarsa" else AGENTS[name](intervals=(4, 4, 4, 4))
+    if name == "ppo":
+        agent = SMALL
+    model = make_model(action_space, limits, agent)
+    save(model, tmp_path, agent)
     expected, _ = model.predict(observations(), deterministic=True)
     loaded = load_policy(tmp_path)
     assert len(np.unique(expected, axis=0)) > 1  # the comparison is not of one constant action
-    for sample in (False, True):
+    np.testing.assert_array_equal(loaded.predict(observations(), deterministic=True)[0], expected)
+    if name in ("ppo", "sac"):  # those that sample from torch's generator
         torch.manual_seed(5)
-        first, _ = model.predict(observations(), deterministic=not sample)
+        first, _ = model.predict(observations(), deterministic=False)
         torch.manual_seed(5)
-        second, _ = loaded.predict(observations(), deterministic=not sample)
+        second, _ = loaded.predict(observations(), deterministic=False)
         np.testing.assert_array_equal(first, second)
+        assert not np.array_equal(first, expected)
 
 
-@pytest.mark.parametrize("net_arch", [[], [4], {"pi": [8, 4], "vf": [16]}], ids=str)
-def test_any_network_shape_survives(tmp_path, net_arch):
-    model = make_model(net_arch=net_arch)
-    save_policy(model, tmp_path)
+@pytest.mark.parametrize("hidden", [(), (4,), (8, 4, 16)], ids=str)
+def test_any_network_shape_survives(tmp_path, hidden):
+    agent = dataclasses.replace(SMALL, hidden=hidden)
+    model = make_model(agent=agent)
+    save(model, tmp_path, agent)
     loaded = load_policy(tmp_path)
     for name, tensor in model.policy.state_dict().items():
         assert torch.equal(loaded.state_dict()[name], tensor), name
 
 
 def test_the_spaces_survive(tmp_path):
-    save_policy(make_model(CONTINUOUS), tmp_path)
+    save(make_model(CONTINUOUS), tmp_path)
     loaded = load_policy(tmp_path)
     assert loaded.observation_space == BOUNDED
     assert loaded.action_space == CONTINUOUS
 
 
 def test_actions_outside_the_box_are_clipped_after_loading(tmp_path):
-    save_policy(make_model(CONTINUOUS), tmp_path)
+    save(make_model(CONTINUOUS), tmp_path)
     actions, _ = load_policy(tmp_path).predict(100 * observations(), deterministic=True)
     assert np.all(actions >= CONTINUOUS.low)
     assert np.all(actions <= CONTINUOUS.high)
 
 
 def test_the_weights_are_readable_by_plain_safetensors_and_the_description_by_plain_json(folder):
-    assert json.loads((folder / DESCRIPTION).read_text())["algorithm"] == "PPO"
+    assert json.loads((folder / DESCRIPTION).read_text())["agent"]["name"] == "ppo"
     shapes = {name: tuple(tensor.shape) for name, tensor in load_file(folder / WEIGHTS).items()}
     assert shapes["mlp_extractor.policy_net.0.weight"] == (8, 4)
     assert shapes["action_net.weight"] == (3, 8)
@@ -122,13 +141,8 @@ def test_the_weights_are_readable_by_plain_safetensors_and_the_description_by_pl
 
 
 def test_a_policy_that_cannot_be_described_is_refused_with_nothing_written(tmp_path):
-    env = Spaces(BOUNDED, DISCRETE)
-    with pytest.raises(ValueError, match="DQNPolicy"):
-        save_policy(DQN("MlpPolicy", env, buffer_size=10, device="cpu"), tmp_path)
-    with pytest.raises(ValueError, match="ELU"):
-        save_policy(make_model(activation_fn=nn.ELU), tmp_path)
     with pytest.raises(ValueError, match="only Box and Discrete"):
-        save_policy(make_model(spaces.MultiBinary(2)), tmp_path)
+        save(make_model(spaces.MultiBinary(2)), tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -163,24 +177,24 @@ def test_a_truncated_description_is_named(folder, keep):
     assert "truncated" in message
 
 
-@pytest.mark.parametrize("content", [{}, [], 1, None, "codrl_mj policy 1", {"format": "codrl_mj policy 0"}], ids=str)
+@pytest.mark.parametrize("content", [{}, [], 1, None, "codrl_mj policy 2", {"format": "codrl_mj policy 1"}], ids=str)
 def test_json_of_another_format_is_named(folder, content):
     (folder / DESCRIPTION).write_text(json.dumps(content))
     message = refused(folder)
     assert str(folder / DESCRIPTION) in message
-    assert "codrl_mj policy 1" in message
+    assert "codrl_mj policy 2" in message
 
 
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("activation", "Threshold"),
-        ("activation", None),
-        ("activation", ["Tanh"]),
-        ("net_arch", "wide"),
-        ("net_arch", [-1]),
-        ("net_arch", [0.5]),
-        ("net_arch", None),
+        ("agent", "ppo"),
+        ("agent", {"name": "pppo"}),
+        ("agent", {"name": "ppo", "hidden": [-1]}),
+        ("agent", {"name": "ppo", "hidden": "wide"}),
+        ("agent", {"name": "ppo", "surplus": 1}),
+        ("agent", {"name": ["ppo"]}),
+        ("agent", None),
         ("observation_space", {"type": "Discrete", "n": -2}),
         ("observation_space", {"type": "Box", "low": ["a"], "high": [1], "dtype": "float32"}),
         ("observation_space", {"type": "Box", "low": [0], "high": [1], "dtype": "no such type"}),
@@ -195,7 +209,7 @@ def test_a_description_with_a_wrong_field_is_named(folder, field, value):
     assert DESCRIPTION in refused(folder)
 
 
-@pytest.mark.parametrize("field", ["net_arch", "activation", "observation_space", "action_space"])
+@pytest.mark.parametrize("field", ["agent", "observation_space", "action_space"])
 def test_a_description_without_a_field_is_named(folder, field):
     path = folder / DESCRIPTION
     path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != field}))
@@ -208,8 +222,8 @@ def test_weights_with_other_names_are_named(folder):
 
 
 def test_weights_of_another_shape_are_named(folder):
-    other = make_model(net_arch=[16, 16])
-    save_policy(other, folder / "other")
+    wider = dataclasses.replace(SMALL, hidden=(16, 16))
+    save(make_model(agent=wider), folder / "other", wider)
     (folder / "other" / WEIGHTS).replace(folder / WEIGHTS)
     message = refused(folder)
     assert str(folder / WEIGHTS) in message
@@ -257,3 +271,41 @@ def test_loading_never_calls_unpickling_code(folder, monkeypatch):
         monkeypatch.setattr(pickle, name, forbidden)
     monkeypatch.setattr(torch, "load", forbidden)
     load_policy(folder)
+
+
+# -- Stable-Baselines3's own files --------------------------------------------------------------------------
+
+
+@pytest.fixture
+def zipped(tmp_path):
+    """A model as Stable-Baselines3 saves it, with an object in it that executes something when it is unpickled."""
+    model = make_model()
+    model.bomb = Executed(tmp_path / "executed")
+    model.save(tmp_path / "model.zip")
+    return tmp_path / "model.zip", model
+
+
+def test_a_zip_is_not_opened_without_trust(zipped):
+    path, _ = zipped
+    with pytest.raises(ValueError, match=r"executes whatever its author put there\. Pass --trust"):
+        load_sb3_zip(path, "ppo", trust=False)
+    assert not (path.parent / "executed").exists()
+
+
+def test_a_trusted_zip_predicts_what_the_model_does_and_shows_why_trust_is_needed(zipped):
+    path, model = zipped
+    expected, _ = model.predict(observations(), deterministic=True)
+    policy = load_sb3_zip(path, "ppo", trust=True)
+    np.testing.assert_array_equal(policy.predict(observations(), deterministic=True)[0], expected)
+    assert (path.parent / "executed").exists()  # this is what the flag is about
+
+
+@pytest.mark.parametrize(("agent", "message"), [("sarsa", "has no such agent"), ("dqn", "not a model of dqn")])
+def test_a_zip_of_another_agent_is_refused(zipped, agent, message):
+    with pytest.raises(ValueError, match=message):
+        load_sb3_zip(zipped[0], agent, trust=True)
+
+
+def test_a_missing_zip_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no model at .*model\.zip"):
+        load_sb3_zip(tmp_path / "model.zip", "ppo", trust=False)

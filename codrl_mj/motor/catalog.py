@@ -79,3 +79,25 @@ def resolve(actuator: "str | Actuator | Mapping[str, Any] | None", task: str) ->
     raise ValueError(
         f"actuator = {actuator!r}: must be a name ({', '.join(NAMED)}), an Actuator or a mapping of its fields"
     )
+
+
+def actuator_over(base: Actuator | None, fields: Mapping[str, Mapping[str, Any]]) -> Actuator | None:
+    """An actuator with single fields set over another's.
+
+    Args:
+        base: the other one; None is the ideal actuator.
+        fields: for example `{"controller": {"kp": 2.0}}`.
+
+    Raises:
+        ValueError: a field is unknown or out of bounds, or set over the ideal actuator, which has none.
+    """
+    if not any(fields.values()):
+        return base
+    if base is None:
+        raise ValueError(
+            "the ideal actuator has no motor and no controller to set fields of: name another actuator, such as paper"
+        )
+    mapping: dict[str, Any] = base.as_mapping()
+    for part, changes in fields.items():
+        mapping[part] = mapping.get(part, {}) | dict(changes)
+    return Actuator.from_mapping(mapping)

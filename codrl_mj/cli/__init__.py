@@ -1,0 +1,67 @@
+"""The command line: parses, calls the package, prints. Nothing imports it."""
+
+import sys
+import warnings
+from typing import Any
+
+import tyro
+
+from codrl_mj.cli.evaluate import Evaluate
+from codrl_mj.cli.render import Render
+from codrl_mj.cli.train import train_verb
+from codrl_mj.cli.validate import Validate
+from codrl_mj.training import TrainingStoppedError
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run `codrl-mj`.
+
+    Args:
+        arguments: the command line without the program's name; None takes the process's.
+
+    Returns:
+        Exit status: 0, 1 when a validation fails, 2 for bad input, 130 after Ctrl-C, 143 after SIGTERM.
+    """
+    given = sys.argv[1:] if arguments is None else arguments
+    with warnings.catch_warnings():
+        warnings.showwarning = _show_warning
+        return _run(given)
+
+
+def _run(arguments: list[str]) -> int:
+    try:
+        verb: Any = tyro.extras.subcommand_cli_from_dict(
+            {
+                "train": train_verb(arguments[1:] if arguments[:1] == ["train"] else []),
+                "evaluate": Evaluate,
+                "render": Render,
+                "validate": Validate,
+            },
+            prog="codrl-mj",
+            description="Reinforcement learning through a real actuator: classic control in MuJoCo, driven by a motor.",
+            args=arguments,
+        )
+        return verb.run()
+    except (ValueError, OSError, RuntimeError, ArithmeticError) as error:
+        print(f"codrl-mj: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except ModuleNotFoundError as error:
+        print(
+            f"codrl-mj: error: {error}. Training and evaluation need the extra 'train', videos the extra 'render', "
+            "certificates the extra 'validate': pip install 'codrl-mj[all]'",
+            file=sys.stderr,
+        )
+        return 2
+    except TrainingStoppedError as stopped:
+        print(f"codrl-mj: {stopped}", file=sys.stderr)
+        return 128 + stopped.signal_number
+    except KeyboardInterrupt:
+        return 130
+
+
+def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+    print(f"codrl-mj: warning: {' '.join(str(message).split())}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,63 @@
+"""`codrl-mj evaluate`."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from codrl_mj.cli.fields import AS_TRAINED, ActuatorFields, ActuatorName, EnvFields, Fields, actuator, environment
+from codrl_mj.cli.subject import Source
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluate:
+    """Measure a trained policy on any actuator: return, success, torque tracking, voltage, energy, heat.
+
+    Example: codrl-mj evaluate runs/cartpole-ppo-ideal-0 --actuator weaker --episodes 100
+    """
+
+    policy: Annotated[
+        tyro.conf.Positional[Path],
+        tyro.conf.arg(help="Run folder; or a folder with a policy alone, or a Stable-Baselines3 zip (see --trust)."),
+    ]
+    source: tyro.conf.OmitArgPrefixes[Source] = Source()
+    actuator_name: ActuatorName = AS_TRAINED
+    actuator_fields: Fields = ActuatorFields()
+    episodes: int = 50
+    """Episodes, each from its own seed."""
+    seed: int = 0
+    """Seed of the first episode; the others count up from it."""
+    stochastic: bool = False
+    """Sample the actions instead of taking the most likely ones."""
+    out: Path | None = None
+    """JSON file for the result."""
+    env: EnvFields = EnvFields()  # type: ignore[valid-type]
+    """The environment."""
+
+    def run(self) -> int:
+        """Evaluate and print a table."""
+        from codrl_mj.evaluation import evaluate
+        from codrl_mj.terminal import print_evaluations, progress_bar
+
+        subject = self.source.load(self.policy)
+        motor = actuator(self.actuator_name, self.actuator_fields, subject.task, subject.actuator)
+        with progress_bar("{task.completed}/{task.total} episodes") as bar:
+            row = bar.add_task("evaluating", total=self.episodes)
+            evaluation = evaluate(
+                subject.policy,
+                subject.task,
+                motor,
+                environment(self.env).seen_as(subject.env),
+                self.episodes,
+                self.seed,
+                not self.stochastic,
+                on_step=lambda _, ended: bar.update(row, completed=ended),
+            )
+        print_evaluations({f"{self.policy.name} on {self.actuator_name}": evaluation})
+        if self.out is not None:
+            from codrl_mj.files import write_json
+
+            write_json(self.out, evaluation.as_mapping())
+            print(f"wrote {self.out}")
+        return 0

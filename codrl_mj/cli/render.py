@@ -1,0 +1,83 @@
+"""`codrl-mj render`."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from codrl_mj.cli.fields import AS_TRAINED, ActuatorFields, ActuatorName, EnvFields, Fields, environment
+from codrl_mj.cli.fields import actuator as chosen_actuator
+from codrl_mj.cli.subject import Source
+from codrl_mj.registration import ENVIRONMENTS
+
+
+@dataclasses.dataclass(frozen=True)
+class Render:
+    """Film one episode: the scene, and a strip of desired and actual torque and the voltage below it.
+
+    Example: codrl-mj render runs/cartpole-ppo-weaker-0 --out balance.mp4, or codrl-mj render cartpole (random actions).
+    """
+
+    subject: Annotated[
+        tyro.conf.Positional[str],
+        tyro.conf.arg(
+            help="Run folder, a folder with a policy alone, or a Stable-Baselines3 zip (see --trust); or a task name "
+            "for random actions."
+        ),
+    ]
+    source: tyro.conf.OmitArgPrefixes[Source] = Source()
+    actuator_name: ActuatorName = AS_TRAINED
+    actuator_fields: Fields = ActuatorFields()
+    seed: int = 0
+    """Seed of the episode."""
+    out: Path = Path("episode.mp4")
+    """File to write: .mp4 (H.264) or .gif; without a suffix, a folder of PNG frames."""
+    trajectory: Path | None = None
+    """File for the episode itself, .npz: time, state, observation, action, reward and every actuator signal."""
+    width: int = 640
+    """Width [px], even."""
+    height: int = 480
+    """Height of the scene [px], even."""
+    camera: str = "fixed"
+    """A camera of the model: fixed or close."""
+    pretty: bool = False
+    """Shadows, reflections and multisampling: slower."""
+    env: EnvFields = EnvFields()  # type: ignore[valid-type]
+    """The environment."""
+
+    def run(self) -> int:
+        """Run the episode and film it."""
+        from codrl_mj.evaluation import RandomPolicy, make_env, run_episodes, save_episode
+        from codrl_mj.policies import Policy
+        from codrl_mj.rendering import Panel, film
+        from codrl_mj.terminal import progress_bar
+
+        if self.subject in ENVIRONMENTS:
+            task, name = self.subject, "paper" if self.actuator_name == AS_TRAINED else self.actuator_name
+            actuator = chosen_actuator(name, self.actuator_fields, task)
+            options = environment(self.env).as_arguments()
+            policy: Policy = RandomPolicy(make_env(task, actuator, **options).action_space, self.seed)
+        else:
+            loaded = self.source.load(Path(self.subject))
+            task, policy, name = loaded.task, loaded.policy, self.actuator_name
+            actuator = chosen_actuator(name, self.actuator_fields, task, loaded.actuator)
+            options = environment(self.env).seen_as(loaded.env).as_arguments()
+        (episode,) = run_episodes(policy, lambda: make_env(task, actuator, **options), 1, self.seed)
+        panel = Panel(f"{Path(self.subject).name} on {name}: return {episode.total:.0f}", task, actuator, episode)
+        with progress_bar("{task.completed}/{task.total} frames") as bar:
+            row = bar.add_task("filming", total=None)
+            film(
+                [panel],
+                self.out,
+                self.width,
+                self.height,
+                self.camera,
+                self.pretty,
+                lambda done, total: bar.update(row, completed=done, total=total),
+            )
+        print(f"wrote {self.out}")
+        if self.trajectory is not None:
+            save_episode(episode, self.trajectory)
+            print(f"wrote {self.trajectory}")
+        return 0

@@ -1,0 +1,226 @@
+"""What to train, on what, for how long: from Python, a YAML file or the command line."""
+
+import dataclasses
+import difflib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from codrl_mj.agents import AgentConfig, agent_from_mapping, check_fits
+from codrl_mj.agents.ppo import PPOConfig
+from codrl_mj.agents.presets import find_preset
+from codrl_mj.disturbances import OFF
+from codrl_mj.env_config import EnvConfig
+from codrl_mj.motor import Actuator, actuator_over, resolve
+from codrl_mj.tasks import find_task
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """What to train, on what, for how long.
+
+    Raises:
+        ValueError: a field is out of bounds, or the agent cannot act in the task; the message says what would do.
+    """
+
+    task: str
+    """Task name, such as `cartpole`."""
+    actuator: str | Actuator | Mapping[str, Any] | None = "paper"
+    """Actuator to train through: a name, an `Actuator`, a mapping of its fields, or None (ideal)."""
+    agent: AgentConfig = PPOConfig()
+    """The agent's settings."""
+    seed: int = 0
+    """Seed of weights, actions and environments, from 0 to 2**32 - 1."""
+    total_steps: int | None = 200_000
+    """Environment steps in all, >= 1; rounded up to whole rollouts. None: until `total_episodes`."""
+    num_envs: int = 8
+    """Environments side by side, >= 1."""
+    env: EnvConfig = EnvConfig()
+    """The environment's other arguments."""
+    total_episodes: int | None = None
+    """Training episodes in all, >= 1, where they and not the steps are counted; None: until `total_steps`."""
+    checkpoint_interval: int = 20_000
+    """Environment steps between two checkpoints, >= 1; the next end of a rollout counts."""
+    evaluation_interval: int = 20_000
+    """Environment steps between two evaluations of the greedy policy, >= 1, of which the best policy is kept."""
+    evaluation_episodes: int = 20
+    """Episodes of each evaluation, >= 1: of the task as Gymnasium poses it, on the actuator trained through."""
+
+    def __post_init__(self) -> None:
+        """Validate, and replace the actuator by the `Actuator` (or None) that it stands for."""
+        task = find_task(self.task)
+        object.__setattr__(self, "actuator", resolve(self.actuator, self.task))
+        for name, kind in (("agent", AgentConfig), ("env", EnvConfig)):
+            if not isinstance(getattr(self, name), kind):
+                raise ValueError(f"TrainConfig.{name} = {getattr(self, name)!r}: must be a {kind.__name__}")
+        check_fits(self.agent.name, task)
+        for name in ("num_envs", "checkpoint_interval", "evaluation_interval", "evaluation_episodes"):
+            self._check_integer(name, 1)
+        self._check_integer("seed", 0, 2**32 - 1)
+        budgets = [name for name in ("total_steps", "total_episodes") if getattr(self, name) is not None]
+        if not budgets:
+            raise ValueError("TrainConfig.total_steps = None: must be an integer >= 1, or total_episodes must be one")
+        for name in budgets:
+            self._check_integer(name, 1)
+
+    def _check_integer(self, name: str, least: int, most: int | None = None) -> None:
+        value = getattr(self, name)
+        whole = isinstance(value, int) and not isinstance(value, bool)
+        if not whole or value < least or (most is not None and value > most):
+            bound = f">= {least}" if most is None else f"from {least} to {most}"
+            raise ValueError(f"TrainConfig.{name} = {value!r}: must be an integer {bound}")
+
+    @classmethod
+    def preset(cls, task: str, agent: str, settings: str = "default", **changes: Any) -> "TrainConfig":
+        """Settings that suit an agent to a task.
+
+        Args:
+            task: task name.
+            agent: the agent's name.
+            settings: `default`; where the paper has this agent, `paper` and, where that fails, `repaired`.
+            **changes: fields to set otherwise.
+
+        Raises:
+            ValueError: there are no such settings, or a field is out of bounds.
+        """
+        check_fits(agent, find_task(task))
+        preset = find_preset(agent, task, settings)
+        chosen = {
+            field.name: getattr(preset, field.name)
+            for field in dataclasses.fields(cls)
+            if hasattr(preset, field.name) and field.name != "task"
+        }
+        return cls(task, **(chosen | changes))
+
+    @property
+    def evaluation_env(self) -> EnvConfig:
+        """What policies are evaluated in: the environment without changes of time limit and reward."""
+        return dataclasses.replace(self.env, max_episode_steps=None, center_radius=None)
+
+    def as_mapping(self) -> dict[str, Any]:
+        """The configuration as JSON-serialisable values; `from_mapping` reads it."""
+        return {**dataclasses.asdict(self), "agent": self.agent.as_mapping()}
+
+    @classmethod
+    def from_mapping(cls, mapping: Mapping[str, Any], whole: bool = False) -> "TrainConfig":
+        """The configuration that a mapping describes: `as_mapping`'s, or any part of it.
+
+        What is not given is the preset's of the given agent (a name, or a mapping with its `name` and fields to set)
+        and the given `settings` (`default` if none is named). `actuator` is a name, a mapping of fields, or both: a
+        mapping with a `name`, over whose fields the others are set.
+
+        Args:
+            mapping: the fields.
+            whole: refuse a mapping that leaves fields out.
+
+        Raises:
+            ValueError: a key is unknown (the message suggests one) or missing, or a value out of bounds.
+        """
+        if not isinstance(mapping, Mapping):
+            raise ValueError(f"not a training configuration: {mapping!r} is no mapping")
+        given = dict(mapping)
+        names = [field.name for field in dataclasses.fields(cls)]
+        _check_keys("", given, [*names, "settings"])
+        missing = [name for name in (names if whole else ["task"]) if name not in given]
+        if missing:
+            raise ValueError(f"not a training configuration: it has no {', '.join(missing)}")
+        task, settings = find_task(given["task"]).name, given.pop("settings", "default")
+        agent = given.pop("agent", None)
+        if isinstance(agent, str) or agent is None:
+            agent = {"name": agent or default_agent(task)}
+        if not isinstance(agent, Mapping) or "name" not in agent:
+            raise ValueError(f"agent = {agent!r}: must be an agent's name, or a mapping with its name and settings")
+        if whole:
+            given["env"] = _env_over(EnvConfig(), given["env"])
+            return cls(agent=agent_from_mapping(agent), **given)
+        base = cls.preset(task, agent["name"], settings)
+        _check_keys("agent.", agent, base.agent.as_mapping())
+        given["agent"] = agent_from_mapping(base.agent.as_mapping() | dict(agent))
+        if "actuator" in given:
+            given["actuator"] = _actuator(given["actuator"], task)
+        if "env" in given:
+            given["env"] = _env_over(base.env, given["env"])
+        return dataclasses.replace(base, **given)
+
+    def differences(self, other: "TrainConfig") -> list[str]:
+        """What differs from another configuration, a line a field."""
+        mine, others = _flat("", self.as_mapping()), _flat("", other.as_mapping())
+        absent = "absent"
+        return [
+            f"{name}: {mine.get(name, absent)!r} and {others.get(name, absent)!r}"
+            for name in dict.fromkeys([*mine, *others])
+            if repr(mine.get(name, absent)) != repr(others.get(name, absent))
+        ]
+
+
+def default_agent(task: str) -> str:
+    """The agent that the paper trains on a task."""
+    return {"pendulum": "ddpg", "mountain_car": "sarsa", "mountain_car_continuous": "ddpg", "acrobot": "dqn"}.get(
+        task, "ppo"
+    )
+
+
+def read_config(path: Path, **overriding: Any) -> TrainConfig:
+    """Read a configuration from a YAML (or JSON) file, as `TrainConfig.from_mapping` understands it.
+
+    Args:
+        path: the file; a run folder's `config.json` will do as well.
+        **overriding: top-level keys to set otherwise; None leaves them.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is not YAML, has an unknown key, or a value out of bounds; the message has the file's name.
+    """
+    import yaml
+
+    if not path.is_file():
+        raise FileNotFoundError(f"no configuration file at {path}")
+    try:
+        content = yaml.safe_load(path.read_text())
+        if isinstance(content, Mapping) and "train" in content:
+            content = content["train"]
+        if isinstance(content, Mapping):
+            content = {**content, **{key: value for key, value in overriding.items() if value is not None}}
+        return TrainConfig.from_mapping(content)
+    except (yaml.YAMLError, UnicodeDecodeError, ValueError, TypeError) as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _actuator(given: Any, task: str) -> Actuator | None:
+    """An actuator of a configuration: `resolve`'s forms, and a mapping of fields over a named one's.
+
+    Raises:
+        ValueError: unknown name or field, or a value out of bounds.
+    """
+    if not isinstance(given, Mapping) or "name" not in given:
+        return resolve(given, task)
+    fields = {key: value for key, value in given.items() if key != "name"}
+    return actuator_over(resolve(given["name"], task), fields)
+
+
+def _env_over(base: EnvConfig, given: Any) -> EnvConfig:
+    if not isinstance(given, Mapping):
+        raise ValueError(f"env = {given!r}: must be a mapping of the environment's arguments")
+    _check_keys("env.", given, [field.name for field in dataclasses.fields(EnvConfig)])
+    fields = dict(given)
+    disturbances = fields.get("disturbances")
+    if isinstance(disturbances, Mapping):
+        _check_keys("env.disturbances.", disturbances, [field.name for field in dataclasses.fields(OFF)])
+        fields["disturbances"] = dataclasses.replace(base.disturbances, **disturbances)
+    return dataclasses.replace(base, **fields)
+
+
+def _check_keys(prefix: str, given: Iterable[Any], known: Iterable[str]) -> None:
+    known = list(known)
+    for key in given:
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, n=1)
+            hint = f"did you mean {prefix}{near[0]}? " if near else ""
+            raise ValueError(f"unknown key {prefix}{key}: {hint}Known keys: {', '.join(known)}")
+
+
+def _flat(prefix: str, mapping: Mapping[str, Any]) -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in mapping.items():
+        flat |= _flat(f"{prefix}{key}.", value) if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return flat

@@ -1,0 +1,117 @@
+"""A run folder: what is in it under which name, what it was made with, and whose it is while it grows."""
+
+import contextlib
+import fcntl
+import functools
+import hashlib
+import importlib.metadata
+import platform
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from codrl_mj.files import read_json, write_json
+from codrl_mj.training.config import TrainConfig
+
+CONFIG, RESULT, EVALUATION = "config.json", "result.json", "evaluation.json"
+PROGRESS, EPISODES, CURVE = "progress.csv", "episodes.csv", "learning_curve.png"
+CHECKPOINTS, BEST, TENSORBOARD, LOCK = "checkpoints", "best", "tensorboard", ".lock"
+
+_PACKAGES = ("codrl-mj", "gymnasium", "mujoco", "numba", "numpy", "stable-baselines3", "torch")
+
+
+def load_config(run: Path) -> TrainConfig:
+    """The configuration of a run folder.
+
+    Raises:
+        FileNotFoundError: the folder is no run folder.
+        ValueError: its configuration is damaged.
+    """
+    content = read_json(run / CONFIG, "run configuration")
+    try:
+        return TrainConfig.from_mapping(content["train"], whole=True)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{run / CONFIG}: not a run configuration: {error}") from None
+
+
+def finished(run: Path) -> bool:
+    """Whether the training of a run folder is finished."""
+    return (run / RESULT).is_file()
+
+
+def start_folder(run: Path, config: TrainConfig) -> None:
+    """Write what the run is, before anything else is in the folder."""
+    write_json(run / CONFIG, {"train": config.as_mapping(), **provenance()})
+
+
+def check_same(run: Path, config: TrainConfig, accept_changes: bool) -> None:
+    """Raise unless a run folder's training can be continued to the result that it would have had uninterrupted.
+
+    Args:
+        run: the run folder.
+        config: what is to be continued.
+        accept_changes: let other code and package versions pass.
+
+    Raises:
+        FileNotFoundError: the folder is no run folder.
+        ValueError: the configuration differs, or code or packages do; the message says what.
+    """
+    differences = load_config(run).differences(config)
+    if differences:
+        raise ValueError(
+            f"{run} was started with another configuration (there, and asked for): {'; '.join(differences)}. A run "
+            "continues as it began: choose another run folder for other settings"
+        )
+    then, now = read_json(run / CONFIG, "run configuration"), provenance()
+    changed = [
+        f"{name} was {then_version}, is {now['versions'].get(name, 'absent')}"
+        for name, then_version in dict(then.get("versions") or {}).items()
+        if now["versions"].get(name) != then_version
+    ]
+    if then.get("code") != now["code"]:
+        changed.append(f"the code of codrl_mj was {str(then.get('code'))[:8]}, is {now['code'][:8]}")
+    if changed and not accept_changes:
+        raise ValueError(
+            f"{run} was started with other software: {'; '.join(changed)}. Its result might differ from that of one "
+            "uninterrupted run: go back to that software, or accept it with --accept-changes"
+        )
+
+
+def provenance() -> dict[str, Any]:
+    """What a run's result depends on besides its configuration: package versions, and a digest of our own code."""
+    versions = {package: importlib.metadata.version(package) for package in _PACKAGES}
+    return {"versions": {"python": platform.python_version(), **versions}, "code": _code_digest()}
+
+
+@functools.cache
+def _code_digest() -> str:
+    """SHA-256 over the package's Python files and models."""
+    from codrl_mj.assets import asset_folder
+
+    package = Path(__file__).parents[1]
+    digest = hashlib.sha256()
+    for root, pattern in ((package, "*.py"), (asset_folder(), "*.xml")):
+        for path in sorted(root.rglob(pattern)):
+            digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+@contextlib.contextmanager
+def owned(run: Path) -> Iterator[None]:
+    """Hold a run folder for oneself while the block runs; the system lets go of it if the process dies.
+
+    Raises:
+        RuntimeError: another process trains in it.
+    """
+    run.mkdir(parents=True, exist_ok=True)
+    with (run / LOCK).open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise RuntimeError(f"{run}: another process is training in it; wait for it, or stop it") from None
+        yield
+
+
+def write_result(run: Path, result: Mapping[str, Any]) -> None:
+    """Write what marks a run as finished."""
+    write_json(run / RESULT, dict(result))

@@ -1,0 +1,99 @@
+"""What happened in a training: a table of episodes and a table of reports."""
+
+import csv
+import dataclasses
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codrl_mj.files import writing
+
+WINDOW = 100
+"""Training episodes that means are taken over."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """Where a training run stands, at the end of a rollout."""
+
+    steps: int
+    """Environment steps so far."""
+    episodes: int
+    """Training episodes that ended so far."""
+    mean_return: float
+    """Mean return of the last 100 training episodes (NaN before the first ends)."""
+    mean_length: float
+    """Mean length of the same episodes [steps]."""
+    torque_error: float
+    """Root mean square of desired minus delivered torque at the motor shaft [N*m] since the last report."""
+    evaluation_return: float
+    """Mean return of the last evaluation (NaN before the first)."""
+    steps_per_second: float
+    """Environment steps per second since training started or was continued."""
+    seconds: float
+    """Wall-clock time spent on the run so far [s], interruptions excluded."""
+
+
+REPORT_COLUMNS = tuple(field.name for field in dataclasses.fields(Progress))
+EPISODE_COLUMNS = ("episode", "steps", "return", "length")
+"""Number of the episode from 1, environment steps of the run when it ended, its return and its length [steps]."""
+
+
+class Table:
+    """A CSV file of numbers that grows row by row, and the rows in memory."""
+
+    def __init__(self, path: Path, columns: Sequence[str], rows: np.ndarray | None = None) -> None:
+        """Write the file anew.
+
+        Args:
+            path: the file.
+            columns: its header.
+            rows: those that are there already, shape (n, columns); what a checkpoint has.
+        """
+        self._columns = columns
+        self._rows: list[tuple[float, ...]] = [] if rows is None else [tuple(row) for row in rows.tolist()]
+        with writing(path) as temporary, temporary.open("w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(columns)
+            writer.writerows(map(_plain, self._rows))
+        self._file = path.open("a", newline="")
+        self._writer = csv.writer(self._file)
+
+    def add(self, row: Iterable[float]) -> None:
+        """Append a row."""
+        self._rows.append(tuple(float(value) for value in row))
+        self._writer.writerow(_plain(self._rows[-1]))
+
+    def flush(self) -> None:
+        """Bring what was added to the file."""
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def __len__(self) -> int:
+        """The number of rows."""
+        return len(self._rows)
+
+    def array(self) -> np.ndarray:
+        """The rows, shape (n, columns)."""
+        return np.array(self._rows, dtype=np.float64).reshape(-1, len(self._columns))
+
+    def last(self, column: str) -> float:
+        """The last row's entry; NaN if there is none."""
+        return self.last_mean(column, 1)
+
+    def last_mean(self, column: str, count: int = WINDOW) -> float:
+        """Mean over the last rows; NaN if there are none."""
+        index = self._columns.index(column)
+        values = [row[index] for row in self._rows[-count:]]
+        return sum(values) / len(values) if values else math.nan
+
+
+def _plain(row: Sequence[float]) -> list[Any]:
+    """Whole numbers as integers, so that a step is not `1000.0`."""
+    return [int(value) if math.isfinite(value) and value == int(value) else value for value in row]

@@ -1,0 +1,170 @@
+"""Runs a training from a configuration to a finished run folder, from the start or from the last checkpoint."""
+
+import contextlib
+import hashlib
+import importlib.util
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from codrl_mj.files import write_json
+from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.training import folder
+from codrl_mj.training.config import TrainConfig
+from codrl_mj.training.history import Progress
+
+
+class TrainingStoppedError(Exception):
+    """A training was asked to stop by a signal; it can be continued."""
+
+    def __init__(self, message: str, signal_number: int) -> None:
+        """Keep the signal, for the exit status."""
+        super().__init__(message)
+        self.signal_number = signal_number
+
+
+class Stop:
+    """Whether a signal has asked to stop."""
+
+    def __init__(self) -> None:
+        """Begin with no signal."""
+        self.signal: int | None = None
+
+
+def train(
+    config: TrainConfig,
+    out: Path,
+    on_progress: Callable[[Progress], None] | None = None,
+    resume: bool = False,
+    accept_changes: bool = False,
+    tensorboard: bool = True,
+    wandb: str | None = None,
+) -> Path:
+    """Train an agent and leave a run folder; or continue one.
+
+    The folder grows while the agent trains: `config.json` (resolved configuration, versions, digest of the code),
+    `progress.csv` and `episodes.csv`, `checkpoints/`, `best/` (the policy of the best evaluation), TensorBoard's
+    events; at the end come `policy.safetensors` and `policy.json` (the last policy), `evaluation.json`,
+    `learning_curve.png` and, last, `result.json`, which marks the run as finished.
+
+    SIGINT (Ctrl-C) and SIGTERM let the rollout end, write a checkpoint and stop; a second Ctrl-C stops at once.
+
+    Args:
+        config: what to train.
+        out: the run folder.
+        on_progress: called at the ends of rollouts.
+        resume: continue the run if `out` has one, from its last checkpoint that is intact, to the very result that an
+            uninterrupted run has; start it if there is none, and return if it is finished.
+        accept_changes: continue even if code or package versions differ from those it was started with.
+        tensorboard: write events for TensorBoard, if it is installed.
+        wandb: name of a Weights & Biases project to report to as well.
+
+    Returns:
+        `out`.
+
+    Raises:
+        FileExistsError: `out` exists and `resume` is False; nothing in it was touched.
+        ValueError: the configuration cannot be trained, for instance because the actuator is unstable; or the run in
+            `out` has another one, or was started with other software.
+        RuntimeError: another process trains in `out`.
+        TrainingStoppedError: a signal asked to stop.
+    """
+    exists = (out / folder.CONFIG).exists()
+    if out.exists() and not (resume and (exists or not any(out.iterdir()))):
+        remedy = "continue it with --resume, " if exists and not folder.finished(out) else ""
+        raise FileExistsError(f"run folder {out} exists already: {remedy}choose another --out, or delete it")
+    if exists:
+        folder.check_same(out, config, accept_changes)
+        if folder.finished(out):
+            return out
+    if wandb is not None and importlib.util.find_spec("wandb") is None:
+        raise ValueError(f"wandb = {wandb!r}: Weights & Biases is not installed: pip install wandb")
+    import torch
+
+    from codrl_mj.training import curve  # noqa: F401 - what is missing is missed now and not in the end
+    from codrl_mj.training.watcher import Watcher
+
+    torch.set_num_threads(1)  # networks this small run several times slower on two
+    with contextlib.closing(_make_envs(config)) as envs:
+        model = config.agent.make_model(envs, config.seed)
+        with folder.owned(out), _stopping() as stop, _reporting_to(wandb, out, config):
+            if not exists:
+                folder.start_folder(out, config)
+            watcher = Watcher(config, out, stop, on_progress, tensorboard)
+            with contextlib.closing(watcher):
+                model.learn(_step_limit(config), callback=watcher, log_interval=None)
+                if stop.signal is not None and not watcher.complete:
+                    raise TrainingStoppedError(
+                        f"stopped after {watcher.saved_steps:,} steps: continue with codrl-mj train --resume {out}",
+                        stop.signal,
+                    )
+                _finish(config, out, model, watcher)
+    return out
+
+
+def _make_envs(config: TrainConfig) -> Any:
+    """The environments as one Stable-Baselines3 `VecEnv`."""
+    from codrl_mj.envs.sb3 import make_sb3_vec_env
+
+    env_id, arguments = ENVIRONMENTS[config.task].env_id, config.env.as_arguments()
+    return make_sb3_vec_env(env_id, config.num_envs, actuator=config.actuator, **arguments)
+
+
+def _step_limit(config: TrainConfig) -> int:
+    """Steps after which training ends at the latest: those of the longest possible episodes where these are counted."""
+    if config.total_steps is not None:
+        return config.total_steps
+    assert config.total_episodes is not None
+    longest = config.env.max_episode_steps or ENVIRONMENTS[config.task].max_episode_steps
+    return config.total_episodes * longest * config.num_envs
+
+
+def _finish(config: TrainConfig, out: Path, model: Any, watcher: Any) -> None:
+    from codrl_mj.policies import save_policy
+    from codrl_mj.training.curve import draw_learning_curve
+
+    watcher.boundary(last=True)
+    save_policy(model.policy, config.agent, out)
+    write_json(out / folder.EVALUATION, watcher.evaluation.as_mapping())
+    draw_learning_curve(out / folder.CURVE, config, watcher.episodes.array(), watcher.reports.array())
+    folder.write_result(out, watcher.result())
+
+
+@contextlib.contextmanager
+def _stopping() -> Iterator[Stop]:
+    """Turn the first SIGINT or SIGTERM within the block into a wish; a second SIGINT raises KeyboardInterrupt."""
+    stop = Stop()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop  # only the main thread may handle signals
+        return
+
+    def wish(number: int, _: Any) -> None:
+        if stop.signal is not None and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        stop.signal = number
+
+    before = {number: signal.signal(number, wish) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _reporting_to(wandb_project: str | None, out: Path, config: TrainConfig) -> contextlib.AbstractContextManager[Any]:
+    """A context in which Weights & Biases gets what goes to TensorBoard."""
+    if wandb_project is None:
+        return contextlib.nullcontext()
+    import wandb
+
+    return wandb.init(
+        project=wandb_project,
+        name=out.name,
+        dir=out,
+        config=config.as_mapping(),
+        sync_tensorboard=True,
+        id=hashlib.sha256(str(out.resolve()).encode()).hexdigest()[:16],  # a continued run goes on there
+        resume="allow",
+    )

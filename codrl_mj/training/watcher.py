@@ -1,0 +1,210 @@
+"""Watches a model learn: records, reports, evaluates, writes checkpoints, and stops it."""
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import KVWriter, Logger
+
+from codrl_mj.evaluation import Evaluation, evaluate
+from codrl_mj.files import write_json
+from codrl_mj.policies import save_policy
+from codrl_mj.training import folder
+from codrl_mj.training.checkpoint import load_checkpoint, save_checkpoint
+from codrl_mj.training.config import TrainConfig
+from codrl_mj.training.history import EPISODE_COLUMNS, REPORT_COLUMNS, Progress, Table
+from codrl_mj.training.state import State, capture, restore
+
+REPORT_INTERVAL = 1000
+"""Environment steps between two reports; the next end of a rollout counts."""
+EVALUATION_SEED = 1_000_000
+"""Seed of the first evaluation episode, away from those that trainings start from."""
+
+
+class Watcher(BaseCallback):
+    """The callback of every training run; what it does, it does between two rollouts."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        out: Path,
+        stop: Any,
+        on_progress: Callable[[Progress], None] | None,
+        tensorboard: bool,
+    ) -> None:
+        """Prepare.
+
+        Args:
+            config: what is trained.
+            out: the run folder.
+            stop: its `signal` is a signal's number once the training is to stop.
+            on_progress: called with every report.
+            tensorboard: write events for TensorBoard, if it is installed.
+        """
+        super().__init__()
+        self._config, self._out, self._stop, self._on_progress = config, out, stop, on_progress
+        self._tensorboard = tensorboard
+        self._arm = 1.0 if config.actuator is None else config.actuator.motor.arm_radius  # type: ignore[union-attr]
+        self._marks = {"report": 0, "evaluation": 0, "checkpoint": 0}
+        self._squares, self._samples = 0.0, 0  # of the torque error since the last report
+        self._best = {"return": -math.inf, "steps": 0}
+        self._evaluation_return = math.nan
+        self._seconds_before, self._steps_before, self._start = 0.0, 0, time.perf_counter()
+        self._leave = False
+        self.saved_steps = 0
+        self.evaluation: Evaluation | None = None
+
+    # -- the callback -------------------------------------------------------------------------------------
+
+    def _on_training_start(self) -> None:
+        """Continue from the last checkpoint, now that the model has set itself up to start from nothing."""
+        state = load_checkpoint(self._out / folder.CHECKPOINTS)
+        rows: dict[str, np.ndarray | None] = {"episodes": None, "reports": None}
+        if state is not None:
+            rows = {name: state.arrays[f"watch.{name}"] for name in rows}
+            for name, value in state.facts["watch"].items():
+                setattr(self, f"_{name}", value)
+            restore(self.model, self.training_env, state)
+            self.saved_steps = self._steps_before = self.model.num_timesteps
+            self.num_timesteps = self.model.num_timesteps
+        self.episodes = Table(self._out / folder.EPISODES, EPISODE_COLUMNS, rows["episodes"])
+        self.reports = Table(self._out / folder.PROGRESS, REPORT_COLUMNS, rows["reports"])
+        self.model.set_logger(Logger(str(self._out), self._writers()))
+        self._start = time.perf_counter()
+
+    def _writers(self) -> list[KVWriter]:
+        if not self._tensorboard:
+            return []
+        try:
+            from stable_baselines3.common.logger import TensorBoardOutputFormat
+
+            return [TensorBoardOutputFormat(str(self._out / folder.TENSORBOARD))]
+        except (AssertionError, ImportError):  # TensorBoard is not installed
+            return []
+
+    def _on_rollout_start(self) -> None:
+        self.boundary()
+
+    def _on_step(self) -> bool:
+        signals = self.training_env.signals  # type: ignore[attr-defined]
+        if signals is not None:
+            errors = np.subtract(signals.desired_force, signals.actual_force)
+            self._squares += float(np.dot(errors, errors))
+            self._samples += errors.size
+        for info in self.locals["infos"]:
+            if "episode" in info:
+                episode = info["episode"]
+                self.episodes.add((len(self.episodes) + 1, self.num_timesteps, episode["r"], episode["l"]))
+        return not (self._leave or self._episodes_done)
+
+    @property
+    def _episodes_done(self) -> bool:
+        return self._config.total_episodes is not None and len(self.episodes) >= self._config.total_episodes
+
+    @property
+    def complete(self) -> bool:
+        """Whether the training has used its budget up."""
+        steps = self._config.total_steps
+        return self._episodes_done or (steps is not None and self.model.num_timesteps >= steps)
+
+    # -- between two rollouts -----------------------------------------------------------------------------
+
+    def boundary(self, last: bool = False) -> None:
+        """Report, evaluate and write a checkpoint, whichever is due.
+
+        Args:
+            last: the training is complete: all are due.
+        """
+        self._leave = self._stop.signal is not None
+        if self.model.num_timesteps == 0:
+            return
+        if self._due("evaluation", self._config.evaluation_interval) or last:
+            self._evaluate()
+        if self._due("report", REPORT_INTERVAL) or last:
+            self._report()
+        if self._due("checkpoint", self._config.checkpoint_interval) or last or self._leave:
+            self._save()
+
+    def _due(self, what: str, interval: int) -> bool:
+        mark = self.model.num_timesteps // interval
+        due = mark > self._marks[what]
+        self._marks[what] = mark
+        return due
+
+    def _evaluate(self) -> None:
+        config = self._config
+        self.evaluation = evaluate(
+            self.model.policy,
+            config.task,
+            config.actuator,
+            config.evaluation_env,
+            config.evaluation_episodes,
+            EVALUATION_SEED,
+        )
+        self._evaluation_return = self.evaluation.returns.mean
+        if self._evaluation_return > self._best["return"]:
+            self._best = {"return": self._evaluation_return, "steps": self.model.num_timesteps}
+            best = self._out / folder.BEST
+            save_policy(self.model.policy, config.agent, best)
+            write_json(best / folder.EVALUATION, self.evaluation.as_mapping())
+
+    def _report(self) -> None:
+        if self.reports.last("steps") == self.model.num_timesteps:
+            return  # killed after the last report, before the run was marked as finished
+        elapsed = time.perf_counter() - self._start
+        progress = Progress(
+            steps=self.model.num_timesteps,
+            episodes=len(self.episodes),
+            mean_return=self.episodes.last_mean("return"),
+            mean_length=self.episodes.last_mean("length"),
+            torque_error=self._arm * math.sqrt(self._squares / self._samples) if self._samples else math.nan,
+            evaluation_return=self._evaluation_return,
+            steps_per_second=(self.model.num_timesteps - self._steps_before) / elapsed,
+            seconds=self._seconds_before + elapsed,
+        )
+        self._squares, self._samples = 0.0, 0
+        self.reports.add(getattr(progress, name) for name in REPORT_COLUMNS)
+        self.reports.flush()
+        self.episodes.flush()
+        for name in REPORT_COLUMNS[1:]:
+            self.logger.record(f"run/{name}", getattr(progress, name))
+        self.logger.dump(self.model.num_timesteps)
+        if self._on_progress is not None:
+            self._on_progress(progress)
+
+    def _save(self) -> None:
+        arrays, facts = capture(self.model, self.training_env)
+        watch = {
+            "marks": self._marks,
+            "squares": self._squares,
+            "samples": self._samples,
+            "best": self._best,
+            "evaluation_return": self._evaluation_return,
+            "seconds_before": self._seconds_before + time.perf_counter() - self._start,
+        }
+        tables = {"watch.episodes": self.episodes.array(), "watch.reports": self.reports.array()}
+        save_checkpoint(self._out / folder.CHECKPOINTS, State(arrays | tables, facts | {"watch": watch}))
+        self.saved_steps = self.model.num_timesteps
+
+    def result(self) -> dict[str, Any]:
+        """What a finished run came to."""
+        return {
+            "steps": self.model.num_timesteps,
+            "episodes": len(self.episodes),
+            "mean_return": self.episodes.last_mean("return"),
+            "evaluation_return": self._evaluation_return,
+            "best": self._best,
+            "seconds": self._seconds_before + time.perf_counter() - self._start,
+        }
+
+    def close(self) -> None:
+        """Close the files."""
+        for name in ("episodes", "reports"):
+            if hasattr(self, name):
+                getattr(self, name).close()
+        if self.model is not None and hasattr(self.model, "_logger"):
+            self.logger.close()

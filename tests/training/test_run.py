@@ -1,0 +1,257 @@
+"""A training from start to end: it learns, a seed repeats, the run folder has what is documented."""
+
+import contextlib
+import csv
+import dataclasses
+import json
+import platform
+import sys
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from safetensors.torch import load_file
+
+from codrl_mj import Actuator, CurrentLoop, Motor
+from codrl_mj.agents import PPOConfig
+from codrl_mj.env_config import EnvConfig
+from codrl_mj.evaluation import RandomPolicy, evaluate, make_env, run_episodes
+from codrl_mj.policies import load_policy
+from codrl_mj.training import TrainConfig, load_config, train
+
+TINY_PPO = PPOConfig(rollout_steps=256, batch_size=64, epochs=2, hidden=(8, 8))
+TINY = TrainConfig("cartpole", "weaker", TINY_PPO, 1, 1000, num_envs=4, env=EnvConfig(center_radius=0.1))
+UNSTABLE = Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=100.0))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A tiny run, and the progress that it reported."""
+    reports = []
+    out = train(TINY, tmp_path_factory.mktemp("runs") / "a" / "run", reports.append)
+    return out, reports
+
+
+def same_weights(first, second):
+    weights = [load_file(folder / "policy.safetensors") for folder in (first, second)]
+    assert weights[0].keys() == weights[1].keys()
+    return all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
+
+
+def mean_return(policy, actuator, episodes=20):
+    return np.mean([e.total for e in run_episodes(policy, lambda: make_env("cartpole", actuator), episodes, seed=1000)])
+
+
+# -- learning -----------------------------------------------------------------------------------------------
+
+
+def test_ppo_learns_to_balance(tmp_path):
+    ppo = PPOConfig(rollout_steps=1024, batch_size=128, learning_rate=3e-3, hidden=(32, 32))
+    config = TrainConfig("cartpole", "ideal", ppo, seed=0, total_steps=16_000)
+    out = train(config, tmp_path / "run")
+    assert mean_return(RandomPolicy("cartpole"), "ideal") < 40
+    assert mean_return(load_policy(out), "ideal") > 400
+
+
+def test_the_same_seed_gives_the_same_weights_and_another_seed_others(run, tmp_path):
+    out, _ = run
+    torch.manual_seed(99)  # what the process drew before does not matter
+    np.random.seed(99)
+    assert same_weights(out, train(TINY, tmp_path / "again"))
+    assert not same_weights(out, train(dataclasses.replace(TINY, seed=2), tmp_path / "other"))
+
+
+def test_the_actuator_and_the_task_option_reach_the_training(run, tmp_path):
+    out, _ = run
+    assert not same_weights(out, train(dataclasses.replace(TINY, actuator="ideal"), tmp_path / "ideal"))
+    free = train(dataclasses.replace(TINY, env=EnvConfig()), tmp_path / "free")
+    assert not same_weights(out, free)
+
+
+def test_training_uses_one_thread_even_where_torch_had_more(tmp_path):
+    torch.set_num_threads(2)
+    train(TINY, tmp_path / "run")
+    assert torch.get_num_threads() == 1
+
+
+# -- the run folder -----------------------------------------------------------------------------------------
+
+
+def test_the_run_folder_has_what_is_documented(run):
+    out, _ = run
+    folders = {"best", "checkpoints", "tensorboard"}
+    tables = {"progress.csv", "episodes.csv"}
+    files = {"config.json", "evaluation.json", "result.json", "learning_curve.png", "policy.json", "policy.safetensors"}
+    assert {path.name for path in out.iterdir()} == {".lock", *folders, *tables, *files}
+    assert {path.name for path in (out / "best").iterdir()} == {"evaluation.json", "policy.json", "policy.safetensors"}
+    with Image.open(out / "learning_curve.png") as image:
+        assert image.size == (900, 525)
+        assert len(image.convert("RGB").getcolors(100_000)) > 10  # something is drawn
+
+
+def test_the_configuration_records_what_was_resolved_and_the_versions(run):
+    out, _ = run
+    content = json.loads((out / "config.json").read_text())
+    assert content["train"]["actuator"]["controller"]["kp"] == 0.2
+    assert content["train"]["actuator"]["motor"]["arm_radius"] == 0.15
+    assert content["train"]["env"]["center_radius"] == 0.1
+    assert content["train"]["agent"]["rollout_steps"] == 256
+    assert content["train"]["agent"]["name"] == "ppo"
+    assert content["versions"]["numpy"] == np.__version__
+    assert content["versions"]["python"] == platform.python_version()
+    assert len(content["code"]) == 64
+    assert load_config(out) == TINY
+
+
+def read_csv(path):
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_progress_is_reported_and_written_at_the_ends_of_rollouts(run):
+    out, reports = run
+    assert [report.steps for report in reports] == [1024]  # 1000 rounded up to whole rollouts
+    (row,) = read_csv(out / "progress.csv")
+    (report,) = reports
+    assert row.keys() == {field.name for field in dataclasses.fields(report)}
+    for name, value in row.items():
+        assert float(value) == getattr(report, name)
+    assert 0 <= report.mean_return <= report.mean_length  # at most 1 a step, nothing beyond the radius
+    assert 8 <= report.mean_length <= 100
+    assert report.torque_error > 0
+    assert report.steps_per_second > 0
+    assert report.seconds > 0
+
+
+def test_every_episode_is_in_the_table(run):
+    out, (report,) = run
+    rows = read_csv(out / "episodes.csv")
+    assert [int(row["episode"]) for row in rows] == list(range(1, report.episodes + 1))
+    steps = [int(row["steps"]) for row in rows]
+    assert steps == sorted(steps)
+    assert steps[-1] <= report.steps
+    last = [float(row["return"]) for row in rows[-100:]]
+    assert report.mean_return == pytest.approx(np.mean(last), rel=1e-12)
+    lengths = sum(int(row["length"]) for row in rows)
+    assert report.steps - TINY.num_envs * 500 < lengths <= report.steps  # the rest is in episodes that go on
+
+
+def test_the_result_and_the_evaluation_agree_with_an_evaluation_of_the_saved_policy(run):
+    out, (report,) = run
+    result, evaluation = (json.loads((out / f"{name}.json").read_text()) for name in ("result", "evaluation"))
+    anew = evaluate(load_policy(out), "cartpole", "weaker", episodes=20, seed=1_000_000)
+    assert evaluation["returns"]["mean"] == anew.returns.mean == result["evaluation_return"]
+    assert result["steps"] == report.steps
+    assert result["episodes"] == report.episodes
+    assert result["best"] == {"return": anew.returns.mean, "steps": 1024}  # the only evaluation
+
+
+def test_the_best_policy_is_kept_though_a_worse_one_comes_last(tmp_path):
+    ppo = dataclasses.replace(TINY_PPO, learning_rate=0.05)  # unsteady
+    config = dataclasses.replace(TINY, agent=ppo, total_steps=6000, evaluation_interval=256, evaluation_episodes=5)
+    out = train(config, tmp_path / "run")
+    evaluations = [float(row["evaluation_return"]) for row in read_csv(out / "progress.csv")]
+    result = json.loads((out / "result.json").read_text())
+    assert result["best"]["return"] >= max(evaluations) > result["evaluation_return"]
+    best = evaluate(load_policy(out / "best"), "cartpole", "weaker", episodes=5, seed=1_000_000)
+    assert best.returns.mean == result["best"]["return"]
+
+
+def test_tensorboard_gets_returns_and_losses(run):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    out, (report,) = run
+    events = EventAccumulator(str(out / "tensorboard"))
+    events.Reload()
+    (scalar,) = events.Scalars("run/mean_return")
+    assert scalar.step == report.steps
+    assert scalar.value == pytest.approx(report.mean_return, rel=1e-6)
+    assert "train/value_loss" in events.Tags()["scalars"]
+
+
+def test_without_tensorboard_there_are_no_events(tmp_path, monkeypatch):
+    assert not (train(TINY, tmp_path / "run", tensorboard=False) / "tensorboard").exists()
+    monkeypatch.setattr("stable_baselines3.common.logger.SummaryWriter", None)  # as if it were not installed
+    assert (train(TINY, tmp_path / "other") / "result.json").exists()
+
+
+def test_weights_and_biases_gets_the_configuration(tmp_path, monkeypatch):
+    calls = []
+
+    @contextlib.contextmanager
+    def init(**arguments):
+        calls.append(arguments)
+        yield
+
+    fake = ModuleType("wandb")
+    fake.init, fake.__spec__ = init, ModuleSpec("wandb", None)
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+    train(TINY, tmp_path / "run", wandb="motors")
+    ((project, name, config),) = [(call["project"], call["name"], call["config"]) for call in calls]
+    assert (project, name, config) == ("motors", "run", TINY.as_mapping())
+    monkeypatch.delitem(sys.modules, "wandb")
+    with pytest.raises(ValueError, match="pip install wandb"):
+        train(TINY, tmp_path / "other", wandb="motors")
+    assert not (tmp_path / "other").exists()
+
+
+def test_episodes_can_be_counted_instead_of_steps(tmp_path):
+    config = dataclasses.replace(TINY, total_steps=None, total_episodes=30, num_envs=1)
+    out = train(config, tmp_path / "run")
+    assert len(read_csv(out / "episodes.csv")) == 30
+    assert json.loads((out / "result.json").read_text())["episodes"] == 30
+
+
+def test_the_saved_policy_plays(run):
+    out, _ = run
+    assert 8 <= mean_return(load_policy(out), "weaker", episodes=3) <= 500
+
+
+# -- refusals -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("holds", ["a file", "nothing"])
+def test_an_existing_folder_is_refused_and_untouched(tmp_path, holds):
+    out = tmp_path / "run"
+    out.mkdir()
+    if holds == "a file":
+        (out / "precious.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match="exists already") as caught:
+        train(TINY, out)
+    assert str(out) in str(caught.value)
+    assert [path.read_text() for path in out.iterdir()] == (["mine"] if holds == "a file" else [])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"actuator": UNSTABLE}, "spectral radius"),
+        ({"agent": dataclasses.replace(TINY_PPO, rollout_steps=258)}, "multiple of num_envs = 4"),
+        ({"agent": dataclasses.replace(TINY_PPO, batch_size=96)}, "multiple of batch_size = 96"),
+        ({"env": EnvConfig(integrator="rk4")}, "integrator = 'rk4'"),
+        ({"env": EnvConfig(inner_steps=0)}, "inner_steps = 0"),
+        ({"env": EnvConfig(center_radius=-1.0)}, "center_radius = -1.0"),
+        ({"env": EnvConfig(physics="newton")}, "physics = 'newton'"),
+        ({"task": "pendulum", "actuator": None}, "center_radius"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused_with_nothing_written(tmp_path, changes, message):
+    config = dataclasses.replace(TINY, **changes)
+    with pytest.raises(ValueError, match=message):
+        train(config, tmp_path / "runs" / "run")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unstable_actuator_can_be_trained_on_when_allowed(tmp_path):
+    config = dataclasses.replace(TINY, actuator=UNSTABLE, env=EnvConfig(allow_unstable=True, inner_steps=1))
+    assert (train(config, tmp_path / "run") / "policy.safetensors").is_file()
+
+
+def test_a_folder_that_cannot_be_made_is_named_before_training(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(OSError, match="file"):
+        train(TINY, tmp_path / "file" / "run", lambda _: pytest.fail("it trained"))
+    assert (tmp_path / "file").read_text() == "in the way"
