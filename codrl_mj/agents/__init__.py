@@ -8,11 +8,12 @@ from codrl_mj.agents.ddpg import DDPGConfig
 from codrl_mj.agents.dqn import DQNConfig
 from codrl_mj.agents.ppo import PPOConfig
 from codrl_mj.agents.sac import SACConfig
+from codrl_mj.agents.sarsa import SARSAConfig
 from codrl_mj.agents.td3 import TD3Config
 from codrl_mj.tasks import Task
 
 AGENTS: dict[str, type[AgentConfig]] = {
-    config.name: config for config in (PPOConfig, DDPGConfig, DQNConfig, TD3Config, SACConfig)
+    config.name: config for config in (PPOConfig, DDPGConfig, DQNConfig, TD3Config, SACConfig, SARSAConfig)
 }
 """Every agent's settings by the agent's name."""
 
@@ -23,6 +24,7 @@ __all__ = [
     "DQNConfig",
     "PPOConfig",
     "SACConfig",
+    "SARSAConfig",
     "TD3Config",
     "agent_from_mapping",
     "check_fits",

@@ -3,7 +3,7 @@
 One module an agent. What the numbers gave, in training and in test, is in docs/agents.md.
 """
 
-from codrl_mj.agents.presets import ddpg, dqn, ppo, sac, td3
+from codrl_mj.agents.presets import ddpg, dqn, ppo, sac, sarsa, td3
 from codrl_mj.agents.presets.preset import Preset
 
 __all__ = ["PRESETS", "SETTINGS", "Preset", "find_preset"]
@@ -13,7 +13,7 @@ SETTINGS = ("default", "paper", "repaired")
 
 PRESETS: dict[tuple[str, str], dict[str, Preset]] = {
     (agent.__name__.rpartition(".")[2], task): named
-    for agent in (ppo, ddpg, dqn, td3, sac)
+    for agent in (ppo, ddpg, dqn, td3, sac, sarsa)
     for task, named in agent.PRESETS.items()
 }
 """(agent, task) -> name of the settings -> the settings."""

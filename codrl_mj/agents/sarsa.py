@@ -1,0 +1,79 @@
+"""SARSA: episodic semi-gradient SARSA with tile coding."""
+
+import dataclasses
+from typing import Any, ClassVar
+
+from gymnasium import spaces
+
+from codrl_mj.agents.base import AgentConfig
+from codrl_mj.agents.bounds import integer, real, reals, units
+
+
+@dataclasses.dataclass(frozen=True)
+class SARSAConfig(AgentConfig):
+    """Episodic semi-gradient SARSA with tile coding, after Sutton and Barto (2018), sections 9.5.4 and 10.1.
+
+    The defaults are the paper's: 8 tilings of 9 x 9 tiles for 3 actions, 1944 weights. Tiles cover as many leading
+    entries of the observation as there are `intervals`, where an angle counts as one; the entries behind, such as those
+    that `observe_actuator` appends, are ignored unless `intervals`, `low` and `high` are given for them as well.
+    Entries outside their bounds lie in the outer tiles.
+    """
+
+    name: ClassVar[str] = "sarsa"
+    action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (spaces.Discrete,)
+
+    step_size: float = real(0.0375, above=0)
+    """alpha of each weight, > 0; 1/tilings would set an estimate to its target at once. The paper: 0.0375."""
+    gamma: float = real(1.0, above=0, most=1)
+    """Discount factor, in (0, 1]. The paper: 1."""
+    epsilon: float = real(0.001, least=0, most=1)
+    """Probability of a random action in the first episode, in [0, 1]. The paper: 0.001."""
+    epsilon_decay: float = real(1.0, above=0, most=1)
+    """Factor on epsilon from one episode to the next, in (0, 1]. The paper: 1."""
+    trace_decay: float = real(0.0, least=0, most=1)
+    """lambda of replacing traces, in [0, 1]. The paper: 0, no traces."""
+    tilings: int = integer(8, least=1)
+    """Grids of tiles, a power of 2. The paper: 8."""
+    intervals: tuple[int, ...] = units((8, 8))
+    """Tiles from bound to bound, >= 1, of each angle and then of each further entry that is tiled. The paper: 8, 8."""
+    angles: int = integer(0, least=0)
+    """Pairs of cosine and sine with which the observation begins, each tiled as the angle that it is (Acrobot: 2)."""
+    low: tuple[float, ...] | None = reals()
+    """Lower bounds of the tiled entries that are no angles; none: the observation space's."""
+    high: tuple[float, ...] | None = reals()
+    """Their upper bounds."""
+    initial_value: float = real(0.0)
+    """Return expected of every action before it was tried; optimistic, it makes the agent try all. The paper: 0, with
+    rewards of -1."""
+
+    def make_model(self, env: Any, seed: int) -> Any:
+        """See `AgentConfig.make_model`.
+
+        Raises:
+            ValueError: there is more than one environment, or its observations or actions do not go with the tiles.
+        """
+        from codrl_mj.agents.sarsa_algorithm import SARSA, TileCodingPolicy
+
+        return SARSA(
+            TileCodingPolicy,
+            env,
+            step_size=self.step_size,
+            gamma=self.gamma,
+            epsilon=self.epsilon,
+            epsilon_decay=self.epsilon_decay,
+            trace_decay=self.trace_decay,
+            policy_kwargs=self._policy_arguments(),
+            seed=seed,
+        )
+
+    def make_policy(self, observation_space: spaces.Box, action_space: spaces.Space[Any]) -> Any:
+        """See `AgentConfig.make_policy`."""
+        from codrl_mj.agents.sarsa_algorithm import TileCodingPolicy
+
+        return TileCodingPolicy(observation_space, action_space, **self._policy_arguments())
+
+    def _policy_arguments(self) -> dict[str, Any]:
+        return {
+            name: getattr(self, name)
+            for name in ("tilings", "intervals", "angles", "low", "high", "initial_value", "epsilon")
+        }

@@ -1,0 +1,350 @@
+"""SARSA against Sutton and Barto's box computed by hand, as an algorithm of Stable-Baselines3, and as a learner."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CheckpointCallback,
+    EvalCallback,
+    EveryNTimesteps,
+    StopTrainingOnMaxEpisodes,
+)
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import configure
+
+import codrl_mj
+from codrl_mj.agents import find_agent
+from codrl_mj.agents.presets import PRESETS
+from codrl_mj.agents.sarsa import SARSAConfig
+from codrl_mj.agents.sarsa_algorithm import SARSA, TileCodingPolicy
+from codrl_mj.agents.sarsa_kernels import FORGOTTEN
+from codrl_mj.policies import load_policy, save_policy
+from codrl_mj.tasks import find_task
+
+TABLE = {"tilings": 1, "intervals": (2,)}  # of a chain of 3 states: one tile for each
+
+
+class Chain(gymnasium.Env):
+    """States 0, 1, 2: action 1 moves on and, from the last, out; action 0 stays. -1 a step."""
+
+    observation_space = spaces.Box(0.0, 2.0, (1,))
+
+    def __init__(self, actions=2):  # noqa: D107
+        self.action_space = spaces.Discrete(actions)
+        self.history = []
+
+    def reset(self, *, seed=None, options=None):  # noqa: ARG002
+        super().reset(seed=seed)
+        self.state = 0
+        self.history.append([])
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.history[-1].append((self.state, int(action)))
+        self.state += int(action)
+        return np.full(1, min(self.state, 2), np.float32), -1.0, self.state == 3, False, {}
+
+
+def _table(model):
+    return model.policy.state_dict()["weights"].numpy().copy()
+
+
+# -- the updates ----------------------------------------------------------------------------------------------
+
+
+def test_it_finds_the_values_of_a_chain():
+    """Greedily the way out takes 3, 2, 1 steps; the other action was given up where it seemed no better."""
+    model = SARSA(TileCodingPolicy, Chain(), step_size=0.5, epsilon=0.0, policy_kwargs=TABLE, seed=0).learn(2000)
+    values = _table(model)
+    np.testing.assert_allclose(values[:, 1], [-3, -2, -1], atol=1e-9)
+    assert (values[:, 0] <= values[:, 1]).all()
+    actions, _ = model.predict(np.array([[0.0], [1.0], [2.0]], np.float32), deterministic=True)
+    assert actions.tolist() == [1, 1, 1]
+
+
+@pytest.mark.parametrize("trace_decay", [0.0, 0.8])
+def test_it_does_what_the_box_says(trace_decay):
+    """The weights are those that the box (10.1; 12.7 with replacing traces) computes from what was done."""
+    step_size, gamma = 0.3, 0.9
+    env = Chain()
+    model = SARSA(
+        TileCodingPolicy, env, step_size, gamma, epsilon=0.5, trace_decay=trace_decay, policy_kwargs=TABLE, seed=3
+    )
+    model.learn(60)
+    values = np.zeros((3, 2))
+    for episode in env.history[:-1]:  # the last one was only begun
+        traces = np.zeros((3, 2))
+        for done, then in zip(episode, [*episode[1:], None], strict=True):
+            target = -1.0 + (0.0 if then is None else gamma * values[then])
+            error = target - values[done]
+            traces *= gamma * trace_decay
+            traces[traces < FORGOTTEN] = 0.0
+            traces[done] = 1.0
+            values += step_size * error * traces
+    assert len(env.history) > 5
+    np.testing.assert_allclose(_table(model), values, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("limit", "value"), [(1, -10.0), (3, -10.0)])
+def test_a_time_limit_is_no_end(limit, value):
+    """Staying for ever is worth -1/(1 - gamma), however short the episodes."""
+    env = TimeLimit(Chain(), limit)
+    env.action_space = spaces.Discrete(1)
+    model = SARSA(TileCodingPolicy, env, step_size=0.5, gamma=0.9, policy_kwargs=TABLE, seed=0).learn(600)
+    assert _table(model)[0, 0] == pytest.approx(value)
+
+
+def test_every_weight_starts_at_its_share_of_the_initial_value():
+    policy = SARSAConfig(initial_value=40.0).make_policy(
+        find_task("mountain_car").observation_space, spaces.Discrete(3)
+    )
+    np.testing.assert_array_equal(policy.table, np.full((648, 3), 5.0))
+
+
+def test_equally_good_actions_are_chosen_alike_and_a_greedy_policy_takes_the_first():
+    env = Chain(actions=4)
+    env.step = lambda action: (env.history[-1].append(action), (np.zeros(1, np.float32), 0.0, True, False, {}))[1]
+    model = SARSA(TileCodingPolicy, env, epsilon=0.0, policy_kwargs=TABLE, seed=0).learn(4000)
+    counts = np.bincount([int(episode[0]) for episode in env.history if episode], minlength=4)
+    assert counts.sum() == 4000
+    assert abs(counts - 1000).max() < 5 * np.sqrt(4000 * 0.25 * 0.75)
+    assert model.predict(np.zeros(1, np.float32), deterministic=True)[0] == 0
+
+
+def test_epsilon_is_the_share_of_random_actions():
+    policy = SARSAConfig(epsilon=0.3, **TABLE).make_policy(Chain.observation_space, spaces.Discrete(2))
+    policy.table[:, 1] = 1.0
+    actions, _ = policy.predict(np.zeros((20_000, 1), np.float32), deterministic=False)
+    assert abs((actions == 0).mean() - 0.15) < 5 * np.sqrt(0.15 * 0.85 / 20_000)
+
+
+def test_epsilon_fades_from_episode_to_episode():
+    model = SARSA(TileCodingPolicy, Chain(), epsilon=0.5, epsilon_decay=0.9, policy_kwargs=TABLE, seed=0)
+    seen = []
+
+    class Look(BaseCallback):
+        def _on_rollout_start(self):
+            seen.append(self.model.exploration_rate)
+
+        def _on_step(self):
+            return True
+
+    model.learn(100, Look())
+    np.testing.assert_allclose(seen, 0.5 * 0.9 ** np.arange(len(seen)))
+
+
+# -- as an algorithm of Stable-Baselines3 -----------------------------------------------------------------------
+
+
+def _car(seed_of_env=None, **arguments):
+    env = codrl_mj.make_sb3_vec_env("codrl_mj/MountainCar-v0", num_envs=1, **({"actuator": "ideal"} | arguments))
+    if seed_of_env is not None:
+        env.seed(seed_of_env)
+    return env
+
+
+def test_the_same_seed_gives_the_same_weights():
+    one, again, other = (_table(SARSAConfig().make_model(_car(), seed).learn(1000)) for seed in (5, 5, 6))
+    np.testing.assert_array_equal(one, again)
+    assert (one != other).any()
+
+
+def test_the_agents_draws_are_not_the_environments():
+    model = SARSAConfig().make_model(_car(), 0)
+    model.env.reset()
+    assert model.snapshot()["generator"].tolist() != model.env.snapshot()["streams"][0].tolist()
+
+
+def test_a_loaded_model_acts_and_learns_on_like_the_one_saved(tmp_path):
+    model = SARSAConfig(trace_decay=0.5).make_model(_car(), 0).learn(500)
+    model.save(tmp_path / "model")
+    loaded = SARSA.load(tmp_path / "model", env=_car())
+    np.testing.assert_array_equal(_table(loaded), _table(model))
+    for each in (model, loaded):
+        each.set_env(_car(seed_of_env=7))
+        each.learn(500, reset_num_timesteps=False)
+    assert model.num_timesteps == loaded.num_timesteps >= 1000
+    np.testing.assert_array_equal(_table(loaded), _table(model))
+
+
+def test_a_policy_travels_as_a_file(tmp_path):
+    config = SARSAConfig(intervals=(8, 4))
+    model = config.make_model(_car(), 0).learn(1000)
+    save_policy(model.policy, config, tmp_path)
+    loaded = load_policy(tmp_path)
+    observations = np.random.default_rng(0).uniform(*_bounds(model), (500, 2)).astype(np.float32)
+    np.testing.assert_array_equal(
+        loaded.predict(observations, deterministic=True)[0], model.predict(observations, deterministic=True)[0]
+    )
+
+
+def _bounds(model):
+    return model.observation_space.low, model.observation_space.high
+
+
+def test_many_predictions_are_each_the_one():
+    model = SARSAConfig().make_model(_car(), 0).learn(2000)
+    observations = np.random.default_rng(0).uniform(*_bounds(model), (200, 2)).astype(np.float32)
+    actions, _ = model.predict(observations, deterministic=True)
+    assert actions.shape == (200,)
+    assert set(actions.tolist()) == {0, 1, 2}
+    assert [model.predict(one, deterministic=True)[0].item() for one in observations] == actions.tolist()
+
+
+def test_no_evaluation_changes_the_training():
+    model, alone = (SARSAConfig().make_model(_car(), 0) for _ in range(2))
+    evaluate = EvalCallback(_car(), n_eval_episodes=2, eval_freq=400, deterministic=False, verbose=0)
+    np.testing.assert_array_equal(_table(model.learn(1000, evaluate)), _table(alone.learn(1000)))
+    assert evaluate.last_mean_reward == -200.0
+
+
+def test_callbacks_and_loggers_work(tmp_path):
+    model = SARSAConfig().make_model(_car(), 0)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    counts = {"rollouts": 0, "every": 0}
+
+    class Count(BaseCallback):
+        def _on_rollout_start(self):
+            assert self.model._last_episode_starts.all()
+            counts["rollouts"] += 1
+
+        def _on_step(self):
+            assert self.locals["dones"].shape == (1,)
+            return True
+
+    class Every(BaseCallback):
+        def _on_step(self):
+            counts["every"] += 1
+            return True
+
+    save = CheckpointCallback(2, str(tmp_path / "checkpoints"))
+    model.learn(10**9, [Count(), EveryNTimesteps(400, Every()), save, StopTrainingOnMaxEpisodes(5)], log_interval=1)
+    assert counts["rollouts"] == 5
+    assert model.num_timesteps == sum(episode["l"] for episode in model.ep_info_buffer)
+    assert counts["every"] == 2  # five episodes of 200 steps
+    assert list((tmp_path / "checkpoints").iterdir())
+    assert "rollout/ep_rew_mean" in (tmp_path / "progress.csv").read_text()
+
+
+def test_learning_ends_with_an_episode_and_goes_on_with_the_next():
+    model = SARSAConfig().make_model(_car(max_episode_steps=30), 0).learn(100)
+    assert model.num_timesteps == 120
+    assert model.learn(1, reset_num_timesteps=False).num_timesteps == 150
+
+
+def test_it_can_be_evaluated():
+    model = SARSAConfig().make_model(_car(), 0)
+    assert evaluate_policy(model, _car(), n_eval_episodes=3)[0] == -200.0
+
+
+@pytest.mark.parametrize("generic", [True, False], ids=["step by step", "compiled"])
+def test_interrupted_training_goes_on_bit_for_bit(generic):
+    def fresh():
+        model = SARSAConfig(epsilon=0.1, epsilon_decay=0.9, trace_decay=0.5).make_model(_car(actuator="paper"), 0)
+        model.compiled = not generic
+        return model
+
+    whole = fresh()
+    whole.learn(10**9, StopTrainingOnMaxEpisodes(6))
+
+    first = fresh()
+    first.learn(10**9, StopTrainingOnMaxEpisodes(4))
+    weights, generator, environment = _table(first), first.snapshot(), first.env.snapshot()
+
+    then = fresh()
+    then.learn(1)
+    then.policy.table[:] = weights
+    then.restore(generator)
+    then.env.restore(environment)
+    then.num_timesteps, then._episode_num, then._last_obs = first.num_timesteps, first._episode_num, first._last_obs
+    then.learn(10**9, StopTrainingOnMaxEpisodes(2), reset_num_timesteps=False)
+    np.testing.assert_array_equal(_table(then), _table(whole))
+    assert then.num_timesteps == whole.num_timesteps
+    assert then.snapshot()["generator"].tolist() == whole.snapshot()["generator"].tolist()
+
+
+# -- refusals -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("task", "config", "message"),
+    [
+        ("Pendulum", SARSAConfig(intervals=(8, 8, 8)), "must be Discrete"),
+        ("MountainCar", SARSAConfig(intervals=(8, 8, 8)), "of 3 observation entries, but there are 2"),
+        ("Acrobot", SARSAConfig(intervals=(8, 8), angles=3), "angles = 3: must be from 0"),
+        ("CartPole", SARSAConfig(intervals=(4, 4, 4, 4)), "axis 1 from -inf to inf"),
+        ("MountainCar", SARSAConfig(tilings=6), "tilings = 6: must be a power of 2"),
+        ("MountainCar", SARSAConfig(low=(0.0,)), r"low = \(0.0,\): must have 2 numbers"),
+    ],
+)
+def test_what_cannot_be_tiled_is_refused(task, config, message):
+    env = codrl_mj.make_sb3_vec_env(f"codrl_mj/{task}-v0", num_envs=1)
+    with pytest.raises(ValueError, match=message):
+        config.make_model(env, 0)
+    with pytest.raises(ValueError, match=message):
+        config.make_policy(env.observation_space, env.action_space)
+
+
+def test_more_than_one_environment_is_refused():
+    env = codrl_mj.make_sb3_vec_env("codrl_mj/MountainCar-v0", num_envs=2)
+    with pytest.raises(ValueError, match="num_envs = 2: SARSA learns from one environment"):
+        SARSAConfig().make_model(env, 0)
+
+
+@pytest.mark.parametrize("setting", [{"step_size": 0.0}, {"gamma": 1.1}, {"epsilon": -0.1}, {"intervals": (8, 0)}])
+def test_settings_out_of_bounds_are_refused(setting):
+    with pytest.raises(ValueError, match=f"SARSAConfig.{next(iter(setting))}"):
+        SARSAConfig(**setting)
+
+
+# -- other observations and actions ---------------------------------------------------------------------------
+
+
+def test_the_actuators_currents_are_ignored_or_tiled_as_the_intervals_say():
+    env = _car(actuator="paper", observe_actuator=True)
+    space = env.observation_space
+    assert SARSAConfig().make_model(env, 0).policy.table.shape == (648, 3)
+    ends = {"low": (*space.low[:2].tolist(), -1.0, -1.0), "high": (*space.high[:2].tolist(), 1.0, 1.0)}
+    assert SARSAConfig(intervals=(8, 8, 2, 2), **ends).make_model(env, 0).policy.table.shape == (648 * 9, 3)
+
+
+def test_any_number_of_levels_can_be_chosen_from():
+    env = _car(actuator="paper", action="current", levels=(-1, -0.5, 0, 0.5, 1))
+    model = SARSAConfig(epsilon=1.0).make_model(env, 0).learn(400)
+    assert ((model.policy.table != 0).sum(axis=0) > 0).all()
+    assert model.policy.table.shape == (648, 5)
+
+
+# -- it learns ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("task", ["mountain_car", "acrobot", "cartpole"])
+def test_its_settings_fit_their_tasks(task):
+    assert find_agent("sarsa") is SARSAConfig
+    for preset in PRESETS["sarsa", task].values():
+        definition = find_task(task)
+        policy = preset.agent.make_policy(definition.observation_space, definition.action_space)
+        assert policy.predict(definition.observation_space.low, deterministic=True)[0].shape == ()
+        assert preset.num_envs == 1
+
+
+def test_the_papers_settings_are_the_papers():
+    """Shared text, The agents: 8 tilings, 1944 tiles, alpha 0.0375, gamma 1, epsilon 0.001, 600 episodes."""
+    preset, task = PRESETS["sarsa", "mountain_car"]["paper"], find_task("mountain_car")
+    policy = preset.agent.make_policy(task.observation_space, task.action_space)
+    assert policy.table.size == 1944
+    assert not policy.table.any()
+    agent = preset.agent
+    assert (agent.tilings, agent.step_size, agent.gamma, agent.epsilon) == (8, 0.0375, 1.0, 0.001)
+    assert (agent.epsilon_decay, agent.trace_decay, preset.total_episodes) == (1.0, 0.0, 600)
+
+
+def test_it_learns_to_leave_the_valley():
+    """Acting at random takes all of the 200 steps."""
+    model = SARSAConfig().make_model(_car(actuator="paper"), 0)
+    model.learn(10**9, StopTrainingOnMaxEpisodes(400))
+    returns = [episode["r"] for episode in model.ep_info_buffer]
+    assert np.mean(returns) > -155
