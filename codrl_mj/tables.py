@@ -1,6 +1,7 @@
 """Results as tables for a terminal of 110 columns. They are built here, and printed by `codrl_mj.terminal`."""
 
-from collections.abc import Callable, Mapping
+import datetime
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from rich import box
@@ -9,6 +10,7 @@ from rich.table import Table
 
 from codrl_mj.evaluation import MEASURES, Evaluation
 from codrl_mj.measures import Interval, Quartiles
+from codrl_mj.runs import Comparison, RunSummary
 
 _COLUMNS = 3  # evaluations side by side
 _NOTHING = "–"
@@ -88,3 +90,59 @@ def _text(value: Any, scale: float = 1.0) -> str:
         return "{} [{}, {}]".format(*(_text(number, scale) for number in value))
     number = scale * value
     return f"{number:.3g}" if abs(number) < 1000 else f"{number:.0f}"
+
+
+def run_table(runs: Sequence[RunSummary]) -> Table:
+    """A row for each run."""
+    table = _table(f"{len(runs)} run{'' if len(runs) == 1 else 's'}")
+    for header in ("run", "task", "agent", "actuator"):
+        table.add_column(header, overflow="fold")
+    for header in ("seed", "steps", "state", "training\nreturn", "evaluated\nreturn", "modified"):
+        table.add_column(header, justify="right", no_wrap=True)
+    for run in runs:
+        known = [_NOTHING if value is None else str(value) for value in (run.task, run.agent, run.actuator, run.seed)]
+        returns = [_NOTHING if value is None else f"{value:.1f}" for value in (run.mean_return, run.evaluation_return)]
+        table.add_row(
+            *map(escape, (run.name, *known, _steps(run))),
+            {"finished": "[green]finished", "unfinished": "[yellow]unfinished", "damaged": "[red]damaged"}[run.state],
+            *returns,
+            _NOTHING if run.modified is None else f"{datetime.datetime.fromtimestamp(run.modified):%m-%d %H:%M}",
+        )
+    return table
+
+
+def _steps(run: RunSummary) -> str:
+    if run.steps is None:
+        return _NOTHING
+    share = f" ({run.steps / run.total_steps:.0%})" if run.state == "unfinished" and run.total_steps else ""
+    return f"{run.steps:,}{share}"
+
+
+def comparison_tables(comparison: Comparison) -> list[Table]:
+    """What differs in the configuration, and the results: a column for each run, at most some at a time."""
+    count = len(comparison.names)
+    return [
+        _side_by_side(title, comparison.names, rows, range(begin, min(begin + _COLUMNS, count)))
+        for begin in range(0, count, _COLUMNS)
+        for title, rows in (("settings that differ", comparison.configuration), ("results", comparison.results))
+        if rows
+    ]
+
+
+def _side_by_side(title: str, names: Sequence[str], rows: Mapping[str, Sequence[Any]], columns: Sequence[int]) -> Table:
+    table = _table(title)
+    table.add_column("", overflow="fold")
+    for column in columns:
+        table.add_column(escape(names[column]), justify="right", overflow="fold")
+    for label, values in rows.items():
+        table.add_row(*map(escape, (label, *(_any_text(values[column]) for column in columns))))
+    return table
+
+
+def _any_text(value: Any) -> str:
+    """Text of whatever JSON can hold; of an interval or quartiles, as `_text` has it."""
+    if isinstance(value, Mapping) and len(value) == 3 and all(isinstance(one, int | float) for one in value.values()):
+        return "{} [{}, {}]".format(*map(_text, value.values()))
+    if isinstance(value, float):
+        return _text(value)
+    return _NOTHING if value is None else str(value)

@@ -14,7 +14,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 from codrl_mj.evaluation import Evaluation
-from codrl_mj.tables import evaluation_tables
+from codrl_mj.runs import Comparison, RunSummary
+from codrl_mj.tables import comparison_tables, evaluation_tables, run_table
 from codrl_mj.training import TrainConfig, train
 from codrl_mj.validation import GROUPS, Caught, Certificate, Check
 from codrl_mj.validation.mutations import margin
@@ -123,6 +124,20 @@ def print_evaluations(evaluations: Mapping[str, Evaluation], details: bool = Tru
         details: whether to print the others.
     """
     for table in evaluation_tables(evaluations, details):
+        console().print(table)
+
+
+def print_runs(runs: Sequence[RunSummary]) -> None:
+    """Print a table with a row for each run, and under it what is wrong with those that are damaged."""
+    console().print(run_table(runs))
+    for run in runs:
+        if run.problem is not None:
+            console().print(f"{run.name}: damaged: {run.problem}", style="red", markup=False, highlight=False)
+
+
+def print_comparison(comparison: Comparison) -> None:
+    """Print what differs between runs, and their results, with a column for each run."""
+    for table in comparison_tables(comparison):
         console().print(table)
 
 

@@ -77,7 +77,7 @@ def main() -> int:
             if deployed == REAL:
                 title = f"trained on {trained}: {episodes[0].total:.0f} of 500"
                 panels.append(Panel(title, TASK, motor, episodes[0]))
-    print_evaluations(evaluations)
+    print_evaluations(evaluations, details=False)
 
     print(f"\n4/4  Film both on {REAL!r}")
     with progress_bar("{task.completed}/{task.total} frames") as bar:

@@ -1,0 +1,299 @@
+"""Run folders: finding them, what they came to, and what differs between them. A damaged one is listed as such."""
+
+import contextlib
+import csv
+import dataclasses
+import datetime
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from codrl_mj.files import read_json
+from codrl_mj.motor import NAMED, Actuator, named_actuator
+
+CONFIG = "config.json"
+"""What makes a folder a run folder."""
+_PROGRESS, _RESULT, _EVALUATION = "progress.csv", "result.json", "evaluation.json"
+_POLICY = ("policy.json", "policy.safetensors")
+
+
+@dataclasses.dataclass(frozen=True)
+class RunSummary:
+    """One run folder. What its files do not say is None."""
+
+    path: Path
+    """The folder."""
+    name: str
+    """The folder relative to the one that was searched."""
+    state: Literal["finished", "unfinished", "damaged"]
+    """Whether the training was finished. Damaged: a file cannot be read, or is missing."""
+    problem: str | None = None
+    """What is damaged."""
+    task: str | None = None
+    """Task name."""
+    agent: str | None = None
+    """Name of the agent, such as `ppo`."""
+    actuator: str | None = None
+    """Name of the actuator trained through; `custom` if it is none of the task's named ones."""
+    seed: int | None = None
+    """Training seed."""
+    steps: int | None = None
+    """Environment steps done."""
+    total_steps: int | None = None
+    """Environment steps to do."""
+    mean_return: float | None = None
+    """Mean return of the last training episodes, as training reported it last."""
+    seconds: float | None = None
+    """Wall-clock time of the training [s]."""
+    modified: float | None = None
+    """When one of its files was written last [s since 1970]."""
+    evaluation: Mapping[str, Any] | None = None
+    """`Evaluation.as_mapping()` of the last policy."""
+    configuration: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """What it was made with: fields of the training's configuration and of the software, by dotted names."""
+
+    @property
+    def evaluation_return(self) -> float | None:
+        """Mean return of the evaluation of the last policy."""
+        returns = (self.evaluation or {}).get("returns")
+        return _number(returns.get("mean")) if isinstance(returns, Mapping) else None
+
+    def as_mapping(self) -> dict[str, Any]:
+        """The summary as JSON-serialisable values; `modified` in ISO 8601, UTC."""
+        modified = None
+        if self.modified is not None:
+            modified = datetime.datetime.fromtimestamp(self.modified, datetime.UTC).isoformat(timespec="seconds")
+        values = {**vars(self), "path": str(self.path), "modified": modified}
+        return values | {"evaluation_return": self.evaluation_return}
+
+
+def find_runs(root: Path) -> list[RunSummary]:
+    """Every run folder at or below a folder, by name. Hidden folders and folders within runs are passed over.
+
+    Raises:
+        FileNotFoundError: there is no such folder.
+    """
+    if not root.is_dir():
+        raise FileNotFoundError(f"no folder {root} to look for runs in")
+    return sorted((read_run(path, _name(path, root)) for path in _run_folders(root)), key=lambda run: run.name)
+
+
+def _run_folders(root: Path) -> Iterator[Path]:
+    for folder, below, files in os.walk(root):
+        if CONFIG in files:
+            below.clear()
+            yield Path(folder)
+        below[:] = [name for name in below if not name.startswith(".")]
+
+
+def _name(path: Path, root: Path) -> str:
+    return root.resolve().name if path == root else path.relative_to(root).as_posix()
+
+
+def read_run(path: Path, name: str | None = None) -> RunSummary:
+    """What a run folder says.
+
+    Args:
+        path: the folder.
+        name: what to call it; the folder's own name by default.
+
+    Raises:
+        FileNotFoundError: it is no run folder.
+    """
+    if not (path / CONFIG).is_file():
+        raise FileNotFoundError(f"no run at {path}: there is no {CONFIG}")
+    problems: list[str] = []
+    content = _mapping(path / CONFIG, "run configuration", problems)
+    config = content.get("train") if content is not None else {}
+    if not isinstance(config, Mapping):
+        problems.append(f"{CONFIG} is not a run configuration: it has no 'train'")
+        config = {}
+    progress = _last_report(path / _PROGRESS, problems)
+    result = _mapping(path / _RESULT, "result of a run", problems)
+    evaluation = _mapping(path / _EVALUATION, "policy evaluation", problems)
+    missing = [file for file in _POLICY if not (path / file).is_file()]
+    finished = (path / _RESULT).exists() or not missing
+    if finished and missing:
+        problems.append(f"it is finished, but {' and '.join(missing)} is missing")
+    agent = config.get("agent")
+    task = config["task"] if isinstance(config.get("task"), str) else None
+    steps = _first(result, progress, "steps")
+    pace = _first(progress, None, "steps_per_second")
+    uninterrupted = steps / pace if steps is not None and pace else None
+    seconds = _first(result, progress, "seconds")
+    return RunSummary(
+        path=path,
+        name=path.resolve().name if name is None else name,
+        state="damaged" if problems else "finished" if finished else "unfinished",
+        problem="; ".join(problems) or None,
+        task=task,
+        agent=str(agent["name"]) if isinstance(agent, Mapping) and "name" in agent else None,
+        actuator=_actuator_name(config["actuator"], task) if "actuator" in config else None,
+        seed=_whole(config.get("seed")),
+        steps=_whole(steps),
+        total_steps=_whole(config.get("total_steps")),
+        mean_return=_first(progress, result, "mean_return"),
+        seconds=uninterrupted if seconds is None else seconds,
+        modified=_modified(path),
+        evaluation=evaluation,
+        configuration=dict(
+            _flat({**config, **{key: value for key, value in (content or {}).items() if key != "train"}})
+        ),
+    )
+
+
+def _mapping(path: Path, what: str, problems: list[str]) -> Mapping[str, Any] | None:
+    """A JSON file's mapping; None if there is no such file, or if it is damaged, which is then noted."""
+    try:
+        content = read_json(path, what)
+    except FileNotFoundError:
+        return None
+    except (ValueError, OSError, RecursionError) as error:
+        problems.append(str(error))
+        return None
+    if not isinstance(content, Mapping):
+        problems.append(f"{path} is not a {what}: it is no JSON object")
+        return None
+    return content
+
+
+def _last_report(path: Path, problems: list[str]) -> Mapping[str, Any]:
+    """The last whole row of a training's progress; empty if there is none. A last row may be half written."""
+    try:
+        with path.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+    except FileNotFoundError:
+        return {}
+    except (ValueError, OSError, csv.Error) as error:
+        problems.append(f"{path.name} cannot be read: {error}")
+        return {}
+    if rows and "steps" not in rows[0]:
+        problems.append(f"{path.name} has no column 'steps'")
+    whole = [row for row in rows[-2:] if None not in row and None not in row.values()]
+    return whole[-1] if whole else {}
+
+
+def _number(value: Any) -> float | None:
+    """A finite number, or None."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _whole(value: Any) -> int | None:
+    """A whole number, or None."""
+    number = _number(value)
+    return None if number is None else int(number)
+
+
+def _modified(folder: Path) -> float | None:
+    """When a file of a folder was written last [s since 1970]; files may vanish meanwhile."""
+    times = []
+    for file in folder.iterdir():
+        with contextlib.suppress(FileNotFoundError):
+            if file.is_file():
+                times.append(file.stat().st_mtime)
+    return max(times, default=None)
+
+
+def _first(one: Mapping[str, Any] | None, other: Mapping[str, Any] | None, name: str) -> float | None:
+    """The first of two sources' numbers of that name; None if neither has one."""
+    numbers = [_number((source or {}).get(name)) for source in (one, other)]
+    return next((number for number in numbers if number is not None), None)
+
+
+def _actuator_name(actuator: Any, task: Any) -> str:
+    """The name of an actuator among the task's named ones, or `custom`."""
+    if actuator is None or isinstance(actuator, str):
+        return actuator or "ideal"
+    try:
+        made = Actuator.from_mapping(actuator)
+        return next((name for name in NAMED if named_actuator(name, task) == made), "custom")
+    except (ValueError, TypeError, KeyError):
+        return "custom"
+
+
+def _flat(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The leaves of nested mappings by dotted names."""
+    for key, value in mapping.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+SORT_KEYS = ("name", "task", "agent", "actuator", "state", "steps", "return", "seconds", "modified")
+"""What runs can be sorted by."""
+_HIGHEST_FIRST = ("steps", "return", "seconds", "modified")
+
+
+def sort_runs(runs: Sequence[RunSummary], key: str) -> list[RunSummary]:
+    """The runs in another order: names from A, numbers and times from the highest. Runs without a value come last.
+
+    Args:
+        runs: the runs.
+        key: one of `SORT_KEYS`; `return` is the evaluation's, or the training's where there was none.
+
+    Raises:
+        ValueError: unknown key.
+    """
+    if key not in SORT_KEYS:
+        raise ValueError(f"sort = {key!r}: must be one of {', '.join(SORT_KEYS)}")
+
+    def value(run: RunSummary) -> Any:
+        if key != "return":
+            return getattr(run, key)
+        return run.mean_return if run.evaluation_return is None else run.evaluation_return
+
+    known = sorted((run for run in runs if value(run) is not None), key=value, reverse=key in _HIGHEST_FIRST)
+    return known + [run for run in runs if value(run) is None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """Runs side by side. Every row has a value for each run, None where it has none."""
+
+    names: tuple[str, ...]
+    """Names of the runs."""
+    configuration: Mapping[str, tuple[Any, ...]]
+    """Dotted name of a setting that differs -> its values."""
+    results: Mapping[str, tuple[Any, ...]]
+    """Name of a result -> its values; measures of the evaluation are numbers, or mappings of a mean and an interval."""
+
+    def as_mapping(self) -> dict[str, Any]:
+        """The comparison as JSON-serialisable values."""
+        return vars(self)
+
+
+def compare(runs: Sequence[RunSummary]) -> Comparison:
+    """What differs in the configuration of runs, and their results.
+
+    Args:
+        runs: two or more.
+
+    Raises:
+        ValueError: fewer than two.
+    """
+    if len(runs) < 2:
+        raise ValueError(f"runs: {len(runs)}: there must be two or more to compare")
+    named = [{**run.configuration, "actuator": run.actuator} for run in runs]
+    if any(run.actuator == "ideal" for run in runs):  # which has no fields that could differ
+        named = [{key: value for key, value in one.items() if not key.startswith("actuator.")} for one in named]
+    settings = {key: tuple(one.get(key) for one in named) for key in dict.fromkeys(key for one in named for key in one)}
+    results: dict[str, tuple[Any, ...]] = {
+        name: tuple(getattr(run, name) for run in runs)
+        for name in ("state", "problem", "steps", "mean_return", "seconds")
+    }
+    evaluations = [run.evaluation or {} for run in runs]
+    units = [one.get("units") for one in evaluations]
+    for measure in dict.fromkeys(name for one in units if isinstance(one, Mapping) for name in one):
+        results[f"evaluation.{measure}"] = tuple(one.get(measure) for one in evaluations)
+    return Comparison(
+        names=tuple(run.name for run in runs),
+        configuration={key: values for key, values in settings.items() if any(value != values[0] for value in values)},
+        results={name: values for name, values in results.items() if any(value is not None for value in values)},
+    )

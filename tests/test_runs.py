@@ -1,0 +1,248 @@
+"""Run folders: what is read from them, whatever is missing or damaged, and how they are compared."""
+
+import datetime
+import json
+import os
+
+import pytest
+import tyro
+
+from codrl_mj import Actuator, CurrentLoop, Motor, named_actuator
+from codrl_mj.cli.runs import Runs
+from codrl_mj.runs import SORT_KEYS, compare, find_runs, read_run, sort_runs
+
+PROGRESS = "steps,episodes,mean_return,steps_per_second,seconds\n"
+UNITS = {"returns": "reward", "tracking_rms": "N*m", "peak_voltage": "V"}
+
+
+def make_run(folder, actuator="weaker", *, seed=3, task="cartpole", finished=True, evaluated=True, **train):
+    """A run folder as trainings leave them."""
+    folder.mkdir(parents=True)
+    motor = named_actuator(actuator, task) if isinstance(actuator, str) else actuator
+    config = {
+        "task": task,
+        "actuator": None if motor is None else motor.as_mapping(),
+        "agent": {"name": "ppo", "learning_rate": 1e-3, "hidden": [64, 64]},
+        "seed": seed,
+        "total_steps": 4000,
+        "env": {"center_radius": None, "disturbances": {"command_delay": 0.0}},
+    } | train
+    (folder / "config.json").write_text(json.dumps({"train": config, "versions": {"torch": "2.13.0"}}))
+    (folder / "progress.csv").write_text(f"{PROGRESS}1000,9,20.5,500,2.5\n2000,12,90.25,500,4.5\n")
+    if finished:
+        (folder / "policy.json").write_text("{}")
+        (folder / "policy.safetensors").write_bytes(b"")
+        (folder / "result.json").write_text(json.dumps({"steps": 4096, "mean_return": 91.0, "seconds": 8.25}))
+    if evaluated:
+        returns = {"mean": 400.0 + seed, "low": 380.0, "high": 420.0}
+        measures = {"returns": returns, "tracking_rms": 0.1, "peak_voltage": None, "units": UNITS}
+        (folder / "evaluation.json").write_text(json.dumps(measures))
+    return folder
+
+
+def test_a_finished_run_says_what_it_was_and_what_it_came_to(tmp_path):
+    run = read_run(make_run(tmp_path / "mine"))
+    assert (run.name, run.state, run.problem) == ("mine", "finished", None)
+    assert (run.task, run.agent, run.actuator, run.seed) == ("cartpole", "ppo", "weaker", 3)
+    assert (run.steps, run.total_steps, run.seconds) == (4096, 4000, 8.25)
+    assert run.mean_return == 90.25  # the last report's
+    assert run.evaluation_return == 403.0
+    assert run.configuration["env.disturbances.command_delay"] == 0.0
+    assert run.configuration["versions.torch"] == "2.13.0"
+    for index, file in enumerate(sorted((tmp_path / "mine").iterdir())):
+        os.utime(file, (0, 1_700_000_000 + index))
+    assert read_run(tmp_path / "mine").modified == 1_700_000_000 + index
+    mapping = json.loads(json.dumps(read_run(tmp_path / "mine").as_mapping()))
+    assert datetime.datetime.fromisoformat(mapping["modified"]).timestamp() == 1_700_000_000 + index
+    assert mapping["evaluation_return"] == 403.0
+
+
+@pytest.mark.parametrize("rest", ["", "3000,1", "3000,15,9"], ids=["whole", "half a row", "most of a row"])
+def test_an_unfinished_run_stands_where_its_last_whole_report_says(tmp_path, rest):
+    folder = make_run(tmp_path / "mine", finished=False, evaluated=False)
+    with (folder / "progress.csv").open("a") as file:
+        file.write(rest)
+    run = read_run(folder)
+    assert (run.state, run.steps, run.mean_return, run.seconds) == ("unfinished", 2000, 90.25, 4.5)
+    assert run.evaluation_return is None
+
+
+def test_the_time_of_a_run_without_a_clock_follows_from_its_pace(tmp_path):
+    folder = make_run(tmp_path / "mine", finished=False)
+    (folder / "progress.csv").write_text(
+        "steps,total_steps,mean_return,mean_length,steps_per_second\n3000,4000,nan,,750"
+    )
+    run = read_run(folder)
+    assert (run.steps, run.mean_return, run.seconds) == (3000, None, 4.0)
+
+
+@pytest.mark.parametrize(
+    ("actuator", "task", "name"),
+    [
+        ("ideal", "cartpole", "ideal"),
+        ("paper", "acrobot", "paper"),
+        ("open_loop", "pendulum", "open_loop"),
+        (named_actuator("paper", "cartpole"), "pendulum", "custom"),  # named, but not on this task
+        (Actuator(Motor(resistance=7.0)), "pendulum", "custom"),
+        (Actuator(Motor(), CurrentLoop(max_voltage=float("inf"))), "pendulum", "custom"),
+    ],
+)
+def test_the_actuator_has_its_name_on_the_task(tmp_path, actuator, task, name):
+    assert read_run(make_run(tmp_path / "mine", actuator, task=task)).actuator == name
+
+
+@pytest.mark.parametrize("actuator", [{"motor": {"colour": 3}}, 7, ["weaker"]])
+def test_an_actuator_that_cannot_be_read_is_custom(tmp_path, actuator):
+    folder = make_run(tmp_path / "mine")
+    content = json.loads((folder / "config.json").read_text())
+    content["train"]["actuator"] = actuator
+    (folder / "config.json").write_text(json.dumps(content))
+    assert read_run(folder).actuator == "custom"
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "problem"),
+    [
+        ("config.json", b"{", "config.json is not a run configuration: it is truncated"),
+        ("config.json", b"[1]", "no JSON object"),
+        ("config.json", b"{}", "it has no 'train'"),
+        ("config.json", b'{"train": 4}', "it has no 'train'"),
+        ("config.json", b"\xff\xfe", "not JSON"),
+        ("config.json", b"[" * 100_000, "recursion"),
+        ("result.json", b'{"steps": 1', "result.json is not a result of a run"),
+        ("evaluation.json", b"3", "evaluation.json is not a policy evaluation: it is no JSON object"),
+        ("progress.csv", b"\xff\xfe\x00", "progress.csv"),
+        ("progress.csv", b"a,b\n1,2\n", "progress.csv has no column 'steps'"),
+        ("policy.safetensors", None, "policy.safetensors is missing"),
+    ],
+)
+def test_a_damaged_run_is_listed_with_what_is_wrong_among_the_others(tmp_path, file, content, problem):
+    make_run(tmp_path / "fine")
+    folder = make_run(tmp_path / "hurt")
+    (folder / file).unlink() if content is None else (folder / file).write_bytes(content)
+    fine, hurt = find_runs(tmp_path)
+    assert fine.state == "finished"
+    assert hurt.state == "damaged"
+    assert problem in hurt.problem
+    assert (hurt.seed == 3) == (file != "config.json")
+    json.dumps(hurt.as_mapping())
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"train": {}},
+        {"train": {"seed": "x", "task": 3, "agent": "ppo", "total_steps": None, "actuator": "weak", "env": 1}},
+        {"train": {"agent": {}, "actuator": None}, "versions": 1},
+    ],
+)
+def test_a_configuration_with_little_in_it_is_no_damage(tmp_path, content):
+    (tmp_path / "config.json").write_text(json.dumps(content))
+    (run,) = find_runs(tmp_path)
+    assert (run.state, run.seed, run.task, run.steps) == ("unfinished", None, None, None)
+    for key in SORT_KEYS:
+        assert sort_runs([run, run], key) == [run, run]
+    compare([run, run])
+
+
+def test_runs_are_found_at_any_depth_but_not_in_each_other_nor_in_hidden_folders(tmp_path):
+    make_run(tmp_path / "b")
+    make_run(tmp_path / "deep" / "er" / "a")
+    make_run(tmp_path / "b" / "best")
+    make_run(tmp_path / ".being-written")
+    (tmp_path / "empty").mkdir()
+    assert [run.name for run in find_runs(tmp_path)] == ["b", "deep/er/a"]
+    assert [run.name for run in find_runs(tmp_path / "b")] == ["b"]
+    assert find_runs(tmp_path / "empty") == []
+    with pytest.raises(FileNotFoundError, match=r"no folder .*nowhere"):
+        find_runs(tmp_path / "nowhere")
+    with pytest.raises(FileNotFoundError, match=r"no run at .*empty"):
+        read_run(tmp_path / "empty")
+
+
+def test_runs_are_sorted_by_any_key_with_those_that_lack_it_last(tmp_path):
+    make_run(tmp_path / "a", "weaker", seed=1)
+    make_run(tmp_path / "b", "ideal", seed=2)
+    make_run(tmp_path / "c", "paper", finished=False, evaluated=False)  # its last training return: 90.25
+    (tmp_path / "d").mkdir()
+    (tmp_path / "d" / "config.json").write_text("{")
+    runs = find_runs(tmp_path)
+    order = lambda key: "".join(run.name for run in sort_runs(runs[::-1], key))  # noqa: E731
+    assert order("name") == "abcd"
+    assert order("return") == "bacd"
+    assert order("actuator") == "bcad"
+    assert order("state") == "dbac"  # damaged, finished, unfinished; ties as they were
+    assert order("steps")[-2:] == "cd"
+    with pytest.raises(ValueError, match=r"sort = 'size': must be one of name, task"):
+        sort_runs(runs, "size")
+
+
+def test_a_comparison_has_the_settings_that_differ_and_every_result(tmp_path):
+    weak = Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=0.2, ki=0.3))
+    runs = [
+        read_run(make_run(tmp_path / "a", "weaker", seed=1)),
+        read_run(make_run(tmp_path / "b", weak, seed=2, num_envs=8)),
+        read_run(make_run(tmp_path / "c", weak, seed=2, num_envs=8, evaluated=False, finished=False)),
+    ]
+    comparison = compare(runs)
+    assert comparison.names == ("a", "b", "c")
+    assert comparison.configuration == {
+        "seed": (1, 2, 2),
+        "actuator": ("weaker", "custom", "custom"),
+        "actuator.controller.ki": (0.2, 0.3, 0.3),
+        "num_envs": (None, 8, 8),
+    }
+    assert comparison.results["state"] == ("finished", "finished", "unfinished")
+    assert comparison.results["steps"] == (4096, 4096, 2000)
+    assert comparison.results["evaluation.tracking_rms"] == (0.1, 0.1, None)
+    assert [one and one["mean"] for one in comparison.results["evaluation.returns"]] == [401.0, 402.0, None]
+    assert "evaluation.peak_voltage" not in comparison.results  # none of them has it
+    json.dumps(comparison.as_mapping())
+    with pytest.raises(ValueError, match="two or more"):
+        compare(runs[:1])
+
+
+def test_beside_an_ideal_actuator_no_field_of_another_is_listed(tmp_path):
+    runs = [read_run(make_run(tmp_path / name, name)) for name in ("ideal", "weaker")]
+    assert compare(runs).configuration == {"actuator": ("ideal", "weaker")}
+
+
+# -- codrl-mj runs ------------------------------------------------------------------------------------------
+
+
+def verb(*arguments):
+    return tyro.cli(Runs, args=list(map(str, arguments))).run()
+
+
+def test_the_verb_lists_runs_in_the_order_asked_for(tmp_path, capsys):
+    make_run(tmp_path / "low", seed=1)
+    make_run(tmp_path / "high", seed=50)
+    make_run(tmp_path / "hurt").joinpath("evaluation.json").write_text("{")
+    assert verb(tmp_path, "--sort", "return", "--out", tmp_path / "list.json") == 0
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= 110
+    rows = [line.split()[0] for line in text.splitlines() if "cartpole" in line]
+    assert rows == ["high", "low", "hurt"]
+    assert "450.0" in text
+    assert "hurt: damaged" in text
+    listed = json.loads((tmp_path / "list.json").read_text())["runs"]
+    assert [run["name"] for run in listed] == rows
+
+
+def test_the_verb_compares_runs_by_name_or_folder(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    make_run(tmp_path / "runs" / "a", "ideal", seed=1)
+    make_run(tmp_path / "elsewhere", "weaker", seed=50)
+    assert verb("--compare", "a", "elsewhere", "--out", "both.json") == 0
+    text = capsys.readouterr().out
+    lines = [" ".join(line.split()) for line in text.splitlines()]
+    assert "seed 1 50" in lines
+    assert "actuator ideal weaker" in lines
+    assert "evaluation.returns 401 [380, 420] 450 [380, 420]" in lines
+    comparison = json.loads((tmp_path / "both.json").read_text())
+    assert comparison["names"] == ["a", "elsewhere"]
+    assert comparison["configuration"]["seed"] == [1, 50]
+    with pytest.raises(FileNotFoundError, match="no run at nothing"):
+        verb("--compare", "a", "nothing")
+    with pytest.raises(ValueError, match="two or more"):
+        verb("--compare", "a")
