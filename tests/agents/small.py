@@ -1,0 +1,46 @@
+"""Agents small enough to train in a test, and how to train them."""
+
+import torch
+
+from codrl_mj.agents import DDPGConfig, DQNConfig, PPOConfig, SACConfig, TD3Config
+from codrl_mj.envs.sb3 import make_sb3_vec_env
+from codrl_mj.registration import ENVIRONMENTS
+
+_BUFFERED = {"learning_starts": 50, "batch_size": 16, "buffer_size": 1000}
+
+SMALL = {
+    "ppo": (PPOConfig(rollout_steps=64, batch_size=32, epochs=2, hidden=(8,)), "cartpole"),
+    "ppo, apart": (
+        PPOConfig(rollout_steps=64, batch_size=None, epochs=3, critic_learning_rate=1e-3, hidden=(8,)),
+        "pendulum",
+    ),
+    "ddpg": (
+        DDPGConfig(actor_units=(8,), state_units=(4,), action_units=(4,), joint_units=(8,), **_BUFFERED),
+        "pendulum",
+    ),
+    "dqn": (DQNConfig(hidden=(8,), **_BUFFERED), "cartpole"),
+    "td3": (TD3Config(hidden=(8,), **_BUFFERED), "mountain_car_continuous"),
+    "sac": (SACConfig(hidden=(8,), state_dependent_noise=True, **_BUFFERED), "mountain_car_continuous"),
+}
+"""Name -> (settings, task)."""
+
+
+def make_envs(task, num_envs=1, **arguments):
+    """Environments of a task for Stable-Baselines3."""
+    return make_sb3_vec_env(ENVIRONMENTS[task].env_id, num_envs, **arguments)
+
+
+def make_model(config, task, seed=0, num_envs=1, **arguments):
+    """An agent's model on a task."""
+    torch.set_num_threads(1)
+    return config.make_model(make_envs(task, num_envs, **arguments), seed)
+
+
+def weights(module):
+    """Copies of a module's tensors by name."""
+    return {name: tensor.clone() for name, tensor in module.state_dict().items()}
+
+
+def differing(before, after, by=0.0):
+    """Names of the tensors that are not the same bits, or that differ by more than `by`."""
+    return {name for name in before if (before[name] - after[name]).abs().max() > by}

@@ -1,0 +1,183 @@
+"""What a training step changes, how far it goes, and that a seed repeats it."""
+
+import pytest
+import torch
+
+from codrl_mj.agents import DDPGConfig, PPOConfig, SACConfig, TD3Config
+from tests.agents.small import SMALL, differing, make_model, weights
+
+TINY, LARGE = 1e-30, 1e-2
+_SMALL = {"batch_size": 16, "buffer_size": 1000, "learning_starts": 30}
+ACTOR_CRITIC = {
+    "ddpg": DDPGConfig(actor_units=(8,), joint_units=(8,), **_SMALL),
+    "td3": TD3Config(hidden=(8,), policy_delay=1, **_SMALL),
+    "sac": SACConfig(hidden=(8,), entropy_coefficient=0.1, **_SMALL),
+}
+
+
+def with_rates(config, actor, critic):
+    return type(config)(**{**vars(config), "learning_rate": actor, "critic_learning_rate": critic})
+
+
+@pytest.mark.parametrize("agent", ACTOR_CRITIC)
+@pytest.mark.parametrize(("actor", "critic"), [(TINY, LARGE), (LARGE, TINY)])
+def test_each_learning_rate_moves_its_own_network(agent, actor, critic):
+    model = make_model(with_rates(ACTOR_CRITIC[agent], actor, critic), "pendulum")
+    before = {name: weights(getattr(model, name)) for name in ("actor", "critic")}
+    model.learn(60)
+    moved = {name for name in before if differing(before[name], weights(getattr(model, name)), by=1e-20)}
+    assert moved == ({"actor"} if actor == LARGE else {"critic"})
+
+
+@pytest.mark.parametrize("agent", ACTOR_CRITIC)
+def test_the_critics_learning_rate_is_the_agents_unless_it_has_one(agent):
+    config = ACTOR_CRITIC[agent]
+
+    def train(critic):
+        model = make_model(with_rates(config, LARGE, critic), "pendulum")
+        model.learn(50)
+        return weights(model.policy)
+
+    assert not differing(train(None), train(LARGE))
+
+
+def apart(**settings):
+    """PPO with separate passes, one rollout long."""
+    return PPOConfig(
+        **{"rollout_steps": 128, "batch_size": None, "hidden": (8,), "critic_learning_rate": 1e-3, **settings}
+    )
+
+
+@pytest.mark.parametrize("task", ["cartpole", "pendulum"])
+@pytest.mark.parametrize(("actor", "critic"), [(TINY, LARGE), (LARGE, TINY)])
+def test_ppo_moves_actor_and_critic_by_their_own_learning_rates(task, actor, critic):
+    model = make_model(apart(learning_rate=actor, critic_learning_rate=critic), task)
+    before = weights(model.policy)
+    model.learn(128)
+    of_critic = {name for name in before if name.startswith(("mlp_extractor.value_net", "value_net"))}
+    of_actor = set(before) - of_critic
+    assert differing(before, weights(model.policy), by=1e-20) == (of_actor if actor == LARGE else of_critic)
+
+
+def steps_taken(model):
+    """Adam's own counts: of the first tensor of the actor, and of the critic."""
+    optimizer = model.policy.optimizer
+    return [int(optimizer.state[group["params"][0]]["step"]) for group in optimizer.param_groups]
+
+
+def test_ppo_takes_its_passes_over_the_whole_rollout_or_in_minibatches():
+    model = make_model(apart(epochs=3, critic_epochs=5, target_kl=None), "cartpole")
+    model.learn(256)  # two rollouts
+    assert steps_taken(model) == [2 * 3, 2 * 5]
+    model = make_model(apart(epochs=3, batch_size=32, target_kl=None), "cartpole")
+    model.learn(128)
+    assert steps_taken(model) == [3 * 4, 3 * 4]
+
+
+def test_too_large_a_move_stops_the_actor_alone():
+    """Before the first step the policy has not moved at all; after one it has moved more than any tiny bound."""
+    model = make_model(apart(learning_rate=LARGE, epochs=7, target_kl=1e-12), "cartpole")
+    model.learn(128)
+    assert steps_taken(model) == [1, 7]
+
+
+@pytest.mark.parametrize("target_kl", [0.003, 0.006, 0.012])
+def test_the_actor_stops_at_one_and_a_half_times_the_bound(target_kl):
+    """The divergence is computed here from probabilities, before every pass of an actor without a bound."""
+    settings = {"learning_rate": LARGE, "critic_learning_rate": TINY, "epochs": 25}
+    free = make_model(apart(**settings, target_kl=None), "pendulum")
+    moves, improve = [], free._improve_actor
+
+    def watched():
+        rollout = next(free.rollout_buffer.get())
+        with torch.no_grad():
+            now = free.policy.get_distribution(rollout.observations).log_prob(rollout.actions)
+        log_ratio = now - rollout.old_log_prob
+        moves.append(float((log_ratio.exp() - 1 - log_ratio).mean()))
+        return improve()
+
+    free._improve_actor = watched
+    free.learn(128)
+    expected = next(index for index, move in enumerate(moves) if move > 1.5 * target_kl)
+    bound = make_model(apart(**settings, target_kl=target_kl), "pendulum")
+    bound.learn(128)
+    assert 1 < expected < 25
+    assert steps_taken(bound)[0] == expected
+
+
+def test_separate_passes_are_the_clipped_loss_and_the_squared_error_stepped_by_two_optimisers():
+    model = make_model(apart(learning_rate=3e-4, critic_learning_rate=1e-3, epochs=4, target_kl=None), "cartpole")
+    reference = make_model(apart(learning_rate=3e-4), "cartpole").policy
+    reference.load_state_dict(model.policy.state_dict())
+    model.learn(128)
+    critic = [*reference.mlp_extractor.value_net.parameters(), *reference.value_net.parameters()]
+    actor = [*reference.mlp_extractor.policy_net.parameters(), *reference.action_net.parameters()]
+    optimizers = torch.optim.Adam(actor, lr=3e-4, eps=1e-5), torch.optim.Adam(critic, lr=1e-3, eps=1e-5)
+    rollout = next(model.rollout_buffer.get())
+    advantage = (rollout.advantages - rollout.advantages.mean()) / rollout.advantages.std()
+    for _ in range(4):
+        value, log_probability, _ = reference.evaluate_actions(rollout.observations, rollout.actions.flatten())
+        ratio = torch.exp(log_probability - rollout.old_log_prob)
+        losses = (
+            -torch.minimum(ratio * advantage, ratio.clip(0.8, 1.2) * advantage).mean(),
+            ((value.flatten() - rollout.returns) ** 2).mean(),
+        )
+        for loss, optimizer in zip(losses, optimizers, strict=True):
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+    for name, tensor in reference.state_dict().items():
+        torch.testing.assert_close(model.policy.state_dict()[name], tensor, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("agent", SMALL)
+def test_the_same_seed_gives_the_same_weights_and_another_seed_does_not(agent):
+    config, task = SMALL[agent]
+
+    def train(seed):
+        model = make_model(config, task, seed)
+        model.learn(128)
+        return weights(model.policy)
+
+    first, again, other = train(5), train(5), train(6)
+    assert not differing(first, again)
+    assert differing(first, other)
+
+
+@pytest.mark.parametrize("agent", ["ddpg", "dqn"])
+def test_training_after_every_episode_takes_a_gradient_step_for_every_step(agent):
+    config, task = SMALL[agent]
+    episodic = type(config)(**{**vars(config), "train_every": None, "learning_starts": 0})
+    model = make_model(episodic, task, max_episode_steps=20)
+    model.learn(100)
+    assert model.num_timesteps >= 100
+    assert model._n_updates == model.num_timesteps
+
+
+def test_gradient_steps_and_their_frequency_are_as_asked():
+    config, task = SMALL["dqn"]
+    model = make_model(
+        type(config)(**{**vars(config), "train_every": 8, "gradient_steps": 3, "learning_starts": 0}), task
+    )
+    model.learn(64)
+    assert model._n_updates == 64 / 8 * 3
+
+
+@pytest.mark.parametrize("agent", SMALL)
+def test_every_optimiser_is_named_for_a_checkpoint(agent):
+    """What Stable-Baselines3 lists as state reaches every parameter that training moves."""
+    config, task = SMALL[agent]
+    model = make_model(config, task)
+    names, variables = model._get_torch_save_params()
+    held = set()
+    for name in names:
+        found = model
+        for part in name.split("."):
+            found = getattr(found, part)
+        if isinstance(found, torch.optim.Optimizer):
+            held |= {id(parameter) for group in found.param_groups for parameter in group["params"]}
+    held |= {id(getattr(model, name)) for name in variables}
+    learned = {
+        name: parameter for name, parameter in model.policy.named_parameters() if "target" not in name.split(".")[0]
+    }
+    assert {name for name, parameter in learned.items() if id(parameter) not in held} == set()
