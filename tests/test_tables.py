@@ -1,0 +1,79 @@
+"""Tables: they fit the terminal, and hold the numbers that they are of."""
+
+import io
+
+import pytest
+from rich.console import Console
+
+from codrl_mj.env_config import EnvConfig
+from codrl_mj.evaluation import MEASURES, RandomPolicy, evaluate
+from codrl_mj.tables import evaluation_tables
+
+SHORT = EnvConfig(max_episode_steps=30)
+
+
+@pytest.fixture(scope="module")
+def results():
+    """Evaluations of random policies, by task and actuator."""
+    return {
+        (task, actuator): evaluate(RandomPolicy(task), task, actuator, SHORT, episodes=3)
+        for task, actuator in (
+            ("cartpole", "ideal"),
+            ("cartpole", "weaker"),
+            ("acrobot", "paper"),
+            ("pendulum", "weak"),
+        )
+    }
+
+
+def printed(evaluations, **options):
+    """The tables as lines of a terminal, without the space at their ends."""
+    console = Console(width=110, file=io.StringIO())
+    for table in evaluation_tables(evaluations, **options):
+        console.print(table)
+    return [line.rstrip() for line in console.file.getvalue().splitlines()]
+
+
+def test_a_row_has_the_most_telling_measures(results):
+    result = results["cartpole", "weaker"]
+    lines = printed({"mine": result}, details=False)
+    (row,) = (line for line in lines if "mine" in line)
+    assert " ".join(row.split()) == (
+        f"mine {100 * result.success.mean:.0f} % "
+        f"{result.returns.mean:.1f} [{result.returns.low:.1f}, {result.returns.high:.1f}] "
+        f"{result.tracking_rms:.3f} N·m {result.saturated_percent:.1f} % {result.peak_voltage:.1f} V "
+        f"{result.energy_drawn.mean:.3g} J"
+    )
+    assert "3 episodes a row" in lines[0]
+
+
+def test_what_an_ideal_actuator_does_not_have_is_a_dash(results):
+    lines = printed({"perfect": results["cartpole", "ideal"], "mine": results["cartpole", "weaker"]})
+    (row,) = (line for line in lines if line.split()[:1] == ["perfect"])
+    assert row.split()[-3:] == ["–", "–", "–"]
+    alone = "\n".join(printed({"perfect": results["cartpole", "ideal"]}))
+    assert "|u|" not in alone  # nor is there a column of dashes
+    assert "copper" not in alone
+    assert "time" not in alone.split("measure")[0]  # a pole has no time to a goal
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_tables_fit_and_break_no_number(results, count):
+    names = [f"a policy with a long name, the {index}th of them, on [some] actuator" for index in range(count)]
+    lines = printed(dict(zip(names, results.values(), strict=False)))
+    assert max(map(len, lines)) <= 110
+    text = "\n".join(lines)
+    for result in list(results.values())[:count]:
+        assert "{:.1f} [{:.1f}, {:.1f}]".format(*result.returns) in text
+        assert f"{result.tracking_rms:.3f} N·m" in text
+
+
+def test_every_measure_is_in_one_of_the_tables(results):
+    result = results["pendulum", "weak"]
+    text = " ".join(" ".join(printed({"mine": result})).split())
+    for name, field in MEASURES.items():
+        shown_above = name in ("returns", "failure", "tracking_rms", "saturated_percent", "peak_voltage")
+        has_row = f"{field.metadata['label']} [" in text
+        assert has_row != (shown_above or getattr(result, name) is None), name
+    assert f"copper loss [J] {result.copper_loss.mean:.3g} [{result.copper_loss.low:.3g}," in text
+    assert f"{result.terminated} task, {3 - result.terminated} time limit" in text
