@@ -31,7 +31,7 @@ def test_the_python_examples_run(capsys):
 @pytest.mark.parametrize("command", re.findall(r"^\$ codrl-mj (.*)$", README, re.MULTILINE))
 def test_the_commands_are_understood(command, monkeypatch):
     parsed = []
-    for verb in cli._VERBS.values():
+    for verb in cli.VERBS.values():
         monkeypatch.setattr(verb, "run", lambda self: parsed.append(self) or 0)
     with contextlib.suppress(SystemExit):
         assert cli.main(shlex.split(command)) == 0

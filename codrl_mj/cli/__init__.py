@@ -8,9 +8,13 @@ import tyro
 
 from codrl_mj.cli.evaluate import Evaluate
 from codrl_mj.cli.render import Render
-from codrl_mj.cli.train import train_verb
+from codrl_mj.cli.runs import Runs
+from codrl_mj.cli.train import Train, train_verb
 from codrl_mj.cli.validate import Validate
 from codrl_mj.training import TrainingStoppedError
+
+VERBS: dict[str, Any] = {"train": Train, "evaluate": Evaluate, "runs": Runs, "render": Render, "validate": Validate}
+"""The verbs by name; `train`'s flags depend on the rest of the command line."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -31,12 +35,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _run(arguments: list[str]) -> int:
     try:
         verb: Any = tyro.extras.subcommand_cli_from_dict(
-            {
-                "train": train_verb(arguments[1:] if arguments[:1] == ["train"] else []),
-                "evaluate": Evaluate,
-                "render": Render,
-                "validate": Validate,
-            },
+            VERBS | {"train": train_verb(arguments[1:] if arguments[:1] == ["train"] else [])},
             prog="codrl-mj",
             description="Reinforcement learning through a real actuator: classic control in MuJoCo, driven by a motor.",
             args=arguments,

@@ -77,8 +77,8 @@ def train_verb(arguments: list[str]) -> Any:
             None,
         ),
     ]
-    verb: Any = dataclasses.make_dataclass("Train", fields, bases=(_Train,), frozen=True)
-    verb.__doc__ = _Train.__doc__
+    verb: Any = dataclasses.make_dataclass("Train", fields, bases=(Train,), frozen=True)
+    verb.__doc__ = Train.__doc__
     verb.base = base
     return verb
 
@@ -99,7 +99,7 @@ _RESUME_HELP = (
 _ACCEPT_HELP = "Continue even if the code or a package is no longer the one that the run was started with."
 
 
-class _Train:
+class Train:
     """Train an agent through an actuator and leave a run folder.
 
     The folder gets the resolved configuration, tables of episodes and progress, checkpoints, the best and the last
