@@ -16,6 +16,8 @@ ALLOWED = {
     "assets": set(),
     "motor": set(),
     "files": set(),
+    "measures": set(),
+    "runs": {"files", "motor"},
     "disturbances": {"motor"},
     "distributions": set(),
     "tasks": set(),
@@ -26,6 +28,8 @@ ALLOWED = {
 FOREIGN = {
     # layer: what it may import besides the standard library
     "motor": {"numpy"},
+    "measures": {"numpy", "scipy"},
+    "runs": set(),
     "disturbances": {"numpy"},
     "distributions": {"numpy"},
     "assets": set(),
