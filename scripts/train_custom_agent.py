@@ -1,0 +1,281 @@
+"""Your own agent on our environments: proximal policy optimisation in plain torch, all of it in this file.
+
+Of ours it needs the registered environments, which `gym.make_vec` steps together, and nothing of any agent library.
+Copy it and change what you like. `docs/other_agents.md` says how the weights are used.
+
+Example: python scripts/train_custom_agent.py --task pendulum --actuator paper --total-steps 400000
+"""
+
+import dataclasses
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+import torch
+import tyro
+from gymnasium.vector import AutoresetMode, VectorEnv
+from rich.progress import Progress
+from safetensors.torch import save
+from torch import Tensor, nn
+from torch.distributions import Categorical, Distribution, Independent, Normal
+
+from codrl_mj.files import writing
+from codrl_mj.registration import ENVIRONMENTS
+
+COUNTS = ("num_envs", "total_steps", "rollout", "epochs", "minibatches", "hidden", "eval_episodes")  # 1 or more
+AMOUNTS = ("seed", "learning_rate", "clip", "entropy", "target_kl", "gamma", "gae_lambda")  # 0 or more
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Train PPO through an actuator, evaluate it greedily, and save its weights."""
+
+    task: Literal[tuple(ENVIRONMENTS)] = "cartpole"  # type: ignore[valid-type]
+    """What to learn."""
+    actuator: str = "paper"
+    """What the force goes through: ideal, paper, weak, weaker or open_loop."""
+    num_envs: int = 64
+    """Environments side by side, >= 1."""
+    total_steps: int = 200_000
+    """Environment steps in all, >= 1; rounded up to whole rollouts."""
+    seed: int = 0
+    """Seed of weights, actions and environments, >= 0; the same seed gives the same weights."""
+    out: Path = Path("runs/custom.safetensors")
+    """The file of weights to write."""
+    rollout: int = 32
+    """Steps of every environment between two updates, >= 1."""
+    epochs: int = 10
+    """Passes over each rollout, >= 1, unless `target_kl` stops them."""
+    minibatches: int = 8
+    """Gradient steps in a pass, >= 1."""
+    learning_rate: float = 1e-3
+    """Adam's first step size, >= 0; it falls linearly to 0."""
+    gamma: float = 0.99
+    """Discount factor, from 0 to 1."""
+    gae_lambda: float = 0.97
+    """Generalised advantage estimation's lambda, from 0 to 1."""
+    clip: float = 0.2
+    """Clip range of the probability ratio, >= 0."""
+    entropy: float = 0.0
+    """Weight of the entropy bonus, >= 0."""
+    target_kl: float = 0.015
+    """Passes over a rollout stop when the policy has moved this far [nat], >= 0."""
+    hidden: int = 64
+    """Units in each of the two hidden layers of actor and critic, >= 1."""
+    eval_episodes: int = 100
+    """Episodes of the evaluation, >= 1."""
+
+    def check(self) -> None:
+        """Raise ValueError, naming field, value and bound, if a number is out of bounds."""
+        for name in COUNTS + AMOUNTS:
+            least, most = int(name in COUNTS), 1 if name in ("gamma", "gae_lambda") else math.inf
+            if not least <= getattr(self, name) <= most:
+                raise ValueError(f"--{name.replace('_', '-')} {getattr(self, name)}: must be from {least} to {most}")
+        if (size := self.num_envs * self.rollout) < 2 * self.minibatches:
+            raise ValueError(f"--minibatches {self.minibatches}: must be <= {size // 2}, half the steps of a rollout")
+
+
+class Moments(nn.Module):
+    """Mean and variance of everything seen so far, to bring observations and rewards to a common scale."""
+
+    mean: Tensor
+    variance: Tensor
+    count: Tensor
+
+    def __init__(self, size: int) -> None:  # noqa: D107
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("variance", torch.ones(size))
+        self.register_buffer("count", torch.zeros(()))
+
+    def update(self, batch: Tensor) -> None:
+        """Take in a batch (n, size), as Chan, Golub and LeVeque (1979) do."""
+        total, apart = self.count + len(batch), batch.mean(0) - self.mean
+        squares = self.variance * self.count + batch.var(0, correction=0) * len(batch)
+        self.variance = (squares + apart**2 * self.count * len(batch) / total) / total
+        self.mean, self.count = self.mean + apart * len(batch) / total, total
+
+    def scale(self) -> Tensor:
+        """Standard deviations (size,), never 0."""
+        return (self.variance + 1e-8).sqrt()
+
+    def forward(self, values: Tensor) -> Tensor:
+        """Values centred and scaled, within 10 standard deviations."""
+        return ((values - self.mean) / self.scale()).clamp(-10.0, 10.0)
+
+
+def network(inputs: int, hidden: int, outputs: int, gain: float) -> nn.Sequential:
+    """Two hidden layers of tanh units; orthogonal weights, the last layer's with the given gain."""
+    layers = [nn.Linear(inputs, hidden), nn.Linear(hidden, hidden), nn.Linear(hidden, outputs)]
+    for layer, scale in zip(layers, (math.sqrt(2), math.sqrt(2), gain), strict=True):
+        nn.init.orthogonal_(layer.weight, scale)
+        nn.init.zeros_(layer.bias)
+    return nn.Sequential(layers[0], nn.Tanh(), layers[1], nn.Tanh(), layers[2])
+
+
+class Agent(nn.Module):
+    """Actor and critic. Continuous actions are Gaussian on a scale where the bounds are -1 and 1, and cut there."""
+
+    def __init__(self, observations: gym.Space[Any], actions: Any, hidden: int) -> None:  # noqa: D107
+        super().__init__()
+        self.discrete = isinstance(actions, gym.spaces.Discrete)
+        inputs, outputs = math.prod(observations.shape or ()), int(actions.n) if self.discrete else actions.shape[0]
+        self.seen = Moments(inputs)
+        self.actor, self.critic = network(inputs, hidden, outputs, 0.01), network(inputs, hidden, 1, 1.0)
+        if not self.discrete:
+            self.log_std = nn.Parameter(torch.full((outputs,), -0.5))
+            self.register_buffer("middle", torch.as_tensor(actions.high + actions.low) / 2)
+            self.register_buffer("reach", torch.as_tensor(actions.high - actions.low) / 2)
+
+    def policy(self, observations: Tensor) -> Distribution:
+        """The distribution of actions for observations (..., k)."""
+        outputs = self.actor(self.seen(observations))
+        if self.discrete:
+            return Categorical(logits=outputs, validate_args=False)
+        return Independent(Normal(outputs, self.log_std.exp(), validate_args=False), 1, validate_args=False)
+
+    def value(self, observations: Tensor) -> Tensor:
+        """The discounted return to expect, in units of `Trainer.returns`'s scale (...,)."""
+        return self.critic(self.seen(observations)).squeeze(-1)
+
+    @torch.no_grad()
+    def act(self, observations: np.ndarray, greedy: bool = True) -> tuple[Tensor, np.ndarray]:
+        """Actions for observations (n, k): as the policy has them, and as the environments take them."""
+        policy = self.policy(torch.as_tensor(observations))
+        actions = policy.mode if greedy else policy.sample()
+        return actions, (actions if self.discrete else self.middle + self.reach * actions.clamp(-1, 1)).numpy()
+
+
+def advantages(
+    rewards: Tensor, values: Tensor, next_values: Tensor, terminated: Tensor, ended: Tensor, gamma: float, lam: float
+) -> Tensor:
+    """Generalised advantage estimation (Schulman et al., arXiv 1506.02438); everything is of shape (T, N).
+
+    `values` are of the observation before each step, `next_values` of the one that it led to, which is the last of the
+    episode where that `ended`. Nothing comes after an episode that the task `terminated`; what would have come after
+    one that the time limit cut off counts.
+    """
+    errors = rewards + gamma * next_values * ~terminated - values
+    result, later = torch.zeros_like(rewards), torch.zeros_like(rewards[0])
+    for step in reversed(range(len(rewards))):
+        result[step] = later = errors[step] + gamma * lam * later * ~ended[step]
+    return result
+
+
+def make_envs(options: Options, num_envs: int) -> VectorEnv[Any, Any, Any]:
+    """The environments, on one thread; one whose episode ends starts another in the same step."""
+    arguments: Any = {"actuator": options.actuator, "num_threads": 1, "autoreset_mode": AutoresetMode.SAME_STEP}
+    env_id = ENVIRONMENTS[options.task].env_id
+    return gym.make_vec(env_id, num_envs, vectorization_mode="vector_entry_point", **arguments)
+
+
+def train(options: Options, on_rollout: Callable[[int, float], None] | None = None) -> Agent:
+    """Train an agent; `on_rollout` is told the steps so far and the mean return of the last 100 episodes (or NaN).
+
+    Raises:
+        ValueError: an option is out of bounds, or the actuator is unknown or unstable.
+    """
+    options.check()
+    torch.set_num_threads(1)  # networks this small run slower on several
+    torch.manual_seed(options.seed)
+    envs = make_envs(options, options.num_envs)
+    agent = Agent(envs.single_observation_space, envs.single_action_space, options.hidden)
+    optimizer = torch.optim.Adam(agent.parameters(), eps=1e-5)
+    returns, finished = Moments(1), [math.nan]
+    discounted, undiscounted = np.zeros((2, options.num_envs))
+    size = options.rollout * options.num_envs
+    rollouts = math.ceil(options.total_steps / size)
+    observations, _ = envs.reset(seed=options.seed)
+    for rollout in range(rollouts):
+        steps = []
+        for _ in range(options.rollout):
+            actions, commands = agent.act(observations, greedy=False)
+            following, rewards, terminated, truncated, infos = envs.step(commands)
+            ended, led_to = terminated | truncated, following.copy()
+            if ended.any():
+                led_to[ended] = np.stack(infos["final_obs"][ended])  # `following` holds the next episode's first there
+            discounted, undiscounted = rewards + options.gamma * discounted, rewards + undiscounted
+            steps.append((observations, actions, rewards, led_to, terminated, ended, discounted))
+            finished += undiscounted[ended].tolist()
+            discounted, undiscounted, observations = discounted * ~ended, undiscounted * ~ended, following
+        columns = (torch.as_tensor(np.stack(column)) for column in zip(*steps, strict=True))
+        seen, acted, earned, ahead, terminations, ends, sums = columns
+        returns.update(sums.float().reshape(-1, 1))
+        with torch.no_grad():
+            before, values, next_values = agent.policy(seen).log_prob(acted), agent.value(seen), agent.value(ahead)
+        earned = earned.float() / returns.scale()
+        gains = advantages(earned, values, next_values, terminations, ends, options.gamma, options.gae_lambda)
+        optimizer.param_groups[0]["lr"] = options.learning_rate * (1 - rollout / rollouts)
+        batch = [tensor.flatten(0, 1) for tensor in (seen, acted, before, gains, gains + values)]
+        improve(agent, optimizer, batch, options)
+        agent.seen.update(batch[0])
+        if on_rollout is not None:
+            on_rollout((rollout + 1) * size, float(np.mean(finished[1:][-100:] or finished)))
+    envs.close()
+    return agent
+
+
+def improve(agent: Agent, optimizer: torch.optim.Optimizer, batch: list[Tensor], options: Options) -> None:
+    """Climb PPO's clipped objective (Schulman et al., arXiv 1707.06347).
+
+    `batch` is n observations, actions, their log-probabilities when they were chosen, advantages, and returns.
+    """
+    for _ in range(options.epochs):
+        moved = []
+        for rows in torch.randperm(len(batch[0])).tensor_split(options.minibatches):
+            seen, acted, before, gains, targets = (tensor[rows] for tensor in batch)
+            gains = (gains - gains.mean()) / (gains.std() + 1e-8)
+            policy = agent.policy(seen)
+            change = policy.log_prob(acted) - before
+            ratio = change.exp()
+            objective = torch.minimum(ratio * gains, ratio.clamp(1 - options.clip, 1 + options.clip) * gains).mean()
+            error = (agent.value(seen) - targets).square().mean()
+            optimizer.zero_grad()
+            (error / 2 - objective - options.entropy * policy.entropy().mean()).backward()
+            nn.utils.clip_grad_norm_(agent.parameters(), 0.5)
+            optimizer.step()
+            moved.append((ratio - 1 - change).mean().item())  # an estimate of the divergence that is never negative
+        if np.mean(moved) > options.target_kl:
+            return
+
+
+def evaluate(agent: Agent, options: Options) -> np.ndarray:
+    """Returns of greedy episodes, shape (eval_episodes,), from initial states of their own."""
+    envs = make_envs(options, options.eval_episodes)
+    observations, _ = envs.reset(seed=2**31 + options.seed)
+    returns, running = np.zeros(options.eval_episodes), np.ones(options.eval_episodes, dtype=bool)
+    while running.any():
+        observations, rewards, terminated, truncated, _ = envs.step(agent.act(observations)[1])
+        returns += rewards * running
+        running &= ~(terminated | truncated)
+    envs.close()
+    return returns
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Train, evaluate, save."""
+    options = tyro.cli(Options, args=arguments, description=__doc__)
+    try:
+        with writing(options.out) as out, Progress() as bar:
+            row = bar.add_task(options.task, total=options.total_steps)
+
+            def show(steps: int, back: float) -> None:
+                bar.update(row, completed=steps, description=f"{options.task}, return {back:.0f}")
+
+            agent = train(options, show)
+            out.write_bytes(save(agent.state_dict()))
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    returns = evaluate(agent, options)
+    print(f"greedy return: {returns.mean():.1f} (worst {returns.min():.1f}) over {len(returns)} episodes")
+    print(f"weights: {options.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
