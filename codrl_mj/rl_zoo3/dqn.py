@@ -1,0 +1,5 @@
+"""The settings of DQN in dqn.yml, as rl-zoo3 takes them from a module."""
+
+from codrl_mj.rl_zoo3 import read
+
+hyperparams = read("dqn")
