@@ -127,5 +127,6 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
         return [env.env for env in self._limits]
 
 
-def _limited(limit: int, task: str, actuator: Any, arguments: Mapping[str, Any]) -> TimeLimit[Any, Any]:
+def _limited(limit: int, task: str, actuator: Any, arguments: Mapping[str, Any]) -> "TimeLimit[Any, Any]":
+    # quoted: rl-zoo3 puts a class of its own in the place of Gymnasium's, and that one is not generic
     return TimeLimit(ActuatedEnv(task, actuator, **arguments), limit)

@@ -1,9 +1,10 @@
 """Settings for rl-zoo3's own command line, one YAML file and one module of the same name for each algorithm.
 
-    python -m rl_zoo3.train --algo ppo --env codrl_mj/CartPole-v0 --gym-packages codrl_mj --conf-file codrl_mj.rl_zoo3.ppo
+    python -m rl_zoo3.train --algo ppo --env codrl_mj/CartPole-v0 --gym-packages codrl_mj \\
+        --conf-file codrl_mj.rl_zoo3.ppo
 
-rl-zoo3 takes either as its `--conf-file`: a path to the YAML file, or the module, which is found wherever the package is
-installed. docs/other_agents.md has the rest.
+rl-zoo3 takes either as its `--conf-file`: a path to the YAML file, or the module, which is found wherever the package
+is installed. docs/other_agents.md has the rest.
 """
 
 from importlib.resources import files
