@@ -225,22 +225,22 @@ def test_the_verb_lists_runs_in_the_order_asked_for(tmp_path, capsys):
     assert rows == ["high", "low", "hurt"]
     assert "450.0" in text
     assert "hurt: damaged" in text
-    listed = json.loads((tmp_path / "list.json").read_text())["runs"]
+    listed = json.loads((tmp_path / "list.json").read_text())
     assert [run["name"] for run in listed] == rows
 
 
-def test_the_verb_compares_runs_by_name_or_folder(tmp_path, capsys, monkeypatch):
+def test_the_verb_compares_runs(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    make_run(tmp_path / "runs" / "a", "ideal", seed=1)
-    make_run(tmp_path / "elsewhere", "weaker", seed=50)
-    assert verb("--compare", "a", "elsewhere", "--out", "both.json") == 0
+    make_run(tmp_path / "a", "ideal", seed=1)
+    make_run(tmp_path / "b", "weaker", seed=50)
+    assert verb("--compare", "a", "b", "--out", "both.json") == 0
     text = capsys.readouterr().out
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert "seed 1 50" in lines
     assert "actuator ideal weaker" in lines
     assert "evaluation.returns 401 [380, 420] 450 [380, 420]" in lines
     comparison = json.loads((tmp_path / "both.json").read_text())
-    assert comparison["names"] == ["a", "elsewhere"]
+    assert comparison["names"] == ["a", "b"]
     assert comparison["configuration"]["seed"] == [1, 50]
     with pytest.raises(FileNotFoundError, match="no run at nothing"):
         verb("--compare", "a", "nothing")
