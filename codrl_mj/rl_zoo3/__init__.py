@@ -1,6 +1,6 @@
-"""Settings for rl-zoo3's own command line, one YAML file and one module of the same name for each algorithm.
+r"""Settings for rl-zoo3's own command line, one YAML file and one module of the same name for each algorithm.
 
-    python -m rl_zoo3.train --algo ppo --env codrl_mj/CartPole-v0 --gym-packages codrl_mj \\
+    python -m rl_zoo3.train --algo ppo --env codrl_mj/CartPole-v0 --gym-packages codrl_mj \
         --conf-file codrl_mj.rl_zoo3.ppo
 
 rl-zoo3 takes either as its `--conf-file`: a path to the YAML file, or the module, which is found wherever the package
