@@ -6,7 +6,6 @@ Cross-validates CartPole against Gymnasium, trains the same agent twice (on the 
 
 import argparse
 import functools
-import shutil
 import sys
 from pathlib import Path
 
@@ -16,16 +15,11 @@ from codrl_mj.motor import named_actuator
 from codrl_mj.policies import load_policy
 from codrl_mj.rendering import Panel, film
 from codrl_mj.terminal import print_checks, print_evaluations, progress_bar, train_with_bars
-from codrl_mj.training import TrainConfig, load_config
+from codrl_mj.training import TrainConfig, finished, load_config
 from codrl_mj.validation import validate
 
 TASK, REAL = "cartpole", "weaker"
 PAPER_REWARD = EnvConfig(center_radius=0.1)  # the paper trains with no reward beyond 0.1 m from the centre
-
-
-def finished(out: Path, config: TrainConfig) -> bool:
-    """Whether `out` already holds this very run."""
-    return (out / "policy.json").is_file() and load_config(out) == config
 
 
 def main() -> int:
@@ -55,16 +49,15 @@ def main() -> int:
     }
     waiting = {}
     for actuator, (config, out) in runs.items():
-        if finished(out, config):
-            print(f"     {out} is trained already (delete it to train anew)")
-        elif (out / "policy.json").is_file():
+        if out.exists() and load_config(out) != config:
             print(f"demo: {out} holds a run with other settings: choose another --out, or delete it", file=sys.stderr)
             return 2
+        if out.exists() and finished(out):
+            print(f"     {out} is trained already (delete it to train anew)")
         else:
-            shutil.rmtree(out, ignore_errors=True)  # what a run that was killed left behind
             waiting[f"trained on {actuator}"] = (config, out)
     if waiting:
-        train_with_bars(waiting)
+        train_with_bars(waiting, resume=True, accept_changes=True)
 
     print(f"\n3/4  Deploy both on {REAL!r}, under Gymnasium's own reward: 500 is full marks")
     evaluations, panels = {}, []

@@ -238,10 +238,16 @@ def test_a_line_that_cannot_be_parsed_exits_with_2(capsys, line):
     assert "Traceback" not in capsys.readouterr().err
 
 
-def test_a_missing_extra_is_named(capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "safetensors", None)
-    monkeypatch.setitem(sys.modules, "safetensors.torch", None)
-    assert "codrl-mj[all]" in refused(capsys, "train", "cartpole", *TINY, "--out", "run")
+@pytest.mark.parametrize("missing", ["torch", "stable_baselines3", "safetensors", "matplotlib"])
+def test_a_missing_extra_is_named_before_anything_is_written(tmp_path, missing):
+    """In a process of its own, where nothing has been imported yet."""
+    code = f"import sys; sys.modules[{missing!r}] = None; from codrl_mj.cli import main; sys.exit(main(sys.argv[1:]))"
+    line = [sys.executable, "-c", code, "train", "cartpole", *TINY, "--out", "run"]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("codrl-mj: error: ")
+    assert "codrl-mj[all]" in done.stderr
+    assert list(tmp_path.iterdir()) == []
 
 
 # -- bad input ----------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import imageio
@@ -14,11 +15,13 @@ DEMO = Path(__file__).parents[1] / "scripts" / "demo.py"
 RUNS = ("ideal-seed4", "weaker-seed4")
 
 
-def demonstrate(out, total_steps=2048):
-    options = ["--out", str(out), "--seed", "4", "--total-steps", str(total_steps), "--episodes", "2"]
-    done = subprocess.run(
-        [sys.executable, str(DEMO), *options], capture_output=True, text=True, timeout=300, check=False
-    )
+def options(out, total_steps=2048):
+    return ["--out", str(out), "--seed", "4", "--total-steps", str(total_steps), "--episodes", "2"]
+
+
+def demonstrate(out):
+    line = [sys.executable, str(DEMO), *options(out)]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
     return done.stdout
@@ -26,11 +29,13 @@ def demonstrate(out, total_steps=2048):
 
 @pytest.fixture(scope="module")
 def demonstrated(tmp_path_factory):
-    """The folder of a demonstration that found a run that was killed, and what was printed."""
+    """The folder of a demonstration that was stopped while it trained and then run again, and what was printed."""
     out = tmp_path_factory.mktemp("demo") / "out"
-    (out / RUNS[0]).mkdir(parents=True)
-    (out / RUNS[0] / "config.json").write_text("{")  # what a killed run left
-    (out / RUNS[1]).mkdir()
+    with subprocess.Popen([sys.executable, str(DEMO), *options(out)], stdout=subprocess.DEVNULL) as killed:
+        while not (out / RUNS[1] / "progress.csv").exists():
+            assert killed.poll() is None
+            time.sleep(0.05)
+        killed.kill()
     return out, demonstrate(out)
 
 
