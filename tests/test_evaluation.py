@@ -280,14 +280,15 @@ def test_the_whole_energy_balance_closes_as_the_steps_shorten(task):
 def test_work_and_peaks_are_those_of_the_shaft():
     motor = Motor(arm_radius=0.5, resistance=2.0)
     rows = [(3.0, 1.0, 6.0, 0.5, 0), (1.0, -4.0, -7.0, -0.8, 1)]  # force, current, voltage, speed, saturated
-    episodes = [made_up(actuator=Actuator(motor), rows=rows)] * 2
+    states = [[0.0, -0.9, 0.0, 0.0]] * 3  # before the first step the cart moves at -0.9 m/s
+    episodes = [made_up(actuator=Actuator(motor), states=states, rows=rows)] * 2
     result = summarize("cartpole", Actuator(motor), episodes)
     dt = 0.02
-    assert result.mechanical_work.mean == pytest.approx((3.0 * 0.25 + 1.0 * -0.15) * dt, rel=1e-12)
+    assert result.mechanical_work.mean == pytest.approx((3.0 * -0.2 + 1.0 * -0.15) * dt, rel=1e-12)
     assert result.energy_drawn.mean == pytest.approx((6.0 * 0.5 + -7.0 * -1.5) * dt, rel=1e-12)
     assert result.copper_loss.mean == pytest.approx(2.0 * (1.0 + (1.0 - 4.0 + 16.0)) / 3 * dt, rel=1e-12)
     assert (result.peak_voltage, result.peak_current, result.saturated_percent) == (7.0, 4.0, 50.0)
-    assert result.peak_speed == pytest.approx(0.8 / 0.5)
+    assert result.peak_speed == pytest.approx(0.9 / 0.5)
 
 
 def test_a_motor_that_brakes_returns_energy():
