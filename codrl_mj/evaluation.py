@@ -208,7 +208,7 @@ def _time_to_goal(task: Task, episode: Episode) -> float | None:
     """Time from which an episode that succeeded was at the goal [s]; None if it did not succeed."""
     if task.goal is None:
         return None if episode.terminated else 0.0
-    since = holds_since(task.goal(episode.state)) * task.step_duration
+    since = holds_since(task.goal(episode.state.T)) * task.step_duration
     succeeded = since + task.goal_hold < episode.time[-1] + 0.5 * task.step_duration  # half a step: rounding
     return since if succeeded else None
 

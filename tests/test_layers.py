@@ -37,7 +37,7 @@ FOREIGN = {
     "tasks": {"numpy", "numba", "gymnasium"},
     "callbacks": {"mujoco", "numba", "llvmlite", "numpy"},
     "physics": {"mujoco", "numba", "numpy", "gymnasium"},
-    "envs": {"gymnasium", "numpy", "mujoco", "stable_baselines3"},
+    "envs": {"gymnasium", "numpy", "numba", "mujoco", "stable_baselines3"},
 }
 GYMNASIUM_IN_TASKS = {"gymnasium.spaces", "gymnasium.envs.classic_control.utils"}
 

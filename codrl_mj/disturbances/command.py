@@ -1,4 +1,4 @@
-"""The way of a command to the actuator, as pure functions of arrays with a leading axis of environments."""
+"""The way of a command to the actuator, as pure functions of numbers. `codrl_mj.physics.disturber` compiles them."""
 
 import math
 
@@ -21,40 +21,34 @@ def whole_and_fraction(delay: float, timestep: float) -> tuple[int, float]:
     return math.floor(steps), steps - math.floor(steps)
 
 
-def delayed(history: np.ndarray, fraction: float) -> np.ndarray:
-    """The command as it was `m - 1` integration steps ago, or `m - 2 + fraction` where that is no whole number.
+def delayed(newer: float, older: float, fraction: float) -> float:
+    """The command between two that were given an integration step apart.
 
     Args:
-        history: the last m commands, newest first, shape (N, m).
-        fraction: of a step, in [0, 1): how far the result lies from the last but one towards the last of them; 0 takes
-            the last.
-
-    Returns:
-        Shape (N,).
+        newer: [N or N*m].
+        older: [N or N*m].
+        fraction: of a step, in [0, 1]: how far the result lies from the newer towards the older.
     """
-    if fraction == 0.0:
-        return history[:, -1].copy()
-    newer, older = history[:, -2], history[:, -1]
     return newer + fraction * (older - newer)
 
 
-def quantised(command: np.ndarray, quantum: float, limit: float) -> np.ndarray:
+def quantised(command: float, quantum: float, limit: float) -> float:
     """The nearest multiple of the quantum, half to even, within +-limit.
 
     Args:
-        command: [N or N*m], shape (N,).
+        command: [N or N*m].
         quantum: [N or N*m], > 0.
         limit: the largest force [N or N*m].
     """
-    return np.minimum(np.maximum(quantum * np.rint(command / quantum), -limit), limit)  # np.clip takes longer
+    return np.minimum(np.maximum(quantum * np.rint(command / quantum), -limit), limit)
 
 
-def rate_limited(command: np.ndarray, before: np.ndarray, change: float) -> np.ndarray:
+def rate_limited(command: float, before: float, change: float) -> float:
     """The command, at most `change` away from the one before.
 
     Args:
-        command: [N or N*m], shape (N,).
-        before: the result one integration step earlier [N or N*m], shape (N,).
+        command: [N or N*m].
+        before: the result one integration step earlier [N or N*m].
         change: largest change in one integration step [N or N*m].
     """
     return np.minimum(np.maximum(command, before - change), before + change)

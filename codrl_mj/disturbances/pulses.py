@@ -12,36 +12,32 @@ the episode, number of the present or next pulse, and when that one starts [s]."
 KEY, STEP, INDEX, START = range(len(PULSE_NAMES))
 
 
-def pulse_load(
-    memory: np.ndarray, timestep: float, force: float, duration: float, interval: float, loads: np.ndarray
-) -> None:
-    """The mean load over the next integration step of every environment; moves the memory on by that step.
+def pulse_load(memory: np.ndarray, timestep: float, force: float, duration: float, interval: float) -> float:
+    """The mean load [N or N*m] over an environment's next integration step; moves the memory on by that step.
 
     A pulse that covers part of a step counts in proportion, so that its impulse does not depend on the step.
 
     Args:
-        memory: shape (N, 4), entries as in `PULSE_NAMES`; (key, 0, 0, 0) at the start of an episode. Changed.
+        memory: shape (4,), entries as in `PULSE_NAMES`; (key, 0, 0, 0) at the start of an episode. Changed.
         timestep: integration step [s].
         force: size of a pulse [N or N*m].
         duration: of a pulse [s].
         interval: mean time between pulses [s].
-        loads: where the loads [N or N*m] go, shape (N,).
     """
-    for row in range(len(memory)):
-        key, step = int(memory[row, KEY]), memory[row, STEP]
-        begin, end = step * timestep, (step + 1.0) * timestep
-        w0, w1, sign, _ = philox(int(memory[row, INDEX]), 0, 0, LOAD_STREAM, key)
-        if step == 0.0:
-            memory[row, START] = -interval * math.log(unit(w0, w1))
-        load = 0.0
-        while memory[row, START] < end:
-            last = memory[row, START] + duration
-            covered = max(min(last, end) - max(memory[row, START], begin), 0.0) / timestep
-            load += min(covered, 1.0) * (force if sign & 1 else -force)
-            if last > end:
-                break
-            memory[row, INDEX] += 1.0
-            w0, w1, sign, _ = philox(int(memory[row, INDEX]), 0, 0, LOAD_STREAM, key)
-            memory[row, START] = last - interval * math.log(unit(w0, w1))
-        memory[row, STEP] = step + 1.0
-        loads[row] = load
+    key, step = int(memory[KEY]), memory[STEP]
+    begin, end = step * timestep, (step + 1.0) * timestep
+    w0, w1, sign, _ = philox(int(memory[INDEX]), 0, 0, LOAD_STREAM, key)
+    if step == 0.0:
+        memory[START] = -interval * math.log(unit(w0, w1))
+    load = 0.0
+    while memory[START] < end:
+        last = memory[START] + duration
+        covered = max(min(last, end) - max(memory[START], begin), 0.0) / timestep
+        load += min(covered, 1.0) * (force if sign & 1 else -force)
+        if last > end:
+            break
+        memory[INDEX] += 1.0
+        w0, w1, sign, _ = philox(int(memory[INDEX]), 0, 0, LOAD_STREAM, key)
+        memory[START] = last - interval * math.log(unit(w0, w1))
+    memory[STEP] = step + 1.0
+    return load

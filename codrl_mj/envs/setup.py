@@ -1,6 +1,7 @@
 """A task made ready: its actuator, its options, and what the agent commands and sees. Shared by every face."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -9,6 +10,7 @@ from gymnasium import spaces
 
 from codrl_mj.distributions import Distribution
 from codrl_mj.disturbances import OFF, Disturbances, resolve_disturbances
+from codrl_mj.envs.outcomes import Outcomes, compiled_outcomes
 from codrl_mj.envs.randomization import Randomization, nominal_parameters
 from codrl_mj.motor import Actuator, CurrentLoop, check_stable, resolve
 from codrl_mj.motor.noise import LARGEST_KEY
@@ -260,6 +262,18 @@ class Setup:
         extra = ("current", "reference_current") if self.observe_actuator else ()
         return (*self.task.observation_names, *extra)
 
+    @functools.cached_property
+    def action_forces(self) -> np.ndarray | None:
+        """Forces [N or N*m] of the discrete actions, in order, as `force` has them; None where the space is a box."""
+        if self.levels is not None:
+            return self.levels * self._force_per_ampere
+        return None if self.task.forces is None else np.array(self.task.forces)
+
+    @functools.cached_property
+    def _box_limit(self) -> tuple[float, float]:
+        """The largest command of a box's action, and the force [N or N*m] of a command of one."""
+        return (self.task.max_force, 1.0) if self.command == "force" else (self._command_limit, self._force_per_ampere)
+
     def force(self, action: Any) -> float:
         """The force [N] or torque [N*m] that the physics is to ask the actuator for.
 
@@ -269,18 +283,17 @@ class Setup:
         Raises:
             ValueError: the action is no element, or not a number.
         """
-        if self.command == "force":
-            return float(self.task.desired_force(self.task.check_action(action)))
-        space = self.action_space
-        if self.levels is not None:
-            if not space.contains(action):
-                raise ValueError(f"action = {action!r}: not in {space}")
-            return float(self.levels[int(action)]) * self._force_per_ampere
+        forces = self.action_forces
+        if forces is not None:
+            plain = type(action) is int or type(action) is np.int64  # spares them the slower test
+            if not (0 <= action < len(forces) if plain else self.action_space.contains(action)):
+                raise ValueError(f"action = {action!r}: not in {self.action_space}")
+            return forces.item(int(action))
         array = np.asarray(action)
-        if array.shape != space.shape or array.dtype.kind != "f" or np.isnan(array).any():
-            raise ValueError(f"action = {action!r}: not in {space}")
-        limit = self._command_limit
-        return min(max(float(array[0]), -limit), limit) * self._force_per_ampere
+        if array.shape != (1,) or array.dtype.kind != "f" or (command := float(array[0])) != command:
+            raise ValueError(f"action = {action!r}: not in {self.action_space}")
+        limit, scale = self._box_limit
+        return min(max(command, -limit), limit) * scale
 
     def forces(self, actions: Any) -> np.ndarray:
         """What `force` does, for a batch.
@@ -306,12 +319,10 @@ class Setup:
         if wrong.any():
             row = int(np.argmax(wrong))
             raise ValueError(f"actions[{row}] = {array[row]}: not in {space} (environment {row})")
-        if self.command == "force":
-            return np.asarray(self.task.desired_force(array), dtype=np.float64)
-        if self.levels is not None:
-            return self.levels[array] * self._force_per_ampere
-        limit = self._command_limit
-        return np.clip(array[:, 0].astype(np.float64), -limit, limit) * self._force_per_ampere
+        if self.action_forces is not None:
+            return self.action_forces[array]
+        limit, scale = self._box_limit
+        return np.clip(array[:, 0].astype(np.float64), -limit, limit) * scale
 
     def signals(self, signals: Signals) -> Signals:
         """The signals as the agent's command defines them: a voltage asks for whatever force follows."""
@@ -329,25 +340,46 @@ class Setup:
         Returns:
             Shape (k,), or (N, k), float32; the currents in A.
         """
-        seen = self.task.observation(state)
-        if not self.observe_actuator:
-            return seen
-        currents = np.zeros((*seen.shape[:-1], 2), np.float32)
-        if signals is not None:
-            currents[..., 0], currents[..., 1] = signals.current, signals.reference_current
-        return np.concatenate([seen, currents], axis=-1)
+        size = len(self.task.observation_names)
+        rows = np.empty((*state.shape[:-1], size + 2 * self.observe_actuator), np.float32)
+        self.outcomes.observe_all(_rows(state), _rows(rows))
+        if self.observe_actuator:
+            rows[..., size:] = 0.0
+            if signals is not None:
+                rows[..., size], rows[..., size + 1] = signals.current, signals.reference_current
+        return rows
 
     def reward(self, before: np.ndarray, signals: Signals, after: np.ndarray) -> float:
         """The task's reward of a step that led from one state to another."""
-        return float(self.rewards(before, signals, after))
+        return float(self.rewards(before[np.newaxis], signals, after[np.newaxis])[0])
 
     def rewards(self, before: np.ndarray, signals: Signals, after: np.ndarray) -> np.ndarray:
         """The same for a batch: states (N, n), signals and rewards (N,)."""
-        return np.asarray(self.task.reward(before, np.asarray(signals.actual_force), after, self.options))
+        rewards = np.empty(len(after))
+        forces = np.atleast_1d(np.asarray(signals.actual_force, dtype=np.float64))
+        self.outcomes.reward_all(_rows(before), forces, _rows(after), self.option_values, rewards)
+        return rewards
 
     def terminated(self, state: np.ndarray) -> bool:
         """Whether the task ends the episode in this state."""
-        return bool(self.task.terminated(state))
+        ended = np.empty(1, dtype=bool)
+        self.outcomes.terminated_all(_rows(state), ended)
+        return bool(ended[0])
+
+    @functools.cached_property
+    def outcomes(self) -> Outcomes:
+        """The task's compiled functions."""
+        return compiled_outcomes(self.task)
+
+    @functools.cached_property
+    def option_values(self) -> np.ndarray:
+        """The task's options as a vector."""
+        return np.array(self.options, dtype=np.float64)
+
+
+def _rows(array: np.ndarray) -> np.ndarray:
+    """An array (n,) or (N, n) as rows (N, n), in the one memory layout that the compiled functions are compiled for."""
+    return np.ascontiguousarray(array.reshape(-1, array.shape[-1]))
 
 
 def _disturbances(

@@ -9,6 +9,7 @@ from gymnasium.utils import seeding
 
 from codrl_mj.distributions import Distribution
 from codrl_mj.disturbances import Disturbances
+from codrl_mj.envs.compiled import arguments, compiled_kernels
 from codrl_mj.envs.setup import Setup
 from codrl_mj.envs.snapshots import check_snapshot
 from codrl_mj.motor import Actuator
@@ -115,6 +116,10 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
             check_view(self._scene().model, width, height, camera)
         self.action_space = self.setup.action_space
         self.observation_space = self.setup.observation_space
+        self._observation_shape = self.observation_space.shape
+        self._compiled: tuple[Any, tuple[Any, ...]] | None = (
+            None  # its step, and the arguments that are this simulation
+        )
 
     @property
     def task(self) -> Task:
@@ -171,8 +176,31 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
             ValueError: the action is not in the action space, or not a number.
             SimulationDivergedError: the simulation left the finite numbers.
         """
+        force = self.setup.force(action)
+        if self._compiled is None:
+            if not isinstance(self.physics, MujocoPhysics):
+                return self._step_apart(force)
+            self._compiled = compiled_kernels(self.setup, self.physics).step, arguments(self.setup, self.physics)
+        step, simulation = self._compiled
+        observation = np.empty(self._observation_shape, np.float32)
+        reward, terminated, fine, desired, actual, current, reference, voltage, saturated = step(
+            force, observation, *simulation
+        )
+        if not fine:
+            self._mujoco_physics().check_finite()
+        info = {
+            "desired_force": desired,
+            "actual_force": actual,
+            "current": current,
+            "reference_current": reference,
+            "voltage": voltage,
+            "saturated": saturated,
+        }
+        return observation, reward, terminated, False, info
+
+    def _step_apart(self, force: float) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """What the compiled step does, in parts, for a physics that is Python."""
         setup, physics = self.setup, self.physics
-        force = setup.force(action)
         before = physics.state
         delivered = physics.step(force)
         signals = setup.signals(delivered)
@@ -258,5 +286,5 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
         self._renderer = self._drawn = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but the renderer, which a copy makes anew."""
-        return self.__dict__ | {"_renderer": None, "_drawn": None}
+        """Everything but the renderer and the compiled step, which a copy makes anew."""
+        return self.__dict__ | {"_renderer": None, "_drawn": None, "_compiled": None}

@@ -181,7 +181,7 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         """
         low, high = self.setup.task.initial_bounds(options)
         draws = low + (high - low) * self._streams.random(rows, len(low))
-        states = self.setup.task.initial_state(draws)
+        states = self.setup.task.initial_states(draws)
         infos = {} if self._draws is None else self._draws.draw(self._streams, rows)
         self.physics.reset(rows, states, self.setup.keys(lambda count: self._streams.random(rows, count)))
         self._observations[rows] = self.setup.observation(states, self.setup.seen(self.physics, None, rows))
@@ -222,14 +222,27 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         signals = self.setup.signals(delivered)
         seen = self.setup.seen(self.physics, delivered) if self.setup.senses else signals
         after = self.physics.state
-        self._elapsed += 1
-        self.physics.check_finite(after, stepping)
-        rewards = np.where(stepping, self.setup.rewards(before, signals, after), 0.0)
-        terminated = np.asarray(self.setup.task.terminated(after)) & stepping
-        limit = np.inf if self.max_episode_steps is None else self.max_episode_steps
-        truncated = (self._elapsed >= limit) & stepping
+        rewards = np.empty(self.num_envs)
+        terminated, truncated = np.empty(self.num_envs, dtype=bool), np.empty(self.num_envs, dtype=bool)
+        broken = self.setup.outcomes.judge(
+            before,
+            signals.actual_force,
+            after,
+            self.setup.option_values,
+            self._elapsed,
+            np.inf if self.max_episode_steps is None else float(self.max_episode_steps),
+            stepping,
+            self._observations,
+            rewards,
+            terminated,
+            truncated,
+        )
+        if self.setup.observe_actuator:
+            assert seen is not None
+            self._observations[:, -2], self._observations[:, -1] = seen.current, seen.reference_current
+        if broken >= 0:
+            self.physics.check_finite(after, stepping)
         self.signals = signals
-        self._observations = self.setup.observation(after, seen)
         infos = _infos(signals, stepping)
         if not stepping.all():
             infos |= self._restart(np.flatnonzero(~stepping), None)

@@ -2,7 +2,7 @@
 
 import math
 import numbers
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -47,6 +47,36 @@ def ideal_signals(desired_force: float, command: float | None = None) -> Signals
     return Signals(desired_force, desired_force if command is None else command, 0.0, 0.0, 0.0, False)
 
 
+def delivered(
+    desired_force: Any,
+    command: Any,
+    current: Any,
+    voltage: Any,
+    arm: Any,
+    torque_constant: Any,
+    available: Any,
+) -> tuple[Any, Any, Any, Any, Any, Any]:
+    """The signals of motors in the order of `Signals`, from numbers or arrays; numba compiles it as it stands.
+
+    Args:
+        desired_force: [N or N*m].
+        command: what has become of the desired force on its way to the motor.
+        current: [A].
+        voltage: [V].
+        arm: [m].
+        torque_constant: [N*m/A].
+        available: largest voltage [V].
+    """
+    return (
+        desired_force,
+        torque_constant * current / arm,
+        current,
+        command * arm / torque_constant,
+        voltage,
+        abs(voltage) >= available,
+    )
+
+
 def motor_signals(
     actuator: Actuator,
     desired_force: float,
@@ -68,14 +98,7 @@ def motor_signals(
     motor = actuator.motor
     command = desired_force if command is None else command
     limit = actuator.controller.max_voltage if available is None else available
-    return Signals(
-        desired_force=desired_force,
-        actual_force=motor.torque_constant * current / motor.arm_radius,
-        current=current,
-        reference_current=command * motor.arm_radius / motor.torque_constant,
-        voltage=voltage,
-        saturated=abs(voltage) >= limit,
-    )
+    return Signals(*delivered(desired_force, command, current, voltage, motor.arm_radius, motor.torque_constant, limit))
 
 
 class Physics(Protocol):

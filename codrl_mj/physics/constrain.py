@@ -1,7 +1,11 @@
-"""Compiles a task's bounds, so that keeping them costs little next to an integration step."""
+"""A task's bounds and the order of its state, compiled for one simulation; each compiled once a process.
+
+The compiled functions take MuJoCo's `qpos` and `qvel` as pointers or as arrays, and change arrays in place.
+"""
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import numba
 import numpy as np
@@ -9,47 +13,104 @@ import numpy as np
 from codrl_mj.physics.base import LARGEST
 from codrl_mj.tasks import Task
 
-Keep = Callable[[np.ndarray, np.ndarray, float], None]
+Compiled = Callable[..., Any]
 
 
-def compiled_constrain(task: Task) -> Keep | None:
-    """The compiled form of the task's `constrain`, applied in place to MuJoCo's arrays; compiled once a process.
+def compiled_reader(task: Task) -> Compiled:
+    """(qpos, qvel, state (n,)) -> nothing: fills `state`, in the task's order.
+
+    Args:
+        task: the task.
+    """
+    return _reader(task.qpos, task.qvel)
+
+
+def compiled_constrain(task: Task) -> Compiled | None:
+    """(qpos, qvel, scratch (n,), integration step [s]) -> nothing: the task's `constrain`, applied in place.
+
+    A state beyond `LARGEST` becomes NaN in all its entries, to be noticed: within its bounds it would look like any
+    other.
 
     Args:
         task: the task.
 
     Returns:
-        (qpos (N, nq), qvel (N, nv), integration step [s]) -> nothing; None for a task without bounds. A state beyond
-        `LARGEST` becomes NaN in all its entries, to be noticed: within its bounds it would look like any other.
+        The function; None for a task without bounds.
     """
-    return None if task.constrain is None else _compiled(task.constrain, task.qpos, task.qvel)
+    return None if task.constrain is None else _keeper(task.constrain, task.qpos, task.qvel)
+
+
+def compiled_correction(task: Task, explicit: bool) -> Compiled | None:
+    """(qpos (N, nq), qvel (N, nv), moved (N, nq), integration step [s]) -> nothing: what follows a step of a batch.
+
+    Args:
+        task: the task.
+        explicit: whether the positions become `moved`, where the old velocities would have taken them.
+
+    Returns:
+        The function; None where nothing follows.
+    """
+    keep = compiled_constrain(task)
+    return _corrector(keep, len(task.state_names), explicit) if explicit or keep is not None else None
 
 
 @functools.cache
-def _compiled(
-    constrain: Callable[[np.ndarray, float], np.ndarray], positions: tuple[int, ...], velocities: tuple[int, ...]
-) -> Keep:
-    bounded = numba.njit(nogil=True, error_model="numpy")(constrain)
-    array = numba.types.Array(numba.float64, 2, "A")  # a batch's are views of its state rows
+def _corrector(keep: Compiled | None, size: int, explicit: bool) -> Compiled:
+    bounded, constrain = keep is not None, keep or _nothing
 
-    @numba.njit(numba.void(array, array, numba.float64), nogil=True, error_model="numpy")
-    def keep(qpos: np.ndarray, qvel: np.ndarray, timestep: float) -> None:
-        state = np.empty((len(qpos), len(positions) + len(velocities)))
-        for row in range(len(qpos)):  # scalar loops: numba compiles them several times faster than slices
-            for entry in range(len(positions)):
-                state[row, positions[entry]] = qpos[row, entry]
-            for entry in range(len(velocities)):
-                state[row, velocities[entry]] = qvel[row, entry]
-            lost = False
-            for entry in range(state.shape[1]):
-                lost |= not abs(state[row, entry]) <= LARGEST
-            if lost:
-                state[row] = np.nan
-        state = bounded(state, timestep)
+    @numba.njit(nogil=True, error_model="numpy")
+    def correct(qpos: np.ndarray, qvel: np.ndarray, moved: np.ndarray, timestep: float) -> None:
+        state = np.empty(size)
         for row in range(len(qpos)):
-            for entry in range(len(positions)):
-                qpos[row, entry] = state[row, positions[entry]]
-            for entry in range(len(velocities)):
-                qvel[row, entry] = state[row, velocities[entry]]
+            if explicit:
+                for entry in range(qpos.shape[1]):
+                    qpos[row, entry] = moved[row, entry]
+            if bounded:
+                constrain(qpos[row], qvel[row], state, timestep)
+
+    return correct
+
+
+@numba.njit
+def _nothing(qpos: Any, qvel: Any, state: np.ndarray, timestep: float) -> None:
+    """Take the place of bounds where there are none."""
+
+
+@functools.cache
+def _reader(positions: tuple[int, ...], velocities: tuple[int, ...]) -> Compiled:
+    @numba.njit(nogil=True, error_model="numpy")
+    def read(qpos: Any, qvel: Any, state: np.ndarray) -> None:
+        for entry in range(len(positions)):
+            state[positions[entry]] = qpos[entry]
+        for entry in range(len(velocities)):
+            state[velocities[entry]] = qvel[entry]
+
+    return read
+
+
+@functools.cache
+def _keeper(constrain: Callable[..., Any], positions: tuple[int, ...], velocities: tuple[int, ...]) -> Compiled:
+    read = _reader(positions, velocities)
+    bounded = numba.njit(nogil=True, error_model="numpy")(constrain)
+
+    @numba.njit(nogil=True, error_model="numpy")
+    def keep(qpos: Any, qvel: Any, state: np.ndarray, timestep: float) -> None:
+        read(qpos, qvel, state)
+        if not is_fine(state):
+            state[:] = np.nan
+        kept = bounded(state, timestep)
+        for entry in range(len(positions)):
+            qpos[entry] = kept[positions[entry]]
+        for entry in range(len(velocities)):
+            qvel[entry] = kept[velocities[entry]]
 
     return keep
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def is_fine(state: np.ndarray) -> bool:
+    """Whether every entry of a state (n,) is a number, and at most `LARGEST`."""
+    fine = True
+    for entry in range(len(state)):
+        fine &= abs(state[entry]) <= LARGEST
+    return fine

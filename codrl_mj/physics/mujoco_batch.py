@@ -12,8 +12,8 @@ from codrl_mj.callbacks.kernels import AVAILABLE_VOLTAGE, CURRENT, NOISE_KEY, VO
 from codrl_mj.disturbances import OFF, Disturbances
 from codrl_mj.motor import Actuator, to_vector
 from codrl_mj.motor.parameters import MAX_VOLTAGE, TORQUE_CONSTANT
-from codrl_mj.physics.base import LARGEST, Signals, SimulationDivergedError
-from codrl_mj.physics.constrain import compiled_constrain
+from codrl_mj.physics.base import LARGEST, Signals, SimulationDivergedError, delivered
+from codrl_mj.physics.constrain import compiled_correction
 from codrl_mj.physics.disturber import disturber, sensed
 from codrl_mj.physics.mjcf import needed_callbacks, task_model
 from codrl_mj.tasks import Task
@@ -74,7 +74,7 @@ class MujocoBatchPhysics:
         self._callbacks = needed_callbacks(self.model)
         self._install()
         self._batch = Batch(self.model, *self._size)
-        self._keep = compiled_constrain(self.task)
+        self._correct = compiled_correction(self.task, self._explicit)
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._ctrl, self._act = self._batch.bind("ctrl"), self._batch.bind("act")
         self._load = self._batch.bind("qfrc_applied")
@@ -193,26 +193,18 @@ class MujocoBatchPhysics:
             return Signals(desired_force, command.copy(), nothing, nothing.copy(), nothing.copy(), nothing > 0)  # type: ignore[arg-type]
         current, voltage = self._act[:, CURRENT].copy(), self._act[:, VOLTAGE].copy()
         limit = self._act[:, AVAILABLE_VOLTAGE] if self._disturbances.of_motor else self._limit
-        return Signals(
-            desired_force=desired_force,  # type: ignore[arg-type]
-            actual_force=self._torque_constant * current / self._arm,
-            current=current,  # type: ignore[arg-type]
-            reference_current=command * self._arm / self._torque_constant,  # type: ignore[arg-type]
-            voltage=voltage,  # type: ignore[arg-type]
-            saturated=np.abs(voltage) >= limit,  # type: ignore[arg-type]
-        )
+        return Signals(*delivered(desired_force, command, current, voltage, self._arm, self._torque_constant, limit))
 
     def _integrate(self, steps: int) -> None:
         """Take integration steps."""
         timestep = self.model.opt.timestep
-        if self._explicit or self._keep is not None:
+        if self._correct is not None:
+            moved = self._qpos  # of no meaning, and not read, unless there is something to move
             for _ in range(steps):
-                moved = self._qpos + timestep * self._qvel if self._explicit else None
+                if self._explicit:
+                    moved = self._qpos + timestep * self._qvel
                 self._batch.step()
-                if moved is not None:
-                    self._qpos[:] = moved
-                if self._keep is not None:
-                    self._keep(self._qpos, self._qvel, timestep)
+                self._correct(self._qpos, self._qvel, moved, timestep)
         else:
             self._batch.step(nstep=steps)
 
@@ -272,4 +264,4 @@ class MujocoBatchPhysics:
         mujoco.mj_passive(self.model, data)
 
 
-_ENGINE = ("_batch", "_keep", "_qpos", "_qvel", "_ctrl", "_act", "_load")
+_ENGINE = ("_batch", "_correct", "_qpos", "_qvel", "_ctrl", "_act", "_load")

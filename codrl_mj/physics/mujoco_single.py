@@ -7,13 +7,13 @@ import mujoco
 import numpy as np
 
 from codrl_mj import callbacks
-from codrl_mj.callbacks.kernels import AVAILABLE_VOLTAGE, CURRENT, NOISE_KEY, VOLTAGE
+from codrl_mj.callbacks.engine import addresses
 from codrl_mj.disturbances import OFF, Disturbances
 from codrl_mj.motor import Actuator, to_vector
-from codrl_mj.physics.base import TRACE_NAMES, Signals, check_finite, ideal_signals, motor_signals
-from codrl_mj.physics.constrain import compiled_constrain
-from codrl_mj.physics.disturber import disturber, sensed
+from codrl_mj.physics.base import TRACE_NAMES, Signals, check_finite
+from codrl_mj.physics.disturber import disturber
 from codrl_mj.physics.mjcf import needed_callbacks, task_model
+from codrl_mj.physics.stepping import ARM, DISTURBANCE, actuator_settings, compiled_stepping
 from codrl_mj.physics.variation import write_fields
 from codrl_mj.tasks import Task
 
@@ -57,15 +57,22 @@ class MujocoPhysics:
         self._disturbances = disturbances
         self._disturber = disturber(disturbances, timestep, self._max_force, 1)
         self.trace = np.zeros((inner_steps, len(TRACE_NAMES)))
-        self._dof = int(self.model.jnt_dofadr[self.model.actuator("motor").trnid[0]])
+        dof = self.model.jnt_dofadr[self.model.actuator("motor").trnid[0]]
+        kind = actuator is not None, disturbances.of_motor, dof
+        sensor = disturbances.current_bias, disturbances.current_noise
+        numbers: Any = [] if self._disturber is None else self._disturber.numbers
+        self._settings = np.array([*kind, *sensor, *actuator_settings(actuator), *numbers], dtype=np.float64)
         self._bind()
         self.reset(np.zeros(len(task.state_names)))
 
     def _bind(self) -> None:
         """Take the views that a step uses, and make sure that the callbacks are there."""
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
-        self._ctrl, self._act = self.data.ctrl, self.data.act
-        self._constrain = compiled_constrain(self.task)
+        memory = np.zeros((1, 0)) if self._disturber is None else self._disturber.memory
+        self.arguments = *addresses(self.data), self._settings, memory, self.trace
+        self.stepping = compiled_stepping(
+            self.task, self._explicit, self._disturber is not None, self._disturbances.current_noise > 0.0
+        )
         self._callbacks = needed_callbacks(self.model)
         self._install()
 
@@ -99,13 +106,7 @@ class MujocoPhysics:
             key: of the random numbers of the episode's disturbances.
         """
         self._install()  # raises if somebody replaced ours since the last episode
-        mujoco.mj_resetData(self.model, self.data)
-        self._qpos[:] = state[self._qpos_order]
-        self._qvel[:] = state[self._qvel_order]
-        if self._disturbances.of_motor:
-            self._act[NOISE_KEY] = key
-        if self._disturber is not None:
-            self._disturber.reset(0, key)
+        self.stepping.start(np.asarray(state, dtype=np.float64), float(key), *self.arguments)
 
     def set_actuator(self, actuator: Actuator) -> None:
         """Exchange the motor for another; to be followed by a reset. An ideal actuator cannot be exchanged."""
@@ -115,6 +116,7 @@ class MujocoPhysics:
         self.model.actuator_user[0, : len(vector)] = vector
         self.model.actuator_gear[0, 0] = 1.0 / arm
         self.model.actuator_ctrlrange[0] = -self._max_force * arm, self._max_force * arm
+        self._settings[ARM:DISTURBANCE] = actuator_settings(actuator)
         self.actuator = actuator
 
     def set_model(self, fields: Mapping[str, np.ndarray]) -> None:
@@ -140,46 +142,22 @@ class MujocoPhysics:
         Raises:
             SimulationDivergedError: the state is no longer finite.
         """
-        command = desired_force
-        arm, torque_constant, available = 1.0, 0.0, np.inf
-        if self.actuator is not None:
-            arm, torque_constant = self.actuator.motor.arm_radius, self.actuator.motor.torque_constant
-            available = self.actuator.controller.max_voltage
-        self._ctrl[0] = command * arm
-        for row in self.trace:
-            if self._disturber is not None:
-                command = float(self._disturber.command(np.array([desired_force]))[0])
-                self.data.qfrc_applied[self._dof] = self._disturber.load()[0]
-                self._ctrl[0] = command * arm
-            self._integrate()
-            if self.actuator is None:
-                row[:] = command, command, 0.0, 0.0, self._qvel[self._dof], 0.0
-            else:
-                current, voltage = float(self._act[CURRENT]), float(self._act[VOLTAGE])
-                if self._disturbances.of_motor:
-                    available = float(self._act[AVAILABLE_VOLTAGE])
-                force = torque_constant * current / arm
-                row[:] = command, force, current, voltage, self._qvel[self._dof], abs(voltage) >= available
-        check_finite(self.task, self.state, self.data.time)
-        if self.actuator is None:
-            return ideal_signals(desired_force, command)
-        return motor_signals(self.actuator, desired_force, current, voltage, command, available)
+        fine, *signals = self.stepping.step(float(desired_force), *self.arguments)
+        if not fine:
+            self.check_finite()
+        return Signals(*signals)
 
-    def _integrate(self) -> None:
-        """Take an integration step."""
-        timestep = self.model.opt.timestep
-        moved = self._qpos + timestep * self._qvel if self._explicit else None
-        mujoco.mj_step(self.model, self.data)
-        if moved is not None:
-            self._qpos[:] = moved
-        if self._constrain is not None:
-            self._constrain(self._qpos[np.newaxis], self._qvel[np.newaxis], timestep)
+    def check_finite(self) -> None:
+        """Raise if the state is not finite or beyond `LARGEST`, saying which entry and when.
+
+        Raises:
+            SimulationDivergedError: as it says.
+        """
+        check_finite(self.task, self.state, self.data.time)
 
     def sensed(self, signals: Signals) -> Signals:
         """Signals of the present moment with the current [A] that the sensor measures."""
-        timestep, key = self.model.opt.timestep, self._act[NOISE_KEY] if self._disturbances.of_motor else 0.0
-        measured = sensed(self._disturbances, [signals.current], [key], [self.data.time], timestep)
-        return signals._replace(current=float(measured[0]))
+        return signals._replace(current=self.stepping.sensed(float(signals.current), *self.arguments))
 
     def snapshot(self) -> np.ndarray:
         """Simulation and motor as the engine's state vector (`mjSTATE_INTEGRATION`), shape (k,), float64.
@@ -207,4 +185,4 @@ def _progression(entries: tuple[int, ...]) -> slice:
 
 
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-_VIEWS = ("model", "_qpos", "_qvel", "_ctrl", "_act", "_constrain")
+_VIEWS = ("model", "_qpos", "_qvel", "stepping", "arguments")

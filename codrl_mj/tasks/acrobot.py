@@ -55,8 +55,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.classic_control import utils
+from numba.extending import register_jitable
 
-from codrl_mj.tasks.base import Task
+from codrl_mj.tasks.base import Entries, Task
 
 # Gymnasium's Acrobot-v1
 TORQUE = 1.0  # N*m
@@ -75,50 +76,45 @@ def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarr
     return np.full(4, low), np.full(4, high)
 
 
-def initial_state(draws: np.ndarray) -> np.ndarray:
-    """The draws as float32, as Gymnasium has them."""
-    return draws.astype(np.float32).astype(np.float64)
+def initial_state(draws: Entries) -> tuple[Any, ...]:
+    """The draws rounded to float32, as Gymnasium has them."""
+    return _rounded(draws[0]), _rounded(draws[1]), _rounded(draws[2]), _rounded(draws[3])
 
 
-def desired_force(action: np.ndarray) -> np.ndarray:
-    """Actions 0, 1, 2 ask for -1, 0, 1 N*m."""
-    return TORQUE * (action - 1.0)
+@register_jitable
+def _rounded(number: Any) -> Any:
+    return np.float64(np.float32(number))
 
 
-def constrain(state: np.ndarray, timestep: float) -> np.ndarray:
+def constrain(state: Entries, timestep: float) -> tuple[Any, ...]:
     """Wrap the angles and limit the speeds."""
-    bounded = state.copy()
+    speed_1 = np.minimum(np.maximum(state[2], -MAX_SPEED_1), MAX_SPEED_1)
+    speed_2 = np.minimum(np.maximum(state[3], -MAX_SPEED_2), MAX_SPEED_2)
+    return _wrapped(state[0]), _wrapped(state[1]), speed_1, speed_2
+
+
+@register_jitable
+def _wrapped(angle: Any) -> Any:
+    """The angle, turned back into [-pi, pi] by as many whole turns as it is beyond."""
     turn = 2 * math.pi
-    for row in bounded:
-        for angle in range(2):
-            if row[angle] > math.pi:
-                row[angle] -= turn * np.ceil((row[angle] - math.pi) / turn)
-            elif row[angle] < -math.pi:
-                row[angle] += turn * np.ceil((-math.pi - row[angle]) / turn)
-        for speed, limit in ((2, MAX_SPEED_1), (3, MAX_SPEED_2)):
-            if row[speed] > limit:
-                row[speed] = limit
-            elif row[speed] < -limit:
-                row[speed] = -limit
-    return bounded
+    angle = angle - turn * np.maximum(np.ceil((angle - math.pi) / turn), 0.0)
+    return angle + turn * np.maximum(np.ceil((-math.pi - angle) / turn), 0.0)
 
 
-def observation(state: np.ndarray) -> np.ndarray:
-    """Cosines and sines of the angles, and the speeds, as float32."""
-    angles = state[..., :2]
-    seen = np.empty((*state.shape[:-1], 6), np.float32)
-    seen[..., 0:4:2], seen[..., 1:4:2], seen[..., 4:] = np.cos(angles), np.sin(angles), state[..., 2:]
-    return seen
+def observation(state: Entries) -> tuple[Any, ...]:
+    """Cosines and sines of the angles, and the speeds."""
+    return np.cos(state[0]), np.sin(state[0]), np.cos(state[1]), np.sin(state[1]), state[2], state[3]
 
 
-def terminated(state: np.ndarray) -> np.ndarray:
+@register_jitable
+def terminated(state: Entries) -> Any:
     """The tip is above the goal line."""
-    return -np.cos(state[..., 0]) - np.cos(state[..., 1] + state[..., 0]) > GOAL_HEIGHT
+    return -np.cos(state[0]) - np.cos(state[1] + state[0]) > GOAL_HEIGHT
 
 
-def reward(state: np.ndarray, force: np.ndarray, next_state: np.ndarray, options: Options) -> np.ndarray:
+def reward(state: Entries, force: Any, next_state: Entries, options: Options) -> Any:
     """-1 a step, 0 for the step that reaches the goal."""
-    return np.where(terminated(next_state), 0.0, -1.0)
+    return -1.0 + terminated(next_state)
 
 
 _HIGH = np.array([1.0, 1.0, 1.0, 1.0, MAX_SPEED_1, MAX_SPEED_2], dtype=np.float32)
@@ -130,6 +126,7 @@ TASK = Task(
     step_duration=0.2,
     motor_inner_steps=10,
     max_force=TORQUE,
+    forces=(-TORQUE, 0.0, TORQUE),
     render_fps=15,
     integrators=("rk4",),
     state_names=("theta1 [rad]", "theta2 [rad]", "theta1_dot [rad/s]", "theta2_dot [rad/s]"),
@@ -141,7 +138,6 @@ TASK = Task(
     options=Options,
     initial_bounds=initial_bounds,
     initial_state=initial_state,
-    desired_force=desired_force,
     observation=observation,
     reward=reward,
     terminated=terminated,

@@ -52,11 +52,10 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.classic_control import utils
 
-from codrl_mj.tasks.base import Task
+from codrl_mj.tasks.base import Entries, Task
 
 # Gymnasium's CartPole-v1
 FORCE = 10.0  # N
-FORCES = np.array([-FORCE, FORCE])
 X_LIMIT = 2.4  # m
 ANGLE_LIMIT = 12 * 2 * np.pi / 360  # rad
 
@@ -74,29 +73,24 @@ def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarr
     return np.full(4, low), np.full(4, high)
 
 
-def initial_state(draws: np.ndarray) -> np.ndarray:
+def initial_state(draws: Entries) -> tuple[Any, ...]:
     """The draws themselves."""
-    return draws
+    return draws[0], draws[1], draws[2], draws[3]
 
 
-def desired_force(action: np.ndarray) -> np.ndarray:
-    """Push left at action 0, right at action 1 [N]."""
-    return FORCES[action]
+def observation(state: Entries) -> tuple[Any, ...]:
+    """The state."""
+    return state[0], state[1], state[2], state[3]
 
 
-def observation(state: np.ndarray) -> np.ndarray:
-    """The state as float32."""
-    return state.astype(np.float32)
-
-
-def terminated(state: np.ndarray) -> np.ndarray:
+def terminated(state: Entries) -> Any:
     """The cart has left the track or the pole has fallen past 12 degrees."""
-    return (np.abs(state[..., 0]) > X_LIMIT) | (np.abs(state[..., 2]) > ANGLE_LIMIT)
+    return (np.abs(state[0]) > X_LIMIT) | (np.abs(state[2]) > ANGLE_LIMIT)
 
 
-def reward(state: np.ndarray, force: np.ndarray, next_state: np.ndarray, options: Options) -> np.ndarray:
+def reward(state: Entries, force: Any, next_state: Entries, options: Options) -> Any:
     """1 a step, the last one included; 0 outside `center_radius`."""
-    return np.where(np.abs(next_state[..., 0]) > options.center_radius, 0.0, 1.0)
+    return 1.0 * (np.abs(next_state[0]) <= options.center_radius)
 
 
 _HIGH = np.array([X_LIMIT * 2, np.inf, ANGLE_LIMIT * 2, np.inf], dtype=np.float32)
@@ -108,6 +102,7 @@ TASK = Task(
     step_duration=0.02,
     motor_inner_steps=1,
     max_force=FORCE,
+    forces=(-FORCE, FORCE),
     render_fps=50,
     integrators=("euler", "semi-implicit"),
     state_names=("x [m]", "x_dot [m/s]", "theta [rad]", "theta_dot [rad/s]"),
@@ -119,7 +114,6 @@ TASK = Task(
     options=Options,
     initial_bounds=initial_bounds,
     initial_state=initial_state,
-    desired_force=desired_force,
     observation=observation,
     reward=reward,
     terminated=terminated,

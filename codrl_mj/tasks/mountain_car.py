@@ -49,7 +49,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.classic_control import utils
 
-from codrl_mj.tasks.base import Task
+from codrl_mj.tasks.base import Entries, Task
 
 # Gymnasium's MountainCar-v0 and, but for the goal, its MountainCarContinuous-v0
 FORCE = 1.0  # N
@@ -68,46 +68,32 @@ def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarr
     return np.array([low]), np.array([high])
 
 
-def initial_state(draws: np.ndarray) -> np.ndarray:
+def initial_state(draws: Entries) -> tuple[Any, ...]:
     """The position drawn, at rest."""
-    return np.concatenate([draws, np.zeros_like(draws)], axis=-1)
+    return draws[0], 0.0 * draws[0]
 
 
-def desired_force(action: np.ndarray) -> np.ndarray:
-    """Actions 0, 1, 2 ask for -1, 0, 1 N."""
-    return FORCE * (action - 1.0)
-
-
-def constrain(state: np.ndarray, timestep: float) -> np.ndarray:
+def constrain(state: Entries, timestep: float) -> tuple[Any, ...]:
     """Limit the speed, by which the car then moves; keep the position between the walls; stop at the left one."""
-    bounded = state.copy()
-    for row in bounded:
-        excess = row[1] - MAX_SPEED if row[1] > MAX_SPEED else row[1] + MAX_SPEED if row[1] < -MAX_SPEED else 0.0
-        if excess != 0.0:
-            row[0] -= excess * timestep
-            row[1] = MAX_SPEED if excess > 0.0 else -MAX_SPEED
-        if row[0] > MAX_POSITION:
-            row[0] = MAX_POSITION
-        elif row[0] <= MIN_POSITION:
-            row[0] = MIN_POSITION
-            if row[1] < 0.0:
-                row[1] = 0.0
-    return bounded
+    speed = np.minimum(np.maximum(state[1], -MAX_SPEED), MAX_SPEED)
+    position = state[0] - (state[1] - speed) * timestep
+    speed = speed - np.minimum(speed, 0.0) * (position <= MIN_POSITION)
+    return np.minimum(np.maximum(position, MIN_POSITION), MAX_POSITION), speed
 
 
-def observation(state: np.ndarray) -> np.ndarray:
-    """The state as float32."""
-    return state.astype(np.float32)
+def observation(state: Entries) -> tuple[Any, ...]:
+    """The state."""
+    return state[0], state[1]
 
 
-def terminated(state: np.ndarray) -> np.ndarray:
+def terminated(state: Entries) -> Any:
     """The car is at the flag or beyond, and not rolling back."""
-    return (state[..., 0] >= GOAL) & (state[..., 1] >= 0.0)
+    return (state[0] >= GOAL) & (state[1] >= 0.0)
 
 
-def reward(state: np.ndarray, force: np.ndarray, next_state: np.ndarray, options: Options) -> np.ndarray:
+def reward(state: Entries, force: Any, next_state: Entries, options: Options) -> Any:
     """-1 a step."""
-    return np.full(next_state.shape[:-1], -1.0)
+    return -1.0
 
 
 _LOW, _HIGH = np.array([[MIN_POSITION, -MAX_SPEED], [MAX_POSITION, MAX_SPEED]], dtype=np.float32)
@@ -119,6 +105,7 @@ TASK = Task(
     step_duration=1.0,
     motor_inner_steps=20,
     max_force=FORCE,
+    forces=(-FORCE, 0.0, FORCE),
     render_fps=30,
     integrators=("semi-implicit",),
     state_names=("x [m]", "x_dot [m/s]"),
@@ -130,7 +117,6 @@ TASK = Task(
     options=Options,
     initial_bounds=initial_bounds,
     initial_state=initial_state,
-    desired_force=desired_force,
     observation=observation,
     reward=reward,
     terminated=terminated,

@@ -45,12 +45,14 @@ with a motor, the paper's choice.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
+from numba.extending import register_jitable
 
 from codrl_mj.tasks import mountain_car
+from codrl_mj.tasks.base import Entries
 
 # Gymnasium's MountainCarContinuous-v0
 FORCE = 1.0  # N
@@ -61,19 +63,15 @@ class Options(NamedTuple):
     """MountainCarContinuous has no options."""
 
 
-def desired_force(action: np.ndarray) -> np.ndarray:
-    """The action as a force [N], saturated."""
-    return np.minimum(np.maximum(action[..., 0].astype(np.float64), -FORCE), FORCE)
-
-
-def terminated(state: np.ndarray) -> np.ndarray:
+@register_jitable
+def terminated(state: Entries) -> Any:
     """The car is at the flag or beyond, and not rolling back."""
-    return (state[..., 0] >= GOAL) & (state[..., 1] >= 0.0)
+    return (state[0] >= GOAL) & (state[1] >= 0.0)
 
 
-def reward(state: np.ndarray, force: np.ndarray, next_state: np.ndarray, options: Options) -> np.ndarray:
+def reward(state: Entries, force: Any, next_state: Entries, options: Options) -> Any:
     """100 at the goal, minus the square of the force delivered."""
-    return 100.0 * terminated(next_state) - 0.1 * (force * force)  # a power might differ in the last bit in a batch
+    return 100.0 * terminated(next_state) - 0.1 * (force * force)
 
 
 TASK = dataclasses.replace(
@@ -82,9 +80,9 @@ TASK = dataclasses.replace(
     gymnasium_id="MountainCarContinuous-v0",
     asset="mountain_car_continuous.xml",
     max_force=FORCE,
+    forces=None,
     action_space=spaces.Box(-FORCE, FORCE, (1,), np.float32),
     options=Options,
-    desired_force=desired_force,
     reward=reward,
     terminated=terminated,
     goal=terminated,

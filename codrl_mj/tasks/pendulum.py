@@ -51,8 +51,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.classic_control import utils
+from numba.extending import register_jitable
 
-from codrl_mj.tasks.base import Task
+from codrl_mj.tasks.base import Entries, Task
 
 # Gymnasium's Pendulum-v1
 MAX_TORQUE = 2.0  # N*m
@@ -74,52 +75,41 @@ def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarr
     return -high, high
 
 
-def initial_state(draws: np.ndarray) -> np.ndarray:
+def initial_state(draws: Entries) -> tuple[Any, ...]:
     """The draws themselves."""
-    return draws
+    return draws[0], draws[1]
 
 
-def desired_force(action: np.ndarray) -> np.ndarray:
-    """The action as a torque [N*m], saturated."""
-    return np.minimum(np.maximum(action[..., 0].astype(np.float64), -MAX_TORQUE), MAX_TORQUE)
-
-
-def constrain(state: np.ndarray, timestep: float) -> np.ndarray:
+def constrain(state: Entries, timestep: float) -> tuple[Any, ...]:
     """Limit the speed; the angle moves by the limited one."""
-    bounded = state.copy()
-    for row in bounded:
-        excess = row[1] - MAX_SPEED if row[1] > MAX_SPEED else row[1] + MAX_SPEED if row[1] < -MAX_SPEED else 0.0
-        if excess != 0.0:
-            row[0] -= excess * timestep
-            row[1] = MAX_SPEED if excess > 0.0 else -MAX_SPEED
-    return bounded
+    speed = np.minimum(np.maximum(state[1], -MAX_SPEED), MAX_SPEED)
+    return state[0] - (state[1] - speed) * timestep, speed
 
 
-def observation(state: np.ndarray) -> np.ndarray:
-    """(cos(theta), sin(theta), theta_dot) as float32."""
-    theta, speed = state[..., 0], state[..., 1]
-    return np.stack([np.cos(theta), np.sin(theta), speed], axis=-1).astype(np.float32)
+def observation(state: Entries) -> tuple[Any, ...]:
+    """(cos(theta), sin(theta), theta_dot)."""
+    return np.cos(state[0]), np.sin(state[0]), state[1]
 
 
-def terminated(state: np.ndarray) -> np.ndarray:
+def terminated(state: Entries) -> Any:
     """Never."""
-    return np.zeros(state.shape[:-1], dtype=bool)
+    return False
 
 
-def upright_angle(state: np.ndarray) -> np.ndarray:
+@register_jitable
+def upright_angle(state: Entries) -> Any:
     """The rod's angle from upright [rad], wrapped to [-pi, pi)."""
-    return (state[..., 0] + np.pi) % (2 * np.pi) - np.pi
+    return (state[0] + np.pi) % (2 * np.pi) - np.pi
 
 
-def goal(state: np.ndarray) -> np.ndarray:
+def goal(state: Entries) -> Any:
     """The rod is upright and still."""
-    return (np.abs(upright_angle(state)) < GOAL_ANGLE) & (np.abs(state[..., 1]) < GOAL_SPEED)
+    return (np.abs(upright_angle(state)) < GOAL_ANGLE) & (np.abs(state[1]) < GOAL_SPEED)
 
 
-def reward(state: np.ndarray, force: np.ndarray, next_state: np.ndarray, options: Options) -> np.ndarray:
+def reward(state: Entries, force: Any, next_state: Entries, options: Options) -> Any:
     """Minus the squares of angle, speed and torque: the state's before the step, the torque's delivered in it."""
-    angle, speed = upright_angle(state), state[..., 1]
-    # products: numpy's powers of one number and of an array may differ in the last bit
+    angle, speed = upright_angle(state), state[1]
     return -(angle * angle + 0.1 * (speed * speed) + 0.001 * (force * force))
 
 
@@ -132,6 +122,7 @@ TASK = Task(
     step_duration=0.05,
     motor_inner_steps=1,
     max_force=MAX_TORQUE,
+    forces=None,
     render_fps=30,
     integrators=("semi-implicit",),
     state_names=("theta [rad]", "theta_dot [rad/s]"),
@@ -143,7 +134,6 @@ TASK = Task(
     options=Options,
     initial_bounds=initial_bounds,
     initial_state=initial_state,
-    desired_force=desired_force,
     observation=observation,
     reward=reward,
     terminated=terminated,

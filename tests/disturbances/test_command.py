@@ -73,7 +73,7 @@ def test_the_delay_counts_integration_steps_within_an_environment_step():
 
 @given(st.floats(-1e3, 1e3), st.floats(1e-3, 10), st.floats(0.1, 2e3))
 def test_a_quantised_command_is_the_nearest_multiple_within_the_limit(command, quantum, limit):
-    value = quantised(np.array([command]), quantum, limit)[0]
+    value = quantised(command, quantum, limit)
     clipped = np.clip(command, -limit, limit)
     assert abs(value) <= limit
     if abs(value) < limit:

@@ -375,7 +375,7 @@ def test_observation_reward_and_end_of_one_state_are_those_of_a_batch_to_the_las
     nothing = np.zeros(3000)
     signals = Signals(forces, forces, nothing, nothing, nothing, nothing > 0)
     observations, rewards = setup.observation(after, signals), setup.rewards(before, signals, after)
-    terminated = setup.task.terminated(after)
+    terminated = np.broadcast_to(setup.task.terminated(after.T), 3000)
     for row in range(3000):
         one = Signals(forces[row], float(forces[row]), 0.0, 0.0, 0.0, False)
         assert np.array_equal(setup.observation(after[row], one), observations[row]), row

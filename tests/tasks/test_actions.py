@@ -70,8 +70,8 @@ def test_the_reward_charges_the_force_that_was_delivered(task):
     for _ in range(3):
         before = env.unwrapped.state
         _, reward, _, _, info = env.step(action)
-        rest = definition.reward(before[np.newaxis], np.zeros(1), env.unwrapped.state[np.newaxis], definition.options())
-        assert reward == pytest.approx(rest[0] - weight * info["actual_force"] ** 2, rel=1e-12)
+        rest = definition.reward(before, 0.0, env.unwrapped.state, definition.options())
+        assert reward == pytest.approx(rest - weight * info["actual_force"] ** 2, rel=1e-12)
         assert abs(info["actual_force"] - LIMITS[task]) > 1e-3
 
 
@@ -79,20 +79,18 @@ def test_the_reward_charges_the_force_that_was_delivered(task):
 def test_a_batch_of_states_is_many_single_states(task):
     definition = TASKS[task]
     generator = np.random.default_rng(0)
-    states = generator.uniform(-1, 1, (2, 7, len(definition.state_names)))
+    before, after = generator.uniform(-1, 1, (2, 7, len(definition.state_names)))
     forces, options = generator.uniform(-1, 1, 7), definition.options()
     together = (
-        definition.observation(states[0]),
-        definition.terminated(states[0]),
-        definition.reward(states[0], forces, states[1], options),
+        np.stack(definition.observation(after.T), axis=1),
+        np.broadcast_to(definition.terminated(after.T), 7),
+        np.broadcast_to(definition.reward(before.T, forces, after.T, options), 7),
     )
     for index in range(7):
         alone = (
-            definition.observation(states[0, index]),
-            definition.terminated(states[0, index]),
-            definition.reward(states[0, index], forces[index], states[1, index], options),
+            definition.observation(after[index]),
+            definition.terminated(after[index]),
+            definition.reward(before[index], forces[index], after[index], options),
         )
         for batch, single in zip(together, alone, strict=True):
-            np.testing.assert_array_equal(batch[index], single)
-    assert together[0].dtype == np.float32
-    assert together[1].dtype == bool
+            np.testing.assert_allclose(batch[index], single, rtol=1e-15, atol=0)

@@ -1,0 +1,124 @@
+"""What a task makes of its states, compiled: observation, reward and end, of one state or of many.
+
+There is one compiled form of a task's functions, and every face calls it: a library's cosine may differ from another's
+in the last bit.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numba.np.unsafe.ndarray import to_fixed_tuple
+
+from codrl_mj.physics.constrain import Compiled, is_fine
+from codrl_mj.tasks import Task
+
+
+class Outcomes(NamedTuple):
+    """Compiled functions.
+
+    States are float64 arrays (n,), or (N, n). Observations are float32 arrays (k,), or (N, k); entries beyond the
+    task's own are left alone. `options` is the vector of the task's options.
+    """
+
+    observe: Compiled
+    """(state, observation) -> nothing: fills the observation."""
+    reward: Compiled
+    """(state before, force delivered, state after, options) -> reward."""
+    terminated: Compiled
+    """(state) -> whether the episode ends there."""
+    observe_all: Compiled
+    """(states, observations) -> nothing."""
+    reward_all: Compiled
+    """(states before, forces (N,), states after, options, rewards (N,)) -> nothing: fills the rewards."""
+    terminated_all: Compiled
+    """(states, terminated (N,) bool) -> nothing: fills it."""
+    judge: Compiled
+    """(states before, forces (N,), states after, options, elapsed (N,), limit, stepping (N,) bool, observations,
+    rewards (N,), terminated (N,) bool, truncated (N,) bool) -> the first row that is stepping and whose state is no
+    longer fine, or -1: all the others at once, and `elapsed` counted on. Rows that are not stepping earn nothing and do
+    not end."""
+
+
+def compiled_outcomes(task: Task) -> Outcomes:
+    """The functions of a task; compiled as they are used, once a process.
+
+    Args:
+        task: the task.
+    """
+    return _compiled(task.observation, task.reward, task.terminated, task.options)  # type: ignore[arg-type]
+
+
+@functools.cache
+def _compiled(
+    observation: Callable[..., Any],
+    reward: Callable[..., Any],
+    terminated: Callable[..., Any],
+    options_type: Callable[..., Any],
+) -> Outcomes:
+    compiled = numba.njit(nogil=True, error_model="numpy")
+    observation_of, reward_of, terminated_at = compiled(observation), compiled(reward), compiled(terminated)
+    options_count = len(options_type._fields)  # type: ignore[attr-defined]
+
+    @compiled
+    def observe(state: np.ndarray, observation: np.ndarray) -> None:
+        seen = observation_of(state)
+        for entry in range(len(seen)):
+            observation[entry] = seen[entry]
+
+    @compiled
+    def rewarded(before: np.ndarray, force: float, after: np.ndarray, options: np.ndarray) -> float:
+        return float(reward_of(before, force, after, options_type(*to_fixed_tuple(options, options_count))))
+
+    @compiled
+    def ended(state: np.ndarray) -> bool:
+        return bool(terminated_at(state))
+
+    @compiled
+    def observe_all(states: np.ndarray, observations: np.ndarray) -> None:
+        for row in range(len(states)):
+            observe(states[row], observations[row])
+
+    @compiled
+    def reward_all(
+        before: np.ndarray, forces: np.ndarray, after: np.ndarray, options: np.ndarray, rewards: np.ndarray
+    ) -> None:
+        for row in range(len(before)):
+            rewards[row] = rewarded(before[row], forces[row], after[row], options)
+
+    @compiled
+    def terminated_all(states: np.ndarray, terminated: np.ndarray) -> None:
+        for row in range(len(states)):
+            terminated[row] = ended(states[row])
+
+    @compiled
+    def judge(
+        before: np.ndarray,
+        forces: np.ndarray,
+        after: np.ndarray,
+        options: np.ndarray,
+        elapsed: np.ndarray,
+        limit: float,
+        stepping: np.ndarray,
+        observations: np.ndarray,
+        rewards: np.ndarray,
+        terminated: np.ndarray,
+        truncated: np.ndarray,
+    ) -> int:
+        broken = -1
+        for row in range(len(before)):
+            elapsed[row] += 1
+            observe(after[row], observations[row])
+            if not stepping[row]:
+                rewards[row], terminated[row], truncated[row] = 0.0, False, False
+                continue
+            if broken < 0 and not is_fine(after[row]):
+                broken = row
+            rewards[row] = rewarded(before[row], forces[row], after[row], options)
+            terminated[row] = ended(after[row])
+            truncated[row] = elapsed[row] >= limit
+        return broken
+
+    return Outcomes(observe, rewarded, ended, observe_all, reward_all, terminated_all, judge)

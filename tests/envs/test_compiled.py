@@ -1,0 +1,208 @@
+"""The compiled step and reset: against a plain composition of their parts, in loops of one's own, in copies."""
+
+import copy
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+
+import gymnasium
+import mujoco
+import numba
+import numpy as np
+import pytest
+
+from codrl_mj import Uniform
+from codrl_mj.envs import ActuatedEnv
+from codrl_mj.envs.compiled import compiled_env
+from codrl_mj.physics import SimulationDivergedError
+from codrl_mj.tasks import TASKS
+from tests.tasks.faces import actions, random_states
+
+every_task = pytest.mark.parametrize("task", TASKS)
+NOISY = {"current_noise": 0.05, "current_bias": 0.1, "supply_resistance": 0.01}
+PULSES = {"pulse_force": 0.3, "pulse_duration": 0.1, "pulse_interval": 0.5}
+SETUPS = {
+    "ideal": {"actuator": "ideal"},
+    "motor": {"observe_actuator": True},
+    "disturbed": {"disturbances": {"command_delay": 0.03, "command_quantum": 0.1, "command_rate": 50.0, **PULSES}},
+    "sensing": {"observe_actuator": True, "disturbances": NOISY},
+    "voltage": {"observe_actuator": True, "action": "voltage", "disturbances": NOISY},
+}
+every_setup = pytest.mark.parametrize("kind", SETUPS)
+
+
+def _env(task, kind="motor", **more):
+    arguments = SETUPS[kind] | more
+    if arguments.get("action") == "voltage" and isinstance(TASKS[task].action_space, gymnasium.spaces.Discrete):
+        arguments |= {"levels": (-3.0, 0.0, 3.0)}
+    return ActuatedEnv(task, **arguments)
+
+
+def _plain_step(env, task, state, force):
+    """The engine's bindings and the task's functions as they stand, in plain Python: state, signals."""
+    definition, model, data = TASKS[task], env.model, mujoco.MjData(env.model)
+    positions, velocities = list(definition.qpos), list(definition.qvel)
+    data.qpos[:], data.qvel[:] = state[positions], state[velocities]
+    arm = 1.0 if env.actuator is None else env.actuator.motor.arm_radius
+    data.ctrl[0] = force * arm
+    for _ in range(env.setup.inner_steps):
+        moved = data.qpos + model.opt.timestep * data.qvel
+        mujoco.mj_step(model, data)
+        if env.setup.integrator == "euler":
+            data.qpos[:] = moved
+        state = np.empty_like(state)
+        state[positions], state[velocities] = data.qpos, data.qvel
+        if definition.constrain is not None:
+            state = np.array(definition.constrain(state, model.opt.timestep))
+            data.qpos[:], data.qvel[:] = state[positions], state[velocities]
+    actual = force if env.actuator is None else env.actuator.motor.torque_constant * data.act[4] / arm
+    return state, actual
+
+
+@every_task
+@pytest.mark.parametrize("kind", ["ideal", "motor"])
+def test_a_step_is_the_plain_composition_of_engine_bounds_and_task(task, kind):
+    definition = TASKS[task]
+    for integrator in definition.integrators:
+        env = _env(task, kind, integrator=integrator)
+        env.reset(seed=0)
+        for before, action in zip(random_states(task, 7, 100), actions(task, 8, 100), strict=True):
+            env.physics.reset(before)
+            after, actual = _plain_step(env, task, before, float(definition.desired_force(np.asarray(action))))
+            observation, reward, terminated, truncated, info = env.step(action)
+            np.testing.assert_array_equal(env.state, after)
+            assert info["actual_force"] == pytest.approx(actual, rel=1e-15)
+            size = len(definition.observation_names)
+            expected = np.array(definition.observation(after), np.float32)
+            np.testing.assert_allclose(observation[:size], expected, rtol=2e-7, atol=0)
+            np.testing.assert_array_equal(
+                observation[size:], np.float32([info["current"], info["reference_current"]])[: len(observation) - size]
+            )
+            plain = definition.reward(before, info["actual_force"], after, definition.options())
+            assert reward == pytest.approx(float(plain), rel=1e-14, abs=1e-14)
+            assert terminated == bool(definition.terminated(after))
+            assert not truncated
+
+
+@numba.njit
+def _episode(step, reset, forces, chosen, generator, low, high, rows, rewards, arguments):
+    reset(generator, low, high, rows[0], *arguments)
+    for index in range(len(chosen)):
+        force = forces[chosen[index]]
+        reward, terminated, fine, _, _, _, _, _, _ = step(force, rows[index + 1], *arguments)
+        rewards[index] = reward
+        if terminated or not fine:
+            return index + 1
+    return len(chosen)
+
+
+@every_task
+@every_setup
+def test_a_compiled_loop_is_the_loop_over_the_environment_bit_for_bit(task, kind):
+    ours, theirs = _env(task, kind), _env(task, kind)
+    parts = compiled_env(ours)
+    ours.reset(seed=3)
+    theirs.reset(seed=3)
+    generator = np.random.default_rng(0)
+    forces = parts.forces
+    if forces is None:
+        table = generator.uniform(-1, 1, (50, 1)).astype(np.float32) * ours.action_space.high
+        forces, chosen = np.array([theirs.setup.force(action) for action in table]), np.arange(50)
+        given = list(table)
+    else:
+        chosen = generator.integers(len(forces), size=50)
+        given = list(chosen)
+    rows, rewards = np.zeros((51, *ours.observation_space.shape), np.float32), np.zeros(50)
+    loop = (forces, chosen, ours.np_random, parts.low, parts.high, rows, rewards)
+    taken = _episode(parts.step, parts.reset, *loop, parts.arguments)
+    observation, _ = theirs.reset()
+    np.testing.assert_array_equal(rows[0], observation)
+    for index in range(taken):
+        observation, reward, terminated, _, _ = theirs.step(given[index])
+        np.testing.assert_array_equal(rows[index + 1], observation)
+        assert rewards[index] == reward
+    assert terminated or taken == 50
+    np.testing.assert_array_equal(ours.state, theirs.state)
+    np.testing.assert_array_equal(ours.physics.trace, theirs.physics.trace)
+    assert ours.np_random.random() == theirs.np_random.random()
+
+
+def test_what_python_has_to_do_is_not_offered_as_compiled():
+    assert compiled_env(ActuatedEnv("pendulum", physics="analytic")) is None
+    assert compiled_env(ActuatedEnv("pendulum", randomize={"motor.inductance": Uniform(0.08, 0.12)})) is None
+
+
+@every_task
+@every_setup
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
+def test_a_copy_goes_on_by_itself(task, kind, copied):
+    env = _env(task, kind)
+    env.reset(seed=1)
+    env.action_space.seed(0)
+    chosen = [env.action_space.sample() for _ in range(12)]
+    for action in chosen[:3]:
+        env.step(action)
+    other = copied(env)
+    unmoved = env.state
+    seen = [other.step(action) for action in chosen[3:]]
+    np.testing.assert_array_equal(env.state, unmoved)
+    for action, (observation, reward, terminated, _, info) in zip(chosen[3:], seen, strict=True):
+        again = env.step(action)
+        np.testing.assert_array_equal(again[0], observation)
+        assert (again[1], again[2], again[4]) == (reward, terminated, info)
+    np.testing.assert_array_equal(env.physics.trace, other.physics.trace)
+    assert other.physics.trace is not env.physics.trace
+
+
+def test_what_a_user_writes_into_the_data_is_where_the_step_begins():
+    env = _env("pendulum", "ideal")
+    env.reset(seed=0)
+    env.step(np.zeros(1))
+    env.data.qpos[0], env.data.qvel[0] = np.pi / 2, 1.0
+    _, reward, _, _, _ = env.step(np.zeros(1))
+    assert reward == pytest.approx(-((np.pi / 2) ** 2 + 0.1), rel=1e-12)
+    assert env.state[1] == pytest.approx(1.0 + 0.05 * 15.0, rel=1e-12)  # 3 g / 2 l sin(theta)
+
+
+@every_task
+def test_a_state_that_is_no_number_is_an_error_and_a_reset_helps(task):
+    env = _env(task)
+    env.reset(seed=0)
+    env.data.qvel[0] = 1e300
+    with pytest.raises(SimulationDivergedError, match=f"{task}: the simulation diverged"):
+        env.step(env.action_space.sample())
+    observation, _ = env.reset(seed=0)
+    assert np.isfinite(observation).all()
+    assert np.isfinite(env.step(env.action_space.sample())[0]).all()
+
+
+@every_task
+@pytest.mark.parametrize("action", [None, "1", 3, -1, 0.5, np.nan, np.zeros(2), np.array([np.nan]), np.zeros(1, int)])
+def test_an_action_that_is_none_changes_nothing(task, action):
+    env = _env(task)
+    env.reset(seed=0)
+    state = env.data.qpos.copy(), env.data.time
+    with pytest.raises(ValueError, match="action = "):
+        env.step(action)
+    assert (env.data.qpos == state[0]).all()
+    assert env.data.time == state[1]
+
+
+@pytest.mark.parametrize("one", [1, np.int64(1), np.int32(1), np.uint8(1), np.array(1), True])
+def test_an_integer_of_any_type_is_a_discrete_action(one):
+    env = _env("cartpole", "ideal")
+    env.reset(seed=0)
+    assert env.step(one)[4]["desired_force"] == 10.0
+
+
+def test_threads_do_not_disturb_each_other():
+    def run(seed):
+        env = _env("cartpole")
+        env.reset(seed=seed)
+        for index in range(300):
+            env.step((index * seed) % 2)
+        return env.state
+
+    alone = [run(seed) for seed in range(1, 9)]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(run, range(1, 9)))
+    np.testing.assert_array_equal(alone, together)
