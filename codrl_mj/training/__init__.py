@@ -1,8 +1,17 @@
 """Training runs: from a configuration to a run folder, however often they are interrupted."""
 
 from codrl_mj.training.config import TrainConfig, read_config
-from codrl_mj.training.folder import finished, load_config
+from codrl_mj.training.folder import RunInUseError, finished, load_config
 from codrl_mj.training.history import Progress
 from codrl_mj.training.run import TrainingStoppedError, train
 
-__all__ = ["Progress", "TrainConfig", "TrainingStoppedError", "finished", "load_config", "read_config", "train"]
+__all__ = [
+    "Progress",
+    "RunInUseError",
+    "TrainConfig",
+    "TrainingStoppedError",
+    "finished",
+    "load_config",
+    "read_config",
+    "train",
+]

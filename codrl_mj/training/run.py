@@ -13,6 +13,7 @@ from codrl_mj.files import write_json
 from codrl_mj.registration import ENVIRONMENTS
 from codrl_mj.training import folder
 from codrl_mj.training.config import TrainConfig
+from codrl_mj.training.folder import RunInUseError
 from codrl_mj.training.history import Progress
 
 
@@ -68,11 +69,11 @@ def train(
         FileExistsError: `out` exists and `resume` is False; nothing in it was touched.
         ValueError: the configuration cannot be trained, for instance because the actuator is unstable; or the run in
             `out` has another one, or was started with other software.
-        RuntimeError: another process trains in `out`.
+        RunInUseError: another process trains in `out`.
         TrainingStoppedError: a signal asked to stop.
     """
     exists = (out / folder.CONFIG).exists()
-    if out.exists() and not (resume and (exists or not any(out.iterdir()))):
+    if out.exists() and not (resume and (exists or folder.unused(out))):
         remedy = "continue it with --resume, " if exists and not folder.finished(out) else ""
         raise FileExistsError(f"run folder {out} exists already: {remedy}choose another --out, or delete it")
     if exists:
@@ -84,17 +85,21 @@ def train(
     import torch
 
     from codrl_mj.training import curve  # noqa: F401 - what is missing is missed now and not in the end
-    from codrl_mj.training.watcher import Watcher
+    from codrl_mj.training.watcher import LearningEnded, Watcher
 
     torch.set_num_threads(1)  # networks this small run several times slower on two
     with contextlib.closing(_make_envs(config)) as envs:
         model = config.agent.make_model(envs, config.seed)
         with folder.owned(out), _stopping() as stop, _reporting_to(wandb, out, config):
+            if (out / folder.CONFIG).exists() != exists or folder.finished(out):
+                raise RunInUseError(f"{out}: another process trained in it in the meantime; start again")
+            folder.remove_leftovers(out)
             if not exists:
                 folder.start_folder(out, config)
             watcher = Watcher(config, out, stop, on_progress, tensorboard)
-            with contextlib.closing(watcher):
-                model.learn(_step_limit(config), callback=watcher, log_interval=None)
+            with _saying_how_to_continue(out), contextlib.closing(watcher):
+                with contextlib.suppress(LearningEnded):
+                    model.learn(_step_limit(config), callback=watcher, log_interval=None)
                 if stop.signal is not None and not watcher.complete:
                     raise TrainingStoppedError(
                         f"stopped after {watcher.saved_steps:,} steps: continue with codrl-mj train --resume {out}",
@@ -130,6 +135,22 @@ def _finish(config: TrainConfig, out: Path, model: Any, watcher: Any) -> None:
     write_json(out / folder.EVALUATION, watcher.evaluation.as_mapping())
     draw_learning_curve(out / folder.CURVE, config, watcher.episodes.array(), watcher.reports.array())
     folder.write_result(out, watcher.result())
+
+
+@contextlib.contextmanager
+def _saying_how_to_continue(out: Path) -> Iterator[None]:
+    """Add to the error of a file that could not be written, such as on a full disk, that nothing is lost.
+
+    Raises:
+        OSError: with the run folder's name.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise OSError(
+            f"training in {out} was broken off: {error}. Its last checkpoint is intact: once the cause is mended, "
+            f"continue with codrl-mj train --resume {out}"
+        ) from error
 
 
 @contextlib.contextmanager

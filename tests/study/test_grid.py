@@ -1,0 +1,159 @@
+"""The grid: each cell once, whatever happens to the others, to the grid, and wherever it is computed."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from codrl_mj import Actuator, CurrentLoop, Motor
+from codrl_mj.agents import PPOConfig
+from codrl_mj.env_config import EnvConfig
+from codrl_mj.evaluation import evaluate
+from codrl_mj.motor import named_actuator
+from codrl_mj.policies import load_policy
+from codrl_mj.study.grid import Deployment, Workers, cell_folder, deploy_cells, train_cells
+from codrl_mj.training import TrainConfig, finished, load_config
+
+PPO = PPOConfig(rollout_steps=256, batch_size=64, epochs=1, hidden=(8,))
+TINY = TrainConfig("cartpole", "weaker", PPO, 0, 512, num_envs=2, evaluation_episodes=2, checkpoint_interval=256)
+UNSTABLE = Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=100.0))
+CELLS = {f"seed {seed}": dataclasses.replace(TINY, seed=seed) for seed in range(3)}
+ONE = Workers(jobs=1)
+
+
+def weights(folder):
+    return (folder / "policy.safetensors").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def computed(tmp_path_factory):
+    """A grid in two processes, one of whose cells cannot be trained."""
+    root = tmp_path_factory.mktemp("grid")
+    reported = []
+    cells = CELLS | {"unstable": dataclasses.replace(TINY, actuator=UNSTABLE), "again": CELLS["seed 0"]}
+    runs, failures = train_cells(cells, root, Workers(jobs=2), on_cell=reported.append)
+    return root, runs, failures, reported
+
+
+def test_a_cell_that_fails_is_recorded_and_does_not_stop_the_others(computed):
+    root, runs, failures, reported = computed
+    assert set(runs) == {*CELLS, "again"}
+    assert all(finished(run) for run in runs.values())
+    assert sorted(reported) == sorted([*CELLS, "again", "unstable"])
+    (failure,) = failures.values()
+    assert "spectral radius" in failure.error
+    record = json.loads(failure.record.read_text())
+    assert record["error"] == failure.error
+    assert "Traceback" in record["traceback"]
+    assert record["train"]["actuator"]["controller"]["kp"] == 100.0
+    assert failure.record.parent == root / "failures"
+
+
+def test_a_cell_is_an_ordinary_run_folder_keyed_by_its_configuration(computed):
+    root, runs, _, _ = computed
+    for name, config in CELLS.items():
+        assert runs[name] == cell_folder(root, config)
+        assert load_config(runs[name]) == config
+    assert runs["again"] == runs["seed 0"]
+    changed = [
+        dataclasses.replace(TINY, total_steps=513),
+        dataclasses.replace(TINY, env=EnvConfig(center_radius=0.1)),
+        dataclasses.replace(TINY, agent=dataclasses.replace(PPO, gamma=0.9)),
+        dataclasses.replace(TINY, actuator="paper"),
+    ]
+    assert len({cell_folder(root, config) for config in [TINY, *changed]}) == 5
+
+
+def test_finished_cells_are_left_alone(computed):
+    root, runs, _, _ = computed
+    before = {path: path.stat().st_mtime_ns for run in runs.values() for path in run.rglob("*")}
+    reported = []
+    again, failures = train_cells(CELLS, root, ONE, on_cell=reported.append)
+    assert again == {name: runs[name] for name in CELLS}
+    assert failures == {}
+    assert reported == [*CELLS]
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+def test_a_failure_is_forgotten_when_the_cell_succeeds(tmp_path):
+    blocked = cell_folder(tmp_path, TINY)
+    blocked.write_text("a file in the way")
+    _, failures = train_cells({"cell": TINY}, tmp_path, ONE)
+    assert failures["cell"].record.is_file()
+    blocked.unlink()
+    runs, failures = train_cells({"cell": TINY}, tmp_path, ONE)
+    assert failures == {}
+    assert finished(runs["cell"])
+    assert list((tmp_path / "failures").iterdir()) == []
+
+
+def test_ray_computes_the_same(computed, tmp_path):
+    _, runs, _, _ = computed
+    ray_runs, failures = train_cells(
+        CELLS | {"unstable": dataclasses.replace(TINY, actuator=UNSTABLE)}, tmp_path, Workers(jobs=2, backend="ray")
+    )
+    assert set(failures) == {"unstable"}
+    for name in CELLS:
+        assert weights(ray_runs[name]) == weights(runs[name])
+
+
+def test_a_killed_grid_goes_on_where_it_was(computed, tmp_path):
+    _, runs, _, _ = computed
+    code = """
+import sys
+from pathlib import Path
+from tests.study.test_grid import CELLS, Workers, train_cells
+train_cells(CELLS, Path(sys.argv[1]), Workers(jobs=2))
+"""
+    first = cell_folder(tmp_path, CELLS["seed 0"])
+    with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], env=os.environ) as grid:
+        while not (first / "checkpoints").exists():
+            assert grid.poll() is None
+            time.sleep(0.02)
+        grid.send_signal(signal.SIGKILL)
+    assert not all(finished(cell_folder(tmp_path, config)) for config in CELLS.values())
+    resumed, failures = train_cells(CELLS, tmp_path, ONE)
+    assert failures == {}
+    for name in CELLS:
+        assert weights(resumed[name]) == weights(runs[name])
+
+
+def test_deployments_are_evaluations_that_are_made_once(computed):
+    _, runs, _, _ = computed
+    paper = named_actuator("paper", "cartpole")
+    deployments = {
+        name: Deployment(runs["seed 0"], actuator, episodes=3, seed=7)
+        for name, actuator in (("paper", paper), ("ideal", None))
+    }
+    results = deploy_cells(deployments, ONE)
+    for name, deployment in deployments.items():
+        expected = evaluate(load_policy(runs["seed 0"]), "cartpole", deployment.actuator, episodes=3, seed=7)
+        assert results[name]["returns"] == expected.returns._asdict()
+    before = {deployment.record: deployment.record.stat().st_mtime_ns for deployment in deployments.values()}
+    assert len(before) == 2
+    assert deploy_cells(deployments, ONE) == results
+    assert {record: record.stat().st_mtime_ns for record in before} == before
+    other = Deployment(runs["seed 0"], paper, EnvConfig(max_episode_steps=5), episodes=3, seed=7)
+    assert deploy_cells({"short": other}, ONE)["short"]["length"]["mean"] == 5.0
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "expected"),
+    [("backend", "slurm", "must be one of local, ray"), ("jobs", 0, ">= 1, or -1"), ("jobs", 2.5, ">= 1, or -1")],
+)
+def test_impossible_workers_are_refused(field, value, expected):
+    with pytest.raises(ValueError, match=field) as caught:
+        Workers(**{field: value})
+    assert f"{field} = {value!r}" in str(caught.value)
+    assert expected in str(caught.value)
+
+
+def test_ray_that_is_not_installed_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ValueError, match=r"pip install 'codrl-mj\[ray\]'"):
+        train_cells({"cell": TINY}, tmp_path, Workers(backend="ray"))
