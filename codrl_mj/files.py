@@ -3,11 +3,14 @@
 import contextlib
 import json
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+_TEMPORARY = re.compile(r"\.(.+)-[a-z0-9_]{8}(\.[^.]+)?")  # what tempfile makes of the names that `writing` asks for
 
 
 @contextlib.contextmanager
@@ -27,6 +30,12 @@ def writing(path: Path) -> Iterator[Path]:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def leftovers(folder: Path) -> list[tuple[Path, str]]:
+    """What `writing` leaves in a folder if its process is killed, and the names that it was to become."""
+    found = ((path, _TEMPORARY.fullmatch(path.name)) for path in (folder.iterdir() if folder.is_dir() else ()))
+    return [(path, match[1] + (match[2] or "")) for path, match in found if match is not None]
 
 
 @contextlib.contextmanager

@@ -14,7 +14,7 @@ from codrl_mj.agents import AgentConfig, agent_from_mapping
 from codrl_mj.files import read_json, write_json, writing
 
 FORMAT = "codrl_mj policy 2"
-_WEIGHTS, _DESCRIPTION = "policy.safetensors", "policy.json"
+POLICY_FILES = _WEIGHTS, _DESCRIPTION = "policy.safetensors", "policy.json"
 
 
 class Policy(Protocol):

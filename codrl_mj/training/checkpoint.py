@@ -2,27 +2,28 @@
 
 import hashlib
 import json
-import re
+import os
 import warnings
 from pathlib import Path
 
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load, save
 
 from codrl_mj.files import writing
+from codrl_mj.training.folder import CHECKPOINT
 from codrl_mj.training.state import State
 
 KEPT = 2
 """Checkpoints that are kept: the last, and the one before in case the last is damaged."""
-_NAME = re.compile(r"step-(\d{12})-([0-9a-f]{16})\.safetensors")
 
 
-def save_checkpoint(folder: Path, state: State) -> Path:
-    """Write a checkpoint and delete the oldest ones.
+def save_checkpoint(folder: Path, state: State, run: str) -> Path:
+    """Write a checkpoint and delete those that are no longer needed.
 
     Args:
         folder: of checkpoints.
         state: what to write; its step goes into the name, and so does a digest of the content.
+        run: what the run is (its configuration), so that none is continued from another's checkpoint.
 
     Returns:
         The file.
@@ -30,45 +31,69 @@ def save_checkpoint(folder: Path, state: State) -> Path:
     Raises:
         OSError: it could not be written; those before are still there.
     """
-    content = save(state.arrays, metadata={"facts": json.dumps(state.facts)})
+    content = save(state.arrays, metadata={"run": run, "facts": json.dumps(state.facts)})
     path = folder / f"step-{state.facts['num_timesteps']:012d}-{_digest(content)}.safetensors"
-    with writing(path) as temporary:
-        temporary.write_bytes(content)
-    for old in _checkpoints(folder)[:-KEPT]:
-        old.unlink(missing_ok=True)
+    with writing(path) as temporary, temporary.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())  # on the disk before the last but one is deleted
+    others = [other for other in _checkpoints(folder) if other != path]
+    before = [other for other in others if _named(other, "step") < _named(path, "step")]
+    # the rest is of the same step or, damaged, of a later one, from which the run fell back
+    for superfluous in set(others) - set(before[1 - KEPT :]):
+        superfluous.unlink(missing_ok=True)
     return path
 
 
-def load_checkpoint(folder: Path) -> State | None:
-    """The last checkpoint that is intact; None if there is none. Damaged ones are warned about and passed over."""
-    for path in reversed(_checkpoints(folder)):
+def load_checkpoint(folder: Path, run: str) -> State | None:
+    """The last checkpoint that is intact; None if there is none. Damaged ones are warned about and passed over.
+
+    Args:
+        folder: of checkpoints.
+        run: what the run is, as it was given to `save_checkpoint`.
+    """
+    checkpoints = _checkpoints(folder)
+    for path in reversed(checkpoints):
         try:
-            return _read(path)
+            return _read(path, run)
         except (ValueError, OSError) as error:
-            warnings.warn(f"checkpoint {path} is damaged ({error}): going back to the one before", stacklevel=2)
+            earlier = path != checkpoints[0]
+            remedy = "going back to the one before" if earlier else "no other is left: starting anew"
+            warnings.warn(f"checkpoint {path} cannot be used ({error}): {remedy}", stacklevel=2)
     return None
 
 
-def _read(path: Path) -> State:
+def _read(path: Path, run: str) -> State:
     """Read one checkpoint.
 
     Raises:
-        ValueError: it is not what was written.
+        ValueError: it is not what was written, or another run's.
+        OSError: it cannot be read.
     """
     content = path.read_bytes()
-    match = _NAME.fullmatch(path.name)
-    if match is None or _digest(content) != match[2]:
-        raise ValueError("its content does not have the digest in its name")
-    with safe_open(path, framework="numpy") as file:
-        metadata = file.metadata()
-    return State(load(content), json.loads(metadata["facts"]))
+    if _digest(content) != _named(path, "digest"):
+        raise ValueError("it is damaged: its content does not have the digest in its name")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            metadata = file.metadata()
+        if metadata["run"] != run:
+            raise ValueError("it is another run's")
+        return State(load(content), json.loads(metadata["facts"]))
+    except (SafetensorError, KeyError, TypeError) as error:
+        raise ValueError(f"it is no checkpoint: {error!r}") from None
 
 
 def _checkpoints(folder: Path) -> list[Path]:
     """The checkpoints of a folder, the oldest first."""
     if not folder.is_dir():
         return []
-    return sorted(path for path in folder.iterdir() if _NAME.fullmatch(path.name))
+    return sorted(path for path in folder.iterdir() if CHECKPOINT.fullmatch(path.name))
+
+
+def _named(checkpoint: Path, part: str) -> str:
+    match = CHECKPOINT.fullmatch(checkpoint.name)
+    assert match is not None
+    return match[part]
 
 
 def _digest(content: bytes) -> str:

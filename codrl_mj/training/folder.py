@@ -6,18 +6,27 @@ import functools
 import hashlib
 import importlib.metadata
 import platform
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from codrl_mj.files import read_json, write_json
+from codrl_mj.files import leftovers, read_json, write_json
+from codrl_mj.policies import POLICY_FILES
 from codrl_mj.training.config import TrainConfig
 
 CONFIG, RESULT, EVALUATION = "config.json", "result.json", "evaluation.json"
 PROGRESS, EPISODES, CURVE = "progress.csv", "episodes.csv", "learning_curve.png"
 CHECKPOINTS, BEST, TENSORBOARD, LOCK = "checkpoints", "best", "tensorboard", ".lock"
 
+CHECKPOINT = re.compile(r"step-(?P<step>\d{12})-(?P<digest>[0-9a-f]{16})\.safetensors")
+"""Names of checkpoints."""
+_FILES = {CONFIG, RESULT, EVALUATION, PROGRESS, EPISODES, CURVE, *POLICY_FILES}
 _PACKAGES = ("codrl-mj", "gymnasium", "mujoco", "numba", "numpy", "stable-baselines3", "torch")
+
+
+class RunInUseError(RuntimeError):
+    """Another process trains in a run folder."""
 
 
 def load_config(run: Path) -> TrainConfig:
@@ -37,6 +46,22 @@ def load_config(run: Path) -> TrainConfig:
 def finished(run: Path) -> bool:
     """Whether the training of a run folder is finished."""
     return (run / RESULT).is_file()
+
+
+def unused(run: Path) -> bool:
+    """Whether no training has begun in a folder: it is empty, or who was to begin was killed before."""
+    return {path.name for path in run.iterdir()} <= {LOCK, *(path.name for path in _leftovers(run))}
+
+
+def remove_leftovers(run: Path) -> None:
+    """Delete what a killed process left half-written. Only for who owns the folder: others' are in use."""
+    for path in [*_leftovers(run), *_leftovers(run / BEST), *_leftovers(run / CHECKPOINTS)]:
+        path.unlink(missing_ok=True)
+
+
+def _leftovers(place: Path) -> list[Path]:
+    """Half-written files of a training."""
+    return [path for path, name in leftovers(place) if name in _FILES or CHECKPOINT.fullmatch(name)]
 
 
 def start_folder(run: Path, config: TrainConfig) -> None:
@@ -101,14 +126,14 @@ def owned(run: Path) -> Iterator[None]:
     """Hold a run folder for oneself while the block runs; the system lets go of it if the process dies.
 
     Raises:
-        RuntimeError: another process trains in it.
+        RunInUseError: another process trains in it.
     """
     run.mkdir(parents=True, exist_ok=True)
     with (run / LOCK).open("w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            raise RuntimeError(f"{run}: another process is training in it; wait for it, or stop it") from None
+            raise RunInUseError(f"{run}: another process is training in it; wait for it, or stop it") from None
         yield
 
 

@@ -1,6 +1,6 @@
 """The whole state of a Stable-Baselines3 model and its environments as plain arrays and JSON, and back.
 
-Everything that the rest of a training depends on: weights, optimisers, replay buffer, action noise, counters, the
+Everything that the rest of a training depends on: weights, optimisers, replay buffer, exploration noise, counters, the
 environments and every random generator. Nothing is pickled. Rollout buffers are left out: states are taken between two
 rollouts, when they are empty.
 """
@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
-from stable_baselines3.common.utils import get_device
 
 _COUNTERS = (
     "num_timesteps",
@@ -23,6 +23,7 @@ _COUNTERS = (
     "exploration_rate",
 )
 _BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+_DRAWN = ("exploration_mat", "exploration_matrices")  # of state-dependent noise, in use until it is drawn anew
 
 
 class State(NamedTuple):
@@ -42,12 +43,13 @@ def capture(model: BaseAlgorithm, envs: Any) -> State:
         envs: its environments (`snapshot()`).
     """
     arrays: dict[str, np.ndarray] = {}
-    facts: dict[str, Any] = {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)}
+    facts: dict[str, Any] = {name: getattr(model, name) for name in _counters(model)}
     modules, tensors = model._get_torch_save_params()
     for module in modules:
         state = _member(model, module).state_dict()
         if "param_groups" in state:
             facts[f"{module}.groups"] = state["param_groups"]
+            facts[f"{module}.moments"] = {str(index): list(moments) for index, moments in state["state"].items()}
             for index, moments in state["state"].items():
                 arrays |= {f"{module}.{index}.{name}": _array(value) for name, value in moments.items()}
         else:
@@ -61,6 +63,8 @@ def capture(model: BaseAlgorithm, envs: Any) -> State:
         arrays |= {f"buffer.{name}": getattr(buffer, name)[:filled] for name in _BUFFER}
         facts["buffer"] = {"pos": int(buffer.pos), "full": bool(buffer.full)}
     arrays |= {f"noise.{index}": noise.noise_prev for index, noise in enumerate(_noises(model))}
+    if (distribution := _state_dependent_noise(model)) is not None:
+        arrays |= {f"noise.{name}": _array(getattr(distribution, name)) for name in _DRAWN}
     if hasattr(model, "snapshot"):
         arrays |= {f"model.{name}": value for name, value in model.snapshot().items()}
     numpy_state: Any = np.random.get_state(legacy=False)  # Stable-Baselines3 draws from NumPy's global generator
@@ -72,7 +76,7 @@ def capture(model: BaseAlgorithm, envs: Any) -> State:
 
 
 def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
-    """Bring a fresh model of the same configuration to a state, once `learn` has set it up.
+    """Bring a model of the same configuration to a state, once `learn` has set it up.
 
     Args:
         model: the model.
@@ -80,29 +84,27 @@ def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
         state: what `capture` returned.
 
     Raises:
-        ValueError: the state is of another configuration.
+        ValueError: the state is of another configuration, or something is missing from it; model and environments are
+            no good then.
     """
     arrays, facts = state
     try:
-        for name in _COUNTERS:
-            if name in facts:
-                setattr(model, name, facts[name])
+        for name in _counters(model):
+            setattr(model, name, facts[name])
         modules, tensors = model._get_torch_save_params()
         for module in modules:
-            inner = _below(arrays, f"{module}.")
-            if f"{module}.groups" in facts:
-                moments: dict[int, dict[str, torch.Tensor]] = {}
-                for key, value in inner.items():
-                    index, _, name = key.partition(".")
-                    if index.isdigit():
-                        moments.setdefault(int(index), {})[name] = torch.from_numpy(value.copy())
-                _member(model, module).load_state_dict({"state": moments, "param_groups": facts[f"{module}.groups"]})
+            own = _member(model, module)
+            if (state_dict := own.state_dict()).keys() == {"state", "param_groups"}:
+                moments = {
+                    int(index): {name: _tensor(arrays[f"{module}.{index}.{name}"]) for name in names}
+                    for index, names in facts[f"{module}.moments"].items()
+                }
+                own.load_state_dict({"state": moments, "param_groups": facts[f"{module}.groups"]})
             else:
-                own = _member(model, module).state_dict()
-                _member(model, module).load_state_dict({key: torch.from_numpy(inner[key].copy()) for key in own})
+                own.load_state_dict({name: _tensor(arrays[f"{module}.{name}"]) for name in state_dict})
         for name in tensors:
             with torch.no_grad():
-                _member(model, name).copy_(torch.from_numpy(arrays[f"tensor.{name}"]).to(get_device("cpu")))
+                _member(model, name).copy_(_tensor(arrays[f"tensor.{name}"]))
         envs.restore(_below(arrays, "env."))
         model._last_obs = arrays["last_obs"].copy()
         model._last_episode_starts = arrays["last_episode_starts"].copy()
@@ -112,14 +114,21 @@ def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
                 getattr(buffer, name)[: _filled(buffer)] = arrays[f"buffer.{name}"]
         for place, noise in enumerate(_noises(model)):
             noise.noise_prev = arrays[f"noise.{place}"].copy()
+        if (distribution := _state_dependent_noise(model)) is not None:
+            for name in _DRAWN:
+                setattr(distribution, name, _tensor(arrays[f"noise.{name}"]))
         if hasattr(model, "restore"):
             model.restore(_below(arrays, "model."))
         numpy_state = facts["random.numpy"]
         np.random.set_state(numpy_state | {"state": numpy_state["state"] | {"key": arrays["random.numpy"]}})
         model.action_space.np_random.bit_generator.state = facts["random.actions"]
-        torch.set_rng_state(torch.from_numpy(arrays["random.torch"].copy()))
-    except (KeyError, RuntimeError, TypeError) as error:
+        torch.set_rng_state(_tensor(arrays["random.torch"]))
+    except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
         raise ValueError(f"the checkpoint is of another configuration: {error!r}") from None
+
+
+def _counters(model: BaseAlgorithm) -> list[str]:
+    return [name for name in _COUNTERS if hasattr(model, name)]
 
 
 def _member(model: Any, path: str) -> Any:
@@ -130,6 +139,10 @@ def _member(model: Any, path: str) -> Any:
 
 def _array(value: Any) -> np.ndarray:
     return torch.as_tensor(value).detach().cpu().numpy().copy()
+
+
+def _tensor(array: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(array.copy())
 
 
 def _below(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
@@ -145,3 +158,9 @@ def _noises(model: Any) -> list[OrnsteinUhlenbeckActionNoise]:
     noise = getattr(model, "action_noise", None)
     every = noise.noises if isinstance(noise, VectorizedActionNoise) else [noise]
     return [one for one in every if isinstance(one, OrnsteinUhlenbeckActionNoise)]
+
+
+def _state_dependent_noise(model: Any) -> StateDependentNoiseDistribution | None:
+    """What explores by noise that is a function of the state, if the model does."""
+    distribution = getattr(getattr(model, "actor", model.policy), "action_dist", None)
+    return distribution if isinstance(distribution, StateDependentNoiseDistribution) else None

@@ -1,5 +1,6 @@
 """Watches a model learn: records, reports, evaluates, writes checkpoints, and stops it."""
 
+import json
 import math
 import time
 from collections.abc import Callable
@@ -23,6 +24,13 @@ REPORT_INTERVAL = 1000
 """Environment steps between two reports; the next end of a rollout counts."""
 EVALUATION_SEED = 1_000_000
 """Seed of the first evaluation episode, away from those that trainings start from."""
+
+
+_REMEMBERED = ("marks", "squares", "samples", "best", "evaluation_return")
+
+
+class LearningEnded(Exception):  # noqa: N818 - no error
+    """The model is to learn no more: the run is complete, or was asked to stop and has its checkpoint."""
 
 
 class Watcher(BaseCallback):
@@ -54,7 +62,8 @@ class Watcher(BaseCallback):
         self._best = {"return": -math.inf, "steps": 0}
         self._evaluation_return = math.nan
         self._seconds_before, self._steps_before, self._start = 0.0, 0, time.perf_counter()
-        self._leave = False
+        self._identity = json.dumps(config.as_mapping(), sort_keys=True)
+        self._resumed: State | None = None
         self.saved_steps = 0
         self.evaluation: Evaluation | None = None
 
@@ -62,13 +71,13 @@ class Watcher(BaseCallback):
 
     def _on_training_start(self) -> None:
         """Continue from the last checkpoint, now that the model has set itself up to start from nothing."""
-        state = load_checkpoint(self._out / folder.CHECKPOINTS)
+        state = self._resumed = load_checkpoint(self._out / folder.CHECKPOINTS, self._identity)
         rows: dict[str, np.ndarray | None] = {"episodes": None, "reports": None}
         if state is not None:
-            rows = {name: state.arrays[f"watch.{name}"] for name in rows}
-            for name, value in state.facts["watch"].items():
-                setattr(self, f"_{name}", value)
             restore(self.model, self.training_env, state)
+            rows = {name: state.arrays[f"watch.{name}"] for name in rows}
+            for name in (*_REMEMBERED, "seconds_before"):
+                setattr(self, f"_{name}", state.facts["watch"][name])
             self.saved_steps = self._steps_before = self.model.num_timesteps
             self.num_timesteps = self.model.num_timesteps
         self.episodes = Table(self._out / folder.EPISODES, EPISODE_COLUMNS, rows["episodes"])
@@ -87,7 +96,15 @@ class Watcher(BaseCallback):
             return []
 
     def _on_rollout_start(self) -> None:
-        self.boundary()
+        if self.complete:
+            raise LearningEnded
+        if self._resumed is not None:  # Stable-Baselines3 has drawn state-dependent noise since it was restored
+            restore(self.model, self.training_env, self._resumed)
+            self._resumed = None
+        stopping = self._stop.signal is not None
+        self.boundary(stopping)
+        if stopping:
+            raise LearningEnded
 
     def _on_step(self) -> bool:
         signals = self.training_env.signals  # type: ignore[attr-defined]
@@ -99,7 +116,7 @@ class Watcher(BaseCallback):
             if "episode" in info:
                 episode = info["episode"]
                 self.episodes.add((len(self.episodes) + 1, self.num_timesteps, episode["r"], episode["l"]))
-        return not (self._leave or self._episodes_done)
+        return not self._episodes_done
 
     @property
     def _episodes_done(self) -> bool:
@@ -113,20 +130,20 @@ class Watcher(BaseCallback):
 
     # -- between two rollouts -----------------------------------------------------------------------------
 
-    def boundary(self, last: bool = False) -> None:
+    def boundary(self, stopping: bool = False, last: bool = False) -> None:
         """Report, evaluate and write a checkpoint, whichever is due.
 
         Args:
+            stopping: a checkpoint is due.
             last: the training is complete: all are due.
         """
-        self._leave = self._stop.signal is not None
         if self.model.num_timesteps == 0:
             return
         if self._due("evaluation", self._config.evaluation_interval) or last:
             self._evaluate()
         if self._due("report", REPORT_INTERVAL) or last:
             self._report()
-        if self._due("checkpoint", self._config.checkpoint_interval) or last or self._leave:
+        if self._due("checkpoint", self._config.checkpoint_interval) or last or stopping:
             self._save()
 
     def _due(self, what: str, interval: int) -> bool:
@@ -178,16 +195,11 @@ class Watcher(BaseCallback):
 
     def _save(self) -> None:
         arrays, facts = capture(self.model, self.training_env)
-        watch = {
-            "marks": self._marks,
-            "squares": self._squares,
-            "samples": self._samples,
-            "best": self._best,
-            "evaluation_return": self._evaluation_return,
-            "seconds_before": self._seconds_before + time.perf_counter() - self._start,
-        }
+        watch = {name: getattr(self, f"_{name}") for name in _REMEMBERED}
+        watch["seconds_before"] = self._seconds_before + time.perf_counter() - self._start
         tables = {"watch.episodes": self.episodes.array(), "watch.reports": self.reports.array()}
-        save_checkpoint(self._out / folder.CHECKPOINTS, State(arrays | tables, facts | {"watch": watch}))
+        state = State(arrays | tables, facts | {"watch": watch})
+        save_checkpoint(self._out / folder.CHECKPOINTS, state, self._identity)
         self.saved_steps = self.model.num_timesteps
 
     def result(self) -> dict[str, Any]:
