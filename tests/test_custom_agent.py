@@ -2,14 +2,17 @@
 
 import importlib.util
 import re
+import shlex
 import sys
 from pathlib import Path
 
 import pytest
 import torch
+import tyro
 from safetensors.torch import load_file
 
 SCRIPT = Path(__file__).parent.parent / "scripts" / "train_custom_agent.py"
+PAGE = (Path(__file__).parent.parent / "docs" / "other_agents.md").read_text()
 TINY = ["--num-envs", "4", "--rollout", "16", "--total-steps", "128", "--minibatches", "2", "--eval-episodes", "2"]
 
 
@@ -132,3 +135,10 @@ def test_an_unknown_task_is_answered_with_those_there_are(script, capsys):
     error = capsys.readouterr().err
     assert "unicycle" in error
     assert "mountain_car_continuous" in error
+
+
+def test_the_documented_commands_are_understood(script):
+    commands = re.findall(r"^\$ python scripts/train_custom_agent\.py (.*)$", PAGE, re.MULTILINE)
+    assert len(commands) >= 2
+    for command in commands:
+        tyro.cli(script.Options, args=shlex.split(command)).check()

@@ -41,9 +41,11 @@ def test_the_wheel_has_every_module_model_and_the_type_marker(wheel):
     package, assets = REPOSITORY / "codrl_mj", REPOSITORY / "assets"
     modules = {path.relative_to(REPOSITORY).as_posix() for path in package.rglob("*.py")}
     models = {f"codrl_mj/_assets/{path.relative_to(assets).as_posix()}" for path in assets.rglob("*") if path.is_file()}
+    settings = {path.relative_to(REPOSITORY).as_posix() for path in (package / "rl_zoo3").glob("*.yml")}
     assert len(modules) > 30
+    assert len(settings) == 5
     assert len(models) >= 5
-    assert names >= modules | models | {"codrl_mj/py.typed"}
+    assert names >= modules | models | settings | {"codrl_mj/py.typed"}
     assert not [name for name in names if name.startswith(("tests", "scripts", "assets", "docs"))]
 
 
