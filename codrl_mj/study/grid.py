@@ -161,7 +161,9 @@ def deploy_cells(
     return {name: read_json(deployment.record, "evaluation") for name, deployment in deployments.items()}
 
 
-def _train_cell(config: TrainConfig, folder: Path, accept_changes: bool, parent: int | None) -> tuple[Path, Failure | None]:
+def _train_cell(
+    config: TrainConfig, folder: Path, accept_changes: bool, parent: int | None
+) -> tuple[Path, Failure | None]:
     """Train one cell: its folder, and what went wrong, of which a record is kept."""
     error = _try_to_train(config, folder, accept_changes, parent)
     record = folder.parent / _FAILURES / f"{folder.name}.json"
