@@ -13,6 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import safe_mean
 
+from codrl_mj.agents.sarsa_episodes import CompiledEpisodes
 from codrl_mj.agents.sarsa_kernels import Rates, begin, choose_actions, learn, no_traces
 from codrl_mj.agents.tile_coding import make_coder
 from codrl_mj.physics.streams import set_words, words_of
@@ -127,6 +128,7 @@ class SARSA(BaseAlgorithm):
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         verbose: int = 0,
+        compiled: bool = True,
         seed: int | None = None,
         device: Any = "cpu",
         _init_setup_model: bool = True,
@@ -145,6 +147,8 @@ class SARSA(BaseAlgorithm):
             stats_window_size: episodes over which logged means are taken.
             tensorboard_log: folder for TensorBoard; None for none.
             verbose: as in Stable-Baselines3.
+            compiled: whether to run whole episodes in compiled code where the environment can; the results are the
+                same.
             seed: of the environment, and of the algorithm's own generator.
             device: not used: tables are looked up on the CPU.
             _init_setup_model: as in Stable-Baselines3.
@@ -153,6 +157,8 @@ class SARSA(BaseAlgorithm):
             ValueError: the environment is more than one, or its spaces do not go with tiles.
         """
         del device
+        self.compiled = compiled
+        self._episodes: CompiledEpisodes | None = None
         self.step_size, self.gamma, self.trace_decay = step_size, gamma, trace_decay
         self.epsilon, self.epsilon_decay = epsilon, epsilon_decay
         self.exploration_rate = epsilon  # in the present episode
@@ -230,35 +236,62 @@ class SARSA(BaseAlgorithm):
         callback.on_training_end()
         return self
 
+    def _compiled_episodes(self) -> CompiledEpisodes | None:
+        """What runs the environment's episodes in compiled code, if that is wanted and possible."""
+        if not self.compiled or not CompiledEpisodes.can_run(self.env):
+            return None
+        if self._episodes is None or self._episodes.env is not self.env:
+            self._episodes = CompiledEpisodes(self.env)  # type: ignore[arg-type]
+        return self._episodes
+
     def _run_episode(self, callback: BaseCallback) -> bool:
         """Learn from the rest of an episode.
 
         Returns:
             Whether the callback lets it go on.
         """
-        assert self.env is not None
-        coder, weights = self.policy.coder, self.policy.table
         rates = Rates(self.step_size, self.gamma, self.trace_decay, self.exploration_rate)
-        tiles = np.empty(len(coder.displacements), dtype=np.int64)
-        action = begin(self._last_obs[0], coder, weights, self._traces, rates, self._generator, tiles)
-        ended = False
-        while not ended:
+        learner = self.policy.coder, self.policy.table, self._traces, rates, self._generator
+        episodes = self._compiled_episodes()
+        ended = None if episodes is None else episodes.run(*learner)
+        if ended is not None:
+            rewards, dones = np.array([ended.total], dtype=np.float32), np.array([True])
+            return self._count(callback, ended.steps, ended.observations, rewards, dones, ended.infos, ended.signals)
+        return self._run_steps(callback, learner)
+
+    def _run_steps(self, callback: BaseCallback, learner: tuple[Any, ...]) -> bool:
+        """The same, step by step."""
+        assert self.env is not None
+        tiles = np.empty(len(self.policy.coder.displacements), dtype=np.int64)
+        action = begin(*learner, tiles, self._last_obs[0])
+        dones = np.array([False])
+        while not dones[0]:
             new_obs, rewards, dones, infos = self.env.step(np.array([action]))
-            self.num_timesteps += 1
-            ended, info = bool(dones[0]), infos[0]
-            terminated = ended and not info.get("TimeLimit.truncated", False)
-            seen = info["terminal_observation"] if ended else new_obs[0]
-            action = learn(
-                coder, weights, self._traces, rates, self._generator, tiles, action, float(rewards[0]), seen, terminated
-            )
-            self._last_obs = new_obs
-            self._last_episode_starts = dones
-            self._episode_num += ended
-            self._update_info_buffer(infos, dones)
-            callback.update_locals(locals())
-            if not callback.on_step():
+            info = infos[0]
+            terminated = bool(dones[0]) and not info.get("TimeLimit.truncated", False)
+            seen = info["terminal_observation"] if dones[0] else new_obs[0]  # type: ignore[index]
+            action = learn(*learner, tiles, action, float(rewards[0]), seen, terminated)
+            if not self._count(callback, 1, new_obs, rewards, dones, infos, getattr(self.env, "signals", None)):
                 return False
         return True
+
+    def _count(
+        self,
+        callback: BaseCallback,
+        steps: int,
+        new_obs: Any,
+        rewards: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+        signals: Any,
+    ) -> bool:
+        """Count steps that were taken, and show the callback what they were: its `locals` are the arguments."""
+        self.num_timesteps += steps
+        self._last_obs, self._last_episode_starts = new_obs, dones
+        self._episode_num += int(dones[0])
+        self._update_info_buffer(infos, dones)
+        callback.update_locals(locals())
+        return callback.on_step()
 
     def dump_logs(self) -> None:
         """Write to the log how training goes."""
@@ -274,7 +307,7 @@ class SARSA(BaseAlgorithm):
         self.logger.dump(step=self.num_timesteps)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_traces"]
+        return [*super()._excluded_save_params(), "_traces", "_episodes"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy"], []

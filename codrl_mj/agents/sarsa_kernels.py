@@ -110,24 +110,24 @@ def choose_actions(
 
 @numba.njit(nogil=True, error_model="numpy")
 def begin(
-    observation: np.ndarray,
     coder: TileCoder,
     weights: np.ndarray,
     traces: Traces,
     rates: Rates,
     generator: np.random.Generator,
     tiles: np.ndarray,
+    observation: np.ndarray,
 ) -> int:
     """Begin an episode.
 
     Args:
-        observation: the first, shape (k,).
-        coder: finds its tiles.
+        coder: finds tiles.
         weights: shape (tiles, actions).
         traces: are emptied.
         rates: how to learn.
         generator: draws.
         tiles: gets the active tiles, shape (n,).
+        observation: the first, shape (k,).
 
     Returns:
         The first action.

@@ -66,17 +66,48 @@ class ActuatedVecEnv(VecEnv):
         ended = terminated | truncated
         outcomes: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for row in np.flatnonzero(ended).tolist():
-            outcomes[row] = {
-                "terminal_observation": infos["final_obs"][row],
-                "TimeLimit.truncated": bool(truncated[row] and not terminated[row]),
-                "episode": {
-                    "r": round(float(self._returns[row]), 6),
-                    "l": int(self._lengths[row]),
-                    "t": round(time.time() - self._start, 6),
-                },
-            }
+            outcomes[row] = self._outcome(row, infos["final_obs"][row], bool(truncated[row] and not terminated[row]))
         self._returns[ended], self._lengths[ended] = 0.0, 0
         return observations, rewards.astype(np.float32), ended, outcomes
+
+    def _outcome(self, row: int, observation: np.ndarray, truncated: bool) -> dict[str, Any]:
+        """The info of an environment whose episode ended."""
+        return {
+            "terminal_observation": observation,
+            "TimeLimit.truncated": truncated,
+            "episode": {
+                "r": round(float(self._returns[row]), 6),
+                "l": int(self._lengths[row]),
+                "t": round(time.time() - self._start, 6),
+            },
+        }
+
+    def conclude(
+        self, observation: np.ndarray, total: float, length: int, truncated: bool, signals: Signals
+    ) -> tuple[np.ndarray, list[dict[str, Any]]]:
+        """Take the episode of the only environment as run elsewhere, from its first step to its end; start the next.
+
+        Args:
+            observation: the last, shape (k,).
+            total: sum of the rewards.
+            length: steps.
+            truncated: whether the time limit ended it, and not the task.
+            signals: the actuator's, each an array of shape (length,).
+
+        Returns:
+            Observations and infos, as the last step would have returned them.
+
+        Raises:
+            ValueError: there is more than one environment.
+        """
+        if self.num_envs != 1:
+            raise ValueError(f"num_envs = {self.num_envs}: an episode can be concluded only where it is the only one")
+        self._returns[0], self._lengths[0] = total, length
+        outcome = self._outcome(0, observation, truncated)
+        observations, _ = self.env.reset()
+        self.env.signals = Signals(*(values[-1:] for values in signals))  # type: ignore[index]
+        self._returns[:], self._lengths[:] = 0.0, 0
+        return observations, [outcome]
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Everything that the future depends on, as plain arrays: environments, episodes' records, pending seeds.

@@ -21,6 +21,7 @@ from codrl_mj.agents.presets import PRESETS
 from codrl_mj.agents.sarsa import SARSAConfig
 from codrl_mj.agents.sarsa_algorithm import SARSA, TileCodingPolicy
 from codrl_mj.agents.sarsa_kernels import FORGOTTEN
+from codrl_mj.physics.base import SimulationDivergedError
 from codrl_mj.policies import load_policy, save_policy
 from codrl_mj.tasks import find_task
 
@@ -196,7 +197,7 @@ def test_many_predictions_are_each_the_one():
 
 def test_no_evaluation_changes_the_training():
     model, alone = (SARSAConfig().make_model(_car(), 0) for _ in range(2))
-    evaluate = EvalCallback(_car(), n_eval_episodes=2, eval_freq=400, deterministic=False, verbose=0)
+    evaluate = EvalCallback(_car(), n_eval_episodes=2, eval_freq=2, deterministic=False, verbose=0)
     np.testing.assert_array_equal(_table(model.learn(1000, evaluate)), _table(alone.learn(1000)))
     assert evaluate.last_mean_reward == -200.0
 
@@ -240,11 +241,95 @@ def test_it_can_be_evaluated():
     assert evaluate_policy(model, _car(), n_eval_episodes=3)[0] == -200.0
 
 
-@pytest.mark.parametrize("generic", [True, False], ids=["step by step", "compiled"])
-def test_interrupted_training_goes_on_bit_for_bit(generic):
+# -- whole episodes in compiled code ----------------------------------------------------------------------------
+
+DISTURBED = {
+    "command_delay": 0.12,
+    "current_noise": 0.05,
+    "pulse_force": 0.1,
+    "pulse_duration": 1.0,
+    "pulse_interval": 9.0,
+}
+
+
+@pytest.mark.parametrize(
+    ("settings", "arguments"),
+    [
+        ({}, {"actuator": "paper"}),
+        ({"trace_decay": 0.8, "gamma": 0.9}, {}),
+        ({}, {"actuator": "paper", "observe_actuator": True, "action": "current", "levels": (-1, -0.5, 0.5, 1)}),
+        ({}, {"actuator": "paper", "disturbances": DISTURBED, "max_episode_steps": 77}),
+    ],
+    ids=["motor", "with traces", "currents", "disturbed"],
+)
+def test_compiled_episodes_are_those_taken_step_by_step(settings, arguments):
+    outcomes = []
+    for compiled in (False, True):
+        model = SARSAConfig(epsilon=0.2, **settings).make_model(_car(**arguments), 0)
+        model.compiled = compiled
+        seen = []
+        model.learn(10**9, [StopTrainingOnMaxEpisodes(5), _Record(seen)])
+        outcomes.append((model, seen))
+    (one, steps), (other, episodes) = outcomes
+    np.testing.assert_array_equal(_table(one), _table(other))
+    assert one.snapshot()["generator"].tolist() == other.snapshot()["generator"].tolist()
+    for name, values in one.env.snapshot().items():
+        np.testing.assert_array_equal(values, other.env.snapshot()[name])
+    np.testing.assert_array_equal(one._last_obs, other._last_obs)
+    np.testing.assert_array_equal(one.env.signals, other.env.signals)
+    assert one.num_timesteps == other.num_timesteps == len(steps)
+    assert len(episodes) == 5
+    ended = [step for step in steps if step["dones"][0]]
+    for step, episode in zip(ended, episodes, strict=True):
+        assert episode["dones"].tolist() == [True]
+        for name in ("terminal_observation", "TimeLimit.truncated"):
+            np.testing.assert_array_equal(step["infos"][0][name], episode["infos"][0][name])
+        assert step["infos"][0]["episode"] | {"t": 0} == episode["infos"][0]["episode"] | {"t": 0}
+    for signal in range(6):
+        np.testing.assert_array_equal(
+            *(np.concatenate([s["signals"][signal] for s in each]) for each in (steps, episodes))
+        )
+
+
+class _Record(BaseCallback):
+    def __init__(self, into):
+        super().__init__()
+        self.into = into
+
+    def _on_step(self):
+        names = ("dones", "infos", "signals")
+        self.into.append({name: self.locals[name] for name in names})
+        return True
+
+
+def test_an_episode_that_was_left_is_finished_step_by_step():
+    models = [SARSAConfig(epsilon=0.2).make_model(_car(), 0) for _ in range(2)]
+    for model in models:
+        model.compiled = False
+        model.learn(10**9, lambda locals_, _: locals_["self"].num_timesteps < 50)
+        assert model.num_timesteps == 50
+    models[1].compiled = True
+    for model in models:
+        model.learn(400, reset_num_timesteps=False)
+    np.testing.assert_array_equal(_table(models[0]), _table(models[1]))
+    assert [episode["l"] for episode in models[1].ep_info_buffer] == [200, 200, 200]
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_diverging_simulation_is_an_error(compiled):
+    loop = codrl_mj.CurrentLoop(kp=1.0, kd=0.2, max_voltage=np.inf)
+    env = _car(actuator=codrl_mj.Actuator(codrl_mj.Motor(), loop), allow_unstable=True)
+    model = SARSAConfig().make_model(env, 0)
+    model.compiled = compiled
+    with pytest.raises(SimulationDivergedError, match="mountain_car"):
+        model.learn(10_000)
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_interrupted_training_goes_on_bit_for_bit(compiled):
     def fresh():
         model = SARSAConfig(epsilon=0.1, epsilon_decay=0.9, trace_decay=0.5).make_model(_car(actuator="paper"), 0)
-        model.compiled = not generic
+        model.compiled = compiled
         return model
 
     whole = fresh()
