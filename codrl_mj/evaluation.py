@@ -106,6 +106,10 @@ class Evaluation:
     """Energy in the winding's magnetic field at the end of an episode."""
     mechanical_work: Interval = _measure("mechanical work", "J")
     """Work done on the joint in an episode."""
+    episode_returns: tuple[float, ...] = ()
+    """Return of each episode, in the order of their seeds."""
+    episode_times_to_goal: tuple[float | None, ...] = ()
+    """Time to the goal of each episode [s]; None where it did not succeed, 0 where the goal is to last."""
     conditions: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """What it was measured under: actuator, environment, seed and so on, as JSON-serialisable values."""
 
@@ -115,11 +119,15 @@ class Evaluation:
         Intervals are mappings of `mean`, `low` and `high`, quartiles of `median`, `low` and `high`; `units` has the
         unit of every measure.
         """
-        named = {
-            name: value._asdict() if isinstance(value, Interval | Quartiles) else value
-            for name, value in vars(self).items()
-        }
+        named = {name: _plain(value) for name, value in vars(self).items()}
         return named | {"units": {name: field.metadata["unit"] for name, field in MEASURES.items()}}
+
+
+def _plain(value: Any) -> Any:
+    """The value as JSON has it."""
+    if isinstance(value, Interval | Quartiles):
+        return value._asdict()
+    return list(value) if isinstance(value, tuple) else value
 
 
 MEASURES: dict[str, dataclasses.Field[Any]] = {
@@ -194,6 +202,8 @@ def summarize(task: str, actuator: Actuator | None, episodes: Sequence[Episode])
         failure=Interval(1 - success.mean, 1 - success.high, 1 - success.low),
         time_to_goal=quartiles(reached) if definition.goal is not None and len(reached) else None,
         mechanical_work=_mean_of(episodes, lambda episode: _work(definition, episode)),
+        episode_returns=tuple(returns.tolist()),
+        episode_times_to_goal=tuple(goals),
         **_tracking(episodes),
         **(dict.fromkeys(_ELECTRICAL) if actuator is None else _electrical(definition, episodes)),
     )

@@ -98,12 +98,17 @@ def test_returns_and_lengths_are_counted():
     assert summary.returns_median == 1.5
     assert summary.returns_interquartile_mean == 1.5
     assert summary.length.mean == 7 / 4
+    assert summary.episode_returns == (3, 0, 10, -7)
+    assert summary.episode_times_to_goal == (None, 0, None, None)
 
 
 def successes(task, *episodes):
     """Share that succeeds, and the quartiles of the time to the goal, of made-up (states, terminated)."""
     summary = summarize(task, None, [made_up(task, None, states, terminated=over) for states, over in episodes])
     assert summary.failure.mean == pytest.approx(1 - summary.success.mean)
+    times = np.array([time for time in summary.episode_times_to_goal if time is not None])
+    assert len(times) == round(summary.success.mean * len(episodes))
+    assert summary.time_to_goal is None or summary.time_to_goal.median == np.median(times)
     assert summary.failure[1:] == pytest.approx([1 - summary.success.high, 1 - summary.success.low])
     return summary.success.mean, summary.time_to_goal
 
