@@ -1,0 +1,163 @@
+"""Tiny trainings of every agent, ways to end them, and what must be equal in the end."""
+
+import contextlib
+import csv
+import dataclasses
+import json
+import math
+import os
+import signal
+
+from codrl_mj.agents import DDPGConfig, DQNConfig, PPOConfig, SACConfig, SARSAConfig, TD3Config
+from codrl_mj.disturbances import Disturbances
+from codrl_mj.env_config import EnvConfig
+from codrl_mj.training import TrainConfig, TrainingStoppedError, train
+from codrl_mj.training.watcher import Watcher
+
+RANDOMIZE = {"motor.inductance": "uniform(0.05, 0.15)", "controller.kp": "choice(0.5, 1)"}
+DISTURBANCES = Disturbances(
+    command_delay=0.03, current_noise=0.1, current_bias=0.05, pulse_interval=0.2, pulse_force=0.5, pulse_duration=0.05
+)
+TIME_COLUMNS = ("steps_per_second", "seconds")
+"""What of a run is not the same every time."""
+
+
+def tiny(task, agent, num_envs=1, steps=240, env=None, **others):
+    """A training of about a second, with three or four checkpoints and evaluations."""
+    budget = {"total_steps": steps} if "total_episodes" not in others else {"total_steps": None}
+    often = {"checkpoint_interval": 60, "evaluation_interval": 80, "evaluation_episodes": 2}
+    env = EnvConfig(**{"max_episode_steps": 25} | (env or {}))
+    return TrainConfig(task, agent=agent, seed=3, num_envs=num_envs, env=env, **often | budget | others)
+
+
+_SMALL = {"learning_starts": 40, "batch_size": 16, "buffer_size": 150}  # the buffer fills, and is written over
+_PPO = {"rollout_steps": 32, "batch_size": 16, "epochs": 2, "hidden": (8, 8)}
+_NETS = {"hidden": (8,)}
+
+CASES = {
+    "ppo, one optimiser": tiny(
+        "cartpole", PPOConfig(**_PPO), 4, actuator="weaker", env={"center_radius": 0.1, "observe_actuator": True}
+    ),
+    "ppo, separate learning rates": tiny(
+        "cartpole", PPOConfig(**_PPO, critic_learning_rate=3e-3), 2, env={"physics": "analytic"}
+    ),
+    "ppo, an episode budget": tiny(
+        "cartpole", PPOConfig(**_PPO), 2, total_episodes=9, env={"randomize": RANDOMIZE, "disturbances": DISTURBANCES}
+    ),
+    "ppo, state-dependent noise": tiny("pendulum", PPOConfig(**_PPO, state_dependent_noise=True), 2),
+    "ppo, state-dependent noise, drawn often": tiny(
+        "pendulum", PPOConfig(**_PPO, state_dependent_noise=True, noise_steps=5)
+    ),
+    "ddpg": tiny(
+        "pendulum",
+        DDPGConfig(**_SMALL, actor_units=(8,), joint_units=(8,), critic_learning_rate=2e-3),
+        env={"disturbances": DISTURBANCES, "observe_actuator": True},
+    ),
+    "ddpg, several environments": tiny(
+        "pendulum", DDPGConfig(**_SMALL, actor_units=(8,), joint_units=(8,)), 3, env={"physics": "analytic"}
+    ),
+    "ddpg, trained after episodes": tiny(
+        "pendulum",
+        DDPGConfig(**_SMALL, actor_units=(8,), joint_units=(8,), train_every=None, gradient_steps=5),
+        total_episodes=8,
+        env={"randomize": RANDOMIZE},
+    ),
+    "dqn, epsilon by episodes": tiny(
+        "cartpole", DQNConfig(**_SMALL, **_NETS, target_every=7), env={"randomize": RANDOMIZE}
+    ),
+    "dqn, epsilon by steps": tiny(
+        "cartpole",
+        DQNConfig(**_SMALL, **_NETS, exploration_decay=None, exploration_fraction=0.8, target_every=10),
+        3,
+        env={"physics": "analytic"},
+    ),
+    "td3": tiny("pendulum", TD3Config(**_SMALL, **_NETS), 2, env={"disturbances": DISTURBANCES}),
+    "sac, learned entropy coefficient": tiny("pendulum", SACConfig(**_SMALL, **_NETS), env={"randomize": RANDOMIZE}),
+    "sac, state-dependent noise": tiny(
+        "pendulum", SACConfig(**_SMALL, **_NETS, entropy_coefficient=0.1, state_dependent_noise=True, train_every=6), 2
+    ),
+    "sarsa": tiny(
+        "mountain_car", SARSAConfig(epsilon=0.2, epsilon_decay=0.9), env={"disturbances": DISTURBANCES}, actuator="weak"
+    ),
+    "sarsa, traces": tiny(
+        "mountain_car", SARSAConfig(epsilon=0.1, trace_decay=0.8), total_episodes=9, env={"physics": "analytic"}
+    ),
+}
+"""Every agent, alone and with several environments, on both physics, with everything that an environment can have."""
+
+
+class Crash(BaseException):
+    """The end of a process, as far as a test within one can have it."""
+
+
+def crash(*_):
+    raise Crash
+
+
+def send(number):
+    """A function that sends a signal to this process."""
+    return lambda: os.kill(os.getpid(), number)
+
+
+TERMINATE, INTERRUPT = send(signal.SIGTERM), send(signal.SIGINT)
+
+
+@contextlib.contextmanager
+def after(steps, act):
+    """Act once when a training has taken some environment steps within the block."""
+    original, due = Watcher._on_step, None
+
+    def counting(watcher):
+        nonlocal due
+        due = watcher.saved_steps + steps if due is None else due
+        goes_on = original(watcher)
+        if watcher.num_timesteps >= due:
+            due = math.inf
+            act()
+        return goes_on
+
+    Watcher._on_step = counting
+    try:
+        yield
+    finally:
+        Watcher._on_step = original
+
+
+def interrupt(config, out, steps, act):
+    """Start or continue a training that ends early: it acts when it has taken some steps.
+
+    Returns:
+        The message of a training that was asked to stop; None if it crashed.
+    """
+    try:
+        with after(steps, act):
+            train(config, out, resume=True, tensorboard=False)
+    except TrainingStoppedError as stopped:
+        return str(stopped)
+    except Crash:
+        return None
+    raise AssertionError("it came to its end")
+
+
+def resume(config, out):
+    return train(config, out, resume=True, tensorboard=False)
+
+
+def outcome(out):
+    """What must not depend on interruptions, by name."""
+    files = ["policy.safetensors", "policy.json", "evaluation.json", "episodes.csv"]
+    files += [f"best/{name}" for name in ("policy.safetensors", "policy.json", "evaluation.json")]
+    with (out / "progress.csv").open() as file:
+        progress = [{name: row[name] for name in row if name not in TIME_COLUMNS} for row in csv.DictReader(file)]
+    result = json.loads((out / "result.json").read_text())
+    result.pop("seconds")
+    return {name: (out / name).read_bytes() for name in files} | {"progress.csv": progress, "result.json": result}
+
+
+def differing(first, second):
+    """The names of what differs between two outcomes."""
+    return [name for name in first if first[name] != second[name]]
+
+
+def changed(config, **changes):
+    return dataclasses.replace(config, **changes)
