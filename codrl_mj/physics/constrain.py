@@ -5,7 +5,7 @@ The compiled functions take MuJoCo's `qpos` and `qvel` as pointers or as arrays,
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -40,23 +40,42 @@ def compiled_constrain(task: Task) -> Compiled | None:
     return None if task.constrain is None else _keeper(task.constrain, task.qpos, task.qvel)
 
 
-def compiled_correction(task: Task, explicit: bool) -> Compiled | None:
-    """(qpos (N, nq), qvel (N, nv), moved (N, nq), integration step [s]) -> nothing: what follows a step of a batch.
+class BatchKernels(NamedTuple):
+    """Compiled functions of the rows of a batch; `qpos` is (N, nq), `qvel` (N, nv), and `moved` like `qpos`."""
+
+    read: Compiled
+    """(qpos, qvel, states (N, n)) -> nothing: fills `states`, in the task's order."""
+    move: Compiled
+    """(qpos, qvel, moved, integration step [s]) -> nothing: fills `moved`, where the present velocities lead."""
+    correct: Compiled
+    """(qpos, qvel, moved, integration step [s]) -> nothing: what follows a step of the engine. With explicit
+    integration the positions become `moved`; bounds are kept."""
+
+
+def compiled_batch(task: Task, explicit: bool) -> BatchKernels:
+    """The functions for a task; compiled as they are used, once a process.
 
     Args:
         task: the task.
-        explicit: whether the positions become `moved`, where the old velocities would have taken them.
-
-    Returns:
-        The function; None where nothing follows.
+        explicit: whether positions are moved by the old velocity.
     """
-    keep = compiled_constrain(task)
-    return _corrector(keep, len(task.state_names), explicit) if explicit or keep is not None else None
+    return _batch(compiled_reader(task), compiled_constrain(task), len(task.state_names), explicit)
 
 
 @functools.cache
-def _corrector(keep: Compiled | None, size: int, explicit: bool) -> Compiled:
+def _batch(read: Compiled, keep: Compiled | None, size: int, explicit: bool) -> BatchKernels:
     bounded, constrain = keep is not None, keep or _nothing
+
+    @numba.njit(nogil=True, error_model="numpy")
+    def read_all(qpos: np.ndarray, qvel: np.ndarray, states: np.ndarray) -> None:
+        for row in range(len(qpos)):
+            read(qpos[row], qvel[row], states[row])
+
+    @numba.njit(nogil=True, error_model="numpy")
+    def move(qpos: np.ndarray, qvel: np.ndarray, moved: np.ndarray, timestep: float) -> None:
+        for row in range(len(qpos)):
+            for entry in range(qpos.shape[1]):
+                moved[row, entry] = qpos[row, entry] + timestep * qvel[row, entry]
 
     @numba.njit(nogil=True, error_model="numpy")
     def correct(qpos: np.ndarray, qvel: np.ndarray, moved: np.ndarray, timestep: float) -> None:
@@ -68,7 +87,7 @@ def _corrector(keep: Compiled | None, size: int, explicit: bool) -> Compiled:
             if bounded:
                 constrain(qpos[row], qvel[row], state, timestep)
 
-    return correct
+    return BatchKernels(read_all, move, correct)
 
 
 @numba.njit

@@ -13,7 +13,7 @@ from codrl_mj.disturbances import OFF, Disturbances
 from codrl_mj.motor import Actuator, to_vector
 from codrl_mj.motor.parameters import MAX_VOLTAGE, TORQUE_CONSTANT
 from codrl_mj.physics.base import LARGEST, Signals, SimulationDivergedError, delivered
-from codrl_mj.physics.constrain import compiled_correction
+from codrl_mj.physics.constrain import compiled_batch
 from codrl_mj.physics.disturber import disturber, sensed
 from codrl_mj.physics.mjcf import needed_callbacks, task_model
 from codrl_mj.tasks import Task
@@ -52,6 +52,7 @@ class MujocoBatchPhysics:
         self.inner_steps = inner_steps
         self.max_force = task.max_force if max_force is None else max_force
         self._explicit = integrator == "euler"
+        self._corrected = self._explicit or task.constrain is not None
         timestep, first = task.step_duration / inner_steps, actuators[0] if actuators else None
         self.model = task_model(task, first, timestep, max_force, self._explicit, disturbances)
         self._disturbances = disturbances
@@ -74,7 +75,7 @@ class MujocoBatchPhysics:
         self._callbacks = needed_callbacks(self.model)
         self._install()
         self._batch = Batch(self.model, *self._size)
-        self._correct = compiled_correction(self.task, self._explicit)
+        self._kernels = compiled_batch(self.task, self._explicit)
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._ctrl, self._act = self._batch.bind("ctrl"), self._batch.bind("act")
         self._load = self._batch.bind("qfrc_applied")
@@ -143,10 +144,7 @@ class MujocoBatchPhysics:
     def state(self) -> np.ndarray:
         """Mechanical states in the task's order, shape (N, n), float64; a new array."""
         state = np.empty((len(self._qpos), len(self.task.state_names)))
-        for column, entry in enumerate(self.task.qpos):
-            state[:, entry] = self._qpos[:, column]
-        for column, entry in enumerate(self.task.qvel):
-            state[:, entry] = self._qvel[:, column]
+        self._kernels.read(self._qpos, self._qvel, state)
         return state
 
     def reset(self, rows: np.ndarray, states: np.ndarray, keys: np.ndarray | float = 0.0) -> None:
@@ -198,15 +196,15 @@ class MujocoBatchPhysics:
     def _integrate(self, steps: int) -> None:
         """Take integration steps."""
         timestep = self.model.opt.timestep
-        if self._correct is not None:
-            moved = self._qpos  # of no meaning, and not read, unless there is something to move
-            for _ in range(steps):
-                if self._explicit:
-                    moved = self._qpos + timestep * self._qvel
-                self._batch.step()
-                self._correct(self._qpos, self._qvel, moved, timestep)
-        else:
+        if not self._corrected:
             self._batch.step(nstep=steps)
+            return
+        moved = np.empty(self._qpos.shape)
+        for _ in range(steps):
+            if self._explicit:
+                self._kernels.move(self._qpos, self._qvel, moved, timestep)
+            self._batch.step()
+            self._kernels.correct(self._qpos, self._qvel, moved, timestep)
 
     def sensed(self, signals: Signals, rows: np.ndarray | None = None) -> Signals:
         """Signals of the present moment with the currents [A] that the sensors measure.
@@ -264,4 +262,4 @@ class MujocoBatchPhysics:
         mujoco.mj_passive(self.model, data)
 
 
-_ENGINE = ("_batch", "_correct", "_qpos", "_qvel", "_ctrl", "_act", "_load")
+_ENGINE = ("_batch", "_kernels", "_qpos", "_qvel", "_ctrl", "_act", "_load")
