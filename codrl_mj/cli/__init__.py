@@ -9,11 +9,19 @@ import tyro
 from codrl_mj.cli.evaluate import Evaluate
 from codrl_mj.cli.render import Render
 from codrl_mj.cli.runs import Runs
+from codrl_mj.cli.study import Study
 from codrl_mj.cli.train import Train, train_verb
 from codrl_mj.cli.validate import Validate
 from codrl_mj.training import TrainingStoppedError
 
-VERBS: dict[str, Any] = {"train": Train, "evaluate": Evaluate, "runs": Runs, "render": Render, "validate": Validate}
+VERBS: dict[str, Any] = {
+    "train": Train,
+    "evaluate": Evaluate,
+    "runs": Runs,
+    "render": Render,
+    "validate": Validate,
+    "study": Study,
+}
 """The verbs by name; `train`'s flags depend on the rest of the command line."""
 
 

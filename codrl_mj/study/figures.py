@@ -1,0 +1,121 @@
+"""The mismatch study's figures: SVG on white, so that they read alike in print, on a light and on a dark page."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codrl_mj.files import writing
+from codrl_mj.measures import Interval
+
+COLOURS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9")
+"""Of Okabe and Ito's palette, which the colour-blind can tell apart."""
+MARKERS = ("o", "s", "^", "D", "v", "P")
+_MISSING = "#d9d9d9"
+
+
+def heat_map(path: Path, values: np.ndarray, rows: Sequence[str], columns: Sequence[str], title: str) -> None:
+    """Draw mean returns as a heat map with the numbers in it.
+
+    Args:
+        path: SVG file.
+        values: shape (rows, columns); NaN is drawn as missing.
+        rows: what policies were trained on.
+        columns: what they were tested on.
+        title: above it.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(2.9 + 0.72 * len(columns), 1.9 + 0.34 * len(rows)), layout="constrained")
+    axes: Any = figure.subplots()
+    import matplotlib
+
+    colours = matplotlib.colormaps["cividis"].with_extremes(bad=_MISSING)
+    image = axes.imshow(np.ma.masked_invalid(values), cmap=colours, aspect="auto")
+    axes.set_xticks(range(len(columns)), columns, rotation=35, ha="right", rotation_mode="anchor")
+    axes.set_yticks(range(len(rows)), rows)
+    axes.set(xlabel="tested on", ylabel="trained on", title=title)
+    for (row, column), value in np.ndenumerate(values):
+        red, green, blue, _ = image.cmap(image.norm(value)) if np.isfinite(value) else (0.9, 0.9, 0.9, 1.0)
+        bright = 0.299 * red + 0.587 * green + 0.114 * blue > 0.5  # luma, ITU-R BT.601
+        text = f"{value:.0f}" if np.isfinite(value) else "–"
+        axes.text(column, row, text, ha="center", va="center", fontsize=9, color="black" if bright else "white")
+    figure.colorbar(image, ax=axes, label="mean return")
+    _save(figure, path)
+
+
+def points(
+    path: Path,
+    series: Mapping[str, Mapping[str, tuple[Interval, np.ndarray]]],
+    tests: Sequence[str],
+    title: str,
+) -> None:
+    """Draw interquartile means with their intervals, and every run as a small dot, over the test conditions.
+
+    Args:
+        path: SVG file.
+        series: label -> test condition -> interquartile mean, and the runs' mean returns.
+        tests: the test conditions, in order.
+        title: above it.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(2.6 + 1.0 * len(tests), 4.0 + 0.16 * len(series)), layout="constrained")
+    axes: Any = figure.subplots()
+    for index, (label, by_test) in enumerate(series.items()):
+        shift = 0.62 * ((index + 0.5) / len(series) - 0.5)
+        there = [test for test in tests if test in by_test]
+        places = np.array([tests.index(test) + shift for test in there])
+        colour, marker = COLOURS[index % len(COLOURS)], MARKERS[index % len(MARKERS)]
+        means = np.array([by_test[test][0] for test in there]).reshape(-1, 3)
+        below, above = means[:, 0] - means[:, 1], means[:, 2] - means[:, 0]
+        spread = np.nan_to_num(np.maximum([below, above], 0.0))  # rounding; a single run has no interval
+        axes.errorbar(
+            places, means[:, 0], spread, fmt=marker, color=colour, markersize=7, capsize=3, linewidth=1.4, label=label
+        )
+        for place, test in zip(places, there, strict=True):
+            runs = by_test[test][1]
+            axes.plot(np.full(len(runs), place + 0.07), runs, ".", color=colour, markersize=4, alpha=0.6)
+    axes.set_xticks(range(len(tests)), tests, rotation=20, ha="right", rotation_mode="anchor")
+    for edge in np.arange(len(tests) - 1) + 0.5:
+        axes.axvline(edge, color="0.85", linewidth=0.8)
+    axes.set_xlim(-0.5, len(tests) - 0.5)
+    axes.set(xlabel="tested on", ylabel="return", title=title)
+    axes.grid(axis="y", color="0.9")
+    axes.set_axisbelow(True)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize="small")
+    _save(figure, path)
+
+
+def probabilities(path: Path, rows: Mapping[str, Interval], title: str) -> None:
+    """Draw probabilities of improvement with their intervals, beside the line of no improvement.
+
+    Args:
+        path: SVG file.
+        rows: what is compared -> the probability.
+        title: above it.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.0, 1.3 + 0.3 * len(rows)), layout="constrained")
+    axes: Any = figure.subplots()
+    means = np.array(list(rows.values())).reshape(-1, 3)
+    places = np.arange(len(rows))[::-1]
+    spread = np.nan_to_num(np.maximum([means[:, 0] - means[:, 1], means[:, 2] - means[:, 0]], 0.0))
+    axes.axvline(0.5, color="0.4", linewidth=1, linestyle="--")
+    axes.errorbar(means[:, 0], places, xerr=spread, fmt="o", color=COLOURS[1], capsize=3, linewidth=1.4)
+    axes.set_yticks(places, rows, fontsize=9)
+    axes.set(xlim=(-0.03, 1.03), ylim=(-0.6, len(rows) - 0.4), xlabel="probability of improvement", title=title)
+    axes.grid(axis="x", color="0.9")
+    axes.set_axisbelow(True)
+    _save(figure, path)
+
+
+def _save(figure: Any, path: Path) -> None:
+    """Write the same bytes for the same figure."""
+    import matplotlib
+
+    figure.set_facecolor("white")
+    with writing(path) as temporary, matplotlib.rc_context({"svg.hashsalt": "codrl_mj"}):
+        figure.savefig(temporary, format="svg", metadata={"Date": None})
