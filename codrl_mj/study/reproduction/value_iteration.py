@@ -15,7 +15,7 @@ from codrl_mj.physics.analytic import DRIVERS
 from codrl_mj.tasks import TASKS
 
 TASK = "mountain_car_continuous"
-DISCOUNTS = (0.85, 0.9, 0.95, 0.99)
+DISCOUNTS = (0.85, 0.9, 0.95, 0.99, 0.999)
 """The paper's discount factor, and larger ones."""
 
 
@@ -58,7 +58,7 @@ class Grid:
 class Model:
     """One step of the car from every point of a grid under every force."""
 
-    def __init__(self, grid: Grid = Grid()) -> None:  # noqa: B008 - frozen
+    def __init__(self, grid: Grid = Grid()) -> None:
         """Step Gymnasium's environment from every point: some seconds."""
         from scipy import sparse
 
@@ -176,7 +176,7 @@ class Optimum:
         }
 
 
-def optimum(model: Model, discount: float, episodes: int = 100) -> Optimum:
+def optimum(model: Model, discount: float, episodes: int = 20) -> Optimum:
     """Find the best policy and let it drive Gymnasium's own car, without a motor.
 
     Args:
