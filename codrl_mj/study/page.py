@@ -66,10 +66,9 @@ def write(results: Results, out: Path) -> list[Path]:
 def _head(results: Results) -> str:
     config = results.config
     total = results.runs + len(results.untrained)
-    budgets = "; ".join(
-        f"{task}: {' and '.join(sorted({agent.upper() for agent in _agents_of(results, task)}))}"
-        for task in config.tasks
-    )
+    arms = [result.trial.arm for result in results.trials.values()]
+    agents = {task: dict.fromkeys(arm.agent.upper() for arm in arms if arm.task == task) for task in config.tasks}
+    acted = "; ".join(f"{task}: {', '.join(names)}" for task, names in agents.items())
     codes = ", ".join(f"`{code}` ({count})" for code, count in sorted(results.codes.items())) or "none"
     return f"""# The mismatch study
 
