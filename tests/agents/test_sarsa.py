@@ -417,7 +417,7 @@ def test_its_settings_fit_their_tasks(task):
 
 
 def test_the_papers_settings_are_the_papers():
-    """Shared text, The agents: 8 tilings, 1944 tiles, alpha 0.0375, gamma 1, epsilon 0.001, 600 episodes."""
+    """In the paper: 8 tilings, 1944 tiles, alpha 0.0375, gamma 1, epsilon 0.001, 600 episodes."""
     preset, task = PRESETS["sarsa", "mountain_car"]["paper"], find_task("mountain_car")
     policy = preset.agent.make_policy(task.observation_space, task.action_space)
     assert policy.table.size == 1944
