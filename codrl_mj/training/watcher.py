@@ -107,7 +107,8 @@ class Watcher(BaseCallback):
             raise LearningEnded
 
     def _on_step(self) -> bool:
-        signals = self.training_env.signals  # type: ignore[attr-defined]
+        # of every step since the last call, where an agent's compiled loop takes several
+        signals = self.locals.get("signals", self.training_env.signals)  # type: ignore[attr-defined]
         if signals is not None:
             errors = np.subtract(signals.desired_force, signals.actual_force)
             self._squares += float(np.dot(errors, errors))

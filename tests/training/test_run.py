@@ -17,6 +17,7 @@ from safetensors.torch import load_file
 
 from codrl_mj import Actuator, CurrentLoop, Motor
 from codrl_mj.agents import PPOConfig
+from codrl_mj.agents.sarsa_episodes import CompiledEpisodes
 from codrl_mj.env_config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy, evaluate, make_env, run_episodes
 from codrl_mj.policies import load_policy
@@ -255,3 +256,15 @@ def test_a_folder_that_cannot_be_made_is_named_before_training(tmp_path):
     with pytest.raises(OSError, match="file"):
         train(TINY, tmp_path / "file" / "run", lambda _: pytest.fail("it trained"))
     assert (tmp_path / "file").read_text() == "in the way"
+
+
+def test_the_torque_error_of_compiled_episodes_is_that_of_all_their_steps(tmp_path, monkeypatch):
+    config = TrainConfig.preset("mountain_car", "sarsa", total_episodes=6, evaluation_episodes=1)
+    errors = []
+    for compiled in (True, False):
+        if not compiled:
+            monkeypatch.setattr(CompiledEpisodes, "can_run", lambda _: False)
+        out = train(config, tmp_path / str(compiled))
+        errors.append([float(row["torque_error"]) for row in read_csv(out / "progress.csv")])
+    assert errors[0] == pytest.approx(errors[1], rel=1e-9)
+    assert errors[0][0] > 0.1
