@@ -85,6 +85,16 @@ def cell_folder(root: Path, config: TrainConfig) -> Path:
     return root / f"{config.task}-{config.agent.name}-s{config.seed}-{_digest(config.as_mapping())}"
 
 
+def read_failure(folder: Path) -> Failure | None:
+    """Why the cell of a run folder was not finished when it was tried last; None if it did not fail."""
+    record = _failure_record(folder)
+    return Failure(read_json(record, "record of a failure")["error"], record) if record.is_file() else None
+
+
+def _failure_record(folder: Path) -> Path:
+    return folder.parent / _FAILURES / f"{folder.name}.json"
+
+
 def train_cells(
     cells: Mapping[str, TrainConfig],
     root: Path,
@@ -166,7 +176,7 @@ def _train_cell(
 ) -> tuple[Path, Failure | None]:
     """Train one cell: its folder, and what went wrong, of which a record is kept."""
     error = _try_to_train(config, folder, accept_changes, parent)
-    record = folder.parent / _FAILURES / f"{folder.name}.json"
+    record = _failure_record(folder)
     if error is None:
         record.unlink(missing_ok=True)
         return folder, None

@@ -16,7 +16,7 @@ from codrl_mj.env_config import EnvConfig
 from codrl_mj.evaluation import evaluate
 from codrl_mj.motor import named_actuator
 from codrl_mj.policies import load_policy
-from codrl_mj.study.grid import Deployment, Workers, cell_folder, deploy_cells, train_cells
+from codrl_mj.study.grid import Deployment, Workers, cell_folder, deploy_cells, read_failure, train_cells
 from codrl_mj.training import TrainConfig, finished, load_config
 
 PPO = PPOConfig(rollout_steps=256, batch_size=64, epochs=1, hidden=(8,))
@@ -52,6 +52,8 @@ def test_a_cell_that_fails_is_recorded_and_does_not_stop_the_others(computed):
     assert "Traceback" in record["traceback"]
     assert record["train"]["actuator"]["controller"]["kp"] == 100.0
     assert failure.record.parent == root / "failures"
+    assert read_failure(cell_folder(root, dataclasses.replace(TINY, actuator=UNSTABLE))) == failure
+    assert read_failure(runs["seed 0"]) is None
 
 
 def test_a_cell_is_an_ordinary_run_folder_keyed_by_its_configuration(computed):
