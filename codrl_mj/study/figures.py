@@ -37,12 +37,18 @@ def heat_map(path: Path, values: np.ndarray, rows: Sequence[str], columns: Seque
     axes.set_yticks(range(len(rows)), rows)
     axes.set(xlabel="tested on", ylabel="trained on", title=title)
     for (row, column), value in np.ndenumerate(values):
-        red, green, blue, _ = image.cmap(image.norm(value)) if np.isfinite(value) else (0.9, 0.9, 0.9, 1.0)
-        bright = 0.299 * red + 0.587 * green + 0.114 * blue > 0.5  # luma, ITU-R BT.601
-        text = f"{value:.0f}" if np.isfinite(value) else "–"
-        axes.text(column, row, text, ha="center", va="center", fontsize=9, color="black" if bright else "white")
+        text = f"{value:.0f}".replace("-", "\N{MINUS SIGN}") if np.isfinite(value) else "–"
+        colour = _legible_on(image.cmap(image.norm(value))) if np.isfinite(value) else "black"
+        axes.text(column, row, text, ha="center", va="center", fontsize=9, color=colour)
     figure.colorbar(image, ax=axes, label="mean return")
     _save(figure, path)
+
+
+def _legible_on(background: Sequence[float]) -> str:
+    """Black or white, whichever contrasts more with an RGB colour: WCAG 2's relative luminance, equal at 0.179."""
+    channels = np.array(background[:3])
+    linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+    return "black" if linear @ [0.2126, 0.7152, 0.0722] > 0.179 else "white"
 
 
 def points(
@@ -61,7 +67,7 @@ def points(
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(2.6 + 1.0 * len(tests), 4.0 + 0.16 * len(series)), layout="constrained")
+    figure = Figure(figsize=(max(7.0, 2.6 + 1.0 * len(tests)), 4.0 + 0.16 * len(series)), layout="constrained")
     axes: Any = figure.subplots()
     for index, (label, by_test) in enumerate(series.items()):
         shift = 0.62 * ((index + 0.5) / len(series) - 0.5)
@@ -84,31 +90,38 @@ def points(
     axes.set(xlabel="tested on", ylabel="return", title=title)
     axes.grid(axis="y", color="0.9")
     axes.set_axisbelow(True)
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize="small")
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize="small")
     _save(figure, path)
 
 
-def probabilities(path: Path, rows: Mapping[str, Interval], title: str) -> None:
+def probabilities(path: Path, questions: Mapping[str, Mapping[str, Interval]], title: str) -> None:
     """Draw probabilities of improvement with their intervals, beside the line of no improvement.
 
     Args:
         path: SVG file.
-        rows: what is compared -> the probability.
+        questions: what is asked -> test condition -> the probability.
         title: above it.
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8.0, 1.3 + 0.3 * len(rows)), layout="constrained")
-    axes: Any = figure.subplots()
-    means = np.array(list(rows.values())).reshape(-1, 3)
-    places = np.arange(len(rows))[::-1]
-    spread = np.nan_to_num(np.maximum([means[:, 0] - means[:, 1], means[:, 2] - means[:, 0]], 0.0))
-    axes.axvline(0.5, color="0.4", linewidth=1, linestyle="--")
-    axes.errorbar(means[:, 0], places, xerr=spread, fmt="o", color=COLOURS[1], capsize=3, linewidth=1.4)
-    axes.set_yticks(places, rows, fontsize=9)
-    axes.set(xlim=(-0.03, 1.03), ylim=(-0.6, len(rows) - 0.4), xlabel="probability of improvement", title=title)
-    axes.grid(axis="x", color="0.9")
-    axes.set_axisbelow(True)
+    sizes = [len(rows) for rows in questions.values()]
+    height = 1.1 + sum(0.42 + 0.24 * size for size in sizes)
+    figure = Figure(figsize=(7.0, height), layout="constrained")
+    ratios = [0.7 + size for size in sizes]
+    every = figure.subplots(len(sizes), 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0]
+    for axes, (question, rows) in zip(every, questions.items(), strict=True):
+        means = np.array(list(rows.values())).reshape(-1, 3)
+        places = np.arange(len(rows))[::-1]
+        spread = np.nan_to_num(np.maximum([means[:, 0] - means[:, 1], means[:, 2] - means[:, 0]], 0.0))
+        axes.axvline(0.5, color="0.4", linewidth=1, linestyle="--")
+        axes.errorbar(means[:, 0], places, xerr=spread, fmt="o", color=COLOURS[1], capsize=3, linewidth=1.4)
+        axes.set_yticks(places, rows, fontsize=9)
+        axes.set(xlim=(-0.03, 1.03), ylim=(-0.6, len(rows) - 0.4))
+        axes.set_title(question, loc="left", fontsize=9)
+        axes.grid(axis="x", color="0.9")
+        axes.set_axisbelow(True)
+    every[-1].set_xlabel("probability of improvement (0.5: none)")
+    figure.suptitle(title)
     _save(figure, path)
 
 

@@ -14,7 +14,7 @@ from codrl_mj.study.experiments import EXPERIMENTS
 from codrl_mj.study.mismatch import Results
 from codrl_mj.study.plan import AGENTS, Comparison, Plan, Trial
 from codrl_mj.study.statistics import RESAMPLES
-from codrl_mj.study.summaries import LEAST_RUNS, Verdict, by_question, judge, over_all_tests, summarize_trial
+from codrl_mj.study.summaries import LEAST_RUNS, Summary, Verdict, by_question, judge, over_all_tests, summarize
 
 PAGE, CONCLUSIONS, FOLDER = "mismatch.md", "mismatch_conclusions.md", "mismatch"
 """The page; what a person writes, which the page includes and nothing overwrites; figures and tables."""
@@ -38,14 +38,14 @@ def write(results: Results, out: Path) -> list[Path]:
     Returns:
         The files that were written.
     """
-    folder = out / FOLDER
+    folder, summary = out / FOLDER, summarize(results)
     drawn = {
-        (name, task): _figures(results, name, task, plan, folder)
+        (name, task): _figures(results, summary, name, task, plan, folder)
         for name, of in results.plans.items()
         for task, plan in of.items()
     }
     written = [path for paths in drawn.values() for path in paths]
-    written += tables.write(results, folder)
+    written += tables.write(results, summary, folder)
     conclusions = out / CONCLUSIONS
     parts = [
         _head(results),
@@ -54,7 +54,7 @@ def write(results: Results, out: Path) -> list[Path]:
         if conclusions.is_file()
         else f"None are written yet: they belong into `{CONCLUSIONS}` beside this page, which includes them.\n",
         _missing(results),
-        *(_experiment(results, name, drawn) for name in results.plans),
+        *(_experiment(results, summary, name, drawn) for name in results.plans),
         _actuators(results),
         _METHOD,
     ]
@@ -76,8 +76,10 @@ What does it cost to train on another actuator than the one that there will be?
 
 {results.runs} of {total} trainings are finished ({results.seconds / 3600:.1f} hours of one core, in all), with up to
 {config.seeds} seeds each; every policy was tested in {config.episodes} episodes on every actuator in question, with
-Gymnasium's own reward and time limit. Agents: {acted}. Versions of the code that trained, by digest, with
-the number of runs: {codes}.
+Gymnasium's own reward and time limit.
+
+- Agents: {acted}
+- Versions of the code that trained, by digest, with the number of runs: {codes}
 
 `codrl-mj study mismatch` writes this page, its figures and its tables; do not edit it. [How to run it](../studies.md);
 [every run]({FOLDER}/{tables.RUNS}) and [every number]({FOLDER}/{tables.RESULTS}) as files.
@@ -100,12 +102,13 @@ def _missing(results: Results) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _figures(results: Results, name: str, task: str, plan: Plan, folder: Path) -> list[Path]:
+def _figures(results: Results, summary: Summary, name: str, task: str, plan: Plan, folder: Path) -> list[Path]:
     """Draw what there is of an experiment on a task."""
-    means = {trial.name: summary for trial in plan.trials if (summary := summarize_trial(results.trials[trial.name]))}
+    means = {trial.name: summary.trials[trial.name] for trial in plan.trials if trial.name in summary.trials}
     if not means:
         return []
-    title = f"{task}: {EXPERIMENTS[name].title.lower()}"
+    heading = EXPERIMENTS[name].title
+    title = f"{task}: {heading[0].lower()}{heading[1:]}"
     path = folder / f"{name}_{task}.svg"
     tests = [test.name for test in plan.tests]
     if plan.series:
@@ -125,31 +128,33 @@ def _figures(results: Results, name: str, task: str, plan: Plan, folder: Path) -
             if trial.name in means:
                 values[rows.index(trial.arm.name), tests.index(trial.test.name)] = means[trial.name].mean
         figures.heat_map(path, values, rows, tests, title)
-    verdicts = [verdict for pair in plan.comparisons if (verdict := judge(results, [pair]))]
-    if not verdicts:
+    questions: dict[str, dict[str, Interval]] = {}
+    for pair in plan.comparisons:
+        if pair in summary.verdicts:
+            questions.setdefault(pair.question, {})[pair.one.test.name] = summary.verdicts[pair].probability
+    if not questions:
         return [path]
     compared = folder / f"{name}_{task}_improvement.svg"
-    labels = {f"{verdict.question}: {verdict.tests[0]}": verdict.probability for verdict in verdicts}
-    figures.probabilities(compared, labels, f"{task}: is the first better?")
+    figures.probabilities(compared, questions, f"{task}: which is better?")
     return [path, compared]
 
 
-def _experiment(results: Results, name: str, drawn: Mapping[tuple[str, str], Sequence[Path]]) -> str:
+def _experiment(results: Results, summary: Summary, name: str, drawn: Mapping[tuple[str, str], Sequence[Path]]) -> str:
     experiment, of = EXPERIMENTS[name], results.plans[name]
     parts = [f"## {experiment.title}\n", textwrap.fill(experiment.about, 120, break_long_words=False) + "\n"]
     for task, plan in of.items():
         parts += [f"### {task}\n"]
         parts += [f"![{path.stem}]({FOLDER}/{path.name})\n" for path in drawn[name, task]]
         if not plan.series:
-            parts += [_means(results, plan)]
-        parts += [_findings(results, plan), _details(results, plan)]
+            parts += [_means(results, summary, plan)]
+        parts += [_findings(summary, plan), _details(summary, plan)]
     pooled = _pooled(results, of)
     if pooled:
         parts += ["### All tests together\n", pooled]
     return "\n".join(parts)
 
 
-def _means(results: Results, plan: Plan) -> str:
+def _means(results: Results, summary: Summary, plan: Plan) -> str:
     """The mean returns: rows trained on, columns tested on."""
     tests = [test.name for test in plan.tests]
     complete = all(f"{arm.task}: {arm.name} on {test}" in results.trials for arm in plan.arms for test in tests)
@@ -158,8 +163,8 @@ def _means(results: Results, plan: Plan) -> str:
         mine = {trial.test.name: trial for trial in plan.trials if trial.arm.name == arm.name}
         row = [f"`{arm.name}`"]
         for test in tests:
-            summary = summarize_trial(results.trials[mine[test].name]) if test in mine else None
-            row.append("–" if summary is None else _number(summary.mean))
+            found = summary.trials.get(mine[test].name) if test in mine else None
+            row.append("–" if found is None else _number(found.mean))
         if complete and len(tests) > 1:
             together = over_all_tests(results, list(mine.values()))
             row.append("–" if together is None else _interval(together[1]))
@@ -170,11 +175,11 @@ def _means(results: Results, plan: Plan) -> str:
     )
 
 
-def _findings(results: Results, plan: Plan) -> str:
+def _findings(summary: Summary, plan: Plan) -> str:
     """What was decided on one task, in words."""
     lines = []
     for question, asked in by_question(plan.comparisons).items():
-        verdicts = [judge(results, [pair]) for pair in asked]
+        verdicts = [summary.verdicts.get(pair) for pair in asked]
         found = [verdict for verdict in verdicts if verdict is not None]
         parts = [
             f"{outcome} on " + ", ".join(_against(verdict) for verdict in found if verdict.outcome == outcome)
@@ -191,25 +196,25 @@ def _against(verdict: Verdict) -> str:
     return f"`{verdict.tests[0]}` ({_number(verdict.one)} against {_number(verdict.other)})"
 
 
-def _details(results: Results, plan: Plan) -> str:
+def _details(summary: Summary, plan: Plan) -> str:
     """Every trial and every comparison, folded away."""
     rows = []
     for trial in plan.trials:
-        summary = summarize_trial(results.trials[trial.name])
+        found = summary.trials.get(trial.name)
         start = [f"`{trial.arm.name}`", f"`{trial.test.name}`"]
-        if summary is None:
+        if found is None:
             rows.append([*start, "0", *["–"] * (3 + len(_UNITS))])
             continue
         measures = [
-            "–" if summary.measures[name] is None else f"{factor * (summary.measures[name] or 0.0):.3g}"
+            "–" if found.measures[name] is None else f"{factor * (found.measures[name] or 0.0):.3g}"
             for name, (_, _, factor) in _UNITS.items()
         ]
-        ends = f"{_number(summary.lowest)} … {_number(summary.highest)}"
-        returns = [_number(summary.mean), _interval(summary.interquartile_mean), ends]
-        rows.append([*start, str(summary.runs), *returns, *measures])
+        ends = f"{_number(found.lowest)} … {_number(found.highest)}"
+        returns = [_number(found.mean), _interval(found.interquartile_mean), ends]
+        rows.append([*start, str(found.runs), *returns, *measures])
     header = ["trained on", "tested on", "runs", "mean return", "interquartile mean", "runs' range"]
     every = _table([*header, *(f"{label} [{unit}]" for label, unit, _ in _UNITS.values())], rows)
-    verdicts = [verdict for pair in plan.comparisons if (verdict := judge(results, [pair]))]
+    verdicts = [summary.verdicts[pair] for pair in plan.comparisons if pair in summary.verdicts]
     compared = _verdicts(verdicts, lambda verdict: f"`{verdict.tests[0]}`", "tested on")
     return f"<details><summary>Every number</summary>\n\n{every}\n{compared}\n</details>\n"
 

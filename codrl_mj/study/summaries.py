@@ -63,6 +63,27 @@ class Verdict:
         return "better" if self.probability.low > 0.5 else "worse" if self.probability.high < 0.5 else "undecided"
 
 
+@dataclasses.dataclass(frozen=True)
+class Summary:
+    """All that the page and the tables say of the trials and the comparisons."""
+
+    trials: Mapping[str, TrialSummary]
+    """By the trial's name; those without a run are left out."""
+    verdicts: Mapping[Comparison, Verdict]
+    """By comparison; those that lack a side are left out."""
+
+
+def summarize(results: Results) -> Summary:
+    """Summarise every trial and judge every comparison."""
+    asked = [pair for of in results.plans.values() for plan in of.values() for pair in plan.comparisons]
+    trials = {name: summarize_trial(result) for name, result in results.trials.items()}
+    verdicts = {pair: judge(results, [pair]) for pair in asked}
+    return Summary(
+        {name: summary for name, summary in trials.items() if summary is not None},
+        {pair: verdict for pair, verdict in verdicts.items() if verdict is not None},
+    )
+
+
 def summarize_trial(result: Result) -> TrialSummary | None:
     """What a trial came to; None if no policy was tested."""
     returns = result.returns

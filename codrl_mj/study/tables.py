@@ -9,7 +9,7 @@ from typing import Any
 from codrl_mj.files import write_json, writing
 from codrl_mj.measures import Interval
 from codrl_mj.study.mismatch import Results
-from codrl_mj.study.summaries import MEASURES, judge, measure, summarize_trial
+from codrl_mj.study.summaries import MEASURES, Summary, measure
 
 RUNS, RESULTS = "runs.csv", "results.json"
 """A row for every policy and test; trials, comparisons and what is missing."""
@@ -28,7 +28,7 @@ COLUMNS = (
 """Columns of `RUNS`: `return` is the mean over the episodes, within 95 % bounds. Units as in docs/evaluation.md."""
 
 
-def write(results: Results, folder: Path) -> list[Path]:
+def write(results: Results, summary: Summary, folder: Path) -> list[Path]:
     """Write both files into a folder."""
     with writing(folder / RUNS) as temporary, temporary.open("w", newline="") as file:
         rows = csv.writer(file, lineterminator="\n")
@@ -44,29 +44,28 @@ def write(results: Results, folder: Path) -> list[Path]:
                         *(measure(name, evaluation) for name in MEASURES),
                     ]
                 )
-    write_json(folder / RESULTS, as_mapping(results))
+    write_json(folder / RESULTS, as_mapping(results, summary))
     return [folder / RUNS, folder / RESULTS]
 
 
-def as_mapping(results: Results) -> dict[str, Any]:
+def as_mapping(results: Results, summary: Summary) -> dict[str, Any]:
     """Everything as JSON-serialisable values; intervals are mappings of `mean`, `low` and `high`, null if unknown."""
     trials = {}
     for name, result in results.trials.items():
-        summary = summarize_trial(result)
-        arm = result.trial.arm
+        arm, of_it = result.trial.arm, summary.trials.get(name)
         trials[name] = {
             "task": arm.task,
             "trained": arm.name,
             "tested": result.trial.test.name,
             "returns": {seed: evaluation["returns"]["mean"] for seed, evaluation in result.evaluations.items()},
-            "summary": None if summary is None else _plain(dataclasses.asdict(summary)),
+            "summary": None if of_it is None else _plain(dataclasses.asdict(of_it)),
         }
     comparisons = [
         {"experiment": experiment, "task": task, "outcome": verdict.outcome, **_plain(dataclasses.asdict(verdict))}
         for experiment, of in results.plans.items()
         for task, plan in of.items()
         for pair in plan.comparisons
-        if (verdict := judge(results, [pair])) is not None
+        if (verdict := summary.verdicts.get(pair)) is not None
     ]
     return {
         "config": _plain(dataclasses.asdict(results.config)),
