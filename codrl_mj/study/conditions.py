@@ -39,7 +39,13 @@ def conditions(task: str) -> dict[str, Condition]:
     assert slow is not None
     return _by_name(
         [
-            *(Condition(name, description, named_actuator(name, task)) for name, (description, _) in NAMED.items()),
+            *(
+                Condition(
+                    name, description, actuator, EnvConfig() if actuator else _integrated_as_with_a_motor(definition)
+                )
+                for name, (description, _) in NAMED.items()
+                for actuator in [named_actuator(name, task)]
+            ),
             Condition(
                 "slow_winding",
                 f"the paper's loop on a slow winding: L = {slow.motor.inductance:g} H instead of "
@@ -57,6 +63,14 @@ def conditions(task: str) -> dict[str, Condition]:
             _randomised(task, paper, slow.motor.inductance),
         ]
     )
+
+
+def _integrated_as_with_a_motor(task: Task) -> EnvConfig:
+    """What makes the ideal actuator's environment differ from a motor's by the motor alone.
+
+    Gymnasium integrates Acrobot in steps of 0.2 s, the paper's inner loop in steps of 0.02 s.
+    """
+    return EnvConfig(inner_steps=task.motor_inner_steps)
 
 
 def low_voltage(paper: Actuator) -> Condition:
@@ -146,27 +160,27 @@ def ladder(task: str) -> dict[str, Condition]:
         known["ideal"],
         Condition(
             "winding",
-            f"a motor's winding (R = {motor.resistance:g} ohm, L = {motor.inductance:g} H) driven open loop: "
+            f"the paper's winding (R = {motor.resistance:g} ohm, L = {motor.inductance:g} H) driven open loop: "
             "u = R*i_ref + kE*omega",
             Actuator(motor, CurrentLoop(kp=0.0, kff=motor.resistance, max_voltage=paper.controller.max_voltage)),
         ),
-        dataclasses.replace(known["paper"], description="a current loop around the winding: the paper's"),
-        dataclasses.replace(known["low_voltage"], description="saturation: 5 V instead of 24 V"),
+        known["paper"],
+        known["low_voltage"],
         Condition(
             "late",
-            f"delay: commands come one environment step ({definition.step_duration:g} s) late",
+            f"`low_voltage`, and every command comes one environment step ({definition.step_duration:g} s) late",
             low,
             EnvConfig(disturbances=Disturbances(**late)),
         ),
         Condition(
             "coarse",
-            f"quantisation: commands in steps of {definition.max_force / 8:g} N*m",
+            f"`late`, and commands in steps of {definition.max_force / 8:g} N*m",
             low,
             EnvConfig(disturbances=Disturbances(**late, **coarse)),
         ),
         Condition(
             "sagging",
-            f"sag: a supply of {sag['supply_resistance']:g} ohm",
+            f"`{'coarse' if coarse else 'late'}`, and a supply that sags: of {sag['supply_resistance']:g} ohm",
             low,
             EnvConfig(disturbances=Disturbances(**late, **coarse, **sag)),
         ),

@@ -12,7 +12,7 @@ from codrl_mj.study import figures, tables
 from codrl_mj.study.conditions import every_condition
 from codrl_mj.study.experiments import EXPERIMENTS
 from codrl_mj.study.mismatch import Results
-from codrl_mj.study.plan import AGENTS, Comparison, Plan, Trial
+from codrl_mj.study.plan import Comparison, Plan, Trial
 from codrl_mj.study.statistics import RESAMPLES
 from codrl_mj.study.summaries import LEAST_RUNS, Summary, Verdict, by_question, judge, over_all_tests, summarize
 
@@ -266,7 +266,7 @@ def _actuators(results: Results) -> str:
     for task in results.config.tasks:
         known = every_condition(task)
         rows = [[f"`{name}`", condition.description] for name, condition in known.items() if name in used]
-        parts += [f"### {task}, by {AGENTS[task][0].upper()}\n", _table(["name", "is"], rows)]
+        parts += [f"### {task}\n", _table(["name", "is"], rows)]
     return "\n".join(parts)
 
 
