@@ -65,8 +65,8 @@ PRESETS: dict[str, dict[str, Preset]] = {
             ),
             total_steps=8000,
             about=(
-                "Ours, for a short run: an ordinary critic, a low discount, targets that follow fast, independent noise; "
-                "learns in a twelfth of the paper's steps."
+                "Ours, for a short run: an ordinary critic, a low discount, targets that follow fast, independent "
+                "noise. It learns in a twelfth of the paper's steps."
             ),
         ),
         "paper": Preset(

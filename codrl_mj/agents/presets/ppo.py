@@ -49,8 +49,8 @@ PRESETS: dict[str, dict[str, Preset]] = {
             total_steps=150_000,
             num_envs=8,
             about=(
-                "Stable-Baselines3 Zoo's, with twice the environments and the speed times 0.2 into the networks. Without "
-                "that and the state-dependent noise, one start in ten was not swung up."
+                "Stable-Baselines3 Zoo's, with twice the environments and the speed times 0.2 into the networks. "
+                "Without that and the state-dependent noise, one start in ten was not swung up."
             ),
         )
     },
