@@ -5,6 +5,7 @@ task's. Nothing of them is written down here again.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -205,6 +206,6 @@ def start_value(model: Model, of_actions: np.ndarray) -> float:
     return float((interpolation(model.grid, np.array([[-0.5, 0.0]])) @ of_actions.max(axis=0))[0])
 
 
-def values_over(model: Model, discounts: np.ndarray) -> np.ndarray:
-    """Values of x = -0.5 m at rest at many discount factors, shape (n,) each."""
-    return np.array([start_value(model, iterate(model.rewards, model.transitions, gamma)) for gamma in discounts])
+def values_over(model: Model, discounts: Sequence[float]) -> list[float]:
+    """Values of x = -0.5 m at rest at many discount factors."""
+    return [start_value(model, iterate(model.rewards, model.transitions, discount)) for discount in discounts]

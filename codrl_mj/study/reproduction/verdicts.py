@@ -111,14 +111,13 @@ class OneEpisode:
         if len(times) == 0:
             return _nothing()
         medians = np.array([np.median(of_seed) for of_seed in times])
-        measured = bootstrap_mean(medians) if np.isfinite(medians).all() else None
         low, high = central_range(np.concatenate(list(times)))
         inside = low <= self.figure <= high
         reason = f"95 % of episodes take {number(low)} to {number(high)} s"
         if math.isinf(high):
             failed = np.mean(np.isinf(np.concatenate(list(times))))
             reason += f"; {100 * failed:.0f} % never arrive, which counts as infinitely long"
-        return Verdict(CONFIRMED if inside else NOT_CONFIRMED, reason, measured, len(times))
+        return Verdict(CONFIRMED if inside else NOT_CONFIRMED, reason, _mean(medians), len(times))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,7 +138,28 @@ class EverySeed:
             return _nothing()
         beyond = int(np.sum(values > self.limit))
         reason = f"{beyond} of {len(values)} seeds are beyond; the largest has {number(float(np.max(values)))}"
-        return Verdict(NOT_CONFIRMED if beyond else CONFIRMED, reason, bootstrap_mean(values), len(values))
+        return Verdict(NOT_CONFIRMED if beyond else CONFIRMED, reason, _mean(values), len(values))
+
+
+@dataclasses.dataclass(frozen=True)
+class SomeSeed:
+    """The value of some seed is at least a limit."""
+
+    limit: float
+    """The limit, included."""
+
+    @property
+    def criterion(self) -> str:
+        """When it is confirmed."""
+        return f"at least {number(self.limit)} in some seed"
+
+    def __call__(self, values: np.ndarray) -> Verdict:
+        """Judge one value for each seed, shape (n,)."""
+        if len(values) == 0:
+            return _nothing()
+        there = int(np.sum(values >= self.limit))
+        reason = f"so in {there} of {len(values)} seeds; the largest has {number(float(np.max(values)))}"
+        return Verdict(CONFIRMED if there else NOT_CONFIRMED, reason, _mean(values), len(values))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -211,11 +231,16 @@ class Holds:
         return Verdict(CONFIRMED if holds else NOT_CONFIRMED, found)
 
 
-Check = Within | OneRun | OneEpisode | EverySeed | Higher | Same | Holds
+Check = Within | OneRun | OneEpisode | EverySeed | SomeSeed | Higher | Same | Holds
 
 
 def _nothing() -> Verdict:
     return Verdict(NOT_TESTABLE, "no finished run")
+
+
+def _mean(values: np.ndarray) -> Interval | None:
+    """Mean over seeds with its interval; None if one of them is infinite."""
+    return bootstrap_mean(values) if np.isfinite(values).all() else None
 
 
 def prediction_interval(values: np.ndarray) -> tuple[float, float]:

@@ -1,0 +1,113 @@
+"""The arms of the paper's experiments: who learns what on which motor, with the settings that the paper prints."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from codrl_mj.env_config import EnvConfig
+from codrl_mj.motor import Actuator
+from codrl_mj.motor.catalog import PAPER
+from codrl_mj.study.grid import Deployment
+from codrl_mj.training import TrainConfig
+
+TEST, CENTRE = "test", "centre"
+"""Tests of a trained policy: the task as Gymnasium poses it; CartPole's with the reward that it was trained with."""
+CENTRE_RADIUS = 0.1  # m, the paper's, CartPole
+TEST_SEED = 1_000_000  # far from the seeds that training draws from
+
+
+@dataclasses.dataclass(frozen=True)
+class Arm:
+    """One way to learn a task, to be repeated with many seeds."""
+
+    task: str
+    """Task name."""
+    agent: str
+    """The agent's name."""
+    settings: str
+    """Of the agent: `paper` or `repaired`."""
+    motor: str
+    """What the arm is called for its actuator, such as `ideal`."""
+    actuator: Actuator | None
+    """What it learns, and is tested, on; None is the ideal actuator."""
+    seconds: float
+    """Computing time of a run and its tests on one core [s], roughly."""
+    physics: Literal["mujoco", "analytic"] = "mujoco"
+    """MuJoCo, or Gymnasium's own equations."""
+
+    @property
+    def name(self) -> str:
+        """A name that no other arm has."""
+        return f"{self.task}, {self.settings}, {self.motor}, {self.physics}"
+
+    @property
+    def gains(self) -> str:
+        """The controller's gains as text."""
+        if self.actuator is None:
+            return "no motor"
+        loop = self.actuator.controller
+        feed_forward = f", kFF {loop.kff:g}" if loop.kff else ""
+        return f"kP {loop.kp:g}, kI {loop.ki:g}, kD {loop.kd:g}{feed_forward}"
+
+    def config(self, seed: int, episodes: int | None = None) -> TrainConfig:
+        """The training run of a seed: the preset's, on this arm's actuator and physics.
+
+        Args:
+            seed: training seed.
+            episodes: stop after that many training episodes already; for trying things out.
+        """
+        preset = TrainConfig.preset(self.task, self.agent, self.settings, actuator=self.actuator, seed=seed)
+        changes: dict[str, Any] = {} if episodes is None else {"total_episodes": episodes}
+        return dataclasses.replace(preset, env=dataclasses.replace(preset.env, physics=self.physics), **changes)
+
+    def deployments(self, run: Path, episodes: int) -> dict[str, Deployment]:
+        """The tests of a trained policy, by name."""
+        env = EnvConfig(physics=self.physics)
+        envs = {TEST: env}
+        if self.task == "cartpole":
+            envs[CENTRE] = dataclasses.replace(env, center_radius=CENTRE_RADIUS)
+        return {name: Deployment(run, self.actuator, one, episodes, TEST_SEED) for name, one in envs.items()}
+
+
+FAST = dataclasses.replace(
+    PAPER["mountain_car"],
+    controller=dataclasses.replace(PAPER["mountain_car"].controller, kp=2.0, ki=10.0, kd=1e-6),
+)
+"""The mountain car's second set of gains (Solving the Mountain Car Environment)."""
+
+
+def _arms(
+    task: str, agent: str, settings: str, seconds: float, others: Mapping[str, Actuator | None] | None = None
+) -> tuple[Arm, ...]:
+    motors = {"paper gains": PAPER[task], **(others or {}), "ideal": None}
+    return tuple(Arm(task, agent, settings, name, motor, seconds) for name, motor in motors.items())
+
+
+def _on_both(arms: Sequence[Arm], analytic_seconds: Mapping[str, float]) -> tuple[Arm, ...]:
+    """The arms on MuJoCo, and again on Gymnasium's equations."""
+    analytic = [
+        dataclasses.replace(arm, physics="analytic", seconds=analytic_seconds.get(arm.motor, arm.seconds))
+        for arm in arms
+    ]
+    return *arms, *analytic
+
+
+ARMS: tuple[Arm, ...] = (
+    *_arms("pendulum", "ddpg", "paper", 400),
+    *_arms("pendulum", "ddpg", "repaired", 400),
+    *_on_both(
+        _arms("mountain_car", "sarsa", "paper", 10, {"fast gains": FAST}),
+        {"paper gains": 45, "fast gains": 45, "ideal": 12},
+    ),
+    *_arms("mountain_car_continuous", "ddpg", "paper", 600),
+    *_arms("mountain_car_continuous", "ddpg", "repaired", 120),
+    *_arms("acrobot", "dqn", "paper", 150),
+    *_on_both(_arms("cartpole", "ppo", "paper", 120), {}),
+)
+"""Every arm of every experiment."""
+
+
+def arms_of(tasks: Sequence[str]) -> list[Arm]:
+    """The arms of some tasks, in the paper's order."""
+    return [arm for arm in ARMS if arm.task in tasks]
