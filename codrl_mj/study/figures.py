@@ -41,7 +41,7 @@ def heat_map(path: Path, values: np.ndarray, rows: Sequence[str], columns: Seque
         colour = _legible_on(image.cmap(image.norm(value))) if np.isfinite(value) else "black"
         axes.text(column, row, text, ha="center", va="center", fontsize=9, color=colour)
     figure.colorbar(image, ax=axes, label="mean return")
-    _save(figure, path)
+    save(figure, path)
 
 
 def _legible_on(background: Sequence[float]) -> str:
@@ -91,7 +91,7 @@ def points(
     axes.grid(axis="y", color="0.9")
     axes.set_axisbelow(True)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize="small")
-    _save(figure, path)
+    save(figure, path)
 
 
 def probabilities(path: Path, questions: Mapping[str, Mapping[str, Interval]], title: str) -> None:
@@ -122,11 +122,11 @@ def probabilities(path: Path, questions: Mapping[str, Mapping[str, Interval]], t
         axes.set_axisbelow(True)
     every[-1].set_xlabel("probability of improvement (0.5: none)")
     figure.suptitle(title)
-    _save(figure, path)
+    save(figure, path)
 
 
-def _save(figure: Any, path: Path) -> None:
-    """Write the same bytes for the same figure."""
+def save(figure: Any, path: Path) -> None:
+    """Write a figure on white as SVG; the same bytes for the same figure."""
     import matplotlib
 
     figure.set_facecolor("white")
