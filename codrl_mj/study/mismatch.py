@@ -189,16 +189,18 @@ def compute(
             if not deployment.record.is_file():
                 _deploy_alone(config, name, deployment)
                 report("testing", name)
+    for deployment in waiting.values():
+        if deployment.record.is_file():
+            _failure_of_test(config, deployment).unlink(missing_ok=True)
 
 
 def _deploy_alone(config: MismatchConfig, name: str, deployment: Deployment) -> None:
     """Evaluate a policy, and keep a record if that fails."""
-    record = _failure_of_test(config, deployment)
     try:
         deploy_cells({name: deployment}, Workers(jobs=1))
-        record.unlink(missing_ok=True)
     except Exception as error:
-        write_json(record, {"error": " ".join(str(error).split()), "test": name, "run": deployment.run.name})
+        content = {"error": " ".join(str(error).split()), "test": name, "run": deployment.run.name}
+        write_json(_failure_of_test(config, deployment), content)
 
 
 def _failure_of_test(config: MismatchConfig, deployment: Deployment) -> Path:

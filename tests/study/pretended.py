@@ -34,7 +34,7 @@ def pretend(config, score, leaving_out=()):
 
 def evaluation(mean_return, episodes):
     """An evaluation whose every measure but the return is 1, or unknown."""
-    values = {name: 1.0 for name in MEASURES} | {"tracking_percent": None}
+    values = dict.fromkeys(MEASURES, 1.0) | {"tracking_percent": None}
     values |= {name: {"mean": 0.5, "low": 0.25, "high": 0.75} for name in INTERVALS}
     return values | {
         "returns": {"mean": mean_return, "low": mean_return - 1.0, "high": mean_return + 1.0},
