@@ -23,8 +23,8 @@ class Speed(NamedTuple):
 SPEEDS: dict[tuple[str, str], Speed] = {
     ("cartpole", "ppo"): Speed(5000, 40),
     ("cartpole", "dqn"): Speed(1050, 40),
-    ("pendulum", "ppo"): Speed(5600, 100),
-    ("pendulum", "sac"): Speed(225, 100),
+    ("pendulum", "ppo"): Speed(4700, 100),
+    ("pendulum", "sac"): Speed(470, 100),
     ("acrobot", "ppo"): Speed(2600, 40),
     ("acrobot", "dqn"): Speed(660, 40),
 }
