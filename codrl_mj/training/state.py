@@ -68,7 +68,7 @@ def capture(model: BaseAlgorithm, envs: Any) -> State:
     if hasattr(model, "snapshot"):
         arrays |= {f"model.{name}": value for name, value in model.snapshot().items()}
     numpy_state: Any = np.random.get_state(legacy=False)  # Stable-Baselines3 draws from NumPy's global generator
-    arrays["random.numpy"] = numpy_state["state"].pop("key")
+    arrays["random.numpy.key"] = numpy_state["state"].pop("key")
     facts["random.numpy"] = numpy_state
     facts["random.actions"] = model.action_space.np_random.bit_generator.state
     arrays["random.torch"] = torch.get_rng_state().numpy()
@@ -120,7 +120,7 @@ def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
         if hasattr(model, "restore"):
             model.restore(_below(arrays, "model."))
         numpy_state = facts["random.numpy"]
-        np.random.set_state(numpy_state | {"state": numpy_state["state"] | {"key": arrays["random.numpy"]}})
+        np.random.set_state(numpy_state | {"state": numpy_state["state"] | {"key": arrays["random.numpy.key"]}})
         model.action_space.np_random.bit_generator.state = facts["random.actions"]
         torch.set_rng_state(_tensor(arrays["random.torch"]))
     except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:

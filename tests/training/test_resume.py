@@ -4,12 +4,16 @@ import functools
 
 import pytest
 
-from codrl_mj.training import TrainConfig, curve, finished, watcher
+from codrl_mj.envs.sb3 import ActuatedVecEnv
+from codrl_mj.training import TrainConfig, TrainingStoppedError, curve, finished, watcher
+from codrl_mj.training.checkpoint import load_checkpoint, save_checkpoint
+from codrl_mj.training.state import State
 from tests.training.interruptions import (
     CASES,
     INTERRUPT,
     TERMINATE,
     Crash,
+    after,
     crash,
     differing,
     interrupt,
@@ -52,3 +56,63 @@ def test_a_run_of_interruptions_changes_nothing(tmp_path, uninterrupted, name):
     assert not finished(out)
     resume(config, out)
     assert differing(uninterrupted(name), outcome(out)) == []
+
+
+@pytest.mark.parametrize("name", ["ppo, one optimiser", "ddpg, several environments", "sarsa, traces"])
+def test_a_crash_right_after_any_checkpoint_changes_nothing(tmp_path, uninterrupted, name):
+    out = tmp_path / "run"
+    for _ in range(3):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(watcher, "save_checkpoint", lambda *arguments: crash(save_checkpoint(*arguments)))
+            with pytest.raises(Crash):
+                resume(CASES[name], out)
+    resume(CASES[name], out)
+    assert differing(uninterrupted(name), outcome(out)) == []
+
+
+def test_a_signal_before_the_first_step_leaves_a_run_that_starts(tmp_path, uninterrupted, monkeypatch):
+    name, out = "dqn, epsilon by steps", tmp_path / "run"
+    with monkeypatch.context() as patch:
+        reset = ActuatedVecEnv.reset
+        patch.setattr(ActuatedVecEnv, "reset", lambda env: (reset(env), TERMINATE())[0])
+        with pytest.raises(TrainingStoppedError, match=r"stopped after 0 steps: .* train --resume"):
+            resume(CASES[name], out)
+    assert not (out / "checkpoints").exists()
+    resume(CASES[name], out)
+    assert differing(uninterrupted(name), outcome(out)) == []
+
+
+def test_a_signal_in_the_last_but_one_step_stops_and_one_in_the_last_comes_too_late(tmp_path, uninterrupted):
+    name, out = "dqn, epsilon by episodes", tmp_path / "run"
+    assert "stopped after 239 steps" in interrupt(CASES[name], out, 239, TERMINATE)
+    with after(1, TERMINATE):
+        resume(CASES[name], out)
+    assert differing(uninterrupted(name), outcome(out)) == []
+
+
+def test_the_second_ctrl_c_stops_at_once(tmp_path):
+    with pytest.raises(KeyboardInterrupt), after(70, lambda: (INTERRUPT(), INTERRUPT())):
+        resume(CASES["ppo, one optimiser"], tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    "entry", ["marks", "squares", "samples", "best", "evaluation_return", "watch.episodes", "watch.reports"]
+)
+def test_what_the_watcher_remembers_matters(tmp_path, uninterrupted, monkeypatch, entry):
+    """As tests/training/test_state.py shows of what the model remembers."""
+    name, out = "ppo, one optimiser", tmp_path / "run"
+    interrupt(CASES[name], out, 180, TERMINATE)
+
+    def load_another(*arguments):
+        arrays, facts = load_checkpoint(*arguments)
+        if entry in arrays:
+            arrays[entry] = arrays[entry][1:]
+        else:
+            value = facts["watch"][entry]
+            another = {"marks": dict.fromkeys(facts["watch"]["marks"], 0), "best": {"return": 1e9, "steps": 1}}
+            facts["watch"][entry] = another.get(entry, value * 2 + 1 if isinstance(value, int | float) else None)
+        return State(arrays, facts)
+
+    monkeypatch.setattr(watcher, "load_checkpoint", load_another)
+    resume(CASES[name], out)
+    assert differing(uninterrupted(name), outcome(out)) != []
