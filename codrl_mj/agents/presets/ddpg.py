@@ -89,7 +89,25 @@ PRESETS: dict[str, dict[str, Preset]] = {
         ),
     },
     "mountain_car_continuous": {
-        "default": Preset(DDPGConfig(), total_steps=50_000),
+        "default": Preset(
+            DDPGConfig(
+                learning_rate=1e-3,
+                tau=0.01,
+                actor_units=(64, 64),
+                state_units=(),
+                action_units=(),
+                joint_units=(64, 64),
+                batch_size=64,
+                learning_starts=1000,
+                train_every=None,
+                noise_sigma=0.5,
+                noise_theta=0.15,
+                noise_dt=1.0,
+                input_scale=(1.0, 10.0),
+            ),
+            total_steps=20_000,
+            about="Ours: noise that lasts for 7 steps drives up the hill; the velocity is times 10 for the networks.",
+        ),
         "paper": Preset(
             _CAR,
             total_steps=None,

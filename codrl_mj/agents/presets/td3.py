@@ -21,6 +21,22 @@ PRESETS: dict[str, dict[str, Preset]] = {
             about="Ours, for a short run: a low discount, targets that follow fast, a high learning rate.",
         )
     },
-    "mountain_car_continuous": {"default": Preset(TD3Config(), total_steps=50_000)},
+    "mountain_car_continuous": {
+        "default": Preset(
+            TD3Config(
+                learning_rate=1e-3,
+                tau=0.01,
+                batch_size=64,
+                learning_starts=1000,
+                train_every=None,
+                noise_sigma=0.5,
+                noise_theta=0.15,
+                noise_dt=1.0,
+                input_scale=(1.0, 10.0),
+            ),
+            total_steps=20_000,
+            about="Ours: noise that lasts for 7 steps drives up the hill; the velocity is times 10 for the networks.",
+        )
+    },
 }
 """Task -> name of the settings -> the settings."""
