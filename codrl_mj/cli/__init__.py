@@ -8,6 +8,7 @@ import tyro
 
 from codrl_mj.cli.evaluate import Evaluate
 from codrl_mj.cli.render import Render
+from codrl_mj.cli.reproduce import Reproduce
 from codrl_mj.cli.runs import Runs
 from codrl_mj.cli.study import Study
 from codrl_mj.cli.train import Train, train_verb
@@ -21,6 +22,7 @@ VERBS: dict[str, Any] = {
     "render": Render,
     "validate": Validate,
     "study": Study,
+    "reproduce": Reproduce,
 }
 """The verbs by name; `train`'s flags depend on the rest of the command line."""
 
@@ -43,7 +45,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _run(arguments: list[str]) -> int:
     try:
         verb: Any = tyro.extras.subcommand_cli_from_dict(
-            VERBS | {"train": train_verb(arguments[1:] if arguments[:1] == ["train"] else [])},
+            VERBS | ({"train": train_verb(arguments[1:])} if arguments[:1] == ["train"] else {}),
             prog="codrl-mj",
             description="Reinforcement learning through a real actuator: classic control in MuJoCo, driven by a motor.",
             args=arguments,

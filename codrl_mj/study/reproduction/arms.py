@@ -32,7 +32,7 @@ class Arm:
     actuator: Actuator | None
     """What it learns, and is tested, on; None is the ideal actuator."""
     seconds: float
-    """Computing time of a run and its tests on one core [s], roughly."""
+    """Computing time of a run and its tests on one core [s]: an estimate from some thousand steps."""
     physics: Literal["mujoco", "analytic"] = "mujoco"
     """MuJoCo, or Gymnasium's own equations."""
 
@@ -70,7 +70,7 @@ class Arm:
         return {name: Deployment(run, self.actuator, one, episodes, TEST_SEED) for name, one in envs.items()}
 
 
-FAST = dataclasses.replace(
+FAST: Actuator = dataclasses.replace(
     PAPER["mountain_car"],
     controller=dataclasses.replace(PAPER["mountain_car"].controller, kp=2.0, ki=10.0, kd=1e-6),
 )
@@ -78,34 +78,38 @@ FAST = dataclasses.replace(
 
 
 def _arms(
-    task: str, agent: str, settings: str, seconds: float, others: Mapping[str, Actuator | None] | None = None
+    task: str,
+    agent: str,
+    settings: str,
+    seconds: Mapping[str, float],
+    physics: Literal["mujoco", "analytic"] = "mujoco",
 ) -> tuple[Arm, ...]:
-    motors = {"paper gains": PAPER[task], **(others or {}), "ideal": None}
-    return tuple(Arm(task, agent, settings, name, motor, seconds) for name, motor in motors.items())
+    """The arms of an experiment, by motor: how long a run takes."""
+    motors = {"paper gains": PAPER[task], "fast gains": FAST, "ideal": None}
+    return tuple(Arm(task, agent, settings, name, motors[name], took, physics) for name, took in seconds.items())
 
 
-def _on_both(arms: Sequence[Arm], analytic_seconds: Mapping[str, float]) -> tuple[Arm, ...]:
-    """The arms on MuJoCo, and again on Gymnasium's equations."""
-    analytic = [
-        dataclasses.replace(arm, physics="analytic", seconds=analytic_seconds.get(arm.motor, arm.seconds))
-        for arm in arms
-    ]
-    return *arms, *analytic
+def _with_and_without(seconds: float) -> dict[str, float]:
+    return {"paper gains": seconds, "ideal": seconds}
 
 
+_HILL, _POLE = ("mountain_car", "sarsa", "paper"), ("cartpole", "ppo", "paper")
 ARMS: tuple[Arm, ...] = (
-    *_arms("pendulum", "ddpg", "paper", 400),
-    *_arms("pendulum", "ddpg", "repaired", 400),
-    *_on_both(
-        _arms("mountain_car", "sarsa", "paper", 10, {"fast gains": FAST}),
-        {"paper gains": 45, "fast gains": 45, "ideal": 12},
-    ),
-    *_arms("mountain_car_continuous", "ddpg", "paper", 600),
-    *_arms("mountain_car_continuous", "ddpg", "repaired", 120),
-    *_arms("acrobot", "dqn", "paper", 150),
-    *_on_both(_arms("cartpole", "ppo", "paper", 120), {}),
+    *_arms("pendulum", "ddpg", "paper", _with_and_without(400)),
+    *_arms("pendulum", "ddpg", "repaired", _with_and_without(400)),
+    *_arms(*_HILL, {"paper gains": 10, "fast gains": 10, "ideal": 3}),
+    *_arms(*_HILL, {"paper gains": 40, "fast gains": 40, "ideal": 10}, "analytic"),
+    *_arms("mountain_car_continuous", "ddpg", "paper", _with_and_without(360)),
+    *_arms("mountain_car_continuous", "ddpg", "repaired", _with_and_without(100)),
+    *_arms("acrobot", "dqn", "paper", _with_and_without(80)),
+    *_arms(*_POLE, _with_and_without(110)),
+    *_arms(*_POLE, _with_and_without(130), "analytic"),
 )
 """Every arm of every experiment."""
+
+
+TASKS: tuple[str, ...] = tuple(dict.fromkeys(arm.task for arm in ARMS))
+"""The tasks in the paper's order."""
 
 
 def arms_of(tasks: Sequence[str]) -> list[Arm]:

@@ -10,9 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from codrl_mj.files import read_json
-from codrl_mj.registration import ENVIRONMENTS
 from codrl_mj.study.grid import Deployment, Workers, cell_folder, deploy_cells, read_failure, train_cells
-from codrl_mj.study.reproduction.arms import Arm, arms_of
+from codrl_mj.study.reproduction.arms import TASKS, Arm, arms_of
 from codrl_mj.study.reproduction.claims import Claim, Evidence, claims_of
 from codrl_mj.study.reproduction.series import Series, Trained, read_trained
 from codrl_mj.study.reproduction.value_iteration import DISCOUNTS, Grid, Model, Optimum, optimum, values_over
@@ -35,7 +34,7 @@ class Reproduction:
 
     root: Path = Path("runs/paper")
     """Folder of the run folders."""
-    tasks: tuple[str, ...] = tuple(ENVIRONMENTS)
+    tasks: tuple[str, ...] = TASKS
     """Tasks."""
     seeds: int = 5
     """Runs of every arm, >= 1, with seeds from 0."""
@@ -50,11 +49,13 @@ class Reproduction:
 
     def __post_init__(self) -> None:
         """Validate."""
+        if not self.tasks:
+            raise ValueError(f"tasks: none is named: name one or more of {', '.join(TASKS)}")
         for task in self.tasks:
-            if task not in ENVIRONMENTS:
-                near = difflib.get_close_matches(task, ENVIRONMENTS, n=1)
+            if task not in TASKS:
+                near = difflib.get_close_matches(task, TASKS, n=1)
                 hint = f"did you mean {near[0]!r}? " if near else ""
-                raise ValueError(f"tasks: unknown {task!r}: {hint}Known are {', '.join(ENVIRONMENTS)}")
+                raise ValueError(f"tasks: unknown {task!r}: {hint}Known are {', '.join(TASKS)}")
         for name in ("seeds", "sarsa_seeds", "test_episodes", "episodes"):
             value = getattr(self, name)
             whole = isinstance(value, int) and not isinstance(value, bool)
@@ -80,13 +81,13 @@ class Reproduction:
         """The run folders by arm and seed."""
         return {cell: cell_folder(self.root, config) for cell, config in self.cells().items()}
 
-    def deployments(self) -> dict[tuple[str, int, str], Deployment]:
-        """The tests of finished runs by arm, seed and name."""
+    def deployments(self, unfinished: bool = False) -> dict[tuple[str, int, str], Deployment]:
+        """The tests of finished runs by arm, seed and name; with `unfinished`, of all runs."""
         arms = {arm.name: arm for arm in self.arms}
         return {
             (name, seed, test): deployment
             for (name, seed), folder in self.folders().items()
-            if finished(folder)
+            if unfinished or finished(folder)
             for test, deployment in arms[name].deployments(folder, self.test_episodes).items()
         }
 
@@ -170,17 +171,17 @@ class Cost(NamedTuple):
 
     arm: Arm
     """The arm."""
-    finished: int
-    """Trainings that are finished."""
-    missing: int
-    """Trainings that are not."""
+    finished: tuple[int, ...]
+    """Seeds whose training is finished."""
+    missing: tuple[int, ...]
+    """Seeds whose training is not."""
     seconds: float
     """Computing time of one [s of one core]: the mean of the finished ones, or an estimate."""
 
     @property
     def left(self) -> float:
         """What is missing takes [s of one core]."""
-        return self.missing * self.seconds
+        return len(self.missing) * self.seconds
 
 
 def costs(plan: Reproduction) -> list[Cost]:
@@ -192,9 +193,14 @@ def costs(plan: Reproduction) -> list[Cost]:
     folders = plan.folders()
     found = []
     for arm in plan.arms:
-        runs = [folders[arm.name, seed] for seed in plan.seeds_of(arm)]
-        took = [float(read_json(run / RESULT, "result of a run")["seconds"]) for run in runs if finished(run)]
-        found.append(Cost(arm, len(took), len(runs) - len(took), float(np.mean(took)) if took else arm.seconds))
+        took = {
+            seed: float(read_json(folders[arm.name, seed] / RESULT, "result of a run")["seconds"])
+            for seed in plan.seeds_of(arm)
+            if finished(folders[arm.name, seed])
+        }
+        missing = tuple(seed for seed in plan.seeds_of(arm) if seed not in took)
+        seconds = float(np.mean(list(took.values()))) if took else arm.seconds
+        found.append(Cost(arm, tuple(took), missing, seconds))
     return found
 
 

@@ -15,6 +15,7 @@ from codrl_mj.measures import Interval, bootstrap_mean
 CONFIRMED, NOT_CONFIRMED, NOT_TESTABLE = "confirmed", "not confirmed", "not testable"
 LEVEL = 0.95
 """Of every interval."""
+_MORE = "more seeds would tell"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,10 +60,16 @@ class Within:
             reason = f"every seed has {number(measured.mean)}" if len(values) > 1 else "one seed: no interval"
         elif inside:
             whole = self.low <= measured.low and measured.high <= self.high
-            reason = "so is the whole interval" if whole else "the interval reaches beyond: more seeds would tell"
+            reason = (
+                "the whole interval is" if whole else "the mean is; the interval reaches beyond: more seeds would tell"
+            )
         else:
             beyond = measured.high < self.low or measured.low > self.high
-            reason = "the whole interval is beyond" if beyond else "the interval reaches in: more seeds would tell"
+            reason = (
+                "the whole interval is beyond"
+                if beyond
+                else "the mean is not; the interval reaches in: more seeds would tell"
+            )
         return Verdict(CONFIRMED if inside else NOT_CONFIRMED, reason, measured, len(values))
 
 
@@ -210,10 +217,10 @@ class Same:
         measured, _ = paired_difference(values, others) if self.paired else difference(values, others)
         inside = -self.margin <= measured.low and measured.high <= self.margin
         if inside:
-            reason = "no two values differ" if measured == (0.0, 0.0, 0.0) else "so it is"
+            reason = "no two values differ" if measured == (0.0, 0.0, 0.0) else "the whole interval is"
         else:
             beyond = measured.low > self.margin or measured.high < -self.margin
-            reason = "they differ by more" if beyond else "the interval is too wide: more seeds would tell"
+            reason = "they differ by more" if beyond else f"the interval is too wide: {_MORE}"
         return Verdict(CONFIRMED if inside else NOT_CONFIRMED, reason, measured, samples)
 
 

@@ -1,0 +1,222 @@
+"""The reproduction's page: Markdown, with figures and tables beside it."""
+
+import collections
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from codrl_mj.files import writing
+from codrl_mj.measures import Interval, bootstrap_mean
+from codrl_mj.study.reproduction import figures, tables
+from codrl_mj.study.reproduction.claims import PAPER_SAYS, PORT, STUDY_SAYS
+from codrl_mj.study.reproduction.reproduce import VALUE_TASK, Findings
+from codrl_mj.study.reproduction.series import LAST, Series, interval_text
+from codrl_mj.study.reproduction.value_iteration import Optimum
+from codrl_mj.study.reproduction.verdicts import CONFIRMED, NOT_CONFIRMED, NOT_TESTABLE, number
+
+PAGE, FOLDER = "reproduction.md", "reproduction"
+"""The page, and the folder beside it with its figures and tables."""
+_TITLES = {
+    "pendulum": "Pendulum",
+    "mountain_car": "Mountain Car",
+    "mountain_car_continuous": "Continuous Mountain Car",
+    "acrobot": "Acrobot",
+    "cartpole": "CartPole",
+}
+
+
+def write(findings: Findings, out: Path) -> list[Path]:
+    """Write the page, its figures and its tables, each whole or not at all.
+
+    Args:
+        findings: what was found.
+        out: folder for the page.
+
+    Returns:
+        The files, the page first.
+    """
+    folder = out / FOLDER
+    drawn = {task: _draw(findings, task, folder) for task in findings.plan.tasks}
+    written = tables.write(findings, folder)
+    parts = [_head(findings), _missing(findings), _verdicts(findings), *_tasks(findings, drawn)]
+    with writing(out / PAGE) as temporary:
+        temporary.write_text("\n".join(part for part in parts if part), encoding="utf-8")
+    return [out / PAGE, *written, *(path for paths in drawn.values() for path in paths)]
+
+
+def _head(findings: Findings) -> str:
+    plan, series = findings.plan, findings.evidence.series.values()
+    runs = [run for one in series for run in one.runs.values()]
+    wanted = sum(len(plan.seeds_of(one.arm)) for one in series)
+    hours = sum(run.seconds for run in runs) / 3600
+    trial = ""
+    if plan.episodes is not None:
+        trial = (
+            f"\n**A trial: every training was cut off after {plan.episodes} episodes. Its verdicts say nothing about "
+            "the paper.**\n"
+        )
+    return f"""# The paper's experiments, done again
+{trial}
+*Control-Optimized Deep Reinforcement Learning* (arXiv 2507.00268) reports one run of each experiment. Here every one of
+them is trained with many seeds, and each reported number is judged by a check that was written down before.
+{len(runs)} of {wanted} trainings are finished; they took {hours:.1f} hours of one core in all. Every trained policy was
+tested, without exploration, in {plan.test_episodes} episodes on the actuator that it was trained on.
+
+`codrl-mj reproduce` writes this page, its figures and its tables from run folders; do not edit it.
+[How it is done](../reproduction.md). As files: [every claim]({FOLDER}/{tables.CLAIMS}),
+[every run]({FOLDER}/{tables.RUNS}), [every number]({FOLDER}/{tables.EVERYTHING}).
+"""
+
+
+def _missing(findings: Findings) -> str:
+    """What is not there, and what went wrong."""
+    lines = []
+    for name, series in findings.evidence.series.items():
+        if series.missing:
+            lines.append(f"- {name}: seeds {interval_text(series.missing)}")
+        lines += [f"  - seed {seed} failed: {error}" for seed, error in series.failures.items()]
+    if not lines:
+        return ""
+    return "\n".join(
+        ["## What is missing\n", "The tables are of the runs that there are, and say how many.\n", *lines, ""]
+    )
+
+
+def _verdicts(findings: Findings) -> str:
+    """How many claims of whom came to what."""
+    outcomes = (CONFIRMED, NOT_CONFIRMED, NOT_TESTABLE)
+    rows = []
+    for source in (PAPER_SAYS, STUDY_SAYS, PORT):
+        counts = collections.Counter(verdict.outcome for claim, verdict in findings.claims if claim.source == source)
+        if counts:
+            rows.append([_SOURCES[source], *(str(counts[outcome]) for outcome in outcomes)])
+    return f"## Verdicts\n\n{_table(['said by', *outcomes], rows, numbers=3)}"
+
+
+_SOURCES = {
+    PAPER_SAYS: "the paper",
+    STUDY_SAYS: "a quick study of the paper's loop on Gymnasium's dynamics, before this port",
+    PORT: "this port: MuJoCo against Gymnasium's equations",
+}
+
+
+def _tasks(findings: Findings, drawn: dict[str, list[Path]]) -> Iterable[str]:
+    for task in findings.plan.tasks:
+        section = next(claim.section for claim, _ in findings.claims if claim.task == task)
+        yield f"## {_TITLES[task]}\n"
+        yield f"The paper's section *{section}*.\n"
+        yield _claims(findings, task)
+        yield _arms([one for one in findings.evidence.series.values() if one.arm.task == task])
+        if task == VALUE_TASK:
+            yield _value_iteration(findings.evidence.optima)
+        yield from (f"![{_caption(path)}]({FOLDER}/{path.name})\n" for path in drawn[task])
+
+
+def _claims(findings: Findings, task: str) -> str:
+    rows = []
+    for claim, verdict in findings.claims:
+        if claim.task != task:
+            continue
+        took = tables.seconds_of(findings, claim)
+        outcome = verdict.outcome if verdict.outcome == NOT_TESTABLE else f"**{verdict.outcome}**"
+        rows.append(
+            [
+                *(claim.source, claim.physics or "–", claim.statement, claim.measure, claim.check.criterion),
+                *("–" if verdict.measured is None else _interval(verdict.measured), str(verdict.samples or "–")),
+                *("–" if took is None else f"{took:.0f} s", outcome, verdict.reason),
+            ]
+        )
+    header = ["said by", "physics", "what is reported", "measure", "confirmed if", "ours [95 %]", "seeds"]
+    return _table([*header, "wall-clock of a training", "verdict", "why"], rows)
+
+
+def _arms(every: Sequence[Series]) -> str:
+    """What was measured of every arm: means over seeds."""
+    columns = (
+        (f"return, last {LAST}", Series.last_returns),
+        ("return in test", lambda series: series.tested("returns")),
+        ("success in test", lambda series: series.tested("success")),
+        ("time to goal [s]", lambda series: series.tested("time_to_goal")),
+        ("torque error [%]", lambda series: series.tested("tracking_percent")),
+        ("largest [N·m]", lambda series: series.tested("tracking_max")),
+        ("saturated [%]", lambda series: series.tested("saturated_percent")),
+    )
+    rows = []
+    for series in every:
+        arm, count = series.arm, len(series.runs)
+        cells = []
+        for _, values in columns:
+            found = values(series)
+            cells.append(_interval(bootstrap_mean(found)) if len(found) else "–")
+        took = f"{np.mean([run.seconds for run in series.runs.values()]):.0f} s" if count else "–"
+        rows.append([arm.settings, arm.gains, arm.physics, f"{count} of {count + len(series.missing)}", *cells, took])
+    header = ["settings", "gains", "physics", "seeds", *(title for title, _ in columns), "wall-clock"]
+    return _table(header, rows)
+
+
+def _value_iteration(optima: Sequence[Optimum]) -> str:
+    """What the best policy does at each discount factor."""
+    rows = [
+        [
+            number(one.discount),
+            "yes" if one.stands_still else "no",
+            _interval(one.returns),
+            f"{100 * one.success:.0f} %",
+            "–" if one.steps is None else number(one.steps.median),
+        ]
+        for one in optima
+    ]
+    header = ["discount factor", "standing still is best", "return of the best policy", "success", "steps to the goal"]
+    return (
+        "Why the printed settings fail: value iteration of Gymnasium's own dynamics, on a grid with interpolation,\n"
+        "and its policy at work in Gymnasium's environment, without a motor. Returns are not discounted.\n\n"
+        + _table(header, rows)
+    )
+
+
+def _draw(findings: Findings, task: str, folder: Path) -> list[Path]:
+    """Draw what there is of a task."""
+    mine = [one for one in findings.evidence.series.values() if one.arm.task == task]
+    paths = []
+    if any(one.runs for one in mine):
+        paths.append(folder / f"learning_{task}.svg")
+        (figures.draw_epochs if task == "cartpole" else figures.draw_learning)(paths[-1], mine)
+    for settings in dict.fromkeys(one.arm.settings for one in mine):
+        shown = [one for one in mine if one.arm.settings == settings and one.arm.physics == "mujoco"]
+        episodes = [(one.arm, episode) for one in shown if (episode := figures.example(one)) is not None]
+        driven = [(arm, episode) for arm, episode in episodes if arm.actuator is not None]
+        if driven:
+            paths.append(folder / f"torque_{task}_{settings}.svg")
+            figures.draw_torque(paths[-1], driven)
+        if episodes:
+            paths.append(folder / f"states_{task}_{settings}.svg")
+            figures.draw_states(paths[-1], task, episodes)
+    if task == VALUE_TASK:
+        paths.append(folder / "discount.svg")
+        figures.draw_discounts(paths[-1], findings.values, findings.evidence.optima)
+    return paths
+
+
+def _caption(path: Path) -> str:
+    """What a figure shows."""
+    kind, _, rest = path.stem.partition("_")
+    task, _, settings = rest.rpartition("_")
+    return {
+        "learning": f"Learning, mean over seeds with its 95 % interval: {_TITLES.get(rest, '')}",
+        "torque": f"Desired and actual torque, and error, {settings} settings: {_TITLES.get(task, '')}",
+        "states": f"States over a test episode, {settings} settings: {_TITLES.get(task, '')}",
+        "discount": "Value of the start, and the best policies, over discount factors",
+    }[kind]
+
+
+def _interval(interval: Interval) -> str:
+    mean, low, high = map(number, interval)
+    return mean if low == high else f"{mean} [{low}, {high}]"
+
+
+def _table(header: Sequence[str], rows: Iterable[Sequence[str]], numbers: int = 0) -> str:
+    """A Markdown table; the last columns, as many as are `numbers`, are aligned to the right."""
+    marks = ["---"] * (len(header) - numbers) + ["---:"] * numbers
+    lines = [header, marks, *([cell.replace("|", "\\|") for cell in row] for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
