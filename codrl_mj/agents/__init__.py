@@ -10,7 +10,6 @@ from codrl_mj.agents.ppo import PPOConfig
 from codrl_mj.agents.sac import SACConfig
 from codrl_mj.agents.sarsa import SARSAConfig
 from codrl_mj.agents.td3 import TD3Config
-from codrl_mj.tasks import Task
 
 AGENTS: dict[str, type[AgentConfig]] = {
     config.name: config for config in (PPOConfig, DDPGConfig, DQNConfig, TD3Config, SACConfig, SARSAConfig)
@@ -53,8 +52,12 @@ def agent_from_mapping(mapping: Mapping[str, Any]) -> AgentConfig:
     return find_agent(str(settings.pop("name", None))).from_mapping(settings)
 
 
-def check_fits(agent: str, task: Task) -> None:
+def check_fits(agent: str, task: Any) -> None:
     """Raise if an agent cannot act in a task's action space.
+
+    Args:
+        agent: the agent's name.
+        task: a `codrl_mj.tasks.Task`, whose module is too heavy for those that only want settings.
 
     Raises:
         ValueError: it cannot; the message names the agents that can.

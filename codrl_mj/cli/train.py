@@ -99,6 +99,7 @@ _RESUME_HELP = (
 _ACCEPT_HELP = "Continue even if the code or a package is no longer the one that the run was started with."
 
 
+@dataclasses.dataclass(frozen=True)
 class Train:
     """Train an agent through an actuator and leave a run folder.
 
@@ -108,8 +109,6 @@ class Train:
     Example: codrl-mj train cartpole --actuator weaker --env.center-radius 0.1 --out runs/through-weaker, and after an
     interruption codrl-mj train --resume runs/through-weaker
     """
-
-    base: TrainConfig
 
     def run(self: Any) -> int:
         """Train, with a progress bar."""

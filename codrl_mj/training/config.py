@@ -12,7 +12,6 @@ from codrl_mj.agents.presets import find_preset
 from codrl_mj.disturbances import OFF
 from codrl_mj.env_config import EnvConfig
 from codrl_mj.motor import Actuator, actuator_over, resolve
-from codrl_mj.tasks import find_task
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +47,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Validate, and replace the actuator by the `Actuator` (or None) that it stands for."""
-        task = find_task(self.task)
+        task = _find_task(self.task)
         object.__setattr__(self, "actuator", resolve(self.actuator, self.task))
         for name, kind in (("agent", AgentConfig), ("env", EnvConfig)):
             if not isinstance(getattr(self, name), kind):
@@ -83,7 +82,7 @@ class TrainConfig:
         Raises:
             ValueError: there are no such settings, or a field is out of bounds.
         """
-        check_fits(agent, find_task(task))
+        check_fits(agent, _find_task(task))
         preset = find_preset(agent, task, settings)
         chosen = {
             field.name: getattr(preset, field.name)
@@ -124,7 +123,7 @@ class TrainConfig:
         missing = [name for name in (names if whole else ["task"]) if name not in given]
         if missing:
             raise ValueError(f"not a training configuration: it has no {', '.join(missing)}")
-        task, settings = find_task(given["task"]).name, given.pop("settings", "default")
+        task, settings = _find_task(given["task"]).name, given.pop("settings", "default")
         agent = given.pop("agent", None)
         if isinstance(agent, str) or agent is None:
             agent = {"name": agent or default_agent(task)}
@@ -151,6 +150,13 @@ class TrainConfig:
             for name in dict.fromkeys([*mine, *others])
             if repr(mine.get(name, absent)) != repr(others.get(name, absent))
         ]
+
+
+def _find_task(name: str) -> Any:
+    """The task of that name; imported here, because the command line's help does without numba."""
+    from codrl_mj.tasks import find_task
+
+    return find_task(name)
 
 
 def default_agent(task: str) -> str:
