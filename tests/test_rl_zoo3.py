@@ -11,8 +11,6 @@ import pytest
 
 from codrl_mj.registration import ENVIRONMENTS
 
-pytest.importorskip("rl_zoo3")
-
 ALGORITHMS = ("ppo", "dqn", "ddpg", "td3", "sac")
 ENV_ID = "codrl_mj/CartPole-v0"
 EVERY_MODEL = """
