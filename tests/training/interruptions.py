@@ -1,12 +1,12 @@
 """Tiny trainings of every agent, ways to end them, and what must be equal in the end."""
 
 import contextlib
-import csv
-import dataclasses
-import json
+import importlib.util
 import math
 import os
 import signal
+import sys
+from pathlib import Path
 
 from codrl_mj.agents import DDPGConfig, DQNConfig, PPOConfig, SACConfig, SARSAConfig, TD3Config
 from codrl_mj.disturbances import Disturbances
@@ -18,8 +18,19 @@ RANDOMIZE = {"motor.inductance": "uniform(0.05, 0.15)", "controller.kp": "choice
 DISTURBANCES = Disturbances(
     command_delay=0.03, current_noise=0.1, current_bias=0.05, pulse_interval=0.2, pulse_force=0.5, pulse_duration=0.05
 )
-TIME_COLUMNS = ("steps_per_second", "seconds")
-"""What of a run is not the same every time."""
+
+
+def _kill_test():
+    """scripts/kill_test.py, which does the same to the program."""
+    path = Path(__file__).parents[2] / "scripts" / "kill_test.py"
+    spec = importlib.util.spec_from_file_location("kill_test", path)
+    module = sys.modules["kill_test"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+kill_test = _kill_test()
+outcome, differing = kill_test.outcome, kill_test.differing
 
 
 def tiny(task, agent, num_envs=1, steps=240, env=None, **others):
@@ -141,23 +152,3 @@ def interrupt(config, out, steps, act):
 
 def resume(config, out):
     return train(config, out, resume=True, tensorboard=False)
-
-
-def outcome(out):
-    """What must not depend on interruptions, by name."""
-    files = ["policy.safetensors", "policy.json", "evaluation.json", "episodes.csv"]
-    files += [f"best/{name}" for name in ("policy.safetensors", "policy.json", "evaluation.json")]
-    with (out / "progress.csv").open() as file:
-        progress = [{name: row[name] for name in row if name not in TIME_COLUMNS} for row in csv.DictReader(file)]
-    result = json.loads((out / "result.json").read_text())
-    result.pop("seconds")
-    return {name: (out / name).read_bytes() for name in files} | {"progress.csv": progress, "result.json": result}
-
-
-def differing(first, second):
-    """The names of what differs between two outcomes."""
-    return [name for name in first if first[name] != second[name]]
-
-
-def changed(config, **changes):
-    return dataclasses.replace(config, **changes)

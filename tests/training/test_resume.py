@@ -101,6 +101,7 @@ def test_the_second_ctrl_c_stops_at_once(tmp_path):
 def test_what_the_watcher_remembers_matters(tmp_path, uninterrupted, monkeypatch, entry):
     """As tests/training/test_state.py shows of what the model remembers."""
     name, out = "ppo, one optimiser", tmp_path / "run"
+    expected = uninterrupted(name)
     interrupt(CASES[name], out, 180, TERMINATE)
 
     def load_another(*arguments):
@@ -115,4 +116,4 @@ def test_what_the_watcher_remembers_matters(tmp_path, uninterrupted, monkeypatch
 
     monkeypatch.setattr(watcher, "load_checkpoint", load_another)
     resume(CASES[name], out)
-    assert differing(uninterrupted(name), outcome(out)) != []
+    assert differing(expected, outcome(out)) != []

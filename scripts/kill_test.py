@@ -1,0 +1,176 @@
+"""Kills trainings at random moments, continues them, and compares what they come to with uninterrupted ones.
+
+Every training is `codrl-mj train` as a program. It is ended by SIGTERM, SIGINT or `kill -9` at a moment drawn between
+its start and the end of the uninterrupted one, and continued by `codrl-mj train --resume`. The status is 1 if anything
+is not as docs/training.md says: exit status and message, steps lost, files left behind, and the result, bit for bit.
+"""
+
+import argparse
+import csv
+import dataclasses
+import json
+import random
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from codrl_mj.terminal import console
+
+PROGRAM = Path(sys.executable).with_name("codrl-mj")
+INTERVAL = 1000
+"""Environment steps between two checkpoints."""
+_OFTEN = f"--checkpoint-interval {INTERVAL} --evaluation-interval 5000 --evaluation-episodes 3"
+TRAININGS = {
+    "ppo": f"cartpole --actuator weaker --agent ppo --agent.rollout-steps 512 --total-steps 30000 {_OFTEN}",
+    "dqn": f"cartpole --agent dqn --total-steps 6000 {_OFTEN}",
+    "sarsa": f"mountain_car --agent sarsa --total-episodes 80 --env.physics analytic {_OFTEN}",
+}
+"""Command lines of about ten seconds, by agent. SARSA's episodes are stepped in Python in the analytic physics."""
+ROLLOUT = {"ppo": 512, "dqn": 1, "sarsa": 200}
+"""The most environment steps from one end of a rollout to the next."""
+TIME_COLUMNS = ("steps_per_second", "seconds")
+"""What of a run is not the same every time."""
+STATUS = {signal.SIGTERM: 143, signal.SIGINT: 130, signal.SIGKILL: -9}
+
+
+def outcome(run: Path) -> dict[str, Any]:
+    """What a run came to that must not depend on interruptions, by name."""
+    files = ["policy.safetensors", "policy.json", "evaluation.json", "episodes.csv"]
+    files += [f"best/{name}" for name in ("policy.safetensors", "policy.json", "evaluation.json")]
+    with (run / "progress.csv").open() as file:
+        progress = [{name: row[name] for name in row if name not in TIME_COLUMNS} for row in csv.DictReader(file)]
+    result = json.loads((run / "result.json").read_text())
+    result.pop("seconds")
+    return {name: (run / name).read_bytes() for name in files} | {"progress.csv": progress, "result.json": result}
+
+
+def differing(first: dict[str, Any], second: dict[str, Any]) -> list[str]:
+    """The names of what differs between two outcomes."""
+    return [name for name in first if first[name] != second[name]]
+
+
+def saved_steps(run: Path) -> int:
+    """Environment steps of the last checkpoint; 0 if there is none."""
+    names = (re.match(r"step-(\d+)-", path.name) for path in (run / "checkpoints").glob("step-*"))
+    return max((int(match[1]) for match in names if match), default=0)
+
+
+def reported_steps(run: Path) -> int:
+    """Environment steps of the last report; 0 if there is none."""
+    path = run / "progress.csv"
+    rows = path.read_text().splitlines(keepends=True)[1:] if path.exists() else []
+    return max((int(row.partition(",")[0]) for row in rows if row.endswith("\n")), default=0)
+
+
+def hidden_files(run: Path) -> list[str]:
+    """Names of the hidden files in a run folder, without its lock."""
+    return [path.name for path in run.rglob(".*") if path.name != ".lock"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Kill:
+    """A training that was killed and continued."""
+
+    agent: str
+    """Name of the agent."""
+    signal: str
+    """How it was killed."""
+    moment: float
+    """When [s after the start of the program]."""
+    status: int
+    """Exit status of the killed program."""
+    reported: int
+    """Environment steps that it had reported."""
+    saved: int
+    """Environment steps of its last checkpoint."""
+    left: int
+    """Hidden files that it left."""
+    problems: tuple[str, ...]
+    """What is not as it should be."""
+
+
+def start(arguments: str, folder: Path) -> subprocess.Popen[str]:
+    """`codrl-mj train` in a folder."""
+    line = [str(PROGRAM), "train", *arguments.split()]
+    return subprocess.Popen(line, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+
+
+def kill(agent: str, number: signal.Signals, moment: float, expected: dict[str, Any], folder: Path) -> Kill:
+    """Kill a training and continue it.
+
+    Args:
+        agent: one of `TRAININGS`.
+        number: the signal.
+        moment: when [s after the start of the program].
+        expected: outcome of the uninterrupted training.
+        folder: empty; gets the run.
+    """
+    run, problems = folder / "run", []
+    training = start(f"{TRAININGS[agent]} --out run", folder)
+    time.sleep(moment)
+    training.send_signal(number)
+    _, error = training.communicate()
+    status, reported, saved, left = training.returncode, reported_steps(run), saved_steps(run), len(hidden_files(run))
+    begun, finished = (run / "config.json").exists(), (run / "result.json").exists()
+    if status != STATUS[number] and not (finished and status == 0) and (begun or status != -number):
+        problems.append(f"exit status {status}")
+    if begun and not finished and number != signal.SIGKILL and "train --resume run" not in error:
+        problems.append(f"message {error!r}")
+    if number != signal.SIGKILL and "Traceback" in error and begun:
+        problems.append("traceback")
+    if reported - saved > INTERVAL + ROLLOUT[agent]:
+        problems.append(f"{reported - saved} steps lost")
+    again = start("--resume run" if begun else f"{TRAININGS[agent]} --out run", folder)
+    _, error = again.communicate()
+    if again.returncode or error:
+        problems.append(f"continued: status {again.returncode}: {error}")
+    else:
+        problems += [f"{name} differs" for name in differing(expected, outcome(run))]
+        problems += [f"{name} is left" for name in hidden_files(run)]
+    return Kill(agent, number.name, moment, status, reported, saved, left, tuple(problems))
+
+
+def main() -> int:
+    """Kill as often as asked, and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0, help="of the moments")
+    arguments = parser.parse_args()
+    moments = random.Random(arguments.seed)
+    table = Table(
+        "agent", "signal", "at [s]", "status", "reported", "saved", "files left", "same result"
+    )
+    kills = []
+    with tempfile.TemporaryDirectory() as root:
+        expected, seconds = {}, {}
+        for agent, line in TRAININGS.items():
+            begin = time.perf_counter()
+            _, error = start(f"{line} --out {agent}", Path(root)).communicate()
+            seconds[agent] = time.perf_counter() - begin
+            if error:
+                raise RuntimeError(f"the uninterrupted training of {agent} failed: {error}")
+            expected[agent] = outcome(Path(root) / agent)
+        for index in range(arguments.kills):
+            agent = list(TRAININGS)[index % len(TRAININGS)]
+            number = moments.choice([signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+            folder = Path(root) / str(index)
+            folder.mkdir()
+            one = kill(agent, number, moments.uniform(0, seconds[agent]), expected[agent], folder)
+            kills.append(one)
+            row = [one.agent, one.signal, f"{one.moment:.2f}", one.status, one.reported, one.saved, one.left]
+            table.add_row(*map(str, row), "; ".join(one.problems) or "yes")
+    console().print(table)
+    bad = sum(bool(one.problems) for one in kills)
+    print(f"{len(kills) - bad} of {len(kills)} trainings came to the uninterrupted result, bit for bit")
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
