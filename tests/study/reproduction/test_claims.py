@@ -1,0 +1,208 @@
+"""Arms and claims: the settings are the paper's, and a claim is confirmed where it is so, and not where it is not."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from codrl_mj.motor import CurrentLoop, Motor, named_actuator
+from codrl_mj.study.reproduction.arms import ARMS, TASKS, arms_of
+from codrl_mj.study.reproduction.claims import CLAIMS, PAPER_SAYS, PORT, STUDY_SAYS, Evidence, claims_of
+from codrl_mj.study.reproduction.series import Series, band, by_epoch, interval_text, running_mean
+from codrl_mj.study.reproduction.value_iteration import TASK as VALUE_TASK
+from codrl_mj.study.reproduction.verdicts import CONFIRMED, NOT_CONFIRMED, NOT_TESTABLE
+from codrl_mj.training import TrainConfig
+from tests.study.reproduction.worlds import PAPERS, STUDYS, trained, world
+
+ARM = {arm.name: arm for arm in ARMS}
+
+
+@pytest.mark.parametrize("arm", ARMS, ids=ARM)
+def test_an_arm_is_trained_as_the_papers_settings_say(arm):
+    config = arm.config(7)
+    preset = TrainConfig.preset(arm.task, arm.agent, arm.settings, seed=7)
+    assert (config.agent, config.seed, config.num_envs) == (preset.agent, 7, preset.num_envs)
+    assert (config.total_steps, config.total_episodes) == (preset.total_steps, preset.total_episodes)
+    assert config.env == dataclasses.replace(preset.env, physics=arm.physics)
+    assert config.actuator == arm.actuator
+    expected = {
+        "paper gains": named_actuator("paper", arm.task),
+        "fast gains": dataclasses.replace(
+            named_actuator("paper", "mountain_car"), controller=CurrentLoop(kp=2.0, ki=10.0, kd=1e-6)
+        ),
+        "ideal": None,
+    }
+    assert arm.actuator == expected[arm.motor]
+
+
+def test_the_gains_are_those_that_the_paper_prints():
+    """Each experiment's caption in the paper; R = 1, L = 0.1, kT = 1 for all."""
+    printed = {
+        ("pendulum", "paper gains"): (1, 20, 1e-6, 0, 1.0),
+        ("mountain_car", "paper gains"): (1, 1, 1e-2, 0, 1.0),
+        ("mountain_car", "fast gains"): (2, 10, 1e-6, 0, 1.0),
+        ("mountain_car_continuous", "paper gains"): (0.1, 10, 1e-3, 0, 1.0),
+        ("acrobot", "paper gains"): (1, 10, 1e-6, 0, 1.0),
+        ("cartpole", "paper gains"): (4.3, 1, 1e-6, 0.6, 0.15),
+    }
+    for arm in ARMS:
+        if arm.actuator is not None:
+            kp, ki, kd, kff, radius = printed[arm.task, arm.motor]
+            loop = arm.actuator.controller
+            assert (loop.kp, loop.ki, loop.kd, loop.kff) == (kp, ki, kd, kff)
+            assert arm.actuator.motor == Motor(resistance=1.0, inductance=0.1, torque_constant=1.0, arm_radius=radius)
+
+
+def test_budgets_are_the_papers():
+    budgets = {arm.task: (arm.config(0).total_episodes, arm.config(0).total_steps) for arm in ARMS}
+    assert budgets == {
+        "pendulum": (500, None),
+        "mountain_car": (600, None),
+        "mountain_car_continuous": (200, None),
+        "acrobot": (500, None),
+        "cartpole": (None, 60 * 4000),
+    }
+
+
+def test_every_experiment_is_there_ideal_and_actuated():
+    assert len(ARM) == len(ARMS)
+    assert len(TASKS) == 5
+    for task in TASKS:
+        assert {arm.motor for arm in arms_of([task])} >= {"ideal", "paper gains"}
+    assert {arm.task for arm in ARMS if arm.settings == "repaired"} == {"pendulum", "mountain_car_continuous"}
+    assert {arm.task for arm in ARMS if arm.physics == "analytic"} == {"mountain_car", "cartpole"}
+
+
+def test_trying_out_cuts_trainings_off_and_changes_nothing_else():
+    for arm in ARMS:
+        assert arm.config(0, 3) == dataclasses.replace(arm.config(0), total_episodes=3)
+
+
+def test_every_claim_is_about_arms_that_there_are():
+    for claim in CLAIMS:
+        assert all(ARM[name].task == claim.task for name in claim.arms)
+        assert claim.arms or claim.task == VALUE_TASK
+    identities = [(claim.task, claim.physics, claim.source, claim.statement, claim.measure) for claim in CLAIMS]
+    assert len(set(identities)) == len(CLAIMS)
+    assert len(claims_of(["acrobot"])) == sum(claim.task == "acrobot" for claim in CLAIMS)
+
+
+def test_without_runs_no_claim_can_be_tested():
+    nothing = Evidence({arm.name: Series(arm, {}) for arm in ARMS})
+    assert {claim.judge(nothing).outcome for claim in CLAIMS} == {NOT_TESTABLE}
+
+
+def outcomes(evidence, source):
+    """Outcome -> statements about runs."""
+    found = {CONFIRMED: set(), NOT_CONFIRMED: set(), NOT_TESTABLE: set()}
+    for claim in CLAIMS:
+        if claim.source == source and claim.arms:
+            found[claim.judge(evidence).outcome].add((claim.task, claim.statement))
+    return found
+
+
+def test_where_the_paper_is_right_every_claim_of_the_paper_is_confirmed():
+    found = outcomes(world(PAPERS), PAPER_SAYS)
+    assert found[NOT_CONFIRMED] == found[NOT_TESTABLE] == set()
+    assert outcomes(world(PAPERS), PORT)[CONFIRMED]
+
+
+def test_where_the_quick_study_is_right_its_claims_are_and_some_of_the_papers_are_not():
+    evidence = world(STUDYS)
+    assert outcomes(evidence, STUDY_SAYS)[NOT_CONFIRMED] == set()
+    refuted = outcomes(evidence, PAPER_SAYS)[NOT_CONFIRMED]
+    beats = "imperfect tracking (gains 1, 1, 1e-2) beats"
+    assert refuted == {
+        ("pendulum", "as printed: upright and still within 10 s"),
+        ("mountain_car", "gains 1, 1, 1e-2: about -114"),
+        ("mountain_car", "gains 2, 10, 1e-6: tracking is perfect"),
+        ("mountain_car", "gains 1, 1, 1e-2: goal in 85 s"),
+        ("mountain_car", "ideal: goal in 160 s"),
+        ("mountain_car", f"{beats} the ideal environment"),
+        ("mountain_car", f"{beats} perfect tracking (gains 2, 10, 1e-6)"),
+        ("mountain_car_continuous", "as printed: the return is about 95"),
+        ("mountain_car_continuous", "as printed: goal in 75 s"),
+        ("acrobot", "the desired torque is well tracked"),
+        ("acrobot", "the return converges to about -200"),
+        ("acrobot", "goal in about 25 s"),
+        ("cartpole", "the torque error is within ±0.1 N·m"),
+        ("cartpole", "episodes last the whole epoch from 32 on"),
+        ("cartpole", "the return approaches 4000 after epoch 35"),
+    }
+
+
+def test_the_quick_studys_claims_are_refuted_where_the_paper_is_right():
+    refuted = {statement for _, statement in outcomes(world(PAPERS), STUDY_SAYS)[NOT_CONFIRMED]}
+    assert refuted >= {
+        "-83 to -95 in training",
+        "as printed it fails: -99.9",
+        "gains 1, 1, 1e-2: -123 ± 3",
+        "the torque error reaches 0.119 N·m",
+        "repaired: settles within 4 s",
+    }
+
+
+def test_both_kinds_of_physics_are_compared_seed_by_seed():
+    evidence = world(STUDYS)
+    (claim,) = [
+        claim for claim in CLAIMS if claim.source == PORT and claim.task == "cartpole" and "ideal" in claim.arms[0]
+    ]
+    assert claim.judge(evidence).reason == "no two values differ"
+    mine, other = (evidence.series[name] for name in claim.arms)
+    shifted = {
+        seed: dataclasses.replace(run, episodes=run.episodes - [[0, 0, 300, 0]]) for seed, run in other.runs.items()
+    }
+    moved = Evidence({mine.arm.name: mine, other.arm.name: Series(other.arm, shifted)})
+    assert claim.judge(moved).outcome == NOT_CONFIRMED
+    one_shared = Evidence({mine.arm.name: mine, other.arm.name: Series(other.arm, {4: shifted[4]})})
+    assert claim.judge(one_shared).outcome == NOT_TESTABLE
+
+
+# -- series -------------------------------------------------------------------------------------------------
+
+
+def test_the_last_episodes_are_counted_from_the_end():
+    run = trained(1, last=-10.0)
+    run.episodes[:10, 2] = -1000.0  # of 60
+    series = Series(ARMS[0], {1: run})
+    assert series.last_returns() == [-10.0]
+    assert series.last_returns(60) == [(-10 * 50 - 1000 * 10) / 60]
+
+
+def test_episodes_are_sorted_into_the_epochs_in_which_they_end():
+    run = trained(1)
+    episodes = np.array([[1, 10, 5.0, 10], [2, 4000, 7.0, 3990], [3, 8001, 9.0, 4001]])
+    epochs = by_epoch(dataclasses.replace(run, episodes=episodes), 4000, 4)
+    assert epochs.counts.tolist() == [2, 0, 1, 0]
+    np.testing.assert_array_equal(epochs.returns, [6.0, np.nan, 9.0, np.nan])
+    np.testing.assert_array_equal(epochs.lengths, [2000.0, np.nan, 4001.0, np.nan])
+    assert epochs.first(epochs.returns >= 9) == 3
+    assert epochs.first(epochs.returns >= 10) == np.inf
+
+
+def test_failures_take_infinitely_long():
+    series = Series(ARMS[0], {1: trained(1, success=0.0), 2: trained(2, success=1.0, time=10.0)})
+    never, always = series.times_to_goal()
+    assert np.isinf(never).all()
+    assert np.median(always) == 11.0
+
+
+def test_the_running_mean_is_over_what_there_is():
+    values = np.arange(1.0, 8.0)
+    expected = [values[max(0, end - 3) : end].mean() for end in range(1, 8)]
+    assert running_mean(np.array([values, 2 * values]), 3) == pytest.approx(
+        np.array([expected, 2 * np.array(expected)])
+    )
+
+
+def test_the_band_is_the_bootstraps():
+    """Two values a and b: a quarter of the resamples has the mean a, a quarter b: the 95 % interval is from a to b."""
+    mean, low, high = band(np.array([[0.0, 1.0], [4.0, 1.0]]))
+    assert (mean.tolist(), low.tolist(), high.tolist()) == ([2.0, 1.0], [0.0, 1.0], [4.0, 1.0])
+    alone = band(np.array([[3.0, 4.0]]))
+    assert [bound.tolist() for bound in alone] == [[3.0, 4.0]] * 3
+
+
+def test_seeds_as_text():
+    assert interval_text([7, 1, 0, 2, 5, 6, 9]) == "0 to 2, 5 to 7, 9"
+    assert interval_text([]) == ""

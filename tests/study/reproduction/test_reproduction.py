@@ -1,0 +1,268 @@
+"""The reproduction from configuration to page: tiny trainings, what is missing, what failed, figures, command line."""
+
+import csv
+import dataclasses
+import json
+import re
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+
+from codrl_mj.cli import main
+from codrl_mj.episodes import Episode
+from codrl_mj.evaluation import evaluate
+from codrl_mj.physics.base import TRACE_NAMES
+from codrl_mj.policies import load_policy
+from codrl_mj.study.grid import Workers
+from codrl_mj.study.reproduction import figures, tables
+from codrl_mj.study.reproduction.arms import ARMS, TASKS, TEST_SEED
+from codrl_mj.study.reproduction.page import FOLDER, PAGE, write
+from codrl_mj.study.reproduction.reproduce import Reproduction, compute, costs, gather
+from codrl_mj.study.reproduction.series import Series
+from codrl_mj.study.reproduction.value_iteration import Grid
+from codrl_mj.study.reproduction.verdicts import NOT_TESTABLE
+from codrl_mj.tasks import find_task
+from tests.study.reproduction.worlds import trained
+
+HILL = [arm for arm in ARMS if arm.task == "mountain_car"]
+BLOCKED = HILL[-1]
+"""The arm whose run folder cannot be made."""
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """One of two seeds of mountain cars that were trained for two episodes; one arm could not be."""
+    root = tmp_path_factory.mktemp("paper")
+    plan = Reproduction(root, ("mountain_car", "mountain_car_continuous"), 1, 2, 2, 3, Grid(31, 31, 5))
+    hill = dataclasses.replace(plan, tasks=("mountain_car",), sarsa_seeds=1)
+    hill.folders()[BLOCKED.name, 0].write_text("a file in the way")
+    reported = []
+    compute(hill, Workers(jobs=1), on_cell=reported.append)
+    findings = gather(plan)
+    out = tmp_path_factory.mktemp("results")
+    return plan, findings, out, write(findings, out), reported
+
+
+def test_every_arm_is_trained_tested_and_read(done):
+    plan, findings, _, _, reported = done
+    assert (reported.count("training"), reported.count("test")) == (6, 5)
+    for arm in HILL[:-1]:
+        series = findings.evidence.series[arm.name]
+        assert (*series.runs, *series.missing) == (0, 1)
+        run = series.runs[0]
+        assert run.folder == plan.folders()[arm.name, 0]
+        assert len(run.episodes) == 2
+        env = arm.config(0).evaluation_env
+        expected = evaluate(load_policy(run.folder), arm.task, arm.actuator, env, 3, TEST_SEED)
+        assert run.tests["test"]["episode_returns"] == list(expected.episode_returns)
+        assert series.tested("returns") == [expected.returns.mean]
+
+
+def test_what_failed_or_was_not_tried_is_said(done):
+    _, findings, out, _, _ = done
+    series = findings.evidence.series[BLOCKED.name]
+    assert series.missing == (0, 1)
+    assert "Not a directory" in series.failures[0]
+    page = (out / PAGE).read_text()
+    assert f"- {BLOCKED.name}: seeds 0 to 1\n  - seed 0 failed: " in page
+    assert "- mountain_car_continuous, repaired, ideal, mujoco: seeds 0\n" in page
+    assert "5 of 16 trainings are finished" in page
+    assert "A trial: every training was cut off after 2 episodes" in page
+
+
+def test_the_page_has_every_claim_with_its_verdict(done):
+    _, findings, out, _, _ = done
+    page = (out / PAGE).read_text()
+    for claim, verdict in findings.claims:
+        (row,) = [
+            line
+            for line in page.splitlines()
+            if line.startswith(f"| {claim.source} | {claim.physics or '–'} | {claim.statement} | {claim.measure} |")
+        ]
+        assert verdict.outcome in row
+        assert verdict.reason in row
+        assert claim.check.criterion in row
+    untested = [claim for claim, verdict in findings.claims if verdict.outcome == NOT_TESTABLE]
+    assert {claim.task for claim in untested} == {"mountain_car_continuous", "mountain_car"}  # one seed: no comparison
+    header = [line for line in page.splitlines() if line.startswith("| said by | physics")]
+    assert len(header) == 2
+
+
+def test_every_file_that_the_page_names_is_there_and_whole(done):
+    _, _, out, files, _ = done
+    page = (out / PAGE).read_text()
+    named = {out / name for name in re.findall(rf"\(({FOLDER}/[^)]+)\)", page)}
+    assert named | {out / PAGE} == set(files)
+    drawn = [path for path in files if path.suffix == ".svg"]
+    assert {path.stem for path in drawn} == {
+        "learning_mountain_car",
+        "torque_mountain_car_paper",
+        "states_mountain_car_paper",
+        "discount",
+    }
+    for path in drawn:
+        assert ElementTree.parse(path).getroot().tag.endswith("svg")
+    assert not [path for path in out.rglob("*") if path.is_file() and path not in files]
+
+
+def test_the_tables_are_the_findings(done):
+    _, findings, out, _, _ = done
+    with (out / FOLDER / tables.RUNS).open() as file:
+        runs = list(csv.DictReader(file))
+    assert len(runs) == 5
+    for row in runs:
+        name = f"{row['task']}, {row['settings']}, {row['motor']}, {row['physics']}"
+        run = findings.evidence.series[name].runs[int(row["seed"])]
+        assert float(row["returns"]) == run.tests["test"]["returns"]["mean"]
+        assert float(row["last_50"]) == run.column("return").mean()
+        assert row["time_to_goal"] == ""  # nobody arrives after two episodes
+    with (out / FOLDER / tables.CLAIMS).open() as file:
+        claims = list(csv.DictReader(file))
+    content = json.loads((out / FOLDER / tables.EVERYTHING).read_text())
+    assert [row["verdict"] for row in claims] == [verdict.outcome for _, verdict in findings.claims]
+    assert [row["verdict"] for row in content["claims"]] == [row["verdict"] for row in claims]
+    assert content["missing"][BLOCKED.name] == [0, 1]
+    assert [one["discount"] for one in content["value_iteration"]] == [0.85, 0.9, 0.95, 0.99, 0.999]
+
+
+def test_written_again_from_the_run_folders_it_is_the_same(done, tmp_path):
+    plan, _, out, files, _ = done
+    again = write(gather(plan), tmp_path)
+    assert [path.relative_to(tmp_path) for path in again] == [path.relative_to(out) for path in files]
+    for path, other in zip(files, again, strict=True):
+        assert path.read_bytes() == other.read_bytes(), path
+
+
+def test_finished_runs_are_not_trained_again(done):
+    plan, _, _, _, _ = done
+    hill = dataclasses.replace(plan, tasks=("mountain_car",), sarsa_seeds=1)
+    results = [folder / "result.json" for folder in hill.folders().values() if (folder / "result.json").is_file()]
+    assert len(results) == 5
+    before = [path.stat().st_mtime_ns for path in results]
+    compute(hill, Workers(jobs=1))
+    assert [path.stat().st_mtime_ns for path in results] == before
+
+
+def test_costs_are_those_of_finished_runs_or_estimates(done):
+    plan, findings, _, _, _ = done
+    by_arm = {cost.arm.name: cost for cost in costs(plan)}
+    half = by_arm[HILL[0].name]
+    assert (half.finished, half.missing) == ((0,), (1,))
+    assert half.left == half.seconds == findings.evidence.series[HILL[0].name].runs[0].seconds
+    none = by_arm[BLOCKED.name]
+    assert (none.finished, none.missing, none.left) == ((), (0, 1), 2 * BLOCKED.seconds)
+
+
+def test_the_whole_is_estimated_at_less_than_four_hours_of_two_cores(tmp_path):
+    plan = Reproduction(tmp_path)
+    assert sum(cost.left for cost in costs(plan)) < 2 * 4 * 3600
+    assert len(plan.cells()) == sum(30 if arm.agent == "sarsa" else 5 for arm in ARMS)
+
+
+def test_all_arms_first_seeds_are_trained_first_and_the_longest_before_the_others(tmp_path):
+    order = list(Reproduction(tmp_path).cells())
+    seeds = [seed for _, seed in order]
+    assert seeds == sorted(seeds)
+    seconds = {arm.name: arm.seconds for arm in ARMS}
+    first = [seconds[name] for name, seed in order if seed == 0]
+    assert first == sorted(first, reverse=True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"tasks": ("cartpol",)}, "unknown 'cartpol': did you mean 'cartpole'"),
+        ({"tasks": ()}, "none is named"),
+        ({"seeds": 0}, "seeds = 0: must be an integer >= 1"),
+        ({"sarsa_seeds": 1.5}, "sarsa_seeds = 1.5"),
+        ({"episodes": 0}, "episodes = 0"),
+        ({"test_episodes": None}, "test_episodes = None"),
+    ],
+)
+def test_impossible_plans_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        Reproduction(**changes)
+
+
+# -- figures ------------------------------------------------------------------------------------------------
+
+
+def made_up(arm, steps=30, inner_steps=3):
+    """An episode of random numbers."""
+    random = np.random.default_rng(0)
+    task = find_task(arm.task)
+    return Episode(
+        time=task.step_duration * np.arange(1, steps + 1),
+        state=random.uniform(-3, 3, (steps + 1, len(task.state_names))),
+        observation=np.zeros((steps + 1, 1)),
+        action=np.zeros(steps),
+        reward=np.zeros(steps),
+        trace=random.uniform(-1, 1, (steps * inner_steps, len(TRACE_NAMES))),
+        signals={"desired_force": random.uniform(-1, 1, steps)},
+        terminated=True,
+        actuator=arm.actuator,
+    )
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_states_and_torques_are_drawn_of_every_task(task, tmp_path):
+    episodes = [(arm, made_up(arm)) for arm in ARMS if arm.task == task and arm.physics == "mujoco"]
+    figures.draw_states(tmp_path / "states.svg", task, episodes)
+    figures.draw_torque(tmp_path / "torque.svg", [one for one in episodes if one[0].actuator is not None])
+    for name in ("states", "torque"):
+        assert ElementTree.parse(tmp_path / f"{name}.svg").getroot().tag.endswith("svg")
+
+
+def test_the_curves_are_what_the_paper_plots():
+    """Acrobot hanging: -2; upright: 2. Pendulum upright: x = 1, y = 0."""
+    (height, *_) = figures.CURVES["acrobot"]
+    states = np.array([[0, 0, 0, 0], [np.pi, 0, 0, 0], [np.pi / 2, np.pi / 2, 0, 0]])
+    assert height.values(states.T) == pytest.approx([-2.0, 2.0, 1.0])
+    x, y, angle, speed = (
+        curve.values(np.array([[2 * np.pi, 3.0], [np.pi / 2, 0.0]]).T) for curve in figures.CURVES["pendulum"]
+    )
+    assert (*x, *y) == pytest.approx((1.0, 0.0, 0.0, 1.0), abs=1e-12)
+    assert angle == pytest.approx([0.0, np.pi / 2], abs=1e-12)
+    assert speed.tolist() == [3.0, 0.0]
+
+
+def test_epochs_are_drawn(tmp_path):
+    arms = [arm for arm in ARMS if arm.task == "cartpole"]
+    series = [Series(arm, {seed: trained(seed, epoch=35) for seed in range(3)}) for arm in arms]
+    figures.draw_epochs(tmp_path / "epochs.svg", series)
+    assert ElementTree.parse(tmp_path / "epochs.svg").getroot().tag.endswith("svg")
+
+
+# -- command line -------------------------------------------------------------------------------------------
+
+
+def test_a_dry_run_lists_and_makes_nothing(tmp_path, capsys):
+    assert (
+        main(["reproduce", "acrobot", "--dry-run", "--seeds", "3", "--jobs", "2", "--root", str(tmp_path / "no")]) == 0
+    )
+    shown = capsys.readouterr().out
+    assert "acrobot, paper, paper gains, mujoco" in shown
+    assert "0 to 2" in shown
+    assert "hours with 2 jobs" in shown
+    assert not (tmp_path / "no").exists()
+
+
+def test_a_page_can_be_written_of_nothing(tmp_path, capsys):
+    given = ["reproduce", "acrobot", "--only-page", "--root", str(tmp_path / "no"), "--out", str(tmp_path / "out")]
+    assert main(given) == 0
+    assert "0 of 10 trainings are finished" in (tmp_path / "out" / PAGE).read_text()
+    assert "not testable" in capsys.readouterr().out
+    assert not (tmp_path / "no").exists()
+
+
+def test_failures_show_in_the_exit_status(done, tmp_path, capsys):
+    plan, _, _, _, _ = done
+    given = ["reproduce", "mountain_car", "--only-page", "--root", str(plan.root), "--out", str(tmp_path)]
+    assert main([*given, "--sarsa-seeds", "2", "--episodes", "2", "--test-episodes", "3"]) == 1
+    assert f"failed: {BLOCKED.name}, seed 0: " in capsys.readouterr().err
+
+
+def test_an_unknown_task_is_named(capsys):
+    assert main(["reproduce", "pendulm", "--dry-run"]) == 2
+    assert "did you mean 'pendulum'" in capsys.readouterr().err

@@ -1,0 +1,103 @@
+"""Made-up runs of every arm, in which what somebody reports is so."""
+
+from pathlib import Path
+
+import numpy as np
+
+from codrl_mj.study.reproduction.arms import ARMS, CENTRE, TEST
+from codrl_mj.study.reproduction.claims import Evidence
+from codrl_mj.study.reproduction.series import Series, Trained
+
+SPREAD = np.array([-1.0, 0.0, 1.0, 0.5, -0.5])
+"""Of five seeds around what they are said to be."""
+
+
+def trained(seed=0, last=0.0, test=0.0, success=1.0, tracking=1.0, largest=0.05, time=50.0, centre=480.0, epoch=None):
+    """A run.
+
+    Args:
+        seed: makes returns, times and epochs differ a little from what is given.
+        last: return of every training episode.
+        test: return of every test episode.
+        success: share of the test episodes that succeed.
+        tracking: rms torque error [%].
+        largest: largest torque error [N*m].
+        time: median time to the goal [s]; the episodes' are up to 20 % away from it.
+        centre: return of the test near the centre.
+        epoch: the epoch from which on episodes last 4000 steps and earn as much; None: no epochs.
+    """
+    shift = SPREAD[seed]
+    if epoch is None:
+        episodes = np.array([[n + 1, 100 * (n + 1), last + shift, 100] for n in range(60)])
+    else:
+        first = int(epoch + 2 * shift)
+        short = [[0, 4000 * (n + k / 10), 390.0, 400] for n in range(first - 1) for k in range(1, 11)]
+        long = [[0, 4000 * n, 3990.0, 4000] for n in range(first, 61)]
+        episodes = np.array(short + long)
+    times = time * np.linspace(0.8, 1.2, 41) + shift
+    arrived = round(success * len(times))
+    evaluation = {
+        "returns": {"mean": test + 0.5 * shift if test != 500 else 500.0, "low": 0.0, "high": 0.0},
+        "success": {"mean": success, "low": 0.0, "high": 1.0},
+        "failure": {"mean": 1 - success, "low": 0.0, "high": 1.0},
+        "tracking_percent": tracking,
+        "tracking_max": largest,
+        "episode_times_to_goal": [*times[:arrived].tolist(), *[None] * (len(times) - arrived)],
+    }
+    tests = {TEST: evaluation, CENTRE: {"returns": {"mean": centre, "low": 0.0, "high": 500.0}}}
+    return Trained(Path("nowhere"), episodes, tests, 60.0)
+
+
+def world(values, seeds=range(5), optima=()):
+    """Evidence from runs.
+
+    Args:
+        values: (task, settings, motor) -> arguments of `trained`; each arm takes those of its task, settings and motor.
+        seeds: of every arm.
+        optima: value iteration's.
+    """
+    series = {}
+    for arm in ARMS:
+        given = values[arm.task, arm.settings, arm.motor]
+        series[arm.name] = Series(arm, {seed: trained(seed, **given) for seed in seeds})
+    return Evidence(series, optima)
+
+
+PAPERS = {
+    **{
+        ("pendulum", settings, motor): {"last": -150, "test": -150, "tracking": 1.0}
+        for settings in ("paper", "repaired")
+        for motor in ("paper gains", "ideal")
+    },
+    ("mountain_car", "paper", "paper gains"): {"last": -114, "test": -85, "tracking": 40.0, "time": 85.0},
+    ("mountain_car", "paper", "fast gains"): {"last": -120, "test": -100, "tracking": 1.0, "time": 100.0},
+    ("mountain_car", "paper", "ideal"): {"last": -150, "test": -160, "time": 160.0},
+    **{
+        ("mountain_car_continuous", settings, motor): {"last": 95, "test": 95, "time": 75.0}
+        for settings in ("paper", "repaired")
+        for motor in ("paper gains", "ideal")
+    },
+    **{
+        ("acrobot", "paper", motor): {"last": -200, "test": -125, "time": 25.0, "tracking": 10.0}
+        for motor in ("paper gains", "ideal")
+    },
+    **{("cartpole", "paper", motor): {"test": 500, "epoch": 33, "largest": 0.09} for motor in ("paper gains", "ideal")},
+}
+"""What the paper reports."""
+
+STUDYS = PAPERS | {
+    ("pendulum", "paper", "paper gains"): {"last": -1400, "test": -1413, "success": 0.0},
+    ("pendulum", "paper", "ideal"): {"last": -1400, "test": -1413, "success": 0.0},
+    ("pendulum", "repaired", "paper gains"): {"last": -160, "test": -150, "time": 1.7},
+    ("mountain_car", "paper", "paper gains"): {"last": -122.5, "test": -120, "tracking": 40.0, "time": 120.0},
+    ("mountain_car", "paper", "fast gains"): {"last": -117.7, "test": -115, "tracking": 20.0, "time": 115.0},
+    ("mountain_car", "paper", "ideal"): {"last": -118.5, "test": -115, "time": 115.0},
+    ("mountain_car_continuous", "paper", "paper gains"): {"last": -99.9, "test": -99.9, "success": 0.0},
+    ("mountain_car_continuous", "paper", "ideal"): {"last": -99.9, "test": -99.9, "success": 0.0},
+    ("mountain_car_continuous", "repaired", "paper gains"): {"last": 92, "test": 92, "time": 80.0},
+    ("mountain_car_continuous", "repaired", "ideal"): {"last": 92, "test": 92, "time": 80.0},
+    ("acrobot", "paper", "paper gains"): {"last": -90, "test": -81, "success": 0.9, "time": 16.0, "tracking": 30.0},
+    ("acrobot", "paper", "ideal"): {"last": -90, "test": -81, "time": 16.0},
+    ("cartpole", "paper", "paper gains"): {"test": 500, "epoch": 40, "largest": 0.119},
+}
+"""What the quick study found."""
