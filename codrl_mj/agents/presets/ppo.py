@@ -34,7 +34,18 @@ PRESETS: dict[str, dict[str, Preset]] = {
             PPOConfig(), total_steps=150_000, num_envs=16, about="The same settings as for the cart-pole."
         )
     },
-    "mountain_car": {"default": Preset(PPOConfig(), total_steps=1_000_000, num_envs=16)},
+    "mountain_car": {
+        "default": Preset(
+            PPOConfig(rollout_steps=4096, gae_lambda=0.98, target_kl=None, input_scale=(1.0, 10.0)),
+            total_steps=300_000,
+            num_envs=16,
+            env=EnvConfig(max_episode_steps=2000),
+            about=(
+                "Ours. It is trained in episodes of 2000 steps: in Gymnasium's 200 it never sees the goal, and does not "
+                "learn in 400 000 steps."
+            ),
+        )
+    },
     "pendulum": {
         "default": Preset(
             PPOConfig(
