@@ -24,7 +24,7 @@ PRESETS: dict[str, dict[str, Preset]] = {
             _ACROBOT,
             total_steps=None,
             total_episodes=500,
-            about="The paper's: fewer, larger or rarer gradient steps left policies that hang for ever from some starts.",
+            about="The paper's. With rarer gradient steps, the policies never finished from some starts.",
         ),
         "paper": Preset(
             _ACROBOT,

@@ -41,8 +41,8 @@ PRESETS: dict[str, dict[str, Preset]] = {
             num_envs=16,
             env=EnvConfig(max_episode_steps=2000),
             about=(
-                "Ours. It is trained in episodes of 2000 steps: in Gymnasium's 200 it never sees the goal, and does not "
-                "learn in 400 000 steps."
+                "Ours. It is trained in episodes of 2000 steps: in Gymnasium's 200 it never saw the goal, and had "
+                "learnt nothing after 400 000 steps."
             ),
         )
     },
