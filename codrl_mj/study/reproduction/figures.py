@@ -104,7 +104,8 @@ def draw_learning(path: Path, arms: Sequence[Series]) -> None:
             values = running_mean(series.returns_by_episode())
             _draw_band(axes, series, np.arange(1, values.shape[1] + 1), values)
         title = f"{settings} settings, {PHYSICS[physics]}"
-        axes.set(xlabel="training episode", ylabel=f"return, mean of last {LAST}", title=title)
+        axes.set(xlabel="training episode", ylabel=f"return, mean of last {LAST}")
+        axes.set_title(title, fontsize="medium")
     _legend(figure, all_axes)
     save(figure, path)
 
