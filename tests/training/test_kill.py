@@ -1,0 +1,164 @@
+"""Trainings that are killed for real, in processes of their own, and continued."""
+
+import gc
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from codrl_mj import files
+from codrl_mj.cli import main
+from codrl_mj.training import checkpoint, folder, history, watcher
+from tests.training.interruptions import differing, kill_test, outcome
+
+PROGRAM = Path(sys.executable).with_name("codrl-mj")
+INTERVAL = 500
+LINE = f"cartpole --actuator weaker --num-envs 4 --total-steps 6000 --checkpoint-interval {INTERVAL} --agent ppo"
+LINE += " --agent.rollout-steps 256 --agent.batch-size 64 --agent.epochs 2 --agent.hidden 8 --no-tensorboard"
+LINE += " --evaluation-interval 2000 --evaluation-episodes 2"
+ROLLOUT = 256
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory):
+    out = tmp_path_factory.mktemp("uninterrupted") / "run"
+    assert main(["train", *LINE.split(), "--out", str(out)]) == 0
+    return outcome(out)
+
+
+def in_a_process(arguments, prepare=lambda: None):
+    """Start the command line in a copy of this process, which has everything imported and compiled.
+
+    Returns:
+        The process's id. What it says goes to the file `said`.
+    """
+    gc.collect()
+    child = os.fork()
+    if child == 0:
+        status = 99
+        gc.freeze()  # deleting an old simulation would wait for its threads, which are not here
+        try:
+            signal.alarm(60)  # whatever happens, it ends
+            said = os.open("said", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+            os.dup2(said, 1)
+            os.dup2(said, 2)
+            sys.stdout, sys.stderr = (os.fdopen(number, "w", closefd=False) for number in (1, 2))
+            prepare()
+            status = main(arguments)
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(status)
+    return child
+
+
+def status_of(child):
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def wait_for(path):
+    end = time.monotonic() + 60
+    while not any(Path().glob(path)):
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+def continued(expected):
+    """Continue the run, and hold it against the uninterrupted one."""
+    assert main(["train", "--resume", "run"]) == 0
+    assert differing(expected, outcome(Path("run"))) == []
+    assert kill_test.hidden_files(Path("run")) == []
+
+
+MOMENTS = random.Random(7)
+
+
+@pytest.mark.parametrize(
+    ("number", "wait"),
+    [(number, MOMENTS.uniform(0.0, 0.4)) for number in ("SIGKILL", "SIGTERM", "SIGINT", "SIGKILL", "SIGKILL")],
+)
+def test_a_training_killed_at_a_random_moment_comes_to_the_same_result(expected, number, wait):
+    child = in_a_process(["train", *LINE.split(), "--out", "run"])
+    wait_for("run/checkpoints/step-*")
+    time.sleep(wait)
+    os.kill(child, signal.Signals[number])
+    assert status_of(child) == {"SIGKILL": -9, "SIGTERM": 143, "SIGINT": 130}[number]
+    assert not Path("run/result.json").exists()
+    lost = kill_test.reported_steps(Path("run")) - kill_test.saved_steps(Path("run"))
+    assert lost <= (INTERVAL + ROLLOUT if number == "SIGKILL" else 0)
+    if number != "SIGKILL":
+        said = Path("said").read_text().splitlines()[-1]
+        assert said.startswith(f"codrl-mj: stopped after {kill_test.saved_steps(Path('run')):,} steps: continue with ")
+        assert said.endswith("codrl-mj train --resume run")
+    continued(expected)
+
+
+def die():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def die_at_call(owner, name, which):
+    """Have a function die at its n-th call."""
+    original, calls = getattr(owner, name), iter(range(1, 10**9))
+
+    def dying(*arguments, **keywords):
+        if next(calls) == which:
+            die()
+        return original(*arguments, **keywords)
+
+    setattr(owner, name, dying)
+
+
+KILLED_WHILE = {
+    "taking the folder": lambda: die_at_call(folder, "start_folder", 1),
+    "writing the configuration": lambda: die_at_call(files.json, "dumps", 1),
+    "beginning the tables": lambda: die_at_call(history.csv, "writer", 3),
+    "writing a checkpoint": lambda: die_at_call(checkpoint.os, "fsync", 3),
+    "deleting an old checkpoint": lambda: die_at_call(Path, "unlink", 2),
+    "writing the best policy": lambda: die_at_call(watcher, "write_json", 2),
+    "marking the run as finished": lambda: die_at_call(folder, "write_json", 2),
+}
+
+
+@pytest.mark.parametrize("moment", KILLED_WHILE)
+def test_a_training_killed_while_writing_comes_to_the_same_result(expected, moment):
+    line = ["train", *LINE.split(), "--out", "run"]
+    assert status_of(in_a_process(line, KILLED_WHILE[moment])) == -9
+    if Path("run/config.json").exists():
+        continued(expected)
+    else:
+        assert main(["train", "--resume", "run"]) == 2  # nothing was begun
+
+
+def test_the_program_says_how_to_continue(expected):
+    line = [str(PROGRAM), "train", *LINE.split(), "--out", "run"]
+    with subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as program:
+        wait_for("run/progress.csv")
+        program.send_signal(signal.SIGTERM)
+        _, said = program.communicate(timeout=60)
+    assert program.returncode == 143
+    assert said.count("\n") == 1
+    assert said.startswith("codrl-mj: stopped after ")
+    assert said.endswith("steps: continue with codrl-mj train --resume run\n")
+    continued(expected)
+
+
+def test_a_second_process_in_the_folder_is_refused(capsys, expected):
+    child = in_a_process(["train", *LINE.split(), "--out", "run"])
+    wait_for("run/checkpoints/step-*")
+    os.kill(child, signal.SIGSTOP)
+    assert main(["train", "--resume", "run"]) == 2
+    os.kill(child, signal.SIGCONT)
+    assert "run: another process is training in it" in capsys.readouterr().err
+    assert status_of(child) == 0
+    assert differing(expected, outcome(Path("run"))) == []
