@@ -28,7 +28,8 @@ def train_verb(arguments: list[str]) -> Any:
 
     Raises:
         FileNotFoundError: the configuration file or the run folder is missing.
-        ValueError: it cannot be read, or there are no such settings for the agent on the task.
+        ValueError: it cannot be read, there are no such settings for the agent on the task, or the run has another
+            agent.
     """
     chosen = _scan(arguments)
     base = _base(chosen)
@@ -55,7 +56,7 @@ def train_verb(arguments: list[str]) -> Any:
         (
             "settings",
             Annotated[Literal[SETTINGS], tyro.conf.arg(help=_SETTINGS_HELP)],  # type: ignore[valid-type]
-            chosen.settings or "default",
+            chosen.settings if chosen.settings in SETTINGS else "default",
         ),
         ("actuator_name", ActuatorName, AS_CONFIGURED if configured else "paper"),
         ("actuator_fields", Fields, ActuatorFields()),
@@ -114,6 +115,10 @@ class Train:
         """Train, with a progress bar."""
         from codrl_mj.terminal import train_with_bars
 
+        if self.task != self.base.task and self.resume is None:
+            raise ValueError(f"name the task before the flags, as in codrl-mj train {self.task} --seed 1")
+        if self.resume is not None and self.out not in (None, self.resume):
+            raise ValueError(f"--out {self.out}: a run continues in its own folder, {self.resume}: leave --out out")
         config = dataclasses.replace(
             self.base,
             task=self.task,
@@ -126,7 +131,7 @@ class Train:
                 if field.name not in _OWN_FLAGS
             },
         )
-        if self.resume is not None and finished(self.resume) and config == self.base:
+        if self.resume is not None and finished(self.resume) and config == load_config(self.resume):
             print(f"{self.resume} is finished already; next: codrl-mj evaluate {self.resume}")
             return 0
         out = (
@@ -163,8 +168,14 @@ def _scan(arguments: list[str]) -> argparse.Namespace:
 
 def _base(chosen: argparse.Namespace) -> TrainConfig:
     """The configuration whose values are the flags' defaults."""
-    if chosen.resume is not None:
-        return load_config(chosen.resume)
+    if chosen.resume is not None and chosen.config is None:
+        begun = load_config(chosen.resume)
+        if chosen.settings is not None or chosen.agent not in (None, begun.agent.name):
+            raise ValueError(
+                f"{chosen.resume} is a training of {begun.agent.name} and continues as it began: leave --agent and "
+                "--settings out"
+            )
+        return begun
     if chosen.config is not None:
         return read_config(chosen.config, task=chosen.task, agent=chosen.agent, settings=chosen.settings)
     task = chosen.task or "cartpole"

@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -171,7 +172,8 @@ def read_config(path: Path, **overriding: Any) -> TrainConfig:
 
     Args:
         path: the file; a run folder's `config.json` will do as well.
-        **overriding: top-level keys to set otherwise; None leaves them.
+        **overriding: top-level keys to set otherwise; None leaves them, and so does the name of the agent that the file
+            has settings for.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -182,10 +184,13 @@ def read_config(path: Path, **overriding: Any) -> TrainConfig:
     if not path.is_file():
         raise FileNotFoundError(f"no configuration file at {path}")
     try:
-        content = yaml.safe_load(path.read_text())
+        content = yaml.load(path.read_text(), _yaml_loader())
         if isinstance(content, Mapping) and "train" in content:
             content = content["train"]
         if isinstance(content, Mapping):
+            agent = content.get("agent")
+            if isinstance(agent, Mapping) and agent.get("name") == overriding.get("agent"):
+                overriding["agent"] = None
             content = {**content, **{key: value for key, value in overriding.items() if value is not None}}
         return TrainConfig.from_mapping(content)
     except (yaml.YAMLError, UnicodeDecodeError, ValueError, TypeError) as error:
@@ -214,6 +219,18 @@ def _env_over(base: EnvConfig, given: Any) -> EnvConfig:
         _check_keys("env.disturbances.", disturbances, [field.name for field in dataclasses.fields(OFF)])
         fields["disturbances"] = dataclasses.replace(base.disturbances, **disturbances)
     return dataclasses.replace(base, **fields)
+
+
+def _yaml_loader() -> Any:
+    """PyYAML's safe loader, which knows neither `3e-4`, a number in YAML 1.2 and JSON, nor JSON's `Infinity`."""
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        pass
+
+    number = r"(?:[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?|-?Infinity|NaN)$"
+    Loader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(number), list("-+.0123456789IN"))
+    return Loader
 
 
 def _check_keys(prefix: str, given: Iterable[Any], known: Iterable[str]) -> None:
