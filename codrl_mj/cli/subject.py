@@ -57,13 +57,22 @@ class Source:
         """
         from codrl_mj.motor import named_actuator
         from codrl_mj.policies import load_policy, load_sb3_zip
-        from codrl_mj.training.folder import BEST, CONFIG, load_config
+        from codrl_mj.training.folder import BEST, CONFIG, finished, load_config
 
         alone = path.suffix == ".zip" or ((path / "policy.json").exists() and not (path / CONFIG).exists())
         if not alone:
             config = load_config(path)
+            if self.task not in (None, config.task):
+                raise ValueError(f"--task {self.task}: {path} was trained for {config.task}: leave --task out")
+            if self.which == "last" and not finished(path):
+                raise FileNotFoundError(
+                    f"{path} is not finished and has no last policy yet: continue it with codrl-mj train --resume "
+                    f"{path}, or take its best one so far with --which best"
+                )
             policy = load_policy(path / BEST if self.which == "best" else path)
             return Subject(config.task, policy, config.actuator, config.env)  # type: ignore[arg-type]
+        if self.which == "best":
+            raise ValueError(f"--which best: {path} is no run folder and holds one policy alone: leave --which out")
         if self.task is None:
             raise ValueError(f"{path} does not say what it was trained for: name its task with --task")
         if path.suffix != ".zip":

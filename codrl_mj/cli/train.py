@@ -161,8 +161,8 @@ def _scan(arguments: list[str]) -> argparse.Namespace:
         chosen, _ = parser.parse_known_args(arguments)
     except argparse.ArgumentError:  # a flag without its value: the real parser says so better
         chosen = argparse.Namespace(agent=None, settings=None, config=None, resume=None)
-    values = {argument for flag, argument in itertools.pairwise(arguments) if flag.startswith("--")}
-    chosen.task = next((name for name in arguments if name in ENVIRONMENTS and name not in values), None)
+    behind = itertools.pairwise(["", *arguments])
+    chosen.task = next((name for flag, name in behind if name in ENVIRONMENTS and not flag.startswith("--")), None)
     return chosen
 
 
