@@ -1,7 +1,8 @@
 """Kills trainings at random moments, continues them, and compares what they come to with uninterrupted ones.
 
 Every training is `codrl-mj train` as a program. It is ended by SIGTERM, SIGINT or `kill -9` at a moment drawn between
-its start and the end of the uninterrupted one, and continued by `codrl-mj train --resume`. The status is 1 if anything
+its start and the end of the uninterrupted one, in processor time, which other programs do not change, and continued by
+`codrl-mj train --resume`. The status is 1 if anything
 is not as docs/training.md says: exit status and message, steps lost, files left behind, and the result, bit for bit.
 """
 
@@ -9,6 +10,7 @@ import argparse
 import csv
 import dataclasses
 import json
+import os
 import random
 import re
 import signal
@@ -83,7 +85,7 @@ class Kill:
     signal: str
     """How it was killed."""
     moment: float
-    """When [s after the start of the program]."""
+    """When [s of processor time]."""
     status: int
     """Exit status of the killed program."""
     reported: int
@@ -102,19 +104,26 @@ def start(arguments: str, folder: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(line, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
 
+def seconds_used(pid: int) -> float:
+    """Processor time of a child of this process [s]."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def kill(agent: str, number: signal.Signals, moment: float, expected: dict[str, Any], folder: Path) -> Kill:
     """Kill a training and continue it.
 
     Args:
         agent: one of `TRAININGS`.
         number: the signal.
-        moment: when [s after the start of the program].
+        moment: when [s of processor time].
         expected: outcome of the uninterrupted training.
         folder: empty; gets the run.
     """
     run, problems = folder / "run", []
     training = start(f"{TRAININGS[agent]} --out run", folder)
-    time.sleep(moment)
+    while training.poll() is None and seconds_used(training.pid) < moment:
+        time.sleep(0.005)
     training.send_signal(number)
     _, error = training.communicate()
     status, reported, saved, left = training.returncode, reported_steps(run), saved_steps(run), len(hidden_files(run))
@@ -144,16 +153,15 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     arguments = parser.parse_args()
     moments = random.Random(arguments.seed)
-    table = Table(
-        "agent", "signal", "at [s]", "status", "reported", "saved", "files left", "same result"
-    )
+    table = Table("agent", "signal", "at [CPU s]", "status", "reported", "saved", "files left", "same result")
     kills = []
     with tempfile.TemporaryDirectory() as root:
         expected, seconds = {}, {}
         for agent, line in TRAININGS.items():
-            begin = time.perf_counter()
+            before = os.times()
             _, error = start(f"{line} --out {agent}", Path(root)).communicate()
-            seconds[agent] = time.perf_counter() - begin
+            after = os.times()
+            seconds[agent] = after.children_user - before.children_user + after.children_system - before.children_system
             if error:
                 raise RuntimeError(f"the uninterrupted training of {agent} failed: {error}")
             expected[agent] = outcome(Path(root) / agent)

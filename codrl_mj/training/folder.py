@@ -88,10 +88,13 @@ def check_same(run: Path, config: TrainConfig, accept_changes: bool) -> None:
             "continues as it began: choose another run folder for other settings"
         )
     then, now = read_json(run / CONFIG, "run configuration"), provenance()
+    versions = then.get("versions")
+    if not isinstance(versions, Mapping):
+        raise ValueError(f"{run / CONFIG}: not a run configuration: versions = {versions!r}: must be a mapping")
     changed = [
-        f"{name} was {then_version}, is {now['versions'].get(name, 'absent')}"
-        for name, then_version in dict(then.get("versions") or {}).items()
-        if now["versions"].get(name) != then_version
+        f"{name} was {versions.get(name, 'absent')}, is {now['versions'].get(name, 'absent')}"
+        for name in dict.fromkeys([*versions, *now["versions"]])
+        if now["versions"].get(name) != versions.get(name)
     ]
     if then.get("code") != now["code"]:
         changed.append(f"the code of codrl_mj was {str(then.get('code'))[:8]}, is {now['code'][:8]}")
@@ -132,7 +135,7 @@ def owned(run: Path) -> Iterator[None]:
     with (run / LOCK).open("w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             raise RunInUseError(f"{run}: another process is training in it; wait for it, or stop it") from None
         yield
 
