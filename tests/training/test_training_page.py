@@ -1,0 +1,72 @@
+"""What docs/training.md tells a reader to type works as it stands, and the files that it names are those of a run."""
+
+import contextlib
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from codrl_mj import cli
+from codrl_mj.training import TrainConfig, folder, read_config
+
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE = (DOCS / "training.md").read_text()
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    """The files that the page speaks of, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    (block,) = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
+    Path("car.yaml").write_text(block)
+    folder.start_folder(Path("runs/mine"), TrainConfig("cartpole"))
+
+
+@pytest.mark.parametrize("command", re.findall(r"^\$ codrl-mj (.*)$|`codrl-mj ([a-z]+ [^`A-Z]*)`", PAGE, re.MULTILINE))
+def test_the_commands_are_understood(command, monkeypatch):
+    parsed = []
+    for verb in cli.VERBS.values():
+        monkeypatch.setattr(verb, "run", lambda self: parsed.append(self) or 0)
+    line = shlex.split(command[0] or command[1])
+    if "--help" in line:
+        with pytest.raises(SystemExit, match="0"):
+            cli.main(line)
+    else:
+        with contextlib.suppress(SystemExit):
+            assert cli.main(line) == 0
+        assert len(parsed) == 1
+
+
+def test_the_configuration_file_says_what_it_seems_to():
+    config = read_config(Path("car.yaml"))
+    assert (config.task, config.agent.name, config.agent.learning_rate, config.seed) == (
+        "mountain_car_continuous",
+        "ddpg",
+        5e-4,
+        7,
+    )
+    assert config.actuator.controller.kp == 3.0
+    assert config.env.observe_actuator
+    assert config.env.randomize == ("motor.inductance=uniform(0.05, 0.15)",)
+
+
+def test_the_python_example_runs_and_leaves_the_files_of_the_table():
+    (block,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    exec(compile(block, "training.md", "exec"), {})
+    run = Path("runs/sarsa")
+    rows = re.findall(r"^\| (`.*?) \| .* \| .* \|$", PAGE.partition("## Configurations")[0], re.MULTILINE)
+    named = {name.rstrip("/") for row in rows for name in re.findall(r"`(.*?)`", row)}
+    assert named == {path.name for path in run.iterdir() if not path.name.startswith(".")}
+
+
+def test_the_columns_that_may_differ_are_those_of_the_tests():
+    from tests.training.interruptions import kill_test
+
+    for column in kill_test.TIME_COLUMNS:
+        assert f"`{column}`" in PAGE
+
+
+def test_every_file_that_it_links_exists():
+    for link in re.findall(r"\]\(([^)#:]+)\)", PAGE):
+        assert (DOCS / link).exists(), link
