@@ -24,7 +24,7 @@ from codrl_mj.training import TrainConfig, load_config
 
 PROGRAM = Path(sys.executable).with_name("codrl-mj")
 TINY = ["--total-steps", "500", "--num-envs", "2", "--agent", "ppo"]
-TINY += "--agent.rollout-steps 256 --agent.batch-size 64 --agent.epochs 1 --agent.hidden 8".split()
+TINY += ["--agent.rollout-steps", "256", "--agent.batch-size", "64", "--agent.epochs", "1", "--agent.hidden", "8"]
 
 
 @pytest.fixture(autouse=True)
