@@ -97,6 +97,7 @@ def measure(members: list[Subject], turns: int, turn_duration: float) -> dict[st
     """
     calls = []
     for member in members:
+        seconds(member, 1)  # compiles what it needs
         count = 1
         while (taken := seconds(member, count)) < turn_duration / 4 and count < 1_000_000:
             count *= 4
