@@ -173,16 +173,21 @@ def test_a_half_written_row_is_repaired(stopped, expected, table):
     assert differing(expected, outcome(stopped)) == []
 
 
-def leave_half_written(path):
-    """What `writing` leaves if the process is killed within its block."""
-    context = writing(path)
-    temporary = context.__enter__()
-    temporary.write_bytes(b"half")
-    context.gen = iter(())  # its end never comes
-    return temporary
+@pytest.fixture
+def leave_half_written():
+    """Leaves what `writing` leaves if the process is killed within its block, whose end is not reached."""
+    entered = []
+
+    def leave(path):
+        entered.append(writing(path))
+        temporary = entered[-1].__enter__()
+        temporary.write_bytes(b"half")
+        return temporary
+
+    return leave
 
 
-def test_what_a_killed_process_left_half_written_goes_and_nothing_else(stopped):
+def test_what_a_killed_process_left_half_written_goes_and_nothing_else(stopped, leave_half_written):
     names = ["policy.json", "best/policy.safetensors", "result.json", "progress.csv", "learning_curve.png"]
     names += [f"checkpoints/{checkpoints(stopped)[0].name}"]
     ours = [leave_half_written(stopped / name) for name in names]
@@ -190,12 +195,13 @@ def test_what_a_killed_process_left_half_written_goes_and_nothing_else(stopped):
     others += [stopped / ".policy.json", stopped / ".policy-old.json", stopped / "checkpoints" / ".keep"]
     for path in others:
         path.touch()
+    assert all(path.exists() for path in ours)
     resume(CONFIG, stopped)
     assert [path for path in ours if path.exists()] == []
     assert [path for path in others if not path.exists()] == []
 
 
-def test_a_folder_in_which_nothing_was_begun_yet_is_started(tmp_path, expected):
+def test_a_folder_in_which_nothing_was_begun_yet_is_started(tmp_path, expected, leave_half_written):
     """Who was to train in it was killed between taking it and writing the configuration."""
     out = tmp_path / "run"
     out.mkdir()

@@ -18,9 +18,9 @@ from tests.training.interruptions import differing, kill_test, outcome
 
 PROGRAM = Path(sys.executable).with_name("codrl-mj")
 INTERVAL = 500
-LINE = f"cartpole --actuator weaker --num-envs 4 --total-steps 6000 --checkpoint-interval {INTERVAL} --agent ppo"
+LINE = f"cartpole --actuator weaker --num-envs 4 --total-steps 4000 --checkpoint-interval {INTERVAL} --agent ppo"
 LINE += " --agent.rollout-steps 256 --agent.batch-size 64 --agent.epochs 2 --agent.hidden 8 --no-tensorboard"
-LINE += " --evaluation-interval 2000 --evaluation-episodes 2"
+LINE += " --evaluation-interval 500 --evaluation-episodes 2"
 ROLLOUT = 256
 
 
@@ -66,9 +66,9 @@ def status_of(child):
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
-def wait_for(path):
+def wait_for(happens):
     end = time.monotonic() + 60
-    while not any(Path().glob(path)):
+    while not happens():
         assert time.monotonic() < end
         time.sleep(0.005)
 
@@ -84,13 +84,16 @@ MOMENTS = random.Random(7)
 
 
 @pytest.mark.parametrize(
-    ("number", "wait"),
-    [(number, MOMENTS.uniform(0.0, 0.4)) for number in ("SIGKILL", "SIGTERM", "SIGINT", "SIGKILL", "SIGKILL")],
+    ("number", "steps", "wait"),
+    [
+        (number, MOMENTS.randint(1, 2500), MOMENTS.uniform(0.0, 0.05))
+        for number in ("SIGKILL", "SIGTERM", "SIGINT", "SIGKILL", "SIGKILL")
+    ],
 )
-def test_a_training_killed_at_a_random_moment_comes_to_the_same_result(expected, number, wait):
+def test_a_training_killed_at_a_random_moment_comes_to_the_same_result(expected, number, steps, wait):
     child = in_a_process(["train", *LINE.split(), "--out", "run"])
-    wait_for("run/checkpoints/step-*")
-    time.sleep(wait)
+    wait_for(lambda: kill_test.saved_steps(Path("run")) >= steps)
+    time.sleep(wait)  # [s]
     os.kill(child, signal.Signals[number])
     assert status_of(child) == {"SIGKILL": -9, "SIGTERM": 143, "SIGINT": 130}[number]
     assert not Path("run/result.json").exists()
@@ -143,7 +146,7 @@ def test_a_training_killed_while_writing_comes_to_the_same_result(expected, mome
 def test_the_program_says_how_to_continue(expected):
     line = [str(PROGRAM), "train", *LINE.split(), "--out", "run"]
     with subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as program:
-        wait_for("run/progress.csv")
+        wait_for(lambda: kill_test.reported_steps(Path("run")))
         program.send_signal(signal.SIGTERM)
         _, said = program.communicate(timeout=60)
     assert program.returncode == 143
@@ -155,10 +158,12 @@ def test_the_program_says_how_to_continue(expected):
 
 def test_a_second_process_in_the_folder_is_refused(capsys, expected):
     child = in_a_process(["train", *LINE.split(), "--out", "run"])
-    wait_for("run/checkpoints/step-*")
+    wait_for(lambda: kill_test.saved_steps(Path("run")))
     os.kill(child, signal.SIGSTOP)
-    assert main(["train", "--resume", "run"]) == 2
-    os.kill(child, signal.SIGCONT)
+    try:
+        assert main(["train", "--resume", "run"]) == 2
+    finally:
+        os.kill(child, signal.SIGCONT)
     assert "run: another process is training in it" in capsys.readouterr().err
     assert status_of(child) == 0
     assert differing(expected, outcome(Path("run"))) == []
