@@ -85,14 +85,31 @@ def cell_folder(root: Path, config: TrainConfig) -> Path:
     return root / f"{config.task}-{config.agent.name}-s{config.seed}-{_digest(config.as_mapping())}"
 
 
-def read_failure(folder: Path) -> Failure | None:
-    """Why the cell of a run folder was not finished when it was tried last; None if it did not fail."""
-    record = _failure_record(folder)
+def read_failure(cell: Path | Deployment) -> Failure | None:
+    """Why a cell was not finished when it was tried last; None if it did not fail.
+
+    Args:
+        cell: run folder of a training, or a test.
+    """
+    record = _failure_record(cell)
     return Failure(read_json(record, "record of a failure")["error"], record) if record.is_file() else None
 
 
-def _failure_record(folder: Path) -> Path:
-    return folder.parent / _FAILURES / f"{folder.name}.json"
+def _failure_record(cell: Path | Deployment) -> Path:
+    if isinstance(cell, Deployment):
+        return cell.run.parent / _FAILURES / f"{cell.run.name}-{cell.record.stem}.json"
+    return cell.parent / _FAILURES / f"{cell.name}.json"
+
+
+def _note(cell: Path | Deployment, error: Exception | None, about: dict[str, Any]) -> Failure | None:
+    """Keep a record of what went wrong with a cell; forget the last one if nothing did."""
+    record = _failure_record(cell)
+    if error is None:
+        record.unlink(missing_ok=True)
+        return None
+    line = " ".join(str(error).split()) or type(error).__name__
+    write_json(record, {"error": line, "traceback": "".join(traceback.format_exception(error)), **about})
+    return Failure(line, record)
 
 
 def train_cells(
@@ -147,28 +164,36 @@ def deploy_cells(
     deployments: Mapping[str, Deployment],
     workers: Workers = Workers(),
     on_cell: Callable[[str], None] | None = None,
-) -> dict[str, dict[str, Any]]:
-    """Evaluate policies; what was evaluated before is not evaluated again.
+) -> tuple[dict[str, dict[str, Any]], dict[str, Failure]]:
+    """Evaluate policies; what was evaluated before is not evaluated again, and one that fails does not stop the others.
 
     Args:
         deployments: by name.
         workers: what computes them.
-        on_cell: called with a deployment's name when it is evaluated; those evaluated before come first.
+        on_cell: called with a deployment's name when it is evaluated or has failed; those evaluated before come first.
 
     Returns:
-        `Evaluation.as_mapping()` of each, by name.
+        `Evaluation.as_mapping()` of those that succeeded, and the failures; both by name. A failure's record stays in
+        `failures` beside the run folders until the evaluation succeeds.
 
     Raises:
-        ValueError: Ray is asked for and not installed; or whatever an evaluation raises.
+        ValueError: Ray is asked for and not installed, or a record of a result is damaged.
     """
     report = on_cell or (lambda _: None)
     waiting = {name: deployment for name, deployment in deployments.items() if not deployment.record.is_file()}
     for name in deployments:
         if name not in waiting:
             report(name)
-    for name in _compute(_deploy_cell, list(waiting.items()), workers):
+    failures = {}
+    for name, failure in _compute(_deploy_cell, list(waiting.items()), workers):
+        if failure is not None:
+            failures[name] = failure
         report(name)
-    return {name: read_json(deployment.record, "evaluation") for name, deployment in deployments.items()}
+    return {
+        name: read_json(deployment.record, "evaluation")
+        for name, deployment in deployments.items()
+        if name not in failures
+    }, failures
 
 
 def _train_cell(
@@ -176,14 +201,7 @@ def _train_cell(
 ) -> tuple[Path, Failure | None]:
     """Train one cell: its folder, and what went wrong, of which a record is kept."""
     error = _try_to_train(config, folder, accept_changes, parent)
-    record = _failure_record(folder)
-    if error is None:
-        record.unlink(missing_ok=True)
-        return folder, None
-    line = " ".join(str(error).split())
-    trace = "".join(traceback.format_exception(error))
-    write_json(record, {"error": line, "traceback": trace, "train": config.as_mapping()})
-    return folder, Failure(line, record)
+    return folder, _note(folder, error, {"train": config.as_mapping()})
 
 
 def _try_to_train(config: TrainConfig, folder: Path, accept_changes: bool, parent: int | None) -> Exception | None:
@@ -208,7 +226,16 @@ def _try_to_train(config: TrainConfig, folder: Path, accept_changes: bool, paren
             return error
 
 
-def _deploy_cell(name: str, deployment: Deployment) -> str:
+def _deploy_cell(name: str, deployment: Deployment) -> tuple[str, Failure | None]:
+    """Evaluate one policy: its name, and what went wrong, of which a record is kept."""
+    try:
+        _deploy(deployment)
+    except Exception as error:
+        return name, _note(deployment, error, {"test": name, "run": deployment.run.name})
+    return name, _note(deployment, None, {})
+
+
+def _deploy(deployment: Deployment) -> None:
     from codrl_mj.evaluation import evaluate
     from codrl_mj.policies import load_policy
 
@@ -222,7 +249,6 @@ def _deploy_cell(name: str, deployment: Deployment) -> str:
         deployment.seed,
     )
     write_json(deployment.record, result.as_mapping())
-    return name
 
 
 def _compute(function: Callable[..., Any], work: Iterable[tuple[Any, ...]], workers: Workers) -> Iterator[Any]:

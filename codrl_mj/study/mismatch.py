@@ -9,17 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.files import read_json, write_json
+from codrl_mj.files import read_json
 from codrl_mj.study.conditions import check_condition
 from codrl_mj.study.experiments import EXPERIMENTS
-from codrl_mj.study.grid import Deployment, Workers, cell_folder, deploy_cells, train_cells
+from codrl_mj.study.grid import Deployment, Workers, cell_folder, deploy_cells, read_failure, train_cells
 from codrl_mj.study.plan import AGENTS, Plan, Trial
-from codrl_mj.training import TrainConfig, finished
-
-FAILURES = "failures"
-"""Folder, in the root, of the records of what went wrong."""
-TEST_SEED = 1_000_000
-"""Seed of the first test episode: far from those that training and its evaluations draw from."""
+from codrl_mj.training import EVALUATION_SEED, TrainConfig, finished
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,7 +105,7 @@ def deployments(config: MismatchConfig) -> dict[str, dict[int, Deployment]]:
                 trial.test.actuator,
                 trial.test.env,
                 config.episodes,
-                TEST_SEED,
+                EVALUATION_SEED,
             )
             for seed in range(config.seeds)
         }
@@ -182,29 +177,7 @@ def compute(
         for seed, deployment in by_seed.items()
         if finished(deployment.run)
     }
-    try:
-        deploy_cells(waiting, workers, lambda name: report("testing", name))
-    except Exception:  # whatever an evaluation raises: alone, each shows whether it is the one
-        for name, deployment in waiting.items():
-            if not deployment.record.is_file():
-                _deploy_alone(config, name, deployment)
-                report("testing", name)
-    for deployment in waiting.values():
-        if deployment.record.is_file():
-            _failure_of_test(config, deployment).unlink(missing_ok=True)
-
-
-def _deploy_alone(config: MismatchConfig, name: str, deployment: Deployment) -> None:
-    """Evaluate a policy, and keep a record if that fails."""
-    try:
-        deploy_cells({name: deployment}, Workers(jobs=1))
-    except Exception as error:
-        content = {"error": " ".join(str(error).split()), "test": name, "run": deployment.run.name}
-        write_json(_failure_of_test(config, deployment), content)
-
-
-def _failure_of_test(config: MismatchConfig, deployment: Deployment) -> Path:
-    return config.root / FAILURES / f"{deployment.run.name}-{deployment.record.stem}.json"
+    deploy_cells(waiting, workers, lambda name: report("testing", name))
 
 
 def collect(config: MismatchConfig) -> Results:
@@ -222,8 +195,8 @@ def collect(config: MismatchConfig) -> Results:
         for seed, deployment in by_seed.items()
         if finished(deployment.run) and not deployment.record.is_file()
     }
-    records = {name: config.root / FAILURES / f"{folders[name].name}.json" for name in every if name not in done}
-    records |= {name: _failure_of_test(config, deployment) for name, deployment in waiting.items()}
+    missing: dict[str, Path | Deployment] = {name: folders[name] for name in every if name not in done}
+    failures = {name: read_failure(cell) for name, cell in (missing | waiting).items()}
     return Results(
         config=config,
         plans=plans(config),
@@ -240,11 +213,7 @@ def collect(config: MismatchConfig) -> Results:
         },
         untrained=tuple(name for name in every if name not in done),
         untested=tuple(waiting),
-        failures={
-            name: read_json(record, "record of a failure")["error"]
-            for name, record in records.items()
-            if record.is_file()
-        },
+        failures={name: failure.error for name, failure in failures.items() if failure is not None},
         runs=len(done),
         seconds=sum(read_json(folders[name] / "result.json", "result of a run")["seconds"] for name in done),
         codes=collections.Counter(

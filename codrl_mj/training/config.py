@@ -14,6 +14,9 @@ from codrl_mj.disturbances import OFF
 from codrl_mj.env_config import EnvConfig
 from codrl_mj.motor import Actuator, actuator_over, resolve
 
+EVALUATION_SEED = 1_000_000
+"""Seed of the first episode in which a trained policy is evaluated, away from those that trainings start from."""
+
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:

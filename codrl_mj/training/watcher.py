@@ -16,16 +16,12 @@ from codrl_mj.files import write_json
 from codrl_mj.policies import save_policy
 from codrl_mj.training import folder
 from codrl_mj.training.checkpoint import load_checkpoint, save_checkpoint
-from codrl_mj.training.config import TrainConfig
+from codrl_mj.training.config import EVALUATION_SEED, TrainConfig
 from codrl_mj.training.history import EPISODE_COLUMNS, REPORT_COLUMNS, Progress, Table
 from codrl_mj.training.state import State, capture, restore
 
 REPORT_INTERVAL = 1000
 """Environment steps between two reports; the next end of a rollout counts."""
-EVALUATION_SEED = 1_000_000
-"""Seed of the first evaluation episode, away from those that trainings start from."""
-
-
 _REMEMBERED = ("marks", "squares", "samples", "best", "evaluation_return")
 
 

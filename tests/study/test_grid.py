@@ -132,16 +132,51 @@ def test_deployments_are_evaluations_that_are_made_once(computed):
         name: Deployment(runs["seed 0"], actuator, episodes=3, seed=7)
         for name, actuator in (("paper", paper), ("ideal", None))
     }
-    results = deploy_cells(deployments, ONE)
+    results, failures = deploy_cells(deployments, ONE)
+    assert failures == {}
     for name, deployment in deployments.items():
         expected = evaluate(load_policy(runs["seed 0"]), "cartpole", deployment.actuator, episodes=3, seed=7)
         assert results[name]["returns"] == expected.returns._asdict()
     before = {deployment.record: deployment.record.stat().st_mtime_ns for deployment in deployments.values()}
     assert len(before) == 2
-    assert deploy_cells(deployments, ONE) == results
+    assert deploy_cells(deployments, ONE) == (results, {})
     assert {record: record.stat().st_mtime_ns for record in before} == before
     other = Deployment(runs["seed 0"], paper, EnvConfig(max_episode_steps=5), episodes=3, seed=7)
-    assert deploy_cells({"short": other}, ONE)["short"]["length"]["mean"] == 5.0
+    assert deploy_cells({"short": other}, ONE)[0]["short"]["length"]["mean"] == 5.0
+
+
+def test_a_deployment_that_fails_is_recorded_and_does_not_stop_the_others(computed):
+    root, runs, _, _ = computed
+    good, bad = (Deployment(runs["seed 1"], actuator, episodes=2, seed=3) for actuator in (None, UNSTABLE))
+    reported = []
+    results, failures = deploy_cells({"bad": bad, "good": good}, ONE, reported.append)
+    assert set(results) == {"good"}
+    assert sorted(reported) == ["bad", "good"]
+    failure = failures["bad"]
+    assert "spectral radius" in failure.error
+    record = json.loads(failure.record.read_text())
+    assert record["error"] == failure.error
+    assert "Traceback" in record["traceback"]
+    assert (record["test"], record["run"]) == ("bad", runs["seed 1"].name)
+    assert failure.record.parent == root / "failures"
+    assert read_failure(bad) == failure
+    assert read_failure(good) is None
+    assert read_failure(runs["seed 1"]) is None
+
+
+def test_a_failure_of_a_deployment_is_forgotten_when_it_succeeds(computed):
+    _, runs, _, _ = computed
+    deployment, policy = Deployment(runs["seed 2"], None, episodes=2), runs["seed 2"] / "policy.json"
+    content = policy.read_text()
+    policy.write_text("{")
+    try:
+        _, failures = deploy_cells({"cell": deployment}, ONE)
+    finally:
+        policy.write_text(content)
+    assert failures["cell"].record.is_file()
+    results, failures = deploy_cells({"cell": deployment}, ONE)
+    assert (set(results), failures) == ({"cell"}, {})
+    assert read_failure(deployment) is None
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from codrl_mj.agents.sarsa_episodes import CompiledEpisodes
 from codrl_mj.env_config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy, evaluate, make_env, run_episodes
 from codrl_mj.policies import load_policy
-from codrl_mj.training import TrainConfig, load_config, train
+from codrl_mj.training import EVALUATION_SEED, TrainConfig, load_config, train
 
 TINY_PPO = PPOConfig(rollout_steps=256, batch_size=64, epochs=2, hidden=(8, 8))
 TINY = TrainConfig("cartpole", "weaker", TINY_PPO, 1, 1000, num_envs=4, env=EnvConfig(center_radius=0.1))
@@ -143,7 +143,7 @@ def test_every_episode_is_in_the_table(run):
 def test_the_result_and_the_evaluation_agree_with_an_evaluation_of_the_saved_policy(run):
     out, (report,) = run
     result, evaluation = (json.loads((out / f"{name}.json").read_text()) for name in ("result", "evaluation"))
-    anew = evaluate(load_policy(out), "cartpole", "weaker", episodes=20, seed=1_000_000)
+    anew = evaluate(load_policy(out), "cartpole", "weaker", episodes=20, seed=EVALUATION_SEED)
     assert evaluation["returns"]["mean"] == anew.returns.mean == result["evaluation_return"]
     assert result["steps"] == report.steps
     assert result["episodes"] == report.episodes
@@ -157,7 +157,7 @@ def test_the_best_policy_is_kept_though_a_worse_one_comes_last(tmp_path):
     evaluations = [float(row["evaluation_return"]) for row in read_csv(out / "progress.csv")]
     result = json.loads((out / "result.json").read_text())
     assert result["best"]["return"] >= max(evaluations) > result["evaluation_return"]
-    best = evaluate(load_policy(out / "best"), "cartpole", "weaker", episodes=5, seed=1_000_000)
+    best = evaluate(load_policy(out / "best"), "cartpole", "weaker", episodes=5, seed=EVALUATION_SEED)
     assert best.returns.mean == result["best"]["return"]
 
 

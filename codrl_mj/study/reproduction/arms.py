@@ -9,12 +9,11 @@ from codrl_mj.env_config import EnvConfig
 from codrl_mj.motor import Actuator
 from codrl_mj.motor.catalog import PAPER
 from codrl_mj.study.grid import Deployment
-from codrl_mj.training import TrainConfig
+from codrl_mj.training import EVALUATION_SEED, TrainConfig
 
 TEST, CENTRE = "test", "centre"
 """Tests of a trained policy: the task as Gymnasium poses it; CartPole's with the reward that it was trained with."""
 CENTRE_RADIUS = 0.1  # m, the paper's, CartPole
-TEST_SEED = 1_000_000  # far from the seeds that training draws from
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +66,7 @@ class Arm:
         envs = {TEST: env}
         if self.task == "cartpole":
             envs[CENTRE] = dataclasses.replace(env, center_radius=CENTRE_RADIUS)
-        return {name: Deployment(run, self.actuator, one, episodes, TEST_SEED) for name, one in envs.items()}
+        return {name: Deployment(run, self.actuator, one, episodes, EVALUATION_SEED) for name, one in envs.items()}
 
 
 FAST: Actuator = dataclasses.replace(

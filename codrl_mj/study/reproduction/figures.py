@@ -12,10 +12,11 @@ from codrl_mj.physics.base import TRACE_ACTUAL_FORCE
 from codrl_mj.policies import load_policy
 from codrl_mj.strip import ACTUAL, DESIRED
 from codrl_mj.study.figures import COLOURS, save
-from codrl_mj.study.reproduction.arms import CENTRE_RADIUS, TEST_SEED, Arm
+from codrl_mj.study.reproduction.arms import CENTRE_RADIUS, Arm
 from codrl_mj.study.reproduction.series import LAST, Series, band, running_mean
 from codrl_mj.study.reproduction.value_iteration import Optimum
 from codrl_mj.tasks import acrobot, cartpole, find_task, mountain_car, mountain_car_continuous, pendulum
+from codrl_mj.training import EVALUATION_SEED
 
 STYLES = {"ideal": (COLOURS[0], "--"), "paper gains": (COLOURS[2], "-"), "fast gains": (COLOURS[1], "-.")}
 """Of an arm, by its motor: colour and dashes."""
@@ -85,7 +86,7 @@ def example(series: Series) -> Episode | None:
         return None
     arm, run = series.arm, next(iter(series.runs.values()))
     (episode,) = run_episodes(
-        load_policy(run.folder), lambda: make_env(arm.task, arm.actuator, physics=arm.physics), 1, TEST_SEED
+        load_policy(run.folder), lambda: make_env(arm.task, arm.actuator, physics=arm.physics), 1, EVALUATION_SEED
     )
     return episode
 

@@ -121,7 +121,7 @@ def compute(
         on_cell: called with `training` or `test` when one is finished or has failed.
 
     Raises:
-        ValueError: Ray is asked for and not installed; or whatever a test raises.
+        ValueError: Ray is asked for and not installed.
         TrainingStoppedError: a signal asked to stop.
     """
     report = on_cell or (lambda _: None)
@@ -150,12 +150,15 @@ def _series(plan: Reproduction, arm: Arm, folders: Mapping[tuple[str, int], Path
     failures: dict[int, str] = {}
     for seed in plan.seeds_of(arm):
         folder = folders[arm.name, seed]
-        records = {test: one.record for test, one in arm.deployments(folder, plan.test_episodes).items()}
-        if finished(folder) and all(record.is_file() for record in records.values()):
-            tests = {test: read_json(record, "evaluation") for test, record in records.items()}
-            runs[seed] = read_trained(folder, tests)
-        elif (failure := read_failure(folder)) is not None:
-            failures[seed] = failure.error
+        tests = arm.deployments(folder, plan.test_episodes)
+        if finished(folder) and all(test.record.is_file() for test in tests.values()):
+            runs[seed] = read_trained(
+                folder, {name: read_json(test.record, "evaluation") for name, test in tests.items()}
+            )
+            continue
+        cells: list[Path | Deployment] = [folder, *tests.values()]
+        if failed := [failure for failure in map(read_failure, cells) if failure is not None]:
+            failures[seed] = failed[0].error
     return Series(arm, runs, tuple(seed for seed in plan.seeds_of(arm) if seed not in runs), failures)
 
 

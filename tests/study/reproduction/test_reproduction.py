@@ -16,13 +16,14 @@ from codrl_mj.physics.base import TRACE_NAMES
 from codrl_mj.policies import load_policy
 from codrl_mj.study.grid import Workers
 from codrl_mj.study.reproduction import figures, tables
-from codrl_mj.study.reproduction.arms import ARMS, TASKS, TEST_SEED
+from codrl_mj.study.reproduction.arms import ARMS, TASKS
 from codrl_mj.study.reproduction.page import FOLDER, PAGE, write
 from codrl_mj.study.reproduction.reproduce import Reproduction, compute, costs, gather
 from codrl_mj.study.reproduction.series import Series
 from codrl_mj.study.reproduction.value_iteration import Grid
 from codrl_mj.study.reproduction.verdicts import NOT_TESTABLE
 from codrl_mj.tasks import find_task
+from codrl_mj.training import EVALUATION_SEED
 from tests.study.reproduction.worlds import trained
 
 HILL = [arm for arm in ARMS if arm.task == "mountain_car"]
@@ -54,7 +55,7 @@ def test_every_arm_is_trained_tested_and_read(done):
         assert run.folder == plan.folders()[arm.name, 0]
         assert len(run.episodes) == 2
         env = arm.config(0).evaluation_env
-        expected = evaluate(load_policy(run.folder), arm.task, arm.actuator, env, 3, TEST_SEED)
+        expected = evaluate(load_policy(run.folder), arm.task, arm.actuator, env, 3, EVALUATION_SEED)
         assert run.tests["test"]["episode_returns"] == list(expected.episode_returns)
         assert series.tested("returns") == [expected.returns.mean]
 
@@ -261,6 +262,21 @@ def test_failures_show_in_the_exit_status(done, tmp_path, capsys):
     given = ["reproduce", "mountain_car", "--only-page", "--root", str(plan.root), "--out", str(tmp_path)]
     assert main([*given, "--sarsa-seeds", "2", "--episodes", "2", "--test-episodes", "3"]) == 1
     assert f"failed: {BLOCKED.name}, seed 0: " in capsys.readouterr().err
+
+
+def test_a_test_that_failed_is_said(done, tmp_path):
+    plan, _, _, _, _ = done
+    folder = plan.folders()[HILL[0].name, 0]
+    broken, content = folder / "policy.json", (folder / "policy.json").read_text()
+    shorter = dataclasses.replace(plan, tasks=("mountain_car",), test_episodes=2)
+    broken.write_text("{")
+    try:
+        compute(shorter, Workers(jobs=1))
+    finally:
+        broken.write_text(content)
+    series = gather(shorter).evidence.series
+    assert "policy.json" in series[HILL[0].name].failures[0]
+    assert 0 in series[HILL[1].name].runs
 
 
 def test_an_unknown_task_is_named(capsys):
