@@ -16,8 +16,8 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP)  ## cross-validate, train on the ideal and on the weak actuator, deploy both, film it
 	@$(BIN)/python scripts/demo.py
 
-test: $(STAMP)
-	@$(BIN)/python -m pytest -m "not slow"
+test: $(STAMP)  ## in two processes, each with whole files: a file's tests share what is slow to make
+	@$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile --no-loadscope-reorder
 
 lint: $(STAMP)
 	@$(BIN)/ruff check .

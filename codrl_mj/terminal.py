@@ -3,8 +3,12 @@
 import concurrent.futures
 import math
 import multiprocessing
+import multiprocessing.connection
+import multiprocessing.managers
+import os
 import queue
 import sys
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -92,9 +96,11 @@ def _train_side_by_side(
     runs: Mapping[str, tuple[TrainConfig, Path]], show: Callable[[str, Any], None], options: Mapping[str, Any]
 ) -> None:
     context = multiprocessing.get_context("spawn")
+    manager = multiprocessing.managers.SyncManager(ctx=context)
+    manager.start(_end_with_parent)
     with (
-        context.Manager() as manager,
-        concurrent.futures.ProcessPoolExecutor(len(runs), mp_context=context) as pool,
+        manager,
+        concurrent.futures.ProcessPoolExecutor(len(runs), context, initializer=_end_with_parent) as pool,
     ):
         reports = manager.Queue()
         futures = [
@@ -110,6 +116,18 @@ def _train_side_by_side(
             show(*reports.get())
         for future in futures:
             future.result()
+
+
+def _end_with_parent() -> None:
+    """Have this process end when its parent does, even if that is killed: it would wait for work forever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        multiprocessing.connection.wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _train_reporting(name: str, config: TrainConfig, out: Path, reports: Any, options: dict[str, Any]) -> None:

@@ -31,11 +31,12 @@ def demonstrate(out):
 def demonstrated(tmp_path_factory):
     """The folder of a demonstration that was stopped while it trained and then run again, and what was printed."""
     out = tmp_path_factory.mktemp("demo") / "out"
-    with subprocess.Popen([sys.executable, str(DEMO), *options(out)], stdout=subprocess.DEVNULL) as killed:
+    with subprocess.Popen([sys.executable, str(DEMO), *options(out)], stdout=subprocess.PIPE) as killed:
         while not (out / RUNS[1] / "progress.csv").exists():
             assert killed.poll() is None
             time.sleep(0.05)
         killed.kill()
+        killed.communicate(timeout=20)  # its processes hold the pipe too: none outlives it
     return out, demonstrate(out)
 
 
