@@ -8,7 +8,7 @@ import numpy as np
 from codrl_mj.files import read_json
 from codrl_mj.study.grid import cell_folder
 from codrl_mj.study.mismatch import MismatchConfig, cells, deployments
-from codrl_mj.training import finished
+from codrl_mj.training import TrainConfig, finished
 
 
 class Speed(NamedTuple):
@@ -18,17 +18,19 @@ class Speed(NamedTuple):
     """Training steps."""
     testing: float
     """Test episodes."""
+    episode: float | None = None
+    """Steps of a training episode, where the agent's budget is in episodes [1]."""
 
 
 SPEEDS: dict[tuple[str, str], Speed] = {
-    ("cartpole", "ppo"): Speed(5000, 40),
-    ("cartpole", "dqn"): Speed(1050, 40),
-    ("pendulum", "ppo"): Speed(4700, 100),
-    ("pendulum", "sac"): Speed(470, 100),
-    ("acrobot", "ppo"): Speed(2600, 40),
-    ("acrobot", "dqn"): Speed(660, 40),
+    ("cartpole", "ppo"): Speed(7700, 130),
+    ("cartpole", "dqn"): Speed(1450, 130),
+    ("pendulum", "ppo"): Speed(6400, 190),
+    ("pendulum", "sac"): Speed(490, 190),
+    ("acrobot", "ppo"): Speed(4300, 40),
+    ("acrobot", "dqn"): Speed(960, 40, episode=135),
 }
-"""(task, agent) -> where nothing is finished yet: measured on one core of a 2-core virtual machine that was busy."""
+"""(task, agent) -> where nothing is finished yet: measured with two trainings at once on a 2-core virtual machine."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +42,7 @@ class Cost:
     agent: str
     """The agent's name."""
     steps: int
-    """Environment steps of a training."""
+    """Environment steps of a training; an estimate if its budget is in episodes."""
     trainings: int
     """Trainings in all."""
     trained: int
@@ -79,8 +81,8 @@ def costs(config: MismatchConfig) -> list[Cost]:
         mine = {name: cell for name, cell in every.items() if (cell.task, cell.agent.name) == (task, agent)}
         runs = {folders[name] for name in mine}
         took = [read_json(run / "result.json", "result of a run")["seconds"] for run in runs if finished(run)]
-        steps = next(iter(mine.values())).total_steps or 0
         speed = SPEEDS[task, agent]
+        steps = _steps(next(iter(mine.values())), speed)
         mine_tested = [deployment for deployment in by_folder if deployment.run in runs]
         found.append(
             Cost(
@@ -96,6 +98,15 @@ def costs(config: MismatchConfig) -> list[Cost]:
             )
         )
     return found
+
+
+def _steps(cell: TrainConfig, speed: Speed) -> int:
+    """Environment steps of a training; an estimate if its budget is in episodes."""
+    if cell.total_steps is not None:
+        return cell.total_steps
+    assert cell.total_episodes is not None
+    assert speed.episode is not None
+    return round(cell.total_episodes * speed.episode)
 
 
 def seeds_finished(config: MismatchConfig) -> dict[str, dict[int, bool]]:
