@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: install demo test lint bench soak docs clean
+.PHONY: install demo test lint bench soak results docs clean
 
 install: $(STAMP)
 
@@ -32,9 +32,13 @@ bench: $(STAMP)  ## speed beside other libraries, which are installed for it
 soak: $(STAMP)  ## a million steps: memory, threads, episodes
 	@$(BIN)/python scripts/soak.py
 
+results: $(STAMP)  ## docs/results/ anew: hours; what is finished in runs/ is not done again
+	@$(BIN)/codrl-mj reproduce
+	@$(BIN)/codrl-mj study mismatch
+
 docs: $(STAMP)  ## write docs/environments/ anew from the code
 	@$(BIN)/python scripts/environment_pages.py
 
-clean:
-	rm -rf .venv .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist runs
+clean:  ## everything but what was trained
+	rm -rf .venv .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
