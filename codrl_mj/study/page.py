@@ -9,6 +9,7 @@ import numpy as np
 from codrl_mj.files import writing
 from codrl_mj.measures import Interval
 from codrl_mj.study import figures, tables
+from codrl_mj.study.conclusions import conclusions_section
 from codrl_mj.study.conditions import every_condition
 from codrl_mj.study.experiments import EXPERIMENTS
 from codrl_mj.study.mismatch import Results
@@ -16,8 +17,8 @@ from codrl_mj.study.plan import Comparison, Plan, Trial
 from codrl_mj.study.statistics import RESAMPLES
 from codrl_mj.study.summaries import LEAST_RUNS, Summary, Verdict, by_question, judge, over_all_tests, summarize
 
-PAGE, CONCLUSIONS, FOLDER = "mismatch.md", "mismatch_conclusions.md", "mismatch"
-"""The page; what a person writes, which the page includes and nothing overwrites; figures and tables."""
+PAGE, FOLDER = "mismatch.md", "mismatch"
+"""The page, and the folder beside it with its figures and tables."""
 _UNITS = {
     "success": ("success", "%", 100.0),
     "tracking_percent": ("torque error", "%", 1.0),
@@ -46,13 +47,9 @@ def write(results: Results, out: Path) -> list[Path]:
     }
     written = [path for paths in drawn.values() for path in paths]
     written += tables.write(results, summary, folder)
-    conclusions = out / CONCLUSIONS
     parts = [
         _head(results),
-        "## Conclusions\n",
-        conclusions.read_text().strip() + "\n"
-        if conclusions.is_file()
-        else f"None are written yet: they belong into `{CONCLUSIONS}` beside this page, which includes them.\n",
+        conclusions_section(out / PAGE),
         _missing(results),
         *(_experiment(results, summary, name, drawn) for name in results.plans),
         _actuators(results),

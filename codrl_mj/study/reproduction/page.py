@@ -8,6 +8,7 @@ import numpy as np
 
 from codrl_mj.files import writing
 from codrl_mj.measures import Interval, bootstrap_mean
+from codrl_mj.study.conclusions import conclusions_section
 from codrl_mj.study.reproduction import figures, tables
 from codrl_mj.study.reproduction.claims import PAPER_SAYS, PORT, STUDY_SAYS
 from codrl_mj.study.reproduction.reproduce import VALUE_TASK, Findings
@@ -39,7 +40,13 @@ def write(findings: Findings, out: Path) -> list[Path]:
     folder = out / FOLDER
     drawn = {task: _draw(findings, task, folder) for task in findings.plan.tasks}
     written = tables.write(findings, folder)
-    parts = [_head(findings), _missing(findings), _verdicts(findings), *_tasks(findings, drawn)]
+    parts = [
+        _head(findings),
+        conclusions_section(out / PAGE),
+        _missing(findings),
+        _verdicts(findings),
+        *_tasks(findings, drawn),
+    ]
     with writing(out / PAGE) as temporary:
         temporary.write_text("\n".join(part for part in parts if part), encoding="utf-8")
     return [out / PAGE, *written, *(path for paths in drawn.values() for path in paths)]

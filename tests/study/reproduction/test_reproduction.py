@@ -135,6 +135,15 @@ def test_written_again_from_the_run_folders_it_is_the_same(done, tmp_path):
         assert path.read_bytes() == other.read_bytes(), path
 
 
+def test_the_page_includes_what_a_person_wrote(done, tmp_path):
+    plan, _, _, _, _ = done
+    written = tmp_path / "reproduction_conclusions.md"
+    written.write_text("What a person wrote.\n")
+    write(gather(dataclasses.replace(plan, tasks=("acrobot",))), tmp_path)
+    assert "## Conclusions\n\nWhat a person wrote.\n" in (tmp_path / PAGE).read_text()
+    assert written.read_text() == "What a person wrote.\n"
+
+
 def test_finished_runs_are_not_trained_again(done):
     plan, _, _, _, _ = done
     hill = dataclasses.replace(plan, tasks=("mountain_car",), sarsa_seeds=1)
