@@ -3,14 +3,13 @@
 from pathlib import Path
 
 
-def conclusions_file(page: Path) -> Path:
-    """The file of a page's conclusions, which nothing here writes: `mismatch_conclusions.md` of `mismatch.md`."""
-    return page.with_name(f"{page.stem}_conclusions.md")
-
-
 def conclusions_section(page: Path) -> str:
-    """The page's section of conclusions: what the file says, or that there is none yet."""
-    file = conclusions_file(page)
+    """A page's section of conclusions: what its file says, or that there is none yet.
+
+    Args:
+        page: the page; the file of `mismatch.md` is `mismatch_conclusions.md` beside it, which nothing here writes.
+    """
+    file = page.with_name(f"{page.stem}_conclusions.md")
     if file.is_file():
         text = file.read_text(encoding="utf-8").strip()
     else:
