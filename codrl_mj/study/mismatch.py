@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.files import read_json
+from codrl_mj.study.arrivals import Arrivals, ends_at_goal, read_arrivals
 from codrl_mj.study.conditions import check_condition
 from codrl_mj.study.experiments import EXPERIMENTS
 from codrl_mj.study.grid import Deployment, Workers, cell_folder, deploy_cells, read_failure, train_cells
@@ -148,6 +149,8 @@ class Results:
     """Finished trainings."""
     seconds: float
     """What they took, each on one core [s]."""
+    arrivals: Mapping[str, Arrivals]
+    """The finished trainings' arrivals at the goal, by name; of tasks whose episodes end there."""
     codes: Mapping[str, int]
     """How many of them each version of the code has trained, by its digest."""
 
@@ -216,6 +219,7 @@ def collect(config: MismatchConfig) -> Results:
         failures={name: failure.error for name, failure in failures.items() if failure is not None},
         runs=len(done),
         seconds=sum(read_json(folders[name] / "result.json", "result of a run")["seconds"] for name in done),
+        arrivals={name: read_arrivals(every[name], folders[name]) for name in done if ends_at_goal(every[name].task)},
         codes=collections.Counter(
             str(read_json(folders[name] / "config.json", "run configuration").get("code"))[:8] for name in done
         ),

@@ -12,7 +12,7 @@ from codrl_mj.study import figures, tables
 from codrl_mj.study.conclusions import conclusions_section
 from codrl_mj.study.conditions import every_condition
 from codrl_mj.study.experiments import EXPERIMENTS
-from codrl_mj.study.mismatch import Results
+from codrl_mj.study.mismatch import Results, cell_name
 from codrl_mj.study.plan import Comparison, Plan, Trial
 from codrl_mj.study.statistics import RESAMPLES
 from codrl_mj.study.summaries import LEAST_RUNS, Summary, Verdict, by_question, judge, over_all_tests, summarize
@@ -52,6 +52,7 @@ def write(results: Results, out: Path) -> list[Path]:
         conclusions_section(out / PAGE),
         _missing(results),
         *(_experiment(results, summary, name, drawn) for name in results.plans),
+        _arrivals(results),
         _actuators(results),
         _METHOD,
     ]
@@ -256,6 +257,27 @@ def _verdicts(verdicts: Sequence[Verdict], place: Callable[[Verdict], str], head
     return _table(header, rows)
 
 
+def _arrivals(results: Results) -> str:
+    """Who met the goal in training, and what came of it."""
+    arms = {(result.trial.arm.task, result.trial.arm.name): result.trial.arm for result in results.trials.values()}
+    rows: dict[str, list[list[str]]] = {}
+    for (task, name), arm in arms.items():
+        met = {seed: results.arrivals.get(cell_name(task, name, seed)) for seed in range(results.config.seeds)}
+        found = {seed: arrivals for seed, arrivals in met.items() if arrivals is not None}
+        own = results.trials.get(Trial(arm, arm.condition).name)
+        tests = own.evaluations if own else {}
+        columns = [
+            ["never" if of.first is None else str(of.first) for of in found.values()],
+            [f"{100 * of.arrived / max(of.episodes, 1):.0f}" for of in found.values()],
+            [_number(tests[seed]["returns"]["mean"]) if seed in tests else "–" for seed in found],
+        ]
+        if found:
+            rows.setdefault(task, []).append([f"`{name}`", *(", ".join(column) for column in columns)])
+    header = ["trained on", "first arrival [episode]", "arrivals [% of the episodes]", "mean return in test there"]
+    parts = [f"### {task}\n\n{_table(header, of)}" for task, of in rows.items()]
+    return "\n".join([_ARRIVALS, *parts]) if parts else ""
+
+
 def _actuators(results: Results) -> str:
     """What the names stand for."""
     parts = ["## The actuators\n"]
@@ -270,6 +292,12 @@ def _actuators(results: Results) -> str:
 def _names(trials: Iterable[Trial]) -> set[str]:
     return {name for trial in trials for name in (trial.test.name, trial.arm.condition.name)}
 
+
+_ARRIVALS = """## Who met the goal in training
+
+Where only the goal tells one action from another, nothing can be learned before it has been reached once. A number for
+each seed, in their order.
+"""
 
 _METHOD = f"""## How the numbers are made
 

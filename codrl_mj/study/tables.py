@@ -75,6 +75,7 @@ def as_mapping(results: Results, summary: Summary) -> dict[str, Any]:
         "untrained": list(results.untrained),
         "untested": list(results.untested),
         "failures": dict(results.failures),
+        "arrivals": {name: dataclasses.asdict(arrivals) for name, arrivals in results.arrivals.items()},
         "trials": trials,
         "comparisons": comparisons,
     }

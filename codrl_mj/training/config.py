@@ -13,6 +13,7 @@ from codrl_mj.agents.presets import find_preset
 from codrl_mj.disturbances import OFF
 from codrl_mj.env_config import EnvConfig
 from codrl_mj.motor import Actuator, actuator_over, resolve
+from codrl_mj.registration import ENVIRONMENTS
 
 EVALUATION_SEED = 1_000_000
 """Seed of the first episode in which a trained policy is evaluated, away from those that trainings start from."""
@@ -99,6 +100,11 @@ class TrainConfig:
     def evaluation_env(self) -> EnvConfig:
         """What policies are evaluated in: the environment without changes of time limit and reward."""
         return dataclasses.replace(self.env, max_episode_steps=None, center_radius=None)
+
+    @property
+    def longest_episode(self) -> int:
+        """The time limit of a training episode [steps]."""
+        return self.env.max_episode_steps or ENVIRONMENTS[self.task].max_episode_steps
 
     def as_mapping(self) -> dict[str, Any]:
         """The configuration as JSON-serialisable values; `from_mapping` reads it."""

@@ -42,6 +42,22 @@ EPISODE_COLUMNS = ("episode", "steps", "return", "length")
 """Number of the episode from 1, environment steps of the run when it ended, its return and its length [steps]."""
 
 
+def read_episodes(path: Path) -> np.ndarray:
+    """The table of a run's training episodes, shape (n, 4), columns `EPISODE_COLUMNS`.
+
+    Raises:
+        ValueError: the file is no such table.
+    """
+    with path.open(newline="") as file:
+        header, *rows = [*csv.reader(file)] or [[]]
+    try:
+        if tuple(header) != EPISODE_COLUMNS:
+            raise ValueError(f"columns {','.join(header)!r}: must be {','.join(EPISODE_COLUMNS)!r}")
+        return np.array(rows, dtype=np.float64).reshape(-1, len(EPISODE_COLUMNS))
+    except ValueError as error:
+        raise ValueError(f"{path}: not a table of episodes: {error}") from None
+
+
 class Table:
     """A CSV file of numbers that grows row by row, and the rows in memory."""
 

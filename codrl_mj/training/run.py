@@ -122,8 +122,7 @@ def _step_limit(config: TrainConfig) -> int:
     if config.total_steps is not None:
         return config.total_steps
     assert config.total_episodes is not None
-    longest = config.env.max_episode_steps or ENVIRONMENTS[config.task].max_episode_steps
-    return config.total_episodes * longest * config.num_envs
+    return config.total_episodes * config.longest_episode * config.num_envs
 
 
 def _finish(config: TrainConfig, out: Path, model: Any, watcher: Any) -> None:

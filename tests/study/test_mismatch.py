@@ -11,6 +11,8 @@ import pytest
 from scipy.stats import mannwhitneyu, trim_mean
 
 from codrl_mj.cli import main
+from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.study.arrivals import ends_at_goal
 from codrl_mj.study.cost import costs, seeds_finished
 from codrl_mj.study.grid import Workers, cell_folder
 from codrl_mj.study.mismatch import MismatchConfig, cells, collect, compute, deployments, trials
@@ -265,6 +267,53 @@ def test_a_single_run_has_no_interval(tmp_path):
     content = read_results(tmp_path)
     assert all(trial["summary"]["interquartile_mean"]["low"] is None for trial in content["trials"].values())
     assert {one["outcome"] for one in content["comparisons"]} == {"undecided"}
+
+
+def test_arrivals_at_the_goal_are_counted_where_episodes_end_there(tmp_path):
+    assert [task for task in ENVIRONMENTS if ends_at_goal(task)] == [
+        "acrobot",
+        "mountain_car",
+        "mountain_car_continuous",
+    ]
+    config = MismatchConfig(tmp_path / "runs", ("acrobot", "pendulum"), ("agents",), 3)
+    pretend(config, lambda _, seed: -80.25 - seed, ["acrobot: weaker, dqn, seed 1"])
+    lengths = {"ideal": [[500, 80, 500, 70], [90] * 7, []], "weaker, dqn": [[500] * 3, None, [500, 500, 499]]}
+    for name, cell in cells(config).items():
+        task, _, rest = name.partition(": ")
+        arm, _, seed = rest.rpartition(", seed ")
+        found = lengths.get(arm, [[500]] * 3)[int(seed)]
+        if task == "acrobot" and found is not None:
+            rows = [f"{index},{index},{-length},{length}" for index, length in enumerate(found, start=1)]
+            text = "\n".join(["episode,steps,return,length", *rows])
+            (cell_folder(config.root, cell) / "episodes.csv").write_text(text + "\n")
+    write(collect(config), tmp_path)
+    page = (tmp_path / "mismatch.md").read_text().partition("## Who met the goal")[2].partition("## The actuators")[0]
+    assert "| `ideal` | 2, 1, never | 50, 100, 0 | -80.2, -81.2, -82.2 |\n" in page
+    assert "| `weaker, dqn` | never, 3 | 0, 33 | -80.2, -82.2 |\n" in page
+    assert page.count("| `") == 6
+    assert "pendulum" not in page
+    arrivals = read_results(tmp_path)["arrivals"]
+    assert arrivals["acrobot: ideal, seed 0"] == {"episodes": 4, "arrived": 2, "first": 2}
+    assert arrivals["acrobot: ideal, seed 2"] == {"episodes": 0, "arrived": 0, "first": None}
+    assert len(arrivals) == 17
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("episode,steps,return,length\n1,2,three,4\n", "three"),
+        ("episode,steps,return,length\n1,2,3\n", "reshape"),
+        ("episode,steps,length\n1,2,3\n", "'episode,steps,length': must be"),
+        ("", "'': must be"),
+    ],
+)
+def test_a_damaged_table_of_episodes_is_named(text, expected, tmp_path):
+    config = MismatchConfig(tmp_path / "runs", ("acrobot",), ("agents",), 1)
+    pretend(config, score)
+    for cell in cells(config).values():
+        (cell_folder(config.root, cell) / "episodes.csv").write_text(text)
+    with pytest.raises(ValueError, match=rf"episodes\.csv: not a table of episodes: .*{expected}"):
+        collect(config)
 
 
 def test_a_training_that_failed_is_listed_with_its_error(partial, tmp_path):

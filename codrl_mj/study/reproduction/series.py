@@ -10,7 +10,7 @@ import numpy as np
 from codrl_mj.files import read_json
 from codrl_mj.study.reproduction.arms import TEST, Arm
 from codrl_mj.training.folder import EPISODES, RESULT
-from codrl_mj.training.history import EPISODE_COLUMNS
+from codrl_mj.training.history import EPISODE_COLUMNS, read_episodes
 
 LAST = 50
 """Training episodes that the paper takes its means over."""
@@ -42,8 +42,7 @@ def read_trained(folder: Path, tests: Mapping[str, Mapping[str, Any]]) -> Traine
         ValueError: a file is damaged.
     """
     result = read_json(folder / RESULT, "result of a run")
-    episodes = np.loadtxt(folder / EPISODES, delimiter=",", skiprows=1, ndmin=2).reshape(-1, len(EPISODE_COLUMNS))
-    return Trained(folder, episodes, tests, float(result["seconds"]))
+    return Trained(folder, read_episodes(folder / EPISODES), tests, float(result["seconds"]))
 
 
 @dataclasses.dataclass(frozen=True)
