@@ -13,7 +13,7 @@ import os
 import sys
 from typing import Any
 
-from codrl_mj.registration import register_envs
+from codrl_mj.envs.registration import register_envs
 
 __version__ = "0.1.0"
 
@@ -25,9 +25,9 @@ _PUBLIC = {
     "spectral_radius": "codrl_mj.motor",
     "named_actuator": "codrl_mj.motor",
     "TASKS": "codrl_mj.tasks",
-    "Uniform": "codrl_mj.distributions",
-    "LogUniform": "codrl_mj.distributions",
-    "Choice": "codrl_mj.distributions",
+    "Uniform": "codrl_mj.envs.distributions",
+    "LogUniform": "codrl_mj.envs.distributions",
+    "Choice": "codrl_mj.envs.distributions",
     "make_sb3_vec_env": "codrl_mj.envs.sb3",
     "motors": "codrl_mj.physics",
     "set_actuator": "codrl_mj.physics",

@@ -19,10 +19,10 @@ from dm_control.rl import control
 from dm_env import specs
 from gymnasium import spaces
 
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.envs.setup import Setup
 from codrl_mj.motor import Actuator
 from codrl_mj.physics import MujocoPhysics, Signals
-from codrl_mj.registration import ENVIRONMENTS
 from codrl_mj.tasks import TASKS
 
 _FULL_STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)

@@ -23,10 +23,10 @@ import numpy as np
 from benchmark_subjects import Subject
 from rich.table import Table
 
-from codrl_mj.files import write_json
-from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.cli.terminal import console
+from codrl_mj.envs.registration import ENVIRONMENTS
+from codrl_mj.runs.files import write_json
 from codrl_mj.tasks import TASKS
-from codrl_mj.terminal import console
 
 Makers = list[Callable[[], Subject]]
 NUM_ENVS = 1024

@@ -13,10 +13,10 @@ import numpy as np
 from mujoco.batch import Batch
 
 from codrl_mj import callbacks
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.motor import named_actuator
 from codrl_mj.physics.mjcf import install_callbacks, task_model
 from codrl_mj.physics.offscreen import OffscreenRenderer
-from codrl_mj.registration import ENVIRONMENTS
 from codrl_mj.tasks import TASKS
 
 ACTIONS = 1000

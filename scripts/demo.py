@@ -9,12 +9,12 @@ import functools
 import sys
 from pathlib import Path
 
-from codrl_mj.env_config import EnvConfig
+from codrl_mj.cli.terminal import print_checks, print_evaluations, progress_bar, train_with_bars
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import make_env, run_episodes, summarize
+from codrl_mj.films.film import Panel, film
 from codrl_mj.motor import named_actuator
-from codrl_mj.policies import load_policy
-from codrl_mj.rendering import Panel, film
-from codrl_mj.terminal import print_checks, print_evaluations, progress_bar, train_with_bars
+from codrl_mj.runs.policies import load_policy
 from codrl_mj.training import TrainConfig, finished, load_config
 from codrl_mj.validation import validate
 

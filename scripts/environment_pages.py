@@ -11,9 +11,9 @@ import sys
 from pathlib import Path
 
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.files import writing
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.motor import named_actuator
-from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.runs.files import writing
 from codrl_mj.tasks import TASKS
 
 FOLDER = Path(__file__).parent.parent / "docs" / "environments"

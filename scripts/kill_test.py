@@ -23,7 +23,7 @@ from typing import Any
 
 from rich.table import Table
 
-from codrl_mj.terminal import console
+from codrl_mj.cli.terminal import console
 
 PROGRAM = Path(sys.executable).with_name("codrl-mj")
 INTERVAL = 1000

@@ -21,10 +21,10 @@ from gymnasium.spaces import Discrete
 from gymnasium.vector import AutoresetMode
 
 from codrl_mj import Actuator, LogUniform, named_actuator, spectral_radius
+from codrl_mj.cli.terminal import console
 from codrl_mj.envs import ActuatedVectorEnv
-from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.tasks import TASKS
-from codrl_mj.terminal import console
 
 GROWTH = 4 * 2**20
 """Largest growth of resident memory after the first tenth [bytes]: 4 MiB, less than 5 bytes a step."""

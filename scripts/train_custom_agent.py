@@ -23,8 +23,8 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution, Independent, Normal
 
-from codrl_mj.files import writing
-from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.envs.registration import ENVIRONMENTS
+from codrl_mj.runs.files import writing
 
 COUNTS = ("num_envs", "total_steps", "rollout", "epochs", "minibatches", "hidden", "eval_episodes")  # 1 or more
 AMOUNTS = ("seed", "learning_rate", "clip", "entropy", "target_kl", "gamma", "gae_lambda")  # 0 or more

@@ -16,10 +16,10 @@ import pytest
 from codrl_mj import TASKS, CurrentLoop, Motor
 from codrl_mj.agents.presets import PRESETS
 from codrl_mj.cli import main
-from codrl_mj.env_config import EnvConfig
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import make_env, run_episodes
 from codrl_mj.motor import NAMED, named_actuator
-from codrl_mj.policies import load_policy
+from codrl_mj.runs.policies import load_policy
 from codrl_mj.training import TrainConfig, load_config
 
 PROGRAM = Path(sys.executable).with_name("codrl-mj")

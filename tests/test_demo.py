@@ -8,7 +8,7 @@ from pathlib import Path
 import imageio
 import pytest
 
-from codrl_mj.policies import load_policy
+from codrl_mj.runs.policies import load_policy
 from codrl_mj.training import load_config
 
 DEMO = Path(__file__).parents[1] / "scripts" / "demo.py"

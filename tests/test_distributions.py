@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from codrl_mj.distributions import Choice, LogUniform, Uniform, parse
+from codrl_mj.envs.distributions import Choice, LogUniform, Uniform, parse
 
 bounds = st.tuples(*[st.floats(allow_nan=False, allow_infinity=False)] * 2).map(sorted)
 positive = st.tuples(*[st.floats(min_value=0.0, exclude_min=True, allow_infinity=False)] * 2).map(sorted)

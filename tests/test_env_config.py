@@ -14,7 +14,7 @@ import yaml
 
 from codrl_mj import Choice, LogUniform, Uniform
 from codrl_mj.cli import main
-from codrl_mj.env_config import EnvConfig
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import make_env
 
 PAGE = (Path(__file__).parent.parent / "docs" / "randomization.md").read_text()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.tasks import TASKS
 
 ROOT = Path(__file__).parent.parent

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from codrl_mj import TASKS, Uniform
-from codrl_mj.episodes import RandomPolicy, load_episode, make_env, run_episodes, save_episode
+from codrl_mj.evaluation.episodes import RandomPolicy, load_episode, make_env, run_episodes, save_episode
 from codrl_mj.physics.base import TRACE_NAMES
 
 SIGNALS = ("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated")

@@ -9,7 +9,7 @@ import pytest
 
 from codrl_mj import TASKS, Actuator, CurrentLoop, Motor, Uniform, named_actuator
 from codrl_mj.disturbances import Disturbances
-from codrl_mj.env_config import EnvConfig
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import (
     MEASURES,
     Episode,

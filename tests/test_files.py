@@ -6,7 +6,7 @@ import stat
 
 import pytest
 
-from codrl_mj.files import read_json, write_json, writing
+from codrl_mj.runs.files import read_json, write_json, writing
 
 
 @pytest.mark.parametrize(

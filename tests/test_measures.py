@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from codrl_mj.measures import (
+from codrl_mj.evaluation.measures import (
     bootstrap_mean,
     delay,
     electrical_energy,

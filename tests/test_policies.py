@@ -14,7 +14,7 @@ from safetensors.torch import load_file, save_file
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from codrl_mj.agents import AGENTS, PPOConfig
-from codrl_mj.policies import load_policy, load_sb3_zip, save_policy
+from codrl_mj.runs.policies import load_policy, load_sb3_zip, save_policy
 
 WEIGHTS, DESCRIPTION = "policy.safetensors", "policy.json"
 

@@ -9,8 +9,8 @@ from PIL import Image
 
 from codrl_mj import TASKS, Actuator, Motor, named_actuator
 from codrl_mj.evaluation import Episode, RandomPolicy, make_env, run_episodes
+from codrl_mj.films.film import Panel, film
 from codrl_mj.physics.offscreen import OffscreenRenderer
-from codrl_mj.rendering import Panel, film
 
 WIDTH, HEIGHT = 200, 120
 FRAME_HEIGHT = 40 + HEIGHT + 24 + 120 + 8 + 60 + 26  # title, scene, and the strip's legend, plots and time axis

@@ -9,7 +9,7 @@ import imageio
 import numpy as np
 import pytest
 
-from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.envs.registration import ENVIRONMENTS
 
 ALGORITHMS = ("ppo", "dqn", "ddpg", "td3", "sac")
 ENV_ID = "codrl_mj/CartPole-v0"

@@ -9,7 +9,7 @@ import tyro
 
 from codrl_mj import Actuator, CurrentLoop, Motor, named_actuator
 from codrl_mj.cli.runs import Runs
-from codrl_mj.runs import SORT_KEYS, compare, find_runs, read_run, sort_runs
+from codrl_mj.runs.summaries import SORT_KEYS, compare, find_runs, read_run, sort_runs
 
 PROGRESS = "steps,episodes,mean_return,steps_per_second,seconds\n"
 UNITS = {"returns": "reward", "tracking_rms": "N*m", "peak_voltage": "V"}

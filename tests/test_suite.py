@@ -16,9 +16,9 @@ from dm_control.suite.wrappers import pixels
 from dm_env import specs, test_utils
 
 from codrl_mj import suite
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.motor import NAMED, Actuator, CurrentLoop, Motor
 from codrl_mj.physics import SimulationDivergedError
-from codrl_mj.registration import ENVIRONMENTS
 from codrl_mj.tasks import TASKS
 from tests.callbacks.models import FULL, changed
 

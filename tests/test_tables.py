@@ -5,9 +5,9 @@ import io
 import pytest
 from rich.console import Console
 
-from codrl_mj.env_config import EnvConfig
+from codrl_mj.cli.tables import evaluation_tables
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import MEASURES, RandomPolicy, evaluate
-from codrl_mj.tables import evaluation_tables
 
 SHORT = EnvConfig(max_episode_steps=30)
 

@@ -555,7 +555,7 @@ def test_a_fault_that_is_missed_fails_the_command(capsys, monkeypatch, missed, s
 
 
 def test_importing_the_certificate_needs_none_of_the_oracles_libraries():
-    code = "import sys, codrl_mj.terminal; print([n for n in ('control', 'scipy', 'jinja2') if n in sys.modules])"
+    code = "import sys, codrl_mj.cli.terminal; print([n for n in ('control', 'scipy', 'jinja2') if n in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert "control" not in done.stdout
     assert "jinja2" not in done.stdout or "scipy" in done.stdout

@@ -37,8 +37,8 @@ class Evaluate:
 
     def run(self) -> int:
         """Evaluate and print a table."""
+        from codrl_mj.cli.terminal import print_evaluations, progress_bar
         from codrl_mj.evaluation import evaluate
-        from codrl_mj.terminal import print_evaluations, progress_bar
 
         subject = self.source.load(self.policy)
         motor = actuator(self.actuator_name, self.actuator_fields, subject.task, subject.actuator)
@@ -56,7 +56,7 @@ class Evaluate:
             )
         print_evaluations({f"{self.policy.name} on {self.actuator_name}": evaluation})
         if self.out is not None:
-            from codrl_mj.files import write_json
+            from codrl_mj.runs.files import write_json
 
             write_json(self.out, evaluation.as_mapping())
             print(f"wrote {self.out}")

@@ -12,9 +12,9 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from codrl_mj.disturbances import Disturbances
-from codrl_mj.env_config import EnvConfig
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.motor import NAMED, Actuator, CurrentLoop, Motor
-from codrl_mj.registration import ENVIRONMENTS
 
 TaskName = Literal[tuple(ENVIRONMENTS)]  # type: ignore[valid-type]
 

@@ -9,7 +9,7 @@ import tyro
 from codrl_mj.cli.fields import AS_TRAINED, ActuatorFields, ActuatorName, EnvFields, Fields, environment
 from codrl_mj.cli.fields import actuator as chosen_actuator
 from codrl_mj.cli.subject import Source
-from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.envs.registration import ENVIRONMENTS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,10 +48,10 @@ class Render:
 
     def run(self) -> int:
         """Run the episode and film it."""
+        from codrl_mj.cli.terminal import progress_bar
         from codrl_mj.evaluation import RandomPolicy, make_env, run_episodes, save_episode
-        from codrl_mj.policies import Policy
-        from codrl_mj.rendering import Panel, film
-        from codrl_mj.terminal import progress_bar
+        from codrl_mj.films.film import Panel, film
+        from codrl_mj.runs.policies import Policy
 
         if self.subject in ENVIRONMENTS:
             task, name = self.subject, "paper" if self.actuator_name == AS_TRAINED else self.actuator_name

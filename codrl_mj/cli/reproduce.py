@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.envs.registration import ENVIRONMENTS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,8 +89,8 @@ def _compute(plan: Any, workers: Any, accept_changes: bool) -> None:
     """Train and test, with a bar for each."""
     import matplotlib  # noqa: F401 - what is missing is missed now and not in the end
 
+    from codrl_mj.cli.terminal import progress_bar
     from codrl_mj.study.reproduction.reproduce import compute
-    from codrl_mj.terminal import progress_bar
 
     with progress_bar("{task.completed}/{task.total}") as bar:
         rows = {
@@ -106,8 +106,8 @@ def _print_verdicts(findings: Any) -> None:
     from rich.markup import escape
     from rich.table import Table
 
+    from codrl_mj.cli.terminal import console
     from codrl_mj.study.reproduction.verdicts import CONFIRMED, NOT_CONFIRMED, number
-    from codrl_mj.terminal import console
 
     colours = {CONFIRMED: "green", NOT_CONFIRMED: "red"}
     for task in findings.plan.tasks:
@@ -127,9 +127,9 @@ def _print_costs(plan: Any, jobs: int) -> None:
     """Print every arm, which of its trainings are finished, and what the others would take."""
     from rich.table import Table
 
+    from codrl_mj.cli.terminal import console
     from codrl_mj.study.reproduction.reproduce import cores, costs
     from codrl_mj.study.reproduction.series import interval_text
-    from codrl_mj.terminal import console
 
     table = Table("training", "seeds finished", "seeds to do", "s each", "core hours left")
     every = costs(plan)

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from codrl_mj.runs import SORT_KEYS
+from codrl_mj.runs.summaries import SORT_KEYS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,9 +28,9 @@ class Runs:
 
     def run(self) -> int:
         """List or compare."""
-        from codrl_mj.files import write_json
-        from codrl_mj.runs import compare, find_runs, read_run, sort_runs
-        from codrl_mj.terminal import print_comparison, print_runs
+        from codrl_mj.cli.terminal import print_comparison, print_runs
+        from codrl_mj.runs.files import write_json
+        from codrl_mj.runs.summaries import compare, find_runs, read_run, sort_runs
 
         content: Any
         if self.compare:

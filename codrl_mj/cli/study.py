@@ -93,8 +93,8 @@ def _compute(config: Any, workers: Any, accept_changes: bool) -> None:
     """Train and test, with a bar for each."""
     import matplotlib  # noqa: F401 - what is missing is missed now and not in the end
 
+    from codrl_mj.cli.terminal import progress_bar
     from codrl_mj.study.mismatch import cells, compute, trials
-    from codrl_mj.terminal import progress_bar
 
     with progress_bar("{task.completed}/{task.total}") as bar:
         rows = {
@@ -108,8 +108,8 @@ def _print_costs(config: Any, jobs: int) -> None:
     """Print every training, and what the unfinished ones would take."""
     from rich.table import Table
 
+    from codrl_mj.cli.terminal import console
     from codrl_mj.study.cost import costs, seeds_finished
-    from codrl_mj.terminal import console
 
     table = Table("training", "seeds finished", "seeds to do")
     for kind, seeds in seeds_finished(config).items():

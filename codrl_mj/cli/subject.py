@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from codrl_mj.cli.fields import TaskName
-from codrl_mj.env_config import EnvConfig
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.motor import Actuator
 
 
@@ -56,7 +56,7 @@ class Source:
             ValueError: it is damaged, or needs a flag to be loaded.
         """
         from codrl_mj.motor import named_actuator
-        from codrl_mj.policies import load_policy, load_sb3_zip
+        from codrl_mj.runs.policies import load_policy, load_sb3_zip
         from codrl_mj.training.folder import BEST, CONFIG, finished, load_config
 
         alone = path.suffix == ".zip" or ((path / "policy.json").exists() and not (path / CONFIG).exists())

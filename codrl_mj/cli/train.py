@@ -12,7 +12,7 @@ from codrl_mj.agents import AGENTS
 from codrl_mj.agents.presets import SETTINGS
 from codrl_mj.cli.fields import AS_CONFIGURED, ActuatorFields, ActuatorName, Fields, TaskName, actuator, environment
 from codrl_mj.cli.fields import unchecked as flags_of
-from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.training.config import TrainConfig, default_agent, read_config
 from codrl_mj.training.folder import finished, load_config
 
@@ -113,7 +113,7 @@ class Train:
 
     def run(self: Any) -> int:
         """Train, with a progress bar."""
-        from codrl_mj.terminal import train_with_bars
+        from codrl_mj.cli.terminal import train_with_bars
 
         if self.task != self.base.task and self.resume is None:
             raise ValueError(f"name the task before the flags, as in codrl-mj train {self.task} --seed 1")

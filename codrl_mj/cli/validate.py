@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.envs.registration import ENVIRONMENTS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Validate:
 
     def run(self) -> int:
         """Validate and print a table for each group."""
-        from codrl_mj.terminal import print_certificate, print_mutations, progress_bar
+        from codrl_mj.cli.terminal import print_certificate, print_mutations, progress_bar
         from codrl_mj.validation import own_model, page, try_mutations, validate, validate_model
         from codrl_mj.validation.mutations import unfailed
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.distributions import Choice, Distribution
+from codrl_mj.envs.distributions import Choice, Distribution
 from codrl_mj.motor import Actuator, CurrentLoop, Motor, spectral_radii, to_vector
 from codrl_mj.motor.parameters import INDUCTANCE, PARAMETER_NAMES, RESISTANCE, SUBSTEPS
 from codrl_mj.physics.variation import Variation, variable

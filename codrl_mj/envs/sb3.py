@@ -8,11 +8,11 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.envs.serial import SerialVectorEnv
 from codrl_mj.envs.snapshots import check_snapshot
 from codrl_mj.envs.vector import ActuatedVectorEnv
 from codrl_mj.physics import Signals
-from codrl_mj.registration import ENVIRONMENTS
 
 _TASKS = {registered.env_id: task for task, registered in ENVIRONMENTS.items()}
 

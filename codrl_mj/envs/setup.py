@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from codrl_mj.distributions import Distribution
 from codrl_mj.disturbances import OFF, Disturbances, resolve_disturbances
+from codrl_mj.envs.distributions import Distribution
 from codrl_mj.envs.outcomes import Outcomes, compiled_outcomes
 from codrl_mj.envs.randomization import Randomization, nominal_parameters
 from codrl_mj.motor import Actuator, CurrentLoop, check_stable, resolve

@@ -7,9 +7,9 @@ import gymnasium
 import numpy as np
 from gymnasium.utils import seeding
 
-from codrl_mj.distributions import Distribution
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.compiled import arguments, compiled_kernels
+from codrl_mj.envs.distributions import Distribution
 from codrl_mj.envs.setup import Setup
 from codrl_mj.envs.snapshots import check_snapshot
 from codrl_mj.motor import Actuator

@@ -4,12 +4,12 @@ import mujoco
 import numpy as np
 
 from codrl_mj import callbacks
-from codrl_mj.assets import asset_path
 from codrl_mj.callbacks import ACT_NAMES, HILL_NAMES, IMPERFECT_ACT_NAMES
 from codrl_mj.disturbances import OFF, Disturbances
 from codrl_mj.motor import Actuator, from_vector, to_vector
 from codrl_mj.motor.parameters import IMPERFECTION_NAMES, PARAMETER_NAMES, SIGNATURE
 from codrl_mj.tasks import Task
+from codrl_mj.tasks.assets import asset_path
 
 
 def set_actuator(

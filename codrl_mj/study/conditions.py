@@ -5,7 +5,7 @@ import difflib
 from collections.abc import Iterable
 
 from codrl_mj.disturbances import Disturbances
-from codrl_mj.env_config import EnvConfig
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.motor import NAMED, Actuator, CurrentLoop, named_actuator
 from codrl_mj.tasks import Task, find_task
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codrl_mj.files import read_json
+from codrl_mj.runs.files import read_json
 from codrl_mj.study.grid import cell_folder
 from codrl_mj.study.mismatch import MismatchConfig, cells, deployments
 from codrl_mj.training import TrainConfig, finished

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.files import writing
-from codrl_mj.measures import Interval
+from codrl_mj.evaluation.measures import Interval
+from codrl_mj.runs.files import writing
 
 COLOURS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9")
 """Of Okabe and Ito's palette, which the colour-blind can tell apart."""

@@ -15,9 +15,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from codrl_mj.env_config import EnvConfig
-from codrl_mj.files import read_json, write_json
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.motor import Actuator
+from codrl_mj.runs.files import read_json, write_json
 from codrl_mj.training import RunInUseError, TrainConfig, TrainingStoppedError, finished, load_config, train
 
 BACKENDS = ("local", "ray")
@@ -237,7 +237,7 @@ def _deploy_cell(name: str, deployment: Deployment) -> tuple[str, Failure | None
 
 def _deploy(deployment: Deployment) -> None:
     from codrl_mj.evaluation import evaluate
-    from codrl_mj.policies import load_policy
+    from codrl_mj.runs.policies import load_policy
 
     config = load_config(deployment.run)
     result = evaluate(

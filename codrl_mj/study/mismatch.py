@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.files import read_json
+from codrl_mj.runs.files import read_json
 from codrl_mj.study.arrivals import Arrivals, ends_at_goal, read_arrivals
 from codrl_mj.study.conditions import check_condition
 from codrl_mj.study.experiments import EXPERIMENTS

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from codrl_mj.files import writing
-from codrl_mj.measures import Interval
+from codrl_mj.evaluation.measures import Interval
+from codrl_mj.runs.files import writing
 from codrl_mj.study import figures, tables
 from codrl_mj.study.conclusions import conclusions_section
 from codrl_mj.study.conditions import every_condition

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codrl_mj.measures import Interval, interquartile_mean
+from codrl_mj.evaluation.measures import Interval, interquartile_mean
 
 RESAMPLES = 2000
 """Bootstrap resamples, as many as Agarwal et al. take for probabilities of improvement."""

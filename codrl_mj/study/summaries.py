@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from codrl_mj.measures import Interval
+from codrl_mj.evaluation.measures import Interval
 from codrl_mj.study.mismatch import Result, Results
 from codrl_mj.study.plan import Comparison, Trial
 from codrl_mj.study.statistics import Scores, interquartile_mean_interval, probability_of_improvement

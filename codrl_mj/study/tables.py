@@ -6,8 +6,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-from codrl_mj.files import write_json, writing
-from codrl_mj.measures import Interval
+from codrl_mj.evaluation.measures import Interval
+from codrl_mj.runs.files import write_json, writing
 from codrl_mj.study.mismatch import Results
 from codrl_mj.study.summaries import MEASURES, Summary, measure
 

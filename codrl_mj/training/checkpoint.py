@@ -9,7 +9,7 @@ from pathlib import Path
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load, save
 
-from codrl_mj.files import writing
+from codrl_mj.runs.files import writing
 from codrl_mj.training.folder import CHECKPOINT
 from codrl_mj.training.state import State
 

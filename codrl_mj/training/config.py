@@ -11,9 +11,9 @@ from codrl_mj.agents import AgentConfig, agent_from_mapping, check_fits
 from codrl_mj.agents.ppo import PPOConfig
 from codrl_mj.agents.presets import find_preset
 from codrl_mj.disturbances import OFF
-from codrl_mj.env_config import EnvConfig
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.motor import Actuator, actuator_over, resolve
-from codrl_mj.registration import ENVIRONMENTS
 
 EVALUATION_SEED = 1_000_000
 """Seed of the first episode in which a trained policy is evaluated, away from those that trainings start from."""

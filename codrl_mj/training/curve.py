@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from codrl_mj.files import writing
+from codrl_mj.runs.files import writing
 from codrl_mj.training.config import TrainConfig
 from codrl_mj.training.history import REPORT_COLUMNS, WINDOW
 

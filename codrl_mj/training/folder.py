@@ -11,8 +11,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from codrl_mj.files import leftovers, read_json, write_json
-from codrl_mj.policies import POLICY_FILES
+from codrl_mj.runs.files import leftovers, read_json, write_json
+from codrl_mj.runs.policies import POLICY_FILES
 from codrl_mj.training.config import TrainConfig
 
 CONFIG, RESULT, EVALUATION = "config.json", "result.json", "evaluation.json"
@@ -114,7 +114,7 @@ def provenance() -> dict[str, Any]:
 @functools.cache
 def _code_digest() -> str:
     """SHA-256 over the package's Python files and models."""
-    from codrl_mj.assets import asset_folder
+    from codrl_mj.tasks.assets import asset_folder
 
     package = Path(__file__).parents[1]
     digest = hashlib.sha256()

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.files import writing
+from codrl_mj.runs.files import writing
 
 WINDOW = 100
 """Training episodes that means are taken over."""

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from codrl_mj.files import write_json
-from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.envs.registration import ENVIRONMENTS
+from codrl_mj.runs.files import write_json
 from codrl_mj.training import folder
 from codrl_mj.training.config import TrainConfig
 from codrl_mj.training.folder import RunInUseError
@@ -126,7 +126,7 @@ def _step_limit(config: TrainConfig) -> int:
 
 
 def _finish(config: TrainConfig, out: Path, model: Any, watcher: Any) -> None:
-    from codrl_mj.policies import save_policy
+    from codrl_mj.runs.policies import save_policy
     from codrl_mj.training.curve import draw_learning_curve
 
     watcher.boundary(last=True)

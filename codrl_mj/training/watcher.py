@@ -12,8 +12,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 
 from codrl_mj.evaluation import Evaluation, evaluate
-from codrl_mj.files import write_json
-from codrl_mj.policies import save_policy
+from codrl_mj.runs.files import write_json
+from codrl_mj.runs.policies import save_policy
 from codrl_mj.training import folder
 from codrl_mj.training.checkpoint import load_checkpoint, save_checkpoint
 from codrl_mj.training.config import EVALUATION_SEED, TrainConfig

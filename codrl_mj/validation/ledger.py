@@ -6,10 +6,10 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from codrl_mj.assets import asset_path
 from codrl_mj.motor import Actuator, Motor
 from codrl_mj.physics.analytic import DRIVERS
 from codrl_mj.tasks import Task
+from codrl_mj.tasks.assets import asset_path
 from codrl_mj.validation.continuous import gymnasium_equations
 
 HILL_TASKS = ("mountain_car", "mountain_car_continuous")

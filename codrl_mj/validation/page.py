@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from codrl_mj.files import writing
+from codrl_mj.runs.files import writing
 from codrl_mj.validation.certificate import GROUPS, Certificate, versions
 from codrl_mj.validation.mutations import Caught, margin, unfailed
 from codrl_mj.validation.outcome import Check

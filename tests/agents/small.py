@@ -3,8 +3,8 @@
 import torch
 
 from codrl_mj.agents import DDPGConfig, DQNConfig, PPOConfig, SACConfig, TD3Config
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.envs.sb3 import make_sb3_vec_env
-from codrl_mj.registration import ENVIRONMENTS
 
 _BUFFERED = {"learning_starts": 50, "batch_size": 16, "buffer_size": 1000}
 

@@ -7,7 +7,7 @@ from torch import nn
 
 from codrl_mj.agents import DDPGConfig, PPOConfig
 from codrl_mj.agents.presets import PRESETS, find_preset
-from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.envs.registration import ENVIRONMENTS
 from tests.agents.small import make_envs, make_model
 
 DEEP = [(agent, task, name) for (agent, task), of in PRESETS.items() for name in of if agent != "sarsa"]

@@ -4,7 +4,7 @@ import pytest
 
 from codrl_mj.agents import AGENTS
 from codrl_mj.agents.presets import PRESETS, SETTINGS, find_preset
-from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.tasks import find_task
 
 # what the paper prints for its deep agents (Experimental Results)

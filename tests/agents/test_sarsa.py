@@ -22,7 +22,7 @@ from codrl_mj.agents.sarsa import SARSAConfig
 from codrl_mj.agents.sarsa_algorithm import SARSA, TileCodingPolicy
 from codrl_mj.agents.sarsa_kernels import FORGOTTEN
 from codrl_mj.physics.base import SimulationDivergedError
-from codrl_mj.policies import load_policy, save_policy
+from codrl_mj.runs.policies import load_policy, save_policy
 from codrl_mj.tasks import find_task
 
 TABLE = {"tilings": 1, "intervals": (2,)}  # of a chain of 3 states: one tile for each

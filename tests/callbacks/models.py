@@ -5,9 +5,9 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from codrl_mj.assets import asset_path
 from codrl_mj.motor import Actuator, CurrentLoop, Motor
 from codrl_mj.physics import set_actuator
+from codrl_mj.tasks.assets import asset_path
 
 FULL = Actuator(
     Motor(resistance=1.2, inductance=0.05, torque_constant=0.8, back_emf_constant=0.7, arm_radius=0.5),

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from codrl_mj import callbacks
-from codrl_mj.assets import asset_path
 from codrl_mj.callbacks.kernels import CURRENT, ERROR, INTEGRAL, TICK, VOLTAGE
 from codrl_mj.motor import Actuator, CurrentLoop, Motor
 from codrl_mj.motor.catalog import PAPER
+from codrl_mj.tasks.assets import asset_path
 from tests.callbacks.models import FULL, cartpole, changed, controls, full_state, rotor, rotor_spec, trajectory
 from tests.reference import MotorSimulation
 

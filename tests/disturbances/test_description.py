@@ -10,7 +10,7 @@ import pytest
 import codrl_mj
 from codrl_mj.cli import main
 from codrl_mj.disturbances import OFF, Disturbances, resolve_disturbances
-from codrl_mj.env_config import EnvConfig
+from codrl_mj.envs.config import EnvConfig
 from tests.disturbances.everything import ALL
 
 FIELDS = [field.name for field in dataclasses.fields(Disturbances)]

@@ -10,8 +10,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import codrl_mj
 from codrl_mj.callbacks import ACT_NAMES, IMPERFECT_ACT_NAMES, install, installed
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.envs.vector import ActuatedVectorEnv
-from codrl_mj.registration import ENVIRONMENTS
 from tests.disturbances.everything import ALL, MOST
 
 WEAK = {"controller": {"kp": 1.0, "ki": 0.5, "max_voltage": 3.0}}

@@ -8,8 +8,8 @@ from safetensors.numpy import load_file, save_file
 
 from codrl_mj import Choice, LogUniform, Uniform, make_sb3_vec_env
 from codrl_mj.envs import ActuatedEnv
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.physics.variation import variable
-from codrl_mj.registration import ENVIRONMENTS
 from tests.disturbances.everything import ALL, MOST
 from tests.envs.vectors import random_actions
 from tests.tasks.faces import actions

@@ -13,12 +13,12 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
-from codrl_mj.assets import asset_path
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.motor import Actuator, CurrentLoop, Motor
 from codrl_mj.physics import PHYSICS
 from codrl_mj.physics.analytic import DRIVERS
-from codrl_mj.registration import ENVIRONMENTS
 from codrl_mj.tasks import TASKS
+from codrl_mj.tasks.assets import asset_path
 from tests.callbacks.models import FULL, changed
 
 DISCRETE = ("cartpole", "acrobot", "mountain_car")

@@ -11,9 +11,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.motor import NAMED
 from codrl_mj.physics import PHYSICS
-from codrl_mj.registration import ENVIRONMENTS
 from codrl_mj.tasks import TASKS
 from tests.reference import MotorSimulation
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from codrl_mj.envs import ActuatedEnv
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.motor import Actuator, CurrentLoop, Motor
 from codrl_mj.physics import PHYSICS, SimulationDivergedError
-from codrl_mj.registration import ENVIRONMENTS
 from codrl_mj.tasks import TASKS
 
 UNSTABLE = Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=100.0, max_voltage=float("inf")))

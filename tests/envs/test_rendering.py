@@ -9,8 +9,8 @@ import gymnasium
 import numpy as np
 import pytest
 
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.physics import PHYSICS
-from codrl_mj.registration import ENVIRONMENTS
 from codrl_mj.tasks import TASKS
 
 every_task = pytest.mark.parametrize("task", TASKS)

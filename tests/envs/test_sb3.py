@@ -12,8 +12,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecMonitor, VecNormalize
 
 import codrl_mj
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.envs.sb3 import ActuatedVecEnv
-from codrl_mj.registration import ENVIRONMENTS
 from codrl_mj.tasks import TASKS
 from tests.envs.vectors import random_actions
 

@@ -11,7 +11,7 @@ from safetensors.numpy import load, load_file, save, save_file
 import codrl_mj
 from codrl_mj import Uniform
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.tasks import TASKS
 from tests.envs.snapshots import PHYSICS, STEPS, everything, run_several, run_single, several, single
 from tests.envs.vectors import assert_same

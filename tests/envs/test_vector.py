@@ -9,10 +9,10 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from codrl_mj.envs import ActuatedEnv, ActuatedVectorEnv
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.envs.setup import Setup
 from codrl_mj.motor import Actuator, CurrentLoop, Motor
 from codrl_mj.physics import Signals
-from codrl_mj.registration import ENVIRONMENTS
 from codrl_mj.tasks import TASKS
 from tests.callbacks.models import FULL, changed
 from tests.envs.vectors import MODES, assert_equal_episodes, assert_same, batched, looped, random_actions

@@ -6,7 +6,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import codrl_mj  # noqa: F401 - registers the environments
 from codrl_mj.envs import ActuatedVectorEnv
-from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.envs.registration import ENVIRONMENTS
 
 MODES = tuple(mode.value for mode in AutoresetMode)
 

@@ -5,10 +5,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from codrl_mj.assets import asset_path
 from codrl_mj.motor import NAMED, Actuator, CurrentLoop, Motor, named_actuator
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError, motors
 from codrl_mj.tasks import TASKS
+from codrl_mj.tasks.assets import asset_path
 from tests.reference import MotorSimulation
 
 TASK = TASKS["cartpole"]

@@ -6,7 +6,7 @@ import itertools
 import numpy as np
 import pytest
 
-from codrl_mj.distributions import parse
+from codrl_mj.envs.distributions import parse
 from codrl_mj.evaluation import make_env
 from codrl_mj.study.conditions import check_condition, conditions, every_condition, ladder, stall_supply
 from codrl_mj.study.experiments import EXPERIMENTS

@@ -12,10 +12,10 @@ import pytest
 
 from codrl_mj import Actuator, CurrentLoop, Motor
 from codrl_mj.agents import PPOConfig
-from codrl_mj.env_config import EnvConfig
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import evaluate
 from codrl_mj.motor import named_actuator
-from codrl_mj.policies import load_policy
+from codrl_mj.runs.policies import load_policy
 from codrl_mj.study.grid import Deployment, Workers, cell_folder, deploy_cells, read_failure, train_cells
 from codrl_mj.training import TrainConfig, finished, load_config
 

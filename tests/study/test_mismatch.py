@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import mannwhitneyu, trim_mean
 
 from codrl_mj.cli import main
-from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.study.arrivals import ends_at_goal
 from codrl_mj.study.cost import costs, seeds_finished
 from codrl_mj.study.grid import Workers, cell_folder

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 
 import codrl_mj  # noqa: F401 - registers the environments
-from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.tasks import TASKS
 
 NEW = ("pendulum", "acrobot", "mountain_car", "mountain_car_continuous")

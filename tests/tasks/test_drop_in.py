@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.tasks import TASKS
 from tests.tasks.faces import NEW, actions, gymnasiums, ours
 

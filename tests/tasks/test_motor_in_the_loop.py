@@ -8,10 +8,10 @@ import mujoco.batch
 import numpy as np
 import pytest
 
-from codrl_mj.assets import asset_path
 from codrl_mj.motor.catalog import PAPER
 from codrl_mj.physics import MujocoPhysics, install_callbacks, motors
 from codrl_mj.tasks import TASKS
+from codrl_mj.tasks.assets import asset_path
 from tests.tasks.faces import NEW, actions, ours
 
 

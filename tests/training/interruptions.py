@@ -10,7 +10,7 @@ from pathlib import Path
 
 from codrl_mj.agents import DDPGConfig, DQNConfig, PPOConfig, SACConfig, SARSAConfig, TD3Config
 from codrl_mj.disturbances import Disturbances
-from codrl_mj.env_config import EnvConfig
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.training import TrainConfig, TrainingStoppedError, train
 from codrl_mj.training.watcher import Watcher
 

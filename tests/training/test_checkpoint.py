@@ -12,7 +12,7 @@ import pytest
 from safetensors.numpy import save
 
 from codrl_mj.cli import main
-from codrl_mj.files import writing
+from codrl_mj.runs.files import writing
 from codrl_mj.training import TrainConfig, curve, watcher
 from codrl_mj.training.checkpoint import load_checkpoint, save_checkpoint
 from codrl_mj.training.state import State

@@ -10,7 +10,7 @@ from codrl_mj import Actuator, CurrentLoop, Motor, named_actuator
 from codrl_mj.agents import AGENTS, PPOConfig
 from codrl_mj.agents.presets import PRESETS
 from codrl_mj.disturbances import Disturbances
-from codrl_mj.env_config import EnvConfig
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.training import TrainConfig, load_config, read_config
 
 TINY = TrainConfig("cartpole", "weaker", PPOConfig(hidden=(8, 8)), 1, 1000, num_envs=4)

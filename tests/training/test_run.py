@@ -18,9 +18,9 @@ from safetensors.torch import load_file
 from codrl_mj import Actuator, CurrentLoop, Motor
 from codrl_mj.agents import PPOConfig
 from codrl_mj.agents.sarsa_episodes import CompiledEpisodes
-from codrl_mj.env_config import EnvConfig
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy, evaluate, make_env, run_episodes
-from codrl_mj.policies import load_policy
+from codrl_mj.runs.policies import load_policy
 from codrl_mj.training import EVALUATION_SEED, TrainConfig, load_config, train
 
 TINY_PPO = PPOConfig(rollout_steps=256, batch_size=64, epochs=2, hidden=(8, 8))

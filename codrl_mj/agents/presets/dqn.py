@@ -2,7 +2,7 @@
 
 from codrl_mj.agents.dqn import DQNConfig
 from codrl_mj.agents.presets.preset import Preset
-from codrl_mj.env_config import EnvConfig
+from codrl_mj.envs.config import EnvConfig
 
 _ACROBOT = DQNConfig(
     learning_rate=1e-3,

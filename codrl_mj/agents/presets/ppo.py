@@ -2,7 +2,7 @@
 
 from codrl_mj.agents.ppo import PPOConfig
 from codrl_mj.agents.presets.preset import Preset
-from codrl_mj.env_config import EnvConfig
+from codrl_mj.envs.config import EnvConfig
 
 PRESETS: dict[str, dict[str, Preset]] = {
     "cartpole": {

@@ -3,7 +3,7 @@
 import dataclasses
 
 from codrl_mj.agents.base import AgentConfig
-from codrl_mj.env_config import EnvConfig
+from codrl_mj.envs.config import EnvConfig
 
 
 @dataclasses.dataclass(frozen=True)

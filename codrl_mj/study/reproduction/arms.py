@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from codrl_mj.env_config import EnvConfig
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.motor import Actuator
 from codrl_mj.motor.catalog import PAPER
 from codrl_mj.study.grid import Deployment

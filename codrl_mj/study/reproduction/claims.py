@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.study.reproduction.arms import CENTRE
 from codrl_mj.study.reproduction.series import Epochs, Series
 from codrl_mj.study.reproduction.value_iteration import Optimum

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.episodes import Episode, make_env, run_episodes
+from codrl_mj.evaluation.episodes import Episode, make_env, run_episodes
+from codrl_mj.films.strip import ACTUAL, DESIRED
 from codrl_mj.physics.base import TRACE_ACTUAL_FORCE
-from codrl_mj.policies import load_policy
-from codrl_mj.strip import ACTUAL, DESIRED
+from codrl_mj.runs.policies import load_policy
 from codrl_mj.study.figures import COLOURS, save
 from codrl_mj.study.reproduction.arms import CENTRE_RADIUS, Arm
 from codrl_mj.study.reproduction.series import LAST, Series, band, running_mean

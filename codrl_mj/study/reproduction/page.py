@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from codrl_mj.files import writing
-from codrl_mj.measures import Interval, bootstrap_mean
+from codrl_mj.evaluation.measures import Interval, bootstrap_mean
+from codrl_mj.runs.files import writing
 from codrl_mj.study.conclusions import conclusions_section
 from codrl_mj.study.reproduction import figures, tables
 from codrl_mj.study.reproduction.claims import PAPER_SAYS, PORT, STUDY_SAYS

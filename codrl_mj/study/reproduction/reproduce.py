@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codrl_mj.files import read_json
+from codrl_mj.runs.files import read_json
 from codrl_mj.study.grid import Deployment, Workers, cell_folder, deploy_cells, read_failure, train_cells
 from codrl_mj.study.reproduction.arms import TASKS, Arm, arms_of
 from codrl_mj.study.reproduction.claims import Claim, Evidence, claims_of

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.files import read_json
+from codrl_mj.runs.files import read_json
 from codrl_mj.study.reproduction.arms import TEST, Arm
 from codrl_mj.training.folder import EPISODES, RESULT
 from codrl_mj.training.history import EPISODE_COLUMNS, read_episodes

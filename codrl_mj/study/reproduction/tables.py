@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.files import write_json, writing
+from codrl_mj.runs.files import write_json, writing
 from codrl_mj.study.reproduction.claims import Claim
 from codrl_mj.study.reproduction.reproduce import Findings
 from codrl_mj.study.reproduction.series import LAST, Series

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.episodes import Episode, make_env, run_episodes
-from codrl_mj.measures import Interval, Quartiles, bootstrap_mean, quartiles
+from codrl_mj.evaluation.episodes import Episode, make_env, run_episodes
+from codrl_mj.evaluation.measures import Interval, Quartiles, bootstrap_mean, quartiles
 from codrl_mj.physics.analytic import DRIVERS
 from codrl_mj.tasks import TASKS
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from codrl_mj.measures import Interval, bootstrap_mean
+from codrl_mj.evaluation.measures import Interval, bootstrap_mean
 
 CONFIRMED, NOT_CONFIRMED, NOT_TESTABLE = "confirmed", "not confirmed", "not testable"
 LEVEL = 0.95

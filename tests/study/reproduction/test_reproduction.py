@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from codrl_mj.cli import main
-from codrl_mj.episodes import Episode
 from codrl_mj.evaluation import evaluate
+from codrl_mj.evaluation.episodes import Episode
 from codrl_mj.physics.base import TRACE_NAMES
-from codrl_mj.policies import load_policy
+from codrl_mj.runs.policies import load_policy
 from codrl_mj.study.grid import Workers
 from codrl_mj.study.reproduction import figures, tables
 from codrl_mj.study.reproduction.arms import ARMS, TASKS

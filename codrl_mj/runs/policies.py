@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.agents import AgentConfig, agent_from_mapping
-from codrl_mj.files import read_json, write_json, writing
+from codrl_mj.runs.files import read_json, write_json, writing
 
 FORMAT = "codrl_mj policy 2"
 POLICY_FILES = _WEIGHTS, _DESCRIPTION = "policy.safetensors", "policy.json"

@@ -17,9 +17,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from codrl_mj.cli.tables import comparison_tables, evaluation_tables, run_table
 from codrl_mj.evaluation import Evaluation
-from codrl_mj.runs import Comparison, RunSummary
-from codrl_mj.tables import comparison_tables, evaluation_tables, run_table
+from codrl_mj.runs.summaries import Comparison, RunSummary
 from codrl_mj.training import TrainConfig, train
 from codrl_mj.validation import GROUPS, Caught, Certificate, Check
 from codrl_mj.validation.mutations import margin

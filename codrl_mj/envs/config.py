@@ -4,8 +4,8 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from codrl_mj.distributions import Distribution, parse
 from codrl_mj.disturbances import OFF, Disturbances, resolve_disturbances
+from codrl_mj.envs.distributions import Distribution, parse
 
 
 @dataclasses.dataclass(frozen=True)

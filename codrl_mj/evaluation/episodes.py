@@ -14,12 +14,12 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from codrl_mj.envs import ActuatedEnv
-from codrl_mj.files import writing
+from codrl_mj.envs.registration import ENVIRONMENTS
+from codrl_mj.envs.single import ActuatedEnv
 from codrl_mj.motor import Actuator
 from codrl_mj.physics import Signals
-from codrl_mj.policies import Policy
-from codrl_mj.registration import ENVIRONMENTS
+from codrl_mj.runs.files import writing
+from codrl_mj.runs.policies import Policy
 from codrl_mj.tasks import find_task
 
 MakeEnv = Callable[[], gymnasium.Env[Any, Any]]

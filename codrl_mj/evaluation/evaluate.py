@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.env_config import EnvConfig
-from codrl_mj.episodes import Episode, RandomPolicy, load_episode, make_env, run_episodes, save_episode
-from codrl_mj.measures import (
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.evaluation.episodes import Episode, make_env, run_episodes
+from codrl_mj.evaluation.measures import (
     Interval,
     Quartiles,
     bootstrap_mean,
@@ -25,23 +25,8 @@ from codrl_mj.measures import (
 from codrl_mj.motor import Actuator, resolve
 from codrl_mj.physics.analytic import DRIVERS
 from codrl_mj.physics.base import TRACE_ACTUAL_FORCE, TRACE_CURRENT, TRACE_SATURATED, TRACE_SPEED, TRACE_VOLTAGE
-from codrl_mj.policies import Policy
+from codrl_mj.runs.policies import Policy
 from codrl_mj.tasks import Task, find_task
-
-__all__ = [
-    "Evaluation",
-    "evaluate",
-    "summarize",
-    "Episode",
-    "RandomPolicy",
-    "load_episode",
-    "make_env",
-    "run_episodes",
-    "save_episode",
-    "Interval",
-    "Quartiles",
-    "bootstrap_mean",
-]
 
 
 def _measure(label: str, unit: str) -> Any:

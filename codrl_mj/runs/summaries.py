@@ -10,8 +10,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from codrl_mj.files import read_json
 from codrl_mj.motor import NAMED, Actuator, named_actuator
+from codrl_mj.runs.files import read_json
 
 CONFIG = "config.json"
 """What makes a folder a run folder."""

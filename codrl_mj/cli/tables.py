@@ -1,4 +1,4 @@
-"""Results as tables for a terminal of 110 columns. They are built here, and printed by `codrl_mj.terminal`."""
+"""Results as tables for a terminal of 110 columns. They are built here, and printed by `codrl_mj.cli.terminal`."""
 
 import datetime
 from collections.abc import Callable, Mapping, Sequence
@@ -9,8 +9,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from codrl_mj.evaluation import MEASURES, Evaluation
-from codrl_mj.measures import Interval, Quartiles
-from codrl_mj.runs import Comparison, RunSummary
+from codrl_mj.evaluation.measures import Interval, Quartiles
+from codrl_mj.runs.summaries import Comparison, RunSummary
 
 _COLUMNS = 3  # evaluations side by side
 _NOTHING = "–"

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.envs import ActuatedEnv
-from codrl_mj.episodes import Episode
-from codrl_mj.files import writing, writing_folder
+from codrl_mj.envs.single import ActuatedEnv
+from codrl_mj.evaluation.episodes import Episode
+from codrl_mj.films.strip import AXIS_WIDTH, HEADER_HEIGHT, PLOT_HEIGHT, draw_strip, draw_text, pixels_per_second
 from codrl_mj.motor import Actuator
 from codrl_mj.physics.offscreen import OffscreenRenderer
-from codrl_mj.strip import AXIS_WIDTH, HEADER_HEIGHT, PLOT_HEIGHT, draw_strip, draw_text, pixels_per_second
+from codrl_mj.runs.files import writing, writing_folder
 
 FORMATS = (".mp4", ".gif", "")
 _TITLE_HEIGHT = 40  # px

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.episodes import Episode
+from codrl_mj.evaluation.episodes import Episode
 from codrl_mj.motor import Actuator
 
 _DPI = 100

@@ -1,0 +1,28 @@
+"""Whole episodes, and what they are reduced to."""
+
+from codrl_mj.evaluation.episodes import (
+    Episode,
+    RandomPolicy,
+    load_episode,
+    make_env,
+    run_episodes,
+    save_episode,
+)
+from codrl_mj.evaluation.evaluate import MEASURES, Evaluation, evaluate, summarize
+from codrl_mj.evaluation.measures import Interval, Quartiles, bootstrap_mean
+
+__all__ = [
+    "MEASURES",
+    "Episode",
+    "Evaluation",
+    "Interval",
+    "Quartiles",
+    "RandomPolicy",
+    "bootstrap_mean",
+    "evaluate",
+    "load_episode",
+    "make_env",
+    "run_episodes",
+    "save_episode",
+    "summarize",
+]

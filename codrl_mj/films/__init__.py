@@ -1,0 +1,1 @@
+"""Films of episodes, and the strip of signals under the scene."""
