@@ -13,24 +13,37 @@ import os
 import sys
 from typing import Any
 
-from codrl_mj.envs.registration import register_envs
-
 __version__ = "0.1.0"
 
 _PUBLIC = {
-    "Actuator": "codrl_mj.motor",
-    "CurrentLoop": "codrl_mj.motor",
+    "Actuator": "codrl_mj.actuators",
+    "CurrentLoop": "codrl_mj.actuators",
     "Disturbances": "codrl_mj.disturbances",
-    "Motor": "codrl_mj.motor",
-    "spectral_radius": "codrl_mj.motor",
-    "named_actuator": "codrl_mj.motor",
+    "Motor": "codrl_mj.actuators",
+    "spectral_radius": "codrl_mj.actuators",
+    "named_actuator": "codrl_mj.tasks",
+    "ActuatorModel": "codrl_mj.actuators",
+    "Supply": "codrl_mj.actuators",
+    "Ideal": "codrl_mj.actuators",
+    "Lag": "codrl_mj.actuators",
+    "TorqueSpeed": "codrl_mj.actuators",
+    "Joint": "codrl_mj.disturbances",
     "TASKS": "codrl_mj.tasks",
+    "EnvConfig": "codrl_mj.envs.config",
+    "Task": "codrl_mj.tasks",
+    "register": "codrl_mj.tasks",
     "Uniform": "codrl_mj.envs.distributions",
     "LogUniform": "codrl_mj.envs.distributions",
     "Choice": "codrl_mj.envs.distributions",
     "make_sb3_vec_env": "codrl_mj.envs.sb3",
-    "motors": "codrl_mj.physics",
-    "set_actuator": "codrl_mj.physics",
+    "motorise": "codrl_mj.specs",
+    "motors": "codrl_mj.engine.reading",
+    "check": "codrl_mj.engine.reading",
+    "clear_motors": "codrl_mj.engine.reading",
+    "signals": "codrl_mj.engine.reading",
+    "Readout": "codrl_mj.engine.reading",
+    "register_physics": "codrl_mj.physics.registry",
+    "load_family": "codrl_mj.engine",
     "install_callbacks": "codrl_mj.physics",
 }
 
@@ -57,4 +70,5 @@ def __dir__() -> list[str]:
 
 
 _choose_headless_backend()
-register_envs()
+importlib.import_module("codrl_mj.plugin").register()  # imports mujoco, which reads the variable
+importlib.import_module("codrl_mj.tasks")  # registers them with Gymnasium

@@ -6,6 +6,7 @@ The same dynamics, rewards and ends as the Gymnasium environments, with observat
 
 import collections
 import copy
+import math
 import operator
 import threading
 from collections.abc import Mapping
@@ -19,9 +20,9 @@ from dm_control.rl import control
 from dm_env import specs
 from gymnasium import spaces
 
-from codrl_mj.envs.registration import ENVIRONMENTS
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.setup import Setup
-from codrl_mj.motor import Actuator
+from codrl_mj.envs.views import signals_of
 from codrl_mj.physics import MujocoPhysics, Signals
 from codrl_mj.tasks import TASKS
 
@@ -38,12 +39,10 @@ class Physics(dm_mujoco.Physics):
     legacy_step: bool = False
     simulation: MujocoPhysics
     """Our simulation, which owns model and data."""
-    desired_force: float = 0.0
-    """Force [N] or torque [N*m] that the next step asks the actuator for."""
+    desired_force: Any = 0.0
+    """Force [N] or torque [N*m] that the next step asks the actuator for; with several motors an array (n,)."""
     signals: Signals | None = None
     """What the actuator did in the last step; None before the first."""
-    delivered: Signals | None = None
-    """The same as the simulation has it, whatever the agent commands."""
 
     @classmethod
     def of(cls, simulation: MujocoPhysics) -> "Physics":
@@ -67,7 +66,7 @@ class Physics(dm_mujoco.Physics):
         if nstep != self.simulation.inner_steps:
             raise ValueError(f"nstep = {nstep}: must be the task's {self.simulation.inner_steps} integration steps")
         with self.check_invalid_state():
-            self.signals = self.simulation.step(self.desired_force)
+            self.simulation.step(self.desired_force)
 
     def get_state(self, sig: int | None = None) -> np.ndarray:
         """The state to continue from: time, positions, velocities and motors, and commands and loads on their way.
@@ -117,7 +116,7 @@ class Physics(dm_mujoco.Physics):
         return copy.deepcopy(self)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in ("simulation", "desired_force", "signals", "delivered")}
+        return {name: getattr(self, name) for name in ("simulation", "desired_force", "signals")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self._contexts_lock = threading.Lock()
@@ -145,7 +144,7 @@ class GymTask(control.Task):
         """Draw the initial state; the motor is at rest."""
         _, info = self.setup.start(physics.simulation, self.random, None)
         self.randomization = info.get("randomization", {})
-        physics.signals = physics.delivered = None
+        physics.signals = None
         self._before = physics.simulation.state
 
     def before_step(self, action: Any, physics: Physics) -> None:
@@ -154,24 +153,23 @@ class GymTask(control.Task):
         Raises:
             ValueError: the action is not of the action spec.
         """
-        if isinstance(self.setup.action_space, spaces.Discrete):
+        if isinstance(self.setup.commands.action_space, spaces.Discrete):
             try:
                 action = operator.index(action)
             except TypeError:
-                raise ValueError(f"action = {action!r}: not in {self.setup.action_space}") from None
+                raise ValueError(f"action = {action!r}: not in {self.setup.commands.action_space}") from None
         self._before = physics.simulation.state
-        physics.desired_force = self.setup.force(action)
+        physics.desired_force = self.setup.commands.force(action)
 
     def after_step(self, physics: Physics) -> None:
         """Express what the actuator did as the command defines it."""
-        assert physics.signals is not None
-        physics.delivered = physics.signals
-        physics.signals = self.setup.signals(physics.signals)
+        trace, setup = physics.simulation.trace, self.setup
+        physics.signals = signals_of(trace[-1], setup.family, physics.desired_force, setup.commands.tracks)
 
     def action_spec(self, physics: Physics) -> specs.Array:
         """The action space as a dm_env spec."""
         del physics
-        space = self.setup.action_space
+        space = self.setup.commands.action_space
         if isinstance(space, spaces.Discrete):
             return specs.DiscreteArray(int(space.n), name="action")
         assert isinstance(space, spaces.Box)
@@ -179,9 +177,12 @@ class GymTask(control.Task):
 
     def get_observation(self, physics: Physics) -> dict[str, np.ndarray]:
         """The observation's entries by name, each of shape (1,), float64."""
-        seen = physics.signals if not self.setup.senses else self.setup.seen(physics.simulation, physics.delivered)
-        values = self.setup.observation(physics.simulation.state, seen)
-        names = self.setup.observation_names
+        simulation, seen = physics.simulation, None
+        if self.setup.view.sensors:
+            row = simulation.trace[-1]
+            seen = simulation.observed(np.zeros_like(row) if physics.signals is None else row)
+        values = self.setup.view.observation(simulation.state, seen)
+        names = self.setup.view.observation_names
         return collections.OrderedDict(
             (name, np.array([value], dtype=np.float64)) for name, value in zip(names, values, strict=True)
         )
@@ -189,17 +190,17 @@ class GymTask(control.Task):
     def get_reward(self, physics: Physics) -> float:
         """The task's reward of the last step."""
         assert physics.signals is not None
-        return self.setup.reward(self._before, physics.signals, physics.simulation.state)
+        return self.setup.view.reward(self._before, physics.signals["actual_force"], physics.simulation.state)
 
     def get_termination(self, physics: Physics) -> float | None:
         """0 (no future) where the task ends the episode, else None."""
-        return 0.0 if self.setup.terminated(physics.simulation.state) else None
+        return 0.0 if self.setup.view.terminated(physics.simulation.state) else None
 
 
 def load(
-    domain_name: str,
+    domain_name: str | EnvConfig,
     task_name: str = TASK_NAME,
-    actuator: str | Actuator | Mapping[str, Any] | None = "paper",
+    actuator: Any = "paper",
     task_kwargs: Mapping[str, Any] | None = None,
     environment_kwargs: Mapping[str, Any] | None = None,
     **options: Any,
@@ -207,14 +208,13 @@ def load(
     """A task as a dm_control environment.
 
     Args:
-        domain_name: task name, such as `pendulum`.
+        domain_name: task name, such as `pendulum`; or an environment's whole configuration.
         task_name: `gym`.
         actuator: as for `codrl_mj.envs.ActuatedEnv`.
         task_kwargs: `random`: a seed or a `numpy.random.Generator` for the initial states.
         environment_kwargs: arguments of `dm_control.rl.control.Environment`, such as `flat_observation`.
-        **options: `integrator`, `inner_steps`, `timestep`, `allow_unstable`, `action`, `levels`, `observe_actuator`,
-            `randomize`, `disturbances` and the task's own options, as for `codrl_mj.envs.ActuatedEnv`. What was drawn
-            for an episode is in the attribute `randomization` of the environment's task.
+        **options: the other fields of `codrl_mj.envs.config.EnvConfig`, and the task's own options. What was drawn for
+            an episode is in the attribute `randomization` of the environment's task.
 
     Returns:
         The environment. An episode ends with discount 0 where the task says so and with discount 1 at the time limit,
@@ -228,12 +228,14 @@ def load(
     given = task_kwargs or {}
     if given.keys() - {"random"}:
         raise ValueError(f"task_kwargs = {dict(given)!r}: may only hold 'random'")
-    setup = Setup.build(domain_name, actuator, **options)
-    simulation = setup.simulate("mujoco")
-    assert isinstance(simulation, MujocoPhysics)
+    config = domain_name if isinstance(domain_name, EnvConfig) else EnvConfig.of(domain_name, actuator, options)
+    setup = Setup.build(config)
+    simulation = setup.simulate(config.physics)
+    if not isinstance(simulation, MujocoPhysics):
+        raise ValueError(f"physics = {config.physics!r}: dm_control's face needs 'mujoco'")
     random = np.random.default_rng(given.get("random"))
     # half a step less: dm_control divides by the step, and a rounded-up quotient would allow one step more
-    limit = ENVIRONMENTS[setup.task.name].max_episode_steps - 0.5
+    limit = math.inf if config.time_limit is None else config.time_limit - 0.5
     return control.Environment(
         Physics.of(simulation),
         GymTask(setup, random),

@@ -24,7 +24,6 @@ from benchmark_subjects import Subject
 from rich.table import Table
 
 from codrl_mj.cli.terminal import console
-from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.runs.files import write_json
 from codrl_mj.tasks import TASKS
 
@@ -46,6 +45,7 @@ def groups(quick: bool) -> dict[str, Makers]:
     for task in TASKS:
         found[f"engine: {task}"] = [partial(subjects.engine, task, False), partial(subjects.engine, task, True)]
     for task, definition in TASKS.items():
+        assert definition.gymnasium_id is not None
         members: Makers = [partial(subjects.theirs, definition.gymnasium_id)]
         members += [partial(subjects.ours, task, actuator) for actuator in ("paper", "ideal")]
         if task == "cartpole":
@@ -128,7 +128,7 @@ def memory() -> dict[str, float]:
         return int(Path("/proc/self/statm").read_text().split()[1]) * page
 
     before = resident()
-    env = gymnasium.make_vec(ENVIRONMENTS["pendulum"].env_id, num_envs, "vector_entry_point")
+    env = gymnasium.make_vec(TASKS["pendulum"].env_id, num_envs, "vector_entry_point")
     env.reset(seed=0)
     env.step(np.zeros((num_envs, 1), np.float32))
     return {"bytes_per_environment": (resident() - before) / num_envs}

@@ -12,12 +12,11 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from codrl_mj import callbacks
-from codrl_mj.envs.registration import ENVIRONMENTS
-from codrl_mj.motor import named_actuator
+from codrl_mj import engine as callbacks
+from codrl_mj.actuators import IDEAL
 from codrl_mj.physics.mjcf import install_callbacks, task_model
 from codrl_mj.physics.offscreen import OffscreenRenderer
-from codrl_mj.tasks import TASKS
+from codrl_mj.tasks import TASKS, named_actuator
 
 ACTIONS = 1000
 """Actions drawn beforehand."""
@@ -40,9 +39,8 @@ class Subject:
 def engine(task: str, with_callbacks: bool) -> Subject:
     """`mj_step` of the task's model; without our callbacks its motor is dead weight, and a hill is flat."""
     definition = TASKS[task]
-    model = task_model(
-        definition, named_actuator("paper", task), definition.step_duration / definition.motor_inner_steps
-    )
+    timestep = definition.step_duration / definition.motor_inner_steps
+    model = task_model(definition, (named_actuator("paper", task),), timestep)
     data = mujoco.MjData(model)
 
     def prepare() -> None:
@@ -74,7 +72,7 @@ def single(name: str, env: Any) -> Subject:
 
 def ours(task: str, actuator: str) -> Subject:
     """Our environment through `gym.make`."""
-    env = gymnasium.make(ENVIRONMENTS[task].env_id, actuator=actuator, disable_env_checker=True)
+    env = gymnasium.make(TASKS[task].env_id, actuator=actuator, disable_env_checker=True)
     return single(f"ours, actuator {actuator!r}", env)
 
 
@@ -129,15 +127,13 @@ def batched(name: str, env: Any) -> Subject:
 
 def vector(task: str, num_envs: int, threads: int, actuator: str = "paper") -> Subject:
     """Our vector environment."""
-    env = gymnasium.make_vec(
-        ENVIRONMENTS[task].env_id, num_envs, "vector_entry_point", num_threads=threads, actuator=actuator
-    )
+    env = gymnasium.make_vec(TASKS[task].env_id, num_envs, "vector_entry_point", num_threads=threads, actuator=actuator)
     return batched(f"ours, N = {num_envs}, threads = {threads}, actuator {actuator!r}", env)
 
 
 def raw_batch(task: str, num_envs: int, threads: int, calls_apart: bool) -> Subject:
     """`Batch.step` of the same model with its motor: all inner steps of an environment step in one call, or apart."""
-    env: Any = gymnasium.make_vec(ENVIRONMENTS[task].env_id, num_envs, "vector_entry_point", num_threads=threads)
+    env: Any = gymnasium.make_vec(TASKS[task].env_id, num_envs, "vector_entry_point", num_threads=threads)
     env.reset(seed=0)
     env.step(np.zeros(env.action_space.shape, env.action_space.dtype))
     physics = env.unwrapped.physics
@@ -169,7 +165,7 @@ def envpool(env_id: str, num_envs: int, threads: int) -> Subject:
 
 def drawing(task: str, fast: bool) -> Subject:
     """Frames of 480 x 480 of the task's scene, with our fast visual settings or with MuJoCo's defaults."""
-    model = task_model(TASKS[task], None, TASKS[task].step_duration)
+    model = task_model(TASKS[task], (IDEAL,), TASKS[task].step_duration)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     if fast:
@@ -215,7 +211,7 @@ def ppo(num_envs: int, batched_ours: bool) -> tuple[str, Callable[[int], float]]
 
     torch.set_num_threads(1)
     if batched_ours:
-        env: Any = codrl_mj.make_sb3_vec_env(ENVIRONMENTS["pendulum"].env_id, num_envs)
+        env: Any = codrl_mj.make_sb3_vec_env(TASKS["pendulum"].env_id, num_envs)
     else:
         env = DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")] * num_envs)
     watch = Stopwatch(env)

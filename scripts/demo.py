@@ -13,13 +13,13 @@ from codrl_mj.cli.terminal import print_checks, print_evaluations, progress_bar,
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import make_env, run_episodes, summarize
 from codrl_mj.films.film import Panel, film
-from codrl_mj.motor import named_actuator
 from codrl_mj.runs.policies import load_policy
+from codrl_mj.tasks import named_actuator
 from codrl_mj.training import TrainConfig, finished, load_config
 from codrl_mj.validation import validate
 
 TASK, REAL = "cartpole", "weaker"
-PAPER_REWARD = EnvConfig(center_radius=0.1)  # the paper trains with no reward beyond 0.1 m from the centre
+PAPER_REWARD = {"center_radius": 0.1}  # the paper trains with no reward beyond 0.1 m from the centre
 
 
 def main() -> int:
@@ -42,7 +42,9 @@ def main() -> int:
     print(f"\n2/4  Train PPO twice: on the ideal actuator, and through the actuator {REAL!r}")
     runs = {
         actuator: (
-            TrainConfig(TASK, actuator, seed=options.seed, total_steps=options.total_steps, env=PAPER_REWARD),
+            TrainConfig(
+                EnvConfig(TASK, actuator, options=PAPER_REWARD), seed=options.seed, total_steps=options.total_steps
+            ),
             options.out / f"{actuator}-seed{options.seed}",
         )
         for actuator in ("ideal", REAL)
@@ -66,7 +68,7 @@ def main() -> int:
         for deployed in ("ideal", REAL):
             motor = named_actuator(deployed, TASK)
             episodes = run_episodes(policy, functools.partial(make_env, TASK, motor), options.episodes)
-            evaluations[f"trained on {trained}, run on {deployed}"] = summarize(TASK, motor, episodes)
+            evaluations[f"trained on {trained}, run on {deployed}"] = summarize(TASK, episodes)
             if deployed == REAL:
                 title = f"trained on {trained}: {episodes[0].total:.0f} of 500"
                 panels.append(Panel(title, TASK, motor, episodes[0]))

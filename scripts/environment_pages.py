@@ -4,24 +4,25 @@
 """
 
 import argparse
+import dataclasses
 import importlib
 import inspect
 import re
 import sys
 from pathlib import Path
 
+from codrl_mj.cli.fields import field_docs
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.envs.registration import ENVIRONMENTS
-from codrl_mj.motor import named_actuator
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.runs.files import writing
-from codrl_mj.tasks import TASKS
+from codrl_mj.tasks import TASKS, named_actuator
 
 FOLDER = Path(__file__).parent.parent / "docs" / "environments"
 
 
 def _title(task_name: str) -> str:
     """What a page is called: the environment's id without our namespace."""
-    return ENVIRONMENTS[task_name].env_id.removeprefix("codrl_mj/")
+    return TASKS[task_name].env_id.removeprefix("codrl_mj/")
 
 
 def _documentation(task_name: str) -> tuple[str, str]:
@@ -52,24 +53,26 @@ def common_arguments() -> str:
     }
     if meanings.keys() - {"task"} != parameters.keys():
         raise ValueError(f"ActuatedEnv documents {', '.join(meanings)} but takes {', '.join(parameters)}")
-    rows = [
-        f"| `{name}` | `{parameter.default!r}` | {meanings[name]} |"
+    defaults = {field.name: field.default for field in dataclasses.fields(EnvConfig)[1:] if field.name != "options"}
+    meanings |= field_docs(EnvConfig)
+    defaults |= {
+        name: parameter.default
         for name, parameter in parameters.items()
-        if parameter.kind is not parameter.VAR_KEYWORD  # the tasks' own options, which each page has
-    ]
+        if name not in defaults and parameter.kind is not parameter.VAR_KEYWORD  # the tasks' own, which each page has
+    }
+    rows = [f"| `{name}` | `{default!r}` | {meanings[name]} |" for name, default in defaults.items()]
     return "| argument | default | meaning |\n| --- | --- | --- |\n" + "\n".join(rows)
 
 
 def page(task_name: str) -> str:
     """The Markdown page of one environment."""
-    task, registered = TASKS[task_name], ENVIRONMENTS[task_name]
+    task = TASKS[task_name]
     summary, body = _documentation(task_name)
     own = task.options()._asdict().items()
     actuator = named_actuator("paper", task_name)
-    assert actuator is not None
     motor, loop = actuator.motor, actuator.controller
     facts = {
-        "make it": f'`gymnasium.make("{registered.env_id}")`, on the command line `{task_name}`',
+        "make it": f'`gymnasium.make("{task.env_id}")`, on the command line `{task_name}`',
         "rebuilds": f"Gymnasium's `{task.gymnasium_id}`",
         "model": f"`assets/{task.asset}`",
         "action space": f"`{_space(task.action_space)}`",
@@ -80,10 +83,8 @@ def page(task_name: str) -> str:
         "integration steps in it": f"{task.motor_inner_steps} with a motor, 1 without",
         "integrators": ", ".join(f"`{name}`" for name in task.integrators),
         "options of its own": ", ".join(f"`{name}` (default {value:g})" for name, value in own) or "none",
-        "time limit": f"{registered.max_episode_steps} steps",
-        "solved at": "not defined"
-        if registered.reward_threshold is None
-        else f"a return of {registered.reward_threshold:g}",
+        "time limit": f"{task.max_episode_steps} steps",
+        "solved at": "not defined" if task.reward_threshold is None else f"a return of {task.reward_threshold:g}",
         "`paper` actuator": f"R {motor.resistance:g} Ω, L {motor.inductance:g} H, kT {motor.torque_constant:g} N·m/A, "
         f"kE {motor.back_emf_constant:g} V·s/rad, arm {motor.arm_radius:g}; kP {loop.kp:g}, kI {loop.ki:g}, "
         f"kD {loop.kd:g}, kFF {loop.kff:g}, {loop.max_voltage:g} V",

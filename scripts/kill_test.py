@@ -9,7 +9,6 @@ is not as docs/training.md says: exit status and message, steps lost, files left
 import argparse
 import csv
 import dataclasses
-import json
 import os
 import random
 import re
@@ -24,6 +23,7 @@ from typing import Any
 from rich.table import Table
 
 from codrl_mj.cli.terminal import console
+from codrl_mj.runs.files import read_json
 
 PROGRAM = Path(sys.executable).with_name("codrl-mj")
 INTERVAL = 1000
@@ -48,7 +48,7 @@ def outcome(run: Path) -> dict[str, Any]:
     files += [f"best/{name}" for name in ("policy.safetensors", "policy.json", "evaluation.json")]
     with (run / "progress.csv").open() as file:
         progress = [{name: row[name] for name in row if name not in TIME_COLUMNS} for row in csv.DictReader(file)]
-    result = json.loads((run / "result.json").read_text())
+    result = read_json(run / "result.json", "result of a run")
     result.pop("seconds")
     return {name: (run / name).read_bytes() for name in files} | {"progress.csv": progress, "result.json": result}
 

@@ -20,10 +20,9 @@ import numpy as np
 from gymnasium.spaces import Discrete
 from gymnasium.vector import AutoresetMode
 
-from codrl_mj import Actuator, LogUniform, named_actuator, spectral_radius
+from codrl_mj import LogUniform, named_actuator, spectral_radius
 from codrl_mj.cli.terminal import console
 from codrl_mj.envs import ActuatedVectorEnv
-from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.tasks import TASKS
 
 GROWTH = 4 * 2**20
@@ -51,18 +50,9 @@ def unstable(env: ActuatedVectorEnv) -> int:
     """How many of the actuators in use have an unstable loop, each judged by itself."""
     drawn = env.randomization
     assert drawn is not None
-    count = 0
-    for row in range(env.num_envs):
-        parts: dict[str, dict[str, float]] = {"motor": {}, "controller": {}}
-        for name in RANDOMIZE:
-            part, field = name.split(".")
-            parts[part][field] = float(drawn[name][row])
-        nominal = named_actuator("paper", env.task.name)
-        assert nominal is not None
-        mapping = nominal.as_mapping()
-        actuator = Actuator.from_mapping({part: mapping[part] | parts[part] for part in mapping})
-        count += spectral_radius(actuator, env.task.step_duration / env.setup.inner_steps) >= 1.0
-    return count
+    nominal, timestep = named_actuator("paper", env.task.name), env.task.step_duration / env.setup.inner_steps
+    rows = ({name: float(drawn[name][row]) for name in RANDOMIZE} for row in range(env.num_envs))
+    return sum(spectral_radius(nominal.replaced(values), timestep) >= 1.0 for values in rows)
 
 
 def digest(results: tuple[Any, ...]) -> bytes:
@@ -85,7 +75,8 @@ def soak(task: str, num_envs: int, steps: int) -> int:
         0, or 1 if something was wrong.
     """
     generator = np.random.default_rng(0)
-    limit = ENVIRONMENTS[task].max_episode_steps
+    limit = TASKS[task].max_episode_steps
+    assert limit is not None
     arguments: dict[str, Any] = {"max_episode_steps": limit, "autoreset_mode": AutoresetMode.SAME_STEP}
     arguments["randomize"] = RANDOMIZE
     envs = [ActuatedVectorEnv(num_envs, task, num_threads=threads, **arguments) for threads in (1, 2)]

@@ -23,8 +23,8 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution, Independent, Normal
 
-from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.runs.files import writing
+from codrl_mj.tasks import TASKS
 
 COUNTS = ("num_envs", "total_steps", "rollout", "epochs", "minibatches", "hidden", "eval_episodes")  # 1 or more
 AMOUNTS = ("seed", "learning_rate", "clip", "entropy", "target_kl", "gamma", "gae_lambda")  # 0 or more
@@ -34,7 +34,7 @@ AMOUNTS = ("seed", "learning_rate", "clip", "entropy", "target_kl", "gamma", "ga
 class Options:
     """Train PPO through an actuator, evaluate it greedily, and save its weights."""
 
-    task: Literal[tuple(ENVIRONMENTS)] = "cartpole"  # type: ignore[valid-type]
+    task: Literal[tuple(TASKS)] = "cartpole"  # type: ignore[valid-type]
     """What to learn."""
     actuator: str = "paper"
     """What the force goes through: ideal, paper, weak, weaker or open_loop."""
@@ -169,7 +169,7 @@ def advantages(
 def make_envs(options: Options, num_envs: int) -> VectorEnv[Any, Any, Any]:
     """The environments, on one thread; one whose episode ends starts another in the same step."""
     arguments: Any = {"actuator": options.actuator, "num_threads": 1, "autoreset_mode": AutoresetMode.SAME_STEP}
-    env_id = ENVIRONMENTS[options.task].env_id
+    env_id = TASKS[options.task].env_id
     return gym.make_vec(env_id, num_envs, vectorization_mode="vector_entry_point", **arguments)
 
 

@@ -4,7 +4,8 @@ import hypothesis
 import mujoco
 import pytest
 
-from codrl_mj import callbacks
+from codrl_mj import engine
+from codrl_mj.actuators import Actuator
 
 hypothesis.settings.register_profile("deterministic", derandomize=True, deadline=None, max_examples=100, database=None)
 hypothesis.settings.load_profile("deterministic")
@@ -26,4 +27,5 @@ def bare_engine():
 @pytest.fixture
 def installed(bare_engine):
     """MuJoCo with our motors' callbacks during the test, and without any after it."""
-    callbacks.install()
+    engine.load_family(Actuator)
+    engine.install()

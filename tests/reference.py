@@ -38,8 +38,8 @@ def paper_loop(
     return step
 
 
-def of_actuator(actuator):
-    """`paper_loop` with the parameters of an `Actuator` (of one substep)."""
+def of_actuator(actuator, u_max=None):
+    """`paper_loop` with the parameters of an `Actuator` (of one substep), or under another voltage limit."""
     motor, loop = actuator.motor, actuator.controller
     return paper_loop(
         r=motor.resistance,
@@ -50,7 +50,7 @@ def of_actuator(actuator):
         ki=loop.ki,
         kd=loop.kd,
         kff=loop.kff,
-        u_max=loop.max_voltage,
+        u_max=loop.max_voltage if u_max is None else u_max,
         compensate=loop.bemf_compensation,
         leak=loop.integral_leak,
         td=loop.derivative_time_constant,

@@ -1,6 +1,7 @@
 """The command line: it teaches, it does what it says, and bad input costs one line and leaves nothing."""
 
 import dataclasses
+import importlib
 import json
 import math
 import re
@@ -13,14 +14,14 @@ import imageio
 import numpy as np
 import pytest
 
-from codrl_mj import TASKS, CurrentLoop, Motor
+from codrl_mj import TASKS, CurrentLoop, Ideal, Lag, Motor, Supply, named_actuator
+from codrl_mj.actuators import NAMED
 from codrl_mj.agents.presets import PRESETS
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import make_env, run_episodes
-from codrl_mj.motor import NAMED, named_actuator
 from codrl_mj.runs.policies import load_policy
-from codrl_mj.training import TrainConfig, load_config
+from codrl_mj.training import TrainConfig, folder, load_config
 
 PROGRAM = Path(sys.executable).with_name("codrl-mj")
 TINY = ["--total-steps", "500", "--num-envs", "2", "--agent", "ppo"]
@@ -81,13 +82,15 @@ def test_the_help_explains_every_named_actuator_and_every_field_with_its_unit(ca
     text = helped(capsys, verb)
     for name, (description, _) in NAMED.items():
         assert f"{name}: {description}" in text
-    for part, kind in (("motor", Motor), ("controller", CurrentLoop)):
+    for part, kind in (("motor", Motor), ("controller", CurrentLoop), ("supply", Supply)):
         for field in dataclasses.fields(kind):
             assert f"--actuator.{part}.{field.name.replace('_', '-')}" in text
     for unit in ("[ohm]", "[H]", "[N*m/A]", "[V*s/rad]", "[m]", "[V/A]", "[V/(A*s)]", "[V*s/A]", "[1/s]", "[s]"):
         assert unit in text
     for field in dataclasses.fields(EnvConfig):
-        assert f"--env.{field.name.replace('_', '-')}" in text
+        if field.name not in ("task", "actuator", "options"):
+            assert f"--env.{field.name.replace('_', '-')}" in text
+    assert "--env.center-radius" in text
     assert "--seed" in text
     assert "--out" in text
 
@@ -100,7 +103,11 @@ def test_the_help_shows_every_default_of_the_agent_on_the_task(capsys, agent, ta
     config = TrainConfig.preset(task, agent, settings)
     values = {f"--agent.{field.name}": getattr(config.agent, field.name) for field in dataclasses.fields(config.agent)}
     values |= {f"--{name}": getattr(config, name) for name in ("seed", "total_steps", "total_episodes", "num_envs")}
-    values |= {"--env.center_radius": config.env.center_radius}
+    options = config.env.as_mapping()["options"]
+    values |= {
+        "--env.center_radius": options.get("center_radius"),
+        "--env.max_episode_steps": config.env.max_episode_steps,
+    }
     for name, value in values.items():
         *_, flag = re.split(rf" {name.replace('_', '-')}(?![\w-])", text)  # the last one: before may be examples
         default = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
@@ -133,7 +140,7 @@ def test_the_examples_in_the_help_are_understood(capsys):
 def test_training_leaves_a_run_folder_and_says_what_is_next(capsys, tmp_path):
     assert main(["train", "cartpole", "--actuator", "ideal", "--seed", "3", *TINY]) == 0
     out = tmp_path / "runs" / "cartpole-ppo-ideal-3"
-    assert load_config(out).actuator is None
+    assert load_config(out).actuator == Ideal()
     assert (load_config(out).seed, load_config(out).total_steps, load_config(out).num_envs) == (3, 500, 2)
     assert load_config(out).agent.hidden == (8,)
     assert "next: codrl-mj evaluate runs/cartpole-ppo-ideal-3" in capsys.readouterr().out
@@ -143,7 +150,7 @@ def test_fields_are_set_over_the_named_actuator(tmp_path):
     flags = "--actuator weaker --actuator.controller.kp 0.3 --actuator.motor.inductance 0.07 --env.center-radius 0.1"
     more = "--actuator.controller.max-voltage inf --actuator.controller.bemf-compensation False --env.inner-steps 2"
     assert main(["train", "cartpole", *flags.split(), *more.split(), *TINY, "--out", "run"]) == 0
-    config = json.loads((tmp_path / "run" / "config.json").read_text())["train"]
+    config = json.loads((tmp_path / "run" / "config.json").read_text())["train"]["env"]
     weaker = named_actuator("weaker", "cartpole").as_mapping()
     assert config["actuator"]["controller"] == weaker["controller"] | {
         "kp": 0.3,
@@ -151,8 +158,8 @@ def test_fields_are_set_over_the_named_actuator(tmp_path):
         "bemf_compensation": False,
     }
     assert config["actuator"]["motor"] == weaker["motor"] | {"inductance": 0.07}
-    assert config["env"]["center_radius"] == 0.1
-    assert config["env"]["inner_steps"] == 2
+    assert config["options"] == {"center_radius": 0.1}
+    assert config["inner_steps"] == 2
 
 
 def test_evaluation_is_that_of_the_package(capsys, trained, tmp_path):
@@ -216,6 +223,110 @@ def test_a_task_can_be_filmed_with_random_actions_through_the_papers_motor(tmp_p
     assert (tmp_path / "film.gif").read_bytes().startswith(b"GIF89a")
 
 
+# -- actuators of any family --------------------------------------------------------------------------------
+
+SHORT_FILM = ["--out", "film.gif", "--width", "160", "--height", "120", "--env.max-episode-steps", "2"]
+OWN_FAMILY = """
+import dataclasses
+from pathlib import Path
+
+from codrl_mj import Lag
+from codrl_mj.fields import real
+
+Path("executed").touch()
+
+
+@dataclasses.dataclass(frozen=True)
+class Slow(Lag):
+    family = "slow"
+
+    time_constant: float = real(0.5, least=0.0, unit="s")
+    \"\"\"Half a second, if nothing else is said.\"\"\"
+"""
+
+
+@pytest.fixture
+def own_family(tmp_path, monkeypatch):
+    """A module of a user's with a family of actuators; a function that forgets having imported it."""
+    (tmp_path / "modules").mkdir()
+    (tmp_path / "modules" / "own_family.py").write_text(OWN_FAMILY)
+    monkeypatch.syspath_prepend(str(tmp_path / "modules"))
+
+    def forget():
+        sys.modules.pop("own_family", None)
+        (tmp_path / "executed").unlink(missing_ok=True)
+
+    yield forget
+    forget()
+
+
+@pytest.mark.parametrize("verb", ["train", "evaluate", "render"])
+def test_the_family_that_is_named_decides_on_the_flags(capsys, verb, trained, own_family):
+    first = {"train": ["train", "cartpole"], "evaluate": ["evaluate", str(trained)], "render": ["render", str(trained)]}
+    for actuator, flags in (
+        ("lag", ("--actuator.time-constant", "--actuator.delay")),
+        ("torque_speed", ("--actuator.stall-torque", "--actuator.no-load-speed", "--actuator.max-torque")),
+        ("weaker", ("--actuator.motor.inductance", "--actuator.supply.resistance")),
+        ("own_family:Slow", ("--actuator.time-constant", "Half a second")),
+    ):
+        text = helped(capsys, *first[verb], "--actuator", actuator)
+        for flag in flags:
+            assert flag in text
+        assert ("--actuator.motor" in text) == (actuator == "weaker")
+
+
+def test_fields_of_a_family_are_set_by_its_flags(tmp_path):
+    flags = "--actuator lag --actuator.time-constant 0.1 --actuator.delay 0.02"
+    assert main(["train", "cartpole", *flags.split(), *TINY]) == 0
+    run = tmp_path / "runs" / "cartpole-ppo-lag-0"
+    assert load_config(run).actuator == Lag(0.1, 0.02)
+    for line in (["evaluate", str(run), "--episodes", "1", "--out", "e.json"], ["render", str(run), *SHORT_FILM]):
+        assert main([*line, "--actuator.delay", "0.04"]) == 0
+    described = json.loads(Path("e.json").read_text())["conditions"]["env"]["actuator"]
+    assert described == {"family": "lag", "time_constant": 0.1, "delay": 0.04}
+
+
+def test_an_actuator_of_a_file_is_its_family_s(tmp_path):
+    (tmp_path / "slow.yaml").write_text("{family: lag, time_constant: 0.3}")
+    assert main(["render", "pendulum", "--actuator", "slow.yaml", "--actuator.delay", "0.05", *SHORT_FILM]) == 0
+
+
+def test_a_module_that_a_run_names_is_imported_only_on_trust(capsys, own_family):
+    assert main(["train", "pendulum", "--actuator", "own_family:Slow", *TINY, "--out", "run"]) == 0
+    own_family()
+    for line in ("evaluate run --episodes 1", "render run", "train --resume run", "train --config run/config.json"):
+        assert "own_family:Slow': needs the module own_family" in refused(capsys, *line.split())
+    assert main(["runs", ".", "--out", "runs.json"]) == 0
+    assert [run["actuator"] for run in json.loads(Path("runs.json").read_text())] == ["own_family:Slow"]
+    assert not Path("executed").exists()
+    assert main(["evaluate", "run", "--episodes", "1", "--trust", "--actuator.delay", "0.05"]) == 0
+    assert Path("executed").exists()
+
+
+def test_the_source_of_a_family_is_part_of_what_a_run_was_made_with(own_family, tmp_path):
+    digests = []
+    for text in (OWN_FAMILY, OWN_FAMILY.replace("0.5", "0.6")):
+        own_family()
+        (tmp_path / "modules" / "own_family.py").write_text(text)
+        folder._code_digest.cache_clear()
+        importlib.invalidate_caches()
+        digests.append(folder.provenance(TrainConfig(EnvConfig("pendulum", "own_family:Slow")))["code"])
+    folder._code_digest.cache_clear()
+    assert len({*digests, folder.provenance(TrainConfig(EnvConfig("pendulum")))["code"]}) == 3
+
+
+def test_a_task_and_an_agent_of_somebody_s_own_are_trained_by_where_they_are(capsys):
+    task, agent = "tests.own_project.arm:TASK", "tests.own_project.a2c:A2CConfig"
+    flags = "--agent.rollout-steps 16 --total-steps 64 --num-envs 2 --evaluation-episodes 1 --env.effort-weight 0.1"
+    line = ["train", task, "--agent", agent, "--actuator", "lag", *flags.split(), "--out", "run"]
+    assert main(line) == 0
+    config = load_config(Path("run"), trust=True)
+    assert (config.task, config.agent.rollout_steps, config.env.options.effort_weight) == (task, 16, 0.1)
+    assert config.actuator == (Lag(), Lag())
+    assert main(["evaluate", "run", "--trust", "--episodes", "1", "--env.effort-weight", "0.2"]) == 0
+    assert main(["render", task, "--actuator", "ideal", "--env.effort-weight", "0.2", *SHORT_FILM]) == 0
+
+
 # -- exit status --------------------------------------------------------------------------------------------
 
 
@@ -257,7 +368,7 @@ def test_a_missing_extra_is_named_before_anything_is_written(tmp_path, missing):
     ("flags", "expected"),
     [
         ("--actuator weakr", "did you mean 'weaker'"),
-        ("--actuator.motor.inductance -0.1", "Motor.inductance = -0.1: must be > 0"),
+        ("--actuator.motor.inductance -0.1", "Motor.inductance = -0.1: must be a finite number > 0"),
         ("--actuator.motor.inductance nan", "Motor.inductance = nan: must be a finite number > 0"),
         ("--actuator.controller.substeps 0", "CurrentLoop.substeps = 0"),
         ("--actuator.controller.kp 100", "spectral radius"),
@@ -398,7 +509,7 @@ try:
     {code}
 except SystemExit:
     pass
-heavy = "torch", "mujoco", "numba", "stable_baselines3", "scipy", "matplotlib", "imageio", "dm_control", "rich.progress"
+heavy = "torch", "numba", "stable_baselines3", "scipy", "matplotlib", "imageio", "dm_control", "rich.progress"
 print("loaded:", [name for name in heavy if name in sys.modules])
 """
     done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, timeout=60, check=True)

@@ -8,6 +8,7 @@ from pathlib import Path
 import imageio
 import pytest
 
+from codrl_mj.actuators import IDEAL
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.training import load_config
 
@@ -44,7 +45,7 @@ def test_it_leaves_two_runs_and_a_film(demonstrated):
     out, _ = demonstrated
     assert {path.name for path in out.iterdir()} == {*RUNS, "side_by_side.mp4"}
     ideal, weaker = (load_config(out / run) for run in RUNS)
-    assert ideal.actuator is None
+    assert ideal.actuator == IDEAL
     assert weaker.actuator.controller.kp == 0.2
     assert ideal.agent == weaker.agent
     assert ideal.seed == weaker.seed == 4

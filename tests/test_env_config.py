@@ -1,4 +1,4 @@
-"""What is drawn at every reset, as configurations and the command line have it."""
+"""An environment's configuration: every form of it, and what is drawn at every reset, also on the command line."""
 
 import dataclasses
 import itertools
@@ -8,13 +8,29 @@ import shlex
 from pathlib import Path
 
 import gymnasium
+import hypothesis
 import numpy as np
 import pytest
 import yaml
+from hypothesis import strategies as st
 
-from codrl_mj import Choice, LogUniform, Uniform
+from codrl_mj import (
+    Actuator,
+    Choice,
+    CurrentLoop,
+    Disturbances,
+    Joint,
+    Lag,
+    LogUniform,
+    Motor,
+    Supply,
+    TorqueSpeed,
+    Uniform,
+    make_sb3_vec_env,
+    suite,
+)
 from codrl_mj.cli import main
-from codrl_mj.envs.config import EnvConfig
+from codrl_mj.envs.config import EnvConfig, upgraded
 from codrl_mj.evaluation import make_env
 
 PAGE = (Path(__file__).parent.parent / "docs" / "randomization.md").read_text()
@@ -46,28 +62,29 @@ WRITTEN = (
     ids=["distributions", "tuple", "list", "mapping of text", "other spaces"],
 )
 def test_every_form_is_the_same_configuration(given):
-    config = EnvConfig(randomize=given)
+    config = EnvConfig("cartpole", randomize=given)
     assert config.randomize == WRITTEN
-    assert hash(config) == hash(EnvConfig(randomize=RANDOMIZE))
+    assert hash(config) == hash(EnvConfig("cartpole", randomize=RANDOMIZE))
     arguments = config.as_arguments()["randomize"]
     assert list(arguments.items()) == list(RANDOMIZE.items())  # the order too: it is that of the draws
-    assert EnvConfig(**json.loads(json.dumps(dataclasses.asdict(config)))) == config
-    assert EnvConfig(**yaml.safe_load(yaml.safe_dump(json.loads(json.dumps(dataclasses.asdict(config)))))) == config
+    written = json.loads(json.dumps(config.as_mapping()))
+    assert EnvConfig.from_mapping(written) == EnvConfig.from_mapping(yaml.safe_load(yaml.safe_dump(written))) == config
 
 
 def test_environments_draw_from_it():
-    ours = make_env("cartpole", "paper", **EnvConfig(randomize=WRITTEN).as_arguments())
+    ours = EnvConfig("cartpole", randomize=WRITTEN).make()
     theirs = make_env("cartpole", "paper", randomize=RANDOMIZE)
     assert ours.reset(seed=3)[1]["randomization"] == theirs.reset(seed=3)[1]["randomization"]
 
 
 def test_nothing_is_drawn_by_default():
-    assert EnvConfig().randomize is None
-    assert "randomize" not in EnvConfig().as_arguments()
-    drawn = EnvConfig(randomize=WRITTEN)
-    assert drawn != EnvConfig()
-    assert dataclasses.replace(drawn, randomize=None) == EnvConfig()
-    assert EnvConfig().seen_as(drawn).randomize is None  # it is no part of what an agent commands and sees
+    plain = EnvConfig("cartpole")
+    assert plain.randomize is None
+    assert "randomize" not in plain.as_arguments()
+    drawn = EnvConfig("cartpole", randomize=WRITTEN)
+    assert drawn != plain
+    assert dataclasses.replace(drawn, randomize=None) == plain
+    assert plain.seen_as(drawn).randomize is None  # it is no part of what an agent commands and sees
 
 
 REFUSED = {
@@ -90,7 +107,144 @@ REFUSED = {
 def test_what_is_no_randomisation_is_refused_with_a_reason(case):
     randomize, message = REFUSED[case]
     with pytest.raises(ValueError, match=f"^{re.escape(message)}"):
-        EnvConfig(randomize=randomize)
+        EnvConfig("cartpole", randomize=randomize)
+
+
+# -- every field --------------------------------------------------------------------------------------------
+
+POSITIVE = st.floats(1e-3, 1e3)
+ACTUATORS = (
+    st.sampled_from(["ideal", "paper", "weaker"])
+    | st.builds(Lag, POSITIVE, POSITIVE)
+    | st.builds(TorqueSpeed, POSITIVE, POSITIVE, POSITIVE)
+    | st.builds(Actuator, st.builds(Motor, POSITIVE), st.builds(CurrentLoop, kp=POSITIVE), st.builds(Supply, POSITIVE))
+)
+
+
+@st.composite
+def configurations(draw):
+    """Configurations with any of their fields set."""
+    task = draw(st.sampled_from(["pendulum", "cartpole", "acrobot", "mountain_car"]))
+    fields = {
+        "physics": st.sampled_from(["mujoco", "analytic"]),
+        "integrator": st.sampled_from(["euler", "semi-implicit"]),
+        "inner_steps": st.integers(1, 100),
+        "timestep": POSITIVE,
+        "action": st.sampled_from(["force", "current", "voltage"]),
+        "levels": st.lists(st.floats(-10, 10), max_size=3),
+        "observe_actuator": st.booleans(),
+        "max_episode_steps": st.integers(1, 10_000),
+        "allow_unstable": st.booleans(),
+        "disturbances": st.builds(Disturbances, POSITIVE, POSITIVE, POSITIVE, POSITIVE, POSITIVE, POSITIVE),
+        "joint": st.builds(Joint, POSITIVE, POSITIVE, POSITIVE),
+        "randomize": st.just(RANDOMIZE),
+        **({"options": st.fixed_dictionaries({"center_radius": POSITIVE})} if task == "cartpole" else {}),
+    }
+    return EnvConfig(task, draw(ACTUATORS), **draw(st.fixed_dictionaries({}, optional=fields)))
+
+
+@hypothesis.given(configurations(), st.randoms())
+def test_a_configuration_survives_json_and_keyword_arguments(config, random):
+    written = json.loads(json.dumps(config.as_mapping()))
+    read = EnvConfig.from_mapping(written)
+    assert (read, hash(read)) == (config, hash(config))
+    assert EnvConfig.from_mapping({}, config) == config
+    names = random.sample(sorted(written), 5)
+    part = EnvConfig.from_mapping({name: written[name] for name in ["task", *names]})
+    assert EnvConfig.from_mapping({name: written[name] for name in written if name not in names}, part) == config
+    arguments = config.as_arguments()
+    arguments.pop("max_episode_steps", None)
+    again = EnvConfig.of(config.task, arguments.pop("actuator"), arguments)
+    assert again == dataclasses.replace(config, max_episode_steps=None)
+
+
+def test_every_face_is_built_from_it():
+    config = EnvConfig(
+        "cartpole",
+        "weaker",
+        inner_steps=2,
+        max_episode_steps=7,
+        disturbances={"command_delay": 0.02},
+        joint={"friction": 0.1},
+        options={"center_radius": 0.02},
+    )
+    single, many, theirs = config.make(), make_sb3_vec_env(config, 2), suite.load(config)
+    for setup in (single.unwrapped.setup, many.env.setup, theirs.task.setup):
+        assert (setup.actuators, setup.inner_steps) == (config.actuators, 2)
+        assert (setup.disturbances, setup.joint) == (config.disturbances, config.joint)
+        assert setup.view.option_values == (0.02,)
+    assert single.spec.max_episode_steps == many.env.max_episode_steps == 7
+    theirs.reset()
+    assert [theirs.step(0).last() for _ in range(7)] == [False] * 6 + [True]
+
+
+def test_fields_are_set_over_another_one_s():
+    base = EnvConfig("cartpole", disturbances={"command_delay": 0.1}, joint={"damping": 1.0}, inner_steps=3)
+    changed = EnvConfig.from_mapping(
+        {"actuator": "weak", "disturbances": {"command_rate": 2.0}, "center_radius": 0.3, "joint": {"friction": 0.5}},
+        base,
+    )
+    assert changed == EnvConfig(
+        "cartpole",
+        "weak",
+        inner_steps=3,
+        disturbances=Disturbances(command_delay=0.1, command_rate=2.0),
+        joint=Joint(damping=1.0, friction=0.5),
+        options={"center_radius": 0.3},
+    )
+
+
+@pytest.mark.parametrize(
+    ("mapping", "message"),
+    [
+        ({"task": "cartpole", "inner_step": 3}, "unknown key env.inner_step; did you mean env.inner_steps?"),
+        ({"task": "cartpole", "center_radios": 3}, "unknown key env.center_radios; did you mean env.center_radius?"),
+        (
+            {"task": "pendulum", "options": {"center_radius": 3}},
+            "unknown option 'center_radius' of pendulum: it has none",
+        ),
+        ({"task": "cartpole", "center_radius": -1.0}, "center_radius = -1.0: must be a number > 0"),
+        ({"inner_steps": 3}, "it has no task"),
+        ("cartpole", "env = 'cartpole': must be a mapping"),
+    ],
+)
+def test_what_is_no_configuration_is_named(mapping, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        EnvConfig.from_mapping(mapping)
+
+
+@pytest.mark.parametrize(
+    ("actuator", "expected"),
+    [
+        ({"controller": {"kp": 2.0}}, {"controller": {"kp": 2.0, "current_noise": 0.1}, "supply": {"resistance": 0.4}}),
+        ("weak", {"name": "weak", "controller": {"current_noise": 0.1}, "supply": {"resistance": 0.4}}),
+        (None, None),
+    ],
+)
+def test_what_were_disturbances_once_are_the_actuator_s_and_the_joint_s(actuator, expected):
+    old = {
+        "current_noise": 0.1,
+        "current_bias": 0.0,
+        "supply_resistance": 0.4,
+        "joint_friction": 0.2,
+        "joint_damping": 0.0,
+    }
+    env = {"disturbances": {"command_delay": 0.03, **old}, "center_radius": 0.1}
+    assert upgraded({"task": "cartpole", "actuator": actuator, "env": env, "seed": 4}) == {
+        "seed": 4,
+        "env": {
+            "task": "cartpole",
+            "actuator": expected,
+            "options": {"center_radius": 0.1},
+            "disturbances": {"command_delay": 0.03},
+            "joint": {"friction": 0.2},
+        },
+    }
+
+
+def test_what_is_written_now_stays_as_it_is():
+    written = {"seed": 4, "env": EnvConfig("cartpole", "weak", options={"center_radius": 0.1}).as_mapping()}
+    assert upgraded(written) == written
 
 
 # -- the command line ---------------------------------------------------------------------------------------
@@ -102,7 +256,7 @@ def _rendered(folder, *flags):
     trajectory = folder / "episode.npz"
     assert main([*arguments, "--out", str(folder / "frames"), "--trajectory", str(trajectory), *flags]) == 0
     with np.load(trajectory) as episode:
-        return episode["current"]
+        return episode["trace/current"]
 
 
 def test_the_command_line_draws(tmp_path):
@@ -153,7 +307,7 @@ def test_the_files_of_the_page_are_configurations():
     assert blocks
     for block in blocks:
         content = yaml.safe_load(block)
-        env = make_env(content["task"], "paper", **EnvConfig(**content["env"]).as_arguments())
+        env = EnvConfig(content["task"], **content["env"]).make()
         assert isinstance(env, gymnasium.Env)
         assert env.reset(seed=0)[1]["randomization"].keys() > content["env"]["randomize"].keys()
 
@@ -164,5 +318,7 @@ def test_the_flags_of_the_page_survive_the_shell():
     for command in commands:
         words = iter(shlex.split(command.replace("\\\n", "")))
         assert "--env.randomize" in words  # leaves what follows it
-        config = EnvConfig(randomize=list(itertools.takewhile(lambda word: not word.startswith("--"), words)))
+        config = EnvConfig(
+            "cartpole", randomize=list(itertools.takewhile(lambda word: not word.startswith("--"), words))
+        )
         assert len(config.as_arguments()["randomize"]) == 2

@@ -1,5 +1,6 @@
 """The environments' pages: that they are what the code says, and that what they say is what the code does."""
 
+import dataclasses
 import importlib.util
 import inspect
 import re
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.envs.registration import ENVIRONMENTS
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.tasks import TASKS
 
 ROOT = Path(__file__).parent.parent
@@ -61,9 +62,7 @@ def test_make_docs_writes_them(tmp_path):
 
 def test_the_index_links_to_every_page():
     links = re.findall(r"\[(.*?)\]\((.*?)\)", (FOLDER / "README.md").read_text())
-    assert dict(links) == {
-        env_id.removeprefix("codrl_mj/"): f"{task}.md" for task, (env_id, *_) in ENVIRONMENTS.items()
-    }
+    assert dict(links) == {task.env_id.removeprefix("codrl_mj/"): f"{name}.md" for name, task in TASKS.items()}
 
 
 def test_an_argument_that_nobody_documents_is_noticed(monkeypatch):
@@ -93,9 +92,11 @@ def test_every_page_has_the_same_sections(task):
 @every_task
 def test_every_argument_is_in_the_page_with_its_default_and_the_tasks_own_options_too(task):
     rows = {row[0].strip("`"): row[1].strip("`") for row in _table(_section(task, "Arguments of every environment"))}
-    parameters = dict(list(inspect.signature(ActuatedEnv).parameters.items())[1:])  # without the task
-    parameters.pop("options")
-    assert rows == {name: repr(parameter.default) for name, parameter in parameters.items()}
+    fields = {field.name: repr(field.default) for field in dataclasses.fields(EnvConfig)[1:]}  # without the task
+    parameters = dict(list(inspect.signature(ActuatedEnv).parameters.items())[1:-1])  # and without **arguments
+    expected = {name: repr(parameter.default) for name, parameter in parameters.items()} | fields
+    assert expected.pop("options") == "None"
+    assert rows == expected
     (own,) = (row[1] for row in _table((FOLDER / f"{task}.md").read_text()) if row[0] == "options of its own")
     assert re.findall(r"`(\w+)`", own) == list(TASKS[task].options._fields)
     for option in TASKS[task].options._fields:
@@ -122,7 +123,7 @@ def test_the_action_space_is_named(task):
     text = _section(task, "Action space")
     if isinstance(space, gymnasium.spaces.Discrete):
         assert f"`Discrete({space.n})`" in text
-        forces = TASKS[task].desired_force(np.arange(space.n))
+        forces = TASKS[task].forces
         assert all(re.search(rf"(?<![\d.]){force:g}(?![\d.])", text) for force in forces)
     else:
         assert f"`Box({space.low[0]:g}, {space.high[0]:g}, (1,), float32)`" in text
@@ -133,9 +134,9 @@ def test_the_action_space_is_named(task):
 
 @every_task
 def test_the_time_limit_is_the_registered_one_and_gymnasiums(task):
-    ours, theirs = gymnasium.spec(ENVIRONMENTS[task].env_id), gymnasium.spec(TASKS[task].gymnasium_id)
-    assert ours.max_episode_steps == theirs.max_episode_steps == ENVIRONMENTS[task].max_episode_steps
-    assert ours.reward_threshold == theirs.reward_threshold == ENVIRONMENTS[task].reward_threshold
+    ours, theirs = gymnasium.spec(TASKS[task].env_id), gymnasium.spec(TASKS[task].gymnasium_id)
+    assert ours.max_episode_steps == theirs.max_episode_steps == TASKS[task].max_episode_steps
+    assert ours.reward_threshold == theirs.reward_threshold == TASKS[task].reward_threshold
     steps, seconds = re.search(r"[Tt]runcated after (\d+) steps\s\(([\d.]+) s\)", _section(task, "End")).groups()
     assert int(steps) == ours.max_episode_steps
     assert float(seconds) == pytest.approx(int(steps) * TASKS[task].step_duration)

@@ -7,12 +7,13 @@ import gymnasium
 import numpy as np
 import pytest
 
-from codrl_mj import TASKS, Uniform
+from codrl_mj import TASKS, Actuator, Ideal, Supply, Uniform, named_actuator
+from codrl_mj.actuators import IDEAL
 from codrl_mj.evaluation.episodes import RandomPolicy, load_episode, make_env, run_episodes, save_episode
-from codrl_mj.physics.base import TRACE_NAMES
+from codrl_mj.physics import signal_names, trace_names
 
-SIGNALS = ("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated")
-ARRAYS = ("time", "state", "observation", "action", "reward", "trace")
+ARRAYS = ("time", "state", "observation", "action", "reward")
+FAMILY = {"ideal": Ideal, "paper": Actuator, "weaker": Actuator}
 
 
 class Leaner:
@@ -35,8 +36,12 @@ def assert_same(first, second):
     """Two episodes are equal in every number."""
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)
-    for name in SIGNALS:
-        np.testing.assert_array_equal(first.signals[name], second.signals[name], err_msg=name)
+    for mapping in ("trace", "signals"):
+        one, other = getattr(first, mapping), getattr(second, mapping)
+        assert one.keys() == other.keys()
+        for name, values in one.items():
+            np.testing.assert_array_equal(values, other[name], err_msg=name)
+            assert values.dtype == other[name].dtype
     assert (first.terminated, first.actuator, first.command) == (second.terminated, second.actuator, second.command)
 
 
@@ -60,7 +65,7 @@ def test_episodes_are_those_of_stepping_one_environment_at_a_time(actuator):
         np.testing.assert_array_equal(episode.reward, rewards)
         assert episode.terminated is ended[0]
         assert episode.total == sum(rewards)
-        for name in SIGNALS:
+        for name in signal_names(FAMILY[actuator]):
             np.testing.assert_array_equal(episode.signals[name], [info[name] for info in infos], err_msg=name)
     assert len({len(episode.reward) for episode in together}) > 1  # they end at different times
 
@@ -86,10 +91,13 @@ def test_an_episodes_arrays_have_the_shapes_that_it_states(task, actuator):
         assert episode.state.shape == (7, len(definition.state_names))
         assert episode.observation.shape == (7, *definition.observation_space.shape)
         assert episode.action.shape == (6, *definition.action_space.shape)
-        assert set(episode.signals) == set(SIGNALS)
+        assert tuple(episode.signals) == signal_names(FAMILY[actuator])
         assert all(values.shape == (6,) for values in episode.signals.values())
+        assert tuple(episode.trace) == trace_names(FAMILY[actuator])
+        assert all(values.shape == (6 * episode.inner_steps,) for values in episode.trace.values())
         assert episode.signals["saturated"].dtype == bool
-        assert episode.signals["current"].any() == (actuator != "ideal")
+        if actuator != "ideal":
+            assert episode.signals["current"].any()
         assert not episode.terminated
 
 
@@ -167,14 +175,14 @@ def test_the_trace_has_every_integration_step_and_ends_each_step_with_its_signal
     for action in episode.action:
         env.step(action)
         expected.append(env.unwrapped.physics.trace.copy())
-    np.testing.assert_array_equal(episode.trace, np.concatenate(expected))
+    whole = np.stack(list(episode.trace.values()), axis=-1)
+    np.testing.assert_array_equal(whole[:, np.newaxis], np.concatenate(expected))
     assert (episode.inner_steps, episode.timestep) == (
         count,
         pytest.approx(TASKS[task].step_duration / count, rel=1e-15),
     )
-    last = episode.trace[count - 1 :: count]
     for name in ("actual_force", "current", "voltage", "saturated"):
-        np.testing.assert_array_equal(last[:, TRACE_NAMES.index(name)], episode.signals[name])
+        np.testing.assert_array_equal(episode.trace[name][count - 1 :: count], episode.signals[name])
 
 
 def test_episodes_know_what_was_drawn_for_them_and_what_was_commanded():
@@ -189,17 +197,20 @@ def test_episodes_know_what_was_drawn_for_them_and_what_was_commanded():
         assert info["randomization"]["motor.resistance"] == resistance
     assert {episode.command for episode in episodes} == {"current"}
     (ideal,) = run_episodes(Leaner(), cartpole("ideal"), 1)
-    assert (ideal.actuator, ideal.command) == (None, "force")
+    assert (ideal.actuator, ideal.command) == (IDEAL, "force")
 
 
 def test_analytic_physics_disturbed_runs_the_same_episodes():
-    options = {"disturbances": {"command_delay": 0.03, "current_bias": 0.1, "supply_resistance": 0.5}}
+    paper = named_actuator("paper", "cartpole").replaced(
+        {"controller.current_bias": 0.1, "supply": Supply(resistance=0.5)}
+    )
+    options = {"disturbances": {"command_delay": 0.03}, "max_episode_steps": 40}
     ours, theirs = (
-        run_episodes(Leaner(), cartpole("paper", physics=physics, max_episode_steps=40, **options), 3)
-        for physics in ("mujoco", "analytic")
+        run_episodes(Leaner(), cartpole(paper, physics=physics, **options), 3) for physics in ("mujoco", "analytic")
     )
     for one, other in zip(ours, theirs, strict=True):
-        np.testing.assert_allclose(one.trace, other.trace, rtol=0, atol=1e-9)
+        for name, values in one.trace.items():
+            np.testing.assert_allclose(values, other.trace[name], rtol=0, atol=1e-9, err_msg=name)
         np.testing.assert_allclose(one.state, other.state, rtol=0, atol=1e-9)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from codrl_mj import TASKS, Actuator, CurrentLoop, Motor, Uniform, named_actuator
+from codrl_mj.actuators import IDEAL
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import (
@@ -19,9 +20,10 @@ from codrl_mj.evaluation import (
     run_episodes,
     summarize,
 )
-from codrl_mj.physics.base import TRACE_CURRENT, TRACE_SPEED, TRACE_VOLTAGE
+from codrl_mj.physics import trace_names
 
-SIGNALS = ("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated")
+TRACE = trace_names(Actuator)
+ROW = ("actual_force", "current", "voltage", "speed", "saturated")
 ELECTRICAL = {
     "saturated_percent",
     "peak_voltage",
@@ -66,10 +68,11 @@ def made_up(task="cartpole", actuator=MOTOR, states=None, rows=(), reward=None, 
     definition = TASKS[task]
     steps = len(rows) if states is None else len(states) - 1
     states = np.zeros((steps + 1, len(definition.state_names))) if states is None else np.array(states, dtype=float)
-    trace = np.zeros((steps, 6)) if len(rows) == 0 else np.array([(0.0, *row) for row in rows])
-    inner_steps = len(trace) // steps
-    ends = trace[inner_steps - 1 :: inner_steps]
-    values = (ends[:, 1] if desired is None else np.array(desired, dtype=float), *ends[:, [1, 2, 2, 3, 5]].T)
+    rows = np.zeros((steps, len(ROW))) if len(rows) == 0 else np.array(rows, dtype=float)
+    trace = {name: np.zeros(len(rows)) for name in TRACE} | dict(zip(ROW, rows.T, strict=True))
+    inner_steps = len(rows) // steps
+    ends = {name: values[inner_steps - 1 :: inner_steps] for name, values in trace.items() if name != "speed"}
+    asked = ends["actual_force"] if desired is None else np.array(desired, dtype=float)
     return Episode(
         time=definition.step_duration * np.arange(1, steps + 1),
         state=states,
@@ -77,7 +80,7 @@ def made_up(task="cartpole", actuator=MOTOR, states=None, rows=(), reward=None, 
         action=np.zeros(steps),
         reward=np.ones(steps) if reward is None else np.array(reward),
         trace=trace,
-        signals=dict(zip(SIGNALS, values, strict=True)),
+        signals=ends | {"desired_force": asked},
         terminated=terminated,
         actuator=actuator,
     )
@@ -91,7 +94,7 @@ def test_returns_and_lengths_are_counted():
         made_up(rows=[(0, 0, 0, 0, 0)] * len(rewards), reward=rewards, terminated=over)
         for rewards, over in (([1.0, 2.0], True), ([0.0], False), ([5.0, 1.0, 4.0], True), ([-7.0], True))
     ]
-    summary = summarize("cartpole", Actuator(), episodes)
+    summary = summarize("cartpole", episodes)
     assert (summary.task, summary.episodes, summary.terminated) == ("cartpole", 4, 3)
     assert summary.returns.mean == (3 + 0 + 10 - 7) / 4
     assert summary.returns.low < summary.returns.mean < summary.returns.high
@@ -104,7 +107,7 @@ def test_returns_and_lengths_are_counted():
 
 def successes(task, *episodes):
     """Share that succeeds, and the quartiles of the time to the goal, of made-up (states, terminated)."""
-    summary = summarize(task, None, [made_up(task, None, states, terminated=over) for states, over in episodes])
+    summary = summarize(task, [made_up(task, IDEAL, states, terminated=over) for states, over in episodes])
     assert summary.failure.mean == pytest.approx(1 - summary.success.mean)
     times = np.array([time for time in summary.episode_times_to_goal if time is not None])
     assert len(times) == round(summary.success.mean * len(episodes))
@@ -167,7 +170,7 @@ def test_the_tracking_error_is_that_of_every_integration_step_in_torques_at_the_
             actuator=actuator, states=np.zeros((2, 4)), rows=[(f, 0, 0, 0, 0) for f in (9.0, 10.0)], desired=[10.0]
         ),
     ]
-    summary = summarize("cartpole", actuator, episodes)
+    summary = summarize("cartpole", episodes)
     error = math.sqrt((2.0**2 + 6.0**2 + 1.0**2) / 6) * ARM  # N*m; the steps' ends are without error
     assert summary.tracking_rms == pytest.approx(error, rel=1e-12)
     assert summary.tracking_percent == pytest.approx(100 * error / (10.0 * ARM), rel=1e-12)
@@ -177,34 +180,34 @@ def test_the_tracking_error_is_that_of_every_integration_step_in_torques_at_the_
 def test_tracking_is_weighed_over_all_steps_and_not_per_episode():
     nine_bad = made_up(rows=[(0, 0, 0, 0, 0)] * 9, desired=[1.0] * 9)
     one_good = made_up(rows=[(1.0, 0, 0, 0, 1)], desired=[1.0])
-    summary = summarize("cartpole", Actuator(), [nine_bad, one_good])
+    summary = summarize("cartpole", [nine_bad, one_good])
     assert summary.tracking_rms == pytest.approx(math.sqrt(0.9), rel=1e-12)
     assert summary.saturated_percent == pytest.approx(10.0, rel=1e-12)
 
 
 def test_a_desired_torque_of_zero_has_no_relative_error_and_no_delay():
-    summary = summarize("cartpole", Actuator(), [made_up(rows=[(0.5, 0, 0, 0, 0)] * 4, desired=[0.0] * 4)])
+    summary = summarize("cartpole", [made_up(rows=[(0.5, 0, 0, 0, 0)] * 4, desired=[0.0] * 4)])
     assert (summary.tracking_rms, summary.tracking_percent, summary.tracking_lag) == (0.5, None, None)
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.05, 0.15])
 def test_the_lag_of_an_ideal_actuator_is_the_delay_of_its_commands(delay):
-    env = EnvConfig(disturbances=Disturbances(command_delay=delay))
-    result = evaluate(RandomPolicy("pendulum"), "pendulum", "ideal", env, episodes=5)
+    env = EnvConfig("pendulum", "ideal", disturbances=Disturbances(command_delay=delay))
+    result = evaluate(RandomPolicy("pendulum"), env, episodes=5)
     assert result.tracking_lag == pytest.approx(delay, abs=0.001)  # noise beside the peak: 1/sqrt(1000) steps of 0.05 s
     assert (result.tracking_rms > 0) == (delay > 0)
 
 
 def test_the_ideal_actuator_tracks_perfectly_and_has_no_motor():
-    result = evaluate(Leaner(), "cartpole", "ideal", episodes=2)
+    result = evaluate(Leaner(), EnvConfig("cartpole", "ideal"), episodes=2)
     assert (result.tracking_rms, result.tracking_percent, result.tracking_max) == (0.0, 0.0, 0.0)
     assert all(getattr(result, name) is None for name in ELECTRICAL)
     assert result.mechanical_work.mean > 0
 
 
 def test_a_voltage_that_the_agent_commands_asks_for_no_torque():
-    env = EnvConfig(action="voltage", max_episode_steps=5)
-    result = evaluate(Constant(1.0), "pendulum", "paper", env, episodes=2)
+    env = EnvConfig("pendulum", action="voltage", max_episode_steps=5)
+    result = evaluate(Constant(1.0), env, episodes=2)
     assert result.tracking_rms is result.tracking_percent is result.tracking_max is result.tracking_lag is None
     assert result.peak_voltage == 1.0
 
@@ -218,8 +221,8 @@ def test_the_saturated_share_is_that_of_voltages_at_the_limit(max_voltage):
     actuator = Actuator(weaker.motor, CurrentLoop(kp=0.2, ki=0.2, kff=0.5, max_voltage=max_voltage))
     make = functools.partial(make_env, "cartpole", actuator, inner_steps=2)
     episodes = run_episodes(Leaner(), make, episodes=3)
-    voltages = np.concatenate([episode.trace[:, TRACE_VOLTAGE] for episode in episodes])
-    summary = summarize("cartpole", actuator, episodes)
+    voltages = np.concatenate([episode.trace["voltage"] for episode in episodes])
+    summary = summarize("cartpole", episodes)
     assert summary.saturated_percent == pytest.approx(100 * np.mean(np.abs(voltages) == max_voltage), rel=1e-12)
     assert summary.peak_voltage <= max_voltage
     assert (summary.saturated_percent > 0) == (max_voltage <= 1.0)
@@ -228,8 +231,8 @@ def test_the_saturated_share_is_that_of_voltages_at_the_limit(max_voltage):
 def test_a_stalled_motor_is_measured_as_its_closed_form_says():
     """No back-EMF, a constant voltage: i(k) = u/R*(1 - q^k) with q = 1 - R*dt/L; every sum below is geometric."""
     motor, voltage, steps, count = Motor(resistance=2.0, inductance=1.5, back_emf_constant=0.0), 0.5, 6, 20
-    env = EnvConfig(action="voltage", max_episode_steps=steps)
-    result = evaluate(Constant(voltage), "mountain_car_continuous", Actuator(motor), env, episodes=3)
+    env = EnvConfig("mountain_car_continuous", Actuator(motor), action="voltage", max_episode_steps=steps)
+    result = evaluate(Constant(voltage), env, episodes=3)
     dt, n, final = 1.0 / count, steps * count, voltage / motor.resistance
     q = 1 - motor.resistance * dt / motor.inductance
     ones, squares = (1 - q**n) / (1 - q), (1 - q ** (2 * n)) / (1 - q**2)
@@ -256,11 +259,11 @@ def test_electrical_energy_balances_to_rounding(task, actuator):
     resolved = named_actuator(actuator, task)
     make = functools.partial(make_env, task, resolved, max_episode_steps=60)
     episodes = run_episodes(RandomPolicy(task), make, episodes=2)
-    result, motor = summarize(task, resolved, episodes), resolved.motor
+    result, motor = summarize(task, episodes), resolved.motor
     balance = 2 * (result.energy_drawn.mean - result.energy_returned.mean - result.magnetic_energy.mean)
     for episode in episodes:
-        current = np.append(0.0, episode.trace[:, TRACE_CURRENT])
-        speeds = np.append(episode.state[0, ACTUATED_VELOCITY[task]], episode.trace[:-1, TRACE_SPEED])
+        current = np.append(0.0, episode.trace["current"])
+        speeds = np.append(episode.state[0, ACTUATED_VELOCITY[task]], episode.trace["speed"][:-1])
         mean = (current[1:] + current[:-1]) / 2
         back_emf = motor.back_emf_constant * speeds / motor.arm_radius
         balance -= np.sum((back_emf + motor.resistance * current[:-1]) * mean) * episode.timestep
@@ -272,8 +275,8 @@ def test_the_whole_energy_balance_closes_as_the_steps_shorten(task):
     """With kE = kT all that is drawn and not returned is heat, field or work, but for Euler's error of first order."""
     gaps, actuator = [], Actuator(Motor(), CurrentLoop(kp=2.0, ki=2.0))
     for timestep in (0.005, 0.0025, 0.00125):  # the winding's time constant is 0.1 s
-        env = EnvConfig(inner_steps=round(TASKS[task].step_duration / timestep), max_episode_steps=8)
-        result = evaluate(RandomPolicy(task), task, actuator, env, episodes=3)
+        env = EnvConfig(task, actuator, timestep=timestep, max_episode_steps=8)
+        result = evaluate(RandomPolicy(task), env, episodes=3)
         spent = result.copper_loss.mean + result.magnetic_energy.mean + result.mechanical_work.mean
         gaps.append(result.energy_drawn.mean - result.energy_returned.mean - spent)
     coarse, middle, fine = map(abs, gaps)
@@ -287,7 +290,7 @@ def test_work_and_peaks_are_those_of_the_shaft():
     rows = [(3.0, 1.0, 6.0, 0.5, 0), (1.0, -4.0, -7.0, -0.8, 1)]  # force, current, voltage, speed, saturated
     states = [[0.0, -0.9, 0.0, 0.0]] * 3  # before the first step the cart moves at -0.9 m/s
     episodes = [made_up(actuator=Actuator(motor), states=states, rows=rows)] * 2
-    result = summarize("cartpole", Actuator(motor), episodes)
+    result = summarize("cartpole", episodes)
     dt = 0.02
     assert result.mechanical_work.mean == pytest.approx((3.0 * -0.2 + 1.0 * -0.15) * dt, rel=1e-12)
     assert result.energy_drawn.mean == pytest.approx((6.0 * 0.5 + -7.0 * -1.5) * dt, rel=1e-12)
@@ -298,29 +301,28 @@ def test_work_and_peaks_are_those_of_the_shaft():
 
 def test_a_motor_that_brakes_returns_energy():
     rows = [(0, 2.0, 5.0, 0, 0), (0, 2.0, -3.0, 0, 0)]
-    result = summarize("cartpole", Actuator(), [made_up(rows=rows)])
+    result = summarize("cartpole", [made_up(rows=rows)])
     assert result.energy_drawn.mean == pytest.approx(5.0 * 1.0 * 0.02)
     assert result.energy_returned.mean == pytest.approx(3.0 * 2.0 * 0.02)
 
 
 def test_every_episode_is_measured_with_the_motor_that_was_drawn_for_it():
     drawn = {"motor.resistance": Uniform(0.5, 3.0), "motor.arm_radius": Uniform(0.5, 2.0)}
-    env = EnvConfig(max_episode_steps=20, randomize=drawn)
-    result = evaluate(RandomPolicy("pendulum"), "pendulum", "weak", env, episodes=3)
-    make = functools.partial(make_env, "pendulum", "weak", randomize=drawn, max_episode_steps=20)
-    episodes = run_episodes(RandomPolicy("pendulum"), make, 3)
+    env = EnvConfig("pendulum", "weak", max_episode_steps=20, randomize=drawn)
+    result = evaluate(RandomPolicy("pendulum"), env, episodes=3)
+    episodes = run_episodes(RandomPolicy("pendulum"), env.make, 3)
     arms = [episode.actuator.motor.arm_radius for episode in episodes]
     assert len(set(arms)) == 3
     errors = [
-        arm * (np.repeat(e.signals["desired_force"], e.inner_steps) - e.trace[:, 1])
+        arm * (np.repeat(e.signals["desired_force"], e.inner_steps) - e.trace["actual_force"])
         for arm, e in zip(arms, episodes, strict=True)
     ]
     assert result.tracking_max == pytest.approx(np.abs(errors).max(), rel=1e-12)
-    fastest = [max(abs(e.state[0, 1]), np.abs(e.trace[:, TRACE_SPEED]).max()) for e in episodes]
+    fastest = [max(abs(e.state[0, 1]), np.abs(e.trace["speed"]).max()) for e in episodes]
     assert result.peak_speed == pytest.approx(max(np.array(fastest) / arms), rel=1e-12)
     motors = [episode.actuator.motor for episode in episodes]
     heats = [
-        summarize("pendulum", e.actuator, [e]).rms_current ** 2 * motor.resistance * e.time[-1]
+        summarize("pendulum", [e]).rms_current ** 2 * motor.resistance * e.time[-1]
         for e, motor in zip(episodes, motors, strict=True)
     ]
     assert result.copper_loss.mean == pytest.approx(np.mean(heats), rel=1e-12)
@@ -330,16 +332,16 @@ def test_every_episode_is_measured_with_the_motor_that_was_drawn_for_it():
 
 
 def test_an_evaluation_is_the_summary_of_its_episodes_and_says_what_it_was_measured_under():
-    env = EnvConfig(physics="analytic", inner_steps=2, disturbances=Disturbances(current_bias=0.2))
-    result = evaluate(Leaner(), "cartpole", "weaker", env, episodes=3, seed=9)
-    make = functools.partial(make_env, "cartpole", "weaker", **env.as_arguments())
-    actuator = named_actuator("weaker", "cartpole")
-    expected = summarize("cartpole", actuator, run_episodes(Leaner(), make, 3, seed=9))
+    actuator = named_actuator("weaker", "cartpole").replaced({"controller.current_bias": 0.2})
+    late = {"command_delay": 0.01}
+    env = EnvConfig("cartpole", actuator, "analytic", inner_steps=2, disturbances=late)
+    result = evaluate(Leaner(), env, episodes=3, seed=9)
+    make = functools.partial(make_env, "cartpole", actuator, physics="analytic", inner_steps=2, disturbances=late)
+    expected = summarize("cartpole", run_episodes(Leaner(), make, 3, seed=9))
     for name in MEASURES:
         assert getattr(result, name) == getattr(expected, name), name
     conditions = result.conditions
-    assert Actuator.from_mapping(conditions["actuator"]) == actuator
-    assert EnvConfig(**conditions["env"]) == env
+    assert EnvConfig.from_mapping(conditions["env"]) == env
     assert (conditions["seed"], conditions["deterministic"]) == (9, True)
 
 
@@ -347,14 +349,14 @@ def test_sampled_evaluations_repeat_with_their_seed():
     from stable_baselines3 import PPO
 
     policy = PPO("MlpPolicy", make_env("cartpole", "paper"), n_steps=8, batch_size=8, seed=0, device="cpu").policy
-    run = functools.partial(evaluate, policy, "cartpole", "paper", episodes=4, deterministic=False)
+    run = functools.partial(evaluate, policy, EnvConfig("cartpole"), episodes=4, deterministic=False)
     assert run(seed=3) == run(seed=3)
     assert run(seed=3).returns != run(seed=4).returns
-    assert run(seed=3).returns != evaluate(policy, "cartpole", "paper", episodes=4, seed=3).returns
+    assert run(seed=3).returns != evaluate(policy, EnvConfig("cartpole"), episodes=4, seed=3).returns
 
 
 def test_an_evaluation_is_json_with_a_unit_for_every_measure():
-    result = evaluate(Constant(0.4), "pendulum", "weak", EnvConfig(max_episode_steps=30), episodes=2)
+    result = evaluate(Constant(0.4), EnvConfig("pendulum", "weak", max_episode_steps=30), episodes=2)
     mapping = result.as_mapping()
     assert json.loads(json.dumps(mapping)) == mapping
     assert mapping["returns"] == {"mean": result.returns.mean, "low": result.returns.low, "high": result.returns.high}
@@ -368,10 +370,10 @@ def test_an_evaluation_is_json_with_a_unit_for_every_measure():
 
 def test_bad_arguments_are_named():
     with pytest.raises(ValueError, match="did you mean 'cartpole'"):
-        evaluate(Leaner(), "cartpol")
+        EnvConfig("cartpol")
     with pytest.raises(ValueError, match="unknown actuator 'papr'"):
-        evaluate(Leaner(), "cartpole", "papr")
+        EnvConfig("cartpole", "papr")
     with pytest.raises(ValueError, match="episodes = 0"):
-        evaluate(Leaner(), "cartpole", episodes=0)
+        evaluate(Leaner(), EnvConfig("cartpole"), episodes=0)
     with pytest.raises(ValueError, match="seed = -1"):
-        evaluate(Leaner(), "cartpole", seed=-1)
+        evaluate(Leaner(), EnvConfig("cartpole"), seed=-1)

@@ -1,12 +1,13 @@
 """Files appear whole or not at all."""
 
 import errno
+import json
 import os
 import stat
 
 import pytest
 
-from codrl_mj.runs.files import read_json, write_json, writing
+from codrl_mj.runs.files import read_json, sealed, write_json, writing
 
 
 @pytest.mark.parametrize(
@@ -109,6 +110,42 @@ def test_json_survives_the_round_trip(tmp_path):
     content = {"text": "ω [rad/s]", "list": [1, 2.5, None, True], "nested": {"limit": float("inf")}, "small": 1e-17}
     write_json(tmp_path / "a.json", content)
     assert read_json(tmp_path / "a.json", "thing") == content
+
+
+CONTENT = {"b": {"limit": float("inf"), 10: (1, 2.5), 9: None}, "a": [float("nan"), "ω"], "seed": 3}
+
+
+def test_what_is_sealed_is_read_as_it_was_and_its_order_does_not_matter(tmp_path):
+    write_json(tmp_path / "plain.json", CONTENT)
+    write_json(tmp_path / "sealed.json", sealed(CONTENT))
+    content = json.loads((tmp_path / "sealed.json").read_text())
+    write_json(tmp_path / "turned.json", dict(reversed(content.items())))
+    plain, read, turned = (read_json(tmp_path / f"{name}.json", "thing") for name in ("plain", "sealed", "turned"))
+    assert repr(read) == repr(plain)  # NaN is not equal to itself
+    assert sorted(turned) == sorted(plain)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda content: content.update(seed=4),
+        lambda content: content.update(surplus=1),
+        lambda content: content.pop("seed"),
+        lambda content: content["b"].update(limit=1.0),
+        lambda content: content["a"].reverse(),
+        lambda content: content.update(sha256=content["sha256"][:-1]),
+        lambda content: content.update(sha256=7),
+    ],
+)
+def test_what_is_sealed_and_was_changed_is_refused_until_its_seal_is_deleted(tmp_path, change):
+    path, content = tmp_path / "a.json", sealed(CONTENT)
+    change(content)
+    write_json(path, content)
+    with pytest.raises(ValueError, match=r"a\.json is not the thing that was written: .* delete its entry sha256 if"):
+        read_json(path, "thing")
+    del content["sha256"]
+    write_json(path, content)
+    assert repr(read_json(path, "thing")) == repr(content)
 
 
 def test_content_that_is_no_json_leaves_no_file(tmp_path):

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-HEAVY = ("mujoco", "numba", "llvmlite", "torch", "stable_baselines3", "matplotlib", "imageio", "scipy", "tyro", "rich")
+HEAVY = ("numba", "llvmlite", "torch", "stable_baselines3", "matplotlib", "imageio", "scipy", "tyro", "rich")
 CLEAN = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL")}
 
 
@@ -33,7 +33,7 @@ def test_importing_the_package_registers_every_environment():
 
 
 def test_importing_the_motor_imports_no_engine():
-    program = "import sys, codrl_mj.motor; print([n for n in ('mujoco', 'numba', 'torch') if n in sys.modules])"
+    program = "import sys, codrl_mj.actuators; print([n for n in ('numba', 'torch') if n in sys.modules])"
     assert _python(program) == "[]"
 
 

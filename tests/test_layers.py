@@ -12,59 +12,70 @@ PACKAGE = Path(__file__).parent.parent / "codrl_mj"
 
 ALLOWED = {
     # a layer: a room, a module at the top, or a module that stands lower than its room -> the layers it may import
-    "motor": set(),
-    "disturbances": {"motor"},
-    "tasks": set(),
-    "callbacks": {"motor"},
-    "physics": {"motor", "disturbances", "callbacks", "tasks"},
-    "envs.registration": set(),
+    "fields": set(),
+    "actuators": {"fields"},
+    "disturbances": {"actuators", "fields"},
+    "tasks": {"actuators"},
+    "plugin": set(),
+    "__init__": {"plugin", "tasks"},
+    "engine": {"actuators", "plugin"},
+    "specs": {"actuators", "engine", "plugin"},
+    "physics": {"actuators", "disturbances", "engine", "tasks"},
     "envs.distributions": set(),
-    "envs.config": {"disturbances", "envs.distributions"},
-    "envs": {"tasks", "physics", "motor", "disturbances", "envs.distributions", "envs.registration"},
-    "__init__": {"envs.registration"},
-    "suite": {"envs", "envs.registration", "motor", "physics", "tasks"},
-    "agents": {"envs", "envs.config", "physics"},
+    "envs.config": {"actuators", "disturbances", "envs.distributions", "fields", "tasks"},
+    "envs": {
+        *("actuators", "disturbances", "engine", "envs.config", "envs.distributions", "physics", "tasks"),
+    },
+    "suite": {"actuators", "envs", "envs.config", "physics", "tasks"},
+    "agents": {"actuators", "envs", "envs.config", "fields", "physics"},
     "runs.files": set(),
-    "runs.summaries": {"runs.files", "motor"},
-    "runs.policies": {"runs.files", "agents"},
+    "runs.layout": set(),
+    "runs.summaries": {"actuators", "envs.config", "runs.files", "runs.layout", "tasks"},
+    "runs.policies": {"actuators", "agents", "runs.files", "runs.layout"},
     "runs": set(),
     "evaluation.measures": set(),
     "evaluation": {
-        *("envs", "envs.config", "envs.registration", "evaluation.measures", "motor", "physics", "runs.files"),
-        *("runs.policies", "tasks"),
+        *("actuators", "envs", "envs.config", "evaluation.measures", "physics", "runs.files", "runs.policies", "tasks"),
     },
-    "films": {"envs", "evaluation", "motor", "physics", "runs.files"},
+    "films": {"actuators", "envs", "envs.config", "evaluation", "physics", "runs.files"},
     "training": {
-        *("agents", "disturbances", "envs", "envs.config", "envs.registration", "evaluation", "motor", "runs.files"),
-        *("runs.policies", "tasks"),
+        *("actuators", "agents", "disturbances", "envs", "envs.config", "evaluation", "runs.files", "runs.layout"),
+        *("runs.policies", "tasks", "fields"),
     },
-    "validation": {"callbacks", "motor", "physics", "runs.files", "tasks"},
+    "validation": {"actuators", "engine", "physics", "runs.files", "tasks"},
     "study": {
-        *("disturbances", "envs.config", "envs.registration", "evaluation", "evaluation.measures", "films", "motor"),
-        *("physics", "runs.files", "runs.policies", "tasks", "training"),
+        *("actuators", "disturbances", "envs.config", "evaluation", "evaluation.measures", "films", "runs.files"),
+        *("runs.policies", "tasks", "training"),
     },
     "rl_zoo3": set(),
-    "__main__": {"cli"},
     "cli": {
-        *("agents", "disturbances", "envs.config", "envs.registration", "evaluation", "evaluation.measures", "films"),
-        *("motor", "runs.files", "runs.policies", "runs.summaries", "study", "training", "validation"),
+        *("actuators", "agents", "disturbances", "envs.config", "evaluation", "evaluation.measures", "fields", "films"),
+        *("runs.files", "runs.layout", "runs.policies", "runs.summaries", "study", "tasks", "training", "validation"),
     },
+    "__main__": {"cli"},
 }
 FOREIGN = {
     # room or module: what it may import besides the standard library
-    "motor": {"numpy"},
+    "fields": set(),
+    "actuators": {"numpy", "yaml"},
+    "disturbances": {"numpy"},
+    "tasks": {"numpy", "gymnasium"},
+    "plugin": {"mujoco"},
+    "engine": {"mujoco", "numba", "llvmlite", "numpy"},
+    "specs": {"mujoco", "numpy"},
+    "physics": {"mujoco", "numba", "numpy", "gymnasium"},
+    "envs.distributions": {"numpy"},
+    "envs.config": {"gymnasium"},
+    "envs": {"gymnasium", "numpy", "numba", "mujoco", "stable_baselines3"},
     "evaluation.measures": {"numpy", "scipy"},
     "runs.files": set(),
     "runs.summaries": set(),
-    "disturbances": {"numpy"},
-    "envs.distributions": {"numpy"},
-    "envs.registration": {"gymnasium"},
-    "tasks": {"numpy", "numba", "gymnasium"},
-    "callbacks": {"mujoco", "numba", "llvmlite", "numpy"},
-    "physics": {"mujoco", "numba", "numpy", "gymnasium"},
-    "envs": {"gymnasium", "numpy", "numba", "mujoco", "stable_baselines3"},
 }
-GYMNASIUM_IN_TASKS = {"gymnasium.spaces", "gymnasium.envs.classic_control.utils"}
+GYMNASIUM_IN_TASKS = {
+    "gymnasium.spaces",
+    "gymnasium.envs.classic_control.utils",
+    "gymnasium.envs.registration",
+}
 
 
 def _layer(module):
@@ -110,8 +121,8 @@ EVERY_FILE = sorted(PACKAGE.rglob("*.py"))
 
 def test_the_reader_sees_what_is_there():
     """The oracle itself: known imports are found."""
-    assert {"motor", "callbacks", "tasks"} <= set().union(*map(_ours, _files("physics")))
-    assert "mujoco" in set(_modules(PACKAGE / "callbacks" / "kernels.py"))
+    assert {"actuators", "engine", "tasks"} <= set().union(*map(_ours, _files("physics")))
+    assert "mujoco" in set(_modules(PACKAGE / "engine" / "control.py"))
     assert len(EVERY_FILE) > 20
 
 
@@ -140,9 +151,9 @@ def test_a_layer_imports_only_its_own_libraries(layer):
         assert roots <= FOREIGN[layer], path
 
 
-def test_tasks_take_from_gymnasium_only_its_spaces_and_its_reset_bounds():
+def test_tasks_take_from_gymnasium_only_spaces_reset_bounds_and_its_registry():
     for path in _files("tasks"):
-        names = {name for name in _modules(path) if name.startswith("gymnasium")}
+        names = {name for name in _modules(path) if name.startswith("gymnasium.")}  # twins make environments
         packages = {name for other in GYMNASIUM_IN_TASKS for name in (other.rpartition(".")[0],)}
         assert all(name in packages or any(name.startswith(good) for good in GYMNASIUM_IN_TASKS) for name in names), (
             path
@@ -160,8 +171,8 @@ def test_nothing_hides_an_import_behind_type_checking():
         assert "TYPE_CHECKING" not in path.read_text(), path
 
 
-def test_only_callbacks_touch_raw_memory():
+def test_only_the_engines_room_touches_raw_memory():
     for path in EVERY_FILE:
-        if "callbacks" not in path.parts:
+        if "engine" not in path.parts:
             assert not re.search(r"\._address\b", path.read_text()), path  # of mjModel and mjData
             assert "llvmlite" not in path.read_text(), path

@@ -1,8 +1,10 @@
 """Policies as files: they predict what the model predicted, and nothing in them is executed."""
 
 import dataclasses
+import hashlib
 import json
 import pickle
+import random
 from pathlib import Path
 
 import gymnasium
@@ -15,6 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from codrl_mj.agents import AGENTS, PPOConfig
 from codrl_mj.runs.policies import load_policy, load_sb3_zip, save_policy
+from tests.damage import damage
 
 WEIGHTS, DESCRIPTION = "policy.safetensors", "policy.json"
 
@@ -61,6 +64,15 @@ def folder(tmp_path):
     """A folder with a policy."""
     save(make_model(), tmp_path)
     return tmp_path
+
+
+@pytest.fixture
+def older(folder):
+    """The same as it was before there were digests, so that nothing but its content can be wrong."""
+    path = folder / DESCRIPTION
+    kept = ("format", "agent", "observation_space", "action_space")
+    path.write_text(json.dumps({name: json.loads(path.read_text())[name] for name in kept}))
+    return folder
 
 
 def observations(count=200):
@@ -203,38 +215,82 @@ def test_json_of_another_format_is_named(folder, content):
     ],
     ids=str,
 )
-def test_a_description_with_a_wrong_field_is_named(folder, field, value):
-    path = folder / DESCRIPTION
+def test_a_description_with_a_wrong_field_is_named(older, field, value):
+    path = older / DESCRIPTION
     path.write_text(json.dumps(json.loads(path.read_text()) | {field: value}))
-    assert DESCRIPTION in refused(folder)
+    assert f"{DESCRIPTION} does not describe a policy" in refused(older)
 
 
 @pytest.mark.parametrize("field", ["agent", "observation_space", "action_space"])
-def test_a_description_without_a_field_is_named(folder, field):
-    path = folder / DESCRIPTION
+def test_a_description_without_a_field_is_named(older, field):
+    path = older / DESCRIPTION
     path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != field}))
-    assert str(path) in refused(folder)
+    assert f"{path} does not describe a policy" in refused(older)
 
 
-def test_weights_with_other_names_are_named(folder):
-    save_file({"weight": torch.zeros(3)}, folder / WEIGHTS)
-    assert str(folder / WEIGHTS) in refused(folder)
+def test_weights_with_other_names_are_named(older):
+    save_file({"weight": torch.zeros(3)}, older / WEIGHTS)
+    assert f"{older / WEIGHTS} and {DESCRIPTION} do not belong together" in refused(older)
 
 
-def test_weights_of_another_shape_are_named(folder):
+@pytest.mark.parametrize("digests", [True, False])
+def test_weights_of_another_shape_are_named(request, folder, digests):
+    if not digests:
+        request.getfixturevalue("older")
     wider = dataclasses.replace(SMALL, hidden=(16, 16))
     save(make_model(agent=wider), folder / "other", wider)
     (folder / "other" / WEIGHTS).replace(folder / WEIGHTS)
     message = refused(folder)
     assert str(folder / WEIGHTS) in message
     assert "do not belong together" in message
+    assert ("sha256" in message) == digests
 
 
-def test_weights_that_are_not_numbers_are_named(folder):
-    tensors = load_file(folder / WEIGHTS)
+def test_weights_that_are_not_numbers_are_named(older):
+    tensors = load_file(older / WEIGHTS)
     tensors["action_net.bias"][0] = torch.nan
-    save_file(tensors, folder / WEIGHTS)
-    assert str(folder / WEIGHTS) in refused(folder)
+    save_file(tensors, older / WEIGHTS)
+    assert f"{older / WEIGHTS} holds weights that are not finite" in refused(older)
+
+
+def test_a_policy_from_before_there_were_digests_is_loaded(older):
+    expected, _ = make_model().predict(observations(), deterministic=True)
+    np.testing.assert_array_equal(load_policy(older).predict(observations(), deterministic=True)[0], expected)
+
+
+def test_the_digest_of_the_weights_is_the_one_that_sha256sum_prints(folder):
+    described = json.loads((folder / DESCRIPTION).read_text())
+    assert described["weights_sha256"] == hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
+
+
+def content_of(policy):
+    """All that a policy is, as text and bytes."""
+    weights = {name: tensor.numpy().tobytes() for name, tensor in policy.state_dict().items()}
+    return weights, repr((policy.observation_space, policy.action_space)), repr(policy)
+
+
+@pytest.mark.parametrize("name", [DESCRIPTION, WEIGHTS])
+def test_a_policy_damaged_in_a_few_bytes_is_refused_or_is_what_it_was(folder, name):
+    random_ = random.Random(0)
+    path, expected = folder / name, content_of(load_policy(folder))
+    whole, refusals = path.read_bytes(), 0
+    for _ in range(150):
+        damaged = damage(whole, random_)
+        path.write_bytes(damaged)
+        try:
+            assert content_of(load_policy(folder)) == expected  # such as a space for a line break in the JSON
+        except ValueError as error:
+            assert str(folder) in str(error)  # noqa: PT017 - most of them raise, not all
+            refusals += 1
+    assert refusals >= 100
+    assert name == DESCRIPTION or refusals == 150  # of the weights every byte counts
+
+
+@pytest.mark.parametrize("entry", ["sha256", "weights_sha256"])
+def test_a_digest_whose_name_is_damaged_is_noticed(folder, entry):
+    path = folder / DESCRIPTION
+    path.write_text(path.read_text().replace(f'"{entry}"', '"sha257"'))
+    assert str(path) in refused(folder)
 
 
 class Executed:

@@ -1,6 +1,7 @@
 """What the README tells a reader to type works as it stands."""
 
 import contextlib
+import csv
 import re
 import shlex
 from pathlib import Path
@@ -18,12 +19,14 @@ def test_the_python_examples_run(capsys):
     namespace = {}
     for block in blocks:
         exec(compile(block, "README.md", "exec"), namespace)  # one after the other, as a reader would
-    desired, actual, current, voltage, saturated = capsys.readouterr().out.split()
+    of_the_step, of_the_model = capsys.readouterr().out.splitlines()
+    desired, actual, current, voltage, saturated = of_the_step.split()
     assert float(desired) == 10.0
     assert 0 < float(actual) < float(desired)  # the weak loop's first step
     assert float(current) > 0
     assert float(voltage) > 0
     assert saturated == "False"
+    assert float(of_the_model.strip("[]")) > 0
     for name in ("envs", "vec_env", "env"):
         namespace[name].close()
 
@@ -36,6 +39,17 @@ def test_the_commands_are_understood(command, monkeypatch):
     with contextlib.suppress(SystemExit):
         assert cli.main(shlex.split(command)) == 0
     assert len(parsed) == 1
+
+
+def test_of_the_papers_claims_as_many_are_confirmed_as_the_results_say():
+    results, outcomes = Path(__file__).parent.parent / "docs" / "results", {}
+    with (results / "reproduction" / "claims.csv").open(newline="") as file:
+        for row in csv.DictReader(file):
+            if row["source"] == "paper":  # on one kind of physics or both
+                outcomes.setdefault((row["task"], row["statement"], row["measure"]), set()).add(row["verdict"])
+    confirmed = sum(found == {"confirmed"} for found in outcomes.values())
+    assert f"{confirmed} of {len(outcomes)} are confirmed." in README
+    assert f"| the paper | {confirmed} | {len(outcomes) - confirmed} | 0 |" in (results / "reproduction.md").read_text()
 
 
 def test_every_file_that_it_links_exists():

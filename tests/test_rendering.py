@@ -10,13 +10,14 @@ from PIL import Image
 from codrl_mj import TASKS, Actuator, Motor, named_actuator
 from codrl_mj.evaluation import Episode, RandomPolicy, make_env, run_episodes
 from codrl_mj.films.film import Panel, film
+from codrl_mj.physics import signal_names
 from codrl_mj.physics.offscreen import OffscreenRenderer
 
 WIDTH, HEIGHT = 200, 120
 FRAME_HEIGHT = 40 + HEIGHT + 24 + 120 + 8 + 60 + 26  # title, scene, and the strip's legend, plots and time axis
 PLOT_TOP = 40 + HEIGHT + 24
 DESIRED, ACTUAL, SATURATED, VOLTAGE = (0, 114, 178), (213, 94, 0), (204, 121, 167), (0, 158, 115)
-SIGNALS = ("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated")
+SIGNALS = signal_names(Actuator)
 
 
 def played(task="cartpole", actuator="weaker", steps=20, seed=1):
@@ -32,7 +33,7 @@ def made_up(desired, actual, *, saturated=False, arm=1.0, steps=40, terminated=F
     values = (desired, actual, actual, desired, 0.0, saturated)
     signals = {name: np.full(steps, value) for name, value in zip(SIGNALS, values, strict=True)}
     states = np.zeros((steps + 1, 4)) if states is None else states
-    actuator, trace, time = Actuator(Motor(arm_radius=arm)), np.zeros((steps, 6)), 0.02 * np.arange(1, steps + 1)
+    actuator, trace, time = Actuator(Motor(arm_radius=arm)), {"speed": np.zeros(steps)}, 0.02 * np.arange(1, steps + 1)
     episode = Episode(time, states, states, np.zeros(steps), np.ones(steps), trace, signals, terminated, actuator)
     return Panel("made up", "cartpole", actuator, episode)
 

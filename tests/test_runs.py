@@ -8,6 +8,7 @@ import pytest
 import tyro
 
 from codrl_mj import Actuator, CurrentLoop, Motor, named_actuator
+from codrl_mj.actuators import mapping_of
 from codrl_mj.cli.runs import Runs
 from codrl_mj.runs.summaries import SORT_KEYS, compare, find_runs, read_run, sort_runs
 
@@ -21,7 +22,7 @@ def make_run(folder, actuator="weaker", *, seed=3, task="cartpole", finished=Tru
     motor = named_actuator(actuator, task) if isinstance(actuator, str) else actuator
     config = {
         "task": task,
-        "actuator": None if motor is None else motor.as_mapping(),
+        "actuator": mapping_of(motor),
         "agent": {"name": "ppo", "learning_rate": 1e-3, "hidden": [64, 64]},
         "seed": seed,
         "total_steps": 4000,
@@ -188,8 +189,8 @@ def test_a_comparison_has_the_settings_that_differ_and_every_result(tmp_path):
     assert comparison.names == ("a", "b", "c")
     assert comparison.configuration == {
         "seed": (1, 2, 2),
-        "actuator": ("weaker", "custom", "custom"),
-        "actuator.controller.ki": (0.2, 0.3, 0.3),
+        "env.actuator": ("weaker", "custom", "custom"),
+        "env.actuator.controller.ki": (0.2, 0.3, 0.3),
         "num_envs": (None, 8, 8),
     }
     assert comparison.results["state"] == ("finished", "finished", "unfinished")
@@ -204,7 +205,7 @@ def test_a_comparison_has_the_settings_that_differ_and_every_result(tmp_path):
 
 def test_beside_an_ideal_actuator_no_field_of_another_is_listed(tmp_path):
     runs = [read_run(make_run(tmp_path / name, name)) for name in ("ideal", "weaker")]
-    assert compare(runs).configuration == {"actuator": ("ideal", "weaker")}
+    assert compare(runs).configuration == {"env.actuator": ("ideal", "weaker")}
 
 
 # -- codrl-mj runs ------------------------------------------------------------------------------------------
@@ -237,7 +238,7 @@ def test_the_verb_compares_runs(tmp_path, capsys, monkeypatch):
     text = capsys.readouterr().out
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert "seed 1 50" in lines
-    assert "actuator ideal weaker" in lines
+    assert "env.actuator ideal weaker" in lines
     assert "evaluation.returns 401 [380, 420] 450 [380, 420]" in lines
     comparison = json.loads((tmp_path / "both.json").read_text())
     assert comparison["names"] == ["a", "b"]

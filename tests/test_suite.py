@@ -1,6 +1,7 @@
 """The dm_control face: dm_env's contract, and the Gymnasium environment bit for bit."""
 
 import copy
+import dataclasses
 import importlib.util
 import pickle
 import re
@@ -16,11 +17,12 @@ from dm_control.suite.wrappers import pixels
 from dm_env import specs, test_utils
 
 from codrl_mj import suite
-from codrl_mj.envs.registration import ENVIRONMENTS
-from codrl_mj.motor import NAMED, Actuator, CurrentLoop, Motor
+from codrl_mj.actuators import NAMED, Actuator, CurrentLoop, Motor
+from codrl_mj.engine.families import slot_size
+from codrl_mj.envs.views import View
 from codrl_mj.physics import SimulationDivergedError
 from codrl_mj.tasks import TASKS
-from tests.callbacks.models import FULL, changed
+from tests.engine.models import FULL, changed
 
 VOLTAGES = (-12.0, -1.0, 0.0, 12.0)
 MOTOR = changed(FULL, inductance=0.2, max_voltage=20.0)
@@ -45,7 +47,7 @@ def _contract(domain, task_name, options):
 
         def make_action_sequence(self):
             spec, generator = self.environment.action_spec(), np.random.default_rng(0)
-            for _ in range(ENVIRONMENTS[domain].max_episode_steps + 5):
+            for _ in range(TASKS[domain].max_episode_steps + 5):
                 if isinstance(spec, specs.DiscreteArray):
                     yield spec.dtype.type(generator.integers(spec.num_values))
                 else:
@@ -75,7 +77,7 @@ def test_every_task_is_offered():
 def _pair(task, seed, environment_kwargs=None, **options):
     return (
         suite.load(task, task_kwargs={"random": seed}, environment_kwargs=environment_kwargs, **options),
-        gymnasium.make(ENVIRONMENTS[task].env_id, disable_env_checker=True, **options),
+        gymnasium.make(TASKS[task].env_id, disable_env_checker=True, **options),
     )
 
 
@@ -123,7 +125,7 @@ def test_episodes_are_those_of_the_gymnasium_environment(task, case):
         np.testing.assert_array_equal(ours.physics.data.qpos, theirs.unwrapped.data.qpos)
         np.testing.assert_array_equal(ours.physics.data.act, theirs.unwrapped.data.act)
         assert timestep.reward == reward
-        assert ours.physics.signals._asdict() == info
+        assert ours.physics.signals == info
         assert timestep.last() == (terminated or truncated)
         assert timestep.discount == (0.0 if terminated else 1.0)
         if timestep.last():  # the next episode continues the random stream
@@ -181,24 +183,23 @@ def test_a_goal_is_an_end_without_a_future(task):
 # -- the time limit -----------------------------------------------------------------------------------------
 
 
-class _Endless:
-    """A task's set-up that never ends an episode."""
-
-    def __init__(self, setup):
-        self._setup = setup
-
-    def __getattr__(self, name):
-        return getattr(self._setup, name)
+class _Endless(View):
+    """A view of a task that never ends an episode."""
 
     def terminated(self, state):  # noqa: ARG002
         return False
+
+
+def _endless(setup):
+    view = setup.view
+    return dataclasses.replace(setup, view=_Endless(view.task, view.options, view.sensors))
 
 
 @every_task
 @pytest.mark.parametrize("inner_steps", [None, 19, 49, 73])  # quotients that rounding lifts over the limit
 def test_an_episode_has_exactly_the_steps_of_gymnasiums(task, inner_steps):
     env = suite.load(task, actuator="ideal", inner_steps=inner_steps)
-    env.task.setup = _Endless(env.task.setup)
+    env.task.setup = _endless(env.task.setup)
     env.physics.simulation.step = env.task.after_step = env.task.get_reward = lambda _: None  # only the count matters
     action = env.action_spec().generate_value()
     for _ in range(2):
@@ -252,7 +253,7 @@ DUPLICATES = {
 def test_a_copy_of_the_environment_continues_bit_for_bit(task, duplicate, options):
     env = suite.load(task, task_kwargs={"random": 0}, **options)
     env.reset()
-    actions = _actions(env.task.setup.action_space, 24, 1)
+    actions = _actions(env.task.setup.commands.action_space, 24, 1)
     env.step(actions[0])
     before = _whole(env.physics)
     if duplicate == "pickle":  # an environment of dm_control's is not made to be pickled, its physics is
@@ -321,7 +322,7 @@ def test_a_copys_model_is_the_one_that_it_simulates():
 def test_a_restored_state_continues_as_it_did_at_whatever_time_it_is_restored(task, ahead):
     """Into a simulation whose own clock is behind, equal or ahead: the motor's tick depends on the time."""
     env = suite.load(task, actuator=MOTOR, task_kwargs={"random": 0}, inner_steps=20)
-    actions = _actions(env.task.setup.action_space, 12, 2)
+    actions = _actions(env.task.setup.commands.action_space, 12, 2)
     env.reset()
     for action in actions[:5]:
         env.step(action)
@@ -360,7 +361,8 @@ def test_a_restored_state_is_exact_one_integration_step_early():
 
 def test_a_state_of_another_size_is_refused_and_parts_can_be_asked_for():
     physics = suite.load("cartpole").physics
-    with pytest.raises(ValueError, match=r"physics_state has shape \(3,\), must be \(13,\)"):
+    size = 1 + 2 + 2 + slot_size(Actuator)  # time, positions, velocities, motor
+    with pytest.raises(ValueError, match=rf"physics_state has shape \(3,\), must be \({size},\)"):
         physics.set_state(np.zeros(3))
     velocities = int(mujoco.mjtState.mjSTATE_QVEL)
     physics.set_state(np.array([1.0, 2.0]), velocities)
@@ -394,7 +396,7 @@ def test_a_forward_pass_between_steps_changes_nothing():
     one, two = (suite.load("acrobot", actuator=MOTOR, task_kwargs={"random": 0}) for _ in range(2))
     one.reset()
     two.reset()
-    for action in _actions(one.task.setup.action_space, 20, 0):
+    for action in _actions(one.task.setup.commands.action_space, 20, 0):
         one.step(action)
         two.step(action)
         two.physics.forward()
@@ -406,13 +408,13 @@ def test_a_diverging_simulation_raises_and_works_again_after_reset(task, tmp_pat
     monkeypatch.chdir(tmp_path)  # the engine writes a log
     wild = Actuator(Motor(), CurrentLoop(kp=1000.0, max_voltage=float("inf")))
     env = suite.load(task, actuator=wild, allow_unstable=True)
-    env.task.setup = _Endless(env.task.setup)
+    env.task.setup = _endless(env.task.setup)
     env.reset()
     action = env.action_spec().generate_value()
     last = TASKS[task].action_space.n - 1 if isinstance(action, np.integer | int) else np.ones_like(action)
 
     def run():
-        for _ in range(ENVIRONMENTS[task].max_episode_steps):
+        for _ in range(TASKS[task].max_episode_steps):
             assert not env.step(last).first()
 
     with pytest.raises((PhysicsError, SimulationDivergedError)):
@@ -495,7 +497,7 @@ def test_a_discrete_action_may_be_any_integer(kind):
 def test_a_generator_may_be_shared():
     generator, twin = np.random.default_rng(4), np.random.default_rng(4)
     one, two = suite.load("pendulum", task_kwargs={"random": generator}), suite.load("pendulum", task_kwargs=None)
-    expected = gymnasium.make(ENVIRONMENTS["pendulum"].env_id)
+    expected = gymnasium.make(TASKS["pendulum"].env_id)
     expected.reset(seed=4)
     one.reset()
     np.testing.assert_array_equal(one.physics.simulation.state, expected.unwrapped.state)

@@ -9,14 +9,12 @@ from codrl_mj.cli.tables import evaluation_tables
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import MEASURES, RandomPolicy, evaluate
 
-SHORT = EnvConfig(max_episode_steps=30)
-
 
 @pytest.fixture(scope="module")
 def results():
     """Evaluations of random policies, by task and actuator."""
     return {
-        (task, actuator): evaluate(RandomPolicy(task), task, actuator, SHORT, episodes=3)
+        (task, actuator): evaluate(RandomPolicy(task), EnvConfig(task, actuator, max_episode_steps=30), episodes=3)
         for task, actuator in (
             ("cartpole", "ideal"),
             ("cartpole", "weaker"),

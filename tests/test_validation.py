@@ -1,5 +1,6 @@
 """The certificate: what it checks passes, every check can fail, and verdict, files and refusals are what they say."""
 
+import inspect
 import json
 import math
 import re
@@ -13,8 +14,9 @@ import numpy as np
 import pytest
 
 from codrl_mj import TASKS
+from codrl_mj.actuators import IDEAL, Actuator, Lag, TorqueSpeed
 from codrl_mj.cli import main
-from codrl_mj.physics import MujocoPhysics, SimulationDivergedError
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError
 from codrl_mj.validation import (
     GROUPS,
     MUTATIONS,
@@ -34,9 +36,9 @@ from codrl_mj.validation import (
 )
 from codrl_mj.validation.compare import Worst, differences
 from codrl_mj.validation.growth import Growth, lyapunov_exponent
-from codrl_mj.validation.mutations import edited, margin, unfailed, wrong_callback
+from codrl_mj.validation.mutations import edited, margin, unfailed, wrong_loop, wrong_loop_everywhere
 from codrl_mj.validation.svg_plot import svg
-from tests.callbacks.models import FULL, add_motor, changed, rotor, rotor_spec
+from tests.engine.models import FULL, add_motor, changed, controls, rotor, rotor_spec, trajectory
 
 OWN = ("dynamics", "trajectories", "execution")
 
@@ -157,6 +159,35 @@ def test_faults_are_undone(caught):
     assert validate("cartpole", quick=True, groups=OWN).passed
 
 
+def functions():
+    """Every function of the package that is loaded, by (whose it is, name)."""
+    modules = [module for name, module in sys.modules.items() if name.startswith("codrl_mj")]
+    classes = [value for module in modules for value in vars(module).values() if isinstance(value, type)]
+    return {
+        (id(owner), name): value
+        for owner in [*modules, *classes]
+        for name, value in vars(owner).items()
+        if callable(value) and not isinstance(value, type) and getattr(value, "__module__", "").startswith("codrl_mj")
+    }
+
+
+def test_a_wrong_function_can_be_called_as_the_right_one():
+    """Otherwise its check fails because of the call, and not because of the fault."""
+    replacing = set()
+    for mutation in MUTATIONS:
+        before = functions()
+        with mutation.apply():
+            during = functions()
+        for place, right in before.items():
+            if (wrong := during[place]) is not right:
+                replacing.add(mutation.name)
+                names = list(inspect.signature(right).parameters)
+                inspect.signature(wrong).bind(*names)  # raises TypeError
+                inspect.signature(wrong).bind(**dict.fromkeys(names))
+    assert replacing >= {"a stale command", "the other Euler integrator", "a reset that leaves the motor running"}
+    assert replacing >= {"bounds that are not kept", "a mass off by 0.1 %", "kp and ki swapped, everywhere"}
+
+
 def test_a_fault_is_undone_after_an_error():
     fault = next(mutation for mutation in MUTATIONS if mutation.name == "a stale command")
     step = MujocoPhysics.step
@@ -171,9 +202,25 @@ def test_a_fault_is_undone_after_an_error():
     assert MujocoPhysics.step is step
 
 
+def test_a_wrong_loop_is_undone_after_an_error(installed):
+    model, inputs = rotor(), controls(20)
+    right, advance = trajectory(model, inputs), vars(Actuator)["advance"]
+
+    def fail():
+        with wrong_loop_everywhere(("- parameters.resistance", "+ parameters.resistance")):
+            assert not np.array_equal(trajectory(model, inputs), right)
+            assert vars(Actuator)["advance"] is not advance
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
+    np.testing.assert_array_equal(trajectory(model, inputs), right)
+    assert vars(Actuator)["advance"] is advance
+
+
 def test_an_edit_whose_text_is_gone_is_an_error_and_not_a_passed_test():
     with pytest.raises(ValueError, match="occurs 0 times"):
-        edited(sys.modules["codrl_mj.motor.current_loop"], [("no such text", "")])
+        edited(sys.modules["codrl_mj.actuators.current_loop"], [("no such text", "")])
 
 
 def test_the_oracle_is_the_installed_gymnasium(monkeypatch):
@@ -282,10 +329,8 @@ def test_angles_are_compared_on_the_circle_only_where_both_were_wrapped():
 
 def test_the_growth_near_an_unstable_equilibrium_is_its_eigenvalue():
     """A pendulum upright: the semi-implicit map's larger eigenvalue, by hand."""
-    from codrl_mj.physics import AnalyticPhysics
-
     task = TASKS["pendulum"]
-    run = AnalyticPhysics(task, None, 1, "semi-implicit")
+    run = AnalyticPhysics(task, [IDEAL], 1, "semi-implicit")
     growth = Growth(task, run, seed=0)
     for _ in range(100):
         run.step(0.0)
@@ -318,11 +363,11 @@ TWO_MOTORS = """
 <body pos="0 0 1"><joint name="a" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 .5" size=".05"/>
 <body pos="0 0 .5"><joint name="b" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 .4" size=".04"/></body></body>
 <body pos="1 0 0.2"><freejoint/><geom type="box" size=".1 .1 .1"/></body></worldbody><actuator>
-<general name="left" joint="a" gear="10" dyntype="user" actdim="8" gainprm="0" biastype="user" ctrllimited="true"
- ctrlrange="-1 1" user="2507.00268 1 0.1 1 1 4.3 1 1e-6 0.6 24 1 1 0 0"/>
+<general name="left" joint="a" gear="10" dyntype="user" actdim="14" gainprm="0" biastype="user" ctrllimited="true"
+ ctrlrange="-1 1" user="250700 268401 843097 1 0.1 1 1 4.3 1 1e-6 0.6 24 1 1 0 0 0 0 inf 0"/>
 <position name="foreign" joint="a" kp="1"/>
-<general name="right" joint="b" gear="5" dyntype="user" actdim="8" gainprm="0" biastype="user" ctrllimited="true"
- ctrlrange="-1 1" user="2507.00268 1 0.1 1 1 4.3 1 1e-6 0.6 2 0 4 0.1 0.01"/>
+<general name="right" joint="b" gear="5" dyntype="user" actdim="14" gainprm="0" biastype="user" ctrllimited="true"
+ ctrlrange="-1 1" user="250700 268401 843097 1 0.1 1 1 4.3 1 1e-6 0.6 2 0 4 0.1 0.01 0 0 inf 0"/>
 </actuator></mujoco>
 """
 
@@ -340,7 +385,7 @@ def test_a_model_of_ones_own_passes_what_applies_and_is_told_what_does_not():
 
 def test_every_check_of_a_model_can_fail():
     model, failed = rotor(), set()
-    with wrong_callback((), (("+ parameters[KI] * integral", "- parameters[KI] * integral"),)):
+    with wrong_loop(("+ parameters.ki * integral", "- parameters.ki * integral")):
         failed |= {check.name for check in validate_model(model, quick=True).checks if not check.passed}
     for mutation in MUTATIONS:
         if mutation.name in ("a motor that runs in every forward pass", "a current that simulations share"):
@@ -349,6 +394,26 @@ def test_every_check_of_a_model_can_fail():
     unstable = rotor(changed(FULL, kp=1000.0))
     failed |= {check.name for check in validate_model(unstable, quick=True).checks if not check.passed}
     assert failed == {check.name for check in validate_model(model, quick=True).checks}
+
+
+def test_actuators_of_other_families_are_checked_beside_motors():
+    spec = rotor_spec()
+    add_motor(spec, "hinge", Lag(time_constant=0.03, delay=0.013), name="late")
+    add_motor(spec, "hinge", TorqueSpeed(), name="line")
+    result = validate_model(spec.compile(), quick=True)
+    assert result.passed
+    names = [check.name for check in result.checks if check.group == "motor" and "response" not in check.name]
+    assert names[:6] == [f"{check}: {name}" for check in ("stable", "steps") for name in ("motor", "late", "line")]
+    assert {skip.name for skip in result.skipped if "no current loop" in skip.reason} == {
+        "responses of late",
+        "responses of line",
+    }
+
+
+def test_an_actuator_that_its_family_would_refuse_is_not_stable():
+    result = validate_model(rotor(Lag(delay=0.081)), quick=True)  # eight steps of 0.01 s are remembered
+    (check,) = (check for check in result.checks if not check.passed)
+    assert (check.name, check.worst, check.unit) == ("stable: motor", math.inf, "instability")
 
 
 def test_a_motor_that_never_runs_is_said():
@@ -382,7 +447,7 @@ def test_an_unknown_group_is_refused():
 
 def test_a_model_without_a_motor_is_refused():
     model = mujoco.MjModel.from_xml_string("<mujoco><worldbody/></mujoco>")
-    with pytest.raises(ValueError, match=r"no motor of codrl_mj among its 0 actuators.*set_actuator"):
+    with pytest.raises(ValueError, match=r"no motor of codrl_mj among its 0 actuators.*mjcf.drive"):
         validate_model(model)
 
 

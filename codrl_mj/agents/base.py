@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 from gymnasium import spaces
 
-from codrl_mj.agents.bounds import check
+from codrl_mj.fields import check
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,8 +54,14 @@ class AgentConfig:
         raise NotImplementedError
 
     def as_mapping(self) -> dict[str, Any]:
-        """The settings as JSON-serialisable values, with the agent's `name`."""
-        return {"name": self.name, **dataclasses.asdict(self)}
+        """The settings as JSON-serialisable values, with the `name` that `find_agent` finds the agent by."""
+        return {"name": self.known_as(), **dataclasses.asdict(self)}
+
+    @classmethod
+    def known_as(cls) -> str:
+        """The name that `codrl_mj.agents.find_agent` finds the agent by: `module:Class` if it is not one of ours."""
+        ours = cls.__module__.startswith("codrl_mj.")
+        return cls.name if ours else f"{cls.__module__}:{cls.__qualname__}"
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> "AgentConfig":

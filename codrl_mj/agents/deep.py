@@ -6,7 +6,7 @@ from typing import Any
 from gymnasium import spaces
 
 from codrl_mj.agents.base import AgentConfig
-from codrl_mj.agents.bounds import factors
+from codrl_mj.fields import factors
 
 
 @dataclasses.dataclass(frozen=True)

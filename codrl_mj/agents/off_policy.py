@@ -5,8 +5,8 @@ from typing import Any
 
 from gymnasium import spaces
 
-from codrl_mj.agents.bounds import integer, real
 from codrl_mj.agents.deep import DeepAgentConfig
+from codrl_mj.fields import integer, real
 
 
 @dataclasses.dataclass(frozen=True)

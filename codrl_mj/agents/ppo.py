@@ -5,8 +5,8 @@ from typing import Any, ClassVar, Literal
 
 from gymnasium import spaces
 
-from codrl_mj.agents.bounds import choice, flag, integer, real, units
 from codrl_mj.agents.deep import DeepAgentConfig
+from codrl_mj.fields import choice, flag, integer, real, units
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,8 +5,8 @@ from typing import Any, ClassVar
 
 from gymnasium import spaces
 
-from codrl_mj.agents.bounds import flag, real, units
 from codrl_mj.agents.off_policy import ActorCriticConfig
+from codrl_mj.fields import flag, real, units
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 from gymnasium import spaces
 
 from codrl_mj.agents.base import AgentConfig
-from codrl_mj.agents.bounds import integer, real, reals, units
+from codrl_mj.fields import integer, real, reals, units
 
 
 @dataclasses.dataclass(frozen=True)

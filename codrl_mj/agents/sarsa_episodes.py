@@ -10,7 +10,7 @@ from codrl_mj.agents.tile_coding import TileCoder
 from codrl_mj.envs import ActuatedVectorEnv
 from codrl_mj.envs.compiled import arguments, compiled_kernels
 from codrl_mj.envs.sb3 import ActuatedVecEnv
-from codrl_mj.physics import Signals
+from codrl_mj.physics import Signals, signal_names, trace_names
 
 
 class Ended(NamedTuple):
@@ -45,17 +45,18 @@ class CompiledEpisodes:
         self._physics: Any = vector.setup.simulate("mujoco")
         self._step = compiled_kernels(vector.setup, self._physics).step
         self._arguments = arguments(vector.setup, self._physics)
-        self._forces = vector.setup.action_forces
-        self._record = np.empty((vector.max_episode_steps, len(Signals._fields)))
+        self._forces = vector.setup.commands.action_forces
+        self._record = np.empty((vector.max_episode_steps, self._physics.trace.shape[2]))
 
     @staticmethod
     def can_run(env: Any) -> bool:
-        """Whether the environment is ours, in MuJoCo, not randomised, and has a time limit."""
+        """Whether the environment is ours, in MuJoCo, of one motor, not randomised, and has a time limit."""
         return (
             type(env) is ActuatedVecEnv
             and isinstance(env.env, ActuatedVectorEnv)
             and env.num_envs == 1
             and env.env.setup.randomization is None
+            and len(env.env.task.motors) == 1
             and env.env.max_episode_steps is not None
         )
 
@@ -91,8 +92,10 @@ class CompiledEpisodes:
         )
         if not fine:
             self._physics.check_finite()
-        *numbers, saturated = self._record[:length].T.copy()
-        signals = Signals(*numbers, saturated != 0.0)  # type: ignore[call-arg]
+        setup = self.env.env.setup
+        columns = dict(zip(trace_names(setup.family), self._record[:length].T.copy(), strict=True))
+        columns["saturated"] = columns.get("saturated", np.zeros(length)) != 0.0
+        signals = setup.signals({name: columns[name] for name in signal_names(setup.family)})
         observations, infos = self.env.conclude(observation, total, length, not terminated, signals)
         return Ended(length, observations, infos, total, signals)
 
@@ -121,7 +124,7 @@ def run_episode(
         rates: how to learn.
         generator: draws.
         observation: the first, shape (k,); gets the last.
-        record: gets the actuator's signals, a row for each step; its length is the time limit.
+        record: gets the trace's last row, for each step; its length is the time limit.
         arguments: the last ones of `step`.
 
     Returns:
@@ -131,13 +134,13 @@ def run_episode(
     action = begin(coder, weights, traces, rates, generator, tiles, observation)
     total, length, terminated = 0.0, 0, False
     while not terminated and length < len(record):
-        reward, terminated, fine, desired, actual, current, reference, voltage, saturated = step(
-            forces[action], observation, *arguments
-        )
+        force = forces[action]
+        reward, terminated, fine = step(force, observation, *arguments)
         if not fine:
             return total, length, False, False
-        row = record[length]
-        row[0], row[1], row[2], row[3], row[4], row[5] = desired, actual, current, reference, voltage, saturated
+        trace = arguments[-1]
+        record[length] = trace[-1, 0]
+        record[length, 0] = force  # as it was asked for, before anything disturbed it
         total, length = total + reward, length + 1
         seen_reward = float(np.float32(reward))  # what Stable-Baselines3's environments hand out
         action = learn(coder, weights, traces, rates, generator, tiles, action, seen_reward, observation, terminated)

@@ -5,8 +5,8 @@ from typing import Any, ClassVar
 
 from gymnasium import spaces
 
-from codrl_mj.agents.bounds import integer, real, units
 from codrl_mj.agents.off_policy import ActorCriticConfig
+from codrl_mj.fields import integer, real, units
 
 
 @dataclasses.dataclass(frozen=True)

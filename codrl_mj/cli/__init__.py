@@ -1,12 +1,15 @@
 """The command line: parses, calls the package, prints. Nothing imports it."""
 
+import functools
 import sys
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import tyro
 
 from codrl_mj.cli.evaluate import Evaluate
+from codrl_mj.cli.fields import with_environment
 from codrl_mj.cli.render import Render
 from codrl_mj.cli.reproduce import Reproduce
 from codrl_mj.cli.runs import Runs
@@ -24,7 +27,13 @@ VERBS: dict[str, Any] = {
     "study": Study,
     "reproduce": Reproduce,
 }
-"""The verbs by name; `train`'s flags depend on the rest of the command line."""
+"""The verbs by name."""
+_MADE: dict[str, Callable[[list[str]], Any]] = {
+    "train": train_verb,
+    "evaluate": functools.partial(with_environment, Evaluate),
+    "render": functools.partial(with_environment, Render),
+}
+"""Those whose flags depend on the rest of the command line."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -45,7 +54,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _run(arguments: list[str]) -> int:
     try:
         verb: Any = tyro.extras.subcommand_cli_from_dict(
-            VERBS | ({"train": train_verb(arguments[1:])} if arguments[:1] == ["train"] else {}),
+            VERBS | {verb: make(arguments[1:]) for verb, make in _MADE.items() if arguments[:1] == [verb]},
             prog="codrl-mj",
             description="Reinforcement learning through a real actuator: classic control in MuJoCo, driven by a motor.",
             args=arguments,

@@ -2,11 +2,11 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.cli.fields import AS_TRAINED, ActuatorFields, ActuatorName, EnvFields, Fields, actuator, environment
+from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, actuator, environment
 from codrl_mj.cli.subject import Source
 
 
@@ -23,7 +23,6 @@ class Evaluate:
     ]
     source: tyro.conf.OmitArgPrefixes[Source] = Source()
     actuator_name: ActuatorName = AS_TRAINED
-    actuator_fields: Fields = ActuatorFields()
     episodes: int = 50
     """Episodes, each from its own seed."""
     seed: int = 0
@@ -32,23 +31,20 @@ class Evaluate:
     """Sample the actions instead of taking the most likely ones."""
     out: Path | None = None
     """JSON file for the result."""
-    env: EnvFields = EnvFields()  # type: ignore[valid-type]
-    """The environment."""
 
-    def run(self) -> int:
+    def run(self: Any) -> int:
         """Evaluate and print a table."""
         from codrl_mj.cli.terminal import print_evaluations, progress_bar
         from codrl_mj.evaluation import evaluate
 
         subject = self.source.load(self.policy)
-        motor = actuator(self.actuator_name, self.actuator_fields, subject.task, subject.actuator)
+        task = subject.env.task
+        motor = actuator(self.actuator_name, self.actuator_fields, task, subject.env.actuator)
         with progress_bar("{task.completed}/{task.total} episodes") as bar:
             row = bar.add_task("evaluating", total=self.episodes)
             evaluation = evaluate(
                 subject.policy,
-                subject.task,
-                motor,
-                environment(self.env).seen_as(subject.env),
+                environment(self.env, task, motor).seen_as(subject.env),
                 self.episodes,
                 self.seed,
                 not self.stochastic,

@@ -2,14 +2,12 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.cli.fields import AS_TRAINED, ActuatorFields, ActuatorName, EnvFields, Fields, environment
-from codrl_mj.cli.fields import actuator as chosen_actuator
+from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, actuator, environment, is_task
 from codrl_mj.cli.subject import Source
-from codrl_mj.envs.registration import ENVIRONMENTS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +26,6 @@ class Render:
     ]
     source: tyro.conf.OmitArgPrefixes[Source] = Source()
     actuator_name: ActuatorName = AS_TRAINED
-    actuator_fields: Fields = ActuatorFields()
     seed: int = 0
     """Seed of the episode."""
     out: Path = Path("episode.mp4")
@@ -43,28 +40,26 @@ class Render:
     """A camera of the model: fixed or close."""
     pretty: bool = False
     """Shadows, reflections and multisampling: slower."""
-    env: EnvFields = EnvFields()  # type: ignore[valid-type]
-    """The environment."""
 
-    def run(self) -> int:
+    def run(self: Any) -> int:
         """Run the episode and film it."""
         from codrl_mj.cli.terminal import progress_bar
-        from codrl_mj.evaluation import RandomPolicy, make_env, run_episodes, save_episode
+        from codrl_mj.evaluation import RandomPolicy, run_episodes, save_episode
         from codrl_mj.films.film import Panel, film
         from codrl_mj.runs.policies import Policy
 
-        if self.subject in ENVIRONMENTS:
+        if is_task(self.subject):
             task, name = self.subject, "paper" if self.actuator_name == AS_TRAINED else self.actuator_name
-            actuator = chosen_actuator(name, self.actuator_fields, task)
-            options = environment(self.env).as_arguments()
-            policy: Policy = RandomPolicy(make_env(task, actuator, **options).action_space, self.seed)
+            env = environment(self.env, task, actuator(name, self.actuator_fields, task))
+            policy: Policy = RandomPolicy(env.make().action_space, self.seed)
         else:
-            loaded = self.source.load(Path(self.subject))
-            task, policy, name = loaded.task, loaded.policy, self.actuator_name
-            actuator = chosen_actuator(name, self.actuator_fields, task, loaded.actuator)
-            options = environment(self.env).seen_as(loaded.env).as_arguments()
-        (episode,) = run_episodes(policy, lambda: make_env(task, actuator, **options), 1, self.seed)
-        panel = Panel(f"{Path(self.subject).name} on {name}: return {episode.total:.0f}", task, actuator, episode)
+            loaded, name = self.source.load(Path(self.subject)), self.actuator_name
+            task, policy = loaded.env.task, loaded.policy
+            motor = actuator(name, self.actuator_fields, task, loaded.env.actuator)
+            env = environment(self.env, task, motor).seen_as(loaded.env)
+        (episode,) = run_episodes(policy, env.make, 1, self.seed)
+        title = f"{Path(self.subject).name} on {name}: return {episode.total:.0f}"
+        panel = Panel(title, task, env.actuator, episode)
         with progress_bar("{task.completed}/{task.total} frames") as bar:
             row = bar.add_task("filming", total=None)
             film(

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from codrl_mj.envs.registration import ENVIRONMENTS
+from codrl_mj.tasks import TASKS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Reproduce:
 
     tasks: Annotated[
         tyro.conf.Positional[tuple[str, ...]],
-        tyro.conf.arg(metavar="{" + ",".join(ENVIRONMENTS) + "}", help="Whose experiments; all if none is named."),
+        tyro.conf.arg(metavar="{" + ",".join(TASKS) + "}", help="Whose experiments; all if none is named."),
     ] = ()
     root: Path = Path("runs/paper")
     """Folder of the run folders."""

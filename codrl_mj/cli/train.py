@@ -2,7 +2,7 @@
 
 import argparse
 import dataclasses
-import itertools
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,14 +10,23 @@ import tyro
 
 from codrl_mj.agents import AGENTS
 from codrl_mj.agents.presets import SETTINGS
-from codrl_mj.cli.fields import AS_CONFIGURED, ActuatorFields, ActuatorName, Fields, TaskName, actuator, environment
+from codrl_mj.cli.fields import (
+    AS_CONFIGURED,
+    ActuatorName,
+    actuator,
+    actuator_fields,
+    env_fields,
+    environment,
+    family,
+    scan,
+)
 from codrl_mj.cli.fields import unchecked as flags_of
-from codrl_mj.envs.registration import ENVIRONMENTS
+from codrl_mj.runs.layout import finished
+from codrl_mj.tasks import TASKS, find_task
 from codrl_mj.training.config import TrainConfig, default_agent, read_config
-from codrl_mj.training.folder import finished, load_config
+from codrl_mj.training.folder import load_config
 
-AgentName = Literal[tuple(AGENTS)]  # type: ignore[valid-type]
-_OWN_FLAGS = ("task", "actuator", "agent", "env")  # of the configuration: not made from its fields' types
+_OWN_FLAGS = ("agent", "env")  # of the configuration: not made from its fields' types
 
 
 def train_verb(arguments: list[str]) -> Any:
@@ -31,27 +40,29 @@ def train_verb(arguments: list[str]) -> Any:
         ValueError: it cannot be read, there are no such settings for the agent on the task, or the run has another
             agent.
     """
-    chosen = _scan(arguments)
+    chosen = scan(arguments, "agent", "settings", "actuator", "config", "resume")
     base = _base(chosen)
     resuming = chosen.resume is not None
     configured = resuming or chosen.config is not None
-    agent_fields, env_fields = flags_of(base.agent), flags_of(base.env)
+    agent_flags, env_flags = flags_of(base.agent), env_fields(base.env)
     rest = flags_of(base, leaving_out=_OWN_FLAGS)
     task_known = configured or chosen.task is not None
+    tasks: Any = Literal[tuple(dict.fromkeys([*TASKS, base.task, chosen.task or base.task]))]
+    agents: Any = Literal[tuple(dict.fromkeys([*AGENTS, base.agent.known_as()]))]
     positional: Any = tyro.conf.Positional
-    task = "task", Annotated[positional[TaskName], tyro.conf.arg(help="What to learn.")]
+    task = "task", Annotated[positional[tasks], tyro.conf.arg(help="What to learn.")]
     fields: list[Any] = [
         (*task, base.task) if task_known else task,
         (
             "agent_name",
             Annotated[
-                AgentName,
+                agents,
                 tyro.conf.arg(
                     name="agent",
                     help="Who learns. Its settings are below; `codrl-mj train TASK --agent NAME --help` shows others'.",
                 ),
             ],
-            base.agent.name,
+            base.agent.known_as(),
         ),
         (
             "settings",
@@ -59,10 +70,10 @@ def train_verb(arguments: list[str]) -> Any:
             chosen.settings if chosen.settings in SETTINGS else "default",
         ),
         ("actuator_name", ActuatorName, AS_CONFIGURED if configured else "paper"),
-        ("actuator_fields", Fields, ActuatorFields()),
+        actuator_fields(family(chosen.actuator, base.task, type(base.env.actuators[0]))),
         *((field.name, field.type, field.default) for field in dataclasses.fields(rest)),
-        ("agent", Annotated[agent_fields, tyro.conf.arg(help="The agent's settings.")], agent_fields()),
-        ("env", Annotated[env_fields, tyro.conf.arg(help="The environment.")], env_fields()),
+        ("agent", Annotated[agent_flags, tyro.conf.arg(help="The agent's settings.")], agent_flags()),
+        ("env", Annotated[env_flags, tyro.conf.arg(help="The environment.")], env_flags()),
         (
             "config",
             Annotated[Path | None, tyro.conf.arg(help=_CONFIG_HELP)],
@@ -71,6 +82,7 @@ def train_verb(arguments: list[str]) -> Any:
         ("out", Annotated[Path | None, tyro.conf.arg(help=_OUT_HELP)], None),
         ("resume", Annotated[Path | None, tyro.conf.arg(help=_RESUME_HELP)], None),
         ("accept_changes", Annotated[bool, tyro.conf.arg(help=_ACCEPT_HELP)], False),
+        ("trust", Annotated[bool, tyro.conf.arg(help=_TRUST_HELP)], False),
         ("tensorboard", Annotated[bool, tyro.conf.arg(help="Write events for TensorBoard, if it is installed.")], True),
         (
             "wandb",
@@ -97,6 +109,10 @@ _RESUME_HELP = (
     "Run folder of a training that was interrupted, to be continued from its last checkpoint to the result that it "
     "would have had. Needs no other flags."
 )
+_TRUST_HELP = (
+    "Import the module of an actuator of somebody's own that the file or the run names as module:NAME, which executes "
+    "whatever its author wants."
+)
 _ACCEPT_HELP = "Continue even if the code or a package is no longer the one that the run was started with."
 
 
@@ -115,29 +131,32 @@ class Train:
         """Train, with a progress bar."""
         from codrl_mj.cli.terminal import train_with_bars
 
-        if self.task != self.base.task and self.resume is None:
+        if find_task(self.task) is not find_task(self.base.task) and self.resume is None:
             raise ValueError(f"name the task before the flags, as in codrl-mj train {self.task} --seed 1")
         if self.resume is not None and self.out not in (None, self.resume):
             raise ValueError(f"--out {self.out}: a run continues in its own folder, {self.resume}: leave --out out")
         config = dataclasses.replace(
             self.base,
-            task=self.task,
-            actuator=actuator(self.actuator_name, self.actuator_fields, self.task, self.base.actuator),  # type: ignore[arg-type]
+            env=environment(
+                self.env,
+                self.task,
+                actuator(self.actuator_name, self.actuator_fields, self.task, self.base.actuator),
+            ),
             agent=type(self.base.agent)(**vars(self.agent)),
-            env=environment(self.env),
             **{
                 field.name: getattr(self, field.name)
                 for field in dataclasses.fields(TrainConfig)
                 if field.name not in _OWN_FLAGS
             },
         )
-        if self.resume is not None and finished(self.resume) and config == load_config(self.resume):
+        if self.resume is not None and finished(self.resume) and config == load_config(self.resume, self.trust):
             print(f"{self.resume} is finished already; next: codrl-mj evaluate {self.resume}")
             return 0
         out = (
             self.resume
             or self.out
-            or Path("runs") / "-".join([config.task, config.agent.name, self.actuator_name, str(config.seed)])
+            or Path("runs")
+            / "-".join(map(_word, [config.task, config.agent.name, self.actuator_name, str(config.seed)]))
         )
         train_with_bars(
             {f"{config.agent.name.upper()} on {config.task}": (config, out)},
@@ -150,34 +169,25 @@ class Train:
         return 0
 
 
-def _scan(arguments: list[str]) -> argparse.Namespace:
-    """What decides on the other flags and their defaults; the rest is left to the real parser."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    for name in ("agent", "settings"):
-        parser.add_argument(f"--{name}")
-    for name in ("config", "resume"):
-        parser.add_argument(f"--{name}", type=Path)
-    try:
-        chosen, _ = parser.parse_known_args(arguments)
-    except argparse.ArgumentError:  # a flag without its value: the real parser says so better
-        chosen = argparse.Namespace(agent=None, settings=None, config=None, resume=None)
-    behind = itertools.pairwise(["", *arguments])
-    chosen.task = next((name for flag, name in behind if name in ENVIRONMENTS and not flag.startswith("--")), None)
-    return chosen
+def _word(name: str) -> str:
+    """A name, or where something is from, as a part of a folder's name."""
+    return re.sub(r"[^\w.]+", "_", name)
 
 
 def _base(chosen: argparse.Namespace) -> TrainConfig:
     """The configuration whose values are the flags' defaults."""
     if chosen.resume is not None and chosen.config is None:
-        begun = load_config(chosen.resume)
-        if chosen.settings is not None or chosen.agent not in (None, begun.agent.name):
+        begun = load_config(Path(chosen.resume), chosen.trust)
+        if chosen.settings is not None or chosen.agent not in (None, begun.agent.known_as()):
             raise ValueError(
                 f"{chosen.resume} is a training of {begun.agent.name} and continues as it began: leave --agent and "
                 "--settings out"
             )
         return begun
     if chosen.config is not None:
-        return read_config(chosen.config, task=chosen.task, agent=chosen.agent, settings=chosen.settings)
+        given = {name: getattr(chosen, name) for name in ("task", "agent", "settings")}
+        return read_config(Path(chosen.config), chosen.trust, **given)
     task = chosen.task or "cartpole"
-    agent = chosen.agent if chosen.agent in AGENTS else default_agent(task)
-    return TrainConfig.preset(task, agent, chosen.settings if chosen.settings in SETTINGS else "default")
+    agent = chosen.agent if chosen.agent in AGENTS or ":" in str(chosen.agent) else default_agent(task)
+    settings = chosen.settings if chosen.settings in SETTINGS else "default"
+    return TrainConfig.preset(task, agent, settings, "paper" if find_task(task).paper else "ideal")

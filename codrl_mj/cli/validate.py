@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from codrl_mj.envs.registration import ENVIRONMENTS
+from codrl_mj.tasks import TASKS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Validate:
 
     tasks: Annotated[
         tyro.conf.Positional[tuple[str, ...]],
-        tyro.conf.arg(metavar="{" + ",".join(ENVIRONMENTS) + "}", help="What to validate; all tasks if none is named."),
+        tyro.conf.arg(metavar="{" + ",".join(TASKS) + "}", help="What to validate; all tasks if none is named."),
     ] = ()
     model: Path | None = None
     """MJCF file of your own with any number of our motors, to be put through the checks that apply to it."""

@@ -1,5 +1,13 @@
-"""What lies between a command and the joint besides the motor: delay, coarse commands, bad sensors, loads, friction."""
+"""What lies between the agent's command and the joint besides the actuator: pure functions, and their description."""
 
-from codrl_mj.disturbances.description import OFF, Disturbances, resolve_disturbances
+from codrl_mj.disturbances.description import (
+    MOVED,
+    OFF,
+    PLAIN,
+    Disturbances,
+    Joint,
+    resolve_disturbances,
+    resolve_joint,
+)
 
-__all__ = ["OFF", "Disturbances", "resolve_disturbances"]
+__all__ = ["MOVED", "OFF", "PLAIN", "Disturbances", "Joint", "resolve_disturbances", "resolve_joint"]

@@ -1,69 +1,52 @@
 """The description of an environment's disturbances: one frozen dataclass, every field off by default."""
 
 import dataclasses
-import difflib
-import math
-import numbers
 from collections.abc import Mapping
 from typing import Any
+
+from codrl_mj import fields
+from codrl_mj.fields import real
 
 
 @dataclasses.dataclass(frozen=True)
 class Disturbances:
-    """Imperfections of an actuator's drive, sensor, supply and joint; each is off at 0, its default.
+    """Imperfections between the agent and its actuator, and loads on the joint; each is off at 0, its default.
 
-    The command is the desired force [N] or torque [N*m] at the joint. On its way to the current loop it is first
+    The command is the desired force [N] or torque [N*m] at the joint. On its way to the actuator it is first
     delayed, then quantised, then limited in its rate, once per integration step. Where an agent commands a current or a
     voltage, the command is the force of that current, or of as many amperes as volts.
+
+    What is the actuator's own (its sensor, its supply) is described there, and what is the joint's (damping, friction)
+    by the environment's `joint`.
 
     Raises:
         ValueError: a field is not a finite number within its bound; the message names field, value and bound.
     """
 
-    command_delay: float = 0.0
+    command_delay: float = real(0.0, least=0, unit="s")
     """Delay of the command [s], >= 0; where it is no whole number of integration steps, the two neighbouring commands
     are interpolated linearly. Before the first command there is zero."""
-    command_quantum: float = 0.0
+    command_quantum: float = real(0.0, least=0, unit="N")
     """Quantisation step of the command [N or N*m], >= 0; rounds half to even, and ends at the largest force."""
-    command_rate: float = 0.0
+    command_rate: float = real(0.0, least=0, unit="N/s")
     """Largest change of the command per second [N/s or N*m/s], >= 0; 0: no limit. It starts from zero."""
-    current_noise: float = 0.0
-    """Standard deviation [A] of the current sensor's white noise, >= 0: a new value for each electrical step."""
-    current_bias: float = 0.0
-    """Offset of the current sensor [A]: the controller measures the current plus this."""
-    supply_resistance: float = 0.0
-    """Resistance of the supply [ohm], >= 0: the voltage is limited to max_voltage - supply_resistance*|current|."""
-    pulse_force: float = 0.0
+    pulse_force: float = real(0.0, least=0, unit="N")
     """Size of random load pulses at the actuated joint [N or N*m], >= 0; either sign is as likely."""
-    pulse_duration: float = 0.0
+    pulse_duration: float = real(0.0, least=0, unit="s")
     """Duration of a load pulse [s], > 0 where there are pulses."""
-    pulse_interval: float = 0.0
+    pulse_interval: float = real(0.0, least=0, unit="s")
     """Mean time [s] from the start, and from the end of each pulse, to the next; exponentially distributed. > 0 where
     there are pulses."""
-    joint_damping: float = 0.0
-    """Viscous friction of the actuated joint [N*s/m or N*m*s/rad], >= 0. MuJoCo physics only."""
-    joint_friction: float = 0.0
-    """Coulomb friction of the actuated joint [N or N*m], >= 0. MuJoCo physics only."""
 
     def __post_init__(self) -> None:
         """Validate."""
-        pulses = isinstance(self.pulse_force, numbers.Real) and self.pulse_force > 0
-        for field in dataclasses.fields(self):
-            value, name = getattr(self, field.name), f"Disturbances.{field.name}"
-            any_sign = field.name == "current_bias"
-            above = pulses and field.name in ("pulse_duration", "pulse_interval")
-            bound = "a finite number" + ("" if any_sign else " > 0 where there are pulses" if above else " >= 0")
-            if isinstance(value, bool) or not isinstance(value, numbers.Real):
-                raise ValueError(f"{name} = {value!r}: must be {bound}")
-            number = float(value)
-            if not math.isfinite(number) or (not any_sign and number < 0) or (above and number == 0):
-                raise ValueError(f"{name} = {number:g}: must be {bound}")
-            object.__setattr__(self, field.name, number)
-        if not pulses and (self.pulse_duration or self.pulse_interval):
-            field_name = "pulse_duration" if self.pulse_duration else "pulse_interval"
-            raise ValueError(
-                f"Disturbances.{field_name} = {getattr(self, field_name):g}: there are no pulses: give pulse_force > 0"
-            )
+        fields.check(self)
+        for name in ("pulse_duration", "pulse_interval"):
+            value = getattr(self, name)
+            if self.pulse_force and not value:
+                raise ValueError(f"Disturbances.{name} = {value:g}: must be a finite number > 0 where there are pulses")
+            if value and not self.pulse_force:
+                raise ValueError(f"Disturbances.{name} = {value:g}: there are no pulses: give pulse_force > 0")
 
     @property
     def of_command(self) -> bool:
@@ -71,24 +54,9 @@ class Disturbances:
         return bool(self.command_delay or self.command_quantum or self.command_rate)
 
     @property
-    def of_sensor(self) -> bool:
-        """Whether the measured current is not the current."""
-        return bool(self.current_noise or self.current_bias)
-
-    @property
-    def of_motor(self) -> bool:
-        """Whether the current loop differs: its sensor or its supply."""
-        return self.of_sensor or bool(self.supply_resistance)
-
-    @property
-    def of_joint(self) -> bool:
-        """Whether the joint has friction or damping."""
-        return bool(self.joint_damping or self.joint_friction)
-
-    @property
     def random(self) -> bool:
         """Whether an episode needs a key for its random numbers."""
-        return bool(self.current_noise or self.pulse_force)
+        return bool(self.pulse_force)
 
     def as_mapping(self) -> dict[str, float]:
         """The fields by name, JSON-serialisable."""
@@ -114,10 +82,52 @@ def resolve_disturbances(disturbances: "Disturbances | Mapping[str, Any] | None"
         return disturbances
     if not isinstance(disturbances, Mapping):
         raise ValueError(f"disturbances = {disturbances!r}: must be a Disturbances or a mapping of its fields")
-    names = [field.name for field in dataclasses.fields(Disturbances)]
-    for key in disturbances:
-        if key not in names:
-            near = difflib.get_close_matches(str(key), names, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"known fields: {', '.join(names)}"
-            raise ValueError(f"unknown field disturbances.{key}; {hint}")
-    return Disturbances(**disturbances)
+    moved = [name for name in MOVED if name in disturbances]
+    if moved:
+        raise ValueError(f"disturbances.{moved[0]} is {MOVED[moved[0]]} now: give it there")
+    return fields.build(Disturbances, disturbances, "field", "disturbances.")
+
+
+MOVED = {
+    "current_bias": "the actuator's controller.current_bias",
+    "current_noise": "the actuator's controller.current_noise",
+    "supply_resistance": "the actuator's supply.resistance",
+    "joint_damping": "the environment's joint.damping",
+    "joint_friction": "the environment's joint.friction",
+}
+"""Fields of earlier versions, and whose they are."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Joint:
+    """What is added to the actuated joints of the model; nothing by default. MuJoCo physics only.
+
+    Raises:
+        ValueError: a field is not a finite number within its bound; the message names field, value and bound.
+    """
+
+    damping: float = real(0.0, least=0, unit="N*s/m")
+    """Viscous friction [N*s/m or N*m*s/rad], >= 0."""
+    friction: float = real(0.0, least=0, unit="N")
+    """Coulomb friction [N or N*m], >= 0."""
+    armature: float = real(0.0, least=0, unit="kg")
+    """Inertia [kg or kg*m^2], >= 0, such as a rotor's behind a gear."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        fields.check(self)
+
+
+PLAIN = Joint()
+"""Nothing added."""
+
+
+def resolve_joint(joint: "Joint | Mapping[str, Any] | None") -> Joint:
+    """Turn whatever a user may write for a joint into a `Joint`.
+
+    Raises:
+        ValueError: an unknown field (the nearest known one is suggested) or a value out of bounds.
+    """
+    if joint is None or isinstance(joint, Joint):
+        return joint or PLAIN
+    return fields.build(Joint, joint, "field", "joint.")

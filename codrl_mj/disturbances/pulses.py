@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from codrl_mj.motor.noise import LOAD_STREAM, philox, unit
+from codrl_mj.actuators.noise import LOAD_STREAM, philox, unit
 
 PULSE_NAMES = ("key", "step", "index", "start")
 """What the memory of an environment's pulses holds: the key of the random numbers, integration steps since the start of

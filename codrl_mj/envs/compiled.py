@@ -30,27 +30,35 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
+from codrl_mj.actuators.noise import LARGEST_KEY
+from codrl_mj.engine.families import jitable
+from codrl_mj.engine.memory import internal
 from codrl_mj.envs.outcomes import Outcomes, compiled_outcomes
 from codrl_mj.envs.setup import Setup
-from codrl_mj.motor.noise import LARGEST_KEY
-from codrl_mj.physics import MujocoPhysics
 from codrl_mj.physics.constrain import Compiled
 from codrl_mj.physics.stepping import Stepping
 
-INTERFACE_NAMES = ("observes_actuator", "commands_voltage", "is_random")
-"""What the vector `interface` begins with: whether the observation ends with measured and reference current, whether
-the agent commands the voltage, and whether an episode's disturbances need a key. The task's options follow."""
-OBSERVES, VOLTAGE, RANDOM = range(len(INTERFACE_NAMES))
-OPTIONS = len(INTERFACE_NAMES)
+
+class Interface(NamedTuple):
+    """What the vector `interface` begins with; the task's options follow."""
+
+    observes: float
+    """Whether the observation ends with what the actuators' sensors say."""
+    random: float
+    """Whether an episode's disturbances or sensors need a key."""
+
+
+OPTIONS, RANDOM = len(Interface._fields), Interface._fields.index("random")
 
 
 class Kernels(NamedTuple):
     """Compiled functions; `arguments` are (interface, *those of `codrl_mj.physics.stepping`)."""
 
     step: Compiled
-    """(force, observation (k,) float32, *arguments) -> (reward, terminated, fine, *signals): takes one environment step
-    under a desired force [N or N*m] and fills the observation. `fine` says whether the simulation is still one of
-    numbers; if not, the environment must be reset. The signals are in the order of `codrl_mj.physics.Signals`."""
+    """(force, observation (k,) float32, *arguments) -> (reward, terminated, fine): takes one environment step under a
+    desired force [N or N*m], or several, an array (n,), and fills the observation. `fine` says whether the simulation
+    is still one of numbers; if not, the environment must be reset. What the actuators did is in the trace, the last of
+    the arguments; columns as in `codrl_mj.physics.trace_names`."""
     reset: Compiled
     """(generator, low, high, observation, *arguments) -> nothing: starts an episode from a state that the numpy
     `Generator` draws between `low` and `high` (see `Task.initial_bounds`), and fills the observation."""
@@ -80,54 +88,87 @@ def compiled_env(env: Any) -> CompiledEnv | None:
         env: an `ActuatedEnv` (`env.unwrapped` of what `gymnasium.make` returns).
 
     Returns:
-        None where they would not be the whole of it: on analytic physics, which are Python, and where actuator or model
-        are drawn at resets, which is Python too.
+        None where they would not be the whole of it: on physics that are Python, such as the analytic one, and where
+        actuator or model are drawn at resets, which is Python too.
     """
     setup, physics = env.setup, env.physics
-    if not isinstance(physics, MujocoPhysics) or setup.randomization is not None:
+    if physics.compiled is None or setup.randomization is not None:
         return None
     kernels = compiled_kernels(setup, physics)
     low, high = setup.task.initial_bounds(None)
-    return CompiledEnv(kernels.step, kernels.reset, arguments(setup, physics), setup.action_forces, low, high)
+    return CompiledEnv(kernels.step, kernels.reset, arguments(setup, physics), setup.commands.action_forces, low, high)
 
 
-def arguments(setup: Setup, physics: MujocoPhysics) -> tuple[Any, ...]:
+def arguments(setup: Setup, physics: Any) -> tuple[Any, ...]:
     """The last arguments of an environment's kernels.
 
     Args:
         setup: the environment's.
-        physics: its simulation.
+        physics: its simulation, one whose steps are compiled.
     """
-    kind = setup.observe_actuator, setup.command == "voltage", setup.disturbances.random
-    return (np.array([*kind, *setup.options], dtype=np.float64), *physics.arguments)
+    kind = Interface(bool(setup.view.sensors), setup.random)
+    return (np.array([*kind, *setup.view.options], dtype=np.float64), *physics.compiled.arguments)
 
 
-def compiled_kernels(setup: Setup, physics: MujocoPhysics) -> Kernels:
+def compiled_kernels(setup: Setup, physics: Any) -> Kernels:
     """The functions for environments of one kind; compiled as they are used, once a process.
 
     Args:
         setup: the environment's.
-        physics: its simulation.
+        physics: its simulation, one whose steps are compiled.
     """
     task = setup.task
-    return _kernels(physics.stepping, compiled_outcomes(task), task.initial_state, len(task.state_names))
+    jitable(task)
+    sensors = len(setup.family.OBSERVED) if setup.view.sensors else 0
+    single, size = len(task.motors) == 1, len(task.state_names)
+    return _kernels(physics.compiled.stepping, compiled_outcomes(task), task.initial_state, size, single, sensors)
+
+
+@internal
+def _only(delivered: np.ndarray) -> float:
+    return delivered[0]
+
+
+@internal
+def _each(delivered: np.ndarray) -> np.ndarray:
+    return delivered
 
 
 @functools.cache
-def _kernels(stepping: Stepping, outcomes: Outcomes, initial_state: Callable[..., Any], size: int) -> Kernels:
-    advance, start, read, sensed = stepping
+def _kernels(
+    stepping: Stepping,
+    outcomes: Outcomes,
+    initial_state: Callable[..., Any],
+    size: int,
+    single: bool,
+    sensors: int,
+) -> Kernels:
+    advance, start, read, observed = stepping
     observe, rewarded, ended = outcomes.observe, outcomes.reward, outcomes.terminated
     compiled = numba.njit(nogil=True, error_model="numpy")
-    initial_entries = compiled(initial_state)
+    initial_entries = internal(initial_state)
+    delivered = _only if single else _each
 
-    @compiled
-    def observe_currents(observation: np.ndarray, measured: float, reference: float, interface: np.ndarray) -> None:
-        observation[-2] = measured
-        observation[-1] = measured if interface[VOLTAGE] != 0.0 else reference  # as `Setup.signals` has it
+    @internal
+    def observe_actuators(
+        row: np.ndarray,
+        observation: np.ndarray,
+        model: int,
+        data: int,
+        settings: np.ndarray,
+        memory: np.ndarray,
+        trace: np.ndarray,
+    ) -> None:
+        seen = np.empty((len(row), sensors))
+        observed(row, seen, model, data, settings, memory, trace)
+        first = len(observation) - seen.size
+        for motor in range(len(row)):
+            for entry in range(sensors):
+                observation[first + motor * sensors + entry] = seen[motor, entry]
 
     @compiled
     def step(
-        force: float,
+        force: Any,
         observation: np.ndarray,
         interface: np.ndarray,
         model: int,
@@ -135,21 +176,17 @@ def _kernels(stepping: Stepping, outcomes: Outcomes, initial_state: Callable[...
         settings: np.ndarray,
         memory: np.ndarray,
         trace: np.ndarray,
-    ) -> tuple[float, bool, bool, float, float, float, float, float, bool]:
+    ) -> tuple[float, bool, bool]:
         before, after = np.empty(size), np.empty(size)
         read(before, model, data, settings, memory, trace)
-        fine, desired, actual, current, reference, voltage, saturated = advance(
-            force, model, data, settings, memory, trace
-        )
+        fine = advance(force, model, data, settings, memory, trace)
         read(after, model, data, settings, memory, trace)
         observe(after, observation)
-        if interface[OBSERVES] != 0.0:
-            measured = sensed(current, model, data, settings, memory, trace)
-            observe_currents(observation, measured, reference, interface)
-        if interface[VOLTAGE] != 0.0:
-            desired, reference = actual, current
-        reward = rewarded(before, actual, after, interface[OPTIONS:])
-        return reward, ended(after), fine, desired, actual, current, reference, voltage, saturated
+        last = trace[len(trace) - 1]
+        if sensors > 0:
+            observe_actuators(last, observation, model, data, settings, memory, trace)
+        reward = rewarded(before, delivered(last[:, 1]), after, interface[OPTIONS:])
+        return reward, ended(after), fine
 
     @compiled
     def reset(
@@ -173,7 +210,8 @@ def _kernels(stepping: Stepping, outcomes: Outcomes, initial_state: Callable[...
         key = generator.random() * LARGEST_KEY if interface[RANDOM] != 0.0 else 0.0
         start(state, key, model, data, settings, memory, trace)
         observe(state, observation)
-        if interface[OBSERVES] != 0.0:
-            observe_currents(observation, sensed(0.0, model, data, settings, memory, trace), 0.0, interface)
+        if sensors > 0:
+            nothing = np.zeros((trace.shape[1], trace.shape[2]))
+            observe_actuators(nothing, observation, model, data, settings, memory, trace)
 
     return Kernels(step, reset)

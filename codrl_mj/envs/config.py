@@ -1,57 +1,125 @@
-"""The environment's arguments as a configuration, for training runs and the command line."""
+"""An environment's arguments, complete: what every face is built from, run folders store and flags are made of.
+
+Light to import: nothing is compiled, and no engine loaded.
+"""
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
-from codrl_mj.disturbances import OFF, Disturbances, resolve_disturbances
+import gymnasium
+
+from codrl_mj.actuators import ActuatorModel, mapping_of
+from codrl_mj.disturbances import MOVED, OFF, PLAIN, Disturbances, Joint, resolve_disturbances, resolve_joint
 from codrl_mj.envs.distributions import Distribution, parse
+from codrl_mj.fields import check_names
+from codrl_mj.tasks import Task, find_task, reference_of, resolve_actuators
+
+
+class UnknownOptionError(ValueError, TypeError):
+    """A keyword that the environment does not have; a TypeError too, as Python's own is, and as TorchRL expects."""
 
 
 @dataclasses.dataclass(frozen=True)
 class EnvConfig:
-    """Arguments of an environment other than task, actuator and rendering; None leaves the task's default.
+    """An environment but for its rendering; None leaves the task's default.
 
     Raises:
-        ValueError: `max_episode_steps` or a disturbance is out of bounds, or a distribution is none; the environment
-            checks the rest.
+        ValueError: unknown task, actuator or option, or a value out of bounds. What depends on several fields at once
+            is checked when the environment is built.
     """
 
-    physics: Literal["mujoco", "analytic"] = "mujoco"
-    """`mujoco`, or `analytic`: Gymnasium's own equations."""
+    task: str
+    """Task name, such as `cartpole`; or `module:NAME` of one's own."""
+    actuator: Any = "paper"
+    """What the force goes through: a name (`ideal`, `paper`, `weak`, `weaker`, `open_loop`, or a family's), an
+    `ActuatorModel`, a mapping of its fields (with a `name`, over that actuator's), a file of them, `module:NAME`, or
+    None (ideal). With several motors all get it, or it is a list with one for each. Kept as an `ActuatorModel`, or as a
+    tuple of several."""
+    physics: str = "mujoco"
+    """`mujoco`; `analytic`: Gymnasium's own equations; or one's own, as registered."""
     integrator: str | None = None
     """One of the task's integrators (CartPole: `euler` or `semi-implicit`); the default is Gymnasium's."""
     inner_steps: int | None = None
     """Integration steps per environment step; the default is the paper's inner loop with a motor and 1 without."""
-    action: Literal["force", "current", "voltage"] = "force"
-    """What the agent commands: the desired force, the reference current, or the voltage past the controller."""
+    timestep: float | None = None
+    """Instead of inner_steps, the integration step [s], which must divide the environment step."""
+    action: str = "force"
+    """What the agent commands: the desired `force` (the paper), the reference `current`, or the raw terminal `voltage`
+    past the controller (end to end); or what else the actuator's family takes."""
     levels: tuple[float, ...] | None = None
     """Discrete tasks that command a current [A] or a voltage [V]: the levels that the actions choose from."""
     observe_actuator: bool = False
     """Whether the agent also observes measured and reference current [A]."""
     max_episode_steps: int | None = None
     """Time limit [environment steps], >= 1; the default is Gymnasium's."""
-    center_radius: float | None = None
-    """CartPole: distance from the centre [m] beyond which a step earns nothing. The paper trains with 0.1."""
     allow_unstable: bool = False
     """Build the environment even if the current loop is unstable."""
     disturbances: Disturbances = OFF
-    """Imperfections of drive, sensor, supply and joint, and load pulses; each is off at 0."""
+    """Imperfections of the commands' way, and load pulses; each is off at 0."""
+    joint: Joint = PLAIN
+    """What is added to the actuated joints."""
     randomize: tuple[str, ...] | None = None
     """What to draw at every reset, as FIELD=DISTRIBUTION, such as 'motor.inductance=uniform(0.05, 0.2)'; distributions
-    are uniform(LOW, HIGH), loguniform(LOW, HIGH) and choice(VALUE, ...). In Python and in files a mapping of fields to
-    distributions will do as well."""
+    are uniform(LOW, HIGH), loguniform(LOW, HIGH) and choice(VALUE, ...). Fields are the actuator's, and of the model
+    model.mass.BODY, model.length.BODY, model.gravity and model.damping.JOINT. In Python and in files a mapping of
+    fields to distributions will do as well. What was drawn is in the reset's info, `randomization`."""
+    options: Any = None
+    """The task's own options, a mapping (CartPole: `center_radius`); kept as the task's `NamedTuple`."""
 
     def __post_init__(self) -> None:
-        """Validate what the environment itself does not see."""
-        if self.levels is not None:
-            object.__setattr__(self, "levels", tuple(self.levels))  # JSON has lists
-        object.__setattr__(self, "disturbances", resolve_disturbances(self.disturbances))  # JSON has mappings
+        """Validate, and turn what files and users write into what it stands for."""
+        task = find_task(self.task)
+        self._set("task", reference_of(task))
+        actuators = resolve_actuators(self.actuator, task)
+        self._set("actuator", actuators[0] if len(actuators) == 1 else actuators)
+        if isinstance(self.levels, list):  # JSON has lists
+            self._set("levels", tuple(self.levels))
+        self._set("disturbances", resolve_disturbances(self.disturbances))
+        self._set("joint", resolve_joint(self.joint))
         if self.randomize is not None:
-            object.__setattr__(self, "randomize", _written(self.randomize))
+            self._set("randomize", _written(self.randomize))
+        given = _changed(self.options) if isinstance(self.options, tuple) else self.options
+        self._set("options", _options(task, given or {}))
         limit = self.max_episode_steps
         if limit is not None and (isinstance(limit, bool) or not isinstance(limit, int) or limit < 1):
             raise ValueError(f"max_episode_steps = {limit!r}: must be an integer >= 1")
+
+    def _set(self, name: str, value: Any) -> None:
+        object.__setattr__(self, name, value)
+
+    @classmethod
+    def of(cls, task: str, actuator: Any, arguments: Mapping[str, Any]) -> "EnvConfig":
+        """The configuration that the keyword arguments of a face describe.
+
+        Args:
+            task: the task's name.
+            actuator: as for the field.
+            arguments: other fields, and the task's own options; a time limit is the face's own matter.
+
+        Raises:
+            UnknownOptionError: neither has a name that is given.
+            ValueError: as for the class.
+        """
+        names = {field.name for field in dataclasses.fields(cls)} - {"options", "max_episode_steps"}
+        fields = {name: value for name, value in arguments.items() if name in names}
+        options = {name: value for name, value in arguments.items() if name not in names}
+        return cls(task, actuator, options=options, **fields)
+
+    @property
+    def actuators(self) -> tuple[ActuatorModel, ...]:
+        """The actuator of each motor."""
+        return self.actuator if isinstance(self.actuator, tuple) else (self.actuator,)
+
+    @property
+    def distributions(self) -> dict[str, Distribution] | None:
+        """What is drawn at every reset, in this order; None if nothing is."""
+        return None if self.randomize is None else {name: parse(text) for name, text in map(_split, self.randomize)}
+
+    @property
+    def time_limit(self) -> int | None:
+        """The longest episode [environment steps]; None for any."""
+        return self.max_episode_steps or find_task(self.task).max_episode_steps
 
     def seen_as(self, trained: "EnvConfig") -> "EnvConfig":
         """This environment with the actions and observations of another: those that a policy was trained with."""
@@ -59,11 +127,120 @@ class EnvConfig:
         return dataclasses.replace(self, **interface)
 
     def as_arguments(self) -> dict[str, Any]:
-        """The keyword arguments for `gymnasium.make`, without those left at the task's default."""
-        arguments = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        if self.randomize is not None:
-            arguments["randomize"] = {name: parse(text) for name, text in map(_split, self.randomize)}
-        return {name: value for name, value in arguments.items() if value is not None and value != OFF}
+        """The keyword arguments for `gymnasium.make` with the task's id, without those left at their defaults."""
+        arguments = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)[1:]}
+        del arguments["options"]
+        arguments["randomize"] = self.distributions
+        given = {name: value for name, value in arguments.items() if value is not None and value not in (OFF, PLAIN)}
+        return given | _changed(self.options)
+
+    def make(self, **view: Any) -> "gymnasium.Env[Any, Any]":
+        """The environment, made by Gymnasium.
+
+        Args:
+            **view: `render_mode`, `width`, `height`, `camera` and `pretty`, as for `codrl_mj.envs.ActuatedEnv`.
+        """
+        env_id = find_task(self.task).env_id
+        return gymnasium.make(env_id, disable_env_checker=True, **self.as_arguments(), **view)
+
+    def as_mapping(self) -> dict[str, Any]:
+        """The configuration as JSON-serialisable values; `from_mapping` reads it."""
+        described = [mapping_of(one) for one in self.actuators]
+        return {
+            **{field.name: getattr(self, field.name) for field in dataclasses.fields(self)},
+            "actuator": described if isinstance(self.actuator, tuple) else described[0],
+            "disturbances": self.disturbances.as_mapping(),
+            "joint": dataclasses.asdict(self.joint),
+            "options": _changed(self.options),
+        }
+
+    @classmethod
+    def from_mapping(cls, mapping: Any, base: "EnvConfig | None" = None) -> "EnvConfig":
+        """The configuration that a mapping describes: `as_mapping`'s, or any part of it.
+
+        Args:
+            mapping: the fields; the task's own options may stand among them.
+            base: what is not given is this one's; disturbances, joint and options by their fields.
+
+        Raises:
+            ValueError: a key is unknown (the nearest known one is suggested), or a value out of bounds.
+        """
+        if not isinstance(mapping, Mapping):
+            raise ValueError(f"env = {mapping!r}: must be a mapping of the environment's arguments")
+        given = dict(mapping) if base is None else {"task": base.task, **mapping}
+        if "task" not in given:
+            raise ValueError("it has no task")
+        own = find_task(given["task"]).options._fields
+        check_names(given, [*(field.name for field in dataclasses.fields(cls)), *own], "key", "env.")
+        if options := {name: given.pop(name) for name in own if name in given}:
+            given["options"] = {**(given.get("options") or {}), **options}
+        if base is None:
+            return cls(**given)
+        there = base.as_mapping()
+        for name in ("disturbances", "joint", "options"):
+            if isinstance(given.get(name), Mapping):
+                given[name] = {**there[name], **given[name]}
+        return dataclasses.replace(base, **given)
+
+
+def upgraded(configuration: Mapping[str, Any]) -> dict[str, Any]:
+    """A training's configuration of any version, or a part of one, as the present version writes it.
+
+    Task and actuator are the environment's; they may also stand above it, as flags do, and win there. Sensor, supply
+    and joint were disturbances once; they are the actuator's and the joint's. Every task had a `center_radius` once.
+
+    Args:
+        configuration: as `TrainConfig.as_mapping` wrote it, or a user did.
+    """
+    given = dict(configuration)
+    above = {name: given.pop(name) for name in ("task", "actuator") if name in given}
+    if not isinstance(given.get("env", {}), Mapping):
+        return given
+    given["env"] = env = {**given.get("env", {}), **above}
+    if (radius := env.pop("center_radius", None)) is not None:
+        env["options"] = {**(env.get("options") or {}), "center_radius": radius}
+    old = env.get("disturbances")
+    if not isinstance(old, Mapping) or not old.keys() & MOVED.keys():
+        return given
+    moved = {name: old[name] for name in MOVED if old.get(name)}
+    env["disturbances"] = {name: value for name, value in old.items() if name not in MOVED}
+    if joint := {name: moved[f"joint_{name}"] for name in ("damping", "friction") if f"joint_{name}" in moved}:
+        env["joint"] = joint
+    actuator = env.get("actuator", "paper")
+    sensor = {name: moved[name] for name in ("current_bias", "current_noise") if name in moved}
+    supply = {"resistance": moved["supply_resistance"]} if "supply_resistance" in moved else {}
+    if (sensor or supply) and actuator not in (None, "ideal"):  # which has neither
+        described = dict(actuator) if isinstance(actuator, Mapping) else {"name": actuator}
+        for part, values in (("controller", sensor), ("supply", supply)):
+            if values:
+                inside = described.get(part)
+                described[part] = {**(inside if isinstance(inside, Mapping) else {}), **values}
+        env["actuator"] = described
+    return given
+
+
+def _options(task: Task, given: Mapping[str, float]) -> Any:
+    """The task's options, checked.
+
+    Raises:
+        UnknownOptionError: unknown option.
+        ValueError: one that is not a number > 0.
+    """
+    known = task.options._fields
+    for name, value in given.items():
+        if name not in known:
+            has = ", ".join(known) or "none"
+            raise UnknownOptionError(
+                f"unknown option {name!r} of {task.name}: it has {has} (unexpected keyword argument {name!r})"
+            )
+        if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
+            raise ValueError(f"{name} = {value!r}: must be a number > 0")
+    return task.options(**{name: float(value) for name, value in given.items()})
+
+
+def _changed(options: Any) -> dict[str, float]:
+    """Those of a task's options that are not at their defaults."""
+    return {name: value for name, value in options._asdict().items() if value != options._field_defaults[name]}
 
 
 def _written(randomize: Any) -> tuple[str, ...]:

@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from codrl_mj.actuators import ActuatorModel
 from codrl_mj.envs.randomization import Randomization, nominal_parameters
-from codrl_mj.motor import Actuator
 from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
-from codrl_mj.physics.screen import stability_radii
 from codrl_mj.physics.streams import Streams
 from codrl_mj.physics.variation import write_fields
 
@@ -17,19 +16,19 @@ class Draws:
     """The drawn values of N environments, as arrays, and their way into the simulations."""
 
     def __init__(
-        self, randomization: Randomization, physics: MujocoBatchPhysics, actuators: Sequence[Actuator]
+        self, randomization: Randomization, physics: MujocoBatchPhysics, actuators: Sequence[Sequence[ActuatorModel]]
     ) -> None:
         """Begin with nothing drawn.
 
         Args:
             randomization: what is drawn.
             physics: the N simulations.
-            actuators: the nominal actuator of each; none if they are ideal.
+            actuators: the nominal ones of each.
         """
         self._randomization = randomization
         self._physics = physics
         count = physics.num_envs
-        self._nominal, self._arms = nominal_parameters(actuators, count)
+        self._nominal, self._arms = nominal_parameters(actuators)
         self._values = np.full((count, len(randomization.names)), np.nan)
         self._rejected = np.zeros(count, dtype=np.int64)
 
@@ -50,7 +49,6 @@ class Draws:
             lambda pending, count: streams.random(rows[pending], count),
             self._nominal[rows],
             self._arms[rows],
-            stability_radii,
         )
         self._apply(rows)
         return self._randomization.reports(rows, self._values, self._rejected)

@@ -12,6 +12,8 @@ import numba
 import numpy as np
 from numba.np.unsafe.ndarray import to_fixed_tuple
 
+from codrl_mj.engine.families import jitable
+from codrl_mj.engine.memory import internal
 from codrl_mj.physics.constrain import Compiled, is_fine
 from codrl_mj.tasks import Task
 
@@ -48,6 +50,7 @@ def compiled_outcomes(task: Task) -> Outcomes:
     Args:
         task: the task.
     """
+    jitable(task)
     return _compiled(task.observation, task.reward, task.terminated, task.options)  # type: ignore[arg-type]
 
 
@@ -59,20 +62,20 @@ def _compiled(
     options_type: Callable[..., Any],
 ) -> Outcomes:
     compiled = numba.njit(nogil=True, error_model="numpy")
-    observation_of, reward_of, terminated_at = compiled(observation), compiled(reward), compiled(terminated)
+    observation_of, reward_of, terminated_at = internal(observation), internal(reward), internal(terminated)
     options_count = len(options_type._fields)  # type: ignore[attr-defined]
 
-    @compiled
+    @internal
     def observe(state: np.ndarray, observation: np.ndarray) -> None:
         seen = observation_of(state)
         for entry in range(len(seen)):
             observation[entry] = seen[entry]
 
-    @compiled
+    @internal
     def rewarded(before: np.ndarray, force: float, after: np.ndarray, options: np.ndarray) -> float:
         return float(reward_of(before, force, after, options_type(*to_fixed_tuple(options, options_count))))
 
-    @compiled
+    @internal
     def ended(state: np.ndarray) -> bool:
         return bool(terminated_at(state))
 

@@ -8,13 +8,12 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
-from codrl_mj.envs.registration import ENVIRONMENTS
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.serial import SerialVectorEnv
 from codrl_mj.envs.snapshots import check_snapshot
 from codrl_mj.envs.vector import ActuatedVectorEnv
 from codrl_mj.physics import Signals
-
-_TASKS = {registered.env_id: task for task, registered in ENVIRONMENTS.items()}
+from codrl_mj.tasks import TASKS, find_task
 
 
 class ActuatedVecEnv(VecEnv):
@@ -105,7 +104,7 @@ class ActuatedVecEnv(VecEnv):
         self._returns[0], self._lengths[0] = total, length
         outcome = self._outcome(0, observation, truncated)
         observations, _ = self.env.reset()
-        self.env.signals = Signals(*(values[-1:] for values in signals))  # type: ignore[index]
+        self.env.signals = {name: values[-1:] for name, values in signals.items()}
         self._returns[:], self._lengths[:] = 0.0, 0
         return observations, [outcome]
 
@@ -139,12 +138,12 @@ class ActuatedVecEnv(VecEnv):
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """An image of the first environment; nothing of the others."""
-        return [self.env.render(), *[None] * (self.num_envs - 1)]
+        return [self.env.image(), *[None] * (self.num_envs - 1)]
 
     def render(self, mode: str | None = None) -> np.ndarray | None:
         """An image of the first environment."""
         del mode
-        return self.env.render()
+        return self.env.image()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """The attribute of the vector environment, once for each of the environments asked for."""
@@ -172,22 +171,26 @@ class ActuatedVecEnv(VecEnv):
         return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]
 
 
-def make_sb3_vec_env(env_id: str, num_envs: int = 64, **arguments: Any) -> ActuatedVecEnv:
+def make_sb3_vec_env(env_id: str | EnvConfig, num_envs: int = 64, **arguments: Any) -> ActuatedVecEnv:
     """Many environments as one Stable-Baselines3 `VecEnv`.
 
     Args:
-        env_id: Gymnasium id, such as `codrl_mj/Pendulum-v0`.
+        env_id: Gymnasium id, such as `codrl_mj/Pendulum-v0`; or an environment's whole configuration.
         num_envs: how many, >= 1.
-        **arguments: as for `codrl_mj.envs.ActuatedVectorEnv`; the time limit is Gymnasium's unless given. With
-            `physics="analytic"` the environments are stepped one by one: a `SerialVectorEnv`.
+        **arguments: as for `codrl_mj.envs.ActuatedVectorEnv`; the time limit is Gymnasium's unless given. On another
+            physics than `mujoco` the environments are stepped one by one: a `SerialVectorEnv`.
 
     Raises:
         ValueError: unknown id, or an argument out of bounds.
     """
-    if env_id not in _TASKS:
-        raise ValueError(f"env_id = {env_id!r}: must be one of {', '.join(_TASKS)}")
-    task = _TASKS[env_id]
-    arguments = {"max_episode_steps": ENVIRONMENTS[task].max_episode_steps} | arguments
-    if arguments.get("physics") == "analytic":
+    known = {one.env_id: name for name, one in TASKS.items()}
+    if isinstance(env_id, EnvConfig):
+        task, arguments = env_id.task, env_id.as_arguments() | arguments
+    elif env_id in known:
+        task = known[env_id]
+    else:
+        raise ValueError(f"env_id = {env_id!r}: must be one of {', '.join(known)}")
+    arguments = {"max_episode_steps": find_task(task).max_episode_steps} | arguments
+    if arguments.get("physics", "mujoco") != "mujoco":
         return ActuatedVecEnv(SerialVectorEnv(num_envs, task, **arguments))
     return ActuatedVecEnv(ActuatedVectorEnv(num_envs, task, autoreset_mode=AutoresetMode.SAME_STEP, **arguments))

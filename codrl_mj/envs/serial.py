@@ -12,9 +12,8 @@ from gymnasium.wrappers import TimeLimit
 from codrl_mj.envs.setup import Setup
 from codrl_mj.envs.single import ActuatedEnv
 from codrl_mj.envs.snapshots import check_snapshot
-from codrl_mj.envs.vector import check_counts
-from codrl_mj.motor import Actuator
-from codrl_mj.physics import Signals
+from codrl_mj.envs.vector import check_counts, one_for_each
+from codrl_mj.physics import Signals, signal_names
 from codrl_mj.tasks import Task
 
 Array = np.ndarray
@@ -31,7 +30,7 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
         self,
         num_envs: int,
         task: str,
-        actuator: str | Actuator | Mapping[str, Any] | Sequence[Actuator] | None = "paper",
+        actuator: Any = "paper",
         max_episode_steps: int | None = None,
         **arguments: Any,
     ) -> None:
@@ -40,7 +39,7 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
         Args:
             num_envs: how many, >= 1.
             task: the task's name.
-            actuator: as for `ActuatedEnv`; or a sequence of N `Actuator`s, one for each environment.
+            actuator: as for `ActuatedEnv`; or a sequence of N actuators, one for each environment.
             max_episode_steps: time limit of each environment [steps]; None for none.
             **arguments: the other arguments of `ActuatedEnv`, `physics` among them.
 
@@ -49,9 +48,7 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
             CallbackInUseError: another library's MuJoCo callback is installed.
         """
         check_counts(num_envs, max_episode_steps)
-        each: Sequence[Any] = [actuator] * num_envs
-        if isinstance(actuator, Sequence) and not isinstance(actuator, str):
-            each = actuator
+        each: Sequence[Any] = actuator if one_for_each(actuator, task) else [actuator] * num_envs
         if len(each) != num_envs:
             raise ValueError(f"actuator: {len(each)} actuators for {num_envs} environments: there must be one for each")
         self.max_episode_steps = max_episode_steps
@@ -85,12 +82,15 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
         ended = terminated | truncated
         last = infos.get("final_info", infos)  # of those that ended
         others = last if ended.all() else infos
-        self.signals = Signals(*(np.where(ended, last[name], others[name]) for name in Signals._fields))
+        self.signals = {
+            name: np.where(ended.reshape(-1, *[1] * (last[name].ndim - 1)), last[name], others[name])
+            for name in signal_names(self.setup.family)
+        }
         return observations, rewards, terminated, truncated, infos
 
-    def render(self) -> Array | None:  # type: ignore[override]
-        """The first environment as an image, shape (height, width, 3), uint8; None if there is no render mode."""
-        return self._singles[0].render()
+    def image(self, row: int = 0) -> Array | None:
+        """One environment as an image, shape (height, width, 3), uint8; None if there is no render mode."""
+        return self._singles[row].render()
 
     def snapshot(self) -> dict[str, Array]:
         """Everything that the future depends on, as plain arrays: the environments' own, and their bookkeeping."""

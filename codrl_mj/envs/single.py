@@ -1,34 +1,36 @@
 """One environment, as Gymnasium knows it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium.utils import seeding
 
-from codrl_mj.disturbances import Disturbances
+from codrl_mj.actuators import IDEAL
+from codrl_mj.envs.attributes import Attribute, GymnasiumAttributes, checked_states, written
 from codrl_mj.envs.compiled import arguments, compiled_kernels
-from codrl_mj.envs.distributions import Distribution
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.setup import Setup
 from codrl_mj.envs.snapshots import check_snapshot
-from codrl_mj.motor import Actuator
+from codrl_mj.envs.views import signals_of
 from codrl_mj.physics import MujocoPhysics
 from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
 from codrl_mj.physics.streams import set_words, words_of
 from codrl_mj.tasks import Task
 
 
-class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
+class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     """A classic-control task whose actions go through an actuator.
 
     Observation, action, reward, start and end are Gymnasium's for the task; what differs is the force: the action
     chooses the desired one, the actuator delivers the actual one. With `actuator="ideal"` they are equal and the
     environment is a drop-in for Gymnasium's.
 
-    Every step's `info` has `desired_force`, `actual_force` [N or N*m], `current`, `reference_current` [A], `voltage`
-    [V] and `saturated` (bool), each at the end of the step. Currents and voltage are 0 where the actuator is ideal;
-    where the agent commands the voltage, what is delivered is what is desired.
+    Every step's `info` has `desired_force`, `actual_force` [N or N*m], the signals of the actuator's family and
+    `saturated` (bool), each at the end of the step: of a current loop `current`, `reference_current` [A] and `voltage`
+    [V], which are 0 where the actuator is ideal. Where the agent commands the voltage, what is delivered is what is
+    desired. With several motors each is an array (n,).
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - as Gymnasium has it
@@ -36,72 +38,35 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
     def __init__(
         self,
         task: str,
-        actuator: str | Actuator | Mapping[str, Any] | None = "paper",
+        actuator: Any = "paper",
         physics: str = "mujoco",
-        integrator: str | None = None,
-        inner_steps: int | None = None,
-        timestep: float | None = None,
-        allow_unstable: bool = False,
-        action: str = "force",
-        levels: Sequence[float] | None = None,
-        observe_actuator: bool = False,
-        randomize: Mapping[str, Distribution] | None = None,
-        disturbances: Disturbances | Mapping[str, Any] | None = None,
         render_mode: str | None = None,
         width: int = 480,
         height: int = 480,
         camera: str = "fixed",
         pretty: bool = False,
-        **options: float,
+        **arguments: Any,
     ) -> None:
         """Build the environment.
 
         Args:
             task: the task's name, such as `cartpole`.
-            actuator: a name (`ideal`, `paper`, `weak`, `weaker`, `open_loop`), an `Actuator`, or a mapping of its
-                fields.
-            physics: `mujoco`, or `analytic` (Gymnasium's own equations).
-            integrator: one of the task's integrators; the default is Gymnasium's.
-            inner_steps: integration steps per environment step; the default is the paper's inner loop with a motor and
-                one without.
-            timestep: instead of `inner_steps`, the integration step [s], which must divide the environment step.
-            allow_unstable: build the environment even if the current loop is unstable.
-            action: what the agent commands: the desired `force` (the paper), the reference `current` [A], or the raw
-                terminal `voltage` [V] past the controller (end to end).
-            levels: for discrete tasks with `action="current"` or `"voltage"`: the commands that actions choose from.
-            observe_actuator: append measured and reference current [A] to the observation.
-            randomize: what to draw at every reset, after the initial state: names of fields of the actuator
-                (`motor.inductance`, `controller.kp`) and the model (`model.mass.BODY`, `model.length.BODY`,
-                `model.gravity`, `model.damping.JOINT`), each with a `Uniform`, `LogUniform` or `Choice`. What was drawn
-                is in the reset's `info["randomization"]`.
-            disturbances: a `Disturbances`, or a mapping of its fields: delayed, coarse and slow commands, a noisy and
-                biased current sensor, a sagging supply, load pulses, joint friction and damping. With
-                `observe_actuator` the agent sees the sensor's current.
+            actuator: what the force goes through, as `EnvConfig.actuator` says.
+            physics: `mujoco`, `analytic` (Gymnasium's own equations), or one's own.
             render_mode: None or `rgb_array`.
             width: width of rendered images [px].
             height: height of rendered images [px].
             camera: a camera of the model: `fixed` or `close`.
             pretty: shadows, reflections and multisampling.
-            **options: the task's own options (CartPole: `center_radius`).
+            **arguments: the other fields of `codrl_mj.envs.config.EnvConfig`: `integrator`, `inner_steps`, `timestep`,
+                `allow_unstable`, `action`, `levels`, `observe_actuator`, `disturbances`, `joint`, `randomize`; and the
+                task's own options (CartPole: `center_radius`).
 
         Raises:
             ValueError: an argument is unknown or out of bounds, or the current loop is unstable; the message names it.
             CallbackInUseError: another library's MuJoCo callback is installed.
         """
-        self.setup = Setup.build(
-            task,
-            actuator,
-            integrator=integrator,
-            inner_steps=inner_steps,
-            timestep=timestep,
-            allow_unstable=allow_unstable,
-            action=action,
-            levels=levels,
-            observe_actuator=observe_actuator,
-            randomize=randomize,
-            disturbances=disturbances,
-            **options,
-        )
+        self.setup = Setup.build(EnvConfig.of(task, actuator, arguments))
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode = {render_mode!r}: must be None or 'rgb_array'")
         self.physics = self.setup.simulate(physics)
@@ -111,11 +76,11 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
         self.metadata = {**self.metadata, "render_fps": self.setup.task.render_fps}
         self._view = {"width": width, "height": height, "camera": camera, "pretty": pretty}
         self._renderer: OffscreenRenderer | None = None
-        self._drawn: MujocoPhysics | None = None
+        self._drawn: Any = None
         if render_mode is not None:
-            check_view(self._scene().model, width, height, camera)
-        self.action_space = self.setup.action_space
-        self.observation_space = self.setup.observation_space
+            check_view(self._scene().scene[0], width, height, camera)
+        self.action_space = self.setup.commands.action_space
+        self.observation_space = self.setup.view.observation_space
         self._observation_shape = self.observation_space.shape
         self._compiled: tuple[Any, tuple[Any, ...]] | None = (
             None  # its step, and the arguments that are this simulation
@@ -127,29 +92,43 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
         return self.setup.task
 
     @property
-    def actuator(self) -> Actuator | None:
-        """The actuator, of the present episode where it is drawn; None is the ideal one."""
+    def actuator(self) -> Any:
+        """The actuator, of the present episode where it is drawn; with several motors a tuple of them."""
         return self._actuator
 
     @property
     def model(self) -> Any:
         """The `mujoco.MjModel` (MuJoCo physics only); one `mj_step` of it is one integration step."""
-        return self._mujoco_physics().model
+        return self._engine()[0]
 
     @property
     def data(self) -> Any:
         """The `mujoco.MjData` (MuJoCo physics only)."""
-        return self._mujoco_physics().data
+        return self._engine()[1]
 
     @property
     def state(self) -> np.ndarray:
-        """The mechanical state, shape (n,), float64, in Gymnasium's order."""
+        """The mechanical state, shape (n,), float64, in Gymnasium's order; set, it moves there, the motor as it is."""
         return self.physics.state.copy()
 
-    def _mujoco_physics(self) -> MujocoPhysics:
-        if not isinstance(self.physics, MujocoPhysics):
-            raise AttributeError("physics='analytic' has no MuJoCo model or data; use physics='mujoco'")
-        return self.physics
+    @state.setter
+    def state(self, state: Any) -> None:
+        self.physics.state = checked_states(state, self.physics.state.shape)
+
+    def _engine(self) -> tuple[Any, Any]:
+        if self.physics.scene is None:
+            raise AttributeError(f"{type(self.physics).__name__} has no MuJoCo model or data; use physics='mujoco'")
+        return self.physics.scene
+
+    def _read_attribute(self, attribute: Attribute) -> Any:
+        return attribute.read(self.setup, self.model)
+
+    def _write_attribute(self, attribute: Attribute, name: str, value: Any) -> None:
+        physics, model = self.physics, self.model
+        kept = physics.snapshot()
+        self.setup = written(attribute, name, value, self.setup, model)
+        physics.set_model({})
+        physics.restore(kept)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -163,7 +142,8 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
         super().reset(seed=seed)
         self._actuator, info = self.setup.start(self.physics, self.np_random, options)
         self._randomization = info.get("randomization", {})
-        return self.setup.observation(self.physics.state, self.setup.seen(self.physics, None)), info
+        seen = self.physics.observed(np.zeros_like(self.physics.trace[-1])) if self.setup.view.sensors else None
+        return self.setup.view.observation(self.physics.state, seen), info
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advance by one environment step.
@@ -176,38 +156,31 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
             ValueError: the action is not in the action space, or not a number.
             SimulationDivergedError: the simulation left the finite numbers.
         """
-        force = self.setup.force(action)
+        force = self.setup.commands.force(action)
         if self._compiled is None:
-            if not isinstance(self.physics, MujocoPhysics):
+            if self.physics.compiled is None:
                 return self._step_apart(force)
             self._compiled = compiled_kernels(self.setup, self.physics).step, arguments(self.setup, self.physics)
         step, simulation = self._compiled
         observation = np.empty(self._observation_shape, np.float32)
-        reward, terminated, fine, desired, actual, current, reference, voltage, saturated = step(
-            force, observation, *simulation
-        )
+        reward, terminated, fine = step(force, observation, *simulation)
         if not fine:
-            self._mujoco_physics().check_finite()
-        info = {
-            "desired_force": desired,
-            "actual_force": actual,
-            "current": current,
-            "reference_current": reference,
-            "voltage": voltage,
-            "saturated": saturated,
-        }
-        return observation, reward, terminated, False, info
+            self.physics.check_finite()  # type: ignore[attr-defined]
+        return observation, reward, terminated, False, self._info(force)
 
-    def _step_apart(self, force: float) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def _step_apart(self, force: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """What the compiled step does, in parts, for a physics that is Python."""
-        setup, physics = self.setup, self.physics
+        view, physics = self.setup.view, self.physics
         before = physics.state
-        delivered = physics.step(force)
-        signals = setup.signals(delivered)
-        seen = setup.seen(physics, delivered) if setup.senses else signals
-        after = physics.state
-        observation, reward = setup.observation(after, seen), setup.reward(before, signals, after)
-        return observation, reward, setup.terminated(after), False, signals._asdict()
+        physics.step(force)
+        info, after = self._info(force), physics.state
+        seen = physics.observed(physics.trace[-1]) if view.sensors else None
+        reward = view.reward(before, info["actual_force"], after)
+        return view.observation(after, seen), reward, view.terminated(after), False, info
+
+    def _info(self, force: Any) -> dict[str, Any]:
+        """What the actuators did in the last step, which asked for a force."""
+        return signals_of(self.physics.trace[-1], self.setup.family, force, self.setup.commands.tracks)
 
     @property
     def randomization(self) -> dict[str, Any]:
@@ -248,7 +221,7 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
             values, drawn = snapshot["drawn"], not np.isnan(snapshot["drawn"]).any()
             self._randomization = randomization.report(values, int(snapshot["rejected"])) if drawn else {}
             self._actuator = self.setup.vary(
-                self.physics, values if drawn else randomization.nominal_values(self.setup.actuator)
+                self.physics, values if drawn else randomization.nominal_values(self.setup.commands.simulated)
             )
         self.physics.restore(snapshot["physics"])
         self.physics.memory[:] = snapshot.get("disturbances", 0.0)
@@ -266,17 +239,18 @@ class ActuatedEnv(gymnasium.Env[np.ndarray, Any]):
             gymnasium.logger.warn("render() without a render mode: pass render_mode='rgb_array' when making it")
             return None
         scene = self._scene()
+        model, data = scene.scene
         if self._renderer is None:
-            self._renderer = OffscreenRenderer(scene.model, **self._view)  # type: ignore[arg-type]
+            self._renderer = OffscreenRenderer(model, **self._view)  # type: ignore[arg-type]
         scene.show(self.physics.state)
-        return self._renderer.render(scene.data)
+        return self._renderer.render(data)
 
-    def _scene(self) -> MujocoPhysics:
-        """What is drawn: the simulation itself, or the task's ideal model where the physics is analytic."""
-        if isinstance(self.physics, MujocoPhysics):
+    def _scene(self) -> Any:
+        """What is drawn: the simulation itself, or the task's ideal model where the physics has none."""
+        if self.physics.scene is not None:
             return self.physics
         if self._drawn is None:
-            self._drawn = MujocoPhysics(self.task, None, 1, self.setup.integrator)
+            self._drawn = MujocoPhysics(self.task, [IDEAL] * len(self.task.motors), 1, self.setup.integrator)
         return self._drawn
 
     def close(self) -> None:

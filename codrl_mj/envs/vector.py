@@ -10,20 +10,23 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from codrl_mj.actuators import ActuatorModel, Ideal, check_same_family
+from codrl_mj.envs.attributes import Attribute, GymnasiumAttributes, checked_states, written
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.draws import Draws
 from codrl_mj.envs.setup import Setup
 from codrl_mj.envs.snapshots import check_snapshot
-from codrl_mj.motor import Actuator
 from codrl_mj.physics import Signals
 from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
 from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
 from codrl_mj.physics.streams import Streams
-from codrl_mj.tasks import Task
+from codrl_mj.physics.variation import DRAWN, VARIED, field_of, write_fields
+from codrl_mj.tasks import Task, find_task
 
 Array = np.ndarray
 
 
-class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
+class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
     """N environments that step together, each bit for bit an `ActuatedEnv` with a time limit.
 
     Made by `gymnasium.make_vec(id, num_envs=N, vectorization_mode="vector_entry_point")`. No Python runs for a single
@@ -39,7 +42,7 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         self,
         num_envs: int,
         task: str,
-        actuator: str | Actuator | Mapping[str, Any] | Sequence[Actuator] | None = "paper",
+        actuator: Any = "paper",
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         num_threads: int = 0,
@@ -56,13 +59,14 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         Args:
             num_envs: how many, >= 1.
             task: the task's name.
-            actuator: as for `ActuatedEnv`; or a sequence of N `Actuator`s, one for each environment.
+            actuator: as for `ActuatedEnv`; or a sequence of N actuators (with several motors, of tuples of them), one
+                for each environment.
             max_episode_steps: time limit of each environment [steps]; None for none.
             autoreset_mode: when an environment whose episode ended is reset: in the `NEXT_STEP`, in the `SAME_STEP`, or
                 by the caller (`DISABLED`), with `reset(options={"reset_mask": ...})`.
             num_threads: threads of the engine; 0 uses every CPU. Results do not depend on it.
             physics: `mujoco`; the analytic physics steps one Gymnasium environment at a time and cannot be batched.
-            render_mode: None or `rgb_array`: `render` then draws the first environment.
+            render_mode: None or `rgb_array`: `render` then draws every environment, `image` one of them.
             width: width of rendered images [px].
             height: height of rendered images [px].
             camera: a camera of the model.
@@ -90,10 +94,10 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
             actuators,
             self.setup.inner_steps,
             self.setup.integrator,
-            self.num_envs,
-            self.setup.max_force,
+            self.setup.commands.max_forces,
             int(num_threads),
             self.setup.disturbances,
+            self.setup.joint,
         )
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {
@@ -103,14 +107,14 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         }
         self.render_mode = render_mode
         self.max_episode_steps = max_episode_steps
-        self.single_action_space = self.setup.action_space
-        self.single_observation_space = self.setup.observation_space
+        self.single_action_space = self.setup.commands.action_space
+        self.single_observation_space = self.setup.view.observation_space
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._streams = Streams(self.num_envs)
         self._draws = None
         if self.setup.randomization is not None:
-            self._draws = Draws(self.setup.randomization, self.physics, actuators or [])
+            self._draws = Draws(self.setup.randomization, self.physics, actuators)
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
         self._ended = np.zeros(self.num_envs, dtype=bool)
         self._observations: Array = np.zeros(self.observation_space.shape or (), dtype=np.float32)
@@ -120,6 +124,7 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
             check_view(self.physics.model, width, height, camera)
         self._renderer: OffscreenRenderer | None = None
         self._data: mujoco.MjData | None = None  # what is drawn
+        self._looks: dict[str, Array] = {}  # fields of the models, where attributes were written
 
     @property
     def task(self) -> Task:
@@ -128,8 +133,56 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
 
     @property
     def state(self) -> Array:
-        """Mechanical states, shape (N, n), float64, in Gymnasium's order."""
+        """Mechanical states, shape (N, n), float64, in Gymnasium's order; set, it moves there, motors as they are."""
         return self.physics.state
+
+    @state.setter
+    def state(self, states: Any) -> None:
+        self.physics.state = checked_states(states, self.physics.state.shape)
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """An attribute, once for each environment, as Gymnasium's `SyncVectorEnv` has it."""
+        value = getattr(self, name)
+        each = isinstance(value, np.ndarray) and value.shape[:1] == (self.num_envs,)
+        return tuple(value.tolist() if value.ndim == 1 else value) if each else (value,) * self.num_envs
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set an attribute of all environments: a list or tuple has a value for each of them."""
+        setattr(self, name, np.array(values) if isinstance(values, list | tuple) else values)
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """An attribute once for each environment; or a method, which is called once for all of them."""
+        value = getattr(self, name)
+        return (value(*args, **kwargs),) * self.num_envs if callable(value) else self.get_attr(name)
+
+    def _read_attribute(self, attribute: Attribute) -> Any:
+        """One value where the environments share it, else shape (N,)."""
+        if attribute.shared:
+            return attribute.read(self.setup, self.physics.model)
+        return np.array([attribute.read(self.setup, model) for model in self.physics.models()])
+
+    def _write_attribute(self, attribute: Attribute, name: str, value: Any) -> None:
+        if attribute.shared and not np.array_equal(value, present := self._read_attribute(attribute)):
+            raise AttributeError(
+                f"{name} = {value!r}: the environments share it, as {present!r}; use vectorization_mode='sync'"
+            )
+        if attribute.shared:
+            return
+        if np.shape(value) not in ((), (self.num_envs,)):
+            raise ValueError(f"{name} = {value!r}: must be one number, or {self.num_envs}, one for each environment")
+        fields = {field: self.physics.field(field).copy() for field in VARIED}
+        looks = {field: np.array([field_of(self.physics.model, field)] * self.num_envs) for field in DRAWN}
+        looks |= {field: rows.copy() for field, rows in self._looks.items() if field in DRAWN}
+        numbers = np.broadcast_to(value, self.num_envs).tolist()
+        for row, (model, number) in enumerate(zip(self.physics.models(), numbers, strict=True)):
+            write_fields(model, looks, row)
+            written(attribute, name, number, self.setup, model)
+            for field, rows in (fields | looks).items():
+                rows[row] = field_of(model, field)
+        kept = self.physics.snapshot()
+        self.physics.set_model(np.arange(self.num_envs), fields)
+        self.physics.restore(kept)
+        self._looks = fields | looks
 
     @property
     def randomization(self) -> dict[str, Array]:
@@ -184,7 +237,8 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         states = self.setup.task.initial_states(draws)
         infos = {} if self._draws is None else self._draws.draw(self._streams, rows)
         self.physics.reset(rows, states, self.setup.keys(lambda count: self._streams.random(rows, count)))
-        self._observations[rows] = self.setup.observation(states, self.setup.seen(self.physics, None, rows))
+        seen = self.physics.observed(None, rows) if self.setup.view.sensors else None
+        self._observations[rows] = self.setup.view.observation(states, seen)
         self._elapsed[rows] = 0
         self._ended[rows] = False
         return infos
@@ -205,7 +259,7 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
                 stepped; once it is reset, by `reset(options={"reset_mask": ...})`, they can go on.
             RuntimeError: in `DISABLED` mode, an environment whose episode ended was not reset.
         """
-        forces = self.setup.forces(actions)
+        forces = self.setup.commands.forces(actions)
         if len(forces) != self.num_envs:
             raise ValueError(
                 f"actions: {len(forces)} rows for {self.num_envs} environments: there must be one for each"
@@ -218,17 +272,15 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
             )
         stepping = ~self._ended  # in NEXT_STEP mode, environments that ended are reset instead
         before = self.physics.state
-        delivered = self.physics.step(forces)
-        signals = self.setup.signals(delivered)
-        seen = self.setup.seen(self.physics, delivered) if self.setup.senses else signals
+        signals = self.setup.signals(self.physics.step(forces))
         after = self.physics.state
         rewards = np.empty(self.num_envs)
         terminated, truncated = np.empty(self.num_envs, dtype=bool), np.empty(self.num_envs, dtype=bool)
-        broken = self.setup.outcomes.judge(
+        broken = self.setup.view.outcomes.judge(
             before,
-            signals.actual_force,
+            np.ascontiguousarray(signals["actual_force"]),
             after,
-            self.setup.option_values,
+            self.setup.view.option_values,
             self._elapsed,
             np.inf if self.max_episode_steps is None else float(self.max_episode_steps),
             stepping,
@@ -237,9 +289,9 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
             terminated,
             truncated,
         )
-        if self.setup.observe_actuator:
-            assert seen is not None
-            self._observations[:, -2], self._observations[:, -1] = seen.current, seen.reference_current
+        if self.setup.view.sensors:
+            seen = self.physics.observed(signals)
+            self._observations[:, -len(self.setup.view.sensors) :] = seen.reshape(self.num_envs, -1)
         if broken >= 0:
             self.physics.check_finite(after, stepping)
         self.signals = signals
@@ -309,8 +361,13 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
         """Everything but the renderer, which a copy makes anew."""
         return self.__dict__ | {"_renderer": None, "_data": None}
 
-    def render(self) -> Array | None:  # type: ignore[override]
-        """The first environment as an image, shape (height, width, 3), uint8; None if there is no render mode."""
+    def render(self) -> tuple[Array, ...] | None:  # type: ignore[override]
+        """Images of the environments, shape (height, width, 3), uint8; None if there is no render mode."""
+        images = [self.image(row) for row in range(self.num_envs if self.render_mode else 1)]
+        return None if images[0] is None else tuple(images)  # type: ignore[arg-type]
+
+    def image(self, row: int = 0) -> Array | None:
+        """One environment as an image, shape (height, width, 3), uint8; None if there is no render mode."""
         if self.render_mode is None:
             gymnasium.logger.warn("render() without a render mode: pass render_mode='rgb_array' when making it")
             return None
@@ -318,8 +375,9 @@ class ActuatedVectorEnv(VectorEnv[Array, Array, Array]):
             self._renderer = OffscreenRenderer(self.physics.model, **self._view)  # type: ignore[arg-type]
             self._data = mujoco.MjData(self.physics.model)
         if self._draws is not None:
-            self._draws.show(0)
-        self.physics.show(0, self._data)
+            self._draws.show(row)
+        write_fields(self.physics.model, self._looks, row)
+        self.physics.show(row, self._data)
         return self._renderer.render(self._data)
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -336,38 +394,45 @@ def check_counts(num_envs: int, max_episode_steps: int | None) -> None:
     Raises:
         ValueError: either is no integer >= 1.
     """
-    if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
-        raise ValueError(f"num_envs = {num_envs!r}: must be an integer >= 1")
-    if max_episode_steps is not None and max_episode_steps < 1:
-        raise ValueError(f"max_episode_steps = {max_episode_steps}: must be >= 1")
+    limit = {} if max_episode_steps is None else {"max_episode_steps": max_episode_steps}
+    for name, count in {"num_envs": num_envs, **limit}.items():
+        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+            raise ValueError(f"{name} = {count!r}: must be an integer >= 1")
+
+
+def one_for_each(actuator: Any, task: str) -> bool:
+    """Whether it is a sequence of what each environment gets, and not what all get: such as one for each motor."""
+    listed = isinstance(actuator, Sequence) and not isinstance(actuator, str)
+    return listed and (len(find_task(task).motors) == 1 or all(isinstance(one, list | tuple) for one in actuator))
 
 
 def _set_up(
     num_envs: int, task: str, actuator: Any, arguments: Mapping[str, Any]
-) -> tuple[Setup, list[Actuator] | None]:
-    """The set-up shared by all environments, and the actuators to simulate.
+) -> tuple[Setup, list[tuple[ActuatorModel, ...]]]:
+    """The set-up shared by all environments, and the actuators to simulate, a tuple for each environment.
 
     Raises:
         ValueError: an argument is out of bounds, or the actuators are not one for each environment.
     """
-    if not isinstance(actuator, Sequence) or isinstance(actuator, str):
-        setup = Setup.build(task, actuator, **arguments)
-        physical = setup.physical_actuator
-        return setup, None if physical is None else [physical] * num_envs
+    if not one_for_each(actuator, task):
+        setup = Setup.build(EnvConfig.of(task, actuator, arguments))
+        return setup, [setup.commands.simulated] * num_envs
     if len(actuator) != num_envs:
         raise ValueError(f"actuator: {len(actuator)} actuators for {num_envs} environments: there must be one for each")
     if arguments.get("action", "force") != "force":
         raise ValueError(f"action = {arguments['action']!r}: with an actuator for each environment only 'force'")
-    setups: dict[Actuator, Setup] = {}
+    setups: dict[Any, Setup] = {}
     for index, one in enumerate(actuator):
-        if not isinstance(one, Actuator):
+        each = one if isinstance(one, tuple) else (one,)
+        if not all(isinstance(model, ActuatorModel) and not isinstance(model, Ideal) for model in each):
             raise ValueError(f"actuator[{index}] = {one!r}: must be an Actuator; the ideal one cannot be among others")
         if one not in setups:
             try:
-                setups[one] = Setup.build(task, one, **arguments)
+                setups[one] = Setup.build(EnvConfig.of(task, one, arguments))
             except ValueError as error:
                 raise ValueError(f"actuator[{index}]: {error}") from None
-    return dataclasses.replace(setups[actuator[0]]), list(actuator)
+    check_same_family([setup.actuators[0] for setup in setups.values()])
+    return dataclasses.replace(setups[actuator[0]]), [setups[one].actuators for one in actuator]
 
 
 def _infos(signals: Signals, stepping: Array) -> dict[str, Any]:
@@ -376,7 +441,8 @@ def _infos(signals: Signals, stepping: Array) -> dict[str, Any]:
         return {}
     every = stepping.all()
     infos: dict[str, Any] = {}
-    for name, values in signals._asdict().items():
-        infos[name] = values if every else np.where(stepping, values, np.zeros((), values.dtype))
+    for name, values in signals.items():
+        mask = stepping.reshape(-1, *[1] * (values.ndim - 1))
+        infos[name] = values if every else np.where(mask, values, np.zeros((), values.dtype))
         infos[f"_{name}"] = stepping.copy()
     return infos

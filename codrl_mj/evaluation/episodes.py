@@ -4,7 +4,6 @@ import contextlib
 import copy
 import dataclasses
 import json
-import operator
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -14,10 +13,9 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from codrl_mj.envs.registration import ENVIRONMENTS
+from codrl_mj.actuators import IDEAL, Actuator, actuator_from_mapping, mapping_of, trusting
 from codrl_mj.envs.single import ActuatedEnv
-from codrl_mj.motor import Actuator
-from codrl_mj.physics import Signals
+from codrl_mj.physics import signal_names, trace_names
 from codrl_mj.runs.files import writing
 from codrl_mj.runs.policies import Policy
 from codrl_mj.tasks import find_task
@@ -39,14 +37,15 @@ class Episode:
     """What the agent did, shape (T, ...)."""
     reward: np.ndarray
     """Reward of each step, shape (T,)."""
-    trace: np.ndarray
-    """What the actuator did in each integration step, shape (T*n, 6); columns `codrl_mj.physics.TRACE_NAMES`."""
+    trace: dict[str, np.ndarray]
+    """What the actuators did in each integration step, by the names of `codrl_mj.physics.trace_names`, each of shape
+    (T*n,); with several motors (T*n, motors)."""
     signals: dict[str, np.ndarray]
-    """The actuator's signals at the end of each step, by their names in `info`, each of shape (T,)."""
+    """The actuators' signals at the end of each step, by their names in `info`, each of shape (T,) or (T, motors)."""
     terminated: bool
     """The task ended it; otherwise the time limit did."""
-    actuator: Actuator | None
-    """What it ran on: the one that was drawn for it, if actuators were; None is the ideal one."""
+    actuator: Any
+    """What it ran on: the one that was drawn for it, if actuators were; with several motors a tuple of them."""
     command: str = "force"
     """What the agent commanded: `force`, `current` or `voltage`."""
 
@@ -58,7 +57,7 @@ class Episode:
     @property
     def inner_steps(self) -> int:
         """Integration steps in an environment step."""
-        return len(self.trace) // len(self.time)
+        return len(self.trace["speed"]) // len(self.time)
 
     @property
     def timestep(self) -> float:
@@ -94,7 +93,9 @@ class RandomPolicy:
         return np.array([self._space.sample() for _ in observation]), None
 
 
-_ARRAYS = ("time", "state", "observation", "action", "reward", "trace")
+_ARRAYS = ("time", "state", "observation", "action", "reward")
+_OLD_TRACE = ("desired_force", "actual_force", "current", "voltage", "speed", "saturated")
+"""Columns of the array `trace` in files of earlier versions."""
 
 
 def save_episode(episode: Episode, path: Path) -> None:
@@ -102,8 +103,8 @@ def save_episode(episode: Episode, path: Path) -> None:
 
     Args:
         episode: the episode.
-        path: `.npz` file; its arrays are named as the fields of `Episode`, the signals by their own names. `actuator`
-            is text: its fields as JSON.
+        path: `.npz` file; its arrays are named as the fields of `Episode`, what is in `trace` and `signals` as
+            `trace/NAME` and `signals/NAME`. `actuator` is text: its fields as JSON, a list for several motors.
 
     Raises:
         ValueError: another suffix.
@@ -111,13 +112,20 @@ def save_episode(episode: Episode, path: Path) -> None:
     if path.suffix != ".npz":
         raise ValueError(f"trajectory {path}: the suffix must be .npz")
     arrays: dict[str, Any] = {field: getattr(episode, field) for field in (*_ARRAYS, "terminated", "command")}
-    arrays["actuator"] = json.dumps(None if episode.actuator is None else episode.actuator.as_mapping())
+    for field in ("trace", "signals"):
+        arrays |= {f"{field}/{name}": values for name, values in getattr(episode, field).items()}
+    several = isinstance(episode.actuator, tuple)
+    described = [mapping_of(one) for one in episode.actuator] if several else mapping_of(episode.actuator)
     with writing(path) as temporary:
-        np.savez_compressed(temporary, **arrays, **episode.signals)  # type: ignore[arg-type]
+        np.savez_compressed(temporary, actuator=json.dumps(described), **arrays)
 
 
-def load_episode(path: Path) -> Episode:
+def load_episode(path: Path, trust: bool = False) -> Episode:
     """Read an episode that `save_episode` wrote; nothing is unpickled.
+
+    Args:
+        path: the file.
+        trust: whether to import the module of an actuator that is none of ours, which executes it.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -125,19 +133,33 @@ def load_episode(path: Path) -> Episode:
     """
     try:
         with np.load(path, allow_pickle=False) as archive:
-            actuator = json.loads(str(archive["actuator"]))
-            return Episode(
-                **{field: archive[field] for field in _ARRAYS},
-                signals={name: archive[name] for name in Signals._fields},
-                terminated=bool(archive["terminated"]),
-                actuator=None if actuator is None else Actuator.from_mapping(actuator),
-                command=str(archive["command"]),
-            )
+            arrays = {name: archive[name] for name in archive.files}
+        if "trace" in arrays:  # of an earlier version
+            arrays |= {f"trace/{name}": column for name, column in zip(_OLD_TRACE, arrays["trace"].T, strict=True)}
+            arrays |= {f"signals/{name}": arrays[name] for name in signal_names(Actuator)}
+        described = json.loads(str(arrays["actuator"]))
+        several = isinstance(described, list)
+        with trusting(trust):
+            actuators = [
+                IDEAL if one is None else actuator_from_mapping(one) for one in (described if several else [described])
+            ]
+        return Episode(
+            **{field: arrays[field] for field in _ARRAYS},
+            trace=_within("trace/", arrays),
+            signals=_within("signals/", arrays),
+            terminated=bool(arrays["terminated"]),
+            actuator=tuple(actuators) if several else actuators[0],
+            command=str(arrays["command"]),
+        )
     except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path} is not the trajectory of an episode: {error}") from None
 
 
-def make_env(task: str, actuator: str | Actuator | Mapping[str, Any] | None, **options: Any) -> gymnasium.Env[Any, Any]:
+def _within(prefix: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
+
+
+def make_env(task: str, actuator: Any, **options: Any) -> gymnasium.Env[Any, Any]:
     """One environment of a task by the task's name, through Gymnasium's registry.
 
     Args:
@@ -145,7 +167,7 @@ def make_env(task: str, actuator: str | Actuator | Mapping[str, Any] | None, **o
         actuator: as `ActuatedEnv` takes it.
         **options: anything else that `ActuatedEnv` or `gymnasium.make` takes.
     """
-    return gymnasium.make(ENVIRONMENTS[task].env_id, actuator=actuator, disable_env_checker=True, **options)
+    return gymnasium.make(find_task(task).env_id, actuator=actuator, disable_env_checker=True, **options)
 
 
 class _Recording:
@@ -160,7 +182,7 @@ class _Recording:
         self._actions: list[Any] = []
         self._rewards: list[float] = []
         self._traces: list[np.ndarray] = []
-        self._signals: list[tuple[Any, ...]] = []
+        self._signals: list[dict[str, Any]] = []
         self._terminated = False
 
     def step(self, action: Any) -> bool:
@@ -171,7 +193,7 @@ class _Recording:
         self._actions.append(action)
         self._rewards.append(float(reward))
         self._traces.append(self._core.physics.trace.copy())
-        self._signals.append(_signals(info))
+        self._signals.append(info)
         return self._terminated or truncated
 
     def episode(self) -> Episode:
@@ -182,18 +204,19 @@ class _Recording:
             observation=np.array(self.observations),
             action=np.array(self._actions),
             reward=np.array(self._rewards),
-            trace=np.concatenate(self._traces),
+            trace=self._trace(),
             signals={
-                name: np.array(values)
-                for name, values in zip(Signals._fields, zip(*self._signals, strict=True), strict=True)
+                name: np.array([info[name] for info in self._signals]) for name in signal_names(self._core.setup.family)
             },
             terminated=self._terminated,
             actuator=self._core.actuator,
-            command=self._core.setup.command,
+            command=self._core.setup.commands.name,
         )
 
-
-_signals = operator.itemgetter(*Signals._fields)
+    def _trace(self) -> dict[str, np.ndarray]:
+        whole = np.concatenate(self._traces)
+        columns = whole[:, 0].T if whole.shape[1] == 1 else np.moveaxis(whole, 2, 0)
+        return dict(zip(trace_names(self._core.setup.family), columns.copy(), strict=True))
 
 
 @contextlib.contextmanager

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from codrl_mj.actuators import ActuatorModel, Ideal
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.evaluation.episodes import Episode, make_env, run_episodes
+from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.evaluation.measures import (
     Interval,
     Quartiles,
@@ -22,9 +23,6 @@ from codrl_mj.evaluation.measures import (
     quartiles,
     wilson_rate,
 )
-from codrl_mj.motor import Actuator, resolve
-from codrl_mj.physics.analytic import DRIVERS
-from codrl_mj.physics.base import TRACE_ACTUAL_FORCE, TRACE_CURRENT, TRACE_SATURATED, TRACE_SPEED, TRACE_VOLTAGE
 from codrl_mj.runs.policies import Policy
 from codrl_mj.tasks import Task, find_task
 
@@ -96,7 +94,7 @@ class Evaluation:
     episode_times_to_goal: tuple[float | None, ...] = ()
     """Time to the goal of each episode [s]; None where it did not succeed, 0 where the goal is to last."""
     conditions: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """What it was measured under: actuator, environment, seed and so on, as JSON-serialisable values."""
+    """What it was measured under: environment, seed and so on, as JSON-serialisable values."""
 
     def as_mapping(self) -> dict[str, Any]:
         """The evaluation as JSON-serialisable values.
@@ -123,9 +121,7 @@ MEASURES: dict[str, dataclasses.Field[Any]] = {
 
 def evaluate(
     policy: Policy,
-    task: str,
-    actuator: str | Actuator | Mapping[str, Any] | None = "paper",
-    env: EnvConfig = EnvConfig(),  # noqa: B008 - frozen
+    env: EnvConfig,
     episodes: int = 100,
     seed: int = 0,
     deterministic: bool = True,
@@ -135,9 +131,7 @@ def evaluate(
 
     Args:
         policy: chooses actions.
-        task: the task's name.
-        actuator: a name, an `Actuator`, a mapping of its fields, or None (ideal).
-        env: the environment's other arguments; what it randomises is drawn for every episode.
+        env: task, actuator and all else; what it randomises is drawn for every episode.
         episodes: their number, >= 1.
         seed: of the first episode, the others counting up from it; and of the actions that are sampled.
         deterministic: whether the policy takes its most likely action or samples.
@@ -147,24 +141,16 @@ def evaluate(
         ValueError: an argument is unknown or out of bounds.
         SimulationDivergedError: a simulation left the finite numbers.
     """
-    nominal = resolve(actuator, find_task(task).name)
-    arguments = env.as_arguments()
-    conditions = {
-        "actuator": None if nominal is None else nominal.as_mapping(),
-        "env": dataclasses.asdict(env),
-        "seed": seed,
-        "deterministic": deterministic,
-    }
-    ran = run_episodes(policy, lambda: make_env(task, nominal, **arguments), episodes, seed, deterministic, on_step)
-    return dataclasses.replace(summarize(task, nominal, ran), conditions=conditions)
+    ran = run_episodes(policy, env.make, episodes, seed, deterministic, on_step)
+    conditions = {"env": env.as_mapping(), "seed": seed, "deterministic": deterministic}
+    return dataclasses.replace(summarize(env.task, ran), conditions=conditions)
 
 
-def summarize(task: str, actuator: Actuator | None, episodes: Sequence[Episode]) -> Evaluation:
+def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
     """Reduce episodes to an `Evaluation`.
 
     Args:
         task: the task's name.
-        actuator: what they ran on, before anything was drawn; None is the ideal actuator.
         episodes: at least one, all of them with the same integration step.
 
     Raises:
@@ -175,6 +161,7 @@ def summarize(task: str, actuator: Actuator | None, episodes: Sequence[Episode])
     goals = [_time_to_goal(definition, episode) for episode in episodes]
     reached = np.array([time for time in goals if time is not None])
     success = wilson_rate(len(reached), len(episodes))
+    driven = [_driven(definition, episode) for episode in episodes]
     return Evaluation(
         task=definition.name,
         episodes=len(episodes),
@@ -186,11 +173,11 @@ def summarize(task: str, actuator: Actuator | None, episodes: Sequence[Episode])
         success=success,
         failure=Interval(1 - success.mean, 1 - success.high, 1 - success.low),
         time_to_goal=quartiles(reached) if definition.goal is not None and len(reached) else None,
-        mechanical_work=_mean_of(episodes, lambda episode: _work(definition, episode)),
+        mechanical_work=bootstrap_mean(np.array([sum(one.work for one in each) for each in driven])),
         episode_returns=tuple(returns.tolist()),
         episode_times_to_goal=tuple(goals),
-        **_tracking(episodes),
-        **(dict.fromkeys(_ELECTRICAL) if actuator is None else _electrical(definition, episodes)),
+        **_tracking(episodes, driven),
+        **_electrical(episodes, driven),
     )
 
 
@@ -208,27 +195,69 @@ def _time_to_goal(task: Task, episode: Episode) -> float | None:
     return since if succeeded else None
 
 
-def _arm(episode: Episode) -> float:
-    """Torque at the motor's shaft for a force of one; 1 for the ideal actuator."""
-    return 1.0 if episode.actuator is None else episode.actuator.motor.arm_radius
+@dataclasses.dataclass(frozen=True)
+class _Driven:
+    """What one motor did in an episode, at its shaft."""
+
+    actuator: ActuatorModel
+    timestep: float
+    """Of the integration [s]."""
+    desired: np.ndarray
+    """Torque that the agent asked for in each integration step [N*m]."""
+    actual: np.ndarray
+    """Torque delivered in it [N*m]."""
+    speed: np.ndarray
+    """Velocity of the joint before the first step and after each [m/s or rad/s]."""
+    force: np.ndarray
+    """Force delivered to it [N or N*m]."""
+    signals: dict[str, np.ndarray]
+    """The family's."""
+
+    @property
+    def work(self) -> float:
+        """Work done on the joint [J]."""
+        return mechanical_work(self.force, self.speed, self.timestep)
+
+    @property
+    def current(self) -> np.ndarray:
+        """Before the first step, which begins with none, and after each [A]."""
+        return np.append(0.0, self.signals["current"])
 
 
-def _speed(task: Task, episode: Episode) -> np.ndarray:
-    """Velocity of the actuated joint before the first integration step and after each [m/s or rad/s]."""
-    return np.append(episode.state[0, DRIVERS[task.name].speed], episode.trace[:, TRACE_SPEED])
+def _driven(task: Task, episode: Episode) -> list[_Driven]:
+    """What each motor did."""
+    several = isinstance(episode.actuator, tuple)
+    made = []
+    for number, actuator in enumerate(episode.actuator if several else (episode.actuator,)):
+        own = {name: values[:, number] if several else values for name, values in episode.trace.items()}
+        asked = episode.signals["desired_force"][:, number] if several else episode.signals["desired_force"]
+        arm, force, speed = actuator.arm_radius, own.pop("actual_force"), own.pop("speed")
+        made.append(
+            _Driven(
+                actuator,
+                episode.timestep,
+                arm * np.repeat(asked, episode.inner_steps),
+                arm * force,
+                np.append(episode.state[0, task.speeds[number]], speed),
+                force,
+                own,
+            )
+        )
+    return made
 
 
-def _work(task: Task, episode: Episode) -> float:
-    """Work done on the joint [J]."""
-    return mechanical_work(episode.trace[:, TRACE_ACTUAL_FORCE], _speed(task, episode), episode.timestep)
+def _tracks(episode: Episode) -> bool:
+    """Whether the agent asked for a force."""
+    actuator = episode.actuator[0] if isinstance(episode.actuator, tuple) else episode.actuator
+    return episode.command == "force" or actuator.commands()[episode.command].actuator.tracks
 
 
-def _tracking(episodes: Sequence[Episode]) -> dict[str, Any]:
+def _tracking(episodes: Sequence[Episode], driven: Sequence[Sequence[_Driven]]) -> dict[str, Any]:
     """The measures of how well the torque follows the desired one, which is held over an environment step."""
-    if any(episode.command == "voltage" for episode in episodes):
+    if not all(map(_tracks, episodes)):
         return dict.fromkeys(("tracking_rms", "tracking_percent", "tracking_max", "tracking_lag"))
-    desired = [_arm(episode) * np.repeat(episode.signals["desired_force"], episode.inner_steps) for episode in episodes]
-    actual = [_arm(episode) * episode.trace[:, TRACE_ACTUAL_FORCE] for episode in episodes]
+    desired = [one.desired for each in driven for one in each]
+    actual = [one.actual for each in driven for one in each]
     asked = np.concatenate(desired)
     error = asked - np.concatenate(actual)
     rms, scale = _root_mean_square(error), _root_mean_square(asked)
@@ -244,41 +273,36 @@ def _root_mean_square(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-_ELECTRICAL = (
-    "saturated_percent",
-    "peak_voltage",
-    "peak_current",
-    "rms_current",
-    "peak_speed",
-    "energy_drawn",
-    "energy_returned",
-    "copper_loss",
-    "magnetic_energy",
-)
-
-
-def _electrical(task: Task, episodes: Sequence[Episode]) -> dict[str, Any]:
-    """The measures of `_ELECTRICAL`, for episodes with a motor, which begin with no current."""
-    rows = np.concatenate([episode.trace for episode in episodes])
-    motors = [episode.actuator.motor for episode in episodes if episode.actuator is not None]
-    currents = [np.append(0.0, episode.trace[:, TRACE_CURRENT]) for episode in episodes]
-    squares = np.array([integral_of_square(i, e.timestep) for i, e in zip(currents, episodes, strict=True)])
-    flows = [
-        electrical_energy(episode.trace[:, TRACE_VOLTAGE], current, episode.timestep)
-        for episode, current in zip(episodes, currents, strict=True)
-    ]
-    drawn, returned = np.array(flows).T
-    resistance = np.array([motor.resistance for motor in motors])
-    left = np.array([motor.inductance * i[-1] ** 2 / 2 for motor, i in zip(motors, currents, strict=True)])
-    duration = math.fsum(episode.time[-1] for episode in episodes)
-    return {
-        "saturated_percent": float(100 * rows[:, TRACE_SATURATED].mean()),
-        "peak_voltage": float(np.abs(rows[:, TRACE_VOLTAGE]).max()),
-        "peak_current": float(np.abs(rows[:, TRACE_CURRENT]).max()),
+def _electrical(episodes: Sequence[Episode], driven: Sequence[Sequence[_Driven]]) -> dict[str, Any]:
+    """What was asked of the actuators: of any but the ideal one, and of windings, as far as the family shows it."""
+    names = ("saturated_percent", "peak_voltage", "peak_current", "rms_current", "peak_speed", "energy_drawn")
+    found: dict[str, Any] = dict.fromkeys((*names, "energy_returned", "copper_loss", "magnetic_energy"))
+    every = [one for each in driven for one in each]
+    if isinstance(every[0].actuator, Ideal):
+        return found
+    found["peak_speed"] = max(float(np.abs(one.speed).max()) / one.actuator.arm_radius for one in every)
+    if "saturated" in every[0].signals:
+        found["saturated_percent"] = float(100 * np.concatenate([one.signals["saturated"] for one in every]).mean())
+    if not {"current", "voltage"} <= every[0].signals.keys() or every[0].actuator.winding is None:
+        return found
+    energies = [[_energies(one) for one in each] for each in driven]
+    drawn, returned, copper, magnetic, squares = np.array([np.sum(each, axis=0) for each in energies]).T
+    duration = math.fsum(episode.time[-1] for episode in episodes) * len(driven[0])
+    return found | {
+        "peak_voltage": float(np.abs(np.concatenate([one.signals["voltage"] for one in every])).max()),
+        "peak_current": float(np.abs(np.concatenate([one.signals["current"] for one in every])).max()),
         "rms_current": math.sqrt(squares.sum() / duration),
-        "peak_speed": max(float(np.abs(_speed(task, episode)).max()) / _arm(episode) for episode in episodes),
         "energy_drawn": bootstrap_mean(drawn),
         "energy_returned": bootstrap_mean(returned),
-        "copper_loss": bootstrap_mean(resistance * squares),
-        "magnetic_energy": bootstrap_mean(left),
+        "copper_loss": bootstrap_mean(copper),
+        "magnetic_energy": bootstrap_mean(magnetic),
     }
+
+
+def _energies(one: _Driven) -> tuple[float, float, float, float, float]:
+    """Energy [J] drawn, returned, lost in the winding and left in it; the integral of the squared current [A^2*s]."""
+    assert one.actuator.winding is not None
+    resistance, inductance = one.actuator.winding
+    drawn, returned = electrical_energy(one.signals["voltage"], one.current, one.timestep)
+    square = integral_of_square(one.current, one.timestep)
+    return drawn, returned, resistance * square, inductance * one.current[-1] ** 2 / 2, square

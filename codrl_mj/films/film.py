@@ -15,7 +15,6 @@ import numpy as np
 from codrl_mj.envs.single import ActuatedEnv
 from codrl_mj.evaluation.episodes import Episode
 from codrl_mj.films.strip import AXIS_WIDTH, HEADER_HEIGHT, PLOT_HEIGHT, draw_strip, draw_text, pixels_per_second
-from codrl_mj.motor import Actuator
 from codrl_mj.physics.offscreen import OffscreenRenderer
 from codrl_mj.runs.files import writing, writing_folder
 
@@ -35,10 +34,12 @@ class Panel:
     """Drawn above the scene."""
     task: str
     """Task name."""
-    actuator: Actuator | None
-    """What the episode ran on; None is the ideal actuator."""
+    actuator: Any
+    """What the episode ran on; with several motors a tuple."""
     episode: Episode
     """The episode."""
+    motor: int = 0
+    """Which of several motors the strip shows."""
 
 
 def film(
@@ -138,7 +139,7 @@ class _DrawnPanel:
         self._title = draw_text(panel.title, width, _TITLE_HEIGHT)
         self._window = min(end, _WINDOW_STEPS * float(panel.episode.time[0]))
         self._scale = pixels_per_second(width, self._window)
-        self._axis, self._strip = draw_strip(panel.episode, panel.actuator, width, self._window, end)
+        self._axis, self._strip = draw_strip(panel.episode, panel.actuator, width, self._window, end, panel.motor)
         self._last = len(panel.episode.reward)
         fell, over = panel.episode.terminated, panel.episode.time[-1]
         ending = f"ended at {over:.2f} s" if fell else f"time limit, {over:.2f} s"

@@ -1,11 +1,12 @@
-"""The strip under a film's scene: desired and actual torque, and the voltage, over time; and its lines of text."""
+"""The strip under a film's scene: desired and actual torque, and a signal, over time; and its lines of text."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
 
+from codrl_mj.actuators import ActuatorModel, Ideal
 from codrl_mj.evaluation.episodes import Episode
-from codrl_mj.motor import Actuator
 
 _DPI = 100
 HEADER_HEIGHT, TORQUE_HEIGHT, GAP, VOLTAGE_HEIGHT, TIME_HEIGHT = 24, 120, 8, 60, 26  # px, from top to bottom
@@ -31,16 +32,17 @@ def pixels_per_second(width: int, window: float) -> float:
 
 
 def draw_strip(
-    episode: Episode, actuator: Actuator | None, width: int, window: float, end: float
+    episode: Episode, actuator: Any, width: int, window: float, end: float, motor: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw an episode's signals once, so that frames can be cut from them.
 
     Args:
         episode: the episode.
-        actuator: what it ran on; without a motor the strip shows forces, and no voltage.
+        actuator: what it ran on, a tuple with several motors; of the ideal one the strip shows forces.
         width: width of a frame [px].
         window: the span of time that a frame shows [s].
         end: time at the right end of the whole strip [s].
+        motor: which of several motors.
 
     Returns:
         The strip's frame, `width` wide (legend and vertical axes), and its whole content below the legend, on which a
@@ -49,10 +51,14 @@ def draw_strip(
     body = PLOT_HEIGHT + TIME_HEIGHT
     frame = _figure(width, HEADER_HEIGHT + body)
     content = _figure(round(pixels_per_second(width, window) * end), body)
+    if isinstance(actuator, tuple):
+        episode = dataclasses.replace(episode, signals={name: v[:, motor] for name, v in episode.signals.items()})
+        actuator = actuator[motor]
     lines = []
+    torque = "force [N]" if isinstance(actuator, Ideal) else "torque [N·m]"
     for bottom, height, plot, label in (
-        (TIME_HEIGHT + VOLTAGE_HEIGHT + GAP, TORQUE_HEIGHT, _plot_torque, "torque [N·m]" if actuator else "force [N]"),
-        (TIME_HEIGHT, VOLTAGE_HEIGHT, _plot_voltage, "u [V]"),
+        (TIME_HEIGHT + VOLTAGE_HEIGHT + GAP, TORQUE_HEIGHT, _plot_torque, torque),
+        (TIME_HEIGHT, VOLTAGE_HEIGHT, _plot_signal, _signal_label(actuator)),
     ):
         total = HEADER_HEIGHT + body
         axis = frame.add_axes((AXIS_WIDTH / width, bottom / total, 1e-6, height / total))
@@ -98,9 +104,9 @@ def _edges(episode: Episode) -> np.ndarray:
     return np.concatenate([[0.0], episode.time])
 
 
-def _plot_torque(episode: Episode, actuator: Actuator | None, axes: Any) -> list[Any]:
-    """Plot desired and actual torque (force, where there is no motor), and where the voltage was at its limit."""
-    arm = 1.0 if actuator is None else actuator.motor.arm_radius
+def _plot_torque(episode: Episode, actuator: ActuatorModel, axes: Any) -> list[Any]:
+    """Plot desired and actual torque (force, where there is no motor), and where the actuator was at its limit."""
+    arm = actuator.arm_radius
     desired, actual = episode.signals["desired_force"] * arm, episode.signals["actual_force"] * arm
     limit = 1.15 * max(np.abs(desired).max(), np.abs(actual).max(), 1e-9)
     axes.set_ylim(-limit, limit)
@@ -116,17 +122,33 @@ def _plot_torque(episode: Episode, actuator: Actuator | None, axes: Any) -> list
     return lines
 
 
-def _plot_voltage(episode: Episode, actuator: Actuator | None, axes: Any) -> list[Any]:
-    """Plot the terminal voltage, and its limit where it comes near."""
-    if actuator is None:
+def _signal(actuator: ActuatorModel) -> str | None:
+    """The signal that the second plot shows: the voltage, or the family's first with a unit; None if there is none."""
+    names = [name for name in actuator.SIGNAL_UNITS if name in actuator.Signals._fields]  # type: ignore[attr-defined]
+    return "voltage" if "voltage" in names else next(iter(names), None)
+
+
+def _signal_label(actuator: ActuatorModel) -> str:
+    name = _signal(actuator)
+    if name is None or name == "voltage":
+        return "u [V]" if name or isinstance(actuator, Ideal) else ""
+    return f"{name} [{actuator.SIGNAL_UNITS[name]}]"
+
+
+def _plot_signal(episode: Episode, actuator: ActuatorModel, axes: Any) -> list[Any]:
+    """Plot the voltage, and its limit where it comes near; of a family without one its first signal."""
+    name = _signal(actuator)
+    if name is None:
         axes.set_ylim(-1, 1)
-        axes.text(0.02, 0, "an ideal actuator has no voltage", va="center", fontsize=8, color="0.5")
+        kind = "an ideal" if isinstance(actuator, Ideal) else f"a {type(actuator).__name__}"
+        axes.text(0.02, 0, f"{kind} actuator has no voltage", va="center", fontsize=8, color="0.5")
         return []
-    voltage, limit = episode.signals["voltage"], actuator.controller.max_voltage
-    span = 1.2 * max(np.abs(voltage).max(), 1e-9)
+    values, limit = episode.signals[name], actuator.voltage_limit if name == "voltage" else None
+    span = 1.2 * max(np.abs(values).max(), 1e-9)
     axes.set_ylim(-span, span)
     axes.axhline(0, color="0.85", linewidth=0.8)
-    if limit < span:
+    if limit is not None and limit < span:
         for side in (-limit, limit):
             axes.axhline(side, color=SATURATED, linewidth=1.0, linestyle="--")
-    return [axes.stairs(voltage, _edges(episode), baseline=None, color=VOLTAGE, linewidth=1.6, label="voltage")]
+    label = name.replace("_", " ")
+    return [axes.stairs(values, _edges(episode), baseline=None, color=VOLTAGE, linewidth=1.6, label=label)]

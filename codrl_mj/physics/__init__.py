@@ -1,15 +1,11 @@
 """Simulation of a task: in MuJoCo or on Gymnasium's analytic dynamics, behind one small interface."""
 
 from codrl_mj.physics.analytic import AnalyticPhysics
-from codrl_mj.physics.base import Physics, Signals, SimulationDivergedError
-from codrl_mj.physics.mjcf import hills, install_callbacks, motors, needed_callbacks, set_actuator
+from codrl_mj.physics.base import Physics, Signals, SimulationDivergedError, signal_names, trace_names
+from codrl_mj.physics.mjcf import hills, install_callbacks, motors, needed_callbacks
 from codrl_mj.physics.mujoco_single import MujocoPhysics
 
-PHYSICS = ("mujoco", "analytic")
-"""The physics that an environment can be built on."""
-
 __all__ = [
-    "PHYSICS",
     "AnalyticPhysics",
     "MujocoPhysics",
     "Physics",
@@ -19,5 +15,6 @@ __all__ = [
     "install_callbacks",
     "motors",
     "needed_callbacks",
-    "set_actuator",
+    "signal_names",
+    "trace_names",
 ]

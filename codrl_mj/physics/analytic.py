@@ -1,282 +1,177 @@
 """A task on the installed Gymnasium environment, unmodified, driven with an arbitrary force through its attributes."""
 
-from typing import Any, Protocol
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-import gymnasium
 import numpy as np
 
-from codrl_mj.disturbances import OFF, Disturbances
-from codrl_mj.motor import Actuator, advance, advance_imperfect, to_vector
-from codrl_mj.physics.base import TRACE_NAMES, Signals, check_finite, ideal_signals, motor_signals
-from codrl_mj.physics.disturber import disturber, sensed
+from codrl_mj.actuators import ActuatorModel, Inputs, check_same_family, parameters_type
+from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint
+from codrl_mj.physics.base import check_finite, trace_names
+from codrl_mj.physics.disturber import disturber
 from codrl_mj.tasks import Task
-
-
-class Driver(Protocol):
-    """Drives one Gymnasium environment by one integration step at a time."""
-
-    speed: int
-    """Index of the actuated body's velocity in the state."""
-
-    def __init__(self, gymnasium_id: str) -> None:
-        """Make the Gymnasium environment."""
-
-    def __call__(self, state: np.ndarray, force: float, timestep: float, integrator: str) -> np.ndarray:
-        """The state one integration step later."""
-
-
-def _unwrapped(gymnasium_id: str) -> Any:
-    return gymnasium.make(gymnasium_id, disable_env_checker=True).unwrapped
-
-
-class PendulumDriver:
-    """`PendulumEnv`: the torque limit and the time step are attributes, the action is the torque."""
-
-    speed = 1
-
-    def __init__(self, gymnasium_id: str) -> None:
-        """Make the Gymnasium environment, without a torque limit."""
-        self._env = _unwrapped(gymnasium_id)
-        self._env.max_torque = np.inf
-
-    def __call__(
-        self,
-        state: np.ndarray,
-        force: float,
-        timestep: float,
-        integrator: str,  # noqa: ARG002 - it has one only
-    ) -> np.ndarray:
-        """One `step` with the torque as a float64 action, which Gymnasium does not round."""
-        env = self._env
-        env.dt = timestep
-        env.state = state
-        env.step(np.array([force]))
-        return env.state
-
-
-class CartPoleDriver:
-    """`CartPoleEnv`: the force magnitude, the time step and the integrator are attributes."""
-
-    speed = 1
-
-    def __init__(self, gymnasium_id: str) -> None:
-        """Make the Gymnasium environment."""
-        self._env = _unwrapped(gymnasium_id)
-
-    def __call__(self, state: np.ndarray, force: float, timestep: float, integrator: str) -> np.ndarray:
-        """One `step` with `force_mag` set to the force."""
-        env = self._env
-        env.force_mag = force
-        env.tau = timestep
-        env.kinematics_integrator = integrator
-        env.state = state
-        env.steps_beyond_terminated = None  # the end of an episode is the task's to judge
-        env.step(1)
-        return env.state
-
-
-class AcrobotDriver:
-    """`AcrobotEnv`: the torques to choose from and the time step are attributes."""
-
-    speed = 3
-    _LARGEST = 400.0  # N*m*s^2
-
-    def __init__(self, gymnasium_id: str) -> None:
-        """Make the Gymnasium environment."""
-        self._env = _unwrapped(gymnasium_id)
-
-    def __call__(
-        self,
-        state: np.ndarray,
-        force: float,
-        timestep: float,
-        integrator: str,  # noqa: ARG002 - it has one only
-    ) -> np.ndarray:
-        """One `step` with the torque as the only one to choose from."""
-        if not abs(force) * timestep**2 < self._LARGEST:  # Gymnasium wraps angles turn by turn: it would not come back
-            return np.full(4, np.nan)
-        env = self._env
-        env.AVAIL_TORQUE = [force]
-        env.dt = timestep
-        env.state = state
-        env.step(0)
-        return env.state
-
-
-class MountainCarDriver:
-    """`MountainCarEnv`: its step has no duration, but force, gravity and speed limit are attributes.
-
-    One step is v += force - gravity cos(3 x), x += v. With w = v dt for its v, and force and gravity times dt^2, it is
-    a step of any duration dt.
-    """
-
-    speed = 1
-    _strength = "force"
-
-    def __init__(self, gymnasium_id: str) -> None:
-        """Make the Gymnasium environment; remember what it is before it is driven."""
-        self._acceleration = getattr(_unwrapped(gymnasium_id), self._strength)  # m/s^2 per N
-        self._env = _unwrapped("MountainCar-v0")
-        self._gravity, self._max_speed = self._env.gravity, self._env.max_speed
-
-    def __call__(
-        self,
-        state: np.ndarray,
-        force: float,
-        timestep: float,
-        integrator: str,  # noqa: ARG002 - it has one only
-    ) -> np.ndarray:
-        """One `step` to the right with `force` set to the force's effect, of either sign."""
-        env = self._env
-        env.force = force * self._acceleration * timestep**2
-        env.gravity = self._gravity * timestep**2
-        env.max_speed = self._max_speed * timestep
-        env.state = (state[0], state[1] * timestep)
-        env.step(2)
-        return np.array([env.state[0], env.state[1] / timestep])
-
-
-class MountainCarContinuousDriver(MountainCarDriver):
-    """`MountainCarEnv` again, with the `power` of `Continuous_MountainCarEnv`.
-
-    The continuous environment's equations are the same, but written so that they cannot be scaled (its gravity is no
-    attribute), and it rounds its state to float32.
-    """
-
-    _strength = "power"
-
-
-DRIVERS: dict[str, type[Driver]] = {
-    "pendulum": PendulumDriver,
-    "cartpole": CartPoleDriver,
-    "acrobot": AcrobotDriver,
-    "mountain_car": MountainCarDriver,
-    "mountain_car_continuous": MountainCarContinuousDriver,
-}
-"""The driver of each task's Gymnasium environment."""
 
 
 class AnalyticPhysics:
     """A task on Gymnasium's own equations. See `codrl_mj.physics.base.Physics`."""
 
+    compiled = None
+    scene = None
+
     def __init__(
         self,
         task: Task,
-        actuator: Actuator | None,
+        actuators: Sequence[ActuatorModel],
         inner_steps: int,
         integrator: str,
-        max_force: float | None = None,
+        max_forces: np.ndarray | None = None,
         disturbances: Disturbances = OFF,
+        joint: Joint = PLAIN,
     ) -> None:
         """Make the Gymnasium environment.
 
         Args:
             task: the task.
-            actuator: motor and current loop; None is the ideal actuator.
+            actuators: one for each of the task's motors, of one family.
             inner_steps: integration steps per environment step.
             integrator: one of the task's integrators.
-            max_force: limit of a quantised force [N] or torque [N*m]; None is the task's.
-            disturbances: imperfections of drive, sensor and supply, and load pulses.
+            max_forces: limits of the desired forces [N] or torques [N*m], shape (n,); None are the task's.
+            disturbances: imperfections of the commands' way, and load pulses.
+            joint: must be plain.
 
         Raises:
-            ValueError: the disturbances include friction or damping, which Gymnasium's equations have no place for.
+            ValueError: something is added to the joint, which Gymnasium's equations have no place for; or the task has
+                no Gymnasium environment.
         """
-        if disturbances.of_joint:
-            raise ValueError(
-                f"joint_damping = {disturbances.joint_damping:g} and joint_friction = "
-                f"{disturbances.joint_friction:g}: Gymnasium's equations have neither; use physics='mujoco'"
-            )
+        for added in (*(actuator.additions for actuator in actuators), joint):
+            for name, value in zip(("armature", "damping", "friction"), _added(added), strict=True):
+                if value:
+                    raise ValueError(
+                        f"joint.{name} = {value:g}: Gymnasium's equations have no place for it; use physics='mujoco'"
+                    )
+        if task.twin is None:
+            raise ValueError(f"physics = 'analytic': {task.name} rebuilds no environment of Gymnasium's; use 'mujoco'")
         self.task = task
-        self.actuator = actuator
+        self.family = check_same_family(actuators)
         self.inner_steps = inner_steps
         self._integrator = integrator
         self._timestep = task.step_duration / inner_steps
-        self._driver = DRIVERS[task.name](task.gymnasium_id)
-        self._parameters = None if actuator is None else to_vector(actuator)
-        self._disturbances = disturbances
-        limit = task.max_force if max_force is None else max_force
-        self._disturber = disturber(disturbances, self._timestep, limit, 1)
-        self.trace = np.zeros((inner_steps, len(TRACE_NAMES)))
+        self._twin = task.twin()
+        self._actuators: list[tuple[float, Any]] = []
+        self.set_actuators(actuators)
+        limits = task.max_forces if max_forces is None else max_forces
+        self._disturber = disturber(disturbances, self._timestep, limits, 1)
+        self.trace = np.zeros((inner_steps, len(actuators), len(trace_names(self.family))))
         self.reset(np.zeros(len(task.state_names)))
 
     def reset(self, state: np.ndarray, key: float = 0.0) -> None:
-        """Start an episode from `state`, with the motor at rest.
+        """Start an episode from `state`, with the actuators at rest.
 
         Args:
             state: the mechanical state.
-            key: of the random numbers of the episode's disturbances.
+            key: of the random numbers of the episode's disturbances and sensors.
         """
         self.state = np.array(state, dtype=np.float64)
-        self._loop = (0.0, 0.0, 0.0)  # current, integral, previous error
+        rest = self.family.State(*[0.0] * len(self.family.State._fields))  # type: ignore[attr-defined]
+        self._states = [rest] * len(self._actuators)
         self._time = 0.0
         self._key = key
         if self._disturber is not None:
-            self._disturber.reset(0, key)
+            self._disturber.reset(np.zeros(1, dtype=np.int64), key)
 
-    def set_actuator(self, actuator: Actuator) -> None:
-        """Exchange the motor for another; to be followed by a reset. An ideal actuator cannot be exchanged."""
-        assert self.actuator is not None
-        self.actuator = actuator
-        self._parameters = to_vector(actuator)
+    def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
+        """Exchange the actuators for others of their family; to be followed by a reset."""
+        kind = parameters_type(self.family)
+        self._actuators = [(actuator.arm_radius, kind(*actuator.numbers)) for actuator in actuators]
 
-    def step(self, desired_force: float) -> Signals:
+    def set_model(self, fields: Mapping[str, np.ndarray]) -> None:
+        """Gymnasium's environments have no such fields.
+
+        Raises:
+            ValueError: always.
+        """
+        raise ValueError(
+            f"physics = 'analytic': cannot set {', '.join(fields)}: Gymnasium's environments share no names for "
+            "masses, lengths and gravity, and have no damping; use physics='mujoco'"
+        )
+
+    def step(self, desired_force: Any) -> None:
         """Advance by one environment step, with the desired force (at most the task's `max_force`) held over it.
+
+        Args:
+            desired_force: a number; for several actuators an array (n,).
 
         Raises:
             SimulationDivergedError: the state is no longer finite.
         """
-        signals = ideal_signals(desired_force)
-        command = desired_force
-        for row in self.trace:
+        desired = np.atleast_2d(np.asarray(desired_force, dtype=np.float64))
+        several, speeds = len(self._actuators) > 1, list(self.task.speeds)
+        for rows in self.trace:
+            commands = desired[0] if self._disturber is None else self._disturber.commands(desired)[0]
+            for number, (row, command) in enumerate(zip(rows, commands.tolist(), strict=True)):
+                row[:-1] = command, *self._advance(number, command)
+            force: Any = rows[:, 1] if several else float(rows[0, 1])
             if self._disturber is not None:
-                command = float(self._disturber.command(np.array([desired_force]))[0])
-                signals = ideal_signals(desired_force, command)
-            if self.actuator is not None:
-                signals = self._motor(self.actuator, desired_force, command, float(self.state[self._driver.speed]))
-            force = signals.actual_force
-            if self._disturber is not None:
-                force += float(self._disturber.load()[0])
-            self.state = self._driver(self.state, force, self._timestep, self._integrator)
+                loads = self._disturber.loads()[0]
+                force = force + (loads if several else float(loads[0]))
+            self.state = self._twin(self.state, force, self._timestep, self._integrator)
             self._time += self._timestep
-            speed = self.state[self._driver.speed]
-            row[:] = command, signals.actual_force, signals.current, signals.voltage, speed, signals.saturated
+            rows[:, -1] = self.state[speeds]
         check_finite(self.task, self.state, self._time)
-        return signals
 
-    def sensed(self, signals: Signals) -> Signals:
-        """Signals of the present moment with the current [A] that the sensor measures."""
-        measured = sensed(self._disturbances, [signals.current], [self._key], [self._time], self._timestep)
-        return signals._replace(current=float(measured[0]))
+    def _advance(self, number: int, command: float) -> tuple[float, ...]:
+        """Advance an actuator by one integration step: the force that it delivers, and its signals."""
+        arm, parameters = self._actuators[number]
+        at = self.task.speeds[number]
+        position, speed = self.state[[self.task.qpos[self.task.qvel.index(at)], at]].tolist()
+        inputs = Inputs(command * arm, position / arm, speed / arm, self._time, self._key + number)
+        self._states[number], torque, signals = self.family.advance(
+            parameters, self._timestep, self._states[number], inputs
+        )
+        return torque / arm, *signals
+
+    def observed(self, row: np.ndarray) -> np.ndarray:
+        """What the sensors say at present, shape (actuators, k).
+
+        Args:
+            row: the last row of `trace`; zeros at the start of an episode.
+        """
+        return np.array(
+            [
+                self.family.observe(
+                    parameters,
+                    self._timestep,
+                    self.family.Signals(*signals[2:-1].tolist()),
+                    Inputs(0.0, 0.0, 0.0, self._time, self._key + number),
+                )
+                for number, ((_, parameters), signals) in enumerate(zip(self._actuators, row, strict=True))
+            ]
+        )
 
     def snapshot(self) -> np.ndarray:
-        """State, motor, time and key as a vector, shape (k,), float64.
+        """State, actuators, time and key as a vector, shape (k,), float64.
 
-        `memory` and what `set_actuator` changed are not in it. Gymnasium's environment remembers nothing else.
+        `memory` and what `set_actuators` changed are not in it. Gymnasium's environment remembers nothing else.
         """
-        return np.array([*self.state, *self._loop, self._time, self._key], dtype=np.float64)
+        states = [value for state in self._states for value in state]
+        return np.array([*self.state, *states, self._time, self._key], dtype=np.float64)
 
     def restore(self, snapshot: np.ndarray) -> None:
         """Continue from what `snapshot` returned."""
-        size = len(self.task.state_names)
+        size, kind = len(self.task.state_names), self.family.State
         self.state = snapshot[:size].copy()
-        *loop, self._time, self._key = snapshot[size:].tolist()
-        self._loop = tuple(loop)
+        *values, self._time, self._key = snapshot[size:].tolist()
+        count = len(kind._fields)  # type: ignore[attr-defined]
+        self._states = [kind(*values[at * count : (at + 1) * count]) for at in range(len(self._actuators))]
 
     @property
     def memory(self) -> np.ndarray:
         """What the disturbances remember, a live array; empty if nothing."""
-        return np.empty(0) if self._disturber is None else self._disturber.memory[0]
+        return np.empty(0) if self._disturber is None else self._disturber.memory.reshape(-1)
 
-    def _motor(self, actuator: Actuator, desired_force: float, command: float, speed: float) -> Signals:
-        """Advance the loop by one integration step."""
-        arm, disturbances = actuator.motor.arm_radius, self._disturbances
-        arguments: Any = (self._parameters, self._timestep, *self._loop, command * arm, speed / arm)
-        available = actuator.controller.max_voltage
-        if disturbances.of_motor:
-            imperfections = disturbances.current_bias, disturbances.current_noise, disturbances.supply_resistance
-            arguments += (*imperfections, self._key, self._time)
-            *loop, voltage, available = advance_imperfect(*arguments)
-        else:
-            *loop, voltage = advance(*arguments)
-        self._loop = tuple(loop)  # type: ignore[assignment]
-        return motor_signals(actuator, desired_force, self._loop[0], voltage, command, available)
+    def show(self, state: np.ndarray) -> None:
+        """Nothing: there is no scene."""
+
+
+def _added(added: Any) -> tuple[float, float, float]:
+    return added.armature, added.damping, added.friction

@@ -2,132 +2,80 @@
 
 import math
 import numbers
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 
-from codrl_mj.motor import Actuator
+from codrl_mj.actuators import ActuatorModel, Family, Ideal
 from codrl_mj.tasks import Task
 
-
-class Signals(NamedTuple):
-    """What the actuator did during one environment step; values at the end of its last integration step."""
-
-    desired_force: float
-    """Force asked for [N], or torque [N*m]."""
-    actual_force: float
-    """Force delivered [N], or torque [N*m]."""
-    current: float
-    """Motor current [A]; 0 for the ideal actuator, which has none."""
-    reference_current: float
-    """Current asked of the loop [A], by the command as it arrived; 0 for the ideal actuator."""
-    voltage: float
-    """Terminal voltage [V]; 0 for the ideal actuator."""
-    saturated: bool
-    """Whether the voltage was at its limit."""
+Signals = dict[str, Any]
+"""What the actuators did during one environment step, by name: `desired_force` and `actual_force` [N or N*m], the
+family's signals at the end of the last integration step, and `saturated`. Numbers for a task with one actuator; arrays
+(n,) for one with several; in a batch one axis more, the first."""
 
 
-TRACE_NAMES = ("desired_force", "actual_force", "current", "voltage", "speed", "saturated")
-"""Columns of `Physics.trace`: the force [N or N*m] asked of the actuator (after whatever disturbs commands on their
-way) and delivered in an integration step, the current [A] at its end, the voltage [V] of its last electrical step (both
-0 for the ideal actuator), the velocity of the actuated joint [m/s or rad/s] at its end, and 1 where that voltage was at
-its limit, else 0."""
-(
-    TRACE_DESIRED_FORCE,
-    TRACE_ACTUAL_FORCE,
-    TRACE_CURRENT,
-    TRACE_VOLTAGE,
-    TRACE_SPEED,
-    TRACE_SATURATED,
-) = range(len(TRACE_NAMES))
+def trace_names(family: Family) -> tuple[str, ...]:
+    """Columns of `Physics.trace`.
 
-
-def ideal_signals(desired_force: float, command: float | None = None) -> Signals:
-    """The signals of an ideal actuator: it delivers the command, and has no current and no voltage."""
-    return Signals(desired_force, desired_force if command is None else command, 0.0, 0.0, 0.0, False)
-
-
-def delivered(
-    desired_force: Any,
-    command: Any,
-    current: Any,
-    voltage: Any,
-    arm: Any,
-    torque_constant: Any,
-    available: Any,
-) -> tuple[Any, Any, Any, Any, Any, Any]:
-    """The signals of motors in the order of `Signals`, from numbers or arrays; numba compiles it as it stands.
-
-    Args:
-        desired_force: [N or N*m].
-        command: what has become of the desired force on its way to the motor.
-        current: [A].
-        voltage: [V].
-        arm: [m].
-        torque_constant: [N*m/A].
-        available: largest voltage [V].
+    The force [N or N*m] asked of the actuator in an integration step (after whatever disturbs commands on their way)
+    and delivered in it, the family's signals at its end, and the velocity of the actuated joint [m/s or rad/s] at its
+    end.
     """
-    return (
-        desired_force,
-        torque_constant * current / arm,
-        current,
-        command * arm / torque_constant,
-        voltage,
-        abs(voltage) >= available,
-    )
+    return ("desired_force", "actual_force", *family.Signals._fields, "speed")
 
 
-def motor_signals(
-    actuator: Actuator,
-    desired_force: float,
-    current: float,
-    voltage: float,
-    command: float | None = None,
-    available: float | None = None,
-) -> Signals:
-    """The signals of a motor that was asked for `desired_force` and has reached `current` under `voltage`.
-
-    Args:
-        actuator: motor and current loop.
-        desired_force: [N or N*m].
-        current: [A].
-        voltage: [V].
-        command: what has become of the desired force on its way to the motor; None: nothing.
-        available: the voltage limit [V], where it is not the controller's.
-    """
-    motor = actuator.motor
-    command = desired_force if command is None else command
-    limit = actuator.controller.max_voltage if available is None else available
-    return Signals(*delivered(desired_force, command, current, voltage, motor.arm_radius, motor.torque_constant, limit))
+def signal_names(family: Family) -> tuple[str, ...]:
+    """Keys of `Signals`, in order."""
+    return (*(name for name in trace_names(family)[:-1] if name != "saturated"), "saturated")
 
 
 class Physics(Protocol):
-    """One simulation of one task."""
+    """One simulation of one task.
+
+    Somebody's own is given to `codrl_mj.register_physics`. What it cannot simulate it refuses when it is made.
+    """
 
     trace: np.ndarray
-    """What the actuator did in each integration step of the last environment step, shape (inner_steps, 6), float64;
-    columns as in `TRACE_NAMES`. A live array: the next step overwrites it."""
+    """What each actuator did in each integration step of the last environment step, shape (inner_steps, actuators,
+    columns), float64; columns as in `trace_names`. A live array: the next step overwrites it."""
+    compiled: Any
+    """What a compiled loop needs (see `codrl_mj.physics.stepping.Compiled`); None where a step is Python."""
+    scene: tuple[Any, Any] | None
+    """The `mujoco.MjModel` and `mujoco.MjData` that it runs on; None where there are none."""
 
-    @property
-    def state(self) -> np.ndarray:
-        """The mechanical state in the task's order, shape (n,), float64; not changed by later steps."""
+    state: np.ndarray
+    """The mechanical state in the task's order, shape (n,), float64; not changed by later steps. Set, it moves the
+    simulation there, the motor left as it is."""
 
-    def set_actuator(self, actuator: Actuator) -> None:
-        """Exchange the motor for another; to be followed by a reset. An ideal actuator cannot be exchanged."""
+    def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
+        """Exchange the actuators for others of their family; to be followed by a reset."""
+
+    def set_model(self, fields: Mapping[str, np.ndarray]) -> None:
+        """Change fields of the model, as `codrl_mj.physics.variation.Variation.fields` has them; then a reset follows.
+
+        Raises:
+            ValueError: it has no such fields.
+        """
 
     def reset(self, state: np.ndarray, key: float = 0.0) -> None:
-        """Start an episode from `state`, with the motor at rest: no current, no integral, no past error.
+        """Start an episode from `state`, with the actuators at rest.
 
         Args:
             state: the mechanical state.
-            key: of the random numbers of the episode's disturbances.
+            key: of the random numbers of the episode's disturbances and sensors.
         """
 
-    def sensed(self, signals: Signals) -> Signals:
-        """Signals of the present moment with the current [A] that the sensor measures."""
+    def observed(self, row: np.ndarray) -> np.ndarray:
+        """What the sensors say at present, shape (actuators, k), with k as the family's `OBSERVED`.
+
+        Args:
+            row: the last row of `trace`; zeros at the start of an episode.
+        """
 
     def snapshot(self) -> np.ndarray:
-        """Simulation and motor as a vector, shape (k,), float64; `memory` and exchanged parameters are not in it."""
+        """Simulation and actuators as a vector, shape (k,), float64, without `memory` and exchanged parameters."""
 
     def restore(self, snapshot: np.ndarray) -> None:
         """Continue from what `snapshot` returned."""
@@ -136,12 +84,18 @@ class Physics(Protocol):
     def memory(self) -> np.ndarray:
         """What the disturbances remember beside, a live array; empty if nothing."""
 
-    def step(self, desired_force: float) -> Signals:
+    def step(self, desired_force: Any) -> None:
         """Advance by one environment step, with the desired force (at most the task's `max_force`) held over it.
+
+        Args:
+            desired_force: a number; for several actuators an array (n,).
 
         Raises:
             SimulationDivergedError: the state is no longer finite.
         """
+
+    def show(self, state: np.ndarray) -> None:
+        """Bring the bodies of `scene` to a state, for drawing; the simulation is left alone otherwise."""
 
 
 class SimulationDivergedError(ArithmeticError):
@@ -171,12 +125,12 @@ def check_finite(task: Task, state: np.ndarray, time: float) -> None:
     )
 
 
-def inner_step_count(task: Task, actuator: Actuator | None, inner_steps: int | None, timestep: float | None) -> int:
+def inner_step_count(task: Task, actuator: ActuatorModel, inner_steps: int | None, timestep: float | None) -> int:
     """Integration steps in one environment step.
 
     Args:
         task: the task, whose `step_duration` they divide.
-        actuator: with a motor the default is the paper's inner loop, without one Gymnasium's single step.
+        actuator: unless it is ideal the default is the paper's inner loop, else Gymnasium's single step.
         inner_steps: their number, or None.
         timestep: the integration step [s], or None; give at most one of the two.
 
@@ -196,7 +150,7 @@ def inner_step_count(task: Task, actuator: Actuator | None, inner_steps: int | N
             )
         return count
     if inner_steps is None:
-        return 1 if actuator is None else task.motor_inner_steps
+        return 1 if isinstance(actuator, Ideal) else task.motor_inner_steps
     if isinstance(inner_steps, bool) or not isinstance(inner_steps, numbers.Integral) or inner_steps < 1:
         raise ValueError(f"inner_steps = {inner_steps!r}: must be an integer >= 1")
     return int(inner_steps)

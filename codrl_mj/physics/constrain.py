@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
+from codrl_mj.engine.families import jitable
+from codrl_mj.engine.memory import internal
 from codrl_mj.physics.base import LARGEST
 from codrl_mj.tasks import Task
 
@@ -37,6 +39,7 @@ def compiled_constrain(task: Task) -> Compiled | None:
     Returns:
         The function; None for a task without bounds.
     """
+    jitable(task)
     return None if task.constrain is None else _keeper(task.constrain, task.qpos, task.qvel)
 
 
@@ -90,14 +93,14 @@ def _batch(read: Compiled, keep: Compiled | None, size: int, explicit: bool) -> 
     return BatchKernels(read_all, move, correct)
 
 
-@numba.njit
+@internal
 def _nothing(qpos: Any, qvel: Any, state: np.ndarray, timestep: float) -> None:
     """Take the place of bounds where there are none."""
 
 
 @functools.cache
 def _reader(positions: tuple[int, ...], velocities: tuple[int, ...]) -> Compiled:
-    @numba.njit(nogil=True, error_model="numpy")
+    @internal
     def read(qpos: Any, qvel: Any, state: np.ndarray) -> None:
         for entry in range(len(positions)):
             state[positions[entry]] = qpos[entry]
@@ -110,7 +113,7 @@ def _reader(positions: tuple[int, ...], velocities: tuple[int, ...]) -> Compiled
 @functools.cache
 def _keeper(constrain: Callable[..., Any], positions: tuple[int, ...], velocities: tuple[int, ...]) -> Compiled:
     read = _reader(positions, velocities)
-    bounded = numba.njit(nogil=True, error_model="numpy")(constrain)
+    bounded = internal(constrain)
 
     @numba.njit(nogil=True, error_model="numpy")
     def keep(qpos: Any, qvel: Any, state: np.ndarray, timestep: float) -> None:
@@ -126,7 +129,7 @@ def _keeper(constrain: Callable[..., Any], positions: tuple[int, ...], velocitie
     return keep
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@internal
 def is_fine(state: np.ndarray) -> bool:
     """Whether every entry of a state (n,) is a number, and at most `LARGEST`."""
     fine = True

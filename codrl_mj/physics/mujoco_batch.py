@@ -1,74 +1,82 @@
 """Many simulations of a task in MuJoCo at once, on the engine's own thread pool."""
 
-from collections.abc import Mapping, Sequence
+import copy
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import mujoco
+import numba
 import numpy as np
 from mujoco.batch import Batch
 
-from codrl_mj import callbacks
-from codrl_mj.callbacks.kernels import AVAILABLE_VOLTAGE, CURRENT, NOISE_KEY, VOLTAGE
-from codrl_mj.disturbances import OFF, Disturbances
-from codrl_mj.motor import Actuator, to_vector
-from codrl_mj.motor.parameters import MAX_VOLTAGE, TORQUE_CONSTANT
-from codrl_mj.physics.base import LARGEST, Signals, SimulationDivergedError, delivered
+from codrl_mj import engine
+from codrl_mj.actuators import ActuatorModel, Ideal, check_same_family
+from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint
+from codrl_mj.engine.families import HEAD, load_family, signals_at
+from codrl_mj.engine.sensors import compiled_observe
+from codrl_mj.physics.base import LARGEST, Signals, SimulationDivergedError
 from codrl_mj.physics.constrain import compiled_batch
-from codrl_mj.physics.disturber import disturber, sensed
+from codrl_mj.physics.disturber import disturber
 from codrl_mj.physics.mjcf import needed_callbacks, task_model
+from codrl_mj.physics.mujoco_single import wiring
+from codrl_mj.physics.stepping import NOISE_KEY, TORQUE
+from codrl_mj.physics.variation import write_fields
 from codrl_mj.tasks import Task
 
 
 class MujocoBatchPhysics:
     """N simulations of one task, bit for bit those of N `MujocoPhysics`; states and signals are arrays.
 
-    Every simulation has its own actuator: parameters are per-simulation model fields.
+    Every simulation has its own actuators: parameters are per-simulation model fields.
     """
 
     def __init__(
         self,
         task: Task,
-        actuators: Sequence[Actuator] | None,
+        actuators: Sequence[Sequence[ActuatorModel]],
         inner_steps: int,
         integrator: str,
-        num_envs: int,
-        max_force: float | None = None,
+        max_forces: np.ndarray | None = None,
         num_threads: int = 0,
         disturbances: Disturbances = OFF,
+        joint: Joint = PLAIN,
     ) -> None:
         """Compile the model and make the batch.
 
         Args:
             task: the task.
-            actuators: one for each simulation, or None for ideal actuators.
+            actuators: for each of N simulations one for each of the task's motors, all of one family.
             inner_steps: integration steps per environment step.
             integrator: one of the task's integrators.
-            num_envs: number of simulations, >= 1.
-            max_force: limit of the desired force [N] or torque [N*m]; None is the task's.
+            max_forces: limits of the desired forces [N] or torques [N*m], shape (n,); None are the task's.
             num_threads: threads of the engine; 0 uses every CPU.
-            disturbances: imperfections of drive, sensor, supply and joint, and load pulses.
+            disturbances: imperfections of the commands' way, and load pulses.
+            joint: what is added to the actuated joints.
         """
         self.task = task
+        self.family = check_same_family([one for each in actuators for one in each])
+        self.motorised = not issubclass(self.family, Ideal)
+        if self.motorised:
+            load_family(self.family)
         self.inner_steps = inner_steps
-        self.max_force = task.max_force if max_force is None else max_force
+        self.max_forces = task.max_forces if max_forces is None else max_forces
         self._explicit = integrator == "euler"
         self._corrected = self._explicit or task.constrain is not None
-        timestep, first = task.step_duration / inner_steps, actuators[0] if actuators else None
-        self.model = task_model(task, first, timestep, max_force, self._explicit, disturbances)
-        self._disturbances = disturbances
-        self._disturber = disturber(disturbances, timestep, self.max_force, num_envs)
-        self._dof = int(self.model.jnt_dofadr[self.model.actuator("motor").trnid[0]])
-        self.num_envs = num_envs
-        self._size = num_envs, num_threads
+        timestep = task.step_duration / inner_steps
+        self.num_envs = len(actuators)
+        self.model = task_model(task, tuple(actuators[0]), timestep, max_forces, self._explicit, joint)
+        self._disturber = disturber(disturbances, timestep, self.max_forces, self.num_envs)
+        self._wiring = [wiring(self.model, name, one) for name, one in zip(task.motors, actuators[0], strict=True)]
+        self._dofs = np.array([int(one.dof) for one in self._wiring])
+        self._slots = np.array([int(one.act) for one in self._wiring])
+        self._controls = np.array([int(one.ctrl) for one in self._wiring])
+        self._size = self.num_envs, num_threads
         self._varied = False  # whether the models differ in more than their actuators
         self._fields: dict[str, np.ndarray] = {}
         self._make_batch()
         self._rest = self._batch.state[0].copy()  # a simulation just reset, motor at rest
-        self.motorised = actuators is not None
-        self._arm = self._torque_constant = self._limit = np.ones(num_envs)
-        if actuators is not None:
-            self._arm, self._torque_constant, self._limit = (np.empty(num_envs) for _ in range(3))
-            self.set_actuators(np.arange(num_envs), actuators)
+        self._arms = np.ones((self.num_envs, len(task.motors)))
+        self.set_actuators(np.arange(self.num_envs), actuators)
 
     def _make_batch(self) -> None:
         """Make the engine's batch, and take the views that a step uses."""
@@ -78,11 +86,11 @@ class MujocoBatchPhysics:
         self._kernels = compiled_batch(self.task, self._explicit)
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._ctrl, self._act = self._batch.bind("ctrl"), self._batch.bind("act")
-        self._load = self._batch.bind("qfrc_applied")
+        self._load, self._time = self._batch.bind("qfrc_applied"), self._batch.bind("time")
 
     def _install(self) -> None:
         if self._callbacks:
-            callbacks.install(*self._callbacks)
+            engine.install(*self._callbacks)
 
     def field(self, name: str) -> np.ndarray:
         """A field of the model with a value for each simulation, shape (N, ...): live, to be written to."""
@@ -107,26 +115,28 @@ class MujocoBatchPhysics:
             self._batch.set_const()
         self.restore(rows)
 
-    def set_actuators(self, rows: np.ndarray, actuators: Sequence[Actuator]) -> None:
-        """Give some simulations other motors; to be followed by a reset of them."""
-        vectors = np.array([to_vector(actuator) for actuator in actuators])
-        self.set_parameters(rows, vectors, np.array([actuator.motor.arm_radius for actuator in actuators]))
+    def set_actuators(self, rows: np.ndarray, actuators: Sequence[Sequence[ActuatorModel]]) -> None:
+        """Give some simulations other actuators of the family; to be followed by a reset of them."""
+        numbers = np.array([[one.numbers for one in each] for each in actuators])
+        self.set_parameters(rows, numbers, np.array([[one.arm_radius for one in each] for each in actuators]))
 
-    def set_parameters(self, rows: np.ndarray, vectors: np.ndarray, arms: np.ndarray) -> None:
+    def set_parameters(self, rows: np.ndarray, numbers: np.ndarray, arms: np.ndarray) -> None:
         """Do what `set_actuators` does, with actuators as arrays.
 
         Args:
             rows: indices of simulations, shape (m,).
-            vectors: parameter vectors, shape (m, p), as `codrl_mj.motor.to_vector` makes them.
-            arms: arms [m], shape (m,).
+            numbers: as `ActuatorModel.numbers`, shape (m, n, p).
+            arms: [m], shape (m, n).
         """
+        if not self.motorised:
+            return
         user, gear, limits = map(self.field, ("actuator_user", "actuator_gear", "actuator_ctrlrange"))
-        user[rows, 0, : vectors.shape[1]] = vectors
-        gear[rows, 0, 0] = 1.0 / arms
-        limits[rows, 0] = np.stack([-self.max_force * arms, self.max_force * arms], axis=-1)
-        self._arm[rows] = arms
-        self._torque_constant[rows] = vectors[:, TORQUE_CONSTANT]
-        self._limit[rows] = vectors[:, MAX_VOLTAGE]
+        for at, (one, limit) in enumerate(zip(self._wiring, self.max_forces, strict=True)):
+            index, arm = int(one.actuator), arms[:, at]
+            user[rows, index, HEAD : HEAD + numbers.shape[2]] = numbers[:, at]
+            gear[rows, index, 0] = 1.0 / arm
+            limits[rows, index] = np.stack([-limit * arm, limit * arm], axis=-1)
+        self._arms[rows] = arms
 
     def set_model(self, rows: np.ndarray, fields: Mapping[str, np.ndarray]) -> None:
         """Change fields of the models of some simulations; to be followed by a reset of them.
@@ -147,6 +157,17 @@ class MujocoBatchPhysics:
         self._kernels.read(self._qpos, self._qvel, state)
         return state
 
+    @state.setter
+    def state(self, states: np.ndarray) -> None:
+        self._qpos[:], self._qvel[:] = states[:, list(self.task.qpos)], states[:, list(self.task.qvel)]
+
+    def models(self) -> Iterator[mujoco.MjModel]:
+        """One model, which has each simulation's fields in turn; what is only drawn is the first one's."""
+        model = copy.copy(self.model)
+        for row in range(self.num_envs):
+            write_fields(model, self._fields, row)
+            yield model
+
     def reset(self, rows: np.ndarray, states: np.ndarray, keys: np.ndarray | float = 0.0) -> None:
         """Start episodes of some simulations, with their motors at rest.
 
@@ -162,8 +183,9 @@ class MujocoBatchPhysics:
         self._batch.state[rows] = self._rest
         self._qpos[rows] = states[:, list(self.task.qpos)]
         self._qvel[rows] = states[:, list(self.task.qvel)]
-        if self._disturbances.of_motor:
-            self._act[rows, NOISE_KEY] = keys
+        if self.motorised:
+            for at, slot in enumerate(self._slots):
+                self._act[rows, slot + NOISE_KEY] = keys + at
         if self._disturber is not None:
             self._disturber.reset(rows, keys)
 
@@ -171,27 +193,32 @@ class MujocoBatchPhysics:
         """Advance every simulation by one environment step.
 
         Args:
-            desired_force: held over the step, shape (N,), at most `max_force`.
+            desired_force: held over the step, shape (N,), or with several actuators (N, n), at most `max_forces`.
 
         Returns:
-            The signals, each an array of shape (N,).
+            The signals, each an array of the same shape.
         """
-        command = desired_force
+        command = desired_force.reshape(self.num_envs, -1)
         if self._disturber is None:
-            self._ctrl[:, 0] = desired_force * self._arm
+            self._ctrl[:, self._controls] = command * self._arms
             self._integrate(self.inner_steps)
         else:
             for _ in range(self.inner_steps):
-                command = self._disturber.command(desired_force)
-                self._load[:, self._dof] = self._disturber.load()
-                self._ctrl[:, 0] = command * self._arm
+                command = self._disturber.commands(desired_force.reshape(self.num_envs, -1))
+                self._load[:, self._dofs] = self._disturber.loads()
+                self._ctrl[:, self._controls] = command * self._arms
                 self._integrate(1)
-        if not self.motorised:
-            nothing = np.zeros(len(desired_force))
-            return Signals(desired_force, command.copy(), nothing, nothing.copy(), nothing.copy(), nothing > 0)  # type: ignore[arg-type]
-        current, voltage = self._act[:, CURRENT].copy(), self._act[:, VOLTAGE].copy()
-        limit = self._act[:, AVAILABLE_VOLTAGE] if self._disturbances.of_motor else self._limit
-        return Signals(*delivered(desired_force, command, current, voltage, self._arm, self._torque_constant, limit))
+        shape, first = desired_force.shape, signals_at(self.family)
+        names = self.family.Signals._fields  # type: ignore[attr-defined]
+        if self.motorised:
+            force = self._act[:, self._slots + TORQUE] / self._arms
+            shown = {name: self._act[:, self._slots + first + at] for at, name in enumerate(names)}
+        else:
+            force = command.copy()
+            shown = {name: np.zeros(command.shape) for name in names}
+        saturated = shown.pop("saturated", np.zeros(command.shape)) != 0.0
+        signals = {"desired_force": desired_force, "actual_force": force, **shown, "saturated": saturated}
+        return {name: values.reshape(shape) for name, values in signals.items()}
 
     def _integrate(self, steps: int) -> None:
         """Take integration steps."""
@@ -206,23 +233,36 @@ class MujocoBatchPhysics:
             self._batch.step()
             self._kernels.correct(self._qpos, self._qvel, moved, timestep)
 
-    def sensed(self, signals: Signals, rows: np.ndarray | None = None) -> Signals:
-        """Signals of the present moment with the currents [A] that the sensors measure.
+    def observed(self, signals: Signals | None, rows: np.ndarray | None = None) -> np.ndarray:
+        """What the sensors say at present, shape (m, n, k).
 
         Args:
-            signals: arrays, of shape (m,).
-            rows: indices of their simulations, shape (m,); None for all.
+            signals: of the last step; None at the start of episodes.
+            rows: indices of the simulations, shape (m,); None for all.
         """
-        chosen = slice(None) if rows is None else rows
-        keys = self._act[chosen, NOISE_KEY] if self._disturbances.of_motor else np.zeros(len(self._act))[chosen]
-        times = self._batch.bind("time")[chosen]
-        timestep = self.model.opt.timestep
-        return signals._replace(current=sensed(self._disturbances, signals.current, keys, times, timestep))  # type: ignore[arg-type]
+        rows = np.arange(self.num_envs) if rows is None else rows
+        names = self.family.Signals._fields  # type: ignore[attr-defined]
+        shown = np.zeros((len(rows), len(self._wiring), len(names)))
+        for at, name in enumerate(names if signals is not None else ()):
+            shown[:, :, at] = signals[name].reshape(self.num_envs, -1)[rows]  # type: ignore[index]
+        seen = np.empty((len(rows), len(self._wiring), len(self.family.OBSERVED)))
+        user, fill = self.field("actuator_user"), compiled_observe(self.family)
+        timestep, times = self.model.opt.timestep, self._time.reshape(-1)
+        _observe_all(
+            fill,
+            rows,
+            np.array([int(one.actuator) for one in self._wiring]),
+            self._slots + NOISE_KEY,
+            *(user, self._act, timestep, times, shown, seen),
+        )
+        return seen
 
     @property
     def memory(self) -> np.ndarray:
         """What the disturbances remember beside the engine's own state, a live array (N, k); (N, 0) if nothing."""
-        return np.empty((self.num_envs, 0)) if self._disturber is None else self._disturber.memory
+        if self._disturber is None:
+            return np.empty((self.num_envs, 0))
+        return self._disturber.memory.reshape(self.num_envs, -1)
 
     def check_finite(self, states: np.ndarray, rows: np.ndarray) -> None:
         """Raise if a state among `rows` (a mask, shape (N,)) left the finite numbers, naming the simulation.
@@ -241,7 +281,7 @@ class MujocoBatchPhysics:
         value = states[first][np.argmin(fine[first])]
         raise SimulationDivergedError(
             f"{self.task.name}: {len(broken)} of {len(states)} simulations diverged; environment {first} at "
-            f"t = {self._batch.bind('time')[first]:g} s: {entry} = {value:g}. Reset them; if this repeats, shorten the "
+            f"t = {self._time.reshape(-1)[first]:g} s: {entry} = {value:g}. Reset them; if this repeats, shorten the "
             "integration step (inner_steps) or lower the gains"
         )
 
@@ -262,4 +302,24 @@ class MujocoBatchPhysics:
         mujoco.mj_passive(self.model, data)
 
 
-_ENGINE = ("_batch", "_kernels", "_qpos", "_qvel", "_ctrl", "_act", "_load")
+@numba.njit(nogil=True, error_model="numpy")
+def _observe_all(
+    fill: Any,
+    rows: np.ndarray,
+    actuators: np.ndarray,
+    keys: np.ndarray,
+    user: np.ndarray,
+    act: np.ndarray,
+    timestep: float,
+    times: np.ndarray,
+    shown: np.ndarray,
+    seen: np.ndarray,
+) -> None:
+    for at in range(len(rows)):
+        row = rows[at]
+        for motor in range(len(actuators)):
+            numbers, signals = user[row, actuators[motor], HEAD:].ctypes.data, shown[at, motor].ctypes.data
+            fill(numbers, signals, timestep, times[row], act[row, keys[motor]], seen[at, motor].ctypes.data)
+
+
+_ENGINE = ("_batch", "_kernels", "_qpos", "_qvel", "_ctrl", "_act", "_load", "_time")

@@ -1,21 +1,33 @@
-"""One simulation of a task in MuJoCo, the motor in the control callback."""
+"""One simulation of a task in MuJoCo, the actuators in the control callback."""
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
-from codrl_mj import callbacks
-from codrl_mj.callbacks.engine import addresses
-from codrl_mj.disturbances import OFF, Disturbances
-from codrl_mj.motor import Actuator, to_vector
-from codrl_mj.physics.base import TRACE_NAMES, Signals, check_finite
+from codrl_mj import engine
+from codrl_mj.actuators import ActuatorModel, Ideal, check_same_family
+from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint
+from codrl_mj.engine.families import HEAD
+from codrl_mj.engine.library import addresses
+from codrl_mj.physics.base import check_finite, trace_names
 from codrl_mj.physics.disturber import disturber
 from codrl_mj.physics.mjcf import needed_callbacks, task_model
-from codrl_mj.physics.stepping import ARM, DISTURBANCE, actuator_settings, compiled_stepping
+from codrl_mj.physics.stepping import Stepping, Wiring, compiled_stepping
 from codrl_mj.physics.variation import write_fields
 from codrl_mj.tasks import Task
+
+ARM = Wiring._fields.index("arm")
+
+
+class Compiled(NamedTuple):
+    """What a compiled loop needs of a simulation."""
+
+    stepping: Stepping
+    """The functions."""
+    arguments: tuple[Any, ...]
+    """Their last arguments."""
 
 
 class MujocoPhysics:
@@ -29,56 +41,54 @@ class MujocoPhysics:
     def __init__(
         self,
         task: Task,
-        actuator: Actuator | None,
+        actuators: Sequence[ActuatorModel],
         inner_steps: int,
         integrator: str,
-        max_force: float | None = None,
+        max_forces: np.ndarray | None = None,
         disturbances: Disturbances = OFF,
+        joint: Joint = PLAIN,
     ) -> None:
         """Compile the model and install the callbacks that it needs.
 
         Args:
             task: the task.
-            actuator: motor and current loop; None is the ideal actuator.
+            actuators: one for each of the task's motors, of one family.
             inner_steps: integration steps per environment step.
             integrator: one of the task's integrators.
-            max_force: limit of the desired force [N] or torque [N*m]; None is the task's.
-            disturbances: imperfections of drive, sensor, supply and joint, and load pulses.
+            max_forces: limits of the desired forces [N] or torques [N*m], shape (n,); None are the task's.
+            disturbances: imperfections of the commands' way, and load pulses.
+            joint: what is added to the actuated joints.
         """
         self.task = task
-        self.actuator = actuator
+        self.family = check_same_family(actuators)
         self.inner_steps = inner_steps
         self._explicit = integrator == "euler"
-        self._max_force = task.max_force if max_force is None else max_force
+        self._max_forces = task.max_forces if max_forces is None else max_forces
         timestep = task.step_duration / inner_steps
-        self.model = task_model(task, actuator, timestep, max_force, self._explicit, disturbances)
+        self.model = task_model(task, tuple(actuators), timestep, max_forces, self._explicit, joint)
         self.data = mujoco.MjData(self.model)
         self._qpos_order, self._qvel_order = _progression(task.qpos), _progression(task.qvel)
-        self._disturbances = disturbances
-        self._disturber = disturber(disturbances, timestep, self._max_force, 1)
-        self.trace = np.zeros((inner_steps, len(TRACE_NAMES)))
-        dof = self.model.jnt_dofadr[self.model.actuator("motor").trnid[0]]
-        kind = actuator is not None, disturbances.of_motor, dof
-        sensor = disturbances.current_bias, disturbances.current_noise
-        numbers: Any = [] if self._disturber is None else self._disturber.numbers
-        self._settings = np.array([*kind, *sensor, *actuator_settings(actuator), *numbers], dtype=np.float64)
+        self._disturber = disturber(disturbances, timestep, self._max_forces, 1)
+        self.trace = np.zeros((inner_steps, len(actuators), len(trace_names(self.family))))
+        rows = [[*wiring(self.model, name, one)] for name, one in zip(task.motors, actuators, strict=True)]
+        numbers = np.empty((len(rows), 0)) if self._disturber is None else self._disturber.numbers
+        self._settings = np.hstack([rows, numbers])
         self._bind()
         self.reset(np.zeros(len(task.state_names)))
 
     def _bind(self) -> None:
         """Take the views that a step uses, and make sure that the callbacks are there."""
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
-        memory = np.zeros((1, 0)) if self._disturber is None else self._disturber.memory
-        self.arguments = *addresses(self.data), self._settings, memory, self.trace
-        self.stepping = compiled_stepping(
-            self.task, self._explicit, self._disturber is not None, self._disturbances.current_noise > 0.0
-        )
+        memory = np.zeros((len(self._settings), 0)) if self._disturber is None else self._disturber.memory
+        stepping = compiled_stepping(self.task, self.family, self._explicit, self._disturber is not None)
+        self.compiled = Compiled(stepping, (*addresses(self.data), self._settings, memory, self.trace))
+        self.scene: tuple[Any, Any] | None = (self.model, self.data)
         self._callbacks = needed_callbacks(self.model)
         self._install()
 
     def _install(self) -> None:
         if self._callbacks:
-            callbacks.install(*self._callbacks)
+            engine.install(*self._callbacks)
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the views and the model, which a copy takes of its own data."""
@@ -98,26 +108,31 @@ class MujocoPhysics:
         state[self._qvel_order] = self._qvel
         return state
 
+    @state.setter
+    def state(self, state: np.ndarray) -> None:
+        self._qpos[:], self._qvel[:] = state[self._qpos_order], state[self._qvel_order]
+
     def reset(self, state: np.ndarray, key: float = 0.0) -> None:
-        """Start an episode from `state`, with the motor at rest.
+        """Start an episode from `state`, with the actuators at rest.
 
         Args:
             state: the mechanical state.
-            key: of the random numbers of the episode's disturbances.
+            key: of the random numbers of the episode's disturbances and sensors.
         """
         self._install()  # raises if somebody replaced ours since the last episode
-        self.stepping.start(np.asarray(state, dtype=np.float64), float(key), *self.arguments)
+        stepping, arguments = self.compiled
+        stepping.start(np.asarray(state, dtype=np.float64), float(key), *arguments)
 
-    def set_actuator(self, actuator: Actuator) -> None:
-        """Exchange the motor for another; to be followed by a reset. An ideal actuator cannot be exchanged."""
-        assert self.actuator is not None
-        arm = actuator.motor.arm_radius
-        vector = to_vector(actuator)
-        self.model.actuator_user[0, : len(vector)] = vector
-        self.model.actuator_gear[0, 0] = 1.0 / arm
-        self.model.actuator_ctrlrange[0] = -self._max_force * arm, self._max_force * arm
-        self._settings[ARM:DISTURBANCE] = actuator_settings(actuator)
-        self.actuator = actuator
+    def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
+        """Exchange the actuators for others of their family; to be followed by a reset."""
+        if issubclass(self.family, Ideal):
+            return
+        for row, (one, limit) in enumerate(zip(actuators, self._max_forces, strict=True)):
+            index, arm, numbers = int(self._settings[row, 0]), one.arm_radius, one.numbers
+            self.model.actuator_user[index, HEAD : HEAD + len(numbers)] = numbers
+            self.model.actuator_gear[index, 0] = 1.0 / arm
+            self.model.actuator_ctrlrange[index] = -limit * arm, limit * arm
+            self._settings[row, ARM] = arm
 
     def set_model(self, fields: Mapping[str, np.ndarray]) -> None:
         """Change fields of the model; to be followed by a reset.
@@ -136,16 +151,18 @@ class MujocoPhysics:
         mujoco.mj_camlight(self.model, self.data)
         mujoco.mj_passive(self.model, self.data)  # where there is a hill, its callback puts the car on it
 
-    def step(self, desired_force: float) -> Signals:
-        """Advance by one environment step, with the desired force (at most `max_force`) held over it.
+    def step(self, desired_force: Any) -> None:
+        """Advance by one environment step, with the desired force (at most `max_forces`) held over it.
+
+        Args:
+            desired_force: a number; for several actuators an array (n,).
 
         Raises:
             SimulationDivergedError: the state is no longer finite.
         """
-        fine, *signals = self.stepping.step(float(desired_force), *self.arguments)
-        if not fine:
+        stepping, arguments = self.compiled
+        if not stepping.step(desired_force, *arguments):
             self.check_finite()
-        return Signals(*signals)
 
     def check_finite(self) -> None:
         """Raise if the state is not finite or beyond `LARGEST`, saying which entry and when.
@@ -155,14 +172,21 @@ class MujocoPhysics:
         """
         check_finite(self.task, self.state, self.data.time)
 
-    def sensed(self, signals: Signals) -> Signals:
-        """Signals of the present moment with the current [A] that the sensor measures."""
-        return signals._replace(current=self.stepping.sensed(float(signals.current), *self.arguments))
+    def observed(self, row: np.ndarray) -> np.ndarray:
+        """What the sensors say at present, shape (actuators, k).
+
+        Args:
+            row: the last row of `trace`; zeros at the start of an episode.
+        """
+        stepping, arguments = self.compiled
+        seen = np.empty((len(row), len(self.family.OBSERVED)))
+        stepping.observed(row, seen, *arguments)
+        return seen
 
     def snapshot(self) -> np.ndarray:
         """Simulation and motor as the engine's state vector (`mjSTATE_INTEGRATION`), shape (k,), float64.
 
-        `memory` and what `set_actuator` and `set_model` changed are not in it.
+        `memory` and what `set_actuators` and `set_model` changed are not in it.
         """
         vector = np.empty(mujoco.mj_stateSize(self.model, _STATE))
         mujoco.mj_getState(self.model, self.data, vector, _STATE)
@@ -175,7 +199,21 @@ class MujocoPhysics:
     @property
     def memory(self) -> np.ndarray:
         """What the disturbances remember beside the engine's own state, a live array; empty if nothing."""
-        return np.empty(0) if self._disturber is None else self._disturber.memory[0]
+        return np.empty(0) if self._disturber is None else self._disturber.memory.reshape(-1)
+
+
+def wiring(model: mujoco.MjModel, name: str, actuator: ActuatorModel) -> Wiring:
+    """Where the numbers of a model's actuator are.
+
+    Args:
+        model: a task's.
+        name: of the actuator.
+        actuator: what drives it.
+    """
+    index = model.actuator(name).id
+    dof = model.jnt_dofadr[model.actuator_trnid[index, 0]]
+    address = max(int(model.actuator_actadr[index]), 0)
+    return Wiring(float(index), float(model.actuator_ctrladr[index]), float(address), float(dof), actuator.arm_radius)
 
 
 def _progression(entries: tuple[int, ...]) -> slice:
@@ -185,4 +223,4 @@ def _progression(entries: tuple[int, ...]) -> slice:
 
 
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-_VIEWS = ("model", "_qpos", "_qvel", "stepping", "arguments")
+_VIEWS = ("model", "_qpos", "_qvel", "compiled", "scene")

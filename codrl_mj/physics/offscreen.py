@@ -5,7 +5,9 @@ import difflib
 import functools
 import numbers
 import os
+import sys
 import weakref
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -19,17 +21,40 @@ _open: "weakref.WeakSet[OffscreenRenderer]" = weakref.WeakSet()
 
 
 @functools.cache
-def _close_all_at_exit() -> None:
+def _watch_process() -> None:
     """At exit free the contexts that nobody closed, while the OpenGL library is still there: later it complains.
 
     To be called after the first context is made: the library registers its own shutdown then, and the last one
-    registered runs first.
+    registered runs first. In a process forked off, contexts are made anew.
     """
 
     @atexit.register
     def close_all() -> None:
         for renderer in list(_open):
             renderer.close()
+
+    os.register_at_fork(after_in_child=_leave_to_parent)
+
+
+def _leave_to_parent() -> None:
+    """Let go of contexts and display after a fork: a software renderer's threads stayed behind, waiting for them hangs.
+
+    A display on another platform has threads of its own. Where there is none, the inherited one has to do.
+    """
+    egl: Any = sys.modules.get("mujoco.egl")
+    if egl is None:
+        return
+    atexit.unregister(egl.EGL.eglTerminate)
+    for renderer in list(_open):
+        _abandon(renderer._renderer)
+        renderer._renderer = None
+    try:
+        egl.EGL_DISPLAY = egl.EGL.eglGetPlatformDisplayEXT(_EGL_PLATFORM_SURFACELESS, None, None) or egl.EGL_DISPLAY
+    except Exception:  # of PyOpenGL, which only the EGL backend needs
+        return
+
+
+_EGL_PLATFORM_SURFACELESS = 0x31DD
 
 
 class OffscreenRenderer:
@@ -64,19 +89,32 @@ class OffscreenRenderer:
         self._pretty = pretty
         model.vis.quality.offsamples = 8 if pretty else 0
         model.vis.quality.shadowsize = 4096 if pretty else 0
+        self._new = functools.partial(mujoco.Renderer, model, height=int(height), width=int(width))
+        self._renderer: mujoco.Renderer | None = self._make()
+        _open.add(self)
+        _watch_process()
+
+    def _make(self) -> mujoco.Renderer:
+        egl: Any = sys.modules.get("mujoco.egl")
         try:
-            self._renderer = mujoco.Renderer(model, height=int(height), width=int(width))
+            if egl is not None and egl.EGL_DISPLAY:  # MuJoCo makes it once, but SDL (pygame) ends it with its window
+                egl.EGL.eglInitialize(egl.EGL_DISPLAY, None, None)
+            return self._new()
         except Exception as error:  # each backend raises its own kind, most of them not exported
             raise RenderingUnavailableError(_no_context(error)) from error
-        _open.add(self)
-        _close_all_at_exit()
 
     def render(self, data: mujoco.MjData) -> np.ndarray:
         """Draw the data's present positions (their kinematics must be up to date).
 
         Returns:
             Image, shape (height, width, 3), uint8.
+
+        Raises:
+            RenderingUnavailableError: somebody ended the OpenGL context, and no other can be made.
         """
+        if self._renderer is None or not _make_current(self._renderer):
+            self.close()
+            self._renderer = self._make()
         self._renderer.update_scene(data, self._camera)
         flags = self._renderer.scene.flags
         flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._pretty
@@ -84,14 +122,41 @@ class OffscreenRenderer:
         return self._renderer.render()
 
     def close(self) -> None:
-        """Free the OpenGL context; harmless when repeated."""
-        renderer, self._renderer = getattr(self, "_renderer", None), None  # type: ignore[assignment]
+        """Free the OpenGL context; harmless when repeated, or when somebody ended the context."""
+        renderer, self._renderer = getattr(self, "_renderer", None), None
         if renderer is not None:
-            renderer.close()
+            _discard(renderer)
 
     def __del__(self) -> None:
         """Free the OpenGL context."""
         self.close()
+
+
+def _make_current(renderer: mujoco.Renderer) -> bool:
+    """Make a renderer's context the thread's; False if it is no more."""
+    try:
+        if renderer._gl_context is not None:
+            renderer._gl_context.make_current()
+    except Exception:  # each backend raises its own kind
+        return False
+    return True
+
+
+def _discard(renderer: mujoco.Renderer) -> None:
+    """Free what a renderer holds, in its own context: in another's, the same names are that one's buffers."""
+    if _make_current(renderer):
+        renderer.close()
+    else:
+        _abandon(renderer)
+
+
+def _abandon(renderer: mujoco.Renderer | None) -> None:
+    """Let go of a renderer whose context is no more, or another process's."""
+    egl: Any = sys.modules.get("mujoco.egl")
+    if egl is not None and renderer is not None:
+        egl.EGL.eglReleaseThread()  # without any context, freeing its buffers frees nobody else's
+        renderer._gl_context._context = None
+        renderer.close()
 
 
 def check_view(model: mujoco.MjModel, width: int, height: int, camera: str) -> None:

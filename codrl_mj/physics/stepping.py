@@ -1,8 +1,9 @@
 """One environment step of one simulation in MuJoCo, compiled: the engine's step with what comes before and after it.
 
 A compiled function knows a simulation by its `arguments`: (address of the model, address of the data, settings,
-memory, trace). `settings` is the vector described by `SETTING_NAMES`, then a disturber's numbers; `memory` a
-disturber's, of one row; `trace` that of `Physics`. They are live: what changes them changes the simulation.
+memory, trace). `settings` has a row for each actuator, a `Wiring` and then a disturber's `Numbers`; `memory` is a
+disturber's, a row for each actuator; `trace` that of `Physics`. They are live: what changes them changes the
+simulation.
 """
 
 import functools
@@ -10,72 +11,80 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from numba import types
+from numba.extending import overload
 
-from codrl_mj.callbacks.engine import engine
-from codrl_mj.callbacks.kernels import AVAILABLE_VOLTAGE, CURRENT, NOISE_KEY, VOLTAGE
-from codrl_mj.motor import Actuator
-from codrl_mj.physics.base import (
-    TRACE_ACTUAL_FORCE,
-    TRACE_CURRENT,
-    TRACE_DESIRED_FORCE,
-    TRACE_SATURATED,
-    TRACE_SPEED,
-    TRACE_VOLTAGE,
-    delivered,
-)
+from codrl_mj.actuators import Family, Ideal
+from codrl_mj.engine.families import Slot, load_family, signals_at
+from codrl_mj.engine.library import engine
+from codrl_mj.engine.memory import internal, read
+from codrl_mj.engine.sensors import compiled_observe, compiled_parameters
 from codrl_mj.physics.constrain import Compiled, compiled_constrain, compiled_reader, is_fine
-from codrl_mj.physics.disturber import KEY_COLUMN, compiled_disturbance, sensor_error
+from codrl_mj.physics.disturber import KEY_COLUMN, compiled_disturbance, numbers_of
 from codrl_mj.tasks import Task
 
-SETTING_NAMES = (
-    "motorised",
-    "imperfect",
-    "dof",
-    "current_bias",
-    "current_noise",
-    "arm",
-    "torque_constant",
-    "max_voltage",
-)
-"""What `settings` begin with: whether there is a motor, and one with an imperfect sensor or supply; the index of the
-actuated joint's velocity; the current sensor's bias and noise [A]; and the motor's arm [m], torque constant [N*m/A] and
-largest voltage [V]."""
-MOTORISED, IMPERFECT, DOF, BIAS, NOISE, ARM, TORQUE_CONSTANT, MAX_VOLTAGE = range(len(SETTING_NAMES))
-DISTURBANCE = len(SETTING_NAMES)
-"""Where the disturber's numbers begin."""
+TORQUE, NOISE_KEY = Slot._fields.index("torque"), Slot._fields.index("noise_key")
 
 
-def actuator_settings(actuator: Actuator | None) -> tuple[float, float, float]:
-    """Arm, torque constant and largest voltage; for the ideal actuator such that force and control are equal."""
-    if actuator is None:
-        return 1.0, 1.0, np.inf
-    return actuator.motor.arm_radius, actuator.motor.torque_constant, actuator.controller.max_voltage
+class Wiring(NamedTuple):
+    """Where an actuator's numbers are in MuJoCo's arrays, and its arm."""
+
+    actuator: float
+    """Its index."""
+    ctrl: float
+    """Index of its control."""
+    act: float
+    """Index of the first of its activations."""
+    dof: float
+    """Index of its joint's velocity."""
+    arm: float
+    """[m]."""
+
+
+WIRING = len(Wiring._fields)
 
 
 class Stepping(NamedTuple):
     """Compiled functions; `arguments` are those of the module's docstring."""
 
     step: Compiled
-    """(force, *arguments) -> (fine, *signals): takes one environment step under a desired force [N or N*m]. `fine` says
-    whether the state is still one of numbers within `LARGEST`; the signals are in the order of `Signals`."""
+    """(force, *arguments) -> whether the state is still one of numbers within `LARGEST`: takes one environment step
+    under a desired force [N or N*m], or under several, an array (n,). What the actuators did is in `trace`."""
     start: Compiled
     """(state (n,), key, *arguments) -> nothing: starts an episode, as `Physics.reset` does."""
     read: Compiled
     """(state (n,), *arguments) -> nothing: fills `state` with the present one."""
-    sensed: Compiled
-    """(current, *arguments) -> current [A] that the sensor measures at present."""
+    observed: Compiled
+    """(row of trace (n, c), seen (n, k), *arguments) -> nothing: fills `seen` with what the sensors say at present."""
 
 
-def compiled_stepping(task: Task, explicit: bool, disturbed: bool, noisy: bool) -> Stepping:
+def compiled_stepping(task: Task, family: Family, explicit: bool, disturbed: bool) -> Stepping:
     """The functions for simulations of a task; compiled as they are used, once a process.
 
     Args:
         task: the task.
+        family: of its actuators.
         explicit: whether positions are moved by the old velocity.
         disturbed: whether there is a disturber.
-        noisy: whether the current sensor has noise.
     """
-    return _stepping(compiled_constrain(task), compiled_reader(task), task.qpos, task.qvel, explicit, disturbed, noisy)
+    motorised = not issubclass(family, Ideal)
+    if motorised:
+        load_family(family)
+    return _stepping(
+        compiled_constrain(task), compiled_reader(task), task.qpos, task.qvel, explicit, disturbed, family, motorised
+    )
+
+
+def force_of(forces: Any, actuator: int) -> float:
+    """The force for an actuator: of an array, or the number itself."""
+    return forces[actuator] if isinstance(forces, np.ndarray) else forces
+
+
+@overload(force_of)  # not inlined by numba, which would drop stores through pointers as dead code
+def _force_of(forces, actuator):  # type: ignore[no-untyped-def]  # noqa: ARG001 - numba compares the arguments
+    if isinstance(forces, types.Array):
+        return lambda forces, actuator: forces[actuator]
+    return lambda forces, actuator: forces  # noqa: ARG005
 
 
 @functools.cache
@@ -86,7 +95,8 @@ def _stepping(
     velocities: tuple[int, ...],
     explicit: bool,
     disturbed: bool,
-    noisy: bool,
+    family: Family,
+    motorised: bool,
 ) -> Stepping:
     mujoco = engine()
     engine_step, engine_reset, engine_timestep, time_of = mujoco.step, mujoco.reset, mujoco.timestep, mujoco.time
@@ -95,24 +105,26 @@ def _stepping(
     bounded, constrain = keep is not None, keep or _nothing
     disturbance = compiled_disturbance()
     disturb, disturbing_load = (disturbance.command, disturbance.load) if disturbed else (_nothing, _nothing)
-    signals_of = numba.njit(nogil=True, error_model="numpy")(delivered)
+    first, count = signals_at(family), len(family.Signals._fields)
+    seeing = bool(family.OBSERVED)
+    observe = compiled_observe(family) if seeing else _nothing
+    parameters_of = compiled_parameters()
 
     @numba.njit(nogil=True, error_model="numpy")
-    def step(
-        force: float, model: int, data: int, settings: np.ndarray, memory: np.ndarray, trace: np.ndarray
-    ) -> tuple[bool, float, float, float, float, float, bool]:
+    def step(force: Any, model: int, data: int, settings: np.ndarray, memory: np.ndarray, trace: np.ndarray) -> bool:
         timestep = engine_timestep(model)
         qpos, qvel, ctrl, act = qpos_of(data), qvel_of(data), ctrl_of(data), act_of(data)
-        arm, torque_constant, available = settings[ARM], settings[TORQUE_CONSTANT], settings[MAX_VOLTAGE]
-        motorised, imperfect, dof = settings[MOTORISED] != 0.0, settings[IMPERFECT] != 0.0, int(settings[DOF])
         state = np.empty(size)
-        command = force
-        signals = (force, force, 0.0, 0.0, 0.0, False)
         for inner in range(len(trace)):
-            if disturbed:
-                command = disturb(settings[DISTURBANCE:], memory[0], force)
-                load_of(data)[dof] = disturbing_load(settings[DISTURBANCE:], memory[0])
-            ctrl[0] = command * arm
+            for actuator in range(len(settings)):
+                wiring = wiring_of(settings[actuator])
+                command = force_of(force, actuator)
+                if disturbed:
+                    numbers = numbers_of(settings[actuator, WIRING:])
+                    command = disturb(numbers, memory[actuator], command)
+                    load_of(data)[int(wiring.dof)] = disturbing_load(numbers, memory[actuator])
+                ctrl[int(wiring.ctrl)] = command * wiring.arm
+                trace[inner, actuator, 0] = command
             if explicit:
                 for entry in range(moving):
                     state[entry] = qpos[entry] + timestep * qvel[entry]
@@ -122,20 +134,19 @@ def _stepping(
                     qpos[entry] = state[entry]
             if bounded:
                 constrain(qpos, qvel, state, timestep)
-            if motorised:
-                if imperfect:
-                    available = act[AVAILABLE_VOLTAGE]
-                signals = signals_of(force, command, act[CURRENT], act[VOLTAGE], arm, torque_constant, available)
-            else:
-                signals = (force, command, 0.0, 0.0, 0.0, False)
-            trace[inner, TRACE_DESIRED_FORCE] = command
-            trace[inner, TRACE_ACTUAL_FORCE] = signals[1]
-            trace[inner, TRACE_CURRENT] = signals[2]
-            trace[inner, TRACE_VOLTAGE] = signals[4]
-            trace[inner, TRACE_SPEED] = qvel[dof]
-            trace[inner, TRACE_SATURATED] = signals[5]
+            for actuator in range(len(settings)):
+                wiring = wiring_of(settings[actuator])
+                row = trace[inner, actuator]
+                if motorised:
+                    own = int(wiring.act)
+                    row[1] = act[own + TORQUE] / wiring.arm
+                    for entry in range(count):
+                        row[2 + entry] = act[own + first + entry]
+                else:
+                    row[1] = row[0]
+                row[2 + count] = qvel[int(wiring.dof)]
         read_state(qpos, qvel, state)
-        return (is_fine(state), *signals)
+        return is_fine(state)
 
     @numba.njit(nogil=True, error_model="numpy")
     def start(
@@ -153,11 +164,12 @@ def _stepping(
             qpos[entry] = state[positions[entry]]
         for entry in range(len(velocities)):
             qvel[entry] = state[velocities[entry]]
-        if settings[IMPERFECT] != 0.0:
-            act_of(data)[NOISE_KEY] = key
-        if disturbed:
-            memory[:] = 0.0
-            memory[0, memory.shape[1] + KEY_COLUMN] = key
+        for actuator in range(len(settings)):
+            if motorised:
+                act_of(data)[int(wiring_of(settings[actuator]).act) + NOISE_KEY] = key + actuator
+            if disturbed:
+                memory[actuator] = 0.0
+                memory[actuator, memory.shape[1] + KEY_COLUMN] = key + actuator
 
     @numba.njit(nogil=True, error_model="numpy")
     def read(
@@ -171,22 +183,36 @@ def _stepping(
         read_state(qpos_of(data), qvel_of(data), state)
 
     @numba.njit(nogil=True, error_model="numpy")
-    def sensed(
-        current: float,
+    def observed(
+        row: np.ndarray,
+        seen: np.ndarray,
         model: int,
         data: int,
         settings: np.ndarray,
         memory: np.ndarray,  # noqa: ARG001
         trace: np.ndarray,  # noqa: ARG001
-    ) -> float:
-        if noisy:  # left out where it is not needed, because it takes long to compile
-            key, time, timestep = act_of(data)[NOISE_KEY], time_of(data), engine_timestep(model)
-            return current + sensor_error(settings[BIAS], settings[NOISE], key, time, timestep)
-        return current + settings[BIAS]
+    ) -> None:
+        if seeing:
+            for actuator in range(len(settings)):
+                wiring = wiring_of(settings[actuator])
+                observe(
+                    parameters_of(model, int(wiring.actuator)),
+                    row[actuator, 2:].ctypes.data,
+                    engine_timestep(model),
+                    time_of(data),
+                    act_of(data)[int(wiring.act) + NOISE_KEY],
+                    seen[actuator].ctypes.data,
+                )
 
-    return Stepping(step, start, read, sensed)
+    return Stepping(step, start, read, observed)
 
 
-@numba.njit
+@internal
+def wiring_of(vector: np.ndarray) -> Wiring:
+    """A row of `settings` as the wiring that it begins with."""
+    return read(vector.ctypes.data, Wiring)
+
+
+@internal
 def _nothing(*arguments: Any) -> float:  # noqa: ARG001 - in the place of another
     return 0.0

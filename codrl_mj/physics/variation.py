@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 import mujoco
 import numpy as np
 
-from codrl_mj.callbacks.hill import GRAVITY
+from codrl_mj.actuators import IDEAL
+from codrl_mj.engine.hill import GRAVITY
 from codrl_mj.physics.mjcf import hills, task_model
 from codrl_mj.tasks import TASKS
 
@@ -18,7 +19,7 @@ DRAWN = ("geom_pos", "geom_size")
 @functools.cache
 def _nominal_model(task: str) -> mujoco.MjModel:
     """A task's model, read only."""
-    return task_model(TASKS[task], None, TASKS[task].step_duration)
+    return task_model(TASKS[task], (IDEAL,) * len(TASKS[task].motors), TASKS[task].step_duration)
 
 
 def variable(task: str) -> tuple[str, ...]:
@@ -52,17 +53,18 @@ class Variation:
     gravity and the force of a hill; `model.damping.JOINT` is the damping [N*s/m or N*m*s/rad] added to a joint.
     """
 
-    def __init__(self, task: str, names: Sequence[str]) -> None:
+    def __init__(self, task: str, names: Sequence[str], model: mujoco.MjModel | None = None) -> None:
         """Find the fields.
 
         Args:
             task: the task's name.
             names: what is varied, of `variable(task)`.
+            model: a model of the task, whose present fields are varied; None is the task's own.
 
         Raises:
             ValueError: an unknown name; the nearest known one is suggested.
         """
-        model = _nominal_model(task)
+        model = _nominal_model(task) if model is None else model
         known = variable(task)
         self.names = tuple(names)
         self._nominal: dict[str, np.ndarray] = {}
@@ -71,8 +73,7 @@ class Variation:
                 near = difflib.get_close_matches(name, known, n=1)
                 raise ValueError(f"unknown {name!r}" + (f": did you mean {near[0]!r}?" if near else ""))
             for field in _FIELDS[name.split(".")[1]]:
-                owner = model.opt if field.startswith("opt.") else model
-                self._nominal[field] = getattr(owner, field.removeprefix("opt.")).copy()
+                self._nominal[field] = field_of(model, field).copy()
         self._bodies = {model.body(body).name: body for body in range(model.nbody)}
         self._dofs = {model.joint(joint).name: int(model.jnt_dofadr[joint]) for joint in range(model.njnt)}
         self._parents = model.body_parentid.copy()
@@ -130,6 +131,8 @@ _FIELDS = {
     "damping": ("dof_damping",),
     "gravity": ("opt.gravity", "jnt_user"),
 }
+VARIED = tuple(dict.fromkeys(name for names in _FIELDS.values() for name in names if name not in DRAWN))
+"""Fields that the dynamics depend on."""
 
 
 def _along(model: mujoco.MjModel) -> dict[int, int]:
@@ -146,6 +149,11 @@ def _along(model: mujoco.MjModel) -> dict[int, int]:
     return found
 
 
+def field_of(model: mujoco.MjModel, name: str) -> np.ndarray:
+    """A field of a model, live, by its name as `Variation.fields` has it."""
+    return getattr(model.opt if name.startswith("opt.") else model, name.removeprefix("opt."))
+
+
 def write_fields(model: mujoco.MjModel, fields: Mapping[str, np.ndarray], row: int = 0) -> None:
     """Write one row of varied fields into a model; what the engine derives from them is not changed.
 
@@ -155,5 +163,4 @@ def write_fields(model: mujoco.MjModel, fields: Mapping[str, np.ndarray], row: i
         row: the row.
     """
     for name, values in fields.items():
-        owner = model.opt if name.startswith("opt.") else model
-        getattr(owner, name.removeprefix("opt."))[:] = values[row]
+        field_of(model, name)[:] = values[row]

@@ -1,15 +1,17 @@
 """Files that appear whole or not at all."""
 
 import contextlib
+import hashlib
 import json
 import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+_SEAL = "sha256"
 _TEMPORARY = re.compile(r"\.(.+)-[a-z0-9_]{8}(\.[^.]+)?")  # what tempfile makes of the names that `writing` asks for
 
 
@@ -68,8 +70,14 @@ def write_json(path: Path, content: Any) -> None:
         temporary.write_text(json.dumps(content, indent=2) + "\n")
 
 
+def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
+    """The content and, as its entry `sha256`, a digest of all the rest, which `read_json` checks and takes off."""
+    plain = json.loads(json.dumps(content))  # what a reader will see: names that are text, lists for tuples
+    return {_SEAL: hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest(), **plain}
+
+
 def read_json(path: Path, what: str) -> Any:
-    """Read JSON.
+    """Read JSON; of what is `sealed`, the content alone.
 
     Args:
         path: the file.
@@ -77,11 +85,20 @@ def read_json(path: Path, what: str) -> Any:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is not JSON, for instance because it is truncated.
+        ValueError: the file is not JSON, for instance because it is truncated, or not what was sealed.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no {what} at {path}")
     try:
-        return json.loads(path.read_text())
+        content = json.loads(path.read_text())
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is not a {what}: it is truncated or not JSON ({error})") from None
+    if not isinstance(content, dict) or _SEAL not in content:
+        return content
+    plain = {name: value for name, value in content.items() if name != _SEAL}
+    if content[_SEAL] != sealed(plain)[_SEAL]:
+        raise ValueError(
+            f"{path} is not the {what} that was written: its content does not have the {_SEAL} that it names. It was "
+            f"damaged or edited: copy it anew from where it came, or delete its entry {_SEAL} if you meant to edit it"
+        )
+    return plain

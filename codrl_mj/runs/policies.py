@@ -4,17 +4,22 @@
 and says so.
 """
 
+import hashlib
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from gymnasium import spaces
 
+from codrl_mj.actuators import trusting
 from codrl_mj.agents import AgentConfig, agent_from_mapping
-from codrl_mj.runs.files import read_json, write_json, writing
+from codrl_mj.runs.files import read_json, sealed, write_json, writing
+from codrl_mj.runs.layout import DESCRIPTION, WEIGHTS
 
 FORMAT = "codrl_mj policy 2"
-POLICY_FILES = _WEIGHTS, _DESCRIPTION = "policy.safetensors", "policy.json"
+_DIGEST = "weights_sha256"
+_REMEDY = "Copy both files anew from where they came; a training that was killed mends its own when it is resumed"
+_ENTRIES = {"format", _DIGEST, "agent", "observation_space", "action_space"}
 
 
 class Policy(Protocol):
@@ -50,59 +55,72 @@ def save_policy(policy: Any, agent: AgentConfig, folder: Path) -> None:
     Args:
         policy: the Stable-Baselines3 policy of a model that `agent` made.
         agent: the settings.
-        folder: gets `policy.safetensors` and `policy.json`.
+        folder: gets `policy.safetensors` and `policy.json`, which has digests of both.
 
     Raises:
         ValueError: the spaces are of a kind that cannot be saved.
     """
     from safetensors.torch import save
 
+    weights = save({name: tensor.contiguous() for name, tensor in policy.state_dict().items()})
     description = {
         "format": FORMAT,
+        _DIGEST: hashlib.sha256(weights).hexdigest(),
         "agent": agent.as_mapping(),
         "observation_space": _describe_space(policy.observation_space),
         "action_space": _describe_space(policy.action_space),
     }
-    with writing(folder / _WEIGHTS) as temporary:
-        temporary.write_bytes(save({name: tensor.contiguous() for name, tensor in policy.state_dict().items()}))
-    write_json(folder / _DESCRIPTION, description)
+    with writing(folder / WEIGHTS) as temporary:
+        temporary.write_bytes(weights)
+    write_json(folder / DESCRIPTION, sealed(description))
 
 
-def load_policy(folder: Path) -> Any:
+def load_policy(folder: Path, trust: bool = False) -> Any:
     """Load a policy that `save_policy` wrote; nothing in the files is executed.
 
     Args:
         folder: a run folder, or any folder with `policy.safetensors` and `policy.json`.
+        trust: whether to import the module of an agent that is none of ours, which executes it.
 
     Returns:
         The policy (`predict(observations, deterministic=...)`).
 
     Raises:
         FileNotFoundError: the folder has no policy.
-        ValueError: the files are truncated, of another format, or do not belong together.
+        ValueError: the files are truncated, damaged, of another format, or do not belong together. Policies from before
+            there were digests are loaded without that proof.
     """
     from safetensors import SafetensorError
-    from safetensors.torch import load_file
+    from safetensors.torch import load
 
-    description = read_json(folder / _DESCRIPTION, "policy description")
+    description = read_json(folder / DESCRIPTION, "policy description")
     if not isinstance(description, dict) or description.get("format") != FORMAT:
-        raise ValueError(f"{folder / _DESCRIPTION}: not a policy of this program: its format must be {FORMAT!r}")
-    weights = folder / _WEIGHTS
+        raise ValueError(f"{folder / DESCRIPTION}: not a policy of this program: its format must be {FORMAT!r}")
+    if surplus := description.keys() - _ENTRIES:  # such as the digest's name, damaged
+        raise ValueError(f"{folder / DESCRIPTION} has unknown entries: {', '.join(sorted(surplus))}. {_REMEDY}")
+    weights = folder / WEIGHTS
     if not weights.is_file():
         raise FileNotFoundError(f"no policy weights at {weights}")
+    content = weights.read_bytes()
+    if _DIGEST in description and hashlib.sha256(content).hexdigest() != description[_DIGEST]:
+        raise ValueError(
+            f"{weights} is truncated or damaged, or it and {DESCRIPTION} do not belong together: its sha256 is not the "
+            f"one there. {_REMEDY}"
+        )
     try:
-        agent = agent_from_mapping(description["agent"])
+        with trusting(trust):
+            agent = agent_from_mapping(description["agent"])
         spaces_ = _make_space(description["observation_space"]), _make_space(description["action_space"])
         policy = agent.make_policy(*spaces_)  # type: ignore[arg-type]
     except (ArithmeticError, AssertionError, AttributeError, LookupError, TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"{folder / _DESCRIPTION} does not describe a policy: {error!r}") from None
+        raise ValueError(f"{folder / DESCRIPTION} does not describe a policy: {error!r}") from None
     try:
-        tensors = load_file(weights)
+        tensors = load(content)
         policy.load_state_dict(tensors)
     except SafetensorError as error:
         raise ValueError(f"{weights} is truncated or not a safetensors file: {error}") from None
     except RuntimeError as error:
-        raise ValueError(f"{weights} and {_DESCRIPTION} do not belong together: {error}") from None
+        raise ValueError(f"{weights} and {DESCRIPTION} do not belong together: {error}") from None
     if not all(tensor.isfinite().all() for tensor in tensors.values()):
         raise ValueError(f"{weights} holds weights that are not finite numbers")
     policy.set_training_mode(False)

@@ -10,13 +10,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from codrl_mj.motor import NAMED, Actuator, named_actuator
+from codrl_mj.actuators import NAMED, actuator_from_mapping, trusting
+from codrl_mj.envs.config import upgraded
 from codrl_mj.runs.files import read_json
-
-CONFIG = "config.json"
-"""What makes a folder a run folder."""
-_PROGRESS, _RESULT, _EVALUATION = "progress.csv", "result.json", "evaluation.json"
-_POLICY = ("policy.json", "policy.safetensors")
+from codrl_mj.runs.layout import CONFIG, EVALUATION, POLICY_FILES, PROGRESS, RESULT, finished
+from codrl_mj.tasks import named_actuator
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,15 +108,18 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
     if not isinstance(config, Mapping):
         problems.append(f"{CONFIG} is not a run configuration: it has no 'train'")
         config = {}
-    progress = _last_report(path / _PROGRESS, problems)
-    result = _mapping(path / _RESULT, "result of a run", problems)
-    evaluation = _mapping(path / _EVALUATION, "policy evaluation", problems)
-    missing = [file for file in _POLICY if not (path / file).is_file()]
-    finished = (path / _RESULT).exists() or not missing
-    if finished and missing:
+    config = upgraded(config)
+    env = config.get("env")
+    env = env if isinstance(env, Mapping) else {}
+    progress = _last_report(path / PROGRESS, problems)
+    result = _mapping(path / RESULT, "result of a run", problems)
+    evaluation = _mapping(path / EVALUATION, "policy evaluation", problems)
+    missing = [file for file in POLICY_FILES if not (path / file).is_file()]
+    done = finished(path)
+    if done and missing:
         problems.append(f"it is finished, but {' and '.join(missing)} is missing")
     agent = config.get("agent")
-    task = config["task"] if isinstance(config.get("task"), str) else None
+    task = env["task"] if isinstance(env.get("task"), str) else None
     steps = _first(result, progress, "steps")
     pace = _first(progress, None, "steps_per_second")
     uninterrupted = steps / pace if steps is not None and pace else None
@@ -126,11 +127,11 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
     return RunSummary(
         path=path,
         name=path.resolve().name if name is None else name,
-        state="damaged" if problems else "finished" if finished else "unfinished",
+        state="damaged" if problems else "finished" if done else "unfinished",
         problem="; ".join(problems) or None,
         task=task,
         agent=str(agent["name"]) if isinstance(agent, Mapping) and "name" in agent else None,
-        actuator=_actuator_name(config["actuator"], task) if "actuator" in config else None,
+        actuator=_actuator_name(env["actuator"], task) if "actuator" in env else None,
         seed=_whole(config.get("seed")),
         steps=_whole(steps),
         total_steps=_whole(config.get("total_steps")),
@@ -207,13 +208,17 @@ def _first(one: Mapping[str, Any] | None, other: Mapping[str, Any] | None, name:
 
 
 def _actuator_name(actuator: Any, task: Any) -> str:
-    """The name of an actuator among the task's named ones, or `custom`."""
+    """The name of an actuator among the task's named ones, or its family's; `custom` if it is a loop of no name."""
     if actuator is None or isinstance(actuator, str):
         return actuator or "ideal"
     try:
-        made = Actuator.from_mapping(actuator)
-        return next((name for name in NAMED if named_actuator(name, task) == made), "custom")
-    except (ValueError, TypeError, KeyError):
+        mapping = actuator if isinstance(actuator, Mapping) else actuator[0]
+        if mapping.get("family", "current_loop") != "current_loop":
+            return str(mapping["family"])
+        with trusting(False):
+            made = actuator_from_mapping(mapping)
+            return next((name for name in NAMED if named_actuator(name, task) == made), "custom")
+    except (ValueError, TypeError, KeyError, AttributeError, IndexError):
         return "custom"
 
 
@@ -280,9 +285,9 @@ def compare(runs: Sequence[RunSummary]) -> Comparison:
     """
     if len(runs) < 2:
         raise ValueError(f"runs: {len(runs)}: there must be two or more to compare")
-    named = [{**run.configuration, "actuator": run.actuator} for run in runs]
+    named = [{**run.configuration, "env.actuator": run.actuator} for run in runs]
     if any(run.actuator == "ideal" for run in runs):  # which has no fields that could differ
-        named = [{key: value for key, value in one.items() if not key.startswith("actuator.")} for one in named]
+        named = [{key: value for key, value in one.items() if not key.startswith("env.actuator.")} for one in named]
     settings = {key: tuple(one.get(key) for one in named) for key in dict.fromkeys(key for one in named for key in one)}
     results: dict[str, tuple[Any, ...]] = {
         name: tuple(getattr(run, name) for run in runs)

@@ -39,5 +39,5 @@ def read_arrivals(config: TrainConfig, run: Path) -> Arrivals:
         ValueError: its table of episodes is damaged.
     """
     lengths = read_episodes(run / EPISODES)[:, EPISODE_COLUMNS.index("length")]
-    arrived = lengths < config.longest_episode
+    arrived = lengths < config.env.time_limit
     return Arrivals(len(arrived), int(arrived.sum()), int(arrived.argmax()) + 1 if arrived.any() else None)

@@ -3,11 +3,12 @@
 import dataclasses
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
+from codrl_mj.actuators import IDEAL, NAMED, Actuator, CurrentLoop, Supply
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.motor import NAMED, Actuator, CurrentLoop, named_actuator
-from codrl_mj.tasks import Task, find_task
+from codrl_mj.tasks import Task, find_task, named_actuator
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,10 +19,13 @@ class Condition:
     """Name, on the command line and in tables."""
     description: str
     """What it is, in a line."""
-    actuator: Actuator | None
-    """Actuator; None is the ideal one."""
-    env: EnvConfig = EnvConfig()
-    """The environment's other arguments: disturbances, and what is drawn at random."""
+    env: EnvConfig
+    """Task and actuator, disturbances, and what is drawn at random."""
+
+    @property
+    def actuator(self) -> Any:
+        """The actuator."""
+        return self.env.actuator
 
 
 def conditions(task: str) -> dict[str, Condition]:
@@ -35,51 +39,51 @@ def conditions(task: str) -> dict[str, Condition]:
     """
     definition, paper = _task_and_paper(task)
     # The slow winding is that of `open_loop`: what differs between the two is the loop alone.
-    slow = NAMED["open_loop"][1](paper)
-    assert slow is not None
+    slow: Any = NAMED["open_loop"][1](paper)
     return _by_name(
         [
             *(
-                Condition(
-                    name, description, actuator, EnvConfig() if actuator else _integrated_as_with_a_motor(definition)
-                )
+                Condition(name, description, _integrated_as_with_a_motor(EnvConfig(definition.name, name)))
                 for name, (description, _) in NAMED.items()
-                for actuator in [named_actuator(name, task)]
             ),
             Condition(
                 "slow_winding",
                 f"the paper's loop on a slow winding: L = {slow.motor.inductance:g} H instead of "
                 f"{paper.motor.inductance:g} H",
-                dataclasses.replace(paper, motor=slow.motor),
+                EnvConfig(definition.name, dataclasses.replace(paper, motor=slow.motor)),
             ),
-            low_voltage(paper),
+            low_voltage(definition.name, paper),
             Condition(
                 "delay",
                 f"the paper's actuator, and every command comes one environment step ({definition.step_duration:g} s) "
                 "late, as when the policy is computed while the step before runs",
-                paper,
-                EnvConfig(disturbances=Disturbances(command_delay=definition.step_duration)),
+                EnvConfig(definition.name, paper, disturbances=Disturbances(command_delay=definition.step_duration)),
             ),
             _randomised(task, paper, slow.motor.inductance),
         ]
     )
 
 
-def _integrated_as_with_a_motor(task: Task) -> EnvConfig:
+def _integrated_as_with_a_motor(env: EnvConfig) -> EnvConfig:
     """What makes the ideal actuator's environment differ from a motor's by the motor alone.
 
     Gymnasium integrates Acrobot in steps of 0.2 s, the paper's inner loop in steps of 0.02 s.
     """
-    return EnvConfig(inner_steps=task.motor_inner_steps)
+    ideal = env.actuator == IDEAL
+    return dataclasses.replace(env, inner_steps=find_task(env.task).motor_inner_steps) if ideal else env
 
 
-def low_voltage(paper: Actuator) -> Condition:
+def low_voltage(task: str, paper: Actuator) -> Condition:
     """The paper's actuator on 5 V.
 
     Its loops ask for peaks of 11 V to 17 V on these tasks, and for 1 V to 2 V to hold the largest force at standstill:
     5 V is between, so that it saturates on the move and not at rest.
     """
-    return Condition("low_voltage", "the paper's actuator on a 5 V supply instead of 24 V", _on_supply(paper, 5.0))
+    return Condition(
+        "low_voltage",
+        "the paper's actuator on a 5 V supply instead of 24 V",
+        EnvConfig(task, _on_supply(paper, 5.0)),
+    )
 
 
 def _randomised(task: str, paper: Actuator, slowest: float) -> Condition:
@@ -90,15 +94,12 @@ def _randomised(task: str, paper: Actuator, slowest: float) -> Condition:
     """
     loop, motor = paper.controller, paper.motor
     weak, weaker = named_actuator("weak", task), named_actuator("weaker", task)
-    assert weak is not None
-    assert weaker is not None
     kp, ki = (
         f"loguniform({getattr(weaker.controller, gain):g}, "
         f"{max(getattr(loop, gain), getattr(weak.controller, gain)):g})"
         for gain in ("kp", "ki")
     )
-    supply = low_voltage(paper).actuator
-    assert supply is not None
+    supply = low_voltage(task, paper).actuator
     drawn = {
         "controller.kp": kp,
         "controller.ki": ki,
@@ -110,8 +111,7 @@ def _randomised(task: str, paper: Actuator, slowest: float) -> Condition:
     return Condition(
         "randomised",
         f"the paper's actuator, drawn anew in every episode: {text}",
-        paper,
-        EnvConfig(randomize=tuple(f"{name}={distribution}" for name, distribution in drawn.items())),
+        EnvConfig(task, paper, randomize=tuple(f"{name}={distribution}" for name, distribution in drawn.items())),
     )
 
 
@@ -132,7 +132,7 @@ def stall_supply(task: str) -> Condition:
     return Condition(
         "stall_supply",
         f"the paper's actuator on {volts:g} V, which just holds the task's largest force at standstill",
-        _on_supply(paper, volts),
+        EnvConfig(definition.name, _on_supply(paper, volts)),
     )
 
 
@@ -154,35 +154,39 @@ def ladder(task: str) -> dict[str, Condition]:
     # 16 steps over the range: a converter of 4 bits, at the coarse end of what is built
     coarse = {"command_quantum": definition.max_force / 8} if definition.forces is None else {}
     # Half the winding's resistance: a stalled motor gets a third less current from it
-    sag = {"supply_resistance": 0.5 * motor.resistance}
-    low = known["low_voltage"].actuator
+    sag = 0.5 * motor.resistance
+    low = known["low_voltage"].env
     rungs = [
         known["ideal"],
         Condition(
             "winding",
             f"the paper's winding (R = {motor.resistance:g} ohm, L = {motor.inductance:g} H) driven open loop: "
             "u = R*i_ref + kE*omega",
-            Actuator(motor, CurrentLoop(kp=0.0, kff=motor.resistance, max_voltage=paper.controller.max_voltage)),
+            EnvConfig(
+                definition.name,
+                Actuator(motor, CurrentLoop(kp=0.0, kff=motor.resistance, max_voltage=paper.controller.max_voltage)),
+            ),
         ),
         known["paper"],
         known["low_voltage"],
         Condition(
             "late",
             f"`low_voltage`, and every command comes one environment step ({definition.step_duration:g} s) late",
-            low,
-            EnvConfig(disturbances=Disturbances(**late)),
+            dataclasses.replace(low, disturbances=Disturbances(**late)),
         ),
         Condition(
             "coarse",
             f"`late`, and commands in steps of {definition.max_force / 8:g} N*m",
-            low,
-            EnvConfig(disturbances=Disturbances(**late, **coarse)),
+            dataclasses.replace(low, disturbances=Disturbances(**late, **coarse)),
         ),
         Condition(
             "sagging",
-            f"`{'coarse' if coarse else 'late'}`, and a supply that sags: of {sag['supply_resistance']:g} ohm",
-            low,
-            EnvConfig(disturbances=Disturbances(**late, **coarse, **sag)),
+            f"`{'coarse' if coarse else 'late'}`, and a supply that sags: of {sag:g} ohm",
+            dataclasses.replace(
+                low,
+                actuator=dataclasses.replace(low.actuator, supply=Supply(resistance=sag)),
+                disturbances=Disturbances(**late, **coarse),
+            ),
         ),
     ]
     return _by_name(rung for rung in rungs if coarse or rung.name != "coarse")
@@ -209,7 +213,6 @@ def check_condition(name: str, tasks: Iterable[str]) -> None:
 def _task_and_paper(task: str) -> tuple[Task, Actuator]:
     definition = find_task(task)
     paper = named_actuator("paper", definition.name)
-    assert paper is not None
     return definition, paper
 
 

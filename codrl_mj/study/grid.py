@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.motor import Actuator
 from codrl_mj.runs.files import read_json, write_json
 from codrl_mj.training import RunInUseError, TrainConfig, TrainingStoppedError, finished, load_config, train
 
@@ -65,19 +64,21 @@ class Deployment:
 
     run: Path
     """Finished run folder."""
-    actuator: Actuator | None
-    """Actuator; None is the ideal one."""
-    env: EnvConfig = EnvConfig()
-    """The environment's other arguments; actions and observations are those of the training."""
+    env: EnvConfig
+    """Actuator and all else but actions and observations, which are those of the training."""
     episodes: int = 100
     """Episodes."""
     seed: int = 0
     """Seed of the first episode."""
 
     @property
+    def _identity(self) -> dict[str, Any]:
+        return {**vars(self), "env": self.env.as_mapping(), "run": None}
+
+    @property
     def record(self) -> Path:
         """The JSON file of the result, in the run folder."""
-        return self.run / _DEPLOYMENTS / f"{_digest({**dataclasses.asdict(self), 'run': None})}.json"
+        return self.run / _DEPLOYMENTS / f"{_digest(self._identity)}.json"
 
 
 def cell_folder(root: Path, config: TrainConfig) -> Path:
@@ -239,11 +240,9 @@ def _deploy(deployment: Deployment) -> None:
     from codrl_mj.evaluation import evaluate
     from codrl_mj.runs.policies import load_policy
 
-    config = load_config(deployment.run)
+    config = load_config(deployment.run, trust=True)  # ours: found by its configuration
     result = evaluate(
         load_policy(deployment.run),
-        config.task,
-        deployment.actuator,
         deployment.env.seen_as(config.env),
         deployment.episodes,
         deployment.seed,

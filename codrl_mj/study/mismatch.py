@@ -103,7 +103,6 @@ def deployments(config: MismatchConfig) -> dict[str, dict[int, Deployment]]:
         name: {
             seed: Deployment(
                 folders[cell_name(trial.arm.task, trial.arm.name, seed)],
-                trial.test.actuator,
                 trial.test.env,
                 config.episodes,
                 EVALUATION_SEED,

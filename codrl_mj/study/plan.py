@@ -54,14 +54,14 @@ class Arm:
             seed: training seed.
             total_steps: environment steps; None: the settings' own budget.
         """
-        base = TrainConfig.preset(self.task, self.agent, seed=seed, actuator=self.condition.actuator)
+        base = TrainConfig.preset(self.task, self.agent, seed=seed)
         radius = PAPER_RADIUS if self.task == "cartpole" and not self.plain_reward else None
         env = dataclasses.replace(
             self.condition.env,
             action=self.action,
             levels=self._levels(),
             observe_actuator=self.observe,
-            center_radius=radius,
+            options={} if radius is None else {"center_radius": radius},
         )
         return dataclasses.replace(base, env=env, total_steps=total_steps or base.total_steps)
 
@@ -73,7 +73,6 @@ class Arm:
         """
         if self.action != "voltage" or find_task(self.task).forces is None:
             return None
-        assert self.condition.actuator is not None
         supply = self.condition.actuator.controller.max_voltage
         steps = (supply / 16, supply / 4, supply)
         return (*(-step for step in reversed(steps)), 0.0, *steps)

@@ -1,29 +1,60 @@
 """The tasks: the only definition of their observations, rewards, ends and resets."""
 
-import difflib
+from typing import Any
 
+from codrl_mj.actuators import check_same_family, resolve
 from codrl_mj.tasks import acrobot, cartpole, mountain_car, mountain_car_continuous, pendulum
 from codrl_mj.tasks.base import Task
+from codrl_mj.tasks.registration import TASKS, find_task, reference_of, register
+from codrl_mj.tasks.twin import Twin
 
-_MODULES = (pendulum, cartpole, acrobot, mountain_car, mountain_car_continuous)
-TASKS: dict[str, Task] = {module.TASK.name: module.TASK for module in _MODULES}
-"""Every task by its name on the command line."""
+for _module in (pendulum, cartpole, acrobot, mountain_car, mountain_car_continuous):
+    register(_module.TASK)
 
 
-def find_task(name: str) -> Task:
-    """The task called `name`.
+def resolve_actuators(given: Any, task: Task) -> tuple[Any, ...]:
+    """Turn whatever a user may write for a task's actuator into one for each of its motors.
 
     Args:
-        name: a key of `TASKS`.
+        given: what `codrl_mj.actuators.resolve` takes, for all motors; or a list of these, one for each.
+        task: the task, whose own actuators the names vary.
+
+    Raises:
+        ValueError: unknown name or field, a value out of bounds, or not one for each motor, or of several families.
+    """
+    count = len(task.motors)
+    each = list(given) if isinstance(given, list | tuple) else [given] * count
+    if len(each) != count:
+        raise ValueError(
+            f"actuator: {len(each)} actuators for the {count} motors of {task.name}: {', '.join(task.motors)}"
+        )
+    papers = task.paper or (None,) * count
+    actuators = tuple(resolve(one, paper, task.name) for one, paper in zip(each, papers, strict=True))
+    check_same_family(actuators)
+    return actuators
+
+
+def named_actuator(name: str, task: str) -> Any:
+    """The actuator called `name` on `task`; with several motors a tuple of them.
+
+    Args:
+        name: one of `codrl_mj.actuators.NAMED`, or a family's.
+        task: a task name, as on the command line.
 
     Raises:
         ValueError: unknown name; the nearest known one is suggested.
     """
-    if name not in TASKS:
-        near = difflib.get_close_matches(name, TASKS, n=1)
-        hint = f"did you mean {near[0]!r}? " if near else ""
-        raise ValueError(f"unknown task {name!r}: {hint}Known tasks: {', '.join(TASKS)}")
-    return TASKS[name]
+    actuators = resolve_actuators(name, find_task(task))
+    return actuators[0] if len(actuators) == 1 else actuators
 
 
-__all__ = ["TASKS", "Task", "find_task"]
+__all__ = [
+    "TASKS",
+    "Task",
+    "Twin",
+    "find_task",
+    "named_actuator",
+    "reference_of",
+    "register",
+    "resolve_actuators",
+]

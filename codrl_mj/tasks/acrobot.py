@@ -55,9 +55,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.classic_control import utils
-from numba.extending import register_jitable
 
+from codrl_mj.actuators import Actuator, CurrentLoop, Motor
 from codrl_mj.tasks.base import Entries, Task
+from codrl_mj.tasks.twin import gymnasium_env
 
 # Gymnasium's Acrobot-v1
 TORQUE = 1.0  # N*m
@@ -81,7 +82,6 @@ def initial_state(draws: Entries) -> tuple[Any, ...]:
     return _rounded(draws[0]), _rounded(draws[1]), _rounded(draws[2]), _rounded(draws[3])
 
 
-@register_jitable
 def _rounded(number: Any) -> Any:
     return np.float64(np.float32(number))
 
@@ -93,7 +93,6 @@ def constrain(state: Entries, timestep: float) -> tuple[Any, ...]:
     return _wrapped(state[0]), _wrapped(state[1]), speed_1, speed_2
 
 
-@register_jitable
 def _wrapped(angle: Any) -> Any:
     """The angle, turned back into [-pi, pi] by as many whole turns as it is beyond."""
     turn = 2 * math.pi
@@ -106,7 +105,6 @@ def observation(state: Entries) -> tuple[Any, ...]:
     return np.cos(state[0]), np.sin(state[0]), np.cos(state[1]), np.sin(state[1]), state[2], state[3]
 
 
-@register_jitable
 def terminated(state: Entries) -> Any:
     """The tip is above the goal line."""
     return -np.cos(state[0]) - np.cos(state[1] + state[0]) > GOAL_HEIGHT
@@ -119,9 +117,42 @@ def reward(state: Entries, force: Any, next_state: Entries, options: Options) ->
 
 _HIGH = np.array([1.0, 1.0, 1.0, 1.0, MAX_SPEED_1, MAX_SPEED_2], dtype=np.float32)
 
+
+class Twin:
+    """`AcrobotEnv`: the torques to choose from and the time step are attributes."""
+
+    _LARGEST = 400.0  # N*m*s^2
+
+    def __init__(self) -> None:
+        """Make the Gymnasium environment."""
+        self._env = gymnasium_env("Acrobot-v1")
+
+    def __call__(
+        self,
+        state: np.ndarray,
+        force: float,
+        timestep: float,
+        integrator: str,  # noqa: ARG002 - it has one only
+    ) -> np.ndarray:
+        """One `step` with the torque as the only one to choose from."""
+        if not abs(force) * timestep**2 < self._LARGEST:  # Gymnasium wraps angles turn by turn: it would not come back
+            return np.full(4, np.nan)
+        env = self._env
+        env.AVAIL_TORQUE = [force]
+        env.dt = timestep
+        env.state = state
+        env.step(0)
+        return env.state
+
+
 TASK = Task(
     name="acrobot",
+    env_id="codrl_mj/Acrobot-v0",
+    max_episode_steps=500,
+    reward_threshold=-100.0,
+    agent="dqn",
     gymnasium_id="Acrobot-v1",
+    twin=Twin,
     asset="acrobot.xml",
     step_duration=0.2,
     motor_inner_steps=10,
@@ -143,4 +174,8 @@ TASK = Task(
     terminated=terminated,
     constrain=constrain,
     goal=terminated,
+    speeds=(3,),
+    helpers=(_rounded, _wrapped, terminated),
+    # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
+    paper=(Actuator(Motor(), CurrentLoop(kp=1.0, ki=10.0, kd=1e-6)),),
 )

@@ -21,11 +21,13 @@ def asset_path(name: str) -> Path:
     """Path of the MJCF file `name`.
 
     Args:
-        name: file name, such as `cartpole.xml`.
+        name: file name, such as `cartpole.xml`; or the path of a file.
 
     Raises:
         FileNotFoundError: neither the checkout nor the wheel has it.
     """
+    if Path(name).is_file():
+        return Path(name)
     for folder in (_PACKAGE / "_assets", _PACKAGE.parent / "assets"):
         if (folder / name).is_file():
             return folder / name

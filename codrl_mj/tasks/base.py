@@ -7,6 +7,9 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from codrl_mj.actuators import Actuator
+from codrl_mj.tasks.twin import Twin
+
 Options = Any
 """A task's options: a `NamedTuple` of floats whose fields have defaults."""
 Entries = Any
@@ -20,23 +23,27 @@ class Task:
     A function of a state takes the state's entries, in Gymnasium's own order: `state[0]`, `state[1]` and so on, each a
     number, or an array with a number for each of N states (`states.T` of states (N, n)). What is the same for all
     states may be returned as a single number. These functions are plain Python that numba compiles as it stands
-    (`codrl_mj.envs.outcomes`); every face runs the compiled form. Helpers of theirs are `register_jitable`.
+    (`codrl_mj.envs.outcomes`); every face runs the compiled form. Helpers of theirs are named in `helpers`.
     """
 
     name: str
     """Name on the command line, such as `cartpole`."""
-    gymnasium_id: str
-    """Id of the Gymnasium environment that this task rebuilds."""
+    env_id: str
+    """Its id in Gymnasium's registry, such as `codrl_mj/CartPole-v0`."""
+    max_episode_steps: int | None
+    """Time limit [environment steps]; None for none."""
     asset: str
-    """MJCF file name."""
+    """MJCF file: a name among ours, or a path."""
     step_duration: float
     """Duration of one environment step [s]."""
     motor_inner_steps: int
     """Integration steps per environment step when a motor is in the loop; one when the actuator is ideal."""
-    max_force: float
-    """Largest desired force [N] or torque [N*m] of any action; where the action is the force, it saturates here."""
-    forces: tuple[float, ...] | None
-    """Desired forces [N] or torques [N*m] of the discrete actions, in order; None where the action is the force."""
+    max_force: Any
+    """Largest desired force [N] or torque [N*m] of any action; where the action is the force, it saturates here. One
+    for each motor, or one for all."""
+    forces: tuple[Any, ...] | None
+    """Desired forces [N] or torques [N*m] of the discrete actions, in order, each a number, or with several motors a
+    tuple; None where the action is the force."""
     render_fps: int
     """Frames per second of a video with one frame a step, Gymnasium's; rarely real time."""
     integrators: tuple[str, ...]
@@ -76,6 +83,31 @@ class Task:
     goal_hold: float = 0.0
     """How long an episode that succeeds has been at the goal when it ends [s]."""
 
+    motors: tuple[str, ...] = ("motor",)
+    """Names of the MJCF model's actuators that the task drives, in the order of actions and forces. With several of
+    them, forces and signals are arrays (n,) wherever they are numbers otherwise."""
+    helpers: tuple[Callable[..., Any], ...] = ()
+    """Plain functions that those above call, innermost first, to be compiled with them."""
+    reward_threshold: float | None = None
+    """Mean return at which the task counts as solved."""
+    agent: str = "ppo"
+    """The agent that `codrl-mj train` takes unless told otherwise."""
+    gymnasium_id: str | None = None
+    """Id of the environment that this task rebuilds, with the same spaces, starts, rewards and ends; None if it is none
+    of Gymnasium's."""
+    twin: Callable[[], Twin] | None = None
+    """Makes that environment, to be driven by any force: the analytic physics, and the oracle of the certificate."""
+    speeds: tuple[int, ...] = (1,)
+    """Which state entries are the velocities of the joints that the motors drive, in their order."""
+    paper: tuple[Actuator, ...] = ()
+    """The paper's actuators, one for each motor, of which other named actuators are variations; none where there are
+    none."""
+
+    @property
+    def max_forces(self) -> np.ndarray:
+        """Largest desired forces [N] or torques [N*m], shape (n,)."""
+        return np.broadcast_to(np.array(self.max_force, dtype=np.float64), (len(self.motors),)).copy()
+
     def initial(self, generator: np.random.Generator, options: dict[str, Any] | None) -> np.ndarray:
         """One initial state, shape (n,): the state that Gymnasium's environment draws from the same generator."""
         return np.array(self.initial_state(generator.uniform(*self.initial_bounds(options))))
@@ -83,9 +115,3 @@ class Task:
     def initial_states(self, draws: np.ndarray) -> np.ndarray:
         """Initial states, shape (N, n), from numbers drawn within the bounds, (N, k)."""
         return np.stack(self.initial_state(draws.T), axis=-1)
-
-    def desired_force(self, actions: np.ndarray) -> np.ndarray:
-        """Desired forces, shape (N,), of actions (N, *action shape); or the force of one action."""
-        if self.forces is not None:
-            return np.asarray(self.forces)[actions]
-        return np.clip(actions[..., 0].astype(np.float64), -self.max_force, self.max_force)

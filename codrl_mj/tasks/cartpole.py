@@ -52,7 +52,9 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.classic_control import utils
 
+from codrl_mj.actuators import Actuator, CurrentLoop, Motor
 from codrl_mj.tasks.base import Entries, Task
+from codrl_mj.tasks.twin import gymnasium_env
 
 # Gymnasium's CartPole-v1
 FORCE = 10.0  # N
@@ -95,9 +97,34 @@ def reward(state: Entries, force: Any, next_state: Entries, options: Options) ->
 
 _HIGH = np.array([X_LIMIT * 2, np.inf, ANGLE_LIMIT * 2, np.inf], dtype=np.float32)
 
+
+class Twin:
+    """`CartPoleEnv`: the force magnitude, the time step and the integrator are attributes."""
+
+    def __init__(self) -> None:
+        """Make the Gymnasium environment."""
+        self._env = gymnasium_env("CartPole-v1")
+
+    def __call__(self, state: np.ndarray, force: float, timestep: float, integrator: str) -> np.ndarray:
+        """One `step` with `force_mag` set to the force."""
+        env = self._env
+        env.force_mag = force
+        env.tau = timestep
+        env.kinematics_integrator = integrator
+        env.state = state
+        env.steps_beyond_terminated = None  # the end of an episode is the task's to judge
+        env.step(1)
+        return env.state
+
+
 TASK = Task(
     name="cartpole",
+    env_id="codrl_mj/CartPole-v0",
+    max_episode_steps=500,
+    reward_threshold=475.0,
+    agent="ppo",
     gymnasium_id="CartPole-v1",
+    twin=Twin,
     asset="cartpole.xml",
     step_duration=0.02,
     motor_inner_steps=1,
@@ -117,4 +144,6 @@ TASK = Task(
     observation=observation,
     reward=reward,
     terminated=terminated,
+    # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
+    paper=(Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=4.3, ki=1.0, kd=1e-6, kff=0.6)),),
 )

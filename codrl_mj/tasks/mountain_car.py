@@ -49,7 +49,9 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.classic_control import utils
 
+from codrl_mj.actuators import Actuator, CurrentLoop, Motor
 from codrl_mj.tasks.base import Entries, Task
+from codrl_mj.tasks.twin import gymnasium_env
 
 # Gymnasium's MountainCar-v0 and, but for the goal, its MountainCarContinuous-v0
 FORCE = 1.0  # N
@@ -98,9 +100,47 @@ def reward(state: Entries, force: Any, next_state: Entries, options: Options) ->
 
 _LOW, _HIGH = np.array([[MIN_POSITION, -MAX_SPEED], [MAX_POSITION, MAX_SPEED]], dtype=np.float32)
 
+
+class Twin:
+    """`MountainCarEnv`: its step has no duration, but force, gravity and speed limit are attributes.
+
+    One step is v += force - gravity cos(3 x), x += v. With w = v dt for its v, and force and gravity times dt^2, it is
+    a step of any duration dt.
+    """
+
+    _source, _strength = "MountainCar-v0", "force"
+
+    def __init__(self) -> None:
+        """Make the Gymnasium environment; remember what it is before it is driven."""
+        self._acceleration = getattr(gymnasium_env(self._source), self._strength)  # m/s^2 per N
+        self._env = gymnasium_env("MountainCar-v0")
+        self._gravity, self._max_speed = self._env.gravity, self._env.max_speed
+
+    def __call__(
+        self,
+        state: np.ndarray,
+        force: float,
+        timestep: float,
+        integrator: str,  # noqa: ARG002 - it has one only
+    ) -> np.ndarray:
+        """One `step` to the right with `force` set to the force's effect, of either sign."""
+        env = self._env
+        env.force = force * self._acceleration * timestep**2
+        env.gravity = self._gravity * timestep**2
+        env.max_speed = self._max_speed * timestep
+        env.state = (state[0], state[1] * timestep)
+        env.step(2)
+        return np.array([env.state[0], env.state[1] / timestep])
+
+
 TASK = Task(
     name="mountain_car",
+    env_id="codrl_mj/MountainCar-v0",
+    max_episode_steps=200,
+    reward_threshold=-110.0,
+    agent="sarsa",
     gymnasium_id="MountainCar-v0",
+    twin=Twin,
     asset="mountain_car.xml",
     step_duration=1.0,
     motor_inner_steps=20,
@@ -122,4 +162,6 @@ TASK = Task(
     terminated=terminated,
     constrain=constrain,
     goal=terminated,
+    # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
+    paper=(Actuator(Motor(), CurrentLoop(kp=1.0, ki=1.0, kd=1e-2)),),
 )

@@ -49,8 +49,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
-from numba.extending import register_jitable
 
+from codrl_mj.actuators import Actuator, CurrentLoop, Motor
 from codrl_mj.tasks import mountain_car
 from codrl_mj.tasks.base import Entries
 
@@ -63,7 +63,6 @@ class Options(NamedTuple):
     """MountainCarContinuous has no options."""
 
 
-@register_jitable
 def terminated(state: Entries) -> Any:
     """The car is at the flag or beyond, and not rolling back."""
     return (state[0] >= GOAL) & (state[1] >= 0.0)
@@ -74,10 +73,25 @@ def reward(state: Entries, force: Any, next_state: Entries, options: Options) ->
     return 100.0 * terminated(next_state) - 0.1 * (force * force)
 
 
+class Twin(mountain_car.Twin):
+    """`MountainCarEnv` again, with the `power` of `Continuous_MountainCarEnv`.
+
+    The continuous environment's equations are the same, but written so that they cannot be scaled (its gravity is no
+    attribute), and it rounds its state to float32.
+    """
+
+    _source, _strength = "MountainCarContinuous-v0", "power"
+
+
 TASK = dataclasses.replace(
     mountain_car.TASK,
     name="mountain_car_continuous",
+    env_id="codrl_mj/MountainCarContinuous-v0",
+    max_episode_steps=999,
+    reward_threshold=90.0,
+    agent="ddpg",
     gymnasium_id="MountainCarContinuous-v0",
+    twin=Twin,
     asset="mountain_car_continuous.xml",
     max_force=FORCE,
     forces=None,
@@ -86,4 +100,7 @@ TASK = dataclasses.replace(
     reward=reward,
     terminated=terminated,
     goal=terminated,
+    helpers=(terminated,),
+    # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
+    paper=(Actuator(Motor(), CurrentLoop(kp=0.1, ki=10.0, kd=1e-3)),),
 )

@@ -51,9 +51,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.classic_control import utils
-from numba.extending import register_jitable
 
+from codrl_mj.actuators import Actuator, CurrentLoop, Motor
 from codrl_mj.tasks.base import Entries, Task
+from codrl_mj.tasks.twin import gymnasium_env
 
 # Gymnasium's Pendulum-v1
 MAX_TORQUE = 2.0  # N*m
@@ -96,7 +97,6 @@ def terminated(state: Entries) -> Any:
     return False
 
 
-@register_jitable
 def upright_angle(state: Entries) -> Any:
     """The rod's angle from upright [rad], wrapped to [-pi, pi)."""
     return (state[0] + np.pi) % (2 * np.pi) - np.pi
@@ -115,9 +115,38 @@ def reward(state: Entries, force: Any, next_state: Entries, options: Options) ->
 
 _HIGH = np.array([1.0, 1.0, MAX_SPEED], dtype=np.float32)
 
+
+class Twin:
+    """`PendulumEnv`: the torque limit and the time step are attributes, the action is the torque."""
+
+    def __init__(self) -> None:
+        """Make the Gymnasium environment, without a torque limit."""
+        self._env = gymnasium_env("Pendulum-v1")
+        self._env.max_torque = np.inf
+
+    def __call__(
+        self,
+        state: np.ndarray,
+        force: float,
+        timestep: float,
+        integrator: str,  # noqa: ARG002 - it has one only
+    ) -> np.ndarray:
+        """One `step` with the torque as a float64 action, which Gymnasium does not round."""
+        env = self._env
+        env.dt = timestep
+        env.state = state
+        env.step(np.array([force]))
+        return env.state
+
+
 TASK = Task(
     name="pendulum",
+    env_id="codrl_mj/Pendulum-v0",
+    max_episode_steps=200,
+    reward_threshold=None,
+    agent="ddpg",
     gymnasium_id="Pendulum-v1",
+    twin=Twin,
     asset="pendulum.xml",
     step_duration=0.05,
     motor_inner_steps=1,
@@ -140,4 +169,7 @@ TASK = Task(
     constrain=constrain,
     goal=goal,
     goal_hold=GOAL_HOLD,
+    helpers=(upright_angle,),
+    # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
+    paper=(Actuator(Motor(), CurrentLoop(kp=1.0, ki=20.0, kd=1e-6)),),
 )

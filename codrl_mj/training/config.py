@@ -1,19 +1,18 @@
 """What to train, on what, for how long: from Python, a YAML file or the command line."""
 
 import dataclasses
-import difflib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from codrl_mj.actuators import trusting
 from codrl_mj.agents import AgentConfig, agent_from_mapping, check_fits
 from codrl_mj.agents.ppo import PPOConfig
 from codrl_mj.agents.presets import find_preset
-from codrl_mj.disturbances import OFF
-from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.registration import ENVIRONMENTS
-from codrl_mj.motor import Actuator, actuator_over, resolve
+from codrl_mj.envs.config import EnvConfig, upgraded
+from codrl_mj.fields import check_names
+from codrl_mj.tasks import find_task
 
 EVALUATION_SEED = 1_000_000
 """Seed of the first episode in which a trained policy is evaluated, away from those that trainings start from."""
@@ -27,10 +26,8 @@ class TrainConfig:
         ValueError: a field is out of bounds, or the agent cannot act in the task; the message says what would do.
     """
 
-    task: str
-    """Task name, such as `cartpole`."""
-    actuator: str | Actuator | Mapping[str, Any] | None = "paper"
-    """Actuator to train through: a name, an `Actuator`, a mapping of its fields, or None (ideal)."""
+    env: EnvConfig
+    """What to train in: task, actuator and all else."""
     agent: AgentConfig = PPOConfig()
     """The agent's settings."""
     seed: int = 0
@@ -39,8 +36,6 @@ class TrainConfig:
     """Environment steps in all, >= 1; rounded up to whole rollouts. None: until `total_episodes`."""
     num_envs: int = 8
     """Environments side by side, >= 1."""
-    env: EnvConfig = EnvConfig()
-    """The environment's other arguments."""
     total_episodes: int | None = None
     """Training episodes in all, >= 1, where they and not the steps are counted; None: until `total_steps`."""
     checkpoint_interval: int = 20_000
@@ -51,13 +46,11 @@ class TrainConfig:
     """Episodes of each evaluation, >= 1: of the task as Gymnasium poses it, on the actuator trained through."""
 
     def __post_init__(self) -> None:
-        """Validate, and replace the actuator by the `Actuator` (or None) that it stands for."""
-        task = _find_task(self.task)
-        object.__setattr__(self, "actuator", resolve(self.actuator, self.task))
+        """Validate."""
         for name, kind in (("agent", AgentConfig), ("env", EnvConfig)):
             if not isinstance(getattr(self, name), kind):
                 raise ValueError(f"TrainConfig.{name} = {getattr(self, name)!r}: must be a {kind.__name__}")
-        check_fits(self.agent.name, task)
+        check_fits(self.agent.known_as(), find_task(self.task))
         for name in ("num_envs", "checkpoint_interval", "evaluation_interval", "evaluation_episodes"):
             self._check_integer(name, 1)
         self._check_integer("seed", 0, 2**32 - 1)
@@ -66,6 +59,8 @@ class TrainConfig:
             raise ValueError("TrainConfig.total_steps = None: must be an integer >= 1, or total_episodes must be one")
         for name in budgets:
             self._check_integer(name, 1)
+        if self.total_steps is None and self.env.time_limit is None:
+            raise ValueError(f"TrainConfig.total_steps = None: {self.task} has no time limit: give max_episode_steps")
 
     def _check_integer(self, name: str, least: int, most: int | None = None) -> None:
         value = getattr(self, name)
@@ -74,49 +69,61 @@ class TrainConfig:
             bound = f">= {least}" if most is None else f"from {least} to {most}"
             raise ValueError(f"TrainConfig.{name} = {value!r}: must be an integer {bound}")
 
+    @property
+    def task(self) -> str:
+        """Task name."""
+        return self.env.task
+
+    @property
+    def actuator(self) -> Any:
+        """What is trained through; with several motors a tuple."""
+        return self.env.actuator
+
     @classmethod
-    def preset(cls, task: str, agent: str, settings: str = "default", **changes: Any) -> "TrainConfig":
+    def preset(
+        cls,
+        task: str,
+        agent: str,
+        settings: str = "default",
+        actuator: Any = "paper",
+        env: Mapping[str, Any] | None = None,
+        **changes: Any,
+    ) -> "TrainConfig":
         """Settings that suit an agent to a task.
 
         Args:
             task: task name.
             agent: the agent's name.
             settings: `default`; where the paper has this agent, `paper` and, where that fails, `repaired`.
+            actuator: what to train through.
+            env: other fields of the environment, and options of the task, to set otherwise.
             **changes: fields to set otherwise.
 
         Raises:
             ValueError: there are no such settings, or a field is out of bounds.
         """
-        check_fits(agent, _find_task(task))
+        check_fits(agent, find_task(task))
         preset = find_preset(agent, task, settings)
-        chosen = {
-            field.name: getattr(preset, field.name)
-            for field in dataclasses.fields(cls)
-            if hasattr(preset, field.name) and field.name != "task"
-        }
-        return cls(task, **(chosen | changes))
+        names = {field.name for field in dataclasses.fields(cls)} - {"env"}
+        chosen = {name: value for name, value in vars(preset).items() if name in names}
+        fields = {**preset.env, **(env or {}), "task": task, "actuator": actuator}
+        return cls(EnvConfig.from_mapping(fields), **(chosen | changes))
 
     @property
     def evaluation_env(self) -> EnvConfig:
         """What policies are evaluated in: the environment without changes of time limit and reward."""
-        return dataclasses.replace(self.env, max_episode_steps=None, center_radius=None)
-
-    @property
-    def longest_episode(self) -> int:
-        """The time limit of a training episode [steps]."""
-        return self.env.max_episode_steps or ENVIRONMENTS[self.task].max_episode_steps
+        return dataclasses.replace(self.env, max_episode_steps=None, options=None)
 
     def as_mapping(self) -> dict[str, Any]:
         """The configuration as JSON-serialisable values; `from_mapping` reads it."""
-        return {**dataclasses.asdict(self), "agent": self.agent.as_mapping()}
+        return {**vars(self), "env": self.env.as_mapping(), "agent": self.agent.as_mapping()}
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any], whole: bool = False) -> "TrainConfig":
         """The configuration that a mapping describes: `as_mapping`'s, or any part of it.
 
         What is not given is the preset's of the given agent (a name, or a mapping with its `name` and fields to set)
-        and the given `settings` (`default` if none is named). `actuator` is a name, a mapping of fields, or both: a
-        mapping with a `name`, over whose fields the others are set.
+        and the given `settings` (`default` if none is named). Task and actuator may stand in `env` or above it.
 
         Args:
             mapping: the fields.
@@ -127,29 +134,28 @@ class TrainConfig:
         """
         if not isinstance(mapping, Mapping):
             raise ValueError(f"not a training configuration: {mapping!r} is no mapping")
-        given = dict(mapping)
+        given = upgraded(mapping)
         names = [field.name for field in dataclasses.fields(cls)]
-        _check_keys("", given, [*names, "settings"])
-        missing = [name for name in (names if whole else ["task"]) if name not in given]
+        check_names(given, [*names, "task", "actuator", "settings"], "key")
+        missing = [name for name in names if name not in given] if whole else []
         if missing:
             raise ValueError(f"not a training configuration: it has no {', '.join(missing)}")
-        task, settings = _find_task(given["task"]).name, given.pop("settings", "default")
-        agent = given.pop("agent", None)
+        env, settings, agent = given.pop("env"), given.pop("settings", "default"), given.pop("agent", None)
+        if whole:
+            return cls(EnvConfig.from_mapping(env), agent_from_mapping(agent), **given)
+        if not isinstance(env, Mapping):
+            raise ValueError(f"env = {env!r}: must be a mapping of the environment's arguments")
+        if "task" not in env:
+            raise ValueError("not a training configuration: it has no task")
+        task = env["task"]
         if isinstance(agent, str) or agent is None:
             agent = {"name": agent or default_agent(task)}
         if not isinstance(agent, Mapping) or "name" not in agent:
             raise ValueError(f"agent = {agent!r}: must be an agent's name, or a mapping with its name and settings")
-        if whole:
-            given["env"] = _env_over(EnvConfig(), given["env"])
-            return cls(agent=agent_from_mapping(agent), **given)
-        base = cls.preset(task, agent["name"], settings)
-        _check_keys("agent.", agent, base.agent.as_mapping())
-        given["agent"] = agent_from_mapping(base.agent.as_mapping() | dict(agent))
-        if "actuator" in given:
-            given["actuator"] = _actuator(given["actuator"], task)
-        if "env" in given:
-            given["env"] = _env_over(base.env, given["env"])
-        return dataclasses.replace(base, **given)
+        base = cls.preset(task, agent["name"], settings, env.get("actuator", "paper"))
+        check_names(agent, base.agent.as_mapping(), "key", "agent.")
+        agent = agent_from_mapping(base.agent.as_mapping() | dict(agent))
+        return dataclasses.replace(base, env=EnvConfig.from_mapping(env, base.env), agent=agent, **given)
 
     def differences(self, other: "TrainConfig") -> list[str]:
         """What differs from another configuration, a line a field."""
@@ -162,25 +168,17 @@ class TrainConfig:
         ]
 
 
-def _find_task(name: str) -> Any:
-    """The task of that name; imported here, because the command line's help does without numba."""
-    from codrl_mj.tasks import find_task
-
-    return find_task(name)
-
-
 def default_agent(task: str) -> str:
-    """The agent that the paper trains on a task."""
-    return {"pendulum": "ddpg", "mountain_car": "sarsa", "mountain_car_continuous": "ddpg", "acrobot": "dqn"}.get(
-        task, "ppo"
-    )
+    """The agent that is trained on a task unless another is named; of the five tasks the paper's."""
+    return str(find_task(task).agent)
 
 
-def read_config(path: Path, **overriding: Any) -> TrainConfig:
+def read_config(path: Path, trust: bool = False, **overriding: Any) -> TrainConfig:
     """Read a configuration from a YAML (or JSON) file, as `TrainConfig.from_mapping` understands it.
 
     Args:
         path: the file; a run folder's `config.json` will do as well.
+        trust: whether to import the module of an actuator that it names as `module:NAME`, which executes it.
         **overriding: top-level keys to set otherwise; None leaves them, and so does the name of the agent that the file
             has settings for.
 
@@ -201,33 +199,10 @@ def read_config(path: Path, **overriding: Any) -> TrainConfig:
             if isinstance(agent, Mapping) and agent.get("name") == overriding.get("agent"):
                 overriding["agent"] = None
             content = {**content, **{key: value for key, value in overriding.items() if value is not None}}
-        return TrainConfig.from_mapping(content)
+        with trusting(trust):
+            return TrainConfig.from_mapping(content)
     except (yaml.YAMLError, UnicodeDecodeError, ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
-
-
-def _actuator(given: Any, task: str) -> Actuator | None:
-    """An actuator of a configuration: `resolve`'s forms, and a mapping of fields over a named one's.
-
-    Raises:
-        ValueError: unknown name or field, or a value out of bounds.
-    """
-    if not isinstance(given, Mapping) or "name" not in given:
-        return resolve(given, task)
-    fields = {key: value for key, value in given.items() if key != "name"}
-    return actuator_over(resolve(given["name"], task), fields)
-
-
-def _env_over(base: EnvConfig, given: Any) -> EnvConfig:
-    if not isinstance(given, Mapping):
-        raise ValueError(f"env = {given!r}: must be a mapping of the environment's arguments")
-    _check_keys("env.", given, [field.name for field in dataclasses.fields(EnvConfig)])
-    fields = dict(given)
-    disturbances = fields.get("disturbances")
-    if isinstance(disturbances, Mapping):
-        _check_keys("env.disturbances.", disturbances, [field.name for field in dataclasses.fields(OFF)])
-        fields["disturbances"] = dataclasses.replace(base.disturbances, **disturbances)
-    return dataclasses.replace(base, **fields)
 
 
 def _yaml_loader() -> Any:
@@ -240,15 +215,6 @@ def _yaml_loader() -> Any:
     number = r"(?:[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?|-?Infinity|NaN)$"
     Loader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(number), list("-+.0123456789IN"))
     return Loader
-
-
-def _check_keys(prefix: str, given: Iterable[Any], known: Iterable[str]) -> None:
-    known = list(known)
-    for key in given:
-        if key not in known:
-            near = difflib.get_close_matches(str(key), known, n=1)
-            hint = f"did you mean {prefix}{near[0]}? " if near else ""
-            raise ValueError(f"unknown key {prefix}{key}: {hint}Known keys: {', '.join(known)}")
 
 
 def _flat(prefix: str, mapping: Mapping[str, Any]) -> dict[str, Any]:

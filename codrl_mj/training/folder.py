@@ -7,16 +7,18 @@ import hashlib
 import importlib.metadata
 import platform
 import re
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from codrl_mj.runs.files import leftovers, read_json, write_json
-from codrl_mj.runs.policies import POLICY_FILES
+from codrl_mj.actuators import trusting
+from codrl_mj.runs.files import leftovers, read_json, sealed, write_json
+from codrl_mj.runs.layout import CONFIG, EVALUATION, POLICY_FILES, PROGRESS, RESULT
+from codrl_mj.tasks import find_task
 from codrl_mj.training.config import TrainConfig
 
-CONFIG, RESULT, EVALUATION = "config.json", "result.json", "evaluation.json"
-PROGRESS, EPISODES, CURVE = "progress.csv", "episodes.csv", "learning_curve.png"
+EPISODES, CURVE = "episodes.csv", "learning_curve.png"
 CHECKPOINTS, BEST, TENSORBOARD, LOCK = "checkpoints", "best", "tensorboard", ".lock"
 
 CHECKPOINT = re.compile(r"step-(?P<step>\d{12})-(?P<digest>[0-9a-f]{16})\.safetensors")
@@ -29,8 +31,12 @@ class RunInUseError(RuntimeError):
     """Another process trains in a run folder."""
 
 
-def load_config(run: Path) -> TrainConfig:
+def load_config(run: Path, trust: bool = False) -> TrainConfig:
     """The configuration of a run folder.
+
+    Args:
+        run: the folder.
+        trust: whether to import the module of an actuator that is none of ours, which executes it.
 
     Raises:
         FileNotFoundError: the folder is no run folder.
@@ -38,14 +44,10 @@ def load_config(run: Path) -> TrainConfig:
     """
     content = read_json(run / CONFIG, "run configuration")
     try:
-        return TrainConfig.from_mapping(content["train"], whole=True)
+        with trusting(trust):
+            return TrainConfig.from_mapping(content["train"], whole=True)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{run / CONFIG}: not a run configuration: {error}") from None
-
-
-def finished(run: Path) -> bool:
-    """Whether the training of a run folder is finished."""
-    return (run / RESULT).is_file()
 
 
 def unused(run: Path) -> bool:
@@ -66,7 +68,7 @@ def _leftovers(place: Path) -> list[Path]:
 
 def start_folder(run: Path, config: TrainConfig) -> None:
     """Write what the run is, before anything else is in the folder."""
-    write_json(run / CONFIG, {"train": config.as_mapping(), **provenance()})
+    write_json(run / CONFIG, sealed({"train": config.as_mapping(), **provenance(config)}))
 
 
 def check_same(run: Path, config: TrainConfig, accept_changes: bool) -> None:
@@ -81,13 +83,13 @@ def check_same(run: Path, config: TrainConfig, accept_changes: bool) -> None:
         FileNotFoundError: the folder is no run folder.
         ValueError: the configuration differs, or code or packages do; the message says what.
     """
-    differences = load_config(run).differences(config)
+    differences = load_config(run, trust=True).differences(config)  # as its caller does, who names it
     if differences:
         raise ValueError(
             f"{run} was started with another configuration (there, and asked for): {'; '.join(differences)}. A run "
             "continues as it began: choose another run folder for other settings"
         )
-    then, now = read_json(run / CONFIG, "run configuration"), provenance()
+    then, now = read_json(run / CONFIG, "run configuration"), provenance(config)
     versions = then.get("versions")
     if not isinstance(versions, Mapping):
         raise ValueError(f"{run / CONFIG}: not a run configuration: versions = {versions!r}: must be a mapping")
@@ -105,15 +107,20 @@ def check_same(run: Path, config: TrainConfig, accept_changes: bool) -> None:
         )
 
 
-def provenance() -> dict[str, Any]:
-    """What a run's result depends on besides its configuration: package versions, and a digest of our own code."""
+def provenance(config: TrainConfig) -> dict[str, Any]:
+    """What a run's result depends on besides its configuration: package versions, and a digest of code.
+
+    The code is ours, and the files of task, agent and family of actuators where these are somebody's own.
+    """
+    family, reward = type(config.env.actuators[0]), find_task(config.task).reward
+    modules = {one.__module__ for one in (family, reward, type(config.agent))}
     versions = {package: importlib.metadata.version(package) for package in _PACKAGES}
-    return {"versions": {"python": platform.python_version(), **versions}, "code": _code_digest()}
+    return {"versions": {"python": platform.python_version(), **versions}, "code": _code_digest(*sorted(modules))}
 
 
 @functools.cache
-def _code_digest() -> str:
-    """SHA-256 over the package's Python files and models."""
+def _code_digest(*modules: str) -> str:
+    """SHA-256 over the package's Python files and models, and the files of modules that are none of these."""
     from codrl_mj.tasks.assets import asset_folder
 
     package = Path(__file__).parents[1]
@@ -121,6 +128,10 @@ def _code_digest() -> str:
     for root, pattern in ((package, "*.py"), (asset_folder(), "*.xml")):
         for path in sorted(root.rglob(pattern)):
             digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes() + b"\0")
+    for module in modules:
+        file = getattr(sys.modules[module], "__file__", None)  # a notebook has none
+        if file is not None and not Path(file).is_relative_to(package):
+            digest.update(Path(file).read_bytes())
     return digest.hexdigest()
 
 
@@ -142,4 +153,4 @@ def owned(run: Path) -> Iterator[None]:
 
 def write_result(run: Path, result: Mapping[str, Any]) -> None:
     """Write what marks a run as finished."""
-    write_json(run / RESULT, dict(result))
+    write_json(run / RESULT, sealed(result))

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from codrl_mj.envs.registration import ENVIRONMENTS
-from codrl_mj.runs.files import write_json
+from codrl_mj.runs.files import sealed, write_json
+from codrl_mj.runs.layout import finished
 from codrl_mj.training import folder
 from codrl_mj.training.config import TrainConfig
 from codrl_mj.training.folder import RunInUseError
@@ -74,11 +74,11 @@ def train(
     """
     exists = (out / folder.CONFIG).exists()
     if out.exists() and not (resume and (exists or folder.unused(out))):
-        remedy = "continue it with --resume, " if exists and not folder.finished(out) else ""
+        remedy = "continue it with --resume, " if exists and not finished(out) else ""
         raise FileExistsError(f"run folder {out} exists already: {remedy}choose another --out, or delete it")
     if exists:
         folder.check_same(out, config, accept_changes)
-        if folder.finished(out):
+        if finished(out):
             return out
     if wandb is not None and importlib.util.find_spec("wandb") is None:
         raise ValueError(f"wandb = {wandb!r}: Weights & Biases is not installed: pip install wandb")
@@ -91,7 +91,7 @@ def train(
     with contextlib.closing(_make_envs(config)) as envs:
         model = config.agent.make_model(envs, config.seed)
         with folder.owned(out), _stopping() as stop, _reporting_to(wandb, out, config):
-            if (out / folder.CONFIG).exists() != exists or folder.finished(out):
+            if (out / folder.CONFIG).exists() != exists or finished(out):
                 raise RunInUseError(f"{out}: another process trained in it in the meantime; start again")
             folder.remove_leftovers(out)
             if not exists:
@@ -113,8 +113,7 @@ def _make_envs(config: TrainConfig) -> Any:
     """The environments as one Stable-Baselines3 `VecEnv`."""
     from codrl_mj.envs.sb3 import make_sb3_vec_env
 
-    env_id, arguments = ENVIRONMENTS[config.task].env_id, config.env.as_arguments()
-    return make_sb3_vec_env(env_id, config.num_envs, actuator=config.actuator, **arguments)
+    return make_sb3_vec_env(config.env, config.num_envs)
 
 
 def _step_limit(config: TrainConfig) -> int:
@@ -122,7 +121,8 @@ def _step_limit(config: TrainConfig) -> int:
     if config.total_steps is not None:
         return config.total_steps
     assert config.total_episodes is not None
-    return config.total_episodes * config.longest_episode * config.num_envs
+    assert config.env.time_limit is not None
+    return config.total_episodes * config.env.time_limit * config.num_envs
 
 
 def _finish(config: TrainConfig, out: Path, model: Any, watcher: Any) -> None:
@@ -131,7 +131,7 @@ def _finish(config: TrainConfig, out: Path, model: Any, watcher: Any) -> None:
 
     watcher.boundary(last=True)
     save_policy(model.policy, config.agent, out)
-    write_json(out / folder.EVALUATION, watcher.evaluation.as_mapping())
+    write_json(out / folder.EVALUATION, sealed(watcher.evaluation.as_mapping()))
     draw_learning_curve(out / folder.CURVE, config, watcher.episodes.array(), watcher.reports.array())
     folder.write_result(out, watcher.result())
 

@@ -12,7 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 
 from codrl_mj.evaluation import Evaluation, evaluate
-from codrl_mj.runs.files import write_json
+from codrl_mj.runs.files import sealed, write_json
 from codrl_mj.runs.policies import save_policy
 from codrl_mj.training import folder
 from codrl_mj.training.checkpoint import load_checkpoint, save_checkpoint
@@ -52,7 +52,7 @@ class Watcher(BaseCallback):
         super().__init__()
         self._config, self._out, self._stop, self._on_progress = config, out, stop, on_progress
         self._tensorboard = tensorboard
-        self._arm = 1.0 if config.actuator is None else config.actuator.motor.arm_radius  # type: ignore[union-attr]
+        self._arms = np.array([one.arm_radius for one in config.env.actuators])
         self._marks = {"report": 0, "evaluation": 0, "checkpoint": 0}
         self._squares, self._samples = 0.0, 0  # of the torque error since the last report
         self._best = {"return": -math.inf, "steps": 0}
@@ -106,7 +106,8 @@ class Watcher(BaseCallback):
         # of every step since the last call, where an agent's compiled loop takes several
         signals = self.locals.get("signals", self.training_env.signals)  # type: ignore[attr-defined]
         if signals is not None:
-            errors = np.subtract(signals.desired_force, signals.actual_force)
+            errors = np.subtract(signals["desired_force"], signals["actual_force"]).reshape(-1, len(self._arms))
+            errors = (errors * self._arms).ravel()
             self._squares += float(np.dot(errors, errors))
             self._samples += errors.size
         for info in self.locals["infos"]:
@@ -153,8 +154,6 @@ class Watcher(BaseCallback):
         config = self._config
         self.evaluation = evaluate(
             self.model.policy,
-            config.task,
-            config.actuator,
             config.evaluation_env,
             config.evaluation_episodes,
             EVALUATION_SEED,
@@ -164,7 +163,7 @@ class Watcher(BaseCallback):
             self._best = {"return": self._evaluation_return, "steps": self.model.num_timesteps}
             best = self._out / folder.BEST
             save_policy(self.model.policy, config.agent, best)
-            write_json(best / folder.EVALUATION, self.evaluation.as_mapping())
+            write_json(best / folder.EVALUATION, sealed(self.evaluation.as_mapping()))
 
     def _report(self) -> None:
         if self.reports.last("steps") == self.model.num_timesteps:
@@ -175,7 +174,7 @@ class Watcher(BaseCallback):
             episodes=len(self.episodes),
             mean_return=self.episodes.last_mean("return"),
             mean_length=self.episodes.last_mean("length"),
-            torque_error=self._arm * math.sqrt(self._squares / self._samples) if self._samples else math.nan,
+            torque_error=math.sqrt(self._squares / self._samples) if self._samples else math.nan,
             evaluation_return=self._evaluation_return,
             steps_per_second=(self.model.num_timesteps - self._steps_before) / elapsed,
             seconds=self._seconds_before + elapsed,

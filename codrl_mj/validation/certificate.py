@@ -13,8 +13,9 @@ from typing import Any
 import mujoco
 
 from codrl_mj.physics import SimulationDivergedError
-from codrl_mj.tasks import TASKS, find_task
+from codrl_mj.tasks import find_task
 from codrl_mj.validation import own_model
+from codrl_mj.validation.compare import CERTIFIED
 from codrl_mj.validation.outcome import Check, Skipped
 
 GROUPS: dict[str, str] = {
@@ -160,11 +161,13 @@ def validate(
         on_part: called as each group and task begins.
 
     Raises:
-        ValueError: an unknown task or group.
+        ValueError: an unknown task or group, or a task that is not the package's own.
     """
-    names = [tasks] if isinstance(tasks, str) else list(tasks or TASKS)
+    names = [tasks] if isinstance(tasks, str) else list(tasks or CERTIFIED)
     for name in names:
-        find_task(name)
+        if name not in CERTIFIED:
+            known = find_task(name).name
+            raise ValueError(f"task {known!r}: there is no certificate of it; must be one of {', '.join(CERTIFIED)}")
     chosen = list(GROUPS) if groups is None else list(groups)
     for group in chosen:
         if group not in GROUPS:
@@ -175,7 +178,7 @@ def validate(
         if group in chosen
         for task in ([None] if group in WITHOUT_TASK else dict.fromkeys(names))
     ]
-    subject = "all tasks" if len(set(names)) == len(TASKS) else ", ".join(dict.fromkeys(names))
+    subject = "all tasks" if len(set(names)) == len(CERTIFIED) else ", ".join(dict.fromkeys(names))
     missing = [] if importlib.util.find_spec("gym_electric_motor") or "motor" not in chosen else [_NO_GEM]
     return _certify(subject, parts, missing, quick, on_check, on_part)
 

@@ -1,13 +1,19 @@
 """How states are compared: relative to their size, angles on the circle, a NaN worse than anything."""
 
 import math
+from typing import Any
 
 import numpy as np
 
-from codrl_mj.motor import Actuator
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics
+from codrl_mj.actuators import ActuatorModel
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, trace_names
 from codrl_mj.physics.base import inner_step_count
-from codrl_mj.tasks import Task
+from codrl_mj.tasks import TASKS, Task
+
+CERTIFIED: dict[str, Task] = {
+    name: TASKS[name] for name in ("pendulum", "cartpole", "acrobot", "mountain_car", "mountain_car_continuous")
+}
+"""The tasks of the certificate: the package's own, for which it has states, runs and bounds."""
 
 WRAPPED: dict[str, tuple[int, ...]] = {"acrobot": (0, 1)}
 """State entries that a task wraps to [-pi, pi]: a rounding error at the cut is one, and not a whole turn."""
@@ -54,11 +60,23 @@ def largest(task: Task, ours: np.ndarray, oracle: np.ndarray) -> tuple[float, in
 
 
 def both(
-    task: Task, actuator: Actuator | None, integrator: str, max_force: float | None = None
+    task: Task, actuator: ActuatorModel, integrator: str, max_force: float | None = None
 ) -> tuple[MujocoPhysics, AnalyticPhysics]:
     """The task in MuJoCo, and on Gymnasium's equations; `max_force` changes MuJoCo's limit of the desired force."""
     steps = inner_step_count(task, actuator, None, None)
+    limits = None if max_force is None else np.array([max_force])
     return (
-        MujocoPhysics(task, actuator, steps, integrator, max_force),
-        AnalyticPhysics(task, actuator, steps, integrator),
+        MujocoPhysics(task, [actuator], steps, integrator, limits),
+        AnalyticPhysics(task, [actuator], steps, integrator),
     )
+
+
+def twin_of(task: Task) -> Any:
+    """The Gymnasium environment that a task of the certificate rebuilds, driven by any force."""
+    assert task.twin is not None
+    return task.twin()
+
+
+def last_signals(physics: MujocoPhysics | AnalyticPhysics) -> dict[str, float]:
+    """What the actuator did in the last integration step, by the names of `trace_names`."""
+    return dict(zip(trace_names(physics.family), physics.trace[-1, 0].tolist(), strict=True))

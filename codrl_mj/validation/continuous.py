@@ -2,15 +2,14 @@
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import gymnasium
 import numpy as np
 from scipy import integrate
 
-from codrl_mj.motor import Actuator
-from codrl_mj.physics.analytic import DRIVERS
+from codrl_mj.actuators import Actuator, ActuatorModel
 from codrl_mj.tasks import Task
+from codrl_mj.validation.compare import twin_of
 
 Equations = Callable[[np.ndarray, float], np.ndarray]
 """(mechanical state, force [N or N*m]) -> its time derivative."""
@@ -24,9 +23,9 @@ def gymnasium_equations(task: Task) -> Equations:
     derivative of a position is its velocity. dt is a power of two and no longer than a quarter of an environment step.
     """
     if task.name == "acrobot":
-        acrobot: Any = gymnasium.make(task.gymnasium_id, disable_env_checker=True).unwrapped
-        return lambda state, force: np.array(acrobot._dsdt([*state, force]))[: len(state)]
-    driver = DRIVERS[task.name](task.gymnasium_id)
+        derivatives = twin_of(task)._env._dsdt
+        return lambda state, force: np.array(derivatives([*state, force]))[: len(state)]
+    driver = twin_of(task)
     dt = 2.0 ** math.floor(math.log2(task.step_duration / 4))
     qpos, qvel, integrator = list(task.qpos), list(task.qvel), task.integrators[0]
 
@@ -48,7 +47,7 @@ class Solution(NamedTuple):
     """Motor currents [A], shape (steps,); zeros without a motor."""
 
 
-def solve(task: Task, start: np.ndarray, forces: np.ndarray, actuator: Actuator | None) -> Solution:
+def solve(task: Task, start: np.ndarray, forces: np.ndarray, actuator: ActuatorModel) -> Solution:
     """Solve the continuous equations by scipy's DOP853 at a relative tolerance of 1e-12.
 
     With a motor they are joined by those of its circuit and its analogue PI loop,
@@ -58,13 +57,13 @@ def solve(task: Task, start: np.ndarray, forces: np.ndarray, actuator: Actuator 
         task: the task.
         start: initial mechanical state; the motor starts at rest.
         forces: desired force, held over each environment step.
-        actuator: None for the ideal one; otherwise without derivative gain and filters, and never saturated.
+        actuator: the ideal one, or a motor under a loop without derivative gain and filters, and never saturated.
     """
     equations = gymnasium_equations(task)
-    size, speed = len(start), DRIVERS[task.name].speed
+    size, speed = len(start), task.speeds[0]
 
     def derivative(_: float, state: np.ndarray, desired: float) -> np.ndarray:
-        if actuator is None:
+        if not isinstance(actuator, Actuator):
             return equations(state, desired)
         motor, loop = actuator.motor, actuator.controller
         current, integral = state[size:]
@@ -76,11 +75,12 @@ def solve(task: Task, start: np.ndarray, forces: np.ndarray, actuator: Actuator 
         mechanical = equations(state[:size], motor.torque_constant * current / motor.arm_radius)
         return np.concatenate([mechanical, [slope, error]])
 
-    state, rows = np.concatenate([start, [] if actuator is None else [0.0, 0.0]]), []
+    motorised = isinstance(actuator, Actuator)
+    state, rows = np.concatenate([start, [0.0, 0.0] if motorised else []]), []
     span = (0.0, task.step_duration)
     for force in forces:
         found = integrate.solve_ivp(derivative, span, state, "DOP853", rtol=1e-12, atol=1e-15, args=(float(force),))
         state = found.y[:, -1]
         rows.append(state)
     solved = np.array(rows)
-    return Solution(solved[:, :size], np.zeros(len(forces)) if actuator is None else solved[:, size])
+    return Solution(solved[:, :size], solved[:, size] if motorised else np.zeros(len(forces)))

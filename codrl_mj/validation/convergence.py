@@ -18,10 +18,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from codrl_mj.motor import Actuator, CurrentLoop, Motor
-from codrl_mj.motor.catalog import PAPER
+from codrl_mj.actuators import IDEAL, Actuator, ActuatorModel, CurrentLoop, Motor
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError
-from codrl_mj.tasks import TASKS, Task
+from codrl_mj.tasks import Task
+from codrl_mj.validation.compare import CERTIFIED
 from codrl_mj.validation.continuous import solve
 from codrl_mj.validation.free_runs import RUNS, commands
 from codrl_mj.validation.order import Family, order_check
@@ -30,9 +30,9 @@ from codrl_mj.validation.outcome import Check, Plot
 PHYSICS = (("MuJoCo", MujocoPhysics), ("analytic", AnalyticPhysics))
 
 
-def _states(kind: type, task: Task, actuator: Actuator | None, inner_steps: int, integrator: str) -> np.ndarray:
+def _states(kind: type, task: Task, actuator: ActuatorModel, inner_steps: int, integrator: str) -> np.ndarray:
     """Mechanical states after each environment step of the task's free run."""
-    physics = kind(task, actuator, inner_steps, integrator)
+    physics = kind(task, [actuator], inner_steps, integrator)
     physics.reset(np.array(RUNS[task.name].start))
     rows = []
     for force in commands(task):
@@ -61,11 +61,11 @@ def analogue(actuator: Actuator) -> Actuator:
     return dataclasses.replace(actuator, controller=loop)
 
 
-def _order_check(task: Task, integrator: str, actuator: Actuator | None, solution: np.ndarray, quick: bool) -> Check:
-    promised = 4.0 if integrator == "rk4" and actuator is None else 1.0
+def _order_check(task: Task, integrator: str, actuator: ActuatorModel, solution: np.ndarray, quick: bool) -> Check:
+    promised = 4.0 if integrator == "rk4" and actuator is IDEAL else 1.0
     if promised == 4.0:
         counts = 2 ** np.arange(2, 6 if quick else 7)
-    elif actuator is None:
+    elif not isinstance(actuator, Actuator):
         counts = 2 ** (np.arange(3, 7) if quick else np.arange(4, 9))
     else:  # a quarter of the winding's time constant, and shorter
         resolved = task.step_duration / (actuator.motor.electrical_time_constant / 4)
@@ -75,8 +75,8 @@ def _order_check(task: Task, integrator: str, actuator: Actuator | None, solutio
         errors = [_error(_states(kind, task, actuator, int(count), integrator), solution) for count in counts]
         families.append(Family(label, task.step_duration / counts, np.array(errors)))
     oracle = f"DOP853 at 1e-12 on the equations of Gymnasium {task.gymnasium_id}"
-    case = "ideal actuator" if actuator is None else "motor in the loop"
-    oracle += "" if actuator is None else " and of the motor"
+    case = "ideal actuator" if actuator is IDEAL else "motor in the loop"
+    oracle += "" if actuator is IDEAL else " and of the motor"
     plot = Plot(
         f"{task.name}, {integrator}, {case}", "integration step [s]", "largest error of the state [relative]", ()
     )
@@ -86,13 +86,13 @@ def _order_check(task: Task, integrator: str, actuator: Actuator | None, solutio
 def _bandwidth_check(task: Task, quick: bool) -> Check:
     """The lag is resolved by two integration steps at every bandwidth; both runs take the same steps."""
     lags = task.step_duration / 2 ** (np.arange(3, 7) if quick else np.arange(4, 9))  # tau [s]
-    integrator, motor = task.integrators[0], Motor(arm_radius=PAPER[task.name].motor.arm_radius)
+    integrator, motor = task.integrators[0], Motor(arm_radius=task.paper[0].motor.arm_radius)
     errors: tuple[list[float], ...] = ([], [])
     for lag in lags:
         count = round(2 * task.step_duration / lag)
         kp = motor.inductance / lag
         loop = CurrentLoop(kp=kp, ki=kp * motor.resistance / motor.inductance, max_voltage=math.inf)
-        ideal = _states(AnalyticPhysics, task, None, count, integrator)
+        ideal = _states(AnalyticPhysics, task, IDEAL, count, integrator)
         for found, (_, kind) in zip(errors, PHYSICS, strict=True):
             found.append(_error(_states(kind, task, Actuator(motor, loop), count, integrator), ideal))
     bandwidth = 1 / (2 * np.pi * lags)
@@ -117,8 +117,8 @@ def checks(task_name: str | None, quick: bool = False) -> Iterator[Check]:
     Raises:
         KeyError: no such task.
     """
-    for task in TASKS.values() if task_name is None else [TASKS[task_name]]:
-        for actuator in (None, analogue(PAPER[task.name])):
+    for task in CERTIFIED.values() if task_name is None else [CERTIFIED[task_name]]:
+        for actuator in (IDEAL, analogue(task.paper[0])):
             solution = solve(task, np.array(RUNS[task.name].start), commands(task), actuator).states
             for integrator in task.integrators:
                 yield _order_check(task, integrator, actuator, solution, quick)

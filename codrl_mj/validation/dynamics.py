@@ -10,10 +10,10 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
+from codrl_mj.actuators import IDEAL
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError
-from codrl_mj.physics.analytic import DRIVERS
 from codrl_mj.tasks import Task, find_task
-from codrl_mj.validation.compare import Worst, both, largest
+from codrl_mj.validation.compare import Worst, both, largest, twin_of
 from codrl_mj.validation.outcome import Check
 
 TOLERANCE = 1e-12
@@ -103,7 +103,7 @@ def one_step(task: Task, integrator: str, samples: int, seed: int = 0) -> Check:
     bounds = np.array(STATE_BOUNDS[task.name])
     states = generator.uniform(-bounds, bounds, (samples, len(bounds)))
     forces = generator.uniform(-task.max_force, task.max_force, samples)
-    ours, oracle = (_after_one_step(physics, states, forces) for physics in both(task, None, integrator))
+    ours, oracle = (_after_one_step(physics, states, forces) for physics in both(task, IDEAL, integrator))
     return _check(task, f"one step, {integrator}", ours, oracle, states, forces)
 
 
@@ -119,7 +119,7 @@ def one_step_at_the_bounds(task: Task, integrator: str, stride: int = 1) -> Chec
         np.array(list(itertools.product(*EDGES[task.name])))[::stride],
         task.max_force * np.array([-EXTREME, -1.0, 0.0, 1.0, EXTREME]),
     )
-    physics = both(task, None, integrator, max_force=EXTREME * task.max_force)
+    physics = both(task, IDEAL, integrator, max_force=EXTREME * task.max_force)
     ours, oracle = (_after_one_step(each, states, forces) for each in physics)
     return _check(task, f"one step at the bounds, {integrator}", ours, oracle, states, forces)
 
@@ -133,7 +133,7 @@ def one_step_beyond_the_force_limit(task: Task, integrator: str, points: int) ->
         points: grid points along each state entry.
     """
     states, forces = _crossed(grid(task, points), task.max_force * np.array([-EXTREME, -1.001, 1.001, EXTREME]))
-    mujoco_physics, analytic = both(task, None, integrator)
+    mujoco_physics, analytic = both(task, IDEAL, integrator)
     ours = _after_one_step(mujoco_physics, states, forces)
     oracle = _after_one_step(analytic, states, np.clip(forces, -task.max_force, task.max_force))
     return _check(task, f"one step beyond the force limit, {integrator}", ours, oracle, states, forces)
@@ -143,9 +143,9 @@ class _GymnasiumAcceleration:
     """The acceleration (state, force) -> one number for each velocity, of an unmodified Gymnasium environment."""
 
     def __init__(self, task: Task) -> None:
-        self._driver = DRIVERS[task.name](task.gymnasium_id)
+        self._driver = twin_of(task)
         self._velocities = list(task.qvel)
-        self._env = env = self._driver._env  # type: ignore[attr-defined]
+        self._env = env = self._driver._env
         self._derivative = getattr(env, "_dsdt", None)  # Acrobot's own equations of motion
         if self._derivative is None:
             # one explicit step of 1 s changes the velocities by the accelerations, where nothing bounds them
@@ -173,7 +173,7 @@ def accelerations(task: Task, points: int) -> Check:
         points: grid points along each state entry.
     """
     states, forces = _crossed(grid(task, points), task.max_force * np.array([-EXTREME, -1.0, 0.0, 0.5, EXTREME]))
-    physics, _ = both(task, None, task.integrators[0], max_force=EXTREME * task.max_force)
+    physics, _ = both(task, IDEAL, task.integrators[0], max_force=EXTREME * task.max_force)
     acceleration = _GymnasiumAcceleration(task)
     ours, oracle = (np.empty((len(states), len(task.qvel))) for _ in range(2))
     for row, (state, force) in enumerate(zip(states, forces.tolist(), strict=True)):

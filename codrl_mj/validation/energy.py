@@ -24,10 +24,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from codrl_mj.motor import Actuator, named_actuator
-from codrl_mj.motor.catalog import PAPER
+from codrl_mj.actuators import IDEAL, ActuatorModel
 from codrl_mj.physics import SimulationDivergedError
-from codrl_mj.tasks import TASKS, Task
+from codrl_mj.tasks import Task, named_actuator
+from codrl_mj.validation.compare import CERTIFIED
 from codrl_mj.validation.convergence import PHYSICS, analogue
 from codrl_mj.validation.free_runs import RUNS, commands
 from codrl_mj.validation.ledger import Ledger, keep
@@ -52,7 +52,6 @@ def _identity_check(task: Task, quick: bool) -> Check:
     steps, found, samples = (20 if quick else 100), [], 0
     for name in ACTUATORS:
         actuator = named_actuator(name, task.name)
-        assert actuator is not None
         generator = np.random.default_rng(5)
         forces = task.max_force * generator.choice([-1.0, 1.0], steps)
         start = task.initial(generator, None)
@@ -83,7 +82,7 @@ def _balance_plot(task: Task, integrator: str, ledger: Ledger) -> Plot:
     return Plot(title, "time [s]", "energy [J]", curves)
 
 
-def _kept(task: Task, integrator: str, actuator: Actuator | None, counts: np.ndarray) -> dict[str, list[Ledger]]:
+def _kept(task: Task, integrator: str, actuator: ActuatorModel, counts: np.ndarray) -> dict[str, list[Ledger]]:
     """Ledgers of the task's free run at every number of inner steps, all at the times of the coarsest."""
     start, forces = np.array(RUNS[task.name].start), commands(task)[: RUNS[task.name].balanced_steps]
     return {
@@ -93,14 +92,14 @@ def _kept(task: Task, integrator: str, actuator: Actuator | None, counts: np.nda
 
 
 def _order_checks(task: Task, integrator: str, quick: bool) -> Iterator[Check]:
-    actuator = analogue(PAPER[task.name])
+    actuator = analogue(task.paper[0])
     resolved = task.step_duration / (actuator.motor.electrical_time_constant / 25)
     counts = 2 ** (math.ceil(math.log2(max(resolved, 64))) + np.arange(4 if quick else 5))
     ledgers = _kept(task, integrator, actuator, counts)
     ideal_counts = 2 ** np.arange(3, 7)  # finer ones reach rounding
     for balance, oracle in BALANCES.items():
         exact = (balance, integrator) == ("mechanical", "rk4")
-        kept, steps = (_kept(task, integrator, None, ideal_counts), ideal_counts) if exact else (ledgers, counts)
+        kept, steps = (_kept(task, integrator, IDEAL, ideal_counts), ideal_counts) if exact else (ledgers, counts)
         families = []
         for label, of_steps in kept.items():
             residuals = [float(np.abs(getattr(ledger, f"{balance}_residual")).max()) for ledger in of_steps]
@@ -130,7 +129,7 @@ def checks(task_name: str | None, quick: bool = False) -> Iterator[Check]:
     Raises:
         KeyError: no such task.
     """
-    for task in TASKS.values() if task_name is None else [TASKS[task_name]]:
+    for task in CERTIFIED.values() if task_name is None else [CERTIFIED[task_name]]:
         yield _identity_check(task, quick)
         for integrator in task.integrators:
             try:

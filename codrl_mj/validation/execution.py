@@ -12,7 +12,6 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from codrl_mj.motor import named_actuator
 from codrl_mj.physics import MujocoPhysics, install_callbacks, motors
 from codrl_mj.physics.base import inner_step_count
 from codrl_mj.tasks import Task, find_task
@@ -157,8 +156,7 @@ def _episode(physics: MujocoPhysics, forces: np.ndarray) -> np.ndarray:
 
 def _simulation(task: Task, integrator: str, seed: int, steps: int) -> tuple[MujocoPhysics, np.ndarray, np.ndarray]:
     generator = np.random.default_rng(seed)
-    actuator = named_actuator("paper", task.name)
-    physics = MujocoPhysics(task, actuator, inner_step_count(task, actuator, None, None), integrator)
+    physics = MujocoPhysics(task, task.paper, inner_step_count(task, task.paper[0], None, None), integrator)
     initial = task.initial(generator, None)
     physics.reset(initial)
     return physics, initial, task.max_force * generator.uniform(-1.0, 1.0, steps)

@@ -8,6 +8,7 @@ small amount along each of its entries, the rest being as in the run. The produc
 - the covariance of independent rounding errors, one in every entry at every step: P <- M P M' + Q.
 """
 
+import copy
 import math
 
 import numpy as np
@@ -18,6 +19,8 @@ from codrl_mj.tasks import Task
 APART = 1e-7
 """A displacement, relative to max(1, size): far above rounding, far below anything that bends."""
 ROUNDING = float(np.finfo(float).eps)
+CLOCK = 2
+"""A snapshot of `AnalyticPhysics` ends with time and key; before them are the states of mechanics and motor."""
 
 
 class Growth:
@@ -32,9 +35,10 @@ class Growth:
             seed: of the direction of the first displacement.
         """
         self._run = run
-        self._twin = AnalyticPhysics(task, run.actuator, run.inner_steps, run._integrator)
+        self._twin = copy.deepcopy(run)
         self._size = len(task.state_names)
-        self._start, entries = self._now(), len(self._now())
+        self._start = run.snapshot()
+        entries = len(self._start) - CLOCK
         direction = np.random.default_rng(seed).standard_normal(entries)
         self._direction = direction / np.linalg.norm(direction)
         self._covariance = np.zeros((entries, entries))
@@ -43,32 +47,25 @@ class Growth:
         self.rounding: list[float] = []
         """Standard deviation of the accumulated rounding errors after each step, relative to max(1, size)."""
 
-    def _now(self) -> np.ndarray:
-        """The state of mechanics and motor."""
-        loop = () if self._run.actuator is None else self._run._loop
-        return np.array([*self._run.state, *loop])
-
     def follow(self, desired_force: float) -> None:
         """The run has just taken a step: linearise it."""
-        run, twin, start, size = self._run, self._twin, self._start, self._size
-        end = self._now()
-        matrix = np.empty((len(end), len(end)))
-        for entry, value in enumerate(start):
-            apart = APART * max(1.0, abs(value))
-            displaced = start.copy()
+        twin, size, entries = self._twin, self._size, len(self._direction)
+        end = self._run.snapshot()
+        matrix = np.empty((entries, entries))
+        for entry in range(entries):
+            apart = APART * max(1.0, abs(self._start[entry]))
+            displaced = self._start.copy()
             displaced[entry] += apart
-            twin.state, twin._time = displaced[:size], run._time
-            twin._loop = tuple(displaced[size:]) or run._loop  # type: ignore[assignment]
+            twin.restore(displaced)
             twin.step(desired_force)
-            loop = () if run.actuator is None else twin._loop
-            gap = np.array([*twin.state, *loop]) - end
+            gap = (twin.snapshot() - end)[:entries]
             gap[:size] -= 2 * math.pi * np.round(gap[:size] / (2 * math.pi))  # one of them was wrapped
             matrix[:, entry] = gap / apart
         moved = matrix @ self._direction
         length = float(np.linalg.norm(moved))
         self.logarithms.append(self.logarithms[-1] + math.log(max(length, ROUNDING)))
         self._direction = moved / length if length > ROUNDING else self._direction  # a wall stopped both
-        scale = np.maximum(1.0, np.abs(end))
+        scale = np.maximum(1.0, np.abs(end[:entries]))
         self._covariance = matrix @ self._covariance @ matrix.T + np.diag((ROUNDING * scale) ** 2)
         self.rounding.append(float((np.sqrt(np.diag(self._covariance)) / scale)[:size].max()))
         self._start = end

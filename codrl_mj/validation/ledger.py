@@ -6,10 +6,10 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from codrl_mj.motor import Actuator, Motor
-from codrl_mj.physics.analytic import DRIVERS
+from codrl_mj.actuators import Actuator, ActuatorModel, Motor
 from codrl_mj.tasks import Task
 from codrl_mj.tasks.assets import asset_path
+from codrl_mj.validation.compare import last_signals
 from codrl_mj.validation.continuous import gymnasium_equations
 
 HILL_TASKS = ("mountain_car", "mountain_car_continuous")
@@ -89,7 +89,7 @@ class Ledger:
 def keep(
     kind: type,
     task: Task,
-    actuator: Actuator | None,
+    actuator: ActuatorModel,
     start: np.ndarray,
     forces: np.ndarray,
     inner_steps: int,
@@ -101,7 +101,7 @@ def keep(
     Args:
         kind: `MujocoPhysics` or `AnalyticPhysics`.
         task: the task; its own bounds should not be reached: what they take is no entry of the ledger.
-        actuator: the motor; with None all electrical entries are zero.
+        actuator: a motor under its loop; with the ideal one all electrical entries are zero.
         start: initial state.
         forces: desired forces, each held for one environment step.
         inner_steps: integration steps to an environment step.
@@ -110,16 +110,17 @@ def keep(
     """
     timestep = task.step_duration / inner_steps
     # an environment step of one integration step shows each of them, and leaves the motor as it is in between
-    physics = kind(dataclasses.replace(task, step_duration=timestep), actuator, 1, integrator)
+    physics = kind(dataclasses.replace(task, step_duration=timestep), [actuator], 1, integrator)
     physics.reset(start)
     rows = []
     for force in forces.repeat(inner_steps):
-        signals = physics.step(float(force))
-        rows.append((signals.current, signals.voltage, signals.actual_force, *physics.state))
+        physics.step(float(force))
+        signals = last_signals(physics)
+        rows.append((signals["current"], signals["voltage"], signals["actual_force"], *physics.state))
     current, voltage, force, *states = np.array(rows).T
     current, state = np.concatenate([[0.0], current]), np.vstack([start, np.array(states).T])
 
-    motor, speed = Motor() if actuator is None else actuator.motor, DRIVERS[task.name].speed
+    motor, speed = actuator.motor if isinstance(actuator, Actuator) else Motor(), task.speeds[0]
     position = task.qpos[task.qvel.index(speed)]
     back_emf = motor.back_emf_constant * state[:, speed] / motor.arm_radius
     mean = (current[1:] + current[:-1]) / 2

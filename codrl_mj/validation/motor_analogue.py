@@ -1,7 +1,7 @@
 """The current loop inside MuJoCo against the analogue loop that it samples, in closed form.
 
 The oracle is the matrix exponential of the RL circuit under an analogue PID, written from the equations; nothing of
-`codrl_mj.motor.current_loop` is in it.
+`codrl_mj.actuators.current_loop` is in it.
 """
 
 from collections.abc import Iterator, Mapping
@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from scipy import linalg
 
-from codrl_mj.motor import Actuator
+from codrl_mj.actuators import Actuator
 from codrl_mj.validation.motor_loops import Loop, run, unlimited
 from codrl_mj.validation.order import Family, order_check
 from codrl_mj.validation.outcome import Check, Plot

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from codrl_mj.motor import Motor
+from codrl_mj.actuators import Motor
 from codrl_mj.validation.motor_loops import Loop
 from codrl_mj.validation.outcome import Check, Curve, Plot
 from codrl_mj.validation.rotors import FREE, HELD, drive, driven_by_voltage, motors_on

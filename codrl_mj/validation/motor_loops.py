@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codrl_mj.motor import Actuator, CurrentLoop, Motor
-from codrl_mj.motor.catalog import PAPER
-from codrl_mj.tasks import TASKS
+from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.validation.compare import CERTIFIED
 from codrl_mj.validation.rotors import HELD, Record, drive, motors_on
 
 
@@ -42,14 +41,16 @@ EVERY_FEATURE = Loop(
 
 def standard_loops() -> dict[str, Loop]:
     """The paper's loop of each task at the task's inner step, and one with every feature."""
-    paper = {task.name: Loop(PAPER[task.name], task.step_duration / task.motor_inner_steps) for task in TASKS.values()}
+    paper = {name: Loop(task.paper[0], task.step_duration / task.motor_inner_steps) for name, task in CERTIFIED.items()}
     return {**paper, "every feature": EVERY_FEATURE}
 
 
 def unlimited(loop: Loop, substeps: int) -> Actuator:
-    """The loop's actuator at infinite voltage, where it is linear, and with so many electrical substeps."""
-    controller = dataclasses.replace(loop.actuator.controller, max_voltage=math.inf, substeps=substeps)
-    return dataclasses.replace(loop.actuator, controller=controller)
+    """The loop's actuator where it is linear: without limit and sensor errors, with so many electrical substeps."""
+    controller = dataclasses.replace(
+        loop.actuator.controller, substeps=substeps, max_voltage=math.inf, current_bias=0.0, current_noise=0.0
+    )
+    return dataclasses.replace(loop.actuator, controller=controller, supply=None)
 
 
 def run(actuator: Actuator, timestep: float, torques: np.ndarray, speeds: np.ndarray) -> Record:

@@ -1,7 +1,7 @@
 """The current loop inside MuJoCo against linear systems theory, as scipy and python-control have it.
 
 Each oracle is built from the loop's equations (the paper, Algorithm 1 and appendix) by another library and in another
-form; nothing of `codrl_mj.motor.current_loop` is in them.
+form; nothing of `codrl_mj.actuators.current_loop` is in them.
 """
 
 import math
@@ -12,7 +12,7 @@ import control
 import numpy as np
 from scipy import signal
 
-from codrl_mj.motor import Actuator
+from codrl_mj.actuators import Actuator
 from codrl_mj.validation.motor_loops import Loop, run, unlimited
 from codrl_mj.validation.outcome import Check, Curve, Plot
 from codrl_mj.validation.rotors import HELD, drive, motors_on

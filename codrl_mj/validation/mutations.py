@@ -19,12 +19,14 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from codrl_mj import callbacks
-from codrl_mj.callbacks import kernels
-from codrl_mj.motor import current_loop
+from codrl_mj import engine
+from codrl_mj.actuators import ActuatorModel, current_loop
+from codrl_mj.engine import control
+from codrl_mj.engine.families import SLOT, replaced
+from codrl_mj.engine.hill import GRAVITY
 from codrl_mj.physics import MujocoPhysics, constrain, mjcf
-from codrl_mj.tasks import TASKS
 from codrl_mj.validation.certificate import WITHOUT_TASK, validate
+from codrl_mj.validation.compare import CERTIFIED
 from codrl_mj.validation.outcome import Check
 
 Fault = contextlib.AbstractContextManager[None]
@@ -45,8 +47,8 @@ def _everywhere(name: str, original: Any, wrong: Any) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _method(owner: type, name: str, wrong: Callable[..., Any]) -> Iterator[None]:
-    original = getattr(owner, name)
+def _method(owner: type, name: str, wrong: Any) -> Iterator[None]:
+    original = vars(owner)[name]  # as it stands there: a static method stays one
     setattr(owner, name, wrong)
     try:
         yield
@@ -78,7 +80,7 @@ def _heavier(model: mujoco.MjModel) -> None:
 def _stronger_gravity(model: mujoco.MjModel) -> None:
     model.opt.gravity[2] *= 1.001
     if model.nuser_jnt:
-        model.jnt_user[0, 1] *= 1.001  # the hill's
+        model.jnt_user[0, GRAVITY] *= 1.001  # the hill's
 
 
 def _longer_gear(model: mujoco.MjModel) -> None:
@@ -119,66 +121,81 @@ def edited(module: types.ModuleType, edits: Sequence[Edit]) -> types.ModuleType:
     return wrong
 
 
-_HIDDEN = np.zeros(1)
-"""Memory that no simulation owns."""
+_HIDDEN = np.zeros(64)
+"""Memory that no simulation owns, one number for each actuator of a model."""
 
 
 @functools.cache
-def _wrong_loop(edits: tuple[Edit, ...]) -> types.ModuleType:
-    return edited(current_loop, edits)
-
-
-@functools.cache
-def _wrong_callbacks(callback_edits: tuple[Edit, ...], loop_edits: tuple[Edit, ...]) -> Callable[[], Any]:
-    sys.modules[current_loop.__name__] = _wrong_loop(loop_edits)  # what the callbacks' source imports
-    try:
-        wrong = edited(kernels, callback_edits)
-    finally:
-        sys.modules[current_loop.__name__] = current_loop
+def _wrong_callbacks(edits: tuple[Edit, ...]) -> Callable[[], Any]:
+    wrong = edited(control, edits)
     wrong.HIDDEN = _HIDDEN.ctypes.data  # type: ignore[attr-defined]
     return wrong.compiled
 
 
 @contextlib.contextmanager
-def wrong_callback(callback_edits: tuple[Edit, ...] = (), loop_edits: tuple[Edit, ...] = ()) -> Iterator[None]:
+def wrong_callback(*edits: Edit) -> Iterator[None]:
     """MuJoCo runs a callback that was compiled from edited source."""
-    parts = importlib.import_module("codrl_mj.callbacks.install")._PARTS  # the package's `install` is the function
+    parts = importlib.import_module("codrl_mj.engine.install")._PARTS  # the package's `install` is the function
     part = parts["motor"]
-    callbacks.uninstall()
-    parts["motor"] = part._replace(compile=_wrong_callbacks(callback_edits, loop_edits))
+    engine.uninstall()
+    parts["motor"] = part._replace(compile=_wrong_callbacks(edits))
     try:
         yield
     finally:
-        callbacks.uninstall()
+        engine.uninstall()
         parts["motor"] = part
 
 
+@functools.cache
+def _wrong_families(edits: tuple[Edit, ...]) -> tuple[type[ActuatorModel], ...]:
+    """The families of the current loop's module, made from its edited source."""
+    wrong = vars(edited(current_loop, edits)).values()
+    return tuple(
+        kind
+        for kind in wrong
+        if isinstance(kind, type) and kind.__module__ == current_loop.__name__ and issubclass(kind, ActuatorModel)
+    )
+
+
 @contextlib.contextmanager
-def wrong_loop_everywhere(*loop_edits: Edit) -> Iterator[None]:
-    """The callback and the plain-Python loop share the fault: comparing the two cannot show it."""
+def wrong_loop(*edits: Edit) -> Iterator[None]:
+    """The callback runs a loop that was compiled from edited source; in Python it stays what it is."""
     with contextlib.ExitStack() as stack:
-        stack.enter_context(wrong_callback((), loop_edits))
-        for name, right in vars(current_loop).items():
-            if getattr(right, "__module__", "") == current_loop.__name__:
-                wrong = getattr(_wrong_loop(loop_edits), name)
-                stack.enter_context(_everywhere(name, right, wrong))
+        for family in _wrong_families(edits):
+            stack.enter_context(replaced(getattr(current_loop, family.__name__), family))
+        yield
+
+
+@contextlib.contextmanager
+def wrong_loop_everywhere(*edits: Edit) -> Iterator[None]:
+    """The callback and the plain-Python loop share the fault: comparing the two cannot show it."""
+    with wrong_loop(*edits), contextlib.ExitStack() as stack:
+        for family in _wrong_families(edits):
+            right = getattr(current_loop, family.__name__)
+            stack.enter_context(_method(right, "advance", vars(family)["advance"]))
         yield
 
 
 _BACK_EMF: Edit = ("voltage - back_emf -", "voltage + back_emf -")
-_GAINS: Edit = (
-    "parameters[KP] * error + parameters[KI] * integral",
-    "parameters[KI] * error + parameters[KP] * integral",
-)
-_RESISTANCE: Edit = ("- parameters[RESISTANCE] * current", "- 1.01 * parameters[RESISTANCE] * current")
+_GAINS: Edit = ("parameters.kp * error + parameters.ki * integral", "parameters.ki * error + parameters.kp * integral")
+_RESISTANCE: Edit = ("- parameters.resistance * current", "- 1.01 * parameters.resistance * current")
 _VOLTAGE_LIMIT: Edit = ("voltage = min(max(voltage, -", "voltage = 0.99 * min(max(voltage / 0.99, -")
-_LATE_FORCE: Edit = ("user[TORQUE_CONSTANT] * act[CURRENT]", "user[TORQUE_CONSTANT] * act[COMMITTED_CURRENT]")
-_EVERY_PASS: Edit = ("if time != act[TICK]:", "if True:")
+_COMMIT = "                commit_slot(number, slot, time)\n"
+_LATE_FORCE: tuple[Edit, ...] = (
+    (
+        _COMMIT,
+        f"                f64(HIDDEN)[actuator] = f64(slot)[2]\n{_COMMIT}"
+        "            if time == 0.0:\n                f64(HIDDEN)[actuator] = 0.0\n",
+    ),
+    ("return f64(slot_of(model, data, actuator))[2]", "return f64(HIDDEN)[actuator]"),
+)
+_EVERY_PASS: Edit = ("if time != f64(slot)[0]:", "if True:")
 _EVERY_STAGE: Edit = ("if i64(data + pbase_at)[0] != 0:", "if False:")
-_KEPT = "            act[CURRENT] = current\n"
+_ADVANCED = "                time,\n            )\n"
+_CANDIDATE = SLOT + len(current_loop.State._fields)
 _SHARED_CURRENT: tuple[Edit, ...] = (
-    ("act[COMMITTED_CURRENT] = act[CURRENT]\n", "act[COMMITTED_CURRENT] = f64(HIDDEN)[0]\n"),
-    (_KEPT, f"{_KEPT}            f64(HIDDEN)[0] = current\n"),
+    (_COMMIT, f"{_COMMIT}                f64(slot)[{SLOT}] = f64(HIDDEN)[0]\n"),
+    (_ADVANCED, f"{_ADVANCED}            f64(HIDDEN)[0] = f64(slot)[{_CANDIDATE}]\n"),
 )
 
 
@@ -196,14 +213,17 @@ def _stale_command() -> Fault:
 
 
 def _no_bounds() -> Fault:
-    return _everywhere("compiled_constrain", constrain.compiled_constrain, lambda _: None)
+    return _everywhere("compiled_constrain", constrain.compiled_constrain, lambda *_, **__: None)
 
 
 def _other_integrator() -> Fault:
     make = MujocoPhysics.__init__
 
-    def explicit(self: Any, task: Any, actuator: Any, inner_steps: int, integrator: str, *more: Any) -> None:
-        make(self, task, actuator, inner_steps, "semi-implicit" if integrator == "euler" else "euler", *more)
+    def explicit(
+        self: Any, task: Any, actuators: Any, inner_steps: int, integrator: str, *more: Any, **named: Any
+    ) -> None:
+        other = "semi-implicit" if integrator == "euler" else "euler"
+        make(self, task, actuators, inner_steps, other, *more, **named)
 
     return _method(MujocoPhysics, "__init__", explicit)
 
@@ -211,9 +231,9 @@ def _other_integrator() -> Fault:
 def _warm_reset() -> Fault:
     reset = MujocoPhysics.reset
 
-    def warm(self: Any, state: np.ndarray) -> None:
+    def warm(self: Any, state: np.ndarray, key: float = 0.0) -> None:
         motor = self.data.act.copy()
-        reset(self, state)
+        reset(self, state, key)
         self.data.act[:] = motor
 
     return _method(MujocoPhysics, "reset", warm)
@@ -232,23 +252,25 @@ class Mutation:
     """Makes it, for the length of a `with` block."""
     groups: tuple[str, ...]
     """The groups of checks that it is shown to."""
-    tasks: tuple[str, ...] = tuple(TASKS)
+    tasks: tuple[str, ...] = tuple(CERTIFIED)
     """The tasks in which it is a fault."""
 
 
 _PHYSICS = ("dynamics", "trajectories")
 _LOOP = ("trajectories", "motor")
-_UNEQUAL_GAINS = tuple(task for task in TASKS if task != "mountain_car")  # whose kp = ki
-_BOUNDED = tuple(name for name, task in TASKS.items() if task.constrain is not None)
-_RUNGE_KUTTA = tuple(name for name, task in TASKS.items() if "rk4" in task.integrators)
+_UNEQUAL_GAINS = tuple(task for task in CERTIFIED if task != "mountain_car")  # whose kp = ki
+_BOUNDED = tuple(name for name, task in CERTIFIED.items() if task.constrain is not None)
+_RUNGE_KUTTA = tuple(name for name, task in CERTIFIED.items() if "rk4" in task.integrators)
 
 
 def _in_model(name: str, change: Callable[[mujoco.MjModel], None], *groups: str) -> Mutation:
     return Mutation(name, lambda: wrong_model(change), (*_PHYSICS, *groups))
 
 
-def _in_loop(name: str, edit: Edit, groups: tuple[str, ...] = _LOOP, tasks: tuple[str, ...] = tuple(TASKS)) -> Mutation:
-    return Mutation(f"{name}, in the callback", lambda: wrong_callback((), (edit,)), groups, tasks)
+def _in_loop(
+    name: str, edit: Edit, groups: tuple[str, ...] = _LOOP, tasks: tuple[str, ...] = tuple(CERTIFIED)
+) -> Mutation:
+    return Mutation(f"{name}, in the callback", lambda: wrong_loop(edit), groups, tasks)
 
 
 MUTATIONS: tuple[Mutation, ...] = (
@@ -263,18 +285,18 @@ MUTATIONS: tuple[Mutation, ...] = (
     Mutation("the sign of the back-EMF, everywhere", lambda: wrong_loop_everywhere(_BACK_EMF), ("motor", "energy")),
     _in_loop("kp and ki swapped", _GAINS, _LOOP, _UNEQUAL_GAINS),
     Mutation("kp and ki swapped, everywhere", lambda: wrong_loop_everywhere(_GAINS), ("motor", "convergence")),
-    Mutation("a force one step late", lambda: wrong_callback((_LATE_FORCE,)), (*_LOOP, "convergence", "energy")),
+    Mutation("a force one step late", lambda: wrong_callback(*_LATE_FORCE), (*_LOOP, "convergence", "energy")),
     Mutation("a stale command", _stale_command, (*_PHYSICS, "convergence")),
     Mutation("bounds that are not kept", _no_bounds, _PHYSICS, _BOUNDED),
     Mutation("the other Euler integrator", _other_integrator, _PHYSICS),
     Mutation(
         "a motor that runs in every Runge-Kutta stage",
-        lambda: wrong_callback((_EVERY_STAGE,)),
+        lambda: wrong_callback(_EVERY_STAGE),
         ("trajectories",),
         _RUNGE_KUTTA,
     ),
-    Mutation("a motor that runs in every forward pass", lambda: wrong_callback((_EVERY_PASS,)), ("execution",)),
-    Mutation("a current that simulations share", lambda: wrong_callback(_SHARED_CURRENT), ("execution",)),
+    Mutation("a motor that runs in every forward pass", lambda: wrong_callback(_EVERY_PASS), ("execution",)),
+    Mutation("a current that simulations share", lambda: wrong_callback(*_SHARED_CURRENT), ("execution",)),
     Mutation("a reset that leaves the motor running", _warm_reset, ("execution",)),
 )
 """Every fault, and which groups are shown it."""
@@ -337,7 +359,7 @@ def try_mutations(
         mutations: the faults.
         on_part: called as each begins, with (done, in all, name).
     """
-    names = [tasks] if isinstance(tasks, str) else list(tasks or TASKS)
+    names = [tasks] if isinstance(tasks, str) else list(tasks or CERTIFIED)
     results = []
     for index, mutation in enumerate(mutations):
         if on_part is not None:

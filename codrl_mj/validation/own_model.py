@@ -8,10 +8,11 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from codrl_mj.motor import Actuator, advance, spectral_radius, to_vector
+from codrl_mj.actuators import Actuator, ActuatorModel, spectral_radius
 from codrl_mj.physics import install_callbacks, motors
 from codrl_mj.validation import execution
 from codrl_mj.validation.compare import Worst
+from codrl_mj.validation.in_python import beside, entries
 from codrl_mj.validation.outcome import Check, Skipped
 
 STEP_TOLERANCE = 1e-11
@@ -42,7 +43,7 @@ def prepare(model: mujoco.MjModel) -> mujoco.MjModel:
     if not motors(model):
         raise ValueError(
             f"the model has no motor of codrl_mj among its {model.nactuator} actuators: put one in with "
-            "codrl_mj.set_actuator, or write its user data in the MJCF as the package's own models do"
+            "codrl_mj.physics.mjcf.drive, or write its user data in the MJCF"
         )
     subject = copy.copy(model)
     subject.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
@@ -66,7 +67,7 @@ def skipped(model: mujoco.MjModel, name: str) -> list[Skipped]:
     return found
 
 
-def _names(model: mujoco.MjModel) -> dict[int, tuple[str, Actuator]]:
+def _names(model: mujoco.MjModel) -> dict[int, tuple[str, ActuatorModel]]:
     return {
         index: (model.actuator(index).name or f"actuator {index}", actuator)
         for index, actuator in motors(model).items()
@@ -74,68 +75,43 @@ def _names(model: mujoco.MjModel) -> dict[int, tuple[str, Actuator]]:
 
 
 def stability(model: mujoco.MjModel, name: str) -> Iterator[Check]:
-    """The spectral radius of each motor's current loop at the model's timestep, which must be below 1."""
+    """How unstable each motor is at the model's timestep: below 1; of a current loop it is the spectral radius."""
     timestep = model.opt.timestep
     below_one = float(np.nextafter(1.0, 0.0))
     for motor, actuator in _names(model).values():
-        radius = spectral_radius(actuator, timestep)
+        found = float(actuator.instability(np.array([actuator.numbers]), timestep)[0])
+        oracle, unit = "the family's own bound", "instability"
+        if isinstance(actuator, Actuator):
+            radius = spectral_radius(actuator, timestep)
+            oracle, unit = "the eigenvalues of the discrete closed loop", "spectral radius"
+            found = max(found, radius) if radius < 1.0 else radius  # the family's own is infinite there
         where = f"at a step of {timestep:g} s"
-        oracle = "the eigenvalues of the discrete closed loop"
-        yield Check(f"stable: {motor}", oracle, 1, radius, below_one, where, "motor", name, "spectral radius")
+        yield Check(f"stable: {motor}", oracle, 1, found, below_one, where, "motor", name, unit)
 
 
 def motor_steps(model: mujoco.MjModel, name: str, steps: int) -> Iterator[Check]:
-    """Each motor in the engine against the loop in plain Python, driven by the speed that the model itself reached.
+    """Each motor in the engine against its own in plain Python, driven by the speed that the model itself reached.
 
-    The Python loop starts at rest and is never corrected; current, integral, error and voltage are compared after every
-    step, and so is the torque that the engine applied.
+    The Python motor starts at rest and is never corrected; states and signals are compared after every step, and so is
+    the torque that the engine applied.
     """
-    data = mujoco.MjData(model)
-    named = _names(model)
-    loops = dict.fromkeys(named, (0.0, 0.0, 0.0))
-    worst = {index: Worst() for index in named}
-    for step, control in enumerate(execution.commands(model, steps, seed=7)):
-        data.ctrl[:] = control
-        before = copy.copy(data)
-        mujoco.mj_forward(model, before)  # the speed that the callback is about to see, and the force it makes
-        mujoco.mj_step(model, data)
-        for index, (_, actuator) in named.items():
-            if _disabled(model, index):
-                continue
-            output = model.actuator_outadr[index]
-            speed, desired = float(before.actuator_velocity[output]), _clamped(model, index, control)
-            *loop, voltage = advance(to_vector(actuator), model.opt.timestep, *loops[index], desired, speed)
-            loops[index] = tuple(loop)  # type: ignore[assignment]
-            act = data.act[model.actuator_actadr[index] :]
-            ours = [*act[4:8], before.actuator_force[output]]
-            oracle = [*loop, voltage, _limited(model, index, actuator.motor.torque_constant * loop[0])]
-            entries = ("current [A]", "integral [A*s]", "error [A]", "voltage [V]", "torque [N*m]")
-            for entry, here, there in zip(entries, ours, oracle, strict=True):
-                worst[index].see(abs(here - there) / max(1.0, abs(there)), f"{entry} at step {step + 1}")
-    for index, (motor, _) in named.items():
-        if not _disabled(model, index):
-            found = worst[index]
-            oracle_name = "the loop in plain Python at the recorded speed"
-            yield Check(
-                f"steps: {motor}", oracle_name, 5 * steps, found.value, STEP_TOLERANCE, found.where, "motor", name
-            )
+    named = {index: found for index, found in _names(model).items() if not _disabled(model, index)}
+    actuators = {index: actuator for index, (_, actuator) in named.items()}
+    for index, (ours, oracle) in beside(model, actuators, execution.commands(model, steps, seed=7)).items():
+        gaps = np.abs(ours - oracle) / np.maximum(1.0, np.abs(oracle))
+        step, entry = np.unravel_index(np.argmax(np.where(np.isnan(gaps), np.inf, gaps)), gaps.shape)
+        worst = Worst()
+        worst.see(gaps[step, entry], f"{entries(actuators[index])[entry]} at step {step + 1}")
+        oracle_name = "the same functions in plain Python at the recorded speed"
+        yield Check(
+            f"steps: {named[index][0]}",
+            *(oracle_name, gaps.size, worst.value, STEP_TOLERANCE, worst.where, "motor", name),
+        )
 
 
 def _disabled(model: mujoco.MjModel, index: int) -> bool:
     group = int(model.actuator_group[index])
     return 0 <= group < mujoco.mjNGROUP and bool(model.opt.disableactuator >> group & 1)
-
-
-def _clamped(model: mujoco.MjModel, index: int, control: np.ndarray) -> float:
-    address = model.actuator_ctrladr[index]
-    low, high = model.actuator_ctrlrange[address] if model.actuator_ctrllimited[address] else (-np.inf, np.inf)
-    return float(np.clip(control[address], low, high))
-
-
-def _limited(model: mujoco.MjModel, index: int, torque: float) -> float:
-    if not model.actuator_forcelimited[model.actuator_outadr[index]]:
-        return torque
-    return float(np.clip(torque, *model.actuator_forcerange[model.actuator_outadr[index]]))
 
 
 def _motor(model: mujoco.MjModel, name: str, quick: bool) -> Iterator[Check | Skipped]:
@@ -148,13 +124,15 @@ def _motor(model: mujoco.MjModel, name: str, quick: bool) -> Iterator[Check | Sk
 
 
 def _alone(model: mujoco.MjModel, name: str, quick: bool) -> Iterator[Check | Skipped]:
-    """The model's motors, each on a rotor of its own, against python-control's discrete model of the loop."""
+    """The model's current loops, each on a rotor of its own, against python-control's discrete model of the loop."""
     from codrl_mj.validation.motor_loops import Loop
     from codrl_mj.validation.motor_sampled import sampled_checks  # needs scipy and python-control
 
     loops = {}
     for motor, actuator in _names(model).values():
-        if spectral_radius(actuator, model.opt.timestep) < 1.0:
+        if not isinstance(actuator, Actuator):
+            yield Skipped(f"responses of {motor}", "it is no current loop: there is no oracle for it", "motor", name)
+        elif spectral_radius(actuator, model.opt.timestep) < 1.0:
             loops[motor] = Loop(actuator, model.opt.timestep)
         else:
             yield Skipped(f"responses of {motor}", "its loop is unstable: it has none", "motor", name)

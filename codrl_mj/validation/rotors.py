@@ -8,9 +8,9 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from codrl_mj.callbacks.kernels import ACT_NAMES, CURRENT
-from codrl_mj.motor import Actuator, CurrentLoop, Motor
-from codrl_mj.physics import install_callbacks, set_actuator
+from codrl_mj.actuators import Actuator, ActuatorModel, CurrentLoop, Motor
+from codrl_mj.engine.families import signals_at, slot_size
+from codrl_mj.physics import install_callbacks, mjcf
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,12 +62,14 @@ def _spec(count: int, load: Load, timestep: float, integrator: str) -> mujoco.Mj
     return spec
 
 
-def motors_on(load: Load, actuators: Sequence[Actuator], timestep: float, integrator: str = "Euler") -> mujoco.MjModel:
+def motors_on(
+    load: Load, actuators: Sequence[ActuatorModel], timestep: float, integrator: str = "Euler"
+) -> mujoco.MjModel:
     """Our motors, each on a rotor of its own, and the callbacks that run them installed."""
     spec = _spec(len(actuators), load, timestep, integrator)
     for index, actuator in enumerate(actuators):
         driver = spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=f"hinge{index}")
-        set_actuator(driver, actuator, None)
+        mjcf.drive(driver, actuator, None)
     model = spec.compile()
     install_callbacks(model)
     return model
@@ -100,12 +102,12 @@ def drive(model: mujoco.MjModel, controls: np.ndarray, speeds: np.ndarray | None
     """Run a model from rest.
 
     Args:
-        model: one of this module's.
+        model: one of this module's, of motors with a current.
         controls: control of every motor at every step, shape (steps,) for all alike or (steps, motors).
         speeds: joint speeds [rad/s] set before each step, shape (steps,); None leaves them to the engine.
     """
     data = mujoco.MjData(model)
-    entry = CURRENT if model.na == model.nactuator * len(ACT_NAMES) else 0
+    entry = signals_at(Actuator) if model.na == model.nactuator * slot_size(Actuator) else 0  # current comes first
     currents = np.asarray(model.actuator_actadr) + entry
     rows = np.empty((len(controls), 4, model.nv))
     for row, control, speed in zip(rows, controls, controls if speeds is None else speeds, strict=True):

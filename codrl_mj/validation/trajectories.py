@@ -12,10 +12,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from codrl_mj.motor import Actuator, named_actuator
+from codrl_mj.actuators import Actuator, ActuatorModel, Ideal
 from codrl_mj.physics import SimulationDivergedError
-from codrl_mj.tasks import Task, find_task
-from codrl_mj.validation.compare import Worst, both, differences
+from codrl_mj.tasks import Task, find_task, named_actuator
+from codrl_mj.validation.compare import Worst, both, differences, last_signals
 from codrl_mj.validation.growth import ROUNDING, Growth, lyapunov_exponent
 from codrl_mj.validation.outcome import Check, Curve, Plot
 
@@ -44,8 +44,7 @@ ACTUATORS = ("ideal", "paper", "weaker", STARVED)
 
 def starved(task: Task) -> Actuator:
     """The paper's motor with 0.5 V and nothing against its back-EMF, both of which its loop hides otherwise."""
-    paper = named_actuator("paper", task.name)
-    assert paper is not None
+    (paper,) = task.paper
     loop = dataclasses.replace(paper.controller, max_voltage=0.5, bemf_compensation=False)
     return dataclasses.replace(paper, controller=loop)
 
@@ -65,7 +64,7 @@ class _Run:
     """What ended it early."""
 
 
-def _run(task: Task, actuator: Actuator | None, integrator: str, steps: int, seed: int) -> _Run:
+def _run(task: Task, actuator: ActuatorModel, integrator: str, steps: int, seed: int) -> _Run:
     mujoco, analytic = both(task, actuator, integrator)
     generator = np.random.default_rng(seed)
     initial = task.initial(generator, None)
@@ -78,7 +77,9 @@ def _run(task: Task, actuator: Actuator | None, integrator: str, steps: int, see
     names = [*task.state_names, "force"]
     for force in forces.tolist():
         try:
-            delivered = [physics.step(force).actual_force for physics in (mujoco, analytic)]
+            for physics in (mujoco, analytic):
+                physics.step(force)
+            delivered = [last_signals(physics)["actual_force"] for physics in (mujoco, analytic)]
             growth.follow(force)
         except SimulationDivergedError as error:
             return _Run(seed, np.array(gaps), entries, growth, str(error))
@@ -132,7 +133,7 @@ def episodes(task: Task, actuator_name: str, integrator: str, seeds: range, long
         The check of the difference itself, and that of the difference in roundings, with a plot of the first run.
     """
     actuator = starved(task) if actuator_name == STARVED else named_actuator(actuator_name, task.name)
-    oracle = f"Gymnasium {task.gymnasium_id}" + (" and the motor in Python" if actuator else "")
+    oracle = f"Gymnasium {task.gymnasium_id}" + ("" if isinstance(actuator, Ideal) else " and the motor in Python")
     steps, horizon = (min(longest, known[task.name]) for known in (EPISODE_STEPS, HORIZON))
     runs = [_run(task, actuator, integrator, steps, seed) for seed in seeds]
     described = f"{integrator}, {actuator_name} actuator"

@@ -3,8 +3,8 @@
 import torch
 
 from codrl_mj.agents import DDPGConfig, DQNConfig, PPOConfig, SACConfig, TD3Config
-from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.envs.sb3 import make_sb3_vec_env
+from codrl_mj.tasks import TASKS
 
 _BUFFERED = {"learning_starts": 50, "batch_size": 16, "buffer_size": 1000}
 
@@ -27,7 +27,7 @@ SMALL = {
 
 def make_envs(task, num_envs=1, **arguments):
     """Environments of a task for Stable-Baselines3."""
-    return make_sb3_vec_env(ENVIRONMENTS[task].env_id, num_envs, **arguments)
+    return make_sb3_vec_env(TASKS[task].env_id, num_envs, **arguments)
 
 
 def make_model(config, task, seed=0, num_envs=1, **arguments):

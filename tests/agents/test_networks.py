@@ -7,7 +7,7 @@ from torch import nn
 
 from codrl_mj.agents import DDPGConfig, PPOConfig
 from codrl_mj.agents.presets import PRESETS, find_preset
-from codrl_mj.envs.registration import ENVIRONMENTS
+from codrl_mj.tasks import TASKS
 from tests.agents.small import make_envs, make_model
 
 DEEP = [(agent, task, name) for (agent, task), of in PRESETS.items() for name in of if agent != "sarsa"]
@@ -148,4 +148,4 @@ def test_weights_make_the_same_policy_again(agent, task, settings):
 
 
 def test_every_environment_is_covered():
-    assert {task for _, task, _ in DEEP} == set(ENVIRONMENTS)
+    assert {task for _, task, _ in DEEP} == set(TASKS)

@@ -4,8 +4,8 @@ import pytest
 
 from codrl_mj.agents import AGENTS
 from codrl_mj.agents.presets import PRESETS, SETTINGS, find_preset
-from codrl_mj.envs.registration import ENVIRONMENTS
-from codrl_mj.tasks import find_task
+from codrl_mj.tasks import TASKS, find_task
+from codrl_mj.training import TrainConfig
 
 # what the paper prints for its deep agents (Experimental Results)
 PRINTED = {
@@ -48,7 +48,7 @@ PRINTED = {
 }
 
 
-@pytest.mark.parametrize("task", ENVIRONMENTS)
+@pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("agent", ["ppo", "ddpg", "dqn", "td3", "sac"])
 def test_an_agent_has_default_settings_for_a_task_exactly_if_it_can_act_in_it(agent, task):
     fits = isinstance(find_task(task).action_space, AGENTS[agent].action_spaces)
@@ -79,8 +79,8 @@ def test_the_papers_settings_are_those_printed(agent, task):
 
 
 def test_the_papers_cart_pole_is_trained_near_the_centre_in_episodes_of_4000_steps():
-    env = find_preset("ppo", "cartpole", "paper").env
-    assert (env.max_episode_steps, env.center_radius) == (4000, 0.1)
+    env = TrainConfig.preset("cartpole", "ppo", "paper").env
+    assert (env.max_episode_steps, env.options.center_radius) == (4000, 0.1)
 
 
 def test_unknown_settings_are_answered_with_those_that_exist():
@@ -90,4 +90,4 @@ def test_unknown_settings_are_answered_with_those_that_exist():
     with pytest.raises(ValueError, match=r"dqn on pendulum has no such settings; .*ddpg: default, paper, repaired"):
         find_preset("dqn", "pendulum")
     with pytest.raises(ValueError, match="ppo on juggling has no such settings; those on juggling are none"):
-        find_preset("ppo", "juggling")
+        find_preset("ppo", "juggling", "paper")

@@ -9,28 +9,30 @@ import pytest
 
 import codrl_mj
 from codrl_mj.cli import main
-from codrl_mj.disturbances import OFF, Disturbances, resolve_disturbances
+from codrl_mj.disturbances import MOVED, OFF, PLAIN, Disturbances, Joint, resolve_disturbances, resolve_joint
 from codrl_mj.envs.config import EnvConfig
-from tests.disturbances.everything import ALL
+from tests.disturbances.everything import MOST, RUBBED
 
 FIELDS = [field.name for field in dataclasses.fields(Disturbances)]
+JOINT_FIELDS = [field.name for field in dataclasses.fields(Joint)]
 
 
 def test_everything_is_off_by_default_and_public():
     assert codrl_mj.Disturbances is Disturbances
-    assert set(dataclasses.asdict(OFF).values()) == {0.0}
-    assert not any((OFF.of_command, OFF.of_motor, OFF.of_joint, OFF.random))
-    assert {*ALL} == {*FIELDS}
+    assert codrl_mj.Joint is Joint
+    assert {*dataclasses.asdict(OFF).values(), *dataclasses.asdict(PLAIN).values()} == {0.0}
+    assert not any((OFF.of_command, OFF.random))
+    assert {*MOST} == {*FIELDS}
+    assert {*RUBBED} == {*JOINT_FIELDS}
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), "1", None, True, -1.0])
-@pytest.mark.parametrize("field", FIELDS)
-def test_a_bad_value_is_refused_by_name(field, value):
-    if field == "current_bias" and value == -1.0 and value is not True:
-        assert Disturbances(current_bias=-1.0).current_bias == -1.0
-        return
-    with pytest.raises(ValueError, match=rf"Disturbances\.{field} = .*: must be a finite number"):
-        Disturbances(**{field: value})
+@pytest.mark.parametrize(
+    ("kind", "field"), [(kind, field.name) for kind in (Disturbances, Joint) for field in dataclasses.fields(kind)]
+)
+def test_a_bad_value_is_refused_by_name(kind, field, value):
+    with pytest.raises(ValueError, match=rf"{kind.__name__}\.{field} = .*: must be a finite number >= 0"):
+        kind(**{field: value})
 
 
 def test_pulses_need_a_duration_and_an_interval_and_these_need_pulses():
@@ -43,24 +45,51 @@ def test_pulses_need_a_duration_and_an_interval_and_these_need_pulses():
 
 
 def test_a_mapping_is_as_good_and_its_unknown_fields_are_refused():
-    assert resolve_disturbances(ALL) == Disturbances(**ALL)
-    assert resolve_disturbances(Disturbances(**ALL).as_mapping()) == Disturbances(**ALL)
+    assert resolve_disturbances(MOST) == Disturbances(**MOST)
+    assert resolve_disturbances(Disturbances(**MOST).as_mapping()) == Disturbances(**MOST)
     assert resolve_disturbances(None) == OFF
-    with pytest.raises(ValueError, match=r"unknown field disturbances\.comand_delay; did you mean command_delay\?"):
+    with pytest.raises(
+        ValueError, match=r"unknown field disturbances\.comand_delay; did you mean disturbances\.command_delay\?"
+    ):
         resolve_disturbances({"comand_delay": 1})
     with pytest.raises(ValueError, match=r"disturbances = 3: must be a Disturbances or a mapping"):
         resolve_disturbances(3)
+    assert resolve_joint(RUBBED) == resolve_joint(Joint(**RUBBED)) == Joint(**RUBBED)
+    assert resolve_joint(None) == PLAIN
+    with pytest.raises(ValueError, match=r"unknown field joint\.frictoin; did you mean joint\.friction\?"):
+        resolve_joint({"frictoin": 1})
+    with pytest.raises(ValueError, match=r"'joint' = 3: must be a mapping of Joint's fields"):
+        resolve_joint(3)
+
+
+@pytest.mark.parametrize("name", MOVED)
+def test_a_field_that_has_moved_says_where_it_is_now(name):
+    with pytest.raises(
+        ValueError, match=rf"disturbances\.{name} is the (actuator's|environment's) .* now: give it there"
+    ):
+        resolve_disturbances({name: 0.1})
+    place = MOVED[name].split()[-1]
+    at, field = place.split(".")
+    value = {at: {field: 0.1}}
+    arguments = {"joint": value["joint"]} if at == "joint" else {"actuator": value}
+    gymnasium.make("codrl_mj/Pendulum-v0", **arguments)
 
 
 REFUSED = {
-    "noise of an ideal actuator": ({"actuator": "ideal", "disturbances": {"current_noise": 0.1}}, "no current sensor"),
-    "bias of an ideal actuator": ({"actuator": "ideal", "disturbances": {"current_bias": 0.1}}, "current_bias = 0.1"),
-    "sag of an ideal actuator": ({"actuator": "ideal", "disturbances": {"supply_resistance": 1}}, "no supply"),
-    "analytic damping": ({"physics": "analytic", "disturbances": {"joint_damping": 0.1}}, "use physics='mujoco'"),
-    "analytic friction": ({"physics": "analytic", "disturbances": {"joint_friction": 0.1}}, "have neither"),
+    "noise of an ideal actuator": (
+        {"actuator": {"family": "ideal", "controller": {"current_noise": 0.1}}},
+        "unknown actuator field controller",
+    ),
+    "sag of an ideal actuator": (
+        {"actuator": {"family": "ideal", "supply": {"resistance": 1}}},
+        "unknown actuator field supply",
+    ),
+    "analytic damping": ({"physics": "analytic", "joint": {"damping": 0.1}}, "use physics='mujoco'"),
+    "analytic friction": ({"physics": "analytic", "joint": {"friction": 0.1}}, "no place for it"),
+    "analytic armature": ({"physics": "analytic", "joint": {"armature": 0.1}}, r"joint\.armature = 0\.1"),
     "oscillating supply": (
-        {"disturbances": {"supply_resistance": 3.0}},
-        r"supply_resistance = 3: must be < .* = 3 ohm",
+        {"actuator": {"supply": {"resistance": 3.0}}},
+        r"supply\.resistance = 3: must be < .* = 3 ohm",
     ),
 }
 
@@ -74,15 +103,16 @@ def test_what_cannot_be_simulated_is_refused_with_a_reason(case):
 
 def test_damping_given_twice_is_refused():
     randomize = {"model.damping.hinge": codrl_mj.Uniform(0.0, 0.1)}
-    with pytest.raises(ValueError, match=r"joint_damping = 0\.1: give either"):
-        gymnasium.make("codrl_mj/Pendulum-v0", randomize=randomize, disturbances={"joint_damping": 0.1})
+    with pytest.raises(ValueError, match=r"joint\.damping = 0\.1: give either"):
+        gymnasium.make("codrl_mj/Pendulum-v0", randomize=randomize, joint={"damping": 0.1})
 
 
 def test_a_configuration_survives_json():
-    config = EnvConfig(disturbances=Disturbances(**ALL))
-    assert EnvConfig(**json.loads(json.dumps(dataclasses.asdict(config)))) == config
-    assert config.as_arguments()["disturbances"] == Disturbances(**ALL)
-    assert "disturbances" not in EnvConfig().as_arguments()
+    config = EnvConfig("pendulum", disturbances=Disturbances(**MOST), joint=Joint(**RUBBED))
+    assert EnvConfig.from_mapping(json.loads(json.dumps(config.as_mapping()))) == config
+    assert config.as_arguments()["disturbances"] == Disturbances(**MOST)
+    assert config.as_arguments()["joint"] == Joint(**RUBBED)
+    assert not {"disturbances", "joint"} & {*EnvConfig("pendulum").as_arguments()}
 
 
 def test_the_command_line_takes_them_and_refuses_in_one_line(capsys, tmp_path):
@@ -94,8 +124,10 @@ def test_the_command_line_takes_them_and_refuses_in_one_line(capsys, tmp_path):
         trajectories.append(np.load(tmp_path / f"{name}.npz"))
     plain, late = trajectories
     np.testing.assert_array_equal(plain["action"], late["action"])
-    assert late["reference_current"][0] == 0.0
-    np.testing.assert_allclose(late["reference_current"][1:], plain["reference_current"][:-1], rtol=1e-12)
+    assert late["signals/reference_current"][0] == 0.0
+    np.testing.assert_allclose(
+        late["signals/reference_current"][1:], plain["signals/reference_current"][:-1], rtol=1e-12
+    )
     capsys.readouterr()
     assert main([*line, "--env.disturbances.command-delay", "-1"]) == 2
-    assert "Disturbances.command_delay = -1: must be a finite number >= 0" in capsys.readouterr().err
+    assert "Disturbances.command_delay = -1.0: must be a finite number >= 0" in capsys.readouterr().err

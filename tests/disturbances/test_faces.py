@@ -9,29 +9,33 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import codrl_mj
-from codrl_mj.callbacks import ACT_NAMES, IMPERFECT_ACT_NAMES, install, installed
-from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.envs.vector import ActuatedVectorEnv
-from tests.disturbances.everything import ALL, MOST
+from codrl_mj.tasks import TASKS
+from tests.disturbances.everything import MOST, RUBBED, imperfect
 
 WEAK = {"controller": {"kp": 1.0, "ki": 0.5, "max_voltage": 3.0}}
+ALL = {"disturbances": MOST, "joint": RUBBED, "actuator": imperfect(WEAK)}
+"""Everything at once; on the analytic physics without a joint's."""
 SIGNALS = ("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated")
 
 
-def _vector(task, num_envs=4, mode=AutoresetMode.NEXT_STEP, disturbances=ALL, **arguments):
-    arguments = {"max_episode_steps": 12, "observe_actuator": True, "actuator": WEAK, **arguments}
-    return ActuatedVectorEnv(num_envs, task, autoreset_mode=mode, disturbances=disturbances, **arguments)
+def _vector(task, num_envs=4, mode=AutoresetMode.NEXT_STEP, **arguments):
+    arguments = {"max_episode_steps": 12, "observe_actuator": True, **ALL, **arguments}
+    return ActuatedVectorEnv(num_envs, task, autoreset_mode=mode, **arguments)
 
 
-def _single(task, disturbances=ALL, **arguments):
-    arguments = {"max_episode_steps": 12, "observe_actuator": True, "actuator": WEAK, **arguments}
-    env_id = ENVIRONMENTS[task].env_id
-    return gymnasium.make(env_id, disturbances=disturbances, disable_env_checker=True, **arguments)
+def _single(task, **arguments):
+    arguments = {"max_episode_steps": 12, "observe_actuator": True, **ALL, **arguments}
+    return gymnasium.make(TASKS[task].env_id, disable_env_checker=True, **arguments)
+
+
+def _plain(task, **arguments):
+    return _single(task, **({"disturbances": None, "joint": None, "actuator": WEAK} | arguments))
 
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-@pytest.mark.parametrize("task", ENVIRONMENTS)
+@pytest.mark.parametrize("task", TASKS)
 def test_many_are_as_one_bit_for_bit(task, mode, threads):
     ours = _vector(task, mode=mode, num_threads=threads)
     theirs = SyncVectorEnv([lambda: _single(task)] * 4, autoreset_mode=mode)
@@ -46,9 +50,9 @@ def test_many_are_as_one_bit_for_bit(task, mode, threads):
             np.testing.assert_array_equal(got[4][name], expected[4][name])
 
 
-@pytest.mark.parametrize("task", ENVIRONMENTS)
+@pytest.mark.parametrize("task", TASKS)
 def test_both_physics_agree_with_everything_that_both_have(task):
-    mujoco, analytic = _single(task, MOST), _single(task, MOST, physics="analytic")
+    mujoco, analytic = (_single(task, joint=None, physics=physics) for physics in ("mujoco", "analytic"))
     np.testing.assert_array_equal(mujoco.reset(seed=1)[0], analytic.reset(seed=1)[0])
     mujoco.action_space.seed(0)
     for _ in range(12):
@@ -61,7 +65,7 @@ def test_both_physics_agree_with_everything_that_both_have(task):
             break
 
 
-@pytest.mark.parametrize("task", ENVIRONMENTS)
+@pytest.mark.parametrize("task", TASKS)
 def test_copies_and_restored_snapshots_go_on_alike(task):
     env = _vector(task)
     env.reset(seed=2)
@@ -81,7 +85,7 @@ def test_copies_and_restored_snapshots_go_on_alike(task):
 
 @pytest.mark.parametrize("physics", ["mujoco", "analytic"])
 def test_a_copy_of_a_single_environment_goes_on_alike(physics):
-    env = _single("cartpole", MOST, physics=physics)
+    env = _single("cartpole", joint=None, physics=physics)
     env.reset(seed=0)
     for action in (1, 0, 0):
         env.step(action)
@@ -94,7 +98,7 @@ def test_a_copy_of_a_single_environment_goes_on_alike(physics):
 
 def test_dm_control_saves_commands_and_loads_with_the_state():
     suite = pytest.importorskip("codrl_mj.suite")
-    arguments = {"actuator": WEAK, "disturbances": ALL, "observe_actuator": True}
+    arguments = {**ALL, "observe_actuator": True}
     env, other = (suite.load("pendulum", task_kwargs={"random": 5}, **arguments) for _ in range(2))
     gym = _single("pendulum", max_episode_steps=200)
     gym.reset(seed=5)
@@ -114,9 +118,8 @@ def test_dm_control_saves_commands_and_loads_with_the_state():
 
 def test_stable_baselines_gets_them_too():
     pytest.importorskip("stable_baselines3")
-    envs = codrl_mj.make_sb3_vec_env(
-        "codrl_mj/Pendulum-v0", 3, disturbances=codrl_mj.Disturbances(**ALL), observe_actuator=True, actuator=WEAK
-    )
+    described = {**ALL, "disturbances": codrl_mj.Disturbances(**MOST), "joint": codrl_mj.Joint(**RUBBED)}
+    envs = codrl_mj.make_sb3_vec_env("codrl_mj/Pendulum-v0", 3, observe_actuator=True, **described)
     reference = _vector("pendulum", 3, AutoresetMode.SAME_STEP, max_episode_steps=200)
     envs.seed(4)
     np.testing.assert_array_equal(envs.reset(), reference.reset(seed=4)[0])
@@ -125,18 +128,20 @@ def test_stable_baselines_gets_them_too():
         np.testing.assert_array_equal(envs.step(action)[0], reference.step(action)[0])
 
 
-@pytest.mark.parametrize("task", ENVIRONMENTS)
+@pytest.mark.parametrize("task", TASKS)
 def test_seeds_draw_the_same_initial_states_with_disturbances_and_without(task):
-    disturbed, plain = _single(task), _single(task, None)
+    disturbed, plain = _single(task), _plain(task)
     disturbed.reset(seed=11)
     plain.reset(seed=11)
     np.testing.assert_array_equal(disturbed.unwrapped.state, plain.unwrapped.state)
 
 
 @pytest.mark.parametrize("physics", ["mujoco", "analytic"])
-@pytest.mark.parametrize("task", ENVIRONMENTS)
+@pytest.mark.parametrize("task", TASKS)
 def test_off_is_bit_for_bit_as_without(task, physics):
-    off, plain = _single(task, {}, physics=physics), _single(task, None, physics=physics)
+    zero = {**WEAK, "controller": {**WEAK["controller"], "current_noise": 0.0, "current_bias": 0.0}, "supply": {}}
+    off = _single(task, disturbances={}, joint={}, actuator=zero, physics=physics)
+    plain = _plain(task, physics=physics)
     off.reset(seed=1)
     plain.reset(seed=1)
     off.action_space.seed(0)
@@ -149,41 +154,28 @@ def test_off_is_bit_for_bit_as_without(task, physics):
     plain.reset()  # nothing was drawn for a key in between
     np.testing.assert_array_equal(off.unwrapped.state, plain.unwrapped.state)
     if physics == "mujoco":
-        assert off.unwrapped.model.na == len(ACT_NAMES)
         assert off.unwrapped.physics._disturber is None
 
 
-EACH = [{name: MOST[name]} for name in MOST if "pulse" not in name]
-EACH += [{name: MOST[name] for name in MOST if "pulse" in name}, {"joint_damping": 0.1}, {"joint_friction": 0.1}]
+EACH = {name: {"disturbances": {name: MOST[name]}} for name in MOST if "pulse" not in name}
+EACH["pulses"] = {"disturbances": {name: MOST[name] for name in MOST if "pulse" in name}}
+EACH |= {f"joint {name}": {"joint": {name: 0.1}} for name in RUBBED}
+EACH |= {
+    name: {"actuator": {**WEAK, "controller": {**WEAK["controller"], name: size}}}
+    for name, size in {"current_noise": 0.05, "current_bias": -0.02}.items()
+}
+EACH["supply"] = {"actuator": {**WEAK, "supply": {"resistance": 0.7}}}
 
 
-@pytest.mark.parametrize("disturbances", EACH, ids=lambda one: next(iter(one)))
-def test_each_alone_changes_what_happens(disturbances):
-    disturbed, plain = _single("pendulum", disturbances), _single("pendulum", None)
+@pytest.mark.parametrize("what", EACH)
+def test_each_alone_changes_what_happens(what):
+    disturbed, plain = _plain("pendulum", **EACH[what]), _plain("pendulum")
     disturbed.reset(seed=1)
     plain.reset(seed=1)
     for value in np.linspace(-1.7, 1.9, 12, dtype=np.float32):
         disturbed.step(np.array([value]))
         plain.step(np.array([value]))
     assert np.abs(disturbed.unwrapped.state - plain.unwrapped.state).max() > 1e-6
-
-
-def test_the_callbacks_for_imperfect_motors_serve_the_others_without_changing_a_bit():
-    def run():
-        env = _single("acrobot", None)
-        env.reset(seed=0)
-        return [env.step(action % 3)[0] for action in range(10)]
-
-    before = run()
-    imperfect = _single("acrobot")
-    imperfect.reset(seed=0)
-    assert installed("imperfect_motor")
-    np.testing.assert_array_equal(run(), before)
-    assert installed("motor")
-    install("motor")
-    assert installed("imperfect_motor")
-    assert imperfect.unwrapped.model.na == len(IMPERFECT_ACT_NAMES)
-    imperfect.step(0)
 
 
 def test_drawn_motors_and_disturbances_go_together_bit_for_bit():

@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from codrl_mj.disturbances import Disturbances
+from codrl_mj.actuators import IDEAL
+from codrl_mj.disturbances import Joint
 from codrl_mj.physics import MujocoPhysics
 from codrl_mj.tasks import TASKS
 
 START = np.array([2.0, 1.0])
 
 
-def _pendulum(inner_steps, torque, **disturbances):
-    physics = MujocoPhysics(TASKS["pendulum"], None, inner_steps, "semi-implicit", None, Disturbances(**disturbances))
+def _pendulum(inner_steps, torque, **joint):
+    physics = MujocoPhysics(TASKS["pendulum"], [IDEAL], inner_steps, "semi-implicit", joint=Joint(**joint))
     physics.reset(START)
     for _ in range(10):
         physics.step(torque)
@@ -35,7 +36,7 @@ def _solved(torque, damping=0.0, friction=0.0):
 
 def test_damping_is_a_torque_against_the_speed():
     expected = _solved(0.5, damping=0.4)
-    coarse, fine = (np.abs(_pendulum(steps, 0.5, joint_damping=0.4) - expected).max() for steps in (250, 500))
+    coarse, fine = (np.abs(_pendulum(steps, 0.5, damping=0.4) - expected).max() for steps in (250, 500))
     assert fine < 1e-3
     assert coarse / fine == pytest.approx(2.0, rel=0.1)  # of first order, as the integrator is
     assert np.abs(_solved(0.5) - expected).max() > 0.1
@@ -43,13 +44,13 @@ def test_damping_is_a_torque_against_the_speed():
 
 def test_friction_is_a_constant_torque_against_the_motion():
     expected = _solved(0.5, friction=0.3)
-    assert np.abs(_pendulum(1000, 0.5, joint_friction=0.3) - expected).max() < 2e-3
+    assert np.abs(_pendulum(1000, 0.5, friction=0.3) - expected).max() < 2e-3
     assert np.abs(_solved(0.5) - expected).max() > 0.1
 
 
 @pytest.mark.parametrize(("torque", "sticks"), [(0.9, True), (-0.9, True), (1.4, False)])
 def test_friction_holds_what_does_not_exceed_it(torque, sticks):
-    physics = MujocoPhysics(TASKS["pendulum"], None, 10, "semi-implicit", None, Disturbances(joint_friction=1.0))
+    physics = MujocoPhysics(TASKS["pendulum"], [IDEAL], 10, "semi-implicit", joint=Joint(friction=1.0))
     physics.reset(np.array([np.pi, 0.0]))
     for _ in range(40):
         physics.step(torque)
@@ -59,11 +60,11 @@ def test_friction_holds_what_does_not_exceed_it(torque, sticks):
 
 def test_the_solver_is_off_without_friction_and_starts_from_nothing_with_it():
     flags = {
-        name: gymnasium.make("codrl_mj/Pendulum-v0", disturbances=disturbances).unwrapped.model.opt.disableflags
-        for name, disturbances in {
+        name: gymnasium.make("codrl_mj/Pendulum-v0", joint=joint).unwrapped.model.opt.disableflags
+        for name, joint in {
             "none": None,
-            "damping": {"joint_damping": 1.0},
-            "friction": {"joint_friction": 1.0},
+            "damping": {"damping": 1.0},
+            "friction": {"friction": 1.0},
         }.items()
     }
     constraint = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
@@ -76,8 +77,8 @@ def test_the_solver_is_off_without_friction_and_starts_from_nothing_with_it():
 def test_the_explicit_integrator_stays_explicit():
     """CartPole: positions move by the old velocity, and damping is that of the old velocity: a force like any other."""
     damping, cartpole = 2.0, TASKS["cartpole"]
-    damped = MujocoPhysics(cartpole, None, 1, "euler", 1e6, Disturbances(joint_damping=damping))
-    plain = MujocoPhysics(cartpole, None, 1, "euler", 1e6)
+    damped = MujocoPhysics(cartpole, [IDEAL], 1, "euler", np.array([1e6]), joint=Joint(damping=damping))
+    plain = MujocoPhysics(cartpole, [IDEAL], 1, "euler", np.array([1e6]))
     generator = np.random.default_rng(0)
     for _ in range(50):
         state, force = generator.normal(size=4), generator.normal() * 10
@@ -86,7 +87,7 @@ def test_the_explicit_integrator_stays_explicit():
         damped.step(force)
         plain.step(force - damping * state[1])
         np.testing.assert_allclose(damped.state, plain.state, rtol=1e-12, atol=1e-12)
-    rubbed = MujocoPhysics(cartpole, None, 1, "euler", None, Disturbances(joint_damping=1.0, joint_friction=1.0))
+    rubbed = MujocoPhysics(cartpole, [IDEAL], 1, "euler", joint=Joint(damping=1.0, friction=1.0))
     rubbed.reset(state)
     rubbed.step(3.0)
     np.testing.assert_array_equal(rubbed.state[[0, 2]], state[[0, 2]] + 0.02 * state[[1, 3]])
@@ -95,9 +96,23 @@ def test_the_explicit_integrator_stays_explicit():
 @pytest.mark.parametrize("task", TASKS)
 def test_only_the_actuated_joint_is_rubbed(task):
     physics = MujocoPhysics(
-        TASKS[task], None, 1, TASKS[task].integrators[0], None, Disturbances(joint_damping=0.5, joint_friction=0.25)
+        TASKS[task], [IDEAL], 1, TASKS[task].integrators[0], joint=Joint(damping=0.5, friction=0.25, armature=0.125)
     )
     actuated = physics.model.actuator("motor").trnid[0]
     expected = np.where(np.arange(physics.model.nv) == actuated, 1.0, 0.0)
     np.testing.assert_array_equal(physics.model.dof_damping, 0.5 * expected)
     np.testing.assert_array_equal(physics.model.dof_frictionloss, 0.25 * expected)
+    np.testing.assert_array_equal(physics.model.dof_armature, 0.125 * expected)
+
+
+def test_armature_is_an_inertia_of_the_joint():
+    """From rest the pendulum turns by tau/(m l^2/3 + I) for a step of semi-implicit Euler, whatever gravity adds."""
+    rotor, torque = 0.25, 1.5
+    physics = MujocoPhysics(TASKS["pendulum"], [IDEAL], 4, "semi-implicit", joint=Joint(armature=rotor))
+    physics.reset(np.zeros(2))
+    physics.step(torque)
+    timestep, speed, angle = 0.05 / 4, 0.0, 0.0
+    for _ in range(4):
+        speed += timestep * (torque + 5.0 * np.sin(angle)) / (1.0 / 3.0 + rotor)
+        angle += timestep * speed
+    np.testing.assert_allclose(physics.state, [angle, speed], rtol=1e-12)

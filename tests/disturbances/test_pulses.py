@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.disturbances.pulses import START
-from codrl_mj.motor.noise import LARGEST_KEY
 from codrl_mj.physics.disturber import Disturber
 
 FORCE, DURATION, INTERVAL = 2.0, 0.33, 0.8
@@ -16,12 +16,12 @@ PULSES = Disturbances(pulse_force=FORCE, pulse_duration=DURATION, pulse_interval
 
 def _loads(timestep, steps, simulations, seed=0):
     """Loads (steps, simulations), and when the present or next pulse starts, before each step."""
-    disturber = Disturber(PULSES, timestep, 10.0, simulations)
+    disturber = Disturber(PULSES, timestep, np.array([10.0]), simulations)
     keys = np.floor(np.random.default_rng(seed).random(simulations) * LARGEST_KEY)
     disturber.reset(np.arange(simulations), keys)
     loads, starts = [], []
     for _ in range(steps):
-        loads.append(disturber.load())
+        loads.append(disturber.loads()[:, 0])
         starts.append(disturber.memory[:, -4 + START].copy())
     return np.array(loads), np.array(starts)
 
@@ -60,9 +60,9 @@ def test_the_impulse_does_not_depend_on_the_integration_step():
 
 
 def test_a_lone_pulse_is_a_force_times_its_duration():
-    disturber = Disturber(Disturbances(pulse_force=3.0, pulse_duration=0.07, pulse_interval=40.0), 0.02, 1.0, 1)
-    disturber.reset(0, 5.0)
-    loads = np.array([disturber.load()[0] for _ in range(4000)])
+    disturber = Disturber(Disturbances(pulse_force=3.0, pulse_duration=0.07, pulse_interval=40.0), 0.02, np.ones(1), 1)
+    disturber.reset(np.zeros(1, np.int64), 5.0)
+    loads = np.array([disturber.loads()[0, 0] for _ in range(4000)])
     (first,) = np.flatnonzero(np.diff((loads != 0).astype(int)) == 1)[:1]
     assert abs(loads[first : first + 8].sum() * 0.02) == pytest.approx(3.0 * 0.07, rel=1e-9)
 

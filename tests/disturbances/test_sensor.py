@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from codrl_mj.callbacks.kernels import IMPERFECT_ACT_NAMES, VOLTAGE
-from codrl_mj.motor.noise import LOAD_STREAM, SENSOR_STREAM, philox, standard_normal
+from codrl_mj.actuators.noise import LOAD_STREAM, SENSOR_STREAM, philox, standard_normal
+from tests.engine.models import VOLTAGE
 
-STILL = {"motor": {"back_emf_constant": 0.0}, "controller": {"kp": 1.0, "max_voltage": float("inf")}}
+
+def _still(**controller):
+    """A motor without back-EMF under a proportional loop, with whatever else its controller has."""
+    return {"motor": {"back_emf_constant": 0.0}, "controller": {"kp": 1.0, "max_voltage": float("inf"), **controller}}
 
 
 @pytest.mark.parametrize(
@@ -46,10 +49,8 @@ def test_the_noise_is_standard_normal_and_white():
 
 def test_the_controller_of_every_environment_has_its_own_white_noise():
     envs, steps, deviation = 100, 100, 0.25
-    disturbances = {"current_noise": deviation, "current_bias": 0.125}
-    env = gymnasium.make_vec(
-        "codrl_mj/Pendulum-v0", envs, "vector_entry_point", actuator=STILL, disturbances=disturbances
-    )
+    actuator = _still(current_noise=deviation, current_bias=0.125)
+    env = gymnasium.make_vec("codrl_mj/Pendulum-v0", envs, "vector_entry_point", actuator=actuator)
     env.reset(seed=0)
     current, noise = np.zeros(envs), []
     for _ in range(steps):
@@ -66,14 +67,13 @@ def test_the_controller_of_every_environment_has_its_own_white_noise():
 
 @pytest.mark.parametrize("task", ["Pendulum", "Acrobot"])
 def test_the_noise_of_a_tick_is_the_same_for_whoever_computes_it(task):
-    env = gymnasium.make(f"codrl_mj/{task}-v0", disturbances={"current_noise": 0.5}).unwrapped
+    env = gymnasium.make(f"codrl_mj/{task}-v0", actuator={"controller": {"current_noise": 0.5}}).unwrapped
     env.reset(seed=4)
     env.action_space.seed(0)
     env.step(env.action_space.sample())
     model, data = env.model, env.data
     mujoco.mj_forward(model, data)
     act = data.act.copy()
-    assert len(act) == len(IMPERFECT_ACT_NAMES)
     twin = copy.copy(data)
     for other in (data, twin):
         mujoco.mj_forward(model, other)
@@ -93,7 +93,7 @@ def test_the_noise_of_a_tick_is_the_same_for_whoever_computes_it(task):
 
 def test_episodes_and_seeds_have_their_own_noise_and_seeds_repeat():
     def voltages(*seeds):
-        env = gymnasium.make("codrl_mj/Pendulum-v0", disturbances={"current_noise": 0.5})
+        env = gymnasium.make("codrl_mj/Pendulum-v0", actuator={"controller": {"current_noise": 0.5}})
         found = []
         for seed in seeds:
             env.reset(seed=seed)
@@ -109,7 +109,7 @@ def test_episodes_and_seeds_have_their_own_noise_and_seeds_repeat():
 def test_a_bias_shifts_the_steady_current_by_the_closed_form(physics):
     kp, bias = 1.0, 0.3
     arguments = {"physics": physics, "observe_actuator": True}
-    env = gymnasium.make("codrl_mj/Pendulum-v0", actuator=STILL, disturbances={"current_bias": bias}, **arguments)
+    env = gymnasium.make("codrl_mj/Pendulum-v0", actuator=_still(current_bias=bias), **arguments)
     start = env.reset(seed=0)[0]
     for _ in range(60):
         observation, *_, info = env.step(np.array([1.5], np.float32))
@@ -117,8 +117,8 @@ def test_a_bias_shifts_the_steady_current_by_the_closed_form(physics):
     assert start[-2] == np.float32(bias)
     assert observation[-2] == pytest.approx(info["current"] + bias, rel=1e-6)
 
-    integral = {"motor": {"back_emf_constant": 0.0}, "controller": {"kp": 1.0, "ki": 5.0}}
-    env = gymnasium.make("codrl_mj/Pendulum-v0", actuator=integral, disturbances={"current_bias": bias}, **arguments)
+    integral = _still(ki=5.0, max_voltage=24.0, current_bias=bias)
+    env = gymnasium.make("codrl_mj/Pendulum-v0", actuator=integral, **arguments)
     env.reset(seed=0)
     for _ in range(150):
         info = env.step(np.array([1.5], np.float32))[4]
@@ -127,8 +127,8 @@ def test_a_bias_shifts_the_steady_current_by_the_closed_form(physics):
 
 @pytest.mark.parametrize("physics", ["mujoco", "analytic"])
 def test_a_noisy_observation_is_what_the_controller_measures_next(physics):
-    disturbances = {"current_noise": 0.2, "current_bias": 0.1}
-    arguments = {"physics": physics, "actuator": STILL, "observe_actuator": True, "disturbances": disturbances}
+    actuator = _still(current_noise=0.2, current_bias=0.1)
+    arguments = {"physics": physics, "actuator": actuator, "observe_actuator": True}
     env = gymnasium.make("codrl_mj/Pendulum-v0", **arguments)
     measured = env.reset(seed=0)[0][-2]
     for _ in range(20):
@@ -142,8 +142,8 @@ def test_a_noisy_observation_is_what_the_controller_measures_next(physics):
 def test_a_sagging_supply_stalls_the_motor_at_the_closed_form(physics, supply, substeps):
     motor = {"resistance": 1.5, "torque_constant": 0.1, "back_emf_constant": 0.0}
     actuator = {"motor": motor, "controller": {"kp": 1.0, "max_voltage": 5.0, "substeps": substeps}}
-    arguments = {"physics": physics, "actuator": actuator, "disturbances": {"supply_resistance": supply}}
-    env = gymnasium.make("codrl_mj/Pendulum-v0", **arguments)
+    actuator["supply"] = {"resistance": supply}
+    env = gymnasium.make("codrl_mj/Pendulum-v0", physics=physics, actuator=actuator)
     env.reset(seed=0)
     for _ in range(80):
         info = env.step(np.array([-2.0], np.float32))[4]
@@ -155,8 +155,7 @@ def test_a_sagging_supply_stalls_the_motor_at_the_closed_form(physics, supply, s
 def test_a_supply_that_is_spent_gives_no_voltage_and_no_other_sign():
     env = gymnasium.make(
         "codrl_mj/Pendulum-v0",
-        actuator={"controller": {"max_voltage": 1.0}},
-        disturbances={"supply_resistance": 100.0},
+        actuator={"controller": {"max_voltage": 1.0}, "supply": {"resistance": 100.0}},
         allow_unstable=True,
     )
     env.reset(seed=0)

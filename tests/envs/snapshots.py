@@ -8,9 +8,9 @@ from safetensors.numpy import load_file, save_file
 
 from codrl_mj import Choice, LogUniform, Uniform, make_sb3_vec_env
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.physics.variation import variable
-from tests.disturbances.everything import ALL, MOST
+from codrl_mj.tasks import TASKS, named_actuator
+from tests.disturbances.everything import MOST, RUBBED, imperfect
 from tests.envs.vectors import random_actions
 from tests.tasks.faces import actions
 
@@ -29,11 +29,13 @@ DRIVE = {
 def everything(task, physics):
     """Arguments with every disturbance, and every field drawn, that the physics has."""
     model = {} if physics == "analytic" else dict.fromkeys(variable(task), Uniform(0.6, 1.7))
-    model = {name: drawn for name, drawn in model.items() if "damping" not in name}  # it is among the disturbances
+    model = {name: drawn for name, drawn in model.items() if "damping" not in name}  # the joint has it
     return {
+        "actuator": imperfect(named_actuator("paper", task).as_mapping()),
         "physics": physics,
         "randomize": DRIVE | model,
-        "disturbances": MOST if physics == "analytic" else ALL,
+        "disturbances": MOST,
+        "joint": None if physics == "analytic" else RUBBED,
         "observe_actuator": True,
     }
 
@@ -45,7 +47,7 @@ def single(task, physics):
 
 def several(task, physics):
     """Environments as Stable-Baselines3 knows them, with episodes short enough to end by time too."""
-    return make_sb3_vec_env(ENVIRONMENTS[task].env_id, NUM_ENVS, max_episode_steps=23, **everything(task, physics))
+    return make_sb3_vec_env(TASKS[task].env_id, NUM_ENVS, max_episode_steps=23, **everything(task, physics))
 
 
 def run_single(env, count, seed):
@@ -78,7 +80,7 @@ def run_several(envs, count, seed):
         found["observations"].append(observations)
         found["rewards"].append(rewards)
         found["dones"].append(dones)
-        found["signals"].append(np.array(envs.signals))
+        found["signals"].append(np.array(list(envs.signals.values())))
         found["drawn"].append(np.array(list(envs.randomization.values())))
         for info in infos:
             if info:

@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from codrl_mj.physics import PHYSICS
+from codrl_mj.physics.registry import PHYSICS
 
 SEEDS = range(20)
 

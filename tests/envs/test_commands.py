@@ -13,13 +13,12 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
-from codrl_mj.envs.registration import ENVIRONMENTS
-from codrl_mj.motor import Actuator, CurrentLoop, Motor
-from codrl_mj.physics import PHYSICS
-from codrl_mj.physics.analytic import DRIVERS
+from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.envs.views import signals_of
+from codrl_mj.physics.registry import PHYSICS
 from codrl_mj.tasks import TASKS
 from codrl_mj.tasks.assets import asset_path
-from tests.callbacks.models import FULL, changed
+from tests.engine.models import FULL, changed
 
 DISCRETE = ("cartpole", "acrobot", "mountain_car")
 CONTINUOUS = ("pendulum", "mountain_car_continuous")
@@ -41,12 +40,12 @@ def make(task, command="force", **options):
         limit = LIMIT[task][command]
         options.setdefault("levels", (-limit, -limit / 3, limit / 7, limit))
     options.setdefault("actuator", MOTOR)
-    return gymnasium.make(ENVIRONMENTS[task].env_id, disable_env_checker=True, action=command, **options)
+    return gymnasium.make(TASKS[task].env_id, disable_env_checker=True, action=command, **options)
 
 
 def commanded(env, action):
     """The current or voltage that an action stands for."""
-    levels = env.unwrapped.setup.levels
+    levels = env.unwrapped.setup.commands.levels
     return float(action[0]) if levels is None else float(levels[action])
 
 
@@ -80,7 +79,8 @@ def test_a_current_is_the_force_that_it_makes(task, physics):
         if task in CONTINUOUS:
             info, expected = env.step(action)[-1], by_force.step(np.array([force]))[-1]
         else:  # its own actions do not reach every force
-            info, expected = env.step(action)[-1], by_force.physics.step(force)._asdict()
+            by_force.physics.step(force)
+            info, expected = env.step(action)[-1], signals_of(by_force.physics.trace[-1], Actuator, force, tracks=True)
         assert info["desired_force"] == pytest.approx(force, rel=1e-12)
         assert info["reference_current"] == pytest.approx(commanded(env, action), rel=1e-12)
         np.testing.assert_allclose(list(info.values()), list(expected.values()), rtol=1e-12, atol=1e-12)
@@ -124,7 +124,7 @@ def winding(motor, dt, substeps, max_voltage, current, voltage, speed):
 @every_physics
 def test_a_voltage_drives_the_winding_and_that_the_task(task, physics):
     """One environment step at a time from the state reached: winding and unmodified Gymnasium, by hand."""
-    env, driver = make(task, "voltage", physics=physics).unwrapped, DRIVERS[task](TASKS[task].gymnasium_id)
+    env, driver = make(task, "voltage", physics=physics).unwrapped, TASKS[task].twin()
     env.reset(seed=0)
     motor, loop = MOTOR.motor, MOTOR.controller
     inner, current = env.task.motor_inner_steps, 0.0
@@ -346,7 +346,7 @@ REFUSED = {
 def test_what_does_not_go_together_is_refused(case):
     options, message = REFUSED[case]
     with pytest.raises(ValueError, match=re.escape(message)):
-        gymnasium.make(ENVIRONMENTS["pendulum"].env_id, **options)
+        gymnasium.make(TASKS["pendulum"].env_id, **options)
 
 
 NO_ACTION = {
@@ -408,7 +408,11 @@ def test_observed_currents_are_those_of_the_info_and_zero_at_the_start(task, com
     assert space.dtype == np.float32
     np.testing.assert_array_equal(space.low, [*plain.low, -np.inf, -np.inf])
     np.testing.assert_array_equal(space.high, [*plain.high, np.inf, np.inf])
-    assert env.unwrapped.setup.observation_names == (*TASKS[task].observation_names, "current", "reference_current")
+    assert env.unwrapped.setup.view.observation_names == (
+        *TASKS[task].observation_names,
+        "current",
+        "reference_current",
+    )
     for seed in range(2):
         observation, _ = env.reset(seed=seed)
         np.testing.assert_array_equal(observation[:size], blind.reset(seed=seed)[0])
@@ -508,7 +512,7 @@ def test_a_copy_made_mid_episode_continues_bit_for_bit(task, command, observe, p
 
 def test_the_default_command_is_the_force():
     for task in TASKS:
-        env = gymnasium.make(ENVIRONMENTS[task].env_id)
+        env = gymnasium.make(TASKS[task].env_id)
         assert env.action_space == TASKS[task].action_space
         assert env.observation_space == TASKS[task].observation_space
-        assert env.unwrapped.setup.command == "force"
+        assert env.unwrapped.setup.commands.name == "force"

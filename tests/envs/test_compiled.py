@@ -11,21 +11,23 @@ import numpy as np
 import pytest
 
 from codrl_mj import Uniform
+from codrl_mj.actuators import IDEAL, Actuator, actuator_over
+from codrl_mj.engine.families import signals_at
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.envs.compiled import compiled_env
 from codrl_mj.physics import SimulationDivergedError
-from codrl_mj.tasks import TASKS
-from tests.tasks.faces import actions, random_states
+from codrl_mj.tasks import TASKS, named_actuator
+from tests.tasks.faces import actions, desired_force, random_states
 
 every_task = pytest.mark.parametrize("task", TASKS)
-NOISY = {"current_noise": 0.05, "current_bias": 0.1, "supply_resistance": 0.01}
+NOISY = {"controller": {"current_noise": 0.05, "current_bias": 0.1}, "supply": {"resistance": 0.01}}
 PULSES = {"pulse_force": 0.3, "pulse_duration": 0.1, "pulse_interval": 0.5}
 SETUPS = {
     "ideal": {"actuator": "ideal"},
     "motor": {"observe_actuator": True},
     "disturbed": {"disturbances": {"command_delay": 0.03, "command_quantum": 0.1, "command_rate": 50.0, **PULSES}},
-    "sensing": {"observe_actuator": True, "disturbances": NOISY},
-    "voltage": {"observe_actuator": True, "action": "voltage", "disturbances": NOISY},
+    "sensing": {"observe_actuator": True, "actuator": NOISY},
+    "voltage": {"observe_actuator": True, "action": "voltage", "actuator": NOISY},
 }
 every_setup = pytest.mark.parametrize("kind", SETUPS)
 
@@ -34,15 +36,17 @@ def _env(task, kind="motor", **more):
     arguments = SETUPS[kind] | more
     if arguments.get("action") == "voltage" and isinstance(TASKS[task].action_space, gymnasium.spaces.Discrete):
         arguments |= {"levels": (-3.0, 0.0, 3.0)}
+    if arguments.get("actuator") is NOISY:
+        arguments |= {"actuator": actuator_over(named_actuator("paper", task), NOISY)}
     return ActuatedEnv(task, **arguments)
 
 
 def _plain_step(env, task, state, force):
-    """The engine's bindings and the task's functions as they stand, in plain Python: state, signals."""
+    """The engine's bindings and the task's functions as they stand, in plain Python: state, force."""
     definition, model, data = TASKS[task], env.model, mujoco.MjData(env.model)
     positions, velocities = list(definition.qpos), list(definition.qvel)
     data.qpos[:], data.qvel[:] = state[positions], state[velocities]
-    arm = 1.0 if env.actuator is None else env.actuator.motor.arm_radius
+    arm = env.actuator.arm_radius
     data.ctrl[0] = force * arm
     for _ in range(env.setup.inner_steps):
         moved = data.qpos + model.opt.timestep * data.qvel
@@ -54,8 +58,9 @@ def _plain_step(env, task, state, force):
         if definition.constrain is not None:
             state = np.array(definition.constrain(state, model.opt.timestep))
             data.qpos[:], data.qvel[:] = state[positions], state[velocities]
-    actual = force if env.actuator is None else env.actuator.motor.torque_constant * data.act[4] / arm
-    return state, actual
+    if env.actuator == IDEAL:
+        return state, force
+    return state, env.actuator.motor.torque_constant * data.act[signals_at(Actuator)] / arm
 
 
 @every_task
@@ -67,7 +72,7 @@ def test_a_step_is_the_plain_composition_of_engine_bounds_and_task(task, kind):
         env.reset(seed=0)
         for before, action in zip(random_states(task, 7, 100), actions(task, 8, 100), strict=True):
             env.physics.reset(before)
-            after, actual = _plain_step(env, task, before, float(definition.desired_force(np.asarray(action))))
+            after, actual = _plain_step(env, task, before, desired_force(task, action))
             observation, reward, terminated, truncated, info = env.step(action)
             np.testing.assert_array_equal(env.state, after)
             assert info["actual_force"] == pytest.approx(actual, rel=1e-15)
@@ -88,7 +93,7 @@ def _episode(step, reset, forces, chosen, generator, low, high, rows, rewards, a
     reset(generator, low, high, rows[0], *arguments)
     for index in range(len(chosen)):
         force = forces[chosen[index]]
-        reward, terminated, fine, _, _, _, _, _, _ = step(force, rows[index + 1], *arguments)
+        reward, terminated, fine = step(force, rows[index + 1], *arguments)
         rewards[index] = reward
         if terminated or not fine:
             return index + 1
@@ -106,7 +111,7 @@ def test_a_compiled_loop_is_the_loop_over_the_environment_bit_for_bit(task, kind
     forces = parts.forces
     if forces is None:
         table = generator.uniform(-1, 1, (50, 1)).astype(np.float32) * ours.action_space.high
-        forces, chosen = np.array([theirs.setup.force(action) for action in table]), np.arange(50)
+        forces, chosen = np.array([theirs.setup.commands.force(action) for action in table]), np.arange(50)
         given = list(table)
     else:
         chosen = generator.integers(len(forces), size=50)

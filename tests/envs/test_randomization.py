@@ -1,6 +1,7 @@
 """Actuators and models drawn at resets: from the right distributions, the same alone and in a batch, and in effect."""
 
 import copy
+import dataclasses
 import math
 import pickle
 import re
@@ -12,11 +13,11 @@ import scipy.stats
 
 import codrl_mj
 from codrl_mj import Choice, LogUniform, Uniform
+from codrl_mj.actuators import Actuator, CurrentLoop, Supply, actuator_over, spectral_radius
+from codrl_mj.actuators.stability import spectral_radii, stability_radii
+from codrl_mj.engine.families import HEAD
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.motor import Actuator, CurrentLoop, spectral_radius, to_vector
-from codrl_mj.motor.stability import spectral_radii
-from codrl_mj.physics.screen import stability_radii
-from codrl_mj.tasks import TASKS
+from codrl_mj.tasks import TASKS, named_actuator
 from tests.envs.vectors import MODES, assert_equal_episodes, assert_same, batched, looped, random_actions
 from tests.tasks.faces import actions, gymnasiums, random_states
 
@@ -48,13 +49,11 @@ def scales(task):
 
 DISTURBED = {
     "command_delay": 0.03,
-    "current_noise": 0.1,
-    "supply_resistance": 2.0,
     "pulse_force": 1.0,
     "pulse_duration": 0.05,
     "pulse_interval": 0.1,
-    "joint_friction": 0.2,
 }
+IMPERFECT = {"controller": {"current_noise": 0.1}, "supply": {"resistance": 2.0}}
 
 
 def everything(task):
@@ -134,7 +133,12 @@ def test_drawn_episodes_are_those_of_single_environments(task, mode):
         {"action": "voltage", "levels": (-9.0, 9.0), "randomize": {"motor.inductance": Uniform(0.05, 0.2)}},
         {"integrator": "semi-implicit", "randomize": everything("cartpole"), "observe_actuator": True},
         {"inner_steps": 4, "randomize": everything("cartpole")},
-        {"disturbances": DISTURBED, "randomize": DRIVE | scales("cartpole")},
+        {
+            "actuator": actuator_over(named_actuator("paper", "cartpole"), IMPERFECT),
+            "disturbances": DISTURBED,
+            "joint": {"friction": 0.2},
+            "randomize": DRIVE | scales("cartpole"),
+        },
     ],
     ids=str,
 )
@@ -188,7 +192,7 @@ def test_the_drawn_actuator_is_what_acts(task, physics):
             np.testing.assert_array_equal(ours.state, same.state)
         trajectories.append(ours.state)
         if physics == "mujoco":
-            assert list(ours.model.actuator_user[0, : len(to_vector(actuator))]) == to_vector(actuator)
+            assert tuple(ours.model.actuator_user[0, HEAD:]) == actuator.numbers
     assert len(set(map(tuple, trajectories))) == 4
 
 
@@ -339,7 +343,7 @@ def test_what_is_drawn_has_the_drawn_length():
         np.testing.assert_array_equal(ours.model.geom("cart").size, nominal.model.geom("cart").size)
     many = batched("cartpole", 2, randomize={"model.length.pole": Uniform(0.5, 2)}, render_mode="rgb_array")
     lengths = many.reset(seed=0)[1]["randomization"]["model.length.pole"]
-    many.render()
+    many.image()
     np.testing.assert_allclose(many.unwrapped.physics.model.geom("pole").size[1], 0.5 * lengths[0], rtol=1e-15)
     many.close()
 
@@ -393,9 +397,11 @@ def test_unstable_draws_are_rejected_whole_and_counted():
 
 def test_a_winding_too_fast_for_its_supply_is_rejected():
     nominal = Actuator(controller=CurrentLoop(kp=0.5))
-    arguments = {"actuator": nominal, "randomize": {"motor.inductance": Uniform(0.02, 0.2)}}
+    arguments = {"randomize": {"motor.inductance": Uniform(0.02, 0.2)}}
     for ohms, least in ((0.0, 0.02), (7.0, 0.08)):  # (R + 7) * 0.02 < 2 L
-        env = batched("cartpole", 500, disturbances={"supply_resistance": ohms}, **arguments)
+        env = batched(
+            "cartpole", 500, actuator=dataclasses.replace(nominal, supply=Supply(resistance=ohms)), **arguments
+        )
         drawn = env.reset(seed=0)[1]["randomization"]
         assert least < drawn["motor.inductance"].min() < least + 0.005
         assert drawn["rejected"].any() == (ohms > 0)
@@ -427,34 +433,36 @@ def test_a_nominal_actuator_may_be_unstable_if_its_draws_are_not():
 
 def test_the_radius_of_one_is_that_among_many():
     generator = np.random.default_rng(0)
-    vectors = np.array([to_vector(Actuator())] * 300)
-    vectors[:, 5:9] = generator.uniform(0.0, [20.0, 50.0, 0.05, 1.0], (300, 4))
+    vectors = np.array([Actuator().numbers] * 300)
+    vectors[:, 4:8] = generator.uniform(0.0, [20.0, 50.0, 0.05, 1.0], (300, 4))
+    vectors[generator.random(300) < 0.3, 5] = 0.0
     vectors[generator.random(300) < 0.3, 6] = 0.0
-    vectors[generator.random(300) < 0.3, 7] = 0.0
-    vectors[:, 11] = generator.integers(1, 4, 300)
-    radii = spectral_radii(vectors, 0.05)
+    vectors[:, 10] = generator.integers(1, 4, 300)
+    radii = spectral_radii(Actuator, vectors, 0.05)
     assert (radii < 1.0).any()
     assert (radii > 1.0).any()
     for size in (1, 2, 7, 100):
-        parts = [spectral_radii(vectors[start : start + size], 0.05) for start in range(0, 300, size)]
+        parts = [spectral_radii(Actuator, vectors[start : start + size], 0.05) for start in range(0, 300, size)]
         np.testing.assert_array_equal(np.concatenate(parts), radii)
 
 
 def test_the_quick_proof_of_stability_and_the_radius_agree():
     generator = np.random.default_rng(1)
-    vectors = np.array([to_vector(Actuator())] * 20000)
-    vectors[:, 1:3] = np.exp(generator.uniform(-3.0, 1.0, (20000, 2)))
-    vectors[:, 5:8] = np.exp(generator.uniform(-9.0, 4.0, (20000, 3))) * (1.0, 1.0, 1e-3)
+    vectors = np.array([Actuator().numbers] * 20000)
+    vectors[:, 0:2] = np.exp(generator.uniform(-3.0, 1.0, (20000, 2)))
+    vectors[:, 4:7] = np.exp(generator.uniform(-9.0, 4.0, (20000, 3))) * (1.0, 1.0, 1e-3)
+    vectors[generator.random(20000) < 0.3, 5] = 0.0
     vectors[generator.random(20000) < 0.3, 6] = 0.0
-    vectors[generator.random(20000) < 0.3, 7] = 0.0
-    vectors[:, 11] = generator.integers(1, 4, 20000)
-    vectors[:, 12:14] = generator.choice([0.0, 1.0], (20000, 2)) * (10.0, 0.01)
-    radii, quick = spectral_radii(vectors, 0.02), stability_radii(vectors, 0.02)
+    vectors[:, 10] = generator.integers(1, 4, 20000)
+    vectors[:, 11:13] = generator.choice([0.0, 1.0], (20000, 2)) * (10.0, 0.01)
+    radii, quick = spectral_radii(Actuator, vectors, 0.02), stability_radii(Actuator, vectors, 0.02)
     np.testing.assert_array_equal(radii < 1.0, quick < 1.0)
     assert 0.02 < (radii >= 1.0).mean() < 0.9
     assert np.isin(quick, (0.0, np.inf)).mean() > 0.8  # it is what saves the time
-    edge = np.array([to_vector(Actuator(controller=CurrentLoop(kp=kp))) for kp in 9.0 + np.linspace(-1e-9, 1e-9, 401)])
-    np.testing.assert_array_equal(spectral_radii(edge, 0.02) < 1.0, stability_radii(edge, 0.02) < 1.0)
+    edge = np.array([Actuator(controller=CurrentLoop(kp=kp)).numbers for kp in 9.0 + np.linspace(-1e-9, 1e-9, 401)])
+    np.testing.assert_array_equal(
+        spectral_radii(Actuator, edge, 0.02) < 1.0, stability_radii(Actuator, edge, 0.02) < 1.0
+    )
 
 
 # -- saved and restored -------------------------------------------------------------------------------------
@@ -535,9 +543,12 @@ BAD = {
     ),
     "unknown body": ({"model.mass.bole": Uniform(1, 2)}, "did you mean 'model.mass.pole'"),
     "no length": ({"model.length.cart": Uniform(1, 2)}, "unknown field 'model.length.cart'"),
-    "field's bound": ({"motor.inductance": Uniform(0.0, 0.2)}, "Motor.inductance = 0: must be > 0"),
-    "field's bound below": ({"controller.kp": Uniform(-1.0, 0.2)}, "CurrentLoop.kp = -1: must be >= 0"),
-    "choice's bound": ({"controller.kp": Choice([1.0, -2.0])}, "CurrentLoop.kp = -2: must be >= 0"),
+    "field's bound": ({"motor.inductance": Uniform(0.0, 0.2)}, "Motor.inductance = 0.0: must be a finite number > 0"),
+    "field's bound below": (
+        {"controller.kp": Uniform(-1.0, 0.2)},
+        "CurrentLoop.kp = -1.0: must be a finite number >= 0",
+    ),
+    "choice's bound": ({"controller.kp": Choice([1.0, -2.0])}, "CurrentLoop.kp = -2.0: must be a finite number >= 0"),
     "infinite": ({"controller.kp": Choice([1.0, math.inf])}, "CurrentLoop.kp = inf: must be a finite number >= 0"),
     "substeps": ({"controller.substeps": Uniform(1, 4)}, "controller.substeps must be drawn from a Choice of int"),
     "substeps float": (
@@ -549,9 +560,12 @@ BAD = {
     "bool": ({"controller.kp": Choice([True])}, "controller.kp must be a number"),
     "mass": ({"model.mass.pole": Uniform(0.0, 1.0)}, "mass.pole = 0: must be a finite number > 0"),
     "damping": ({"model.damping.hinge": Uniform(-1.0, 1.0)}, "damping.hinge = -1: must be a finite number >= 0"),
-    "no distribution": ({"controller.kp": (1.0, 2.0)}, "must be a Uniform, LogUniform or Choice"),
-    "empty": ({}, "must be a mapping of one or more fields to distributions"),
-    "no mapping": ("motor.inductance", "must be a mapping of one or more fields to distributions"),
+    "no distribution": (
+        {"controller.kp": (1.0, 2.0)},
+        "controller.kp: (1.0, 2.0) is no distribution: must be uniform(",
+    ),
+    "empty": ({}, "must be one or more of FIELD=DISTRIBUTION, or a mapping of fields to these"),
+    "no mapping": ("motor.inductance", "must be one or more of FIELD=DISTRIBUTION, or a mapping of fields to these"),
 }
 
 

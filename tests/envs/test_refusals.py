@@ -6,10 +6,10 @@ import gymnasium
 import numpy as np
 import pytest
 
+from codrl_mj.actuators import Actuator, CurrentLoop, Motor
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.envs.registration import ENVIRONMENTS
-from codrl_mj.motor import Actuator, CurrentLoop, Motor
-from codrl_mj.physics import PHYSICS, SimulationDivergedError
+from codrl_mj.physics import SimulationDivergedError
+from codrl_mj.physics.registry import PHYSICS
 from codrl_mj.tasks import TASKS
 
 UNSTABLE = Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=100.0, max_voltage=float("inf")))
@@ -20,7 +20,10 @@ BAD = {
     "actuator": ({"actuator": "papr"}, "unknown actuator 'papr': did you mean 'paper'"),
     "actuator type": ({"actuator": 3.0}, r"actuator = 3.0: must be a name"),
     "actuator field": ({"actuator": {"motor": {"resistanze": 1}}}, "motor.resistanze; did you mean motor.resistance?"),
-    "actuator value": ({"actuator": {"motor": {"resistance": -1.0}}}, "Motor.resistance = -1: must be > 0"),
+    "actuator value": (
+        {"actuator": {"motor": {"resistance": -1.0}}},
+        "Motor.resistance = -1.0: must be a finite number > 0",
+    ),
     "physics": ({"physics": "bullet"}, "physics = 'bullet': must be one of mujoco, analytic"),
     "integrator": ({"integrator": "rk45"}, "integrator = 'rk45': cartpole has euler, semi-implicit"),
     "inner_steps": ({"inner_steps": 0}, "inner_steps = 0: must be an integer >= 1"),
@@ -70,7 +73,7 @@ def test_a_bad_view_is_refused(view, message, physics):
     "action", [np.nan, None, "left", 7, -1, 1.5, [0, 1], np.array([np.nan], np.float32), {}], ids=repr
 )
 def test_a_bad_action_is_refused_and_changes_nothing(task, action):
-    env = gymnasium.make(ENVIRONMENTS[task].env_id, disable_env_checker=True).unwrapped
+    env = gymnasium.make(TASKS[task].env_id, disable_env_checker=True).unwrapped
     env.reset(seed=0)
     before = env.state
     with pytest.raises(ValueError, match="action") as refused:

@@ -9,8 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from codrl_mj.envs.registration import ENVIRONMENTS
-from codrl_mj.physics import PHYSICS
+from codrl_mj.physics.registry import PHYSICS
 from codrl_mj.tasks import TASKS
 
 every_task = pytest.mark.parametrize("task", TASKS)
@@ -24,7 +23,7 @@ def make(request):
 
     def make(task="cartpole", **options):
         view = {"render_mode": "rgb_array", "width": 120, "height": 90}
-        made.append(gymnasium.make(ENVIRONMENTS[task].env_id, **{**view, **options}))
+        made.append(gymnasium.make(TASKS[task].env_id, **{**view, **options}))
         return made[-1]
 
     yield make
@@ -139,7 +138,7 @@ def test_without_a_render_mode_there_is_a_warning_and_no_image(make):
 
 @every_task
 def test_the_frame_rate_is_gymnasiums(task):
-    ours, theirs = gymnasium.make(ENVIRONMENTS[task].env_id), gymnasium.make(TASKS[task].gymnasium_id)
+    ours, theirs = gymnasium.make(TASKS[task].env_id), gymnasium.make(TASKS[task].gymnasium_id)
     assert ours.unwrapped.metadata["render_fps"] == theirs.metadata["render_fps"]
 
 

@@ -8,11 +8,12 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from codrl_mj.actuators import Actuator, CurrentLoop, Motor, spectral_radius
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.motor import Actuator, CurrentLoop, Motor, spectral_radius
-from codrl_mj.physics import PHYSICS, SimulationDivergedError
+from codrl_mj.physics import SimulationDivergedError
+from codrl_mj.physics.registry import PHYSICS
 from codrl_mj.tasks import TASKS
-from tests.motor.strategies import between, zero_or
+from tests.actuators.strategies import between, zero_or
 
 every_task = pytest.mark.parametrize("task", TASKS)
 WILD = Actuator(Motor(), CurrentLoop(kp=1000.0, max_voltage=float("inf")))

@@ -12,7 +12,6 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecMonitor, VecNormalize
 
 import codrl_mj
-from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.envs.sb3 import ActuatedVecEnv
 from codrl_mj.tasks import TASKS
 from tests.envs.vectors import random_actions
@@ -21,11 +20,11 @@ every_task = pytest.mark.parametrize("task", TASKS)
 
 
 def batched(task, num_envs, **arguments):
-    return codrl_mj.make_sb3_vec_env(ENVIRONMENTS[task].env_id, num_envs, **arguments)
+    return codrl_mj.make_sb3_vec_env(TASKS[task].env_id, num_envs, **arguments)
 
 
 def looped(task, num_envs, **arguments):
-    make = ENVIRONMENTS[task].env_id
+    make = TASKS[task].env_id
     return DummyVecEnv([lambda: Monitor(gymnasium.make(make, disable_env_checker=True, **arguments))] * num_envs)
 
 
@@ -127,7 +126,7 @@ def test_seeds_count_up_and_are_used_once():
     env = batched("cartpole", 3)
     assert list(env.seed(5)) == [5, 6, 7]
     first = env.reset()
-    single = gymnasium.make(ENVIRONMENTS["cartpole"].env_id)
+    single = gymnasium.make(TASKS["cartpole"].env_id)
     for row in range(3):
         np.testing.assert_array_equal(first[row], single.reset(seed=5 + row)[0])
     second = env.reset()
@@ -162,8 +161,8 @@ def test_signals_of_the_last_step_are_arrays():
     env.reset()
     env.step(np.array([0, 1, 0, 1]))
     assert env.signals is not None
-    np.testing.assert_array_equal(env.signals.desired_force, [-10.0, 10.0, -10.0, 10.0])
-    assert env.signals.current.shape == (4,)
+    np.testing.assert_array_equal(env.signals["desired_force"], [-10.0, 10.0, -10.0, 10.0])
+    assert env.signals["current"].shape == (4,)
 
 
 def test_rendering_shows_the_first_environment():

@@ -10,8 +10,7 @@ import pytest
 import codrl_mj
 from codrl_mj import Uniform
 from codrl_mj.envs import ActuatedEnv, SerialVectorEnv
-from codrl_mj.motor import named_actuator
-from codrl_mj.tasks import TASKS
+from codrl_mj.tasks import TASKS, named_actuator
 from tests.envs.snapshots import everything
 from tests.envs.vectors import assert_equal_episodes, assert_same, batched, looped, random_actions
 
@@ -41,7 +40,7 @@ def test_signals_and_draws_are_those_of_the_batched_environment(task):
             theirs.reset(options={"reset_mask": mask})
         ours.step(actions)
         theirs.step(actions)
-        assert_same(ours.signals._asdict(), theirs.signals._asdict(), f"step {index}")
+        assert_same(ours.signals, theirs.signals, f"step {index}")
         assert_same(ours.randomization, theirs.randomization, f"step {index}")
 
 
@@ -89,7 +88,7 @@ def test_each_can_have_an_actuator_of_its_own():
     for row, actuator in enumerate(actuators):
         single = ActuatedEnv("cartpole", actuator, "analytic", randomize={"motor.resistance": Uniform(1, 2)})
         assert single.reset(seed=3 + row)[1]["randomization"]["motor.resistance"] == drawn[row]
-        assert single.step(1)[4]["current"] == env.signals.current[row]
+        assert single.step(1)[4]["current"] == env.signals["current"][row]
 
 
 def test_rendering_shows_the_first_environment():
@@ -110,7 +109,7 @@ def test_rendering_shows_the_first_environment():
     [
         ({"num_envs": 0}, "num_envs = 0: must be an integer >= 1"),
         ({"num_envs": 2.0}, "num_envs = 2.0: must be an integer >= 1"),
-        ({"max_episode_steps": 0}, "max_episode_steps = 0: must be >= 1"),
+        ({"max_episode_steps": 0}, "max_episode_steps = 0: must be an integer >= 1"),
         ({"physics": "newton"}, "physics = 'newton'"),
         ({"actuator": [named_actuator("weak", "pendulum")] * 3}, "actuator: 3 actuators for 2 environments"),
         ({"center_radius": 1.0}, "unknown option 'center_radius' of pendulum"),

@@ -11,7 +11,6 @@ from safetensors.numpy import load, load_file, save, save_file
 import codrl_mj
 from codrl_mj import Uniform
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.tasks import TASKS
 from tests.envs.snapshots import PHYSICS, STEPS, everything, run_several, run_single, several, single
 from tests.envs.vectors import assert_same
@@ -203,7 +202,7 @@ def test_a_foreign_generator_is_refused():
 
 @both_physics
 def test_other_numbers_of_environments_are_refused(physics):
-    make = ENVIRONMENTS["cartpole"].env_id
+    make = TASKS["cartpole"].env_id
     arguments = everything("cartpole", physics)
     three, four = (codrl_mj.make_sb3_vec_env(make, count, **arguments) for count in (3, 4))
     before = three.snapshot()

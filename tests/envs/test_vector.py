@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
+from codrl_mj.actuators import Actuator, CurrentLoop, Motor
 from codrl_mj.envs import ActuatedEnv, ActuatedVectorEnv
-from codrl_mj.envs.registration import ENVIRONMENTS
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.setup import Setup
-from codrl_mj.motor import Actuator, CurrentLoop, Motor
-from codrl_mj.physics import Signals
 from codrl_mj.tasks import TASKS
-from tests.callbacks.models import FULL, changed
+from tests.engine.models import FULL, changed
 from tests.envs.vectors import MODES, assert_equal_episodes, assert_same, batched, looped, random_actions
 from tests.tasks.faces import random_states
 
@@ -46,7 +45,7 @@ def test_episodes_are_those_of_single_environments(task, mode, actuator):
 
 @every_task
 def test_episodes_are_equal_over_the_registered_time_limit_and_end_both_ways(task):
-    steps = min(ENVIRONMENTS[task].max_episode_steps + 20, 230)
+    steps = min(TASKS[task].max_episode_steps + 20, 230)
     arguments = {"max_episode_steps": 60} if task == "acrobot" else {}
     ends = assert_equal_episodes(batched(task, 3, **arguments), looped(task, 3, **arguments), steps, masks=False)
     if task == "cartpole":
@@ -82,7 +81,7 @@ def test_each_environment_may_have_its_own_actuator(task, mode):
     runs = [batched(task, 7, mode, num_threads=threads, **arguments) for threads in (1, 2)]
     for ours in runs:
         assert_equal_episodes(ours, looped(task, 7, mode, **arguments), 30)
-    currents = runs[0].unwrapped.signals.current
+    currents = runs[0].unwrapped.signals["current"]
     assert len(np.unique(currents)) == 7  # the parameters arrive
 
 
@@ -172,12 +171,12 @@ def test_spaces_spec_and_metadata_are_those_of_gymnasiums_loop(task):
     assert ours.num_envs == 3
     for name in ("action_space", "observation_space", "single_action_space", "single_observation_space"):
         assert getattr(ours, name) == getattr(theirs, name), name
-    assert ours.spec.id == theirs.spec.id == ENVIRONMENTS[task].env_id
+    assert ours.spec.id == theirs.spec.id == TASKS[task].env_id
     assert ours.spec.kwargs["vectorization_mode"] == "vector_entry_point"
     assert ours.metadata == theirs.metadata
-    assert ours.unwrapped.max_episode_steps == ENVIRONMENTS[task].max_episode_steps
+    assert ours.unwrapped.max_episode_steps == TASKS[task].max_episode_steps
     assert gymnasium.make_vec(ours.spec).num_envs == 3
-    assert gymnasium.make_vec(ENVIRONMENTS[task].env_id, 2).unwrapped.num_envs == 2  # the default mode is ours
+    assert gymnasium.make_vec(TASKS[task].env_id, 2).unwrapped.num_envs == 2  # the default mode is ours
     assert ActuatedVectorEnv.metadata["render_modes"] == ["rgb_array"]
 
 
@@ -323,24 +322,28 @@ def test_a_snapshot_of_others_is_refused_and_nothing_changes():
 # -- rendering ----------------------------------------------------------------------------------------------
 
 
-def test_rendering_shows_the_first_environment_and_leaves_the_episode_alone():
+def test_rendering_shows_every_environment_and_leaves_the_episode_alone():
     arguments = {"render_mode": "rgb_array", "width": 64, "height": 48}
     env, control = batched("pendulum", 3, **arguments), batched("pendulum", 3)
-    single = gymnasium.make(ENVIRONMENTS["pendulum"].env_id, **arguments)
+    singles = [gymnasium.make(TASKS["pendulum"].env_id, **arguments) for _ in range(3)]
     for one in (env, control):
         one.reset(seed=1)
-    single.reset(seed=1)
+    for row, single in enumerate(singles):
+        single.reset(seed=1 + row)
     for _ in range(5):
-        image = env.render()
-        np.testing.assert_array_equal(image, single.render())
+        np.testing.assert_array_equal(env.render(), [single.render() for single in singles])
         actions = np.full((3, 1), 2.0, np.float32)
         assert_same(env.step(actions), control.step(actions))
-        single.step(actions[0])
+        for single in singles:
+            single.step(actions[0])
+    env.set_attr("l", [1.0, 0.5, 2.0])
+    singles[1].set_wrapper_attr("l", 0.5)
     twin = copy.deepcopy(env)
     np.testing.assert_array_equal(twin.render(), env.render())
-    assert env.render().shape == (48, 64, 3)
-    assert env.render().dtype == np.uint8
-    for one in (env, twin, single):
+    np.testing.assert_array_equal(env.image(1), singles[1].render())
+    assert env.image().shape == (48, 64, 3)
+    assert env.image().dtype == np.uint8
+    for one in (env, twin, *singles):
         one.close()
 
 
@@ -369,15 +372,13 @@ def test_an_actuator_in_any_form_is_the_same():
 
 @every_task
 def test_observation_reward_and_end_of_one_state_are_those_of_a_batch_to_the_last_bit(task):
-    setup = Setup.build(task)
+    setup = Setup.build(EnvConfig(task))
     before, after = (random_states(task, seed, 3000) for seed in (0, 1))
-    forces = np.random.default_rng(2).uniform(-1, 1, 3000) * setup.max_force
-    nothing = np.zeros(3000)
-    signals = Signals(forces, forces, nothing, nothing, nothing, nothing > 0)
-    observations, rewards = setup.observation(after, signals), setup.rewards(before, signals, after)
+    forces = np.random.default_rng(2).uniform(-1, 1, 3000) * setup.commands.max_forces
+    view = setup.view
+    observations, rewards = view.observation(after, None), view.rewards(before, forces, after)
     terminated = np.broadcast_to(setup.task.terminated(after.T), 3000)
     for row in range(3000):
-        one = Signals(forces[row], float(forces[row]), 0.0, 0.0, 0.0, False)
-        assert np.array_equal(setup.observation(after[row], one), observations[row]), row
-        assert setup.reward(before[row], one, after[row]) == rewards[row], row
-        assert setup.terminated(after[row]) == terminated[row], row
+        assert np.array_equal(view.observation(after[row], None), observations[row]), row
+        assert view.reward(before[row], float(forces[row]), after[row]) == rewards[row], row
+        assert view.terminated(after[row]) == terminated[row], row

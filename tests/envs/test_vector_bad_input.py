@@ -8,12 +8,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from codrl_mj.callbacks import CallbackInUseError
+from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.engine import CallbackInUseError
 from codrl_mj.envs import ActuatedVectorEnv
-from codrl_mj.motor import Actuator, CurrentLoop, Motor
 from codrl_mj.physics import SimulationDivergedError
 from codrl_mj.tasks import TASKS
-from tests.callbacks.models import changed
+from tests.engine.models import changed
 from tests.envs.vectors import MODES, assert_same, batched, looped, random_actions
 
 every_task = pytest.mark.parametrize("task", TASKS)
@@ -26,7 +26,9 @@ BAD = {
     "negative": ({"num_envs": -3}, "num_envs = -3: must be an integer >= 1"),
     "half": ({"num_envs": 1.5}, "num_envs = 1.5: must be an integer >= 1"),
     "bool": ({"num_envs": True}, "num_envs = True: must be an integer >= 1"),
-    "limit": ({"max_episode_steps": 0}, "max_episode_steps = 0: must be >= 1"),
+    "limit": ({"max_episode_steps": 0}, "max_episode_steps = 0: must be an integer >= 1"),
+    "half a limit": ({"max_episode_steps": 1.5}, "max_episode_steps = 1.5: must be an integer >= 1"),
+    "bool as a limit": ({"max_episode_steps": True}, "max_episode_steps = True: must be an integer >= 1"),
     "threads": ({"num_threads": -1}, "num_threads = -1: must be an integer >= 0"),
     "threads type": ({"num_threads": "2"}, "num_threads = '2': must be an integer >= 0"),
     "physics": ({"physics": "analytic"}, "one Gymnasium environment at a time: use vectorization_mode='sync' for it"),

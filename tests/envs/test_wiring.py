@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.physics import PHYSICS
-from codrl_mj.physics.analytic import DRIVERS
+from codrl_mj.physics.registry import PHYSICS
 from codrl_mj.tasks import TASKS
-from tests.callbacks.models import FULL, changed
+from tests.engine.models import FULL, changed
 from tests.reference import MotorSimulation
+from tests.tasks.faces import desired_force
 
 SPEED = {"pendulum": 1, "cartpole": 1, "acrobot": 3, "mountain_car": 1, "mountain_car_continuous": 1}
 STEPS = {"pendulum": 60, "cartpole": 40, "acrobot": 15, "mountain_car": 30, "mountain_car_continuous": 30}
@@ -39,7 +39,7 @@ OFF = {  # feature -> the change that takes it away, and what else both sides of
 
 def _episode(task, physics, actuator):
     """States and forces of an episode under random actions, as the environment and as the oracle have them."""
-    env, driver = ActuatedEnv(task, actuator=actuator, physics=physics), DRIVERS[task](TASKS[task].gymnasium_id)
+    env, driver = ActuatedEnv(task, actuator=actuator, physics=physics), TASKS[task].twin()
     env.reset(seed=0)
     env.action_space.seed(0)
     motor, state = MotorSimulation(actuator), env.state
@@ -48,7 +48,7 @@ def _episode(task, physics, actuator):
     for _ in range(STEPS[task]):
         action = env.action_space.sample()
         info = env.step(action)[-1]
-        desired = float(env.task.desired_force(np.asarray(action)))
+        desired = desired_force(task, action)
         for _ in range(env.task.motor_inner_steps):
             delivered = motor.step(dt, desired, state[SPEED[task]])
             state = np.array(driver(state, delivered, dt, env.setup.integrator))

@@ -6,16 +6,14 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import codrl_mj  # noqa: F401 - registers the environments
 from codrl_mj.envs import ActuatedVectorEnv
-from codrl_mj.envs.registration import ENVIRONMENTS
+from codrl_mj.tasks import TASKS
 
 MODES = tuple(mode.value for mode in AutoresetMode)
 
 
 def batched(task, num_envs, mode="NextStep", **arguments):
     """Ours, as a user makes it."""
-    return gymnasium.make_vec(
-        ENVIRONMENTS[task].env_id, num_envs, "vector_entry_point", autoreset_mode=mode, **arguments
-    )
+    return gymnasium.make_vec(TASKS[task].env_id, num_envs, "vector_entry_point", autoreset_mode=mode, **arguments)
 
 
 def looped(task, num_envs, mode="NextStep", **arguments):
@@ -23,8 +21,8 @@ def looped(task, num_envs, mode="NextStep", **arguments):
     actuators = arguments.pop("actuator", "paper")
     if not isinstance(actuators, list):
         options = {"autoreset_mode": AutoresetMode(mode)}
-        return gymnasium.make_vec(ENVIRONMENTS[task].env_id, num_envs, "sync", options, actuator=actuators, **arguments)
-    single = ENVIRONMENTS[task].env_id
+        return gymnasium.make_vec(TASKS[task].env_id, num_envs, "sync", options, actuator=actuators, **arguments)
+    single = TASKS[task].env_id
     makers = [lambda one=one: gymnasium.make(single, actuator=one, **arguments) for one in actuators]
     return SyncVectorEnv(makers, autoreset_mode=mode)
 

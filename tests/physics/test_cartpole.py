@@ -1,13 +1,15 @@
 """CartPole in MuJoCo against the installed Gymnasium, with and without a motor."""
 
+from types import SimpleNamespace
+
 import gymnasium
 import mujoco
 import numpy as np
 import pytest
 
-from codrl_mj.motor import NAMED, Actuator, CurrentLoop, Motor, named_actuator
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError, motors
-from codrl_mj.tasks import TASKS
+from codrl_mj.actuators import IDEAL, NAMED, Actuator, CurrentLoop, Motor
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError, motors, trace_names
+from codrl_mj.tasks import TASKS, named_actuator
 from codrl_mj.tasks.assets import asset_path
 from tests.reference import MotorSimulation
 
@@ -28,13 +30,19 @@ def _gymnasium_step(env, state, force):
     return np.array(env.state)
 
 
+def _step(physics, force):
+    """Step, and say what the actuator did."""
+    physics.step(force)
+    return SimpleNamespace(**dict(zip(trace_names(physics.family), physics.trace[-1, 0].tolist(), strict=True)))
+
+
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_one_step_is_gymnasiums_from_ten_thousand_states_under_as_many_forces(integrator):
     generator = np.random.default_rng(0)
     high = np.array([2.4, 5.0, np.pi, 10.0])
     states = generator.uniform(-high, high, (10_000, 4))
     forces = generator.uniform(-10.0, 10.0, 10_000)
-    physics, env = MujocoPhysics(TASK, None, 1, integrator), _gymnasium(integrator)
+    physics, env = MujocoPhysics(TASK, [IDEAL], 1, integrator), _gymnasium(integrator)
     found, expected = np.empty_like(states), np.empty_like(states)
     for index, (state, force) in enumerate(zip(states, forces, strict=True)):
         physics.reset(state)
@@ -48,7 +56,7 @@ def test_one_step_is_gymnasiums_from_ten_thousand_states_under_as_many_forces(in
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_the_two_integrators_are_not_the_same(integrator):
     other = INTEGRATORS[1 - INTEGRATORS.index(integrator)]
-    one, two = MujocoPhysics(TASK, None, 1, integrator), MujocoPhysics(TASK, None, 1, other)
+    one, two = MujocoPhysics(TASK, [IDEAL], 1, integrator), MujocoPhysics(TASK, [IDEAL], 1, other)
     for physics in (one, two):
         physics.reset(np.array([0.0, 0.0, 0.1, 0.0]))
         physics.step(10.0)
@@ -58,7 +66,7 @@ def test_the_two_integrators_are_not_the_same(integrator):
 @pytest.mark.parametrize("physics", [MujocoPhysics, AnalyticPhysics])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_inner_steps_are_gymnasium_steps_of_a_fraction_of_the_time(physics, integrator):
-    simulation, env = physics(TASK, None, 5, integrator), _gymnasium(integrator, 0.004)
+    simulation, env = physics(TASK, [IDEAL], 5, integrator), _gymnasium(integrator, 0.004)
     state = np.array([0.1, -0.2, 0.05, 0.3])
     simulation.reset(state)
     for force in np.random.default_rng(1).uniform(-10, 10, 50):
@@ -75,13 +83,13 @@ def test_inner_steps_are_gymnasium_steps_of_a_fraction_of_the_time(physics, inte
 def test_the_motor_in_the_loop_is_the_reference_driving_gymnasium(physics, integrator, inner_steps, name):
     """The whole chain by hand: the reference motor turns desired into delivered force, Gymnasium moves."""
     actuator = named_actuator(name, "cartpole")
-    simulation = physics(TASK, actuator, inner_steps, integrator)
+    simulation = physics(TASK, [actuator], inner_steps, integrator)
     env, motor = _gymnasium(integrator, 0.02 / inner_steps), MotorSimulation(actuator)
     state = np.array([0.01, -0.02, 0.03, 0.04])
     simulation.reset(state)
     for step in range(100):
         desired = 10.0 if state[2] + 0.5 * state[3] > 0 else -10.0
-        signals = simulation.step(desired)
+        signals = _step(simulation, desired)
         for _ in range(inner_steps):
             delivered = motor.step(0.02 / inner_steps, desired, state[1])
             state = _gymnasium_step(env, state, delivered)
@@ -108,14 +116,15 @@ def _linear(state, generator):
 
 def episode_errors(actuator, policy, integrator="euler", inner_steps=1, steps=500, seed=0):
     """Largest distance between both physics over an episode that no end interrupts; each acts on its own state."""
-    both = [kind(TASK, actuator, inner_steps, integrator) for kind in (MujocoPhysics, AnalyticPhysics)]
+    both = [kind(TASK, [actuator], inner_steps, integrator) for kind in (MujocoPhysics, AnalyticPhysics)]
     start, worst = np.random.default_rng(seed).uniform(-0.05, 0.05, 4), 0.0
     generators = [np.random.default_rng(seed) for _ in both]
     for physics in both:
         physics.reset(start)
     for _ in range(steps):
         one, two = (
-            physics.step(policy(physics.state, generator)) for physics, generator in zip(both, generators, strict=True)
+            _step(physics, policy(physics.state, generator))
+            for physics, generator in zip(both, generators, strict=True)
         )
         worst = max(worst, np.abs(both[0].state - both[1].state).max(), abs(one.actual_force - two.actual_force))
     return worst
@@ -139,13 +148,13 @@ def test_both_physics_agree_with_inner_steps(integrator, inner_steps):
 def test_saturation_is_reported():
     actuator = Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=4.3, max_voltage=2.0))
     for kind in (MujocoPhysics, AnalyticPhysics):
-        physics = kind(TASK, actuator, 1, "euler")
+        physics = kind(TASK, [actuator], 1, "euler")
         physics.reset(np.zeros(4))
-        first = physics.step(10.0)
+        first = _step(physics, 10.0)
         assert first.saturated
         assert first.voltage == 2.0
         for _ in range(20):
-            last = physics.step(0.0)
+            last = _step(physics, 0.0)
         assert not last.saturated
 
 
@@ -185,7 +194,7 @@ def test_a_diverging_simulation_is_reported_with_task_time_and_entry_and_works_a
     kind, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)  # the engine writes a log
-    physics = kind(TASK, UNSTABLE, 1, "euler")
+    physics = kind(TASK, [UNSTABLE], 1, "euler")
     physics.reset(np.zeros(4))
 
     def run():
@@ -195,5 +204,5 @@ def test_a_diverging_simulation_is_reported_with_task_time_and_entry_and_works_a
     with pytest.raises(SimulationDivergedError, match=r"cartpole: .*diverged at t = [\d.]+ s: .*(x|theta).* = "):
         run()
     physics.reset(np.zeros(4))
-    assert np.isfinite(physics.step(1.0).current)
+    assert np.isfinite(_step(physics, 1.0).current)
     assert np.isfinite(physics.state).all()

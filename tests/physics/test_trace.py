@@ -3,34 +3,27 @@
 import numpy as np
 import pytest
 
+from codrl_mj.actuators import Actuator, CurrentLoop, Inputs, Motor, Supply, parameters_type
 from codrl_mj.disturbances import Disturbances
-from codrl_mj.motor import Actuator, CurrentLoop, Motor, advance, named_actuator, to_vector
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics
-from codrl_mj.physics.base import (
-    TRACE_ACTUAL_FORCE,
-    TRACE_CURRENT,
-    TRACE_DESIRED_FORCE,
-    TRACE_SATURATED,
-    TRACE_SPEED,
-    TRACE_VOLTAGE,
-)
-from codrl_mj.tasks import TASKS
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, trace_names
+from codrl_mj.tasks import TASKS, named_actuator
+
+DESIRED, ACTUAL, CURRENT, REFERENCE, VOLTAGE, SATURATED, SPEED = range(7)
 
 STEPS = 20
 
 
 def _physics(kind, task, actuator="paper", **more):
     definition = TASKS[task]
-    motor = None if actuator == "ideal" else named_actuator(actuator, task)
     inner_steps = max(3, definition.motor_inner_steps)
-    physics = kind(definition, motor, inner_steps, definition.integrators[0], **more)
+    physics = kind(definition, [named_actuator(actuator, task)], inner_steps, definition.integrators[0], **more)
     physics.reset(np.full(len(definition.state_names), 0.05))
     return physics
 
 
 def _traces(physics, seed=0):
     forces = np.random.default_rng(seed).uniform(-1, 1, STEPS) * physics.task.max_force
-    return forces, np.array([(physics.step(float(force)), physics.trace.copy())[1] for force in forces])
+    return forces, np.array([(physics.step(float(force)), physics.trace[:, 0].copy())[1] for force in forces])
 
 
 @pytest.mark.parametrize("kind", [MujocoPhysics, AnalyticPhysics])
@@ -39,30 +32,39 @@ def test_every_row_follows_from_the_row_before_by_the_loops_own_equations(kind, 
     physics = _physics(kind, task)
     speed_at_start = 0.05
     forces, traces = _traces(physics)
-    actuator, vector = physics.actuator, to_vector(physics.actuator)
+    assert trace_names(physics.family) == (
+        *("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated", "speed"),
+    )
+    actuator = named_actuator("paper", task)
+    parameters = parameters_type(Actuator)(*actuator.numbers)
     arm, timestep = actuator.motor.arm_radius, physics.task.step_duration / physics.inner_steps
-    loop, speed = (0.0, 0.0, 0.0), speed_at_start
+    loop, speed = Actuator.State(0.0, 0.0, 0.0), speed_at_start
     for force, trace in zip(forces, traces, strict=True):
-        assert trace.shape == (physics.inner_steps, 6)
+        assert trace.shape == (physics.inner_steps, 7)
         for row in trace:
-            *loop, voltage = advance(vector, timestep, *loop, force * arm, speed / arm)
-            assert row[TRACE_DESIRED_FORCE] == force
-            np.testing.assert_allclose(row[[TRACE_CURRENT, TRACE_VOLTAGE]], [loop[0], voltage], rtol=1e-9, atol=1e-9)
-            np.testing.assert_allclose(
-                row[TRACE_ACTUAL_FORCE], actuator.motor.torque_constant * row[TRACE_CURRENT] / arm, rtol=1e-12
-            )
-            loop, speed = (row[TRACE_CURRENT], *loop[1:]), row[TRACE_SPEED]
+            inputs = Inputs(force * arm, 0.0, speed / arm, 0.0, 0.0)
+            loop, _, signals = actuator.advance(parameters, timestep, loop, inputs)
+            assert row[DESIRED] == force
+            np.testing.assert_allclose(row[[CURRENT, VOLTAGE]], [loop.current, signals.voltage], rtol=1e-9, atol=1e-9)
+            assert row[REFERENCE] == signals.reference_current
+            np.testing.assert_allclose(row[ACTUAL], actuator.motor.torque_constant * row[CURRENT] / arm, rtol=1e-12)
+            loop, speed = loop._replace(current=row[CURRENT]), row[SPEED]
 
 
 @pytest.mark.parametrize("actuator", ["ideal", "weak"])
 @pytest.mark.parametrize("task", TASKS)
-def test_the_last_row_is_what_the_step_says_of_its_end(task, actuator):
+def test_the_last_row_is_what_the_engine_says_of_the_steps_end(task, actuator):
     physics = _physics(MujocoPhysics, task, actuator)
     for _ in range(STEPS):
-        signals, last = physics.step(0.5 * physics.task.max_force), physics.trace[-1]
-        assert (signals.desired_force, signals.actual_force, signals.current, signals.voltage) == tuple(last[:4])
-        assert last[TRACE_SATURATED] == signals.saturated
-        assert last[TRACE_SPEED] == physics.data.qvel[physics.model.actuator("motor").trnid[0]]
+        physics.step(0.5 * physics.task.max_force)
+        last, dof = physics.trace[-1, 0], physics.model.actuator("motor").trnid[0]
+        assert last[DESIRED] == 0.5 * physics.task.max_force
+        np.testing.assert_allclose(last[ACTUAL], physics.data.qfrc_actuator[dof], rtol=1e-14)
+        assert last[SPEED] == physics.data.qvel[dof]
+        if actuator == "ideal":
+            np.testing.assert_array_equal(last[CURRENT : SATURATED + 1], 0.0)
+        else:
+            np.testing.assert_array_equal(last[CURRENT : SATURATED + 1], physics.data.act[-5:-1])
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -71,7 +73,7 @@ def test_both_physics_leave_the_same_trace(task):
     pair = [_physics(kind, task, disturbances=disturbances) for kind in (MujocoPhysics, AnalyticPhysics)]
     (forces, ours), (_, theirs) = (_traces(physics) for physics in pair)
     np.testing.assert_allclose(ours[:8], theirs[:8], rtol=0, atol=1e-9)
-    delayed = ours[:, :, TRACE_DESIRED_FORCE]
+    delayed = ours[:, :, DESIRED]
     assert not (delayed == forces[:, np.newaxis]).all(), "the command arrives as it was given"
 
 
@@ -84,13 +86,13 @@ def physics_step(task):
 @pytest.mark.parametrize("kind", [MujocoPhysics, AnalyticPhysics])
 def test_the_integration_steps_are_marked_in_which_the_voltage_is_at_its_sagging_limit(kind):
     task, limit, supply_resistance = TASKS["cartpole"], 2.0, 0.8
-    actuator = Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=2.0, max_voltage=limit))
-    disturbances = Disturbances(supply_resistance=supply_resistance)
-    physics = kind(task, actuator, 3, "euler", disturbances=disturbances)
+    loop = CurrentLoop(kp=2.0, max_voltage=limit)
+    actuator = Actuator(Motor(arm_radius=0.15), loop, Supply(resistance=supply_resistance))
+    physics = kind(task, [actuator], 3, "euler")
     _, traces = _traces(physics)
     rows = traces.reshape(-1, traces.shape[-1])
-    before = np.append(0.0, rows[:-1, TRACE_CURRENT])  # the supply sags by the current at the step's start
+    before = np.append(0.0, rows[:-1, CURRENT])  # the supply sags by the current at the step's start
     available = limit - supply_resistance * np.abs(before)
-    expected = np.abs(rows[:, TRACE_VOLTAGE]) >= available * (1 - 1e-12)
-    np.testing.assert_array_equal(rows[:, TRACE_SATURATED].astype(bool), expected)
+    expected = np.abs(rows[:, VOLTAGE]) >= available * (1 - 1e-12)
+    np.testing.assert_array_equal(rows[:, SATURATED].astype(bool), expected)
     assert 0 < expected.sum() < len(expected)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from codrl_mj.envs.distributions import parse
-from codrl_mj.evaluation import make_env
 from codrl_mj.study.conditions import check_condition, conditions, every_condition, ladder, stall_supply
 from codrl_mj.study.experiments import EXPERIMENTS
 from codrl_mj.study.plan import AGENTS, Arm
@@ -84,16 +83,16 @@ def test_conditions_differ_from_the_papers_actuator_only_in_what_their_names_say
     paper = main_arm(task, "paper")
     step = find_task(task).step_duration
     expected = {
-        "slow_winding": {"actuator.motor.inductance"},
-        "low_voltage": {"actuator.controller.max_voltage"},
-        "stall_supply": {"actuator.controller.max_voltage"},
+        "slow_winding": {"env.actuator.motor.inductance"},
+        "low_voltage": {"env.actuator.controller.max_voltage"},
+        "stall_supply": {"env.actuator.controller.max_voltage"},
         "delay": {"env.disturbances.command_delay"},
         "randomised": {"env.randomize"},
     }
     for name, fields in expected.items():
         assert differing(main_arm(task, name), paper) == fields, name
     for name in ("weak", "weaker"):
-        assert all(field.startswith("actuator.controller.k") for field in differing(main_arm(task, name), paper))
+        assert all(field.startswith("env.actuator.controller.k") for field in differing(main_arm(task, name), paper))
     assert conditions(task)["delay"].env.disturbances.command_delay == step
     motor = conditions(task)["paper"].actuator.motor
     holding = stall_supply(task).actuator.controller.max_voltage / motor.resistance * motor.torque_constant
@@ -104,11 +103,11 @@ def test_conditions_differ_from_the_papers_actuator_only_in_what_their_names_say
 def test_each_rung_of_the_ladder_adds_one_thing(task):
     rungs = list(ladder(task))
     added = {
-        "paper": "actuator.controller.",
-        "low_voltage": "actuator.controller.max_voltage",
+        "paper": "env.actuator.controller.",
+        "low_voltage": "env.actuator.controller.max_voltage",
         "late": "env.disturbances.command_delay",
         "coarse": "env.disturbances.command_quantum",
-        "sagging": "env.disturbances.supply_resistance",
+        "sagging": "env.actuator.supply",
     }
     assert rungs == ["ideal", "winding", *(name for name in added if name != "coarse" or task not in DISCRETE)]
     for before, rung in itertools.pairwise(rungs[1:]):
@@ -126,7 +125,7 @@ def test_each_rung_of_the_ladder_adds_one_thing(task):
 @pytest.mark.parametrize("task", TASKS)
 def test_the_ideal_actuator_is_integrated_as_the_others_are(task):
     for condition in every_condition(task).values():
-        env = make_env(task, condition.actuator, **condition.env.as_arguments())
+        env = condition.env.make()
         assert env.unwrapped.model.opt.timestep == find_task(task).step_duration / find_task(task).motor_inner_steps
 
 
@@ -136,7 +135,7 @@ def test_variants_of_a_training_differ_in_one_thing(task):
     assert differing(main_arm(task, "paper", observe=True), force) == {"env.observe_actuator"}
     levels = {"env.levels"} if task in DISCRETE else set()
     assert differing(main_arm(task, "paper", action="voltage"), force) == {"env.action"} | levels
-    reward = {"env.center_radius"} if task == "cartpole" else set()
+    reward = {"env.options.center_radius"} if task == "cartpole" else set()
     assert differing(main_arm(task, "paper", plain_reward=True), force) == reward
     assert force.config(3) == dataclasses.replace(force.config(0), seed=3)
     assert force.config(0, 512) == dataclasses.replace(force.config(0), total_steps=512)
@@ -146,7 +145,7 @@ def test_variants_of_a_training_differ_in_one_thing(task):
 def test_every_training_has_an_environment(task):
     for arm in {arm.name: arm for arm in arms(task)}.values():
         config = arm.config(0)
-        env = make_env(task, config.actuator, **config.env.as_arguments())
+        env = config.env.make()
         env.reset(seed=0)
         env.step(env.action_space.sample())
 

@@ -14,14 +14,15 @@ from codrl_mj import Actuator, CurrentLoop, Motor
 from codrl_mj.agents import PPOConfig
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import evaluate
-from codrl_mj.motor import named_actuator
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.study.grid import Deployment, Workers, cell_folder, deploy_cells, read_failure, train_cells
 from codrl_mj.training import TrainConfig, finished, load_config
 
 PPO = PPOConfig(rollout_steps=256, batch_size=64, epochs=1, hidden=(8,))
-TINY = TrainConfig("cartpole", "weaker", PPO, 0, 512, num_envs=2, evaluation_episodes=2, checkpoint_interval=256)
-UNSTABLE = Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=100.0))
+ENV = EnvConfig("cartpole", "weaker")
+TINY = TrainConfig(ENV, PPO, 0, 512, num_envs=2, evaluation_episodes=2, checkpoint_interval=256)
+UNSTABLE = EnvConfig("cartpole", Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=100.0)))
+IDEAL = EnvConfig("cartpole", "ideal")
 CELLS = {f"seed {seed}": dataclasses.replace(TINY, seed=seed) for seed in range(3)}
 ONE = Workers(jobs=1)
 
@@ -35,7 +36,7 @@ def computed(tmp_path_factory):
     """A grid in two processes, one of whose cells cannot be trained."""
     root = tmp_path_factory.mktemp("grid")
     reported = []
-    cells = CELLS | {"unstable": dataclasses.replace(TINY, actuator=UNSTABLE), "again": CELLS["seed 0"]}
+    cells = CELLS | {"unstable": dataclasses.replace(TINY, env=UNSTABLE), "again": CELLS["seed 0"]}
     runs, failures = train_cells(cells, root, Workers(jobs=2), on_cell=reported.append)
     return root, runs, failures, reported
 
@@ -50,9 +51,9 @@ def test_a_cell_that_fails_is_recorded_and_does_not_stop_the_others(computed):
     record = json.loads(failure.record.read_text())
     assert record["error"] == failure.error
     assert "Traceback" in record["traceback"]
-    assert record["train"]["actuator"]["controller"]["kp"] == 100.0
+    assert record["train"]["env"]["actuator"]["controller"]["kp"] == 100.0
     assert failure.record.parent == root / "failures"
-    assert read_failure(cell_folder(root, dataclasses.replace(TINY, actuator=UNSTABLE))) == failure
+    assert read_failure(cell_folder(root, dataclasses.replace(TINY, env=UNSTABLE))) == failure
     assert read_failure(runs["seed 0"]) is None
 
 
@@ -64,9 +65,9 @@ def test_a_cell_is_an_ordinary_run_folder_keyed_by_its_configuration(computed):
     assert runs["again"] == runs["seed 0"]
     changed = [
         dataclasses.replace(TINY, total_steps=513),
-        dataclasses.replace(TINY, env=EnvConfig(center_radius=0.1)),
+        dataclasses.replace(TINY, env=dataclasses.replace(ENV, options={"center_radius": 0.1})),
         dataclasses.replace(TINY, agent=dataclasses.replace(PPO, gamma=0.9)),
-        dataclasses.replace(TINY, actuator="paper"),
+        dataclasses.replace(TINY, env=EnvConfig("cartpole", "paper")),
     ]
     assert len({cell_folder(root, config) for config in [TINY, *changed]}) == 5
 
@@ -97,7 +98,7 @@ def test_a_failure_is_forgotten_when_the_cell_succeeds(tmp_path):
 def test_ray_computes_the_same(computed, tmp_path):
     _, runs, _, _ = computed
     ray_runs, failures = train_cells(
-        CELLS | {"unstable": dataclasses.replace(TINY, actuator=UNSTABLE)}, tmp_path, Workers(jobs=2, backend="ray")
+        CELLS | {"unstable": dataclasses.replace(TINY, env=UNSTABLE)}, tmp_path, Workers(jobs=2, backend="ray")
     )
     assert set(failures) == {"unstable"}
     for name in CELLS:
@@ -127,27 +128,25 @@ train_cells(CELLS, Path(sys.argv[1]), Workers(jobs=2))
 
 def test_deployments_are_evaluations_that_are_made_once(computed):
     _, runs, _, _ = computed
-    paper = named_actuator("paper", "cartpole")
     deployments = {
-        name: Deployment(runs["seed 0"], actuator, episodes=3, seed=7)
-        for name, actuator in (("paper", paper), ("ideal", None))
+        name: Deployment(runs["seed 0"], EnvConfig("cartpole", name), episodes=3, seed=7) for name in ("paper", "ideal")
     }
     results, failures = deploy_cells(deployments, ONE)
     assert failures == {}
     for name, deployment in deployments.items():
-        expected = evaluate(load_policy(runs["seed 0"]), "cartpole", deployment.actuator, episodes=3, seed=7)
+        expected = evaluate(load_policy(runs["seed 0"]), deployment.env, episodes=3, seed=7)
         assert results[name]["returns"] == expected.returns._asdict()
     before = {deployment.record: deployment.record.stat().st_mtime_ns for deployment in deployments.values()}
     assert len(before) == 2
     assert deploy_cells(deployments, ONE) == (results, {})
     assert {record: record.stat().st_mtime_ns for record in before} == before
-    other = Deployment(runs["seed 0"], paper, EnvConfig(max_episode_steps=5), episodes=3, seed=7)
+    other = Deployment(runs["seed 0"], EnvConfig("cartpole", max_episode_steps=5), episodes=3, seed=7)
     assert deploy_cells({"short": other}, ONE)[0]["short"]["length"]["mean"] == 5.0
 
 
 def test_a_deployment_that_fails_is_recorded_and_does_not_stop_the_others(computed):
     root, runs, _, _ = computed
-    good, bad = (Deployment(runs["seed 1"], actuator, episodes=2, seed=3) for actuator in (None, UNSTABLE))
+    good, bad = (Deployment(runs["seed 1"], env, episodes=2, seed=3) for env in (IDEAL, UNSTABLE))
     reported = []
     results, failures = deploy_cells({"bad": bad, "good": good}, ONE, reported.append)
     assert set(results) == {"good"}
@@ -166,7 +165,7 @@ def test_a_deployment_that_fails_is_recorded_and_does_not_stop_the_others(comput
 
 def test_a_failure_of_a_deployment_is_forgotten_when_it_succeeds(computed):
     _, runs, _, _ = computed
-    deployment, policy = Deployment(runs["seed 2"], None, episodes=2), runs["seed 2"] / "policy.json"
+    deployment, policy = Deployment(runs["seed 2"], IDEAL, episodes=2), runs["seed 2"] / "policy.json"
     content = policy.read_text()
     policy.write_text("{")
     try:

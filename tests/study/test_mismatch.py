@@ -11,13 +11,13 @@ import pytest
 from scipy.stats import mannwhitneyu, trim_mean
 
 from codrl_mj.cli import main
-from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.study.arrivals import ends_at_goal
 from codrl_mj.study.cost import costs, seeds_finished
 from codrl_mj.study.grid import Workers, cell_folder
 from codrl_mj.study.mismatch import MismatchConfig, cells, collect, compute, deployments, trials
 from codrl_mj.study.page import write
 from codrl_mj.study.summaries import LEAST_RUNS, judge, summarize
+from codrl_mj.tasks import TASKS
 from codrl_mj.training import finished, load_config
 from tests.study.pretended import pretend
 
@@ -64,7 +64,7 @@ def test_a_study_trains_every_cell_and_tests_it_on_every_actuator(real):
     assert (results.runs, results.untrained, results.untested, dict(results.failures)) == (4, (), (), {})
     for run in (cell_folder(config.root, cell) for cell in cells(config).values()):
         assert finished(run)
-        assert load_config(run).env.center_radius == 0.1
+        assert load_config(run).env.options.center_radius == 0.1
 
 
 def test_the_numbers_are_those_of_the_evaluations_in_the_run_folders(real):
@@ -75,10 +75,10 @@ def test_the_numbers_are_those_of_the_evaluations_in_the_run_folders(real):
         trained = json.loads((run / "config.json").read_text())["train"]
         for record in (run / "deployments").iterdir():
             evaluation = json.loads(record.read_text())
-            assert evaluation["conditions"]["env"]["center_radius"] is None
+            assert evaluation["conditions"]["env"]["options"] == {}
             names = (
                 "ideal" if of is None else "weaker"
-                for of in (trained["actuator"], evaluation["conditions"]["actuator"])
+                for of in (trained["env"]["actuator"], evaluation["conditions"]["env"]["actuator"])
             )
             found.setdefault(tuple(names), {})[trained["seed"]] = evaluation["returns"]["mean"]
     assert len(found) == 4
@@ -270,7 +270,7 @@ def test_a_single_run_has_no_interval(tmp_path):
 
 
 def test_arrivals_at_the_goal_are_counted_where_episodes_end_there(tmp_path):
-    assert [task for task in ENVIRONMENTS if ends_at_goal(task)] == [
+    assert [task for task in TASKS if ends_at_goal(task)] == [
         "acrobot",
         "mountain_car",
         "mountain_car_continuous",

@@ -4,7 +4,6 @@ import gymnasium as gym
 import numpy as np
 
 import codrl_mj  # noqa: F401 - registers the environments
-from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.tasks import TASKS
 
 NEW = ("pendulum", "acrobot", "mountain_car", "mountain_car_continuous")
@@ -21,7 +20,7 @@ SPEED_LIMITED = {  # task -> (least, largest) state to draw from, a little beyon
 
 def ours(task, **arguments):
     """Our environment of a task, with its time limit."""
-    return gym.make(ENVIRONMENTS[task].env_id, disable_env_checker=True, **arguments)
+    return gym.make(TASKS[task].env_id, disable_env_checker=True, **arguments)
 
 
 def gymnasiums(task):
@@ -36,6 +35,12 @@ def actions(task, seed, count, dtype=np.float64):
     if isinstance(space, gym.spaces.Discrete):
         return [int(action) for action in generator.integers(space.n, size=count)]
     return list(generator.uniform(space.low, space.high, size=(count, 1)).astype(dtype))
+
+
+def desired_force(task, action):
+    """The force that an action within the bounds asks for: the task's table has it, or the action is it."""
+    forces = TASKS[task].forces
+    return float(action[0] if forces is None else forces[action])
 
 
 def random_states(task, seed, count):

@@ -13,10 +13,10 @@ LEVELS = {"cartpole": [-10, 10], "acrobot": [-1, 0, 1], "mountain_car": [-1, 0, 
 @pytest.mark.parametrize("task", LEVELS)
 def test_discrete_actions_choose_a_force(task):
     actions = np.arange(len(LEVELS[task]))
-    forces = TASKS[task].desired_force(actions)
+    env = ours(task, actuator="ideal")
+    forces = env.unwrapped.setup.commands.forces(actions)
     np.testing.assert_array_equal(forces, LEVELS[task])
     assert forces.dtype == np.float64
-    env = ours(task, actuator="ideal")
     env.reset(seed=0)
     for action in actions:
         assert env.step(action)[4]["desired_force"] == LEVELS[task][action]
@@ -28,10 +28,10 @@ def test_continuous_actions_saturate(task, dtype):
     limit = LIMITS[task]
     given = np.array([[-np.inf], [-3.0], [-0.5], [0.25], [limit], [3.0]], dtype=dtype)
     expected = [-limit, -limit, -0.5, 0.25, limit, limit]
-    forces = TASKS[task].desired_force(given)
+    env = ours(task, actuator="ideal")
+    forces = env.unwrapped.setup.commands.forces(given)
     np.testing.assert_array_equal(forces, expected)
     assert forces.dtype == np.float64
-    env = ours(task, actuator="ideal")
     env.reset(seed=0)
     for action, force in zip(given, expected, strict=True):
         assert env.step(action)[4]["desired_force"] == force

@@ -4,7 +4,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.tasks import TASKS
 from tests.tasks.faces import NEW, actions, gymnasiums, ours
 
@@ -62,7 +61,7 @@ def _compare(task, seed, choose, states_to, steps=None):
     ],
 )
 def test_random_actions_to_the_end_of_the_episode(task, dtype, states_to, steps, seed):
-    drawn = actions(task, seed, ENVIRONMENTS[task].max_episode_steps, dtype)
+    drawn = actions(task, seed, TASKS[task].max_episode_steps, dtype)
     end = _compare(task, seed, lambda step, _: drawn[step], states_to, steps)
     assert end.any() or steps is not None
 

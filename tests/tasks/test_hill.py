@@ -4,9 +4,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from codrl_mj import callbacks
-from codrl_mj.callbacks import CallbackInUseError
-from codrl_mj.motor.parameters import SIGNATURE
+from codrl_mj import engine
+from codrl_mj.actuators import IDEAL
+from codrl_mj.engine import CallbackInUseError
+from codrl_mj.engine.families import SIGNATURE
 from codrl_mj.physics import MujocoPhysics, hills, install_callbacks
 from codrl_mj.tasks import TASKS
 from tests.tasks.faces import WITH_HILL, ours
@@ -31,7 +32,8 @@ _SLED = """
   </worldbody>
 </mujoco>
 """
-_OURS = f'user="{SIGNATURE} 0.5 2 0.3"'
+_SIGNATURE = " ".join(map(repr, SIGNATURE))
+_OURS = f'user="{_SIGNATURE} 0.5 2 0.3"'
 
 
 def _sled(turned="", axis='axis="1 0 0"', user=_OURS, x=0.4):
@@ -44,7 +46,7 @@ def _sled(turned="", axis='axis="1 0 0"', user=_OURS, x=0.4):
 
 @pytest.fixture
 def with_hill(bare_engine):
-    callbacks.install("hill")
+    engine.install("hill")
 
 
 @pytest.mark.parametrize("task", WITH_HILL)
@@ -67,8 +69,8 @@ def test_without_the_callback_there_is_no_hill(task, actuator, bare_engine):
 @pytest.mark.parametrize("task", TASKS)
 def test_only_models_with_a_hill_install_the_callback(task, bare_engine):
     env = ours(task, actuator="ideal").unwrapped
-    assert callbacks.installed("hill") == (task in WITH_HILL) == bool(hills(env.model))
-    assert not callbacks.installed("motor")
+    assert engine.installed("hill") == (task in WITH_HILL) == bool(hills(env.model))
+    assert not engine.installed("motor")
 
 
 def test_the_force_is_a_function_of_the_position(with_hill):
@@ -107,13 +109,17 @@ def test_the_bodys_geoms_ride_on_the_hill(turned, with_hill):
 
 @pytest.mark.parametrize(
     ("axis", "user"),
-    [('axis="1 0 0"', ""), ('axis="1 0 0"', 'user="1 0.5 2 0.3"'), ('axis="1 0 0"', f'user="{SIGNATURE} 0.5"')],
+    [
+        ('axis="1 0 0"', ""),
+        ('axis="1 0 0"', f'user="{SIGNATURE[0]!r} 1 0.5 2 0.3"'),
+        ('axis="1 0 0"', f'user="{_SIGNATURE} 0.5"'),
+    ],
 )
 def test_foreign_models_are_left_alone(axis, user, bare_engine):
     trajectories = []
     for parts in ((), ("hill", "motor")):
         if parts:
-            callbacks.install(*parts)
+            engine.install(*parts)
         model, data = _sled(axis=axis, user=user)
         mujoco.mj_step(model, data, 50)
         trajectories.append([data.qpos.copy(), data.qvel.copy(), data.qfrc_passive.copy(), data.geom_xpos.copy()])
@@ -130,7 +136,10 @@ def test_hinges_with_the_signature_are_left_alone(with_hill):
 
 def test_a_joint_that_misuses_the_signature_is_named():
     for wrong, message in (
-        ({"user": f'user="{SIGNATURE} 1"'}, "sled: user = .* needs signature, gravity, wavenumber, height"),
+        (
+            {"user": f'user="{_SIGNATURE} 1"'},
+            "sled: user = .* needs signature_1, signature_2, gravity, wavenumber, height",
+        ),
         ({"axis": 'axis="0 1 0"'}, 'sled: a hill of codrl_mj needs type="slide" and axis="1 0 0"'),
     ):
         with pytest.raises(ValueError, match=message):
@@ -162,7 +171,7 @@ def _hull_pose(data):
 def test_the_car_follows_the_hill(task, x, after):
     """What our renders draw, and what any viewer draws after the engine's own functions."""
     definition = TASKS[task]
-    physics = MujocoPhysics(definition, None, 1, "semi-implicit")
+    physics = MujocoPhysics(definition, [IDEAL], 1, "semi-implicit")
     physics.reset(np.array([x, 0.0]))
     if after == "render":
         physics.show(np.array([x, 0.0]))
@@ -177,9 +186,9 @@ def test_the_car_follows_the_hill(task, x, after):
 
 @pytest.mark.parametrize("task", WITH_HILL)
 def test_the_drawn_hill_is_the_one_the_car_follows(task):
-    model = MujocoPhysics(TASKS[task], None, 1, "semi-implicit").model
+    model = MujocoPhysics(TASKS[task], [IDEAL], 1, "semi-implicit").model
     (joint,) = hills(model)
-    np.testing.assert_array_equal(model.jnt_user[joint], [SIGNATURE, 0.0025, WAVENUMBER, HEIGHT])
+    np.testing.assert_array_equal(model.jnt_user[joint], [*SIGNATURE, 0.0025, WAVENUMBER, HEIGHT])
     height = model.geom("hill").pos[2] + model.hfield_size[0][2] * model.hfield_data.reshape(2, -1)
     middle, radius = model.geom("hill").pos[0], model.hfield_size[0][0]
     x = np.linspace(middle - radius, middle + radius, height.shape[1])

@@ -8,7 +8,6 @@ import mujoco.batch
 import numpy as np
 import pytest
 
-from codrl_mj.motor.catalog import PAPER
 from codrl_mj.physics import MujocoPhysics, install_callbacks, motors
 from codrl_mj.tasks import TASKS
 from codrl_mj.tasks.assets import asset_path
@@ -56,9 +55,9 @@ def test_the_stored_model_holds_the_papers_actuator(task):
     model = mujoco.MjModel.from_xml_path(str(asset_path(TASKS[task].asset)))
     definition = TASKS[task]
     (found,) = motors(model).values()
-    assert found == PAPER[task]
+    assert found == TASKS[task].paper[0]
     assert model.opt.timestep == pytest.approx(definition.step_duration / definition.motor_inner_steps, rel=1e-15)
-    limit = definition.max_force * PAPER[task].motor.arm_radius
+    limit = definition.max_force * TASKS[task].paper[0].motor.arm_radius
     np.testing.assert_array_equal(model.actuator_ctrlrange, [[-limit, limit]])
     assert model.nq == len(definition.qpos)
     assert model.nv == len(definition.qvel)
@@ -77,7 +76,7 @@ def test_the_stored_model_opens_without_us(task, bare_engine):
 def test_a_batch_is_bit_identical_to_a_loop(task):
     """Every simulation with its own start and control; RK4 (Acrobot) and the hill (mountain cars) included."""
     definition, simulations, steps = TASKS[task], 16, 200
-    model = MujocoPhysics(definition, PAPER[task], definition.motor_inner_steps, definition.integrators[0]).model
+    model = MujocoPhysics(definition, definition.paper, definition.motor_inner_steps, definition.integrators[0]).model
     install_callbacks(model)
     generator = np.random.default_rng(0)
     starts = np.array([definition.initial(generator, None) for _ in range(simulations)])

@@ -15,9 +15,9 @@ from codrl_mj.training import TrainConfig, TrainingStoppedError, train
 from codrl_mj.training.watcher import Watcher
 
 RANDOMIZE = {"motor.inductance": "uniform(0.05, 0.15)", "controller.kp": "choice(0.5, 1)"}
-DISTURBANCES = Disturbances(
-    command_delay=0.03, current_noise=0.1, current_bias=0.05, pulse_interval=0.2, pulse_force=0.5, pulse_duration=0.05
-)
+DISTURBANCES = Disturbances(command_delay=0.03, pulse_interval=0.2, pulse_force=0.5, pulse_duration=0.05)
+NOISY = {"controller": {"current_noise": 0.1, "current_bias": 0.05}}
+"""What a sensor of the current gets wrong."""
 
 
 def _kill_test():
@@ -33,12 +33,12 @@ kill_test = _kill_test()
 outcome, differing = kill_test.outcome, kill_test.differing
 
 
-def tiny(task, agent, num_envs=1, steps=240, env=None, **others):
+def tiny(task, agent, num_envs=1, steps=240, env=None, actuator="paper", **others):
     """A training of about a second, with three or four checkpoints and evaluations."""
     budget = {"total_steps": steps} if "total_episodes" not in others else {"total_steps": None}
     often = {"checkpoint_interval": 60, "evaluation_interval": 80, "evaluation_episodes": 2}
-    env = EnvConfig(**{"max_episode_steps": 25} | (env or {}))
-    return TrainConfig(task, agent=agent, seed=3, num_envs=num_envs, env=env, **often | budget | others)
+    env = EnvConfig(task, actuator, **{"max_episode_steps": 25} | (env or {}))
+    return TrainConfig(env, agent, seed=3, num_envs=num_envs, **often | budget | others)
 
 
 _SMALL = {"learning_starts": 40, "batch_size": 16, "buffer_size": 150}  # the buffer fills, and is written over
@@ -47,13 +47,22 @@ _NETS = {"hidden": (8,)}
 
 CASES = {
     "ppo, one optimiser": tiny(
-        "cartpole", PPOConfig(**_PPO), 4, actuator="weaker", env={"center_radius": 0.1, "observe_actuator": True}
+        "cartpole",
+        PPOConfig(**_PPO),
+        4,
+        actuator="weaker",
+        env={"options": {"center_radius": 0.1}, "observe_actuator": True},
     ),
     "ppo, separate learning rates": tiny(
         "cartpole", PPOConfig(**_PPO, critic_learning_rate=3e-3), 2, env={"physics": "analytic"}
     ),
     "ppo, an episode budget": tiny(
-        "cartpole", PPOConfig(**_PPO), 2, total_episodes=9, env={"randomize": RANDOMIZE, "disturbances": DISTURBANCES}
+        "cartpole",
+        PPOConfig(**_PPO),
+        2,
+        total_episodes=9,
+        env={"randomize": RANDOMIZE, "disturbances": DISTURBANCES},
+        actuator={"name": "paper", **NOISY},
     ),
     "ppo, state-dependent noise": tiny("pendulum", PPOConfig(**_PPO, state_dependent_noise=True), 2),
     "ppo, state-dependent noise, drawn often": tiny(
@@ -63,6 +72,7 @@ CASES = {
         "pendulum",
         DDPGConfig(**_SMALL, actor_units=(8,), joint_units=(8,), critic_learning_rate=2e-3),
         env={"disturbances": DISTURBANCES, "observe_actuator": True},
+        actuator={"name": "paper", **NOISY},
     ),
     "ddpg, several environments": tiny(
         "pendulum", DDPGConfig(**_SMALL, actor_units=(8,), joint_units=(8,)), 3, env={"physics": "analytic"}
@@ -82,13 +92,22 @@ CASES = {
         3,
         env={"physics": "analytic"},
     ),
-    "td3": tiny("pendulum", TD3Config(**_SMALL, **_NETS), 2, env={"disturbances": DISTURBANCES}),
+    "td3": tiny(
+        "pendulum",
+        TD3Config(**_SMALL, **_NETS),
+        2,
+        env={"disturbances": DISTURBANCES},
+        actuator={"name": "paper", **NOISY},
+    ),
     "sac, learned entropy coefficient": tiny("pendulum", SACConfig(**_SMALL, **_NETS), env={"randomize": RANDOMIZE}),
     "sac, state-dependent noise": tiny(
         "pendulum", SACConfig(**_SMALL, **_NETS, entropy_coefficient=0.1, state_dependent_noise=True, train_every=6), 2
     ),
     "sarsa": tiny(
-        "mountain_car", SARSAConfig(epsilon=0.2, epsilon_decay=0.9), env={"disturbances": DISTURBANCES}, actuator="weak"
+        "mountain_car",
+        SARSAConfig(epsilon=0.2, epsilon_decay=0.9),
+        env={"disturbances": DISTURBANCES},
+        actuator={"name": "weak", **NOISY},
     ),
     "sarsa, traces": tiny(
         "mountain_car", SARSAConfig(epsilon=0.1, trace_decay=0.8), total_episodes=9, env={"physics": "analytic"}

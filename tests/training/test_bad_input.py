@@ -73,7 +73,7 @@ def test_a_finished_run_is_left_alone(capsys, finished):
     [
         ("--seed 3", "seed: 0 and 3"),
         ("--agent.gamma 0.5 --num-envs 4", "agent.gamma: 0.99 and 0.5; num_envs: 2 and 4"),
-        ("--actuator ideal", "actuator.motor.resistance: 1.0 and 'absent'"),
+        ("--actuator ideal", "env.actuator.motor.resistance: 1.0 and 'absent'"),
         ("--config other.yaml", "seed: 0 and 9"),
         ("--agent dqn", "run is a training of ppo and continues as it began"),
         ("--settings paper", "leave --agent and --settings out"),
@@ -104,7 +104,9 @@ def test_a_folder_that_is_no_run_is_named(capsys):
 )
 def test_a_damaged_configuration_is_named(capsys, unfinished, content):
     if content is None:  # all is well but for the versions
-        content = json.dumps(json.loads((unfinished / "config.json").read_text()) | {"versions": 5})
+        content = json.loads((unfinished / "config.json").read_text()) | {"versions": 5}
+        del content["sha256"]
+        content = json.dumps(content)
     (unfinished / "config.json").write_text(content)
     assert "run/config.json" in refused(capsys, "train --resume run")
 
@@ -113,6 +115,7 @@ def edit(config, **changes):
     content = json.loads(config.read_text())
     for name, change in changes.items():
         content[name] = change(content[name])
+    del content["sha256"]  # it is edited on purpose
     config.write_text(json.dumps(content))
 
 
@@ -146,7 +149,7 @@ def test_other_software_is_named_and_can_be_accepted(capsys, unfinished, changes
         ("train pendulum --agent dqn", "cannot act in the Box actions of pendulum"),
         ("train acrobot --agent ddpg", "agents that can: ppo, dqn, sarsa"),
         ("train cartpole --settings repaired", "settings = 'repaired': ppo on cartpole has no such settings; those on"),
-        ("train --config other.yaml", "other.yaml: unknown key total_step: did you mean total_steps?"),
+        ("train --config other.yaml", "other.yaml: unknown key total_step; did you mean total_steps?"),
         ("train --config nowhere.yaml", "no configuration file at nowhere.yaml"),
         ("train --no-tensorboard pendulum", "name the task before the flags, as in codrl-mj train pendulum"),
     ],
@@ -190,7 +193,7 @@ def test_flags_win_over_the_file_and_leave_the_rest_of_it(tmp_path):
         0.4,
         0.15,
     )
-    assert (config.env.center_radius, config.env.inner_steps) == (0.2, 2)
+    assert (config.env.options.center_radius, config.env.inner_steps) == (0.2, 2)
 
 
 def test_the_task_is_found_behind_flags_and_beside_folders_of_its_name():

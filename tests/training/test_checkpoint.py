@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import pickle
+import random
 import resource
 import shutil
 from pathlib import Path
@@ -16,6 +17,7 @@ from codrl_mj.runs.files import writing
 from codrl_mj.training import TrainConfig, curve, watcher
 from codrl_mj.training.checkpoint import load_checkpoint, save_checkpoint
 from codrl_mj.training.state import State
+from tests.damage import damage
 from tests.training.interruptions import CASES, TERMINATE, differing, interrupt, outcome, resume
 
 CONFIG = CASES["ppo, one optimiser"]
@@ -151,6 +153,19 @@ def test_a_damaged_one_of_a_later_step_is_not_kept_in_place_of_an_intact_one(tmp
     truncate(sorted(tmp_path.iterdir())[-1])
     save_checkpoint(tmp_path, state_at(15), "a run")  # of the run that fell back to 10
     assert steps_kept(tmp_path) == [10, 15]
+
+
+def test_however_a_few_bytes_are_damaged_the_one_before_is_loaded_whole(tmp_path):
+    random_ = random.Random(0)
+    for step in (10, 20):
+        last = save_checkpoint(tmp_path, state_at(step), "a run")
+    whole = last.read_bytes()
+    for _ in range(150):
+        last.write_bytes(damage(whole, random_))
+        with pytest.warns(UserWarning, match=f"{last} cannot be used"):
+            loaded = load_checkpoint(tmp_path, "a run")
+        assert loaded.facts == {"num_timesteps": 10}
+        assert loaded.arrays["array"].tolist() == [10.0] * 4
 
 
 def test_of_one_step_the_last_written_is_kept_beside_the_one_before(tmp_path):

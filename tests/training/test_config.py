@@ -6,14 +6,15 @@ import math
 
 import pytest
 
-from codrl_mj import Actuator, CurrentLoop, Motor, named_actuator
+from codrl_mj import Actuator, CurrentLoop, Ideal, Motor, named_actuator
 from codrl_mj.agents import AGENTS, PPOConfig
 from codrl_mj.agents.presets import PRESETS
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.training import TrainConfig, load_config, read_config
 
-TINY = TrainConfig("cartpole", "weaker", PPOConfig(hidden=(8, 8)), 1, 1000, num_envs=4)
+ENV = EnvConfig("cartpole", "weaker")
+TINY = TrainConfig(ENV, PPOConfig(hidden=(8, 8)), 1, 1000, num_envs=4)
 
 # -- configuration ------------------------------------------------------------------------------------------
 
@@ -26,9 +27,9 @@ OWN = Actuator(Motor(inductance=0.07, arm_radius=0.3), CurrentLoop(kp=0.9, max_v
     ids=["ideal", "None", "paper", "weaker", "open_loop", "Actuator", "mapping"],
 )
 def test_a_configuration_survives_json(tmp_path, actuator):
-    ppo, env = PPOConfig(hidden=(4, 5, 6), gamma=1.0), EnvConfig("analytic", "semi-implicit", 3)
-    config = TrainConfig("cartpole", actuator, ppo, 7, 123, 2, env)
-    assert config.actuator is None or isinstance(config.actuator, Actuator)
+    ppo, env = PPOConfig(hidden=(4, 5, 6), gamma=1.0), EnvConfig("cartpole", actuator, "analytic", "semi-implicit", 3)
+    config = TrainConfig(env, ppo, 7, 123, 2)
+    assert isinstance(config.actuator, Actuator | Ideal)
     assert TrainConfig.from_mapping(json.loads(json.dumps(config.as_mapping()))) == config
     (tmp_path / "config.json").write_text(json.dumps({"train": config.as_mapping()}))
     assert load_config(tmp_path) == config
@@ -36,9 +37,10 @@ def test_a_configuration_survives_json(tmp_path, actuator):
 
 def test_a_name_a_mapping_and_an_actuator_mean_the_same():
     own = {"motor": {"arm_radius": 0.15}, "controller": {"kp": 0.2, "ki": 0.2}}
-    configs = {TrainConfig("cartpole", what) for what in ("weaker", named_actuator("weaker", "cartpole"))}
-    assert configs == {TrainConfig("cartpole", own)}
-    assert TrainConfig("cartpole", "ideal") == TrainConfig("cartpole", None) != TrainConfig("cartpole", "paper")
+    over = {"name": "paper", "controller": {"kp": 0.2, "ki": 0.2, "kd": 0.0, "kff": 0.0}}
+    forms = (own, over, named_actuator("weaker", "cartpole"))
+    assert {TrainConfig(EnvConfig("cartpole", what)) for what in forms} == {TrainConfig(ENV)}
+    assert EnvConfig("cartpole", "ideal") == EnvConfig("cartpole", None) != EnvConfig("cartpole", "paper")
 
 
 @pytest.mark.parametrize(
@@ -59,7 +61,7 @@ def test_a_name_a_mapping_and_an_actuator_mean_the_same():
 )
 def test_a_bad_field_is_named_with_its_value_and_bound(field, value, bound):
     with pytest.raises(ValueError, match=field) as caught:
-        TrainConfig("cartpole", **{field: value})
+        TrainConfig(**{"env": ENV, field: value})
     assert f"{field} = {value!r}" in str(caught.value)
     assert bound in str(caught.value)
 
@@ -67,17 +69,17 @@ def test_a_bad_field_is_named_with_its_value_and_bound(field, value, bound):
 @pytest.mark.parametrize("value", [0, -1, 2.5, True])
 def test_a_bad_time_limit_is_named(value):
     with pytest.raises(ValueError, match="max_episode_steps") as caught:
-        EnvConfig(max_episode_steps=value)
+        EnvConfig("cartpole", max_episode_steps=value)
     assert ">= 1" in str(caught.value)
 
 
 def test_unknown_tasks_and_actuators_are_named():
     with pytest.raises(ValueError, match="did you mean 'cartpole'"):
-        TrainConfig("cartpoll")
+        EnvConfig("cartpoll")
     with pytest.raises(ValueError, match="did you mean 'weaker'"):
-        TrainConfig("cartpole", "weakr")
+        EnvConfig("cartpole", "weakr")
     with pytest.raises(ValueError, match=r"did you mean motor\.inductance"):
-        TrainConfig("cartpole", {"motor": {"inductanc": 1.0}})
+        EnvConfig("cartpole", {"motor": {"inductanc": 1.0}})
 
 
 @pytest.mark.parametrize(
@@ -139,10 +141,14 @@ env:
     weaker = named_actuator("weaker", "cartpole")
     assert config == dataclasses.replace(
         default,
+        env=EnvConfig(
+            "cartpole",
+            dataclasses.replace(weaker, controller=dataclasses.replace(weaker.controller, kp=0.3)),
+            options={"center_radius": 0.1},
+            disturbances=Disturbances(command_delay=0.02),
+        ),
         agent=dataclasses.replace(default.agent, gamma=0.98, hidden=(32,)),
-        actuator=dataclasses.replace(weaker, controller=dataclasses.replace(weaker.controller, kp=0.3)),
         seed=5,
-        env=EnvConfig(center_radius=0.1, disturbances=Disturbances(command_delay=0.02)),
     )
     assert read_config(tmp_path / "train.yaml", seed=6) == dataclasses.replace(config, seed=6)
 
@@ -160,10 +166,10 @@ def test_a_runs_configuration_is_a_configuration_file(tmp_path):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("task: cartpole\ntotal_step: 5", "unknown key total_step: did you mean total_steps?"),
-        ("task: cartpole\nagent: {name: ppo, gama: 0.9}", "unknown key agent.gama: did you mean agent.gamma?"),
-        ("task: cartpole\nenv: {center_radios: 0.1}", "unknown key env.center_radios: did you mean env.center_radius?"),
-        ("task: cartpole\nenv: {disturbances: {comand_delay: 1}}", "did you mean env.disturbances.command_delay?"),
+        ("task: cartpole\ntotal_step: 5", "unknown key total_step; did you mean total_steps?"),
+        ("task: cartpole\nagent: {name: ppo, gama: 0.9}", "unknown key agent.gama; did you mean agent.gamma?"),
+        ("task: cartpole\nenv: {center_radios: 0.1}", "unknown key env.center_radios; did you mean env.center_radius?"),
+        ("task: cartpole\nenv: {disturbances: {comand_delay: 1}}", "did you mean disturbances.command_delay?"),
         ("task: cartpole\nactuator: {controler: {kp: 1}}", "did you mean controller?"),
         ("task: cartpole\nactuator: {name: weaker, controller: {kq: 1}}", "unknown actuator field controller.kq"),
         ("task: cartpole\nactuator: {name: ideal, controller: {kp: 1}}", "ideal actuator has no motor"),
@@ -197,19 +203,21 @@ def test_an_agent_that_cannot_act_in_the_task_is_refused_and_those_that_can_are_
     with pytest.raises(ValueError, match=r"agent = 'dqn': cannot act in the Box actions of pendulum.*ppo.*ddpg"):
         TrainConfig.preset("pendulum", "dqn")
     with pytest.raises(ValueError, match=r"agent = 'ddpg': cannot act in the Discrete actions of acrobot.*ppo.*dqn"):
-        TrainConfig("acrobot", agent=AGENTS["ddpg"]())
+        TrainConfig(EnvConfig("acrobot"), AGENTS["ddpg"]())
 
 
 def test_a_budget_is_needed():
     with pytest.raises(ValueError, match=r"total_steps = None: .* or total_episodes"):
-        TrainConfig("cartpole", total_steps=None)
-    assert TrainConfig("cartpole", total_steps=None, total_episodes=3).total_episodes == 3
+        TrainConfig(ENV, total_steps=None)
+    assert TrainConfig(ENV, total_steps=None, total_episodes=3).total_episodes == 3
 
 
 def test_differences_are_named_field_by_field():
-    other = dataclasses.replace(TINY, seed=2, agent=PPOConfig(hidden=(8, 8), gamma=0.5), actuator="ideal")
+    other = dataclasses.replace(
+        TINY, seed=2, agent=PPOConfig(hidden=(8, 8), gamma=0.5), env=EnvConfig("cartpole", "ideal")
+    )
     text = "; ".join(TINY.differences(other))
     assert "seed: 1 and 2" in text
     assert "agent.gamma: 0.99 and 0.5" in text
-    assert "actuator.motor.inductance: 0.1 and 'absent'" in text
+    assert "env.actuator.motor.inductance: 0.1 and 'absent'" in text
     assert TINY.differences(dataclasses.replace(TINY)) == []

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from codrl_mj import files
 from codrl_mj.cli import main
+from codrl_mj.runs import files, policies
 from codrl_mj.training import checkpoint, folder, history, watcher
 from tests.training.interruptions import differing, kill_test, outcome
 
@@ -124,10 +124,11 @@ def die_at_call(owner, name, which):
 
 KILLED_WHILE = {
     "taking the folder": lambda: die_at_call(folder, "start_folder", 1),
-    "writing the configuration": lambda: die_at_call(files.json, "dumps", 1),
+    "writing the configuration": lambda: die_at_call(files.json, "dumps", 3),
     "beginning the tables": lambda: die_at_call(history.csv, "writer", 3),
     "writing a checkpoint": lambda: die_at_call(checkpoint.os, "fsync", 3),
     "deleting an old checkpoint": lambda: die_at_call(Path, "unlink", 2),
+    "exchanging the best policy's files": lambda: die_at_call(policies, "write_json", 2),
     "writing the best policy": lambda: die_at_call(watcher, "write_json", 1),
     "marking the run as finished": lambda: die_at_call(folder, "write_json", 2),
 }

@@ -1,10 +1,13 @@
 """A training that was interrupted, however and how often, comes to the very result of one that was not."""
 
 import functools
+from pathlib import Path
 
 import pytest
 
 from codrl_mj.envs.sb3 import ActuatedVecEnv
+from codrl_mj.runs.files import write_json
+from codrl_mj.runs.summaries import read_run
 from codrl_mj.training import TrainConfig, TrainingStoppedError, curve, finished, watcher
 from codrl_mj.training.checkpoint import load_checkpoint, save_checkpoint
 from codrl_mj.training.state import State
@@ -17,6 +20,7 @@ from tests.training.interruptions import (
     crash,
     differing,
     interrupt,
+    kill_test,
     outcome,
     resume,
 )
@@ -55,6 +59,35 @@ def test_a_run_of_interruptions_changes_nothing(tmp_path, uninterrupted, name):
             resume(config, out)
     assert not finished(out)
     resume(config, out)
+    assert differing(uninterrupted(name), outcome(out)) == []
+
+
+FINAL = ("policy.safetensors", "policy.json", "evaluation.json", "learning_curve.png", "result.json")
+"""What a training writes when it has learned, in this order."""
+
+
+@pytest.mark.parametrize("written", range(1, len(FINAL) + 1))
+def test_between_the_final_files_a_run_is_not_finished_for_anybody(tmp_path, uninterrupted, monkeypatch, written):
+    name, out = "ppo, one optimiser", tmp_path / "run"
+    replace, final = Path.replace, []
+
+    def crash_behind(path, target):
+        replace(path, target)
+        if target.parent == out and kill_test.saved_steps(out) >= CASES[name].total_steps:
+            final.append(target.name)
+            if len(final) == written:
+                raise Crash
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", crash_behind)
+        patch.setattr(curve, "draw_learning_curve", lambda path, *_: write_json(path, "no picture"))
+        with pytest.raises(Crash):
+            resume(CASES[name], out)
+    done = written == len(FINAL)
+    assert tuple(final) == FINAL[:written]
+    assert (read_run(out).state, finished(out)) == ("finished" if done else "unfinished", done)
+    resume(CASES[name], out)
+    assert (read_run(out).state, finished(out)) == ("finished", True)
     assert differing(uninterrupted(name), outcome(out)) == []
 
 

@@ -24,8 +24,14 @@ from codrl_mj.runs.policies import load_policy
 from codrl_mj.training import EVALUATION_SEED, TrainConfig, load_config, train
 
 TINY_PPO = PPOConfig(rollout_steps=256, batch_size=64, epochs=2, hidden=(8, 8))
-TINY = TrainConfig("cartpole", "weaker", TINY_PPO, 1, 1000, num_envs=4, env=EnvConfig(center_radius=0.1))
+ENV = EnvConfig("cartpole", "weaker", options={"center_radius": 0.1})
+TINY = TrainConfig(ENV, TINY_PPO, 1, 1000, num_envs=4)
 UNSTABLE = Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=100.0))
+
+
+def within(**changes):
+    """The tiny training in another environment."""
+    return dataclasses.replace(TINY, env=dataclasses.replace(ENV, **changes))
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +57,7 @@ def mean_return(policy, actuator, episodes=20):
 
 def test_ppo_learns_to_balance(tmp_path):
     ppo = PPOConfig(rollout_steps=1024, batch_size=128, learning_rate=3e-3, hidden=(32, 32))
-    config = TrainConfig("cartpole", "ideal", ppo, seed=0, total_steps=16_000)
+    config = TrainConfig(EnvConfig("cartpole", "ideal"), ppo, seed=0, total_steps=16_000)
     out = train(config, tmp_path / "run")
     assert mean_return(RandomPolicy("cartpole"), "ideal") < 40
     assert mean_return(load_policy(out), "ideal") > 400
@@ -67,8 +73,8 @@ def test_the_same_seed_gives_the_same_weights_and_another_seed_others(run, tmp_p
 
 def test_the_actuator_and_the_task_option_reach_the_training(run, tmp_path):
     out, _ = run
-    assert not same_weights(out, train(dataclasses.replace(TINY, actuator="ideal"), tmp_path / "ideal"))
-    free = train(dataclasses.replace(TINY, env=EnvConfig()), tmp_path / "free")
+    assert not same_weights(out, train(within(actuator="ideal"), tmp_path / "ideal"))
+    free = train(within(options=None), tmp_path / "free")
     assert not same_weights(out, free)
 
 
@@ -96,9 +102,9 @@ def test_the_run_folder_has_what_is_documented(run):
 def test_the_configuration_records_what_was_resolved_and_the_versions(run):
     out, _ = run
     content = json.loads((out / "config.json").read_text())
-    assert content["train"]["actuator"]["controller"]["kp"] == 0.2
-    assert content["train"]["actuator"]["motor"]["arm_radius"] == 0.15
-    assert content["train"]["env"]["center_radius"] == 0.1
+    assert content["train"]["env"]["actuator"]["controller"]["kp"] == 0.2
+    assert content["train"]["env"]["actuator"]["motor"]["arm_radius"] == 0.15
+    assert content["train"]["env"]["options"] == {"center_radius": 0.1}
     assert content["train"]["agent"]["rollout_steps"] == 256
     assert content["train"]["agent"]["name"] == "ppo"
     assert content["versions"]["numpy"] == np.__version__
@@ -143,7 +149,7 @@ def test_every_episode_is_in_the_table(run):
 def test_the_result_and_the_evaluation_agree_with_an_evaluation_of_the_saved_policy(run):
     out, (report,) = run
     result, evaluation = (json.loads((out / f"{name}.json").read_text()) for name in ("result", "evaluation"))
-    anew = evaluate(load_policy(out), "cartpole", "weaker", episodes=20, seed=EVALUATION_SEED)
+    anew = evaluate(load_policy(out), EnvConfig("cartpole", "weaker"), episodes=20, seed=EVALUATION_SEED)
     assert evaluation["returns"]["mean"] == anew.returns.mean == result["evaluation_return"]
     assert result["steps"] == report.steps
     assert result["episodes"] == report.episodes
@@ -157,7 +163,7 @@ def test_the_best_policy_is_kept_though_a_worse_one_comes_last(tmp_path):
     evaluations = [float(row["evaluation_return"]) for row in read_csv(out / "progress.csv")]
     result = json.loads((out / "result.json").read_text())
     assert result["best"]["return"] >= max(evaluations) > result["evaluation_return"]
-    best = evaluate(load_policy(out / "best"), "cartpole", "weaker", episodes=5, seed=EVALUATION_SEED)
+    best = evaluate(load_policy(out / "best"), EnvConfig("cartpole", "weaker"), episodes=5, seed=EVALUATION_SEED)
     assert best.returns.mean == result["best"]["return"]
 
 
@@ -229,14 +235,12 @@ def test_an_existing_folder_is_refused_and_untouched(tmp_path, holds):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"actuator": UNSTABLE}, "spectral radius"),
+        ({"env": within(actuator=UNSTABLE).env}, "spectral radius"),
         ({"agent": dataclasses.replace(TINY_PPO, rollout_steps=258)}, "multiple of num_envs = 4"),
         ({"agent": dataclasses.replace(TINY_PPO, batch_size=96)}, "multiple of batch_size = 96"),
-        ({"env": EnvConfig(integrator="rk4")}, "integrator = 'rk4'"),
-        ({"env": EnvConfig(inner_steps=0)}, "inner_steps = 0"),
-        ({"env": EnvConfig(center_radius=-1.0)}, "center_radius = -1.0"),
-        ({"env": EnvConfig(physics="newton")}, "physics = 'newton'"),
-        ({"task": "pendulum", "actuator": None}, "center_radius"),
+        ({"env": within(integrator="rk4").env}, "integrator = 'rk4'"),
+        ({"env": within(inner_steps=0).env}, "inner_steps = 0"),
+        ({"env": within(physics="newton").env}, "physics = 'newton'"),
     ],
 )
 def test_what_cannot_be_trained_is_refused_with_nothing_written(tmp_path, changes, message):
@@ -247,7 +251,7 @@ def test_what_cannot_be_trained_is_refused_with_nothing_written(tmp_path, change
 
 
 def test_an_unstable_actuator_can_be_trained_on_when_allowed(tmp_path):
-    config = dataclasses.replace(TINY, actuator=UNSTABLE, env=EnvConfig(allow_unstable=True, inner_steps=1))
+    config = within(actuator=UNSTABLE, allow_unstable=True, inner_steps=1)
     assert (train(config, tmp_path / "run") / "policy.safetensors").is_file()
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from codrl_mj import cli
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.training import TrainConfig, folder, read_config
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -20,7 +21,7 @@ def elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (block,) = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
     Path("car.yaml").write_text(block)
-    folder.start_folder(Path("runs/mine"), TrainConfig("cartpole"))
+    folder.start_folder(Path("runs/mine"), TrainConfig(EnvConfig("cartpole")))
 
 
 @pytest.mark.parametrize("command", re.findall(r"^\$ codrl-mj (.*)$|`codrl-mj ([a-z]+ [^`A-Z]*)`", PAGE, re.MULTILINE))

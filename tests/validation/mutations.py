@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from codrl_mj.actuators import Actuator, parameters_type
+from codrl_mj.engine.families import HEAD
 from codrl_mj.physics import MujocoPhysics
 
 
@@ -16,12 +18,17 @@ def wrong_model(monkeypatch, change):
     monkeypatch.setattr(MujocoPhysics, "__init__", make_wrong)
 
 
-def scaled_motor(entry, factor):
+def entry(parameter):
+    """Where a current loop's parameter is in the user data of its actuator."""
+    return HEAD + parameters_type(Actuator)._fields.index(parameter)
+
+
+def scaled_motor(parameter, factor):
     """A change that scales one parameter of the motor, where there is one."""
 
     def change(model):
         if model.nuser_actuator:
-            model.actuator_user[:, entry] *= factor
+            model.actuator_user[:, entry(parameter)] *= factor
 
     return change
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from codrl_mj import TASKS
-from codrl_mj.motor.catalog import PAPER
-from codrl_mj.motor.parameters import BACK_EMF_CONSTANT, INDUCTANCE, RESISTANCE, TORQUE_CONSTANT
+from codrl_mj.actuators import IDEAL
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics
 from codrl_mj.validation import convergence
 from codrl_mj.validation.continuous import Solution, gymnasium_equations, solve
@@ -69,8 +68,7 @@ def test_a_gear_off_by_a_hundredth_fails_every_check_of_its_motor(monkeypatch, t
 
 @pytest.mark.parametrize(
     ("parameter", "factor"),
-    [(INDUCTANCE, 1.05), (RESISTANCE, 1.05), (TORQUE_CONSTANT, 1.05), (BACK_EMF_CONSTANT, -1.0)],
-    ids=["inductance", "resistance", "torque constant", "back-EMF sign"],
+    [("inductance", 1.05), ("resistance", 1.05), ("torque_constant", 1.05), ("back_emf_constant", -1.0)],
 )
 def test_a_wrong_motor_fails_the_check_with_the_motor(monkeypatch, parameter, factor):
     wrong_model(monkeypatch, scaled_motor(parameter, factor))
@@ -140,7 +138,7 @@ def test_the_equations_are_the_textbooks():
 def test_acrobots_equations_are_the_limit_of_its_steps():
     task = TASKS["acrobot"]
     equations, state = gymnasium_equations(task), np.array([0.3, -0.7, 0.9, -1.1])
-    physics = AnalyticPhysics(dataclasses.replace(task, step_duration=1e-4), None, 1, "rk4")
+    physics = AnalyticPhysics(dataclasses.replace(task, step_duration=1e-4), [IDEAL], 1, "rk4")
     physics.reset(state)
     physics.step(1.0)
     np.testing.assert_allclose((physics.state - state) / 1e-4, equations(state, 1.0), rtol=0, atol=2e-3)
@@ -151,10 +149,10 @@ def test_acrobots_equations_are_the_limit_of_its_steps():
 def test_the_runs_stay_away_from_every_bound(task, motor):
     """Solution and coarsest run, at every integration step of it."""
     definition, start = TASKS[task], np.array(RUNS[task].start)
-    actuator = convergence.analogue(PAPER[task]) if motor else None
+    actuator = convergence.analogue(definition.paper[0]) if motor else IDEAL
     states = [*solve(definition, start, commands(definition), actuator).states]
     unbounded = dataclasses.replace(definition, step_duration=definition.step_duration / 128, constrain=None)
-    physics = MujocoPhysics(unbounded, actuator, 1, definition.integrators[0])
+    physics = MujocoPhysics(unbounded, [actuator], 1, definition.integrators[0])
     physics.reset(start)
     for force in commands(definition):
         for _ in range(128):

@@ -11,24 +11,13 @@ import numpy as np
 import pytest
 from scipy import integrate, signal
 
-from codrl_mj.motor import Actuator, CurrentLoop, Motor
-from codrl_mj.motor.parameters import (
-    BACK_EMF_CONSTANT,
-    INDUCTANCE,
-    KD,
-    KFF,
-    KI,
-    KP,
-    MAX_VOLTAGE,
-    RESISTANCE,
-    SUBSTEPS,
-    TORQUE_CONSTANT,
-)
-from codrl_mj.validation import motor, motor_gem, motor_native, rotors
+from codrl_mj.actuators import FAMILIES, Actuator, CurrentLoop, Motor
+from codrl_mj.validation import in_python, motor, motor_gem, motor_native, rotors
 from codrl_mj.validation.motor_analogue import closed_form
 from codrl_mj.validation.motor_loops import EVERY_FEATURE, Loop, standard_loops
 from codrl_mj.validation.motor_sampled import closed_loop, sampled_system
 from tests.reference import of_actuator
+from tests.validation.mutations import entry
 
 pytestmark = pytest.mark.usefixtures("bare_engine")
 
@@ -43,13 +32,14 @@ FAST, RK4 = "native <dcmotor>, implicitfast, order in the step", "RK4, locked ro
 GEM = "gym-electric-motor, order in the step"
 LOOP = {ORDER, LIMIT, SAMPLED, STEP, MAGNITUDE, PHASE}
 NATIVE = {MAP, SUB, FAST}
-EVERY = LOOP | {VOLTAGE, LINE, NO_LOAD, RK4, GEM} | NATIVE
+COMPILED = {f"compiled advance: {kind}" for kind in ("Actuator", "VoltageDriven", "Lag", "TorqueSpeed")}
+EVERY = LOOP | {VOLTAGE, LINE, NO_LOAD, RK4, GEM} | NATIVE | COMPILED
 
 
 def outcomes():
     """All checks with a few loops and motors only, by name."""
     checks = [*motor.checks_of({"every feature": EVERY_FEATURE}, quick=True)]
-    checks += motor_native.native_checks(SMALL, quick=True)
+    checks += [*in_python.compiled_checks(quick=True), *motor_native.native_checks(SMALL, quick=True)]
     checks.append(motor_gem.gem_check(Motor(), quick=True))
     return {check.name: check for check in checks}
 
@@ -69,15 +59,15 @@ def mutate(monkeypatch, change):
     monkeypatch.setattr(rotors, "install_callbacks", wrong)
 
 
-def scaled(entry, factor):
+def scaled(parameter, factor):
     def change(user, _):
-        user[:, entry] *= factor
+        user[:, entry(parameter)] *= factor
 
     return change
 
 
 def swapped(user, _):
-    user[:, [KP, KI]] = user[:, [KI, KP]]
+    user[:, [entry("kp"), entry("ki")]] = user[:, [entry("ki"), entry("kp")]]
 
 
 def longer_gear(_, gear):
@@ -85,20 +75,20 @@ def longer_gear(_, gear):
 
 
 def one_substep(user, _):
-    user[:, SUBSTEPS] = 1
+    user[:, entry("substeps")] = 1
 
 
 MUTATIONS = {
-    "inductance + 0.1 %": (scaled(INDUCTANCE, 1.001), LOOP | {MAP, SUB}),
-    "resistance + 1 %": (scaled(RESISTANCE, 1.01), EVERY - {NO_LOAD}),
-    "torque constant + 1 %": (scaled(TORQUE_CONSTANT, 1.01), {VOLTAGE, LINE} | NATIVE | {GEM}),
-    "back-EMF reversed": (scaled(BACK_EMF_CONSTANT, -1), {ORDER, LIMIT, SAMPLED, LINE, NO_LOAD, GEM} | NATIVE),
+    "inductance + 0.1 %": (scaled("inductance", 1.001), LOOP | {MAP, SUB}),
+    "resistance + 1 %": (scaled("resistance", 1.01), EVERY - {NO_LOAD}),
+    "torque constant + 1 %": (scaled("torque_constant", 1.01), {VOLTAGE, LINE} | NATIVE | {GEM}),
+    "back-EMF reversed": (scaled("back_emf_constant", -1), {ORDER, LIMIT, SAMPLED, LINE, NO_LOAD, GEM} | NATIVE),
     "kp and ki swapped": (swapped, LOOP),
-    "kp + 0.1 %": (scaled(KP, 1.001), LOOP),
-    "ki + 1 %": (scaled(KI, 1.01), LOOP),
-    "kd doubled": (scaled(KD, 2.0), LOOP),
-    "kff + 0.1 %": (scaled(KFF, 1.001), LOOP | NATIVE | {RK4, GEM}),
-    "voltage limit - 1 %": (scaled(MAX_VOLTAGE, 0.99), {VOLTAGE}),
+    "kp + 0.1 %": (scaled("kp", 1.001), LOOP),
+    "ki + 1 %": (scaled("ki", 1.01), LOOP),
+    "kd doubled": (scaled("kd", 2.0), LOOP),
+    "kff + 0.1 %": (scaled("kff", 1.001), LOOP | NATIVE | {RK4, GEM}),
+    "voltage limit - 1 %": (scaled("max_voltage", 0.99), {VOLTAGE}),
     "gear + 1 %": (longer_gear, LOOP - {PHASE} | {VOLTAGE, LINE, NO_LOAD, GEM} | NATIVE),
     "substeps ignored": (one_substep, {ORDER, LIMIT, SAMPLED, SUB}),
 }
@@ -118,7 +108,7 @@ def test_every_check_passes_and_can_be_looked_at(installed):
             assert "[" in plot.x_label
             assert "[" in plot.y_label
             assert all(len(curve.x) == len(curve.y) > 2 for curve in plot.curves)
-    assert {check.name for check in checks if not check.plots} == {LIMIT, VOLTAGE, NO_LOAD}
+    assert {check.name for check in checks if not check.plots} == {LIMIT, VOLTAGE, NO_LOAD} | COMPILED
 
 
 @pytest.mark.parametrize("mutation", MUTATIONS)
@@ -126,6 +116,11 @@ def test_a_wrong_motor_fails(monkeypatch, mutation):
     change, seen_by = MUTATIONS[mutation]
     mutate(monkeypatch, change)
     assert seen_by <= failed()
+
+
+def test_every_family_is_compared_with_its_python():
+    names = {f"compiled advance: {kind.__name__}" for kind in FAMILIES.values()}
+    assert names - COMPILED == {"compiled advance: Ideal"}, "the ideal actuator alone has no callback"
 
 
 def test_every_check_is_failed_by_some_mutation():
@@ -136,7 +131,8 @@ def test_a_command_that_is_a_step_late_fails(monkeypatch):
     step, waiting = mujoco.mj_step, {}
 
     def late(model, data):
-        command, waiting[id(data)] = waiting.get(id(data), np.zeros_like(data.ctrl)), data.ctrl.copy()
+        _, command = waiting.get(id(data), (data, np.zeros_like(data.ctrl)))
+        waiting[id(data)] = data, data.ctrl.copy()  # which keeps the data: their id is not used again
         data.ctrl[:] = command
         step(model, data)
 
@@ -208,10 +204,10 @@ def test_the_closed_form_solves_the_circuits_equations():
 
 def test_the_oracles_use_none_of_our_mathematics():
     """Only the parameters' names are taken from the motor: not one of its functions."""
-    classes = {"Motor", "CurrentLoop", "Actuator", "PAPER"}
+    classes = {"Motor", "CurrentLoop", "Actuator"}
     for path in Path(motor.__file__).parent.glob("motor*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.ImportFrom) and node.module.startswith("codrl_mj.motor"):
+            if isinstance(node, ast.ImportFrom) and node.module.startswith("codrl_mj.actuators"):
                 assert {alias.name for alias in node.names} <= classes, path
 
 
@@ -226,4 +222,4 @@ def test_the_native_motor_is_wrong_under_rk4_and_ours_is_not():
 def test_without_gym_electric_motor_its_check_is_left_out(monkeypatch):
     monkeypatch.setattr(motor, "checks_of", lambda *_: iter(()))
     monkeypatch.setattr(motor, "available", lambda: False)
-    assert {check.name for check in motor.checks(quick=True)} == NATIVE | {RK4}
+    assert {check.name for check in motor.checks(quick=True)} == NATIVE | {RK4} | COMPILED

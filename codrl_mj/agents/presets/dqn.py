@@ -2,7 +2,6 @@
 
 from codrl_mj.agents.dqn import DQNConfig
 from codrl_mj.agents.presets.preset import Preset
-from codrl_mj.envs.config import EnvConfig
 
 _ACROBOT = DQNConfig(
     learning_rate=1e-3,
@@ -69,7 +68,7 @@ PRESETS: dict[str, dict[str, Preset]] = {
                 input_scale=(1.0, 10.0),
             ),
             total_steps=80_000,
-            env=EnvConfig(max_episode_steps=1000),
+            env={"max_episode_steps": 1000},
             about=(
                 "Ours. It is trained in episodes of 1000 steps: in Gymnasium's 200 it sees the goal rarely, and "
                 "Stable-Baselines3 Zoo's settings reached -189."

@@ -2,7 +2,6 @@
 
 from codrl_mj.agents.ppo import PPOConfig
 from codrl_mj.agents.presets.preset import Preset
-from codrl_mj.envs.config import EnvConfig
 
 PRESETS: dict[str, dict[str, Preset]] = {
     "cartpole": {
@@ -22,7 +21,7 @@ PRESETS: dict[str, dict[str, Preset]] = {
                 activation="tanh",
             ),
             total_steps=60 * 4000,
-            env=EnvConfig(max_episode_steps=4000, center_radius=0.1),
+            env={"max_episode_steps": 4000, "center_radius": 0.1},
             about=(
                 "As printed. Not printed, and taken from the Keras example of PPO, whose numbers the paper's are: 80 "
                 "passes over the whole rollout for actor and critic each, the actor's stopping at 1.5 times the KL."
@@ -39,7 +38,7 @@ PRESETS: dict[str, dict[str, Preset]] = {
             PPOConfig(rollout_steps=4096, gae_lambda=0.98, target_kl=None, input_scale=(1.0, 10.0)),
             total_steps=300_000,
             num_envs=16,
-            env=EnvConfig(max_episode_steps=2000),
+            env={"max_episode_steps": 2000},
             about=(
                 "Ours. It is trained in episodes of 2000 steps: in Gymnasium's 200 it never saw the goal, and had "
                 "learnt nothing after 400 000 steps."

@@ -1,9 +1,10 @@
 """What settings of an agent for a task consist of."""
 
 import dataclasses
+from collections.abc import Mapping
+from typing import Any
 
 from codrl_mj.agents.base import AgentConfig
-from codrl_mj.envs.config import EnvConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,7 +19,7 @@ class Preset:
     """Training episodes in all; None where the steps are counted."""
     num_envs: int = 1
     """Environments side by side."""
-    env: EnvConfig = EnvConfig()
-    """The environment's arguments in training."""
+    env: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Fields of the environment in training, and options of the task, that are not at their defaults."""
     about: str = ""
     """Where the settings come from; for `repaired`, every deviation from the paper and why."""

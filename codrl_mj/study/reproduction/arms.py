@@ -5,10 +5,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+from codrl_mj.actuators import IDEAL, Actuator
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.motor import Actuator
-from codrl_mj.motor.catalog import PAPER
 from codrl_mj.study.grid import Deployment
+from codrl_mj.tasks import find_task
 from codrl_mj.training import EVALUATION_SEED, TrainConfig
 
 TEST, CENTRE = "test", "centre"
@@ -28,8 +28,8 @@ class Arm:
     """Of the agent: `paper` or `repaired`."""
     motor: str
     """What the arm is called for its actuator, such as `ideal`."""
-    actuator: Actuator | None
-    """What it learns, and is tested, on; None is the ideal actuator."""
+    actuator: Any
+    """What it learns, and is tested, on."""
     seconds: float
     """Computing time of a run and its tests on one core [s]: about the median of the results in docs/results."""
     physics: Literal["mujoco", "analytic"] = "mujoco"
@@ -43,7 +43,7 @@ class Arm:
     @property
     def gains(self) -> str:
         """The controller's gains as text."""
-        if self.actuator is None:
+        if self.actuator == IDEAL:
             return "no motor"
         loop = self.actuator.controller
         feed_forward = f", kFF {loop.kff:g}" if loop.kff else ""
@@ -56,22 +56,23 @@ class Arm:
             seed: training seed.
             episodes: stop after that many training episodes already; for trying things out.
         """
-        preset = TrainConfig.preset(self.task, self.agent, self.settings, actuator=self.actuator, seed=seed)
         changes: dict[str, Any] = {} if episodes is None else {"total_episodes": episodes}
-        return dataclasses.replace(preset, env=dataclasses.replace(preset.env, physics=self.physics), **changes)
+        return TrainConfig.preset(
+            self.task, self.agent, self.settings, self.actuator, {"physics": self.physics}, seed=seed, **changes
+        )
 
     def deployments(self, run: Path, episodes: int) -> dict[str, Deployment]:
         """The tests of a trained policy, by name."""
-        env = EnvConfig(physics=self.physics)
+        env = EnvConfig(self.task, self.actuator, self.physics)
         envs = {TEST: env}
         if self.task == "cartpole":
-            envs[CENTRE] = dataclasses.replace(env, center_radius=CENTRE_RADIUS)
-        return {name: Deployment(run, self.actuator, one, episodes, EVALUATION_SEED) for name, one in envs.items()}
+            envs[CENTRE] = dataclasses.replace(env, options={"center_radius": CENTRE_RADIUS})
+        return {name: Deployment(run, one, episodes, EVALUATION_SEED) for name, one in envs.items()}
 
 
 FAST: Actuator = dataclasses.replace(
-    PAPER["mountain_car"],
-    controller=dataclasses.replace(PAPER["mountain_car"].controller, kp=2.0, ki=10.0, kd=1e-6),
+    find_task("mountain_car").paper[0],
+    controller=dataclasses.replace(find_task("mountain_car").paper[0].controller, kp=2.0, ki=10.0, kd=1e-6),
 )
 """The mountain car's second set of gains (Solving the Mountain Car Environment)."""
 
@@ -84,7 +85,7 @@ def _arms(
     physics: Literal["mujoco", "analytic"] = "mujoco",
 ) -> tuple[Arm, ...]:
     """The arms of an experiment, by motor: how long a run takes."""
-    motors = {"paper gains": PAPER[task], "fast gains": FAST, "ideal": None}
+    motors = {"paper gains": find_task(task).paper[0], "fast gains": FAST, "ideal": IDEAL}
     return tuple(Arm(task, agent, settings, name, motors[name], took, physics) for name, took in seconds.items())
 
 

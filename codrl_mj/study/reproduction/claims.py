@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.envs.registration import ENVIRONMENTS
 from codrl_mj.study.reproduction.arms import CENTRE
 from codrl_mj.study.reproduction.series import Epochs, Series
 from codrl_mj.study.reproduction.value_iteration import Optimum
@@ -26,6 +25,7 @@ from codrl_mj.study.reproduction.verdicts import (
     Verdict,
     Within,
 )
+from codrl_mj.tasks import TASKS
 
 PAPER_SAYS, STUDY_SAYS, PORT = "paper", "quick study", "this port"
 """Who says it: the paper; the quick study; or ourselves, since both kinds of physics are to be one."""
@@ -135,7 +135,7 @@ def largest_error(series: Series) -> np.ndarray:
 
 def near_centre(series: Series) -> np.ndarray:
     """Share of the time limit that is spent near the centre of the track."""
-    limit = ENVIRONMENTS[series.arm.task].max_episode_steps
+    limit = TASKS[series.arm.task].max_episode_steps
     return series.tested("returns", CENTRE) / limit
 
 

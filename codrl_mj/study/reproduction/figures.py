@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.evaluation.episodes import Episode, make_env, run_episodes
+from codrl_mj.actuators import IDEAL
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.films.strip import ACTUAL, DESIRED
-from codrl_mj.physics.base import TRACE_ACTUAL_FORCE
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.study.figures import COLOURS, save
 from codrl_mj.study.reproduction.arms import CENTRE_RADIUS, Arm
@@ -86,7 +87,7 @@ def example(series: Series) -> Episode | None:
         return None
     arm, run = series.arm, next(iter(series.runs.values()))
     (episode,) = run_episodes(
-        load_policy(run.folder), lambda: make_env(arm.task, arm.actuator, physics=arm.physics), 1, EVALUATION_SEED
+        load_policy(run.folder), EnvConfig(arm.task, arm.actuator, arm.physics).make, 1, EVALUATION_SEED
     )
     return episode
 
@@ -144,11 +145,10 @@ def draw_torque(path: Path, episodes: Sequence[tuple[Arm, Episode]]) -> None:
     """
     figure, all_axes = _panels(2, len(episodes), heights=(2, 1))
     for (above, below), (arm, episode) in zip(all_axes.T, episodes, strict=True):
-        assert arm.actuator is not None
         radius = arm.actuator.motor.arm_radius
-        edges = np.arange(len(episode.trace) + 1) * episode.timestep
+        edges = np.arange(len(episode.trace["speed"]) + 1) * episode.timestep
         desired = radius * np.repeat(episode.signals["desired_force"], episode.inner_steps)
-        actual = radius * episode.trace[:, TRACE_ACTUAL_FORCE]
+        actual = radius * episode.trace["actual_force"]
         options: dict[str, Any] = {"baseline": None, "rasterized": len(edges) > _MANY}
         above.stairs(actual, edges, color=ACTUAL, linewidth=1.8, label="actual", **options)
         above.stairs(desired, edges, color=DESIRED, linewidth=0.9, linestyle="--", label="desired", **options)
@@ -258,7 +258,7 @@ def _filled(values: np.ndarray) -> np.ndarray:
 
 
 def _name(arm: Arm) -> str:
-    return "ideal" if arm.actuator is None else arm.gains
+    return "ideal" if arm.actuator == IDEAL else arm.gains
 
 
 def _legend(figure: Any, axes: Any) -> None:

@@ -3,9 +3,11 @@
 import collections
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from codrl_mj.actuators import IDEAL
 from codrl_mj.evaluation.measures import Interval, bootstrap_mean
 from codrl_mj.runs.files import writing
 from codrl_mj.study.conclusions import conclusions_section
@@ -91,14 +93,22 @@ def _missing(findings: Findings) -> str:
 
 
 def _verdicts(findings: Findings) -> str:
-    """How many claims of whom came to what."""
+    """How many claims of whom came to what; one that is judged on both kinds of physics is one claim."""
     outcomes = (CONFIRMED, NOT_CONFIRMED, NOT_TESTABLE)
     rows = []
     for source in (PAPER_SAYS, STUDY_SAYS, PORT):
-        counts = collections.Counter(verdict.outcome for claim, verdict in findings.claims if claim.source == source)
-        if counts:
+        found: dict[Any, set[str]] = {}
+        for claim, verdict in findings.claims:
+            if claim.source == source:
+                found.setdefault((claim.task, claim.statement, claim.measure), set()).add(verdict.outcome)
+        if found:
+            decisive = (NOT_CONFIRMED, CONFIRMED, NOT_TESTABLE)  # confirmed if it is wherever it could be tested
+            counts = collections.Counter(next(one for one in decisive if one in several) for several in found.values())
             rows.append([_SOURCES[source], *(str(counts[outcome]) for outcome in outcomes)])
-    return f"## Verdicts\n\n{_table(['said by', *outcomes], rows, numbers=3)}"
+    return f"## Verdicts\n\n{_ONCE}\n\n{_table(['said by', *outcomes], rows, numbers=3)}"
+
+
+_ONCE = "A claim that is judged on MuJoCo and on Gymnasium's equations counts once, as confirmed if it is on both."
 
 
 _SOURCES = {
@@ -192,7 +202,7 @@ def _draw(findings: Findings, task: str, folder: Path) -> list[Path]:
     for settings in dict.fromkeys(one.arm.settings for one in mine):
         shown = [one for one in mine if one.arm.settings == settings and one.arm.physics == "mujoco"]
         episodes = [(one.arm, episode) for one in shown if (episode := figures.example(one)) is not None]
-        driven = [(arm, episode) for arm, episode in episodes if arm.actuator is not None]
+        driven = [(arm, episode) for arm, episode in episodes if arm.actuator != IDEAL]
         if driven:
             paths.append(folder / f"torque_{task}_{settings}.svg")
             figures.draw_torque(paths[-1], driven)

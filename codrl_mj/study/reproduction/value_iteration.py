@@ -12,7 +12,6 @@ import numpy as np
 
 from codrl_mj.evaluation.episodes import Episode, make_env, run_episodes
 from codrl_mj.evaluation.measures import Interval, Quartiles, bootstrap_mean, quartiles
-from codrl_mj.physics.analytic import DRIVERS
 from codrl_mj.tasks import TASKS
 
 TASK = "mountain_car_continuous"
@@ -64,7 +63,8 @@ class Model:
         from scipy import sparse
 
         task = TASKS[TASK]
-        step = DRIVERS[TASK](task.gymnasium_id)
+        assert task.twin is not None
+        step = task.twin()
         self.grid = grid
         points = np.stack([axis.ravel() for axis in np.meshgrid(*grid.axes, indexing="ij")], axis=-1)
         after = np.array(

@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from codrl_mj.motor import CurrentLoop, Motor, named_actuator
+from codrl_mj import CurrentLoop, Motor, named_actuator
+from codrl_mj.actuators import IDEAL
 from codrl_mj.study.reproduction.arms import ARMS, TASKS, arms_of
 from codrl_mj.study.reproduction.claims import CLAIMS, PAPER_SAYS, PORT, STUDY_SAYS, Evidence, claims_of
 from codrl_mj.study.reproduction.series import Series, band, by_epoch, interval_text, running_mean
@@ -23,14 +24,14 @@ def test_an_arm_is_trained_as_the_papers_settings_say(arm):
     preset = TrainConfig.preset(arm.task, arm.agent, arm.settings, seed=7)
     assert (config.agent, config.seed, config.num_envs) == (preset.agent, 7, preset.num_envs)
     assert (config.total_steps, config.total_episodes) == (preset.total_steps, preset.total_episodes)
-    assert config.env == dataclasses.replace(preset.env, physics=arm.physics)
+    assert config.env == dataclasses.replace(preset.env, physics=arm.physics, actuator=arm.actuator)
     assert config.actuator == arm.actuator
     expected = {
         "paper gains": named_actuator("paper", arm.task),
         "fast gains": dataclasses.replace(
             named_actuator("paper", "mountain_car"), controller=CurrentLoop(kp=2.0, ki=10.0, kd=1e-6)
         ),
-        "ideal": None,
+        "ideal": IDEAL,
     }
     assert arm.actuator == expected[arm.motor]
 
@@ -46,7 +47,7 @@ def test_the_gains_are_those_that_the_paper_prints():
         ("cartpole", "paper gains"): (4.3, 1, 1e-6, 0.6, 0.15),
     }
     for arm in ARMS:
-        if arm.actuator is not None:
+        if arm.actuator != IDEAL:
             kp, ki, kd, kff, radius = printed[arm.task, arm.motor]
             loop = arm.actuator.controller
             assert (loop.kp, loop.ki, loop.kd, loop.kff) == (kp, ki, kd, kff)

@@ -5,23 +5,26 @@ import dataclasses
 import json
 import re
 import xml.etree.ElementTree as ElementTree
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from codrl_mj.actuators import Actuator
 from codrl_mj.cli import main
 from codrl_mj.evaluation import evaluate
 from codrl_mj.evaluation.episodes import Episode
-from codrl_mj.physics.base import TRACE_NAMES
+from codrl_mj.physics import trace_names
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.study.grid import Workers
 from codrl_mj.study.reproduction import figures, tables
 from codrl_mj.study.reproduction.arms import ARMS, TASKS
-from codrl_mj.study.reproduction.page import FOLDER, PAGE, write
+from codrl_mj.study.reproduction.claims import CLAIMS
+from codrl_mj.study.reproduction.page import FOLDER, PAGE, _verdicts, write
 from codrl_mj.study.reproduction.reproduce import Reproduction, compute, costs, gather
 from codrl_mj.study.reproduction.series import Series
 from codrl_mj.study.reproduction.value_iteration import Grid
-from codrl_mj.study.reproduction.verdicts import NOT_TESTABLE
+from codrl_mj.study.reproduction.verdicts import CONFIRMED, NOT_CONFIRMED, NOT_TESTABLE, Verdict
 from codrl_mj.tasks import find_task
 from codrl_mj.training import EVALUATION_SEED
 from tests.study.reproduction.worlds import trained
@@ -55,7 +58,7 @@ def test_every_arm_is_trained_tested_and_read(done):
         assert run.folder == plan.folders()[arm.name, 0]
         assert len(run.episodes) == 2
         env = arm.config(0).evaluation_env
-        expected = evaluate(load_policy(run.folder), arm.task, arm.actuator, env, 3, EVALUATION_SEED)
+        expected = evaluate(load_policy(run.folder), env, 3, EVALUATION_SEED)
         assert run.tests["test"]["episode_returns"] == list(expected.episode_returns)
         assert series.tested("returns") == [expected.returns.mean]
 
@@ -88,6 +91,22 @@ def test_the_page_has_every_claim_with_its_verdict(done):
     assert {claim.task for claim in untested} == {"mountain_car_continuous", "mountain_car"}  # one seed: no comparison
     header = [line for line in page.splitlines() if line.startswith("| said by | physics")]
     assert len(header) == 2
+
+
+@pytest.mark.parametrize(
+    ("mujoco", "analytic", "counted"),
+    [
+        (CONFIRMED, CONFIRMED, "1 | 0 | 0"),
+        (CONFIRMED, NOT_CONFIRMED, "0 | 1 | 0"),
+        (CONFIRMED, NOT_TESTABLE, "1 | 0 | 0"),
+        (NOT_TESTABLE, NOT_TESTABLE, "0 | 0 | 1"),
+    ],
+)
+def test_a_claim_about_both_kinds_of_physics_is_counted_once(mujoco, analytic, counted):
+    both = [claim for claim in CLAIMS if claim.statement == "ideal: goal in 160 s"]
+    assert [claim.physics for claim in both] == ["mujoco", "analytic"]
+    judged = zip(both, (Verdict(mujoco, ""), Verdict(analytic, "")), strict=True)
+    assert f"| the paper | {counted} |" in _verdicts(SimpleNamespace(claims=list(judged)))
 
 
 def test_every_file_that_the_page_names_is_there_and_whole(done):
@@ -208,7 +227,7 @@ def made_up(arm, steps=30, inner_steps=3):
         observation=np.zeros((steps + 1, 1)),
         action=np.zeros(steps),
         reward=np.zeros(steps),
-        trace=random.uniform(-1, 1, (steps * inner_steps, len(TRACE_NAMES))),
+        trace={name: random.uniform(-1, 1, steps * inner_steps) for name in trace_names(Actuator)},
         signals={"desired_force": random.uniform(-1, 1, steps)},
         terminated=True,
         actuator=arm.actuator,

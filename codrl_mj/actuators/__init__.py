@@ -1,0 +1,69 @@
+"""Actuators as mathematics: what one is, the families of them, stability, names. No MuJoCo."""
+
+from codrl_mj.actuators.current_loop import Actuator, CurrentLoop, Motor, Supply, electrical_step
+from codrl_mj.actuators.ideal import IDEAL, Ideal
+from codrl_mj.actuators.lag import Lag
+from codrl_mj.actuators.model import (
+    ActuatorModel,
+    Command,
+    Family,
+    Inputs,
+    JointAdditions,
+    Nothing,
+    family_name,
+    family_number,
+    field_paths,
+    parameter_paths,
+    parameters_type,
+    reference,
+    trusting,
+)
+from codrl_mj.actuators.named import (
+    FAMILIES,
+    NAMED,
+    actuator_from_mapping,
+    actuator_over,
+    check_same_family,
+    find_family,
+    mapping_of,
+    resolve,
+)
+from codrl_mj.actuators.stability import check_stable, closed_loop_matrix, spectral_radii, spectral_radius
+from codrl_mj.actuators.torque_speed import TorqueSpeed
+
+__all__ = [
+    "FAMILIES",
+    "IDEAL",
+    "NAMED",
+    "Actuator",
+    "ActuatorModel",
+    "Command",
+    "CurrentLoop",
+    "Family",
+    "Ideal",
+    "Inputs",
+    "JointAdditions",
+    "Lag",
+    "Motor",
+    "Nothing",
+    "Supply",
+    "TorqueSpeed",
+    "actuator_from_mapping",
+    "actuator_over",
+    "check_same_family",
+    "check_stable",
+    "closed_loop_matrix",
+    "electrical_step",
+    "family_name",
+    "family_number",
+    "field_paths",
+    "find_family",
+    "mapping_of",
+    "parameter_paths",
+    "parameters_type",
+    "reference",
+    "resolve",
+    "spectral_radii",
+    "spectral_radius",
+    "trusting",
+]

@@ -1,0 +1,347 @@
+"""The paper's actuator, family `current_loop`: a DC motor whose winding is driven by a PID current loop.
+
+Source of the equations and of the defaults: *Control-Optimized Deep Reinforcement Learning* (arXiv 2507.00268),
+Methodology; "the paper" below.
+
+`advance` is plain Python on purpose: numba compiles it for MuJoCo's control callback and actuator plugin, and it also
+runs as it stands, in the analytic physics and in the stability analysis.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from codrl_mj.actuators import noise, stability
+from codrl_mj.actuators.model import ActuatorModel, Command, Inputs
+from codrl_mj.fields import check, flag, integer, part, real
+
+
+@dataclasses.dataclass(frozen=True)
+class Motor:
+    """A brushed DC motor: a winding (R, L) whose current makes torque and whose speed makes voltage.
+
+    L di/dt = u - kE*omega - R*i and torque = kT*i (the paper, eqs. for the current update and the torque).
+
+    Raises:
+        ValueError: a field is not a finite number within its bound; the message names field, value and bound.
+    """
+
+    resistance: float = real(1.0, above=0.0, unit="ohm")
+    """Winding resistance R [ohm], > 0. The paper: 1, all tasks."""
+    inductance: float = real(0.1, above=0.0, unit="H")
+    """Winding inductance L [H], > 0. The paper: 0.1, all tasks."""
+    torque_constant: float = real(1.0, above=0.0, unit="N*m/A")
+    """Torque constant kT [N*m/A], > 0. The paper: 1, all tasks."""
+    back_emf_constant: float = real(1.0, least=0.0, unit="V*s/rad")
+    """Back-EMF constant kE [V*s/rad], >= 0; equal to kT in SI units for an ideal motor. The paper: 1."""
+    arm_radius: float = real(1.0, above=0.0, unit="m")
+    """Arm r [m] between shaft and load, > 0: torque = r*F and omega = v/r. On a hinge it is the inverse of the
+    gear ratio (no unit). The paper: 0.15 for CartPole, else 1."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        check(self)
+
+    @property
+    def electrical_time_constant(self) -> float:
+        """L/R [s]: how fast the current would follow a voltage step with no loop around it."""
+        return self.inductance / self.resistance
+
+
+@dataclasses.dataclass(frozen=True)
+class CurrentLoop:
+    """The PID loop that chooses the motor's terminal voltage from desired and measured current.
+
+    u = sat(kp*e + ki*I + kd*D + kff*i_ref + kE*omega, +-max_voltage), with e = i_ref - i.
+
+    Raises:
+        ValueError: a field is not a finite number within its bound; the message names field, value and bound.
+    """
+
+    kp: float = real(1.0, least=0.0, unit="V/A")
+    """Proportional gain [V/A], >= 0."""
+    ki: float = real(0.0, least=0.0, unit="V/(A*s)")
+    """Integral gain [V/(A*s)], >= 0."""
+    kd: float = real(0.0, least=0.0, unit="V*s/A")
+    """Derivative gain [V*s/A], >= 0."""
+    kff: float = real(0.0, least=0.0, unit="V/A")
+    """Feed-forward gain on the reference current [V/A], >= 0; kff = R holds the current without feedback."""
+    max_voltage: float = real(24.0, above=0.0, unit="V", infinite=True)
+    """Supply limit u_max [V], > 0; `inf` for none. The paper gives no value: 24 V never saturates at its settings."""
+    bemf_compensation: bool = flag(True)
+    """Add kE*omega to the voltage, which cancels the back-EMF unless the voltage saturates. The paper: yes."""
+    substeps: int = integer(1, least=1)
+    """Electrical steps within one mechanical step, >= 1: for winding time constants below the mechanical step."""
+    integral_leak: float = real(0.0, least=0.0, unit="1/s")
+    """Leak rate of the integral [1/s], >= 0: the paper appendix's low-pass form of the integral. 0: a plain sum."""
+    derivative_time_constant: float = real(0.0, least=0.0, unit="s")
+    """Time constant [s] of the low-pass on the derivative, >= 0: the appendix's high-pass form of the derivative.
+    0: the plain difference of two samples."""
+    current_bias: float = real(0.0, unit="A")
+    """Offset of the current sensor [A]: the controller measures the current plus this."""
+    current_noise: float = real(0.0, least=0.0, unit="A")
+    """Standard deviation [A] of the current sensor's white noise, >= 0: a new value for each electrical step."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        check(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class Supply:
+    """What feeds the drive: a voltage behind a resistance.
+
+    Raises:
+        ValueError: a field is out of bounds; the message names field, value and bound.
+    """
+
+    voltage: float = real(math.inf, above=0.0, unit="V", infinite=True)
+    """Open-circuit voltage [V], > 0; the terminal voltage is limited by the controller's `max_voltage` as well. `inf`:
+    the controller's `max_voltage`."""
+    resistance: float = real(0.0, least=0.0, unit="ohm")
+    """Resistance [ohm], >= 0: the voltage that is available sags by resistance*|current|."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        check(self)
+
+
+class State(NamedTuple):
+    """What the loop remembers."""
+
+    current: float
+    """Motor current i [A]."""
+    integral: float
+    """Integral of the current error [A*s]."""
+    error: float
+    """Current error of the last electrical step [A]; low-passed when the derivative filter is on."""
+
+
+class Signals(NamedTuple):
+    """What can be seen of the loop at the end of a step."""
+
+    current: float
+    """Motor current [A]."""
+    reference_current: float
+    """Current asked of the loop [A], by the command as it arrived."""
+    voltage: float
+    """Terminal voltage [V] of the last electrical step."""
+    saturated: float
+    """1 where that voltage was at its limit."""
+
+
+def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Signals]:
+    """Advance the loop by one mechanical step, with desired torque and speed held over it.
+
+    The paper's Algorithm 1 (function DCMotorENVStep), with its CartPole feed-forward and its appendix's
+    filters, repeated `substeps` times with timestep/substeps. With both filters off, every operation is the paper's.
+
+    The integral leaks as dI/dt = e - leak*I and the derivative is that of the error seen through
+    1/(1 + Td*s); both by backward Euler, so they are stable at any step and become the paper's sum and
+    difference at leak = 0 and Td = 0.
+
+    The controller reads i + current_bias + current_noise*n, with a new standard normal n for each electrical step, a
+    function of key, time and electrical step: whoever computes the step again gets it again. The voltage that is
+    available is the least of max_voltage and the supply's, which sags with the current at the electrical step's start.
+
+    Args:
+        parameters: named as the fields of `Actuator` and its parts.
+        timestep: mechanical step [s].
+        state: current, integral and error.
+        inputs: desired torque [N*m] and speed [rad/s] at the motor's shaft, time [s] and noise key.
+    """
+    current, integral, error = state
+    substeps = int(parameters.substeps)
+    dt = timestep / substeps
+    voltage, available = 0.0, min(parameters.max_voltage, parameters.supply_voltage)
+    open_circuit = parameters.max_voltage if math.isinf(parameters.supply_voltage) else parameters.supply_voltage
+    for substep in range(substeps):
+        sensor_error = parameters.current_bias
+        if parameters.current_noise > 0.0:
+            step = int(inputs.time / timestep + 0.5)
+            sensor_error += parameters.current_noise * noise.standard_normal(inputs.noise_key, step, substep)
+        if parameters.supply_resistance > 0.0:
+            sag = parameters.supply_resistance * abs(current)
+            available = min(parameters.max_voltage, max(open_circuit - sag, 0.0))
+        current, integral, error, voltage = electrical_step(
+            parameters, dt, current, integral, error, inputs.desired_torque, inputs.speed, sensor_error, available
+        )
+    reference = inputs.desired_torque / parameters.torque_constant
+    saturated = 1.0 if abs(voltage) >= available else 0.0
+    torque = parameters.torque_constant * current
+    return State(current, integral, error), torque, Signals(current, reference, voltage, saturated)
+
+
+def electrical_step(
+    parameters: Any,
+    dt: float,
+    current: Any,
+    integral: Any,
+    previous_error: Any,
+    desired_torque: float,
+    speed: float,
+    sensor_error: float,
+    limit: Any,
+) -> tuple[Any, Any, Any, Any]:
+    """One sample of the controller and one step of the winding: the only place where their equations stand.
+
+    Args:
+        parameters: as for `advance`; each may be an array.
+        dt: electrical step [s].
+        current: [A].
+        integral: [A*s].
+        previous_error: [A].
+        desired_torque: [N*m].
+        speed: [rad/s].
+        sensor_error: measured minus real current [A].
+        limit: largest magnitude of the voltage [V].
+
+    Returns:
+        Current [A], integral [A*s] and error [A] afterwards, and the voltage [V].
+    """
+    back_emf = parameters.back_emf_constant * speed
+    reference = desired_torque / parameters.torque_constant
+    feed_forward = parameters.kff * reference + parameters.bemf_compensation * back_emf
+    error = reference - current - sensor_error
+    integral = (integral + error * dt) / (1.0 + parameters.integral_leak * dt)
+    derivative = (error - previous_error) / (dt + parameters.derivative_time_constant)
+    previous_error = error - parameters.derivative_time_constant * derivative
+    voltage = parameters.kp * error + parameters.ki * integral + parameters.kd * derivative + feed_forward
+    voltage = min(max(voltage, -limit), limit)
+    current = current + (voltage - back_emf - parameters.resistance * current) / parameters.inductance * dt
+    return current, integral, previous_error, voltage
+
+
+def observe(parameters: Any, timestep: float, signals: Signals, inputs: Inputs) -> tuple[float, float]:
+    """The current [A] that the sensor measures at present, at the first electrical step to come, and the reference."""
+    error = parameters.current_bias
+    if parameters.current_noise > 0.0:
+        step = math.floor(inputs.time / timestep + 0.5)
+        error += parameters.current_noise * noise.standard_normal(inputs.noise_key, step, 0)
+    return signals.current + error, signals.reference_current
+
+
+_PAST_THE_CONTROLLER = ("max_voltage", "substeps", "current_bias", "current_noise")
+"""What of a controller counts where the agent commands the voltage."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Actuator(ActuatorModel):
+    """A motor and the current loop that drives it: what stands between a desired force and the force delivered."""
+
+    family: ClassVar[str] = "current_loop"
+    State: ClassVar[type] = State
+    Signals: ClassVar[type] = Signals
+    SIGNAL_UNITS: ClassVar[Mapping[str, str]] = {"current": "A", "reference_current": "A", "voltage": "V"}
+    OBSERVED: ClassVar[tuple[str, ...]] = ("current", "reference_current")
+    RANDOM: ClassVar[tuple[str, ...]] = ("controller.current_noise",)
+    helpers: ClassVar[tuple[Any, ...]] = (noise.philox, noise.unit, noise.standard_normal, electrical_step)
+    advance: ClassVar = staticmethod(advance)
+    observe: ClassVar = staticmethod(observe)
+
+    motor: Motor = Motor()
+    """The motor and its arm."""
+    controller: CurrentLoop = CurrentLoop()
+    """The current loop and its sensor."""
+    supply: Supply | None = part(Supply())
+    """What feeds the drive; None: `controller.max_voltage`, whatever the current."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        for field, kind in (("motor", Motor), ("controller", CurrentLoop), ("supply", Supply)):
+            if not isinstance(getattr(self, field), kind) and not (field == "supply" and self.supply is None):
+                raise ValueError(
+                    f"Actuator.{field} = {getattr(self, field)!r}: must be a {kind.__name__}; "
+                    "to build an actuator from nested mappings use Actuator.from_mapping"
+                )
+
+    @property
+    def arm_radius(self) -> float:
+        """The motor's arm [m]."""
+        return self.motor.arm_radius
+
+    @property
+    def winding(self) -> tuple[float, float]:
+        """Resistance [ohm] and inductance [H]."""
+        return self.motor.resistance, self.motor.inductance
+
+    @property
+    def voltage_limit(self) -> float:
+        """The largest voltage [V] without a current."""
+        return min(self.controller.max_voltage, math.inf if self.supply is None else self.supply.voltage)
+
+    def commands(self) -> Mapping[str, Command]:
+        """A reference `current` [A], or a `voltage` [V] past the controller: end to end."""
+        torque = self.motor.torque_constant
+        fixed = dict.fromkeys(("motor.torque_constant", "motor.arm_radius"), "it would change what an action means")
+        passed = [f"controller.{f.name}" for f in dataclasses.fields(CurrentLoop) if f.name != "substeps"]
+        driven_fixed = fixed | dict.fromkeys(passed, "the command goes past the controller")
+        through = dataclasses.replace(
+            CurrentLoop(kp=0.0, kff=1.0, bemf_compensation=False),
+            **{name: getattr(self.controller, name) for name in _PAST_THE_CONTROLLER},
+        )
+        driven = VoltageDriven(self.motor, through, self.supply)
+        return {
+            "current": Command("A", self, torque, None, fixed),
+            "voltage": Command("V", driven, torque, self.controller.max_voltage, driven_fixed),
+        }
+
+    def check(self, timestep: float) -> None:
+        """Refuse a loop that is unstable at this step, or a supply under which a saturated motor's current is.
+
+        Raises:
+            ValueError: the spectral radius is 1 or more; the message has the number and a remedy that was checked.
+        """
+        if self.supply is not None and self.supply.resistance:
+            substeps = self.controller.substeps
+            bound = 2.0 * self.motor.inductance * substeps / timestep - self.motor.resistance
+            if not self.supply.resistance < bound:
+                raise ValueError(
+                    f"actuator: supply.resistance = {self.supply.resistance:g}: must be < 2*L/dt - R = {bound:g} ohm "
+                    f"at an electrical step of {timestep / substeps:g} s, or a saturated motor's current oscillates "
+                    "from step to step. Raise controller.substeps, or pass allow_unstable=True"
+                )
+        stability.check_stable(self, timestep)
+
+    @classmethod
+    def instability(cls, numbers: np.ndarray, timestep: float) -> np.ndarray:
+        """The spectral radius of the loop, or that of a saturated motor's current under its supply, if greater."""
+        columns = stability.columns(cls, numbers)
+        radii = stability.stability_radii(cls, numbers, timestep)
+        # under a saturated voltage the current is fed back through the supply
+        pole = (columns.resistance + columns.supply_resistance) * timestep / (columns.inductance * columns.substeps)
+        return np.where(columns.supply_resistance > 0.0, np.maximum(radii, np.abs(1.0 - pole)), radii)
+
+    def as_mapping(self) -> dict[str, Any]:
+        """The nested mapping that `actuator_from_mapping` reads, without a family: it is the one that goes unsaid."""
+        return dataclasses.asdict(self) if type(self) is Actuator else super().as_mapping()
+
+
+def _advance_driven(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Signals]:
+    """`advance`, where the current asks for itself: an agent that commands the voltage desires whatever follows."""
+    state, torque, signals = advance(parameters, timestep, state, inputs)
+    return state, torque, Signals(signals.current, signals.current, signals.voltage, signals.saturated)
+
+
+def _observe_driven(parameters: Any, timestep: float, signals: Signals, inputs: Inputs) -> tuple[float, float]:
+    """The measured current, which is its own reference too."""
+    measured, _ = observe(parameters, timestep, signals, inputs)
+    return measured, measured
+
+
+@dataclasses.dataclass(frozen=True)
+class VoltageDriven(Actuator):
+    """A motor under commanded voltage.
+
+    With no feedback, a feed-forward gain of 1 V/A and no back-EMF compensation, the terminal voltage in volts is the
+    reference current in amperes.
+    """
+
+    family: ClassVar[str] = ""
+    helpers: ClassVar[tuple[Any, ...]] = (*Actuator.helpers, advance, observe)
+    tracks: ClassVar[bool] = False
+    advance: ClassVar = staticmethod(_advance_driven)
+    observe: ClassVar = staticmethod(_observe_driven)

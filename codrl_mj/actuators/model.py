@@ -1,0 +1,379 @@
+"""What an actuator is to the rest of the package: a frozen dataclass of numbers, and one pure function.
+
+A *family* of actuators is a subclass of `ActuatorModel`, in one file. What it says here is all that is known of it
+elsewhere: the doors into MuJoCo, the analytic physics, configuration files, the command line, randomisation, `info`,
+films and evaluations read it. docs/actuators.md builds one.
+"""
+
+import contextlib
+import contextvars
+import dataclasses
+import functools
+import hashlib
+import importlib
+from collections import namedtuple
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from codrl_mj import fields
+
+
+class Inputs(NamedTuple):
+    """What an actuator is told of the step that it drives; all of it is held over the step."""
+
+    desired_torque: float
+    """Torque asked for at the shaft [N*m], or force [N]."""
+    position: float
+    """Position of the shaft at the beginning of the step [rad] or [m]."""
+    speed: float
+    """Its speed there [rad/s] or [m/s]."""
+    time: float
+    """Time since the start of the episode [s], at the beginning of the step."""
+    noise_key: float
+    """Key of the episode's random numbers, a whole number: see `codrl_mj.actuators.noise`."""
+
+
+class Nothing(NamedTuple):
+    """No states, or no signals."""
+
+
+class Command(NamedTuple):
+    """What an agent's action can stand for other than a force."""
+
+    unit: str
+    """Its unit, for messages."""
+    actuator: "ActuatorModel"
+    """What is simulated: the actuator with whatever the command goes past left out."""
+    torque_per_unit: float
+    """Torque [N*m] at the shaft that stands for a command of one."""
+    limit: float | None
+    """The largest command; None: that of the task's largest force."""
+    fixed: Mapping[str, str]
+    """Fields that cannot be drawn -> why."""
+
+
+class JointAdditions(NamedTuple):
+    """What an actuator adds to the joint that it drives."""
+
+    armature: float = 0.0
+    """Inertia [kg*m^2], or mass [kg]."""
+    damping: float = 0.0
+    """Viscous friction [N*m*s/rad], or [N*s/m]."""
+    friction: float = 0.0
+    """Coulomb friction [N*m], or [N]."""
+
+
+Family = Any
+"""A subclass of `ActuatorModel`: `type[ActuatorModel]`, which mypy takes for unhashable."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ActuatorModel:
+    """Base of every family of actuators: a frozen dataclass whose fields are made with `codrl_mj.fields`.
+
+    A family has a name, says its states and signals as `NamedTuple`s of floats, and defines `advance`. The other
+    methods have defaults that suit an actuator without a gear, without electrics, and stable at any step.
+
+    Raises:
+        ValueError: a field is out of bounds.
+    """
+
+    family: ClassVar[str] = ""
+    """The family's name in mappings, files and on the command line; `module:Class` will always do as well."""
+    State: ClassVar[type] = Nothing
+    """What it remembers: a `NamedTuple` of floats, all 0 at the start of an episode."""
+    Signals: ClassVar[type] = Nothing
+    """What can be seen of it after a step: a `NamedTuple` of floats. A signal called `saturated` is 1 where the
+    actuator is at its limit. Signals called `current` [A] and `voltage` [V] make the electrical measures of an
+    evaluation."""
+    SIGNAL_UNITS: ClassVar[Mapping[str, str]] = {}
+    """Units of the signals, for tables and figures."""
+    OBSERVED: ClassVar[tuple[str, ...]] = ()
+    """Names of what `observe` returns: what `observe_actuator=True` appends to an observation."""
+    helpers: ClassVar[tuple[Callable[..., Any], ...]] = ()
+    """Plain Python functions that `advance` and `observe` call, innermost first, to be compiled with them."""
+    RANDOM: ClassVar[tuple[str, ...]] = ()
+    """Dotted paths of the fields that need the episode's key of random numbers where they are not 0."""
+    tracks: ClassVar[bool] = True
+    """Whether a torque is asked for at all; otherwise what is delivered counts as desired."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        fields.check(self)
+
+    @staticmethod
+    def advance(parameters: Any, timestep: float, state: Any, inputs: Inputs) -> tuple[Any, float, Any]:
+        """Advance by one mechanical step. A pure function, in plain Python that numba compiles as it stands.
+
+        Args:
+            parameters: a named tuple of floats: the fields by their names, those of parts too.
+            timestep: mechanical step [s].
+            state: a `State`, as the step before left it.
+            inputs: what is held over the step.
+
+        Returns:
+            The new `State`, the torque delivered at the shaft [N*m] over the step, and `Signals`.
+        """
+        raise NotImplementedError
+
+    @staticmethod
+    def observe(parameters: Any, timestep: float, signals: Any, inputs: Inputs) -> tuple[float, ...]:
+        """What a sensor says of the signals at the time of `inputs`, entries as in `OBSERVED`; compiled as `advance`.
+
+        Args:
+            parameters: as for `advance`.
+            timestep: mechanical step [s].
+            signals: of the last step; all 0 at the start of an episode.
+            inputs: of the present moment; only time and key are set.
+        """
+        raise NotImplementedError
+
+    @property
+    def arm_radius(self) -> float:
+        """Arm [m] between shaft and load: torque = arm*force, speed of the shaft = speed/arm; 1/gear on a hinge."""
+        return 1.0
+
+    @property
+    def additions(self) -> JointAdditions:
+        """What it adds to its joint."""
+        return JointAdditions()
+
+    @property
+    def random(self) -> bool:
+        """Whether an episode needs a key for its random numbers."""
+        return any(_get(self, path) != 0.0 for path in self.RANDOM)
+
+    @property
+    def winding(self) -> tuple[float, float] | None:
+        """Resistance [ohm] and inductance [H] that its `current` flows through; None where there is none."""
+        return None
+
+    @property
+    def voltage_limit(self) -> float | None:
+        """The largest voltage [V], to be drawn in figures of the signal `voltage`."""
+        return None
+
+    def commands(self) -> Mapping[str, Command]:
+        """What an agent can command besides the force, by name.
+
+        Raises:
+            ValueError: when a command is read that the fields do not allow; the message names the field.
+        """
+        return {}
+
+    def check(self, timestep: float) -> None:
+        """Refuse what cannot be simulated at a mechanical step [s].
+
+        Raises:
+            ValueError: the reason, with its number, and a remedy.
+        """
+
+    @classmethod
+    def instability(cls, numbers: np.ndarray, timestep: float) -> np.ndarray:
+        """How unstable actuators are at a mechanical step: 1 or more, or NaN, where `check` would refuse.
+
+        Args:
+            numbers: shape (m, p), rows as `numbers` returns them.
+            timestep: mechanical step [s].
+
+        Returns:
+            Shape (m,).
+        """
+        del timestep
+        return np.zeros(len(numbers))
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """The parameters, in the order of `parameters_type`: what a model's `user` data hold."""
+        return tuple(float(_get(self, path)) for path in parameter_paths(_family(self)).values())
+
+    @classmethod
+    def from_numbers(cls, numbers: Any, arm_radius: float = 1.0) -> Any:
+        """The actuator that `numbers` describe.
+
+        Args:
+            numbers: shape (p,).
+            arm_radius: the arm [m], which is not among them.
+
+        Raises:
+            ValueError: a number is out of its field's bounds.
+        """
+        values = dict(zip(parameter_paths(_family(cls)).values(), map(float, numbers), strict=True))
+        values |= {path: arm_radius for path in field_paths(_family(cls)) if _is_arm(path)}
+        return _from_values(cls, values)
+
+    def replaced(self, values: Mapping[str, Any]) -> Any:
+        """A copy with other values of some fields.
+
+        Args:
+            values: by dotted path, such as `motor.inductance`.
+
+        Raises:
+            ValueError: a value is out of bounds.
+        """
+        changes: dict[str, Any] = {}
+        nested: dict[str, dict[str, Any]] = {}
+        for path, value in values.items():
+            name, _, rest = path.partition(".")
+            if rest:
+                nested.setdefault(name, {})[rest] = value
+            else:
+                changes[name] = _of_kind(type(self), name, value)
+        for name, inner in nested.items():
+            owner = getattr(self, name)
+            if owner is None:
+                raise ValueError(f"{type(self).__name__}.{name} = None: give it before setting its fields")
+            kinds = {field: _of_kind(type(owner), field, value) for field, value in inner.items()}
+            changes[name] = dataclasses.replace(owner, **kinds)
+        return dataclasses.replace(self, **changes)
+
+    @classmethod
+    def from_mapping(cls, mapping: Mapping[str, Any]) -> Any:
+        """Build one from nested mappings; absent fields take the dataclasses' defaults.
+
+        Args:
+            mapping: for example `{"motor": {"inductance": 0.2}, "controller": {"kp": 2.0}}`.
+
+        Raises:
+            ValueError: an unknown field (the nearest known one is suggested) or a value out of bounds.
+        """
+        return fields.build(cls, mapping, "actuator field")
+
+    def as_mapping(self) -> dict[str, Any]:
+        """The nested mapping, `family` included, that `actuator_from_mapping` reads."""
+        return {"family": family_name(_family(self)), **dataclasses.asdict(self)}
+
+
+def _family(actuator: Any) -> Any:
+    """The family of an actuator, or of itself."""
+    return actuator if isinstance(actuator, type) else type(actuator)
+
+
+def _get(owner: Any, path: str) -> Any:
+    """What stands at a dotted path; in a part that is None, what stands for it."""
+    for name in path.split("."):
+        absent = next((f.metadata.get("absent") for f in dataclasses.fields(owner) if f.name == name), None)
+        value = getattr(owner, name)
+        owner = absent if value is None else value
+    return owner
+
+
+def _of_kind(cls: type, name: str, value: Any) -> Any:
+    """A number as the field's own type: whole numbers and flags come as floats from arrays."""
+    default = next(field.default for field in dataclasses.fields(cls) if field.name == name)
+    if isinstance(default, bool) and value in (0.0, 1.0):
+        return bool(value)
+    if isinstance(default, int) and isinstance(value, float) and value.is_integer():
+        return int(value)
+    return value
+
+
+def _from_values(cls: type, values: Mapping[str, Any], prefix: str = "") -> Any:
+    """Build a dataclass from values by dotted path; a part whose values stand for None is None."""
+    nested, made = fields.parts(cls), {}
+    for field in dataclasses.fields(cls):
+        if field.name in nested:
+            inner = _from_values(nested[field.name], values, f"{prefix}{field.name}.")
+            made[field.name] = None if inner == field.metadata.get("absent") else inner
+        else:
+            made[field.name] = _of_kind(cls, field.name, values[f"{prefix}{field.name}"])
+    return cls(**made)
+
+
+def _is_arm(path: str) -> bool:
+    return path.rpartition(".")[2] == "arm_radius"
+
+
+@functools.cache
+def field_paths(cls: type) -> tuple[str, ...]:
+    """Dotted paths of all fields of a family, those of its parts too."""
+    nested = fields.parts(cls)
+    inner = (
+        [f"{f.name}.{path}" for path in field_paths(nested[f.name])] if f.name in nested else [f.name]
+        for f in dataclasses.fields(cls)
+    )
+    return tuple(path for paths in inner for path in paths)
+
+
+@functools.cache
+def parameter_paths(cls: type) -> Mapping[str, str]:
+    """Name -> dotted path of the fields that are parameters of `advance`: all but the arm, which is the gear's.
+
+    A parameter is called as its field is, and in a part that may be None by the part's name and the field's.
+
+    Raises:
+        TypeError: two of them have the same name.
+    """
+    optional = {field.name for field in dataclasses.fields(cls) if "absent" in field.metadata}
+    paths = [path for path in field_paths(cls) if not _is_arm(path)]
+    named = {
+        path.replace(".", "_") if path.split(".")[0] in optional else path.rpartition(".")[2]: path for path in paths
+    }
+    if len(named) < len(paths):
+        raise TypeError(f"{cls.__name__}: two parameters have the same name: {', '.join(paths)}")
+    return named
+
+
+@functools.cache
+def parameters_type(cls: type) -> Any:
+    """The named tuple that a family's `advance` takes its parameters in."""
+    make: Callable[..., Any] = namedtuple  # mypy wants the names of a named tuple as a literal
+    made = make("Parameters", parameter_paths(cls))
+    made.__reduce__ = lambda self: (_parameters, (cls, *self))  # to be pickled
+    return made
+
+
+def _parameters(cls: type, *numbers: float) -> Any:
+    return parameters_type(cls)(*numbers)
+
+
+def reference(cls: type) -> str:
+    """Where a family is to be imported from: `module:Class`."""
+    return f"{cls.__module__}:{cls.__qualname__}"
+
+
+@functools.cache
+def family_number(cls: type) -> int:
+    """The family's number in a model's `user` data: six digits of a hash of `reference`, which survive as text."""
+    return int(hashlib.sha256(reference(cls).encode()).hexdigest(), 16) % 10**6
+
+
+def family_name(cls: Family) -> str:
+    """The name that `find_family` finds it by."""
+    from codrl_mj.actuators.named import FAMILIES
+
+    name: str = cls.family
+    return name if FAMILIES.get(name) is cls else reference(cls)
+
+
+_TRUSTED = contextvars.ContextVar("trusted", default=True)
+
+
+@contextlib.contextmanager
+def trusting(trust: bool) -> Iterator[None]:
+    """While the block runs, let `module:NAME` import modules, or refuse it."""
+    token = _TRUSTED.set(trust)
+    try:
+        yield
+    finally:
+        _TRUSTED.reset(token)
+
+
+def load_object(text: str) -> Any:
+    """What stands at `module:NAME`.
+
+    Raises:
+        ValueError: there is no such module, or nothing of that name in it; or it may not be imported (`trusting`).
+    """
+    module, _, name = text.partition(":")
+    if not _TRUSTED.get():
+        raise ValueError(
+            f"{text!r}: needs the module {module}, and importing it executes whatever its author put there. Pass "
+            "--trust (in Python: trust=True) if that author is you, or somebody whose programs you would run"
+        )
+    try:
+        return functools.reduce(getattr, name.split("."), importlib.import_module(module))
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"{text!r}: {error}; must be module:NAME, of a module that Python finds") from None

@@ -1,0 +1,176 @@
+"""Families and actuators by name, and whatever a user may write for an actuator."""
+
+import dataclasses
+import difflib
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from codrl_mj.actuators.current_loop import Actuator, CurrentLoop
+from codrl_mj.actuators.ideal import IDEAL, Ideal
+from codrl_mj.actuators.lag import Lag
+from codrl_mj.actuators.model import ActuatorModel, Family, load_object
+from codrl_mj.actuators.torque_speed import TorqueSpeed
+
+FAMILIES: dict[str, Family] = {kind.family: kind for kind in (Actuator, Ideal, Lag, TorqueSpeed)}
+"""Our families by name; anybody else's is found as `module:Class`."""
+
+
+def _with_loop(paper: Actuator, **gains: float) -> Actuator:
+    return dataclasses.replace(paper, controller=CurrentLoop(**gains))  # type: ignore[arg-type]
+
+
+def _open_loop(paper: Actuator) -> Actuator:
+    slow = dataclasses.replace(paper.motor, inductance=0.5)
+    return Actuator(slow, CurrentLoop(kp=0.0, kff=slow.resistance))
+
+
+NAMED: dict[str, tuple[str, Callable[[Actuator], ActuatorModel]]] = {
+    "ideal": ("force = desired force: no motor at all", lambda _: IDEAL),
+    "paper": ("the paper's motor and gains for the task", lambda paper: paper),
+    "weak": (
+        "the paper's motor under a weak loop: kp = ki = 1",
+        lambda paper: _with_loop(paper, kp=1.0, ki=1.0),
+    ),
+    "weaker": ("a weaker loop: kp = ki = 0.2", lambda paper: _with_loop(paper, kp=0.2, ki=0.2)),
+    "open_loop": ("no feedback, u = R*i_ref + kE*omega, and a slow winding: L = 0.5 H", _open_loop),
+}
+"""Name -> (what it is, function from the task's paper actuator to the actuator): variations of the task's own motor, so
+that a name means the same kind of actuator on every task."""
+
+
+def find_family(name: str) -> Family:
+    """The family called `name`, one of ours or `module:Class` of anybody's, which is imported.
+
+    Raises:
+        ValueError: there is none; the nearest known name is suggested.
+    """
+    if name in FAMILIES:
+        return FAMILIES[name]
+    if ":" in name:
+        family = load_object(name)
+        if isinstance(family, type) and issubclass(family, ActuatorModel):
+            return family
+        raise ValueError(f"family {name!r}: {family!r} is no subclass of codrl_mj.ActuatorModel")
+    near = difflib.get_close_matches(str(name), FAMILIES, n=1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    raise ValueError(f"unknown family {name!r}: {hint}Known: {', '.join(FAMILIES)}, or module:Class of your own")
+
+
+def actuator_from_mapping(mapping: Mapping[str, Any]) -> Any:
+    """The actuator that a mapping of its fields describes; without a `family` it is a `current_loop`.
+
+    Raises:
+        ValueError: unknown family or field, or a value out of bounds.
+    """
+    fields = dict(mapping)
+    return find_family(fields.pop("family", Actuator.family)).from_mapping(fields)
+
+
+def mapping_of(actuator: ActuatorModel) -> dict[str, Any] | None:
+    """The actuator as JSON-serialisable values, which `resolve` reads: None for the ideal one."""
+    return None if actuator == IDEAL else actuator.as_mapping()
+
+
+def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
+    """Turn whatever a user may write for an actuator into an `ActuatorModel`.
+
+    Args:
+        given: a name of `NAMED` or `FAMILIES`, `module:NAME` of an actuator or a family, a YAML or JSON file of fields,
+            an actuator, a mapping of its fields (with a `name`, over that actuator's), or None (ideal).
+        paper: the actuator that the names vary; None where there is none.
+        whose: whose it is, for messages.
+
+    Raises:
+        ValueError: unknown name or field, or a value out of bounds.
+    """
+    if given is None:
+        return IDEAL
+    if isinstance(given, ActuatorModel):
+        return given
+    if isinstance(given, Mapping) and "name" in given:
+        changes = {name: value for name, value in given.items() if name != "name"}
+        return actuator_over(resolve(given["name"], paper, whose), changes)
+    if isinstance(given, Mapping):
+        return actuator_from_mapping(given)
+    if not isinstance(given, str):
+        raise ValueError(
+            f"actuator = {given!r}: must be a name ({', '.join(NAMED)}), an actuator or a mapping of its fields"
+        )
+    if given == "ideal":
+        return IDEAL
+    if given in NAMED:
+        if paper is None:
+            raise ValueError(
+                f"actuator = {given!r}: a variation of the paper's actuator, of which {whose} has none; known are "
+                f"{', '.join(FAMILIES)}"
+            )
+        return NAMED[given][1](paper)
+    if given in FAMILIES:
+        return FAMILIES[given]()
+    if Path(given).suffix in (".yaml", ".yml", ".json"):
+        return actuator_from_file(Path(given))
+    if ":" in given:
+        found = load_object(given)
+        made = found() if isinstance(found, type) and issubclass(found, ActuatorModel) else found
+        if isinstance(made, ActuatorModel):
+            return made
+        raise ValueError(f"actuator = {given!r}: {found!r} is neither an actuator nor a family of them")
+    known = [*NAMED, *(name for name in FAMILIES if name not in NAMED)]
+    near = difflib.get_close_matches(given, known, n=1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    raise ValueError(f"unknown actuator {given!r}: {hint}Known actuators: {', '.join(known)}")
+
+
+def actuator_from_file(path: Path) -> Any:
+    """Read an actuator from a YAML or JSON file that holds a mapping of its fields.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is not YAML, or describes no actuator; the message has the file's name.
+    """
+    import yaml
+
+    if not path.is_file():
+        raise FileNotFoundError(f"no actuator file at {path}")
+    try:
+        return actuator_from_mapping(yaml.safe_load(path.read_text()))
+    except (yaml.YAMLError, UnicodeDecodeError, ValueError, TypeError) as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def actuator_over(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
+    """An actuator with single fields set over another's.
+
+    Args:
+        base: the other one.
+        changes: nested, for example `{"controller": {"kp": 2.0}}`.
+
+    Raises:
+        ValueError: a field is unknown or out of bounds, or set over the ideal actuator, which has none.
+    """
+    given = {name: value for name, value in changes.items() if value not in ({}, None)}
+    if not given:
+        return base
+    if isinstance(base, Ideal):
+        raise ValueError(
+            "the ideal actuator has no motor and no controller to set fields of: name another actuator, such as paper"
+        )
+    merged: dict[str, Any] = base.as_mapping()
+    for name, value in given.items():
+        inner = merged.get(name)
+        merged[name] = {**(inner or {}), **value} if isinstance(value, Mapping) else value
+    return type(base).from_mapping({name: value for name, value in merged.items() if name != "family"})
+
+
+def check_same_family(actuators: Sequence[ActuatorModel]) -> Family:
+    """The family of several actuators that one environment simulates together.
+
+    Raises:
+        ValueError: they are of several.
+    """
+    kinds = {type(actuator) for actuator in actuators}
+    if len(kinds) > 1:
+        names = ", ".join(sorted(kind.__name__ for kind in kinds))
+        raise ValueError(f"actuators of several families ({names}): the actuators of one environment must be of one")
+    return kinds.pop()

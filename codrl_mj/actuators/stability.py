@@ -1,0 +1,165 @@
+"""Stability of the discrete closed loop of controller and winding, without the mechanics."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from codrl_mj.actuators.model import Inputs, parameters_type
+
+
+def columns(family: Any, numbers: np.ndarray) -> Any:
+    """Parameters of m actuators at once, each an array (m,), from rows of numbers (m, p)."""
+    return parameters_type(family)(*numbers.T)
+
+
+def closed_loop_matrix(actuator: Any, timestep: float) -> np.ndarray:
+    """Transition matrix of the unsaturated loop over one mechanical step, at zero reference and speed.
+
+    Only the states that some gain reads are part of the loop: the current always, the integral if ki > 0 and the
+    previous error if kd > 0. The matrix is read off `advance` itself, a linear map while the voltage does not saturate.
+
+    Args:
+        actuator: motor and gains.
+        timestep: mechanical step [s].
+
+    Returns:
+        Square matrix, shape (n, n) with n in 1..3.
+    """
+    family: Any = type(actuator)
+    parameters = parameters_type(family)(*actuator.numbers)._replace(
+        max_voltage=np.inf, supply_voltage=np.inf, supply_resistance=0.0, current_bias=0.0, current_noise=0.0
+    )
+    states = [0]
+    states += [1] if actuator.controller.ki > 0 else []
+    states += [2] if actuator.controller.kd > 0 else []
+    units = np.eye(3)[states]
+    rest = Inputs(0.0, 0.0, 0.0, 0.0, 0.0)
+    after = [actuator.advance(parameters, timestep, actuator.State(*unit), rest)[0] for unit in units]
+    return np.array(after).T[states]
+
+
+class _Unlimited:
+    """A voltage limit that no voltage reaches, be it a number or an array: it compares as neither above nor below."""
+
+    def __neg__(self) -> "_Unlimited":
+        return self
+
+    def __lt__(self, other: object) -> bool:
+        return False
+
+    def __gt__(self, other: object) -> bool:
+        return False
+
+
+def spectral_radii(family: Any, numbers: np.ndarray, timestep: float) -> np.ndarray:
+    """`spectral_radius` of many actuators at once.
+
+    Args:
+        family: `codrl_mj.Actuator`, or one with its fields.
+        numbers: shape (m, p), rows as `ActuatorModel.numbers` has them.
+        timestep: mechanical step [s].
+
+    Returns:
+        Shape (m,); the radius of each does not depend on the others, to the last bit.
+    """
+    from codrl_mj.actuators.current_loop import electrical_step
+
+    parameters = columns(family, numbers)
+    substeps = parameters.substeps
+    current, integral, error = np.eye(3)[:, :, np.newaxis]  # all states of all actuators at once: (state, actuator)
+    with np.errstate(all="ignore"):
+        after = electrical_step(parameters, timestep / substeps, current, integral, error, 0.0, 0.0, 0.0, _Unlimited())[
+            :3
+        ]
+        matrices = np.stack([np.broadcast_to(entry, (3, len(numbers))) for entry in after])  # (to, from, actuator)
+        # what no gain reads is no part of the loop: 0 instead of the eigenvalue of a state of its own
+        read = np.stack([np.ones(len(numbers), dtype=bool), parameters.ki > 0, parameters.kd > 0])
+        matrices = np.moveaxis(np.where(read[:, np.newaxis] & read, matrices, 0.0), 2, 0)
+        finite = np.isfinite(matrices).all(axis=(1, 2))
+        values = np.linalg.eigvals(np.where(finite[:, np.newaxis, np.newaxis], matrices, 0.0))
+        radii = np.abs(values.astype(np.complex128)).max(axis=1)
+        radii = np.where(finite, radii, np.inf)
+        return radii**substeps  # a power of the matrix itself would overflow into NaN
+
+
+MARGIN = 1e-9
+"""By how much, relative to their terms, Jury's conditions must hold or not: far above the rounding of either method."""
+
+
+def stability_radii(family: Any, numbers: np.ndarray, timestep: float) -> np.ndarray:
+    """`spectral_radii`, but 0 or infinity in clear cases, which saves nearly all of the eigenvalues.
+
+    Args:
+        family: as for `spectral_radii`, and so are the others.
+        numbers: see there.
+        timestep: see there.
+
+    Returns:
+        Shape (m,): below 1 exactly where the spectral radii are.
+    """
+    from codrl_mj.actuators.current_loop import electrical_step
+
+    parameters = columns(family, numbers)
+    nothing, one = np.zeros(len(numbers)), np.ones(len(numbers))
+    units = (one, nothing, nothing), (nothing, one, nothing), (nothing, nothing, one)
+    dt = timestep / parameters.substeps
+    with np.errstate(all="ignore"):
+        after = [electrical_step(parameters, dt, *unit, 0.0, 0.0, 0.0, _Unlimited())[:3] for unit in units]
+        read = (np.ones(len(numbers), dtype=bool), parameters.ki > 0.0, parameters.kd > 0.0)
+        (a, b, c), (d, e, f), (g, h, i) = (
+            [np.where(read[to] & read[source], after[source][to], 0.0) for source in range(3)] for to in range(3)
+        )
+        # z^3 + two z^2 + one z + zero
+        two = -(a + e + i)
+        linear = (a * e - b * d) + (a * i - c * g) + (e * i - f * h)
+        zero = -(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
+        margin = MARGIN * (1.0 + abs(two) + abs(linear) + abs(zero)) ** 2
+        least = np.minimum(np.minimum(1.0 + two + linear + zero, 1.0 - two + linear - zero), 1.0 - abs(zero))
+        last = np.minimum(least, 1.0 - zero * zero - abs(linear - zero * two))
+        least = np.where(least > margin, last, least)
+        radii = np.where(least > margin, 0.0, np.where(least < -margin, np.inf, np.nan))
+    doubtful = np.isnan(radii)
+    if doubtful.any():
+        radii[doubtful] = spectral_radii(family, numbers[doubtful], timestep)
+    return radii
+
+
+def spectral_radius(actuator: Any, timestep: float) -> float:
+    """Largest absolute eigenvalue of the closed loop over one mechanical step: below 1 the loop is stable.
+
+    Args:
+        actuator: motor and gains.
+        timestep: mechanical step [s].
+    """
+    return float(spectral_radii(type(actuator), np.array([actuator.numbers]), timestep)[0])
+
+
+def check_stable(actuator: Any, timestep: float) -> None:
+    """Refuse an actuator whose closed loop is unstable at this step.
+
+    Args:
+        actuator: motor and gains.
+        timestep: mechanical step [s].
+
+    Raises:
+        ValueError: the spectral radius is 1 or more; the message has the number and a remedy that was checked.
+    """
+    radius = spectral_radius(actuator, timestep)
+    if radius < 1.0:
+        return
+    raise ValueError(
+        f"actuator: the current loop is unstable at a step of {timestep:g} s: spectral radius {radius:.4g}, must be "
+        f"< 1. {_remedy(actuator, timestep)}, or pass allow_unstable=True to study it as it is"
+    )
+
+
+def _remedy(actuator: Any, timestep: float) -> str:
+    """The smallest power-of-two number of electrical substeps that stabilises the loop, else smaller gains."""
+    for doubling in range(1, 11):
+        substeps = actuator.controller.substeps * 2**doubling
+        finer = dataclasses.replace(actuator.controller, substeps=substeps)
+        if spectral_radius(dataclasses.replace(actuator, controller=finer), timestep) < 1.0:
+            return f"Set controller.substeps = {substeps}, lower the gains, or shorten the step"
+    gains = actuator.controller
+    return f"Lower the gains (kp = {gains.kp:g}, ki = {gains.ki:g}, kd = {gains.kd:g}): more substeps do not help"

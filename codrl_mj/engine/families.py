@@ -1,0 +1,253 @@
+"""Families of actuators, compiled: one table of C functions that both doors into MuJoCo call by a family's number.
+
+A family's number is in the model's `user` data, so a callback or plugin that was compiled once runs families that were
+written later. Compiling one takes a fraction of a second, once a process.
+"""
+
+import contextlib
+import ctypes
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numba import types
+from numba.extending import register_jitable
+
+from codrl_mj.actuators import Family, Inputs, family_number, parameters_type, reference
+from codrl_mj.engine.memory import call_family, f64, i32, internal, read, u8, u64, write
+
+SIGNATURE = (250700.0, 268401.0)
+"""First two numbers of the `user` data of every actuator and joint that is ours: the paper's arXiv identifier, in two,
+because a number keeps six digits in an XML file."""
+
+
+class Head(NamedTuple):
+    """What the `user` data of an actuator of ours begin with, at either door; the family's parameters follow."""
+
+    signature_1: float
+    signature_2: float
+    family: float
+    """The family's number."""
+
+
+class Slot(NamedTuple):
+    """What the state of an actuator of ours begins with, in `data.act` or `data.plugin_state`.
+
+    The family's committed state follows (at time `tick`), then its candidate one step later, then its signals, then a
+    0: the engine multiplies the last activation by the actuator's gain, 0, which makes NaN of infinity.
+    """
+
+    tick: float
+    """Time [s] of the committed state."""
+    noise_key: float
+    """Key of the episode's random numbers."""
+    torque: float
+    """Torque delivered at the shaft [N*m]."""
+
+
+HEAD, SLOT = len(Head._fields), len(Slot._fields)
+
+_ADDRESSES = np.zeros(10**6, dtype=np.uintp)
+"""Address of a family's compiled function by its number; 0 where it has not been compiled. 8 MB that the system hands
+out page by page."""
+_SIZES = np.zeros((10**6, 3), dtype=np.int32)
+"""Numbers of states, signals and parameters, likewise."""
+_REFERENCES = np.zeros(10**6, dtype=np.uintp)
+"""Address of its `reference`, as C has strings, likewise."""
+_COMPILED: dict[int, tuple[Family, Any]] = {}
+"""Number -> (family, what owns the memory that the tables point to)."""
+
+ADDRESSES_AT, SIZES_AT, REFERENCES_AT = (table.ctypes.data for table in (_ADDRESSES, _SIZES, _REFERENCES))
+
+_F64, _AT = types.float64, types.uintp
+_FUNCTION = _F64(_AT, _F64, _AT, _AT, _AT, _F64, _F64, _F64, _F64, _F64)
+
+
+def loaded_families() -> tuple[Family, ...]:
+    """The families that have been compiled in this process."""
+    return tuple(family for family, _ in _COMPILED.values())
+
+
+def slot_size(family: Family) -> int:
+    """Numbers of state that an actuator of a family has in MuJoCo."""
+    return signals_at(family) + len(family.Signals._fields) + 1
+
+
+def signals_at(family: Family) -> int:
+    """Where its signals begin in there."""
+    return SLOT + 2 * len(family.State._fields)
+
+
+def user_head(family: Family) -> Head:
+    """What the `user` data of a family's actuators begin with."""
+    return Head(*SIGNATURE, float(family_number(family)))
+
+
+def load_family(family: Family) -> None:
+    """Compile a family, on first use, and put it into the table.
+
+    A class that was defined anew, as in a notebook, takes the place of the one before.
+
+    Raises:
+        ValueError: another family has the same number: rename one of the two. Or the one before had other numbers of
+            states, signals or parameters, which models that exist rely on.
+        numba.core.errors.NumbaError: `advance` is not what numba compiles.
+    """
+    number, sizes = family_number(family), family_sizes(family)
+    other, _ = _COMPILED.get(number, (None, None))
+    if other is family:
+        return
+    if other is not None and reference(other) != reference(family):
+        raise ValueError(
+            f"families {reference(family)} and {reference(other)} have the same number {number}: rename one"
+        )
+    if other is not None and family_sizes(other) != sizes:
+        raise ValueError(
+            f"family {reference(family)} has {sizes} states, signals and parameters, and {family_sizes(other)} when it "
+            "was loaded before: give it another name, or start Python anew"
+        )
+    function, text = _compile(family), ctypes.create_string_buffer(reference(family).encode())
+    _SIZES[number], _REFERENCES[number] = sizes, ctypes.addressof(text)
+    _ADDRESSES[number] = function.address
+    _COMPILED[number] = family, (function, text, _COMPILED.get(number))
+
+
+def family_sizes(family: Family) -> tuple[int, ...]:
+    """Numbers of a family's states, signals and parameters."""
+    return tuple(len(kind._fields) for kind in (family.State, family.Signals, parameters_type(family)))
+
+
+@contextlib.contextmanager
+def replaced(family: Family, other: Family) -> Iterator[None]:
+    """Run another's `advance` in place of a family's, in all models, for the length of a `with` block.
+
+    Args:
+        family: the family.
+        other: has the same parameters, states and signals.
+    """
+    load_family(family)
+    number, function = family_number(family), _compile(other)
+    right = _ADDRESSES[number]
+    _ADDRESSES[number] = function.address
+    try:
+        yield
+    finally:
+        _ADDRESSES[number] = right
+
+
+def jitable(owner: Any) -> None:
+    """Make the functions that a family's, or a task's, call known to numba; they stay what they are."""
+    for helper in owner.helpers:
+        _register(helper)
+
+
+@functools.cache
+def _register(helper: Callable[..., Any]) -> None:
+    register_jitable(helper)
+
+
+@functools.cache
+def _compile(family: Any) -> Any:
+    jitable(family)
+    advance = internal(family.advance)
+    parameters_of, state_of = parameters_type(family), family.State
+
+    @numba.cfunc(_FUNCTION, nogil=True, error_model="numpy")
+    def step(
+        parameters: int,
+        timestep: float,
+        before: int,
+        after: int,
+        seen: int,
+        desired: float,
+        position: float,
+        speed: float,
+        time: float,
+        key: float,
+    ) -> float:
+        state, torque, outcome = advance(
+            read(parameters, parameters_of),
+            timestep,
+            read(before, state_of),
+            Inputs(desired, position, speed, time, key),
+        )
+        write(state, after)
+        write(outcome, seen)
+        return torque
+
+    return step
+
+
+@internal
+def is_compiled(number: float) -> bool:
+    """Whether a family of that number is in the table; any float will do."""
+    return 0.0 <= number < 1e6 and u64(ADDRESSES_AT)[int(number)] != 0
+
+
+@internal
+def state_count(number: int) -> int:
+    """A family's number of states."""
+    return i32(SIZES_AT)[3 * number]
+
+
+@internal
+def size_of(number: int) -> int:
+    """`slot_size` by a family's number."""
+    return SLOT + 2 * i32(SIZES_AT)[3 * number] + i32(SIZES_AT)[3 * number + 1] + 1
+
+
+@internal(inline="always")
+def parameter_count(number: int) -> int:
+    """A family's number of parameters."""
+    return i32(SIZES_AT)[3 * number + 2]
+
+
+@internal(inline="always")
+def is_called(number: int, text: int) -> bool:
+    """Whether the C string at an address is a family's `reference`."""
+    name, place = u64(REFERENCES_AT)[number], 0
+    while u8(name)[place] == u8(text)[place]:
+        if u8(name)[place] == 0:
+            return True
+        place += 1
+    return False
+
+
+@internal
+def commit_slot(number: int, slot: int, time: float) -> None:
+    """A step was taken and it is `time` now: what was an actuator's candidate has happened."""
+    own, count = f64(slot), state_count(number)
+    own[0] = time
+    for entry in range(SLOT, SLOT + count):
+        own[entry] = own[entry + count]
+
+
+@internal
+def advance_slot(
+    number: int, parameters: int, timestep: float, slot: int, desired: float, position: float, speed: float, time: float
+) -> float:
+    """Compute an actuator's candidate and signals from its committed state.
+
+    Args:
+        number: the family's.
+        parameters: address of its parameters.
+        timestep: mechanical step [s].
+        slot: address of the actuator's state.
+        desired: torque asked for [N*m].
+        position: of the shaft [rad].
+        speed: of the shaft [rad/s].
+        time: [s].
+
+    Returns:
+        The torque [N*m], which the slot keeps too.
+    """
+    own, size = f64(slot), 8 * state_count(number)
+    before = slot + 8 * SLOT
+    after = before + size
+    own[2] = call_family(
+        u64(ADDRESSES_AT)[number],
+        *(parameters, timestep, before, after, after + size, desired, position, speed, time, own[1]),
+    )
+    return own[2]

@@ -1,0 +1,95 @@
+"""Reads and writes raw memory in functions that numba compiles: integer addresses become typed pointers."""
+
+import functools
+from typing import Any
+
+import numba
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+internal = functools.partial(numba.njit, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
+"""`numba.njit` for what only compiled code calls: the ways in from Python, left out, take their time to compile."""
+
+
+def _pointer(element: Any) -> Any:
+    """A numba intrinsic that turns an integer address into a typed pointer."""
+
+    @intrinsic
+    def pointer(typing_context: Any, address: Any) -> Any:  # noqa: ARG001 - numba fixes the arguments
+        def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
+            return builder.inttoptr(arguments[0], ir.PointerType(context.get_data_type(element)))
+
+        return types.CPointer(element)(types.uintp), codegen
+
+    return pointer
+
+
+f64, i32, i64, u8, u64 = (
+    _pointer(kind) for kind in (types.float64, types.int32, types.int64, types.uint8, types.uint64)
+)
+
+
+@intrinsic
+def call_family(
+    typing_context: Any,  # noqa: ARG001 - numba fixes the arguments
+    function: Any,  # noqa: ARG001
+    parameters: Any,  # noqa: ARG001
+    timestep: Any,  # noqa: ARG001
+    before: Any,  # noqa: ARG001
+    after: Any,  # noqa: ARG001
+    seen: Any,  # noqa: ARG001
+    desired: Any,  # noqa: ARG001
+    position: Any,  # noqa: ARG001
+    speed: Any,  # noqa: ARG001
+    time: Any,  # noqa: ARG001
+    key: Any,  # noqa: ARG001
+) -> Any:
+    """Call a family's compiled function (see `codrl_mj.engine.families`) by its address; returns the torque [N*m]."""
+    number, address = types.float64, types.uintp
+    kinds = (address, number, address, address, address, number, number, number, number, number)
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
+        llvm = [context.get_value_type(kind) for kind in kinds]
+        function_type = ir.FunctionType(context.get_value_type(number), llvm)
+        return builder.call(builder.inttoptr(arguments[0], function_type.as_pointer()), arguments[1:])
+
+    return number(address, *kinds), codegen
+
+
+@intrinsic
+def array(typing_context: Any, struct: Any, at: Any) -> Any:  # noqa: ARG001 - numba fixes the arguments
+    """Address of the array whose pointer the structure at address `struct` holds at offset `at`."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
+        kind = ir.PointerType(context.get_value_type(types.uintp))
+        return builder.load(builder.inttoptr(builder.add(*arguments), kind))
+
+    return types.uintp(types.uintp, types.uintp), codegen
+
+
+@intrinsic
+def read(typing_context: Any, address: Any, kind: Any) -> Any:  # noqa: ARG001 - numba fixes the arguments
+    """The named tuple of class `kind` whose entries are the float64 numbers from an address on."""
+    made = types.BaseTuple.from_types((types.float64,) * len(kind.instance_class._fields), kind.instance_class)
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
+        pointer = builder.inttoptr(arguments[0], ir.PointerType(context.get_value_type(types.float64)))
+        places = (builder.gep(pointer, [context.get_constant(types.intp, at)]) for at in range(len(made)))
+        return context.make_tuple(builder, made, [builder.load(place) for place in places])
+
+    return made(types.uintp, kind), codegen
+
+
+@intrinsic
+def write(typing_context: Any, values: Any, address: Any) -> Any:  # noqa: ARG001 - numba fixes the arguments
+    """Write a tuple of numbers as float64 from an address on."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
+        pointer = builder.inttoptr(arguments[1], ir.PointerType(context.get_value_type(types.float64)))
+        for at, kind in enumerate(values):
+            value = context.cast(builder, builder.extract_value(arguments[0], at), kind, types.float64)
+            builder.store(value, builder.gep(pointer, [context.get_constant(types.intp, at)]))
+        return context.get_dummy_value()
+
+    return types.void(values, types.uintp), codegen

@@ -1,0 +1,206 @@
+"""What compiled models and their data say of our actuators, at either door."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from codrl_mj.actuators import FAMILIES, ActuatorModel, Family, family_number, parameters_type, reference
+from codrl_mj.engine.families import HEAD, SIGNATURE, loaded_families, signals_at, slot_size
+from codrl_mj.engine.plugin import EXTRA_STATES, PLUGIN_HEAD, REASONS
+from codrl_mj.plugin import FAMILY, NAME, registered
+
+
+def motors(model: mujoco.MjModel) -> dict[int, ActuatorModel]:
+    """Our actuators in a compiled model, at both doors.
+
+    Args:
+        model: any MuJoCo model.
+
+    Returns:
+        The actuator by its index, in order.
+
+    Raises:
+        ValueError: an actuator carries our signature but not our layout, or a parameter out of bounds; its plugin is
+            not ours, or ours and it does not carry the signature; its family is not known in this process; or, at the
+            control callback's door, it uses MuJoCo's actuator delay, which the callback does not see, a gain, which
+            would add to the motor's torque, or limits of its activations, which are the motor's state.
+    """
+    found = {}
+    slot = registered()[NAME][0]
+    for index in range(model.nactuator):
+        user, instance = model.actuator_user[index], model.actuator_plugin[index]
+        ours = instance >= 0 and model.plugin[instance] == slot
+        if not ours and (len(user) < HEAD or tuple(user[:2]) != SIGNATURE):
+            continue
+        read = _behind_callback if instance < 0 else _behind_plugin
+        try:
+            found[index] = read(model, index)
+        except ValueError as error:
+            raise ValueError(f"{model.actuator(index).name or f'actuator {index}'}: {error}") from None
+    return found
+
+
+def check(model: mujoco.MjModel) -> None:
+    """Refuse a model whose motors would not be what they were, such as one from an `.mjb` file or a pickle.
+
+    To be called before an `MjData` is made: MuJoCo runs whatever plugin has the number that such a file has kept.
+
+    Args:
+        model: any MuJoCo model.
+
+    Raises:
+        ValueError: see `motors`.
+    """
+    motors(model)
+
+
+def _family(number: float) -> Family:
+    known = {family_number(family): family for family in (*FAMILIES.values(), *loaded_families())}
+    if number not in known:
+        raise ValueError(
+            f"family {number:g} is not known in this process: import its module and call codrl_mj.load_family first"
+        )
+    return known[int(number)]
+
+
+def _made(family: Family, user: np.ndarray, head: int, arm: float) -> ActuatorModel:
+    names = parameters_type(family)._fields
+    if len(user) < head + len(names):
+        raise ValueError(f"user = {list(user)}: a {family.__name__} needs {head} numbers and {', '.join(names)}")
+    return family.from_numbers(user[head : head + len(names)], arm)
+
+
+def _behind_plugin(model: mujoco.MjModel, index: int) -> ActuatorModel:
+    user, instance, slot = model.actuator_user[index], model.actuator_plugin[index], registered()[NAME][0]
+    if model.plugin[instance] != slot:
+        raise ValueError(
+            f"plugin slot = {model.plugin[instance]}: a motor of codrl_mj needs {slot}, where its plugin is. The model "
+            "was compiled where others were registered before it: compile it here, from XML or a spec"
+        )
+    if len(user) < PLUGIN_HEAD or tuple(user[:2]) != SIGNATURE:
+        raise ValueError(REASONS[1])
+    family = _family(user[2])
+    name = bytes(model.plugin_attr[model.plugin_attradr[instance] :]).partition(b"\0")[0].decode()
+    if name != reference(family):
+        raise ValueError(f"{FAMILY} = {name!r} of its plugin: its user data are those of {reference(family)}")
+    if model.plugin_statenum[instance] != slot_size(family) + EXTRA_STATES:
+        raise ValueError(REASONS[5])
+    return _made(family, user, PLUGIN_HEAD, user[HEAD])
+
+
+def _behind_callback(model: mujoco.MjModel, index: int) -> ActuatorModel:
+    user = model.actuator_user[index]
+    family = _family(user[2])
+    size = slot_size(family)
+    expected = {
+        "dyntype": (model.actuator_dyntype[index], mujoco.mjtDyn.mjDYN_USER, 'dyntype="user"'),
+        "biastype": (model.actuator_biastype[index], mujoco.mjtBias.mjBIAS_USER, 'biastype="user"'),
+        "actdim": (model.actuator_actnum[index], size, f'actdim="{size}"'),
+        "delay": (model.actuator_delay[index], 0.0, 'delay="0"'),
+        "gaintype": (model.actuator_gaintype[index], mujoco.mjtGain.mjGAIN_FIXED, 'gaintype="fixed"'),
+        "gainprm": (model.actuator_gainprm[index, 0], 0.0, 'gainprm="0"'),
+        "actlimited": (model.actuator_actlimited[index], False, 'actlimited="false"'),
+    }
+    for field, (value, wanted, remedy) in expected.items():
+        if value != wanted:
+            raise ValueError(f"{field} = {value:g}: a motor of codrl_mj needs {remedy}")
+    gear = model.actuator_gear[model.actuator_outadr[index]]
+    if not gear[0] > 0 or np.any(gear[1:]):
+        raise ValueError(f"gear = {gear}: a motor of codrl_mj needs gear = 1/arm > 0 and no other entry")
+    return _made(family, user, HEAD, 1.0 / gear[0])
+
+
+def _slots(data: mujoco.MjData) -> list[tuple[Family, np.ndarray]]:
+    """The family of each motor, and a view of its state."""
+    model, found = data.model, []
+    for index, actuator in motors(model).items():
+        instance, family = model.actuator_plugin[index], type(actuator)
+        start = model.actuator_actadr[index] if instance < 0 else model.plugin_stateadr[instance]
+        size = slot_size(family) + (0 if instance < 0 else EXTRA_STATES)
+        found.append((family, (data.act if instance < 0 else data.plugin_state)[start : start + size]))
+    return found
+
+
+def clear_motors(data: mujoco.MjData, noise_keys: Sequence[int] | None = None) -> None:
+    """Bring all motors of a simulation to rest, at its present time; `mj_resetData` does that too.
+
+    To be called where positions and velocities are set in the middle of an episode, and at the start of an episode in
+    which sensors have noise: each key gives other random numbers.
+
+    Args:
+        data: the simulation.
+        noise_keys: one for each motor, whole numbers below 2**53; None: those that they have, 0 after a reset.
+
+    Raises:
+        ValueError: the model is not as `motors` wants it, or there are not as many keys as motors.
+    """
+    slots = [slot for _, slot in _slots(data)]
+    keys = [slot[1] for slot in slots] if noise_keys is None else list(noise_keys)
+    if len(keys) != len(slots):
+        raise ValueError(f"noise_keys: there are {len(keys)}, must be {len(slots)}, one for each motor of the model")
+    for slot, key in zip(slots, keys, strict=True):
+        slot[:] = 0.0
+        slot[:2] = data.time, key
+
+
+class Readout:
+    """Reads the signals of all motors of a model, quickly: one array a signal.
+
+    Args:
+        model: a compiled model.
+
+    Raises:
+        ValueError: see `motors`.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        """Find the places."""
+        self.motors = motors(model)
+        indices = np.array(list(self.motors), dtype=int)
+        families: list[Family] = [type(actuator) for actuator in self.motors.values()]
+        self._out = model.actuator_outadr[indices]
+        self._control = model.actuator_ctrladr[indices]
+        instances = model.actuator_plugin[indices]
+        self._behind_plugin = instances >= 0
+        # a motor at the callback's door has its arm in the gear, and forces at the shaft
+        self._gear = np.where(self._behind_plugin, 1.0, model.actuator_gear[self._out, 0])
+        limited = model.actuator_ctrllimited[self._control].astype(bool)
+        low, high = model.actuator_ctrlrange[self._control].T
+        self._low, self._high = np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
+        nothing = model.na + model.npluginstate
+        in_plugin = model.plugin_stateadr[instances] if model.nplugin else nothing
+        starts = np.where(self._behind_plugin, model.na + in_plugin, model.actuator_actadr[indices])
+        self._places: dict[str, np.ndarray] = {}
+        for motor, (start, family) in enumerate(zip(starts, families, strict=True)):
+            for place, name in enumerate(family.Signals._fields, start + signals_at(family)):
+                self._places.setdefault(name, np.full(len(families), nothing))[motor] = place
+        last = np.array([slot_size(family) for family in families], dtype=int)
+        self._desired = np.where(self._behind_plugin, starts + last, nothing)
+
+    def __call__(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
+        """The signals after the last step or `mj_forward`.
+
+        Args:
+            data: a simulation of the model.
+
+        Returns:
+            Name -> array (n_motors,): `desired_force` and `actual_force` [N], or torques [N*m], at the joint's side of
+            the arm (and before the gear that the model of a plugin has), and every signal of the families, NaN where a
+            motor's family has none of that name.
+        """
+        states = np.concatenate((data.act, data.plugin_state, [np.nan]))
+        commanded = np.clip(data.ctrl[self._control], self._low, self._high) * self._gear
+        desired = np.where(self._behind_plugin, states[self._desired], commanded)
+        forces: dict[str, Any] = {"desired_force": desired, "actual_force": data.actuator_force[self._out] * self._gear}
+        return forces | {name: states[places] for name, places in self._places.items()}
+
+
+def signals(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, np.ndarray]:
+    """The signals of all motors: `Readout(model)(data)`, which is quicker where it is asked often.
+
+    Raises:
+        ValueError: see `motors`.
+    """
+    return Readout(model)(data)

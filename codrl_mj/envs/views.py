@@ -1,0 +1,131 @@
+"""What an agent gets of a state: observation, reward and end, by the task's compiled functions."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from codrl_mj.actuators import Family
+from codrl_mj.envs.outcomes import Outcomes, compiled_outcomes
+from codrl_mj.physics import Signals
+from codrl_mj.tasks import Task
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """A task's observations and rewards, of one state or of many."""
+
+    task: Task
+    """The task."""
+    options: Any
+    """The task's options."""
+    sensors: tuple[str, ...]
+    """Names of what the actuators' sensors add to an observation; none if they are not observed."""
+
+    @classmethod
+    def build(cls, task: Task, options: Any, family: Family, observe_actuator: bool) -> "View":
+        """A view.
+
+        Args:
+            task: the task.
+            options: its options.
+            family: of its actuators.
+            observe_actuator: whether the observation ends with what their sensors say.
+
+        Raises:
+            ValueError: they have none.
+        """
+        if observe_actuator and not family.OBSERVED:
+            raise ValueError(
+                f"observe_actuator=True: the {family.family or family.__name__} actuator has no current to observe, "
+                "and nothing else; choose another"
+            )
+        motors = task.motors if observe_actuator else ()
+        single = len(task.motors) == 1
+        names = tuple(name if single else f"{motor}.{name}" for motor in motors for name in family.OBSERVED)
+        return cls(task, options, names)
+
+    @functools.cached_property
+    def outcomes(self) -> Outcomes:
+        """The task's compiled functions."""
+        return compiled_outcomes(self.task)
+
+    @functools.cached_property
+    def option_values(self) -> np.ndarray:
+        """The task's options as a vector."""
+        return np.array(self.options, dtype=np.float64)
+
+    @property
+    def observation_space(self) -> spaces.Box:
+        """The task's observation space, with unbounded entries for the sensors."""
+        space = self.task.observation_space
+        if not self.sensors:
+            return space
+        inf = np.full(len(self.sensors), np.inf)
+        low, high = np.append(space.low, -inf), np.append(space.high, inf)
+        return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+
+    @property
+    def observation_names(self) -> tuple[str, ...]:
+        """Names of the observation's entries."""
+        return (*self.task.observation_names, *self.sensors)
+
+    def observation(self, state: np.ndarray, seen: np.ndarray | None) -> np.ndarray:
+        """What the agent sees.
+
+        Args:
+            state: the mechanical state, shape (n,); or a batch of them, (N, n).
+            seen: what the sensors say, as many numbers for each state as there are `sensors`; None if there are none.
+
+        Returns:
+            Shape (k,), or (N, k), float32.
+        """
+        size = len(self.task.observation_names)
+        rows = np.empty((*state.shape[:-1], size + len(self.sensors)), np.float32)
+        self.outcomes.observe_all(_rows(state), _rows(rows))
+        if seen is not None:
+            rows[..., size:] = seen.reshape(rows[..., size:].shape)
+        return rows
+
+    def reward(self, before: np.ndarray, force: Any, after: np.ndarray) -> float:
+        """The task's reward of a step that led from one state to another under a force [N or N*m]."""
+        return float(self.rewards(before[np.newaxis], np.asarray(force)[np.newaxis], after[np.newaxis])[0])
+
+    def rewards(self, before: np.ndarray, forces: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """The same for a batch: states (N, n), forces (N,) or (N, motors), and rewards (N,)."""
+        rewards = np.empty(len(after))
+        forces = np.ascontiguousarray(forces, dtype=np.float64)
+        self.outcomes.reward_all(_rows(before), forces, _rows(after), self.option_values, rewards)
+        return rewards
+
+    def terminated(self, state: np.ndarray) -> bool:
+        """Whether the task ends the episode in this state."""
+        ended = np.empty(1, dtype=bool)
+        self.outcomes.terminated_all(_rows(state), ended)
+        return bool(ended[0])
+
+
+def signals_of(row: np.ndarray, family: Family, desired: Any, tracks: bool) -> Signals:
+    """The last row of a simulation's trace as signals.
+
+    Args:
+        row: shape (motors, columns).
+        family: of the actuators.
+        desired: the force [N or N*m] that was asked for.
+        tracks: whether it counts; otherwise what was delivered does.
+    """
+    names = ("desired_force", "actual_force", *family.Signals._fields)
+    several = len(row) > 1
+    values = row.T.copy() if several else row[0].tolist()
+    signals = dict(zip(names, values, strict=False))
+    signals["desired_force"] = desired if tracks else signals["actual_force"]
+    saturated = signals.pop("saturated", np.zeros(len(row)) if several else 0.0)
+    signals["saturated"] = saturated != 0.0
+    return signals
+
+
+def _rows(array: np.ndarray) -> np.ndarray:
+    """An array (n,) or (N, n) as rows (N, n), in the one memory layout that the compiled functions are compiled for."""
+    return np.ascontiguousarray(array.reshape(-1, array.shape[-1]))

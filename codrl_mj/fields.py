@@ -1,0 +1,198 @@
+"""Fields of frozen dataclasses that know their own bounds and units: the one place where settings are checked."""
+
+import dataclasses
+import difflib
+import math
+import numbers
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+
+def real(
+    default: float | None,
+    above: float | None = None,
+    least: float | None = None,
+    below: float | None = None,
+    most: float | None = None,
+    optional: bool = False,
+    unit: str = "",
+    infinite: bool = False,
+) -> Any:
+    """A field for a finite number within bounds, stored as a float.
+
+    Args:
+        default: its default.
+        above: it must be greater than this.
+        least: it must be at least this.
+        below: it must be less than this.
+        most: it must be at most this.
+        optional: let it be None; so does a default of None.
+        unit: for tables and documentation.
+        infinite: let it be infinite.
+    """
+    limits = [("> ", above), (">= ", least), ("< ", below), ("<= ", most)]
+    kind = "a number" if infinite else "a finite number"
+    text = " ".join([kind, " and ".join(f"{sign}{limit:g}" for sign, limit in limits if limit is not None)]).strip()
+
+    def holds(value: Any) -> bool:
+        return (
+            (_is_real(value) or (infinite and _is_infinite(value)))
+            and (above is None or value > above)
+            and (least is None or value >= least)
+            and (below is None or value < below)
+            and (most is None or value <= most)
+        )
+
+    return _bounded(default, holds, text, optional, unit, float)
+
+
+def integer(default: int | None, least: int, optional: bool = False, unit: str = "") -> Any:
+    """A field for an integer of at least `least`; `optional`, or a default of None, lets it be None."""
+    return _bounded(
+        default, lambda value: _is_integer(value) and value >= least, f"an integer >= {least}", optional, unit, int
+    )
+
+
+def flag(default: bool) -> Any:
+    """A field for True or False."""
+    return _bounded(default, lambda value: isinstance(value, bool), "true or false")
+
+
+def choice(default: str, *options: str) -> Any:
+    """A field for one of some words."""
+    return _bounded(default, lambda value: value in options, f"one of {', '.join(options)}")
+
+
+def units(default: tuple[int, ...]) -> Any:
+    """A field for the units of a network's hidden layers."""
+
+    def holds(value: Any) -> bool:
+        return isinstance(value, tuple) and all(_is_integer(count) and count >= 1 for count in value)
+
+    return _bounded(default, holds, "a tuple of integers >= 1")
+
+
+def factors(default: tuple[float, ...] | None = None) -> Any:
+    """An optional field for finite numbers > 0, one for each entry of something."""
+
+    def holds(value: Any) -> bool:
+        return isinstance(value, tuple) and all(_is_real(factor) and factor > 0 for factor in value)
+
+    return _bounded(default, holds, "a tuple of finite numbers > 0")
+
+
+def reals(default: tuple[float, ...] | None = None) -> Any:
+    """An optional field for finite numbers, one for each entry of something."""
+
+    def holds(value: Any) -> bool:
+        return isinstance(value, tuple) and all(_is_real(one) for one in value)
+
+    return _bounded(default, holds, "a tuple of finite numbers")
+
+
+def check(settings: Any) -> None:
+    """Check every field of a dataclass made with the functions above, and store numbers as Python's own.
+
+    Raises:
+        ValueError: a field is out of bounds; the message names it, its value and the bound.
+    """
+    for field in dataclasses.fields(settings):
+        if "bound" not in field.metadata:
+            continue
+        holds, text, optional, kind = field.metadata["bound"]
+        value = getattr(settings, field.name)
+        if value is None and optional:
+            continue
+        if not holds(value):
+            none = " or none" if optional else ""
+            raise ValueError(f"{type(settings).__name__}.{field.name} = {value!r}: must be {text}{none}")
+        if kind is not None:
+            object.__setattr__(settings, field.name, kind(value))
+
+
+def check_names(given: Iterable[Any], known: Iterable[str], what: str, prefix: str = "") -> None:
+    """Refuse names that are not known; the nearest known one is suggested.
+
+    Args:
+        given: the names.
+        known: what they may be.
+        what: what to call them, such as `actuator field`.
+        prefix: stands before each of them in the message.
+
+    Raises:
+        ValueError: one is unknown.
+    """
+    known = list(known)
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(str(name), known, n=1)
+            hint = f"did you mean {prefix}{near[0]}?" if near else f"known: {', '.join(known)}"
+            raise ValueError(f"unknown {what} {prefix}{name}; {hint}")
+
+
+def build(cls: type, mapping: object, what: str, prefix: str = "") -> Any:
+    """Build a dataclass, and those in its fields, from nested mappings; absent fields take their defaults.
+
+    Args:
+        cls: the dataclass; a field whose default is a dataclass, or that `part` made, is nested.
+        mapping: the fields by name.
+        what: what to call a field in messages.
+        prefix: dotted path of the mapping.
+
+    Raises:
+        ValueError: an unknown field (the nearest known one is suggested) or a value out of bounds.
+    """
+    if not isinstance(mapping, Mapping):
+        raise ValueError(f"{what} {prefix.rstrip('.')!r} = {mapping!r}: must be a mapping of {cls.__name__}'s fields")
+    check_names(mapping, (field.name for field in dataclasses.fields(cls)), what, prefix)
+    nested = parts(cls)
+    return cls(
+        **{
+            key: build(nested[key], value, what, f"{prefix}{key}.") if key in nested and value is not None else value
+            for key, value in mapping.items()
+        }
+    )
+
+
+def part(absent: Any) -> Any:
+    """A field for an optional dataclass, None by default.
+
+    Args:
+        absent: the instance whose numbers stand for None.
+    """
+    return dataclasses.field(default=None, metadata={"absent": absent})
+
+
+def parts(cls: type) -> dict[str, type]:
+    """The fields of a dataclass that hold dataclasses, and which."""
+    found = {}
+    for field in dataclasses.fields(cls):
+        if "absent" in field.metadata:
+            found[field.name] = type(field.metadata["absent"])
+        elif dataclasses.is_dataclass(field.default):
+            found[field.name] = type(field.default)
+    return found
+
+
+def _bounded(
+    default: Any,
+    holds: Callable[[Any], bool],
+    text: str,
+    optional: bool = False,
+    unit: str = "",
+    kind: type | None = None,
+) -> Any:
+    metadata = {"bound": (holds, text, optional or default is None, kind), "unit": unit}
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def _is_real(value: Any) -> bool:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_infinite(value: Any) -> bool:
+    return isinstance(value, numbers.Real) and math.isinf(value)
+
+
+def _is_integer(value: Any) -> bool:
+    return isinstance(value, numbers.Integral) and not isinstance(value, bool)

@@ -1,0 +1,77 @@
+"""The tasks that are known, ours and anybody's, and their registration with Gymnasium."""
+
+import difflib
+import sys
+
+from gymnasium.envs.registration import register as register_with_gymnasium
+from gymnasium.envs.registration import registry
+
+from codrl_mj.actuators.model import load_object
+from codrl_mj.tasks.base import Task
+
+TASKS: dict[str, Task] = {}
+"""Every task by its name on the command line."""
+
+
+def register(task: Task) -> Task:
+    """Make a task known: `gymnasium.make` and `make_vec` take its id, and every other face and command its name.
+
+    Harmless when repeated.
+
+    Args:
+        task: the task, of any module.
+
+    Returns:
+        The task.
+
+    Raises:
+        ValueError: another task has its name, or another environment its id.
+    """
+    if not isinstance(task, Task):
+        raise ValueError(f"{task!r}: must be a codrl_mj.Task")
+    if TASKS.get(task.name, task) is not task:
+        raise ValueError(f"task {task.name!r} is registered already, of {reference_of(TASKS[task.name])}: rename one")
+    if task.name not in TASKS and task.env_id in registry:
+        raise ValueError(f"environment id {task.env_id!r} is registered already: choose another for task {task.name!r}")
+    TASKS[task.name] = task
+    if task.env_id not in registry:
+        register_with_gymnasium(
+            id=task.env_id,
+            entry_point="codrl_mj.envs:ActuatedEnv",
+            vector_entry_point="codrl_mj.envs:ActuatedVectorEnv",
+            kwargs={"task": reference_of(task)},
+            max_episode_steps=task.max_episode_steps,
+            reward_threshold=task.reward_threshold,
+        )
+    return task
+
+
+def reference_of(task: Task) -> str:
+    """What `find_task` finds a task by in any process: the name of ours, `module:NAME` of somebody's."""
+    module = task.reward.__module__
+    if module.startswith("codrl_mj."):
+        return task.name
+    names = (
+        (name for name, value in vars(sys.modules[module]).items() if value is task) if module in sys.modules else ()
+    )
+    return next((f"{module}:{name}" for name in names), task.name)
+
+
+def find_task(name: str) -> Task:
+    """The task called `name`.
+
+    Args:
+        name: a key of `TASKS`; or `module:NAME` of anybody's task, which is imported and registered.
+
+    Raises:
+        ValueError: unknown name; the nearest known one is suggested.
+    """
+    if name in TASKS:
+        return TASKS[name]
+    if ":" in str(name):
+        return register(load_object(name))
+    near = difflib.get_close_matches(str(name), TASKS, n=1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    raise ValueError(
+        f"unknown task {name!r}: {hint}Known tasks: {', '.join(TASKS)}; of your own: module:NAME, as my_module:TASK"
+    )

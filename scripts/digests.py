@@ -1,0 +1,261 @@
+"""Digests of what a change of the code's structure must leave as it is, to the last bit.
+
+Written on two commits and compared by `--compare`: trajectories of every task through every actuator, command and
+disturbance; the weights that short trainings of every agent end with; and what every check of the quick certificate
+found at worst, as the number itself. They may depend on the machine and on the versions of the packages.
+"""
+
+import argparse
+import dataclasses
+import hashlib
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Discrete
+from safetensors.numpy import load_file
+
+from codrl_mj import TASKS, Actuator, CurrentLoop, Ideal, Motor, Supply, Uniform, named_actuator
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.runs.files import read_json, write_json
+from codrl_mj.training import TrainConfig, train
+
+_COMMAND = {"command_delay": 0.027, "command_quantum": 0.3, "command_rate": 1.5}
+_PULSE = {"pulse_force": 0.7, "pulse_duration": 0.13, "pulse_interval": 0.4}
+_MOTOR = {"current_noise": 0.05, "current_bias": -0.02, "supply_resistance": 0.7}
+_JOINT = {"joint_damping": 0.03, "joint_friction": 0.02}
+DISTURBANCES: dict[str, dict[str, float]] = {
+    **{name: {name: value} for name, value in (_COMMAND | _MOTOR | _JOINT).items()},
+    "pulse": _PULSE,
+    "most": _COMMAND | _PULSE | _MOTOR,
+    "low_voltage": {},
+}
+"""Name -> fields. `supply_resistance` and `most` are at `low_voltage`, where the voltage saturates."""
+LOW_VOLTAGE = ("supply_resistance", "most", "low_voltage")
+
+
+def disturbed(name: str, task: str, actuator: str = "paper") -> dict[str, Any]:
+    """Arguments of `gymnasium.make` for a disturbance. Nothing else here knows how disturbances are spelled.
+
+    Args:
+        name: one of `DISTURBANCES`.
+        task: the task's name.
+        actuator: a named actuator.
+    """
+    fields = DISTURBANCES[name]
+    joint = {field.removeprefix("joint_"): value for field, value in fields.items() if field in _JOINT}
+    sensor = {field: value for field, value in fields.items() if field in ("current_noise", "current_bias")}
+    others = {field: value for field, value in fields.items() if field not in _JOINT | _MOTOR}
+    arguments: dict[str, Any] = {"actuator": actuator, "disturbances": others, "joint": joint}
+    nominal = named_actuator(actuator, task)
+    if not isinstance(nominal, Ideal):
+        limit = {"max_voltage": 0.5} if name in LOW_VOLTAGE else {}
+        controller = dataclasses.replace(nominal.controller, **sensor, **limit)
+        supply = Supply(resistance=fields["supply_resistance"]) if "supply_resistance" in fields else None
+        arguments["actuator"] = dataclasses.replace(nominal, controller=controller, supply=supply)
+    return arguments
+
+
+ACTUATORS = ("ideal", "paper", "weak", "weaker", "open_loop")
+_WINDING = Motor(resistance=1.3, inductance=0.2, torque_constant=0.9, back_emf_constant=0.8, arm_radius=0.7)
+_GAINS = CurrentLoop(kp=1.0, ki=2.0, kd=0.01, kff=0.5, bemf_compensation=False, substeps=3)
+CUSTOM = Actuator(_WINDING, dataclasses.replace(_GAINS, integral_leak=0.1, derivative_time_constant=0.02))
+"""An actuator none of whose fields is neutral."""
+STEPS, LIMIT, HOLD = 200, 50, 10
+"""Steps of a trajectory, of its episodes at most, and for which an action is held."""
+_CAR = {"low": -1.2, "high": 0.6}
+STARTS = {
+    "pendulum": {"y_init": 8.0},
+    "acrobot": {"low": -2.0, "high": 2.0},
+    "mountain_car": _CAR,
+    "mountain_car_continuous": _CAR,
+}
+"""Task -> reset options that lead to speed limits, walls and goals."""
+LEVELS = {"current": (-0.6, 0.2, 0.6), "voltage": (-24.0, 1.0, 24.0)}
+"""Command -> levels [A or V] of discrete tasks."""
+RANDOMIZE = {"motor.inductance": Uniform(0.05, 0.2), "model.gravity": Uniform(0.8, 1.2)}
+SIGNALS = ("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated")
+Entries = Iterator[tuple[str, str]]
+
+
+def digest(arrays: list[np.ndarray]) -> str:
+    """The first digits of the SHA-256 of arrays' bytes."""
+    return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()[:16]
+
+
+def trajectory(task: str, num_envs: int | None, arguments: dict[str, Any]) -> str:
+    """The digest of what an environment returns under random actions.
+
+    Args:
+        task: the task's name.
+        num_envs: environments of the vector environment; None for a single one.
+        arguments: of the environment.
+    """
+    size: tuple[int, ...] = () if num_envs is None else (num_envs,)
+    env: Any
+    if num_envs is None:
+        single = {"max_episode_steps": LIMIT, "disable_env_checker": True} | arguments
+        env = gymnasium.make(TASKS[task].env_id, **single)
+    else:
+        vector = {"max_episode_steps": LIMIT, "num_threads": 1} | arguments
+        env = gymnasium.make_vec(TASKS[task].env_id, num_envs, "vector_entry_point", **vector)
+    space = env.action_space if num_envs is None else env.single_action_space
+    generator, options = np.random.default_rng(1), STARTS.get(task)
+    observation, _ = env.reset(seed=2, options=options)
+    seen = [observation, env.unwrapped.state]
+    for step in range(STEPS):
+        if step % HOLD == 0 and isinstance(space, Discrete):
+            action = generator.integers(space.n, size=size)
+        elif step % HOLD == 0:
+            action = generator.uniform(space.low, space.high, (*size, *space.shape)).astype(np.float32)
+        observation, reward, terminated, truncated, info = env.step(action)
+        signals = [info.get(name, np.zeros(size)) for name in SIGNALS]  # none where every environment was reset
+        seen += [observation, reward, terminated, env.unwrapped.state, *signals]
+        if num_envs is None and (terminated or truncated):
+            observation, _ = env.reset(options=options)
+            seen += [observation, env.unwrapped.state]
+    env.close()
+    return digest([np.asarray(array, dtype=np.float64) for array in seen])
+
+
+def variants(task: str, physics: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Names and arguments of a task's environments: every actuator, and one thing varied at `paper` or `ideal`."""
+    for actuator in ACTUATORS:
+        yield actuator, {"actuator": actuator}
+        for name in DISTURBANCES if actuator in ("ideal", "paper") else ():
+            of_motor, of_joint = name in LOW_VOLTAGE or name in _MOTOR, name in _JOINT
+            if (actuator == "paper" or not of_motor) and (physics == "mujoco" or not of_joint):
+                yield f"{actuator}/{name}", disturbed(name, task, actuator)
+    for command, levels in LEVELS.items():
+        discrete = isinstance(TASKS[task].action_space, Discrete)
+        commanded = {"action": command, "levels": levels if discrete else None}
+        yield f"paper/{command}", commanded
+        yield f"custom/{command}", commanded | {"actuator": CUSTOM}
+    yield "custom/force", {"actuator": CUSTOM}
+    yield "paper/inner_steps", {"inner_steps": 25}
+    if task == "cartpole":
+        yield "paper/center_radius", {"center_radius": 0.02}
+    for name, distribution in RANDOMIZE.items():
+        if physics == "mujoco" or not name.startswith("model."):
+            yield f"paper/{name}", {"randomize": {name: distribution}}
+
+
+def trajectories() -> Entries:
+    """Names and digests of trajectories."""
+    for task, definition in TASKS.items():
+        for physics in ("mujoco", "analytic"):
+            for name, arguments in variants(task, physics):
+                common = {"physics": physics, "observe_actuator": not name.startswith("ideal")} | arguments
+                for integrator in definition.integrators if name in ACTUATORS else definition.integrators[:1]:
+                    digested = trajectory(task, None, common | {"integrator": integrator})
+                    yield f"trajectory/{task}/{physics}/{integrator}/{name}", digested
+                if physics == "mujoco":
+                    yield f"trajectory/{task}/vector/{name}", trajectory(task, 8, common)
+        mixed = [named_actuator(name, task) for name in ACTUATORS[1:] * 2]
+        yield f"trajectory/{task}/vector/mixed", trajectory(task, 8, {"actuator": mixed})
+        both = {"randomize": RANDOMIZE, "autoreset_mode": "SameStep"}
+        yield f"trajectory/{task}/vector/paper/randomize, same step", trajectory(task, 8, both)
+
+
+TRAININGS: dict[str, dict[str, Any]] = {
+    "ppo/cartpole/default": {"rollout_steps": 512},
+    "ppo/cartpole/paper": {"rollout_steps": 512, "epochs": 10},
+    "ppo/pendulum/default": {"rollout_steps": 512},
+    "ddpg/pendulum/default": {"learning_starts": 100},
+    "ddpg/pendulum/repaired": {"learning_starts": 100},
+    "td3/pendulum/default": {"learning_starts": 100},
+    "sac/pendulum/default": {"learning_starts": 100},
+    "sac/mountain_car_continuous/default": {"learning_starts": 100},
+    "dqn/acrobot/default": {"learning_starts": 100, "target_every": 4},
+    "dqn/cartpole/default": {"learning_starts": 100, "train_every": 64},
+    "sarsa/mountain_car/default": {},
+    "sarsa/cartpole/default": {},
+}
+"""Agent, task and settings -> what is set otherwise, so that a short training learns."""
+
+
+def weights(subject: str, num_envs: int, arguments: dict[str, Any]) -> str:
+    """The digest of the policy that a short training ends with.
+
+    Args:
+        subject: one of `TRAININGS`.
+        num_envs: environments side by side.
+        arguments: of the environment.
+    """
+    agent, task, settings = subject.split("/")
+    budget: dict[str, Any] = {"total_steps": {"ppo": 1024, "sarsa": 2000}.get(agent, 600), "total_episodes": None}
+    others: dict[str, Any] = {"seed": 3, "num_envs": num_envs, "evaluation_episodes": 1}
+    config = TrainConfig.preset(task, agent, settings, **budget, **others)
+    changes = dict(TRAININGS[subject])
+    if num_envs > 1 and getattr(config.agent, "train_every", 1) is None:  # at the end of a single environment's episode
+        changes["train_every"] = 4
+    env = EnvConfig(task, **arguments)
+    config = dataclasses.replace(config, env=env, agent=dataclasses.replace(config.agent, **changes))
+    with tempfile.TemporaryDirectory() as folder:
+        tensors = load_file(train(config, Path(folder) / "run", tensorboard=False) / "policy.safetensors")
+    return digest([tensors[name] for name in sorted(tensors)])
+
+
+def trainings() -> Entries:
+    """Names and digests of trained weights."""
+    for subject in TRAININGS:
+        for physics in ("mujoco", "analytic"):
+            for num_envs in (1,) if subject.startswith("sarsa") else (1, 4):
+                yield f"weights/{subject}/{physics}/{num_envs}", weights(subject, num_envs, {"physics": physics})
+    for subject, num_envs in (("ppo/cartpole/default", 4), ("sarsa/mountain_car/default", 1)):
+        for name in ("current_noise", "supply_resistance", "pulse"):
+            arguments = {"observe_actuator": True} | disturbed(name, subject.split("/")[1])
+            yield f"weights/{subject}/{name}", weights(subject, num_envs, arguments)
+        yield f"weights/{subject}/randomize", weights(subject, num_envs, {"randomize": RANDOMIZE})
+
+
+def certificate() -> Entries:
+    """Names of the quick certificate's checks, and the worst that they found."""
+    for check in __import__("codrl_mj.validation").validation.validate(quick=True).checks:
+        yield f"certificate/{check.group}/{check.task or 'no task'}/{check.name}", repr(float(check.worst))
+
+
+PARTS = {"trajectory": trajectories, "weights": trainings, "certificate": certificate}
+
+
+def compare(first: dict[str, str], second: dict[str, str]) -> int:
+    """Print what differs between two files; the number of entries that do."""
+    names = sorted(first.keys() | second.keys())
+    differing = [name for name in names if first.get(name) != second.get(name)]
+    for name in differing:
+        print(f"{name}: {first.get(name, 'absent')} and {second.get(name, 'absent')}")
+    print(f"{len(differing)} of {len(names)} differ")
+    return len(differing)
+
+
+def main() -> int:
+    """Make digests, or compare them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", choices=list(PARTS), help="only this part")
+    parser.add_argument("--out", type=Path, help="JSON file for the digests")
+    parser.add_argument("--compare", type=Path, nargs=2, metavar="FILE", help="print what differs between two such")
+    options = parser.parse_args()
+    parts = [options.only] if options.only else list(PARTS)
+    if options.compare:
+        files = [read_json(path, "file of digests") for path in options.compare]
+        return int(compare(*({n: v for n, v in file.items() if n.split("/")[0] in parts} for file in files)) > 0)
+    found: dict[str, str] = {}
+    for part in parts:
+        start = time.perf_counter()
+        for name, value in PARTS[part]():
+            assert name not in found, name
+            found[name] = value
+            print(f"{name} {value}", flush=True)
+        print(f"{part}: {time.perf_counter() - start:.0f} s", file=sys.stderr)
+    if options.out is not None:
+        write_json(options.out, dict(sorted(found.items())))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

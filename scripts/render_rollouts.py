@@ -1,0 +1,35 @@
+"""Film a trained policy on several actuators side by side, off screen.
+
+Example: python scripts/render_rollouts.py runs/cartpole-ppo-ideal-0 ideal weaker --out rollouts.mp4
+"""
+
+import argparse
+import dataclasses
+from pathlib import Path
+
+from codrl_mj.evaluation import run_episodes
+from codrl_mj.films.film import Panel, film
+from codrl_mj.runs.policies import load_policy
+from codrl_mj.training import load_config
+
+
+def main() -> None:
+    """Run an episode on each actuator and film them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path, help="run folder of a finished training")
+    parser.add_argument("actuators", nargs="+", help="such as ideal or weaker")
+    parser.add_argument("--seed", type=int, default=0, help="of the episode")
+    parser.add_argument("--out", type=Path, default=Path("rollouts.mp4"))
+    options = parser.parse_args()
+
+    trained, policy = load_config(options.run).env, load_policy(options.run)
+    panels = []
+    for name in options.actuators:
+        env = dataclasses.replace(trained, actuator=name, max_episode_steps=None)
+        (episode,) = run_episodes(policy, env.make, 1, options.seed)
+        panels.append(Panel(f"on {name}: return {episode.total:.0f}", env.task, env.actuator, episode))
+    print(f"wrote {film(panels, options.out)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,67 @@
+"""Random actuators, over everything that may be constructed."""
+
+import dataclasses
+
+from hypothesis import strategies as st
+
+from codrl_mj.actuators import IDEAL, Actuator, CurrentLoop, Lag, Motor, Supply, TorqueSpeed
+
+
+def between(low, high):
+    """Finite floats from low to high."""
+    return st.floats(low, high, allow_nan=False, allow_infinity=False)
+
+
+def zero_or(low, high):
+    """Zero (a feature that is off), or a float from low to high."""
+    return st.just(0.0) | between(low, high)
+
+
+motors = st.builds(
+    Motor,
+    resistance=between(0.05, 20),
+    inductance=between(1e-3, 2),
+    torque_constant=between(0.01, 5),
+    back_emf_constant=zero_or(0.01, 5),
+    arm_radius=between(0.01, 3),
+)
+controllers = st.builds(
+    CurrentLoop,
+    kp=zero_or(1e-3, 50),
+    ki=zero_or(1e-3, 50),
+    kd=zero_or(1e-6, 0.5),
+    kff=zero_or(1e-3, 5),
+    max_voltage=between(0.1, 100) | st.just(float("inf")),
+    bemf_compensation=st.booleans(),
+    substeps=st.integers(1, 5),
+    integral_leak=zero_or(1e-3, 50),
+    derivative_time_constant=zero_or(1e-4, 0.5),
+)
+actuators = st.builds(Actuator, motor=motors, controller=controllers)
+"""Current loops with perfect sensors and supplies."""
+
+
+def _with_sensor(actuator, bias, noise):
+    errors = {"current_bias": bias, "current_noise": noise}
+    return dataclasses.replace(actuator, controller=dataclasses.replace(actuator.controller, **errors))
+
+
+supplies = st.none() | st.builds(
+    Supply, voltage=between(0.1, 100) | st.just(float("inf")), resistance=zero_or(1e-3, 10)
+)
+every_actuator = st.builds(
+    _with_sensor,
+    st.builds(Actuator, motor=motors, controller=controllers, supply=supplies),
+    between(-5, 5),
+    zero_or(1e-3, 5),
+)
+"""Current loops with everything that they can have."""
+of_every_family = st.one_of(
+    every_actuator,
+    st.just(IDEAL),
+    st.builds(Lag, time_constant=zero_or(1e-3, 5), delay=zero_or(1e-3, 5)),
+    st.builds(
+        TorqueSpeed, stall_torque=between(1e-3, 50), no_load_speed=between(0.1, 500), max_torque=between(1e-3, 50)
+    ),
+)
+"""Actuators of all our families."""

@@ -1,1 +1,0 @@
-"""Tests of `codrl_mj.callbacks`."""

@@ -1,0 +1,16 @@
+"""Damage to files, as a failing disk or a careless transfer does it."""
+
+
+def damage(content, random):
+    """The content with one to four bytes changed: other ones anywhere, or a bit flipped, which often is text still.
+
+    Args:
+        content: bytes.
+        random: a `random.Random`.
+    """
+    damaged = bytearray(content)
+    while damaged == content:
+        for _ in range(random.randint(1, 4)):
+            flip = 1 << random.randrange(3) if random.random() < 0.7 else random.randrange(256)
+            damaged[random.randrange(len(damaged))] ^= flip
+    return bytes(damaged)

@@ -1,0 +1,109 @@
+"""Small models that hold our motors."""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+
+from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.engine.families import SLOT, Slot, signals_at
+from codrl_mj.physics.mjcf import drive
+from codrl_mj.tasks.assets import asset_path
+
+FULL = Actuator(
+    Motor(resistance=1.2, inductance=0.05, torque_constant=0.8, back_emf_constant=0.7, arm_radius=0.5),
+    CurrentLoop(
+        kp=2.0,
+        ki=5.0,
+        kd=1e-3,
+        kff=0.4,
+        max_voltage=4.0,
+        substeps=2,
+        integral_leak=0.3,
+        derivative_time_constant=0.01,
+    ),
+)
+"""An actuator with every feature in use."""
+
+
+TICK = Slot._fields.index("tick")
+_SIZE = len(Actuator.State._fields)
+STATE = [SLOT + _SIZE + entry for entry in range(_SIZE)]
+"""Where a current loop's state of the last step is in `data.act`: current, integral, error."""
+CURRENT = STATE[0]
+VOLTAGE = signals_at(Actuator) + Actuator.Signals._fields.index("voltage")
+
+
+def changed(actuator, **fields):
+    """The actuator with some fields of its motor or controller changed."""
+    motor = {name: value for name, value in fields.items() if hasattr(actuator.motor, name)}
+    loop = {name: value for name, value in fields.items() if name not in motor}
+    return Actuator(dataclasses.replace(actuator.motor, **motor), dataclasses.replace(actuator.controller, **loop))
+
+
+_ROTOR = """
+<mujoco>
+  <compiler autolimits="false"/>
+  <option timestep="0.01"/>
+  <worldbody>
+    <body name="rotor">
+      <joint name="hinge" axis="0 1 0"/>
+      <inertial pos="0.1 0 -0.2" mass="0.5" diaginertia="0.05 0.05 0.05"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def add_motor(spec, joint, actuator, max_force=None, **fields):
+    """Drive a joint of the spec by our motor."""
+    driver = spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint, **fields)
+    drive(driver, actuator, max_force)
+    return driver
+
+
+def rotor_spec(actuator=FULL, *, max_force=None, integrator="Euler"):
+    """The spec of an eccentric rotor on a hinge under gravity, driven by our motor."""
+    spec = mujoco.MjSpec.from_string(_ROTOR)
+    spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    add_motor(spec, "hinge", actuator, max_force, name="motor")
+    return spec
+
+
+def rotor(*arguments, **options):
+    """`rotor_spec`, compiled."""
+    return rotor_spec(*arguments, **options).compile()
+
+
+def cartpole(actuator, *, integrator="Euler"):
+    """The cart-pole asset with another actuator or integrator."""
+    spec = mujoco.MjSpec.from_file(str(asset_path("cartpole.xml")))
+    spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    drive(spec.actuator("motor"), actuator, 10.0)
+    return spec.compile()
+
+
+def controls(steps, nu=1, seed=0, size=1.0):
+    """Random controls, each held for five steps."""
+    generator = np.random.default_rng(seed)
+    return np.repeat(generator.uniform(-size, size, (steps // 5 + 1, nu)), 5, axis=0)[:steps]
+
+
+def full_state(model, data):
+    """Time, positions, velocities and activations: everything that an episode is continued from."""
+    state = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
+    mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    return state
+
+
+def trajectory(model, inputs, data=None, before_step=None):
+    """The full state after each step under the given controls; `before_step(data, index)` may interfere."""
+    data = mujoco.MjData(model) if data is None else data
+    states = []
+    for index, ctrl in enumerate(inputs):
+        data.ctrl[:] = ctrl
+        if before_step is not None:
+            before_step(data, index)
+        mujoco.mj_step(model, data)
+        states.append(full_state(model, data))
+    return np.array(states)

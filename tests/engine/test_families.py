@@ -1,0 +1,312 @@
+"""Families in the callback: anybody's runs there bit for bit as it does in Python."""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+import pytest
+from mujoco.batch import Batch
+
+from codrl_mj import engine
+from codrl_mj.actuators import Actuator, ActuatorModel, Inputs, Lag, Supply, TorqueSpeed, family_number, parameters_type
+from codrl_mj.actuators.noise import philox, standard_normal, unit
+from codrl_mj.engine.families import HEAD, SLOT, Slot, loaded_families, signals_at, slot_size, user_head
+from codrl_mj.fields import flag, integer, part, real
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, install_callbacks, motors
+from codrl_mj.physics.mjcf import drive
+from codrl_mj.tasks import TASKS
+from tests.engine.models import FULL, changed, controls, rotor, rotor_spec, trajectory
+
+KEY = 2.0**52 + 12345.0
+
+
+class Memory(NamedTuple):
+    """What a spring remembers."""
+
+    filtered: float
+    steps: float
+
+
+class Seen(NamedTuple):
+    """What a spring shows."""
+
+    heat: float
+    draw: float
+    saturated: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Coil:
+    """A part of a spring."""
+
+    stiffness: float = real(0.7, least=0.0)
+    turns: int = integer(3, least=1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Brake:
+    """A part that a spring may lack."""
+
+    drag: float = real(0.0, least=0.0)
+
+
+def _softened(torque, limit):
+    return limit * math.tanh(torque / limit)
+
+
+def _advance(parameters, timestep, state, inputs):
+    draw = standard_normal(inputs.noise_key, int(inputs.time / timestep + 0.5), 7)
+    wanted = inputs.desired_torque - parameters.stiffness * math.sin(inputs.position) * parameters.turns
+    wanted = wanted - parameters.brake_drag * inputs.speed * abs(inputs.speed) + 0.01 * draw
+    filtered = state.filtered + (wanted - state.filtered) * timestep / (timestep + 0.03)
+    if parameters.soft:
+        torque = _softened(filtered, parameters.limit)
+    else:
+        torque = min(max(filtered, -parameters.limit), parameters.limit)
+    saturated = 1.0 if abs(filtered) > parameters.limit else 0.0
+    return Memory(filtered, state.steps + 1.0), torque, Seen(torque * inputs.speed, draw, saturated)
+
+
+@dataclasses.dataclass(frozen=True)
+class Spring(ActuatorModel):
+    """Somebody's own: with parts, flags, whole numbers, noise, a helper, and every input used."""
+
+    family = "spring"
+    State = Memory
+    Signals = Seen
+    helpers = (philox, unit, standard_normal, _softened)
+    advance = staticmethod(_advance)
+
+    coil: Coil = Coil()
+    brake: Brake | None = part(Brake())
+    limit: float = real(0.5, above=0.0)
+    soft: bool = flag(False)
+    arm_radius: float = real(0.4, above=0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Bare(ActuatorModel):
+    """The least that a family can be: no fields, no states, no signals."""
+
+    @staticmethod
+    def advance(parameters, timestep, state, inputs):  # noqa: ARG004
+        return state, 0.5 * inputs.desired_torque, state
+
+
+SPRINGS = [
+    Spring(),
+    Spring(Coil(0.3, 5), Brake(0.2), limit=0.3),
+    Spring(brake=Brake(0.05), soft=True, arm_radius=1.3),
+]
+ALL = [
+    *SPRINGS,
+    Bare(),
+    Lag(0.07),
+    Lag(0.02, 0.033),
+    Lag(0.0, 0.08),
+    TorqueSpeed(0.4, 3.0, 0.3),
+    FULL,
+    dataclasses.replace(changed(FULL, current_noise=0.2, current_bias=0.1), supply=Supply(5.0, 0.7)),
+    FULL.commands()["voltage"].actuator,
+]
+STEPS = 80
+
+
+@pytest.fixture
+def _families(installed):
+    for family in {type(one) for one in ALL}:
+        engine.load_family(family)
+
+
+pytestmark = pytest.mark.usefixtures("_families")
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
+@pytest.mark.parametrize("actuator", ALL, ids=lambda one: type(one).__name__)
+def test_a_family_runs_in_the_callback_bit_for_bit_as_in_python(actuator, integrator):
+    model, family = rotor(actuator, integrator=integrator), type(actuator)
+    data, parameters = mujoco.MjData(model), parameters_type(family)(*actuator.numbers)
+    states, shown = len(family.State._fields), signals_at(family)
+    data.act[Slot._fields.index("noise_key")] = KEY
+    state, timestep, gear = family.State(*[0.0] * states), model.opt.timestep, model.actuator_gear[0, 0]
+    assert gear == 1.0 / actuator.arm_radius
+    torques = []
+    for (ctrl,) in controls(STEPS, size=0.6):
+        inputs = Inputs(ctrl, gear * data.qpos[0], gear * data.qvel[0], data.time, KEY)
+        data.ctrl[:] = ctrl
+        mujoco.mj_step(model, data)
+        state, torque, signals = family.advance(parameters, timestep, state, inputs)
+        candidate = data.act[SLOT + states : shown]
+        np.testing.assert_array_equal(candidate, state)
+        np.testing.assert_array_equal(data.act[shown:], [*signals, 0.0])
+        assert data.act[Slot._fields.index("torque")] == torque
+        assert data.actuator_force[0] == torque
+        torques.append(torque)
+    assert np.ptp(torques) > 0.05
+    assert len(data.act) == slot_size(family)
+
+
+def test_a_signal_may_be_infinite():
+    """Alone as the last one too, which the engine multiplies by a gain of 0."""
+
+    class Endless(NamedTuple):
+        limit: float
+
+    @dataclasses.dataclass(frozen=True)
+    class Boundless(ActuatorModel):
+        Signals = Endless
+
+        @staticmethod
+        def advance(parameters, timestep, state, inputs):  # noqa: ARG004
+            return state, inputs.desired_torque, Endless(math.inf)
+
+    engine.load_family(Boundless)
+    model = rotor(Boundless())
+    data = mujoco.MjData(model)
+    data.ctrl[0] = 0.25
+    mujoco.mj_step(model, data)
+    assert data.act[signals_at(Boundless)] == math.inf
+    assert data.actuator_force[0] == 0.25
+
+
+def test_every_field_of_a_family_of_ones_own_acts():
+    changes = (
+        {"coil": Coil(stiffness=0.1)},
+        {"coil": Coil(turns=1)},
+        {"brake": Brake(0.3)},
+        {"limit": 0.1},
+        {"soft": True},
+        {"arm_radius": 0.8},
+    )
+    inputs = controls(STEPS, size=0.6)
+    before = trajectory(rotor(Spring()), inputs)[-1]
+    ends = [trajectory(rotor(dataclasses.replace(Spring(), **change)), inputs)[-1] for change in changes]
+    assert all(np.abs(end[1:3] - before[1:3]).max() > 1e-6 for end in ends)
+
+
+@pytest.mark.parametrize("actuator", ALL, ids=lambda one: type(one).__name__)
+def test_it_is_read_back_from_the_model_as_it_was_written(actuator):
+    ((index, found),) = motors(rotor(actuator)).items()
+    assert index == 0
+    assert type(found) is type(actuator)
+    assert found.numbers == actuator.numbers
+    assert found.arm_radius == pytest.approx(actuator.arm_radius, rel=1e-15)
+
+
+def test_many_springs_in_a_batch_are_a_serial_loop_bit_for_bit():
+    several = [SPRINGS[index % 3] for index in range(12)]
+    batch = Batch(rotor(Spring()), nsim=len(several), nthread=2)
+    batch.expand("actuator_user")[:, 0, HEAD:] = [one.numbers for one in several]
+    batch.expand("actuator_gear")[:, 0, 0] = [1.0 / one.arm_radius for one in several]
+    inputs = np.stack([controls(STEPS, seed=seed, size=0.6) for seed in range(len(several))], axis=1)
+    ctrl = batch.bind("ctrl")
+    for row in inputs:
+        ctrl[:] = row
+        batch.step()
+    ends = [trajectory(rotor(one), inputs[:, index])[-1] for index, one in enumerate(several)]
+    np.testing.assert_array_equal(batch.bind("act"), np.array(ends)[:, 3:])
+    np.testing.assert_array_equal(batch.bind("qpos")[:, 0], np.array(ends)[:, 1])
+
+
+def test_families_beside_each_other_are_each_as_alone():
+    spec = mujoco.MjSpec.from_string(
+        "<mujoco><option timestep='0.01'/><worldbody>"
+        + "".join(f"<body><joint name='{at}'/><geom size='.1' pos='.2 0 .1'/></body>" for at in range(len(ALL)))
+        + "</worldbody></mujoco>"
+    )
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    for index, actuator in enumerate(ALL):
+        drive(spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=str(index)), actuator, None)
+    together, alone = spec.compile(), []
+    assert list(motors(together)) == list(range(len(ALL)))
+    inputs = controls(STEPS, len(ALL), size=0.6)
+    data = mujoco.MjData(together)
+    trajectory(together, inputs, data)
+    for index, actuator in enumerate(ALL):
+        one = mujoco.MjSpec.from_string(
+            "<mujoco><option timestep='0.01'/><worldbody><body><joint name='0'/><geom size='.1' pos='.2 0 .1'/></body>"
+            "</worldbody></mujoco>"
+        )
+        drive(one.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target="0"), actuator, None)
+        model = one.compile()
+        alone = mujoco.MjData(model)
+        trajectory(model, inputs[:, [index]], alone)
+        own = together.actuator_actadr[index]
+        np.testing.assert_allclose(data.act[own : own + model.na], alone.act, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_both_physics_give_it_the_same_inputs(task):
+    """Position, speed and time are what the spring's torque is made of."""
+    definition = TASKS[task]
+    actuators = [dataclasses.replace(SPRINGS[1], limit=10.0)]
+    start = np.full(len(definition.state_names), 0.05)
+    rows = []
+    for kind in (MujocoPhysics, AnalyticPhysics):
+        physics = kind(definition, actuators, 4, definition.integrators[0])
+        physics.reset(start, KEY)
+        for force in controls(10, size=definition.max_force)[:, 0]:
+            physics.step(float(force))
+        rows.append([*physics.trace[-1, 0], *physics.state])
+    np.testing.assert_allclose(*rows, rtol=0, atol=1e-9)
+
+
+# -- the table ----------------------------------------------------------------------------------------------
+
+
+def test_loading_again_changes_nothing():
+    before = loaded_families()
+    engine.load_family(Spring)
+    engine.load_family(Actuator)
+    assert loaded_families() == before
+    assert Spring in before
+
+
+def test_a_model_compiles_its_families_on_installation():
+    @dataclasses.dataclass(frozen=True)
+    class Late(ActuatorModel):
+        @staticmethod
+        def advance(parameters, timestep, state, inputs):  # noqa: ARG004
+            return state, 2.0 * inputs.desired_torque, state
+
+    spec = rotor_spec()
+    drive(spec.actuator("motor"), Late(), None)
+    model = spec.compile()
+    with pytest.raises(ValueError, match=r"motor: .* is not known in this process: import its module"):
+        motors(model)
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 0.25
+    mujoco.mj_step(model, data)
+    assert data.actuator_force[0] == 0.0  # nobody's
+    engine.load_family(Late)
+    install_callbacks(model)
+    mujoco.mj_step(model, data)
+    assert data.actuator_force[0] == 0.5
+
+
+def test_two_families_of_one_number_are_refused_and_the_first_stays(monkeypatch):
+    @dataclasses.dataclass(frozen=True)
+    class Other(Spring):
+        pass
+
+    monkeypatch.setattr("codrl_mj.engine.families.family_number", lambda family: family_number(Spring))  # noqa: ARG005
+    with pytest.raises(
+        ValueError, match=f"Other and .*:Spring have the same number {family_number(Spring)}: rename one"
+    ):
+        engine.load_family(Other)
+    assert Spring in loaded_families()
+    assert Other not in loaded_families()
+
+
+def test_a_familys_number_is_its_own_and_survives_an_xml_file(tmp_path):
+    numbers = [family_number(type(one)) for one in ALL]
+    assert len(set(numbers)) == len({type(one) for one in ALL})
+    assert user_head(Spring).family == family_number(Spring)
+    spec = rotor_spec(Spring())
+    spec.compile()
+    path = tmp_path / "model.xml"
+    path.write_text(spec.to_xml())
+    (found,) = motors(mujoco.MjModel.from_xml_path(str(path))).values()
+    assert found == Spring()

@@ -1,0 +1,105 @@
+"""Installation: idempotent, and never at the cost of somebody else's callback."""
+
+import mujoco
+import pytest
+
+from codrl_mj import engine
+from codrl_mj.actuators import IDEAL, Actuator
+from codrl_mj.physics import MujocoPhysics, trace_names
+from codrl_mj.tasks import TASKS
+
+pytestmark = pytest.mark.usefixtures("bare_engine")
+
+
+def _foreign_control(model, data):
+    pass
+
+
+def _foreign_act_bias(model, data, index):
+    return 0.0
+
+
+FOREIGN = {"control": _foreign_control, "act_bias": _foreign_act_bias}
+
+
+def _present():
+    return {name: getattr(mujoco, f"get_mjcb_{name}")() for name in FOREIGN}
+
+
+def _set(name, callback):
+    getattr(mujoco, f"set_mjcb_{name}")(callback)
+
+
+def test_install_sets_both_callbacks_and_uninstall_removes_them():
+    assert not engine.installed()
+    engine.install()
+    assert engine.installed()
+    assert None not in _present().values()
+    engine.uninstall()
+    assert not engine.installed()
+    assert _present() == {"control": None, "act_bias": None}
+
+
+def test_install_and_uninstall_are_idempotent():
+    engine.uninstall()
+    engine.install()
+    once = _present()
+    engine.install()
+    assert all(_present()[name] is once[name] for name in once)
+    engine.uninstall()
+    engine.uninstall()
+    engine.install()
+    assert all(_present()[name] is once[name] for name in once)
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_a_foreign_callback_is_not_replaced_and_nothing_changes(name):
+    _set(name, FOREIGN[name])
+    with pytest.raises(engine.CallbackInUseError, match=f"mjcb_{name} is already set.*set_mjcb_{name}.None."):
+        engine.install()
+    assert _present() == {"control": None, "act_bias": None, name: FOREIGN[name]}
+    assert not engine.installed()
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_uninstall_leaves_a_foreign_callback_alone(name):
+    engine.install()
+    _set(name, FOREIGN[name])
+    engine.uninstall()
+    assert _present() == {"control": None, "act_bias": None, name: FOREIGN[name]}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_installed_is_false_while_one_callback_is_missing(name):
+    engine.install()
+    _set(name, None)
+    assert not engine.installed()
+    engine.install()
+    assert engine.installed()
+
+
+def test_an_unknown_part_is_refused():
+    with pytest.raises(ValueError, match="callbacks 'engine': must be one of motor"):
+        engine.install("engine")
+
+
+def test_a_simulation_whose_callback_was_replaced_says_so_at_the_next_episode():
+    physics = MujocoPhysics(TASKS["cartpole"], [Actuator()], 1, "euler")
+    mujoco.set_mjcb_control(FOREIGN["control"])
+    with pytest.raises(engine.CallbackInUseError):
+        physics.reset(physics.state)
+
+
+def test_a_simulation_whose_callback_was_removed_works_again_at_the_next_episode():
+    physics = MujocoPhysics(TASKS["cartpole"], [Actuator()], 1, "euler")
+    engine.uninstall()
+    physics.reset(physics.state)
+    physics.step(5.0)
+    assert physics.trace[-1, 0, trace_names(Actuator).index("current")] > 0.0
+
+
+def test_an_ideal_actuator_needs_no_callback():
+    mujoco.set_mjcb_act_bias(FOREIGN["act_bias"])
+    physics = MujocoPhysics(TASKS["cartpole"], [IDEAL], 1, "euler")
+    physics.step(10.0)
+    assert physics.state[1] > 0.0

@@ -1,0 +1,139 @@
+"""Structure offsets: against the addresses of live objects, and that a wrong layout is never used."""
+
+import ctypes
+
+import mujoco
+import numpy as np
+import pytest
+
+from codrl_mj.engine import LayoutError, control, hill, layout
+
+OPTION_FIELDS = [field.removeprefix("opt.") for field in control.MODEL_FIELDS if field.startswith("opt.")]
+FIELDS = {
+    "mjModel": [field for field in (*control.MODEL_FIELDS, *hill.MODEL_FIELDS) if "." not in field],
+    "mjData": [*control.DATA_FIELDS, *control.PBASE_NEIGHBOURS, *hill.DATA_FIELDS],
+    "mjOption": OPTION_FIELDS,
+}
+CASES = [(struct, field) for struct, fields in FIELDS.items() for field in dict.fromkeys(fields)]
+# These are equal outside a step: no probe can tell them apart.
+INDISTINGUISHABLE = {
+    "pstack": {"pbase", "parena", "threadpool"},
+    "maxuse_stack": {"maxuse_arena"},
+}
+
+
+def _is_pointer(struct_name, field):
+    """Two pointers are never equal, so only scalars need a probe that gives them different values."""
+    return dict(layout.struct(struct_name)._fields_)[field] is ctypes.c_void_p
+
+
+def _model():
+    spec = mujoco.MjSpec.from_string(layout._PROBE)
+    return spec.compile()
+
+
+def _live_arrays(owner, struct_name):
+    """(field, address) of every array of the C structure that the bindings show and that is not empty."""
+    for field in layout.STRUCTS[struct_name].fields:
+        live = getattr(owner, field.name, None)
+        if isinstance(live, np.ndarray) and live.size and isinstance(field.type, layout.ast_nodes.PointerType):
+            yield field.name, live.ctypes.data
+
+
+@pytest.mark.parametrize("struct_name", ["mjModel", "mjData"])
+def test_every_array_of_a_live_object_lies_where_its_offset_says(struct_name):
+    model = _model()
+    owner = model if struct_name == "mjModel" else mujoco.MjData(model)
+    checked = 0
+    for field, address in _live_arrays(owner, struct_name):
+        found = ctypes.c_void_p.from_address(owner._address + layout.offset(struct_name, field)).value
+        if found is None:
+            continue  # lives in the arena, which nothing has used yet
+        assert found == address, field
+        checked += 1
+    assert checked > 50
+
+
+def test_dotted_fields_are_read_through_the_nested_structure():
+    model = _model()
+    timestep = ctypes.c_double.from_address(model._address + layout.offset("mjModel", "opt.timestep"))
+    assert timestep.value == model.opt.timestep
+    timestep.value = 0.25
+    assert model.opt.timestep == 0.25
+
+
+def test_scalars_are_read_and_written_where_their_offset_says():
+    model = _model()
+    data = mujoco.MjData(model)
+    assert ctypes.c_int64.from_address(model._address + layout.offset("mjModel", "nactuator")).value == model.nactuator
+    ctypes.c_double.from_address(data._address + layout.offset("mjData", "time")).value = 7.5
+    assert data.time == 7.5
+
+
+def test_the_hidden_stack_frame_lies_between_its_checked_neighbours():
+    order = [name for name, _ in layout.struct("mjData")._fields_]
+    at = {name: order.index(name) for name in ("pbase", *control.PBASE_NEIGHBOURS)}
+    assert at["narena"] < at["nbuffer"] < at["pstack"] < at["pbase"] < at["maxuse_stack"]
+
+
+def test_unknown_fields_and_types_are_refused():
+    with pytest.raises(LayoutError, match=f"MuJoCo {mujoco.__version__}: mjModel has no field 'no_such_thing'"):
+        layout.offset("mjModel", "no_such_thing")
+    with pytest.raises(LayoutError, match=r"mjModel has no field 'opt\.no_such_thing'"):
+        layout.offset("mjModel", "opt.no_such_thing")
+    with pytest.raises(LayoutError, match="does not know: 'quaternion128'"):
+        layout._ctype(layout.ast_nodes.ValueType(name="quaternion128"))
+
+
+def _check():
+    layout.check_layout(
+        (*control.MODEL_FIELDS, *hill.MODEL_FIELDS),
+        (*control.DATA_FIELDS, *control.PBASE_NEIGHBOURS, *hill.DATA_FIELDS),
+    )
+
+
+def _corrupt(monkeypatch, struct_name, members):
+    """Let the layout of one structure be the given (name, type) members."""
+    true = layout.struct
+    bad = type(struct_name, (ctypes.Structure,), {"_fields_": members})
+    replaced = {struct_name: bad}
+    if struct_name == "mjOption":
+        outer = [(name, bad if name == "opt" else kind) for name, kind in true("mjModel")._fields_]
+        replaced = {"mjModel": type("mjModel", (ctypes.Structure,), {"_fields_": outer})}
+    monkeypatch.setattr(layout, "struct", lambda name: replaced.get(name) or true(name))
+
+
+def test_the_installed_layout_is_accepted():
+    _check()
+
+
+@pytest.mark.parametrize(("struct_name", "field"), CASES)
+def test_a_field_that_has_moved_is_refused(struct_name, field, monkeypatch):
+    members = list(layout.struct(struct_name)._fields_)
+    place = [name for name, _ in members].index(field)
+    _corrupt(monkeypatch, struct_name, [*members[:place], ("added_by_a_new_version", ctypes.c_int64), *members[place:]])
+    with pytest.raises(LayoutError, match="where its layout says, expected"):
+        _check()
+
+
+@pytest.mark.parametrize(("struct_name", "field"), [case for case in CASES if not _is_pointer(*case)])
+def test_a_scalar_that_changed_places_with_another_is_refused(struct_name, field, monkeypatch):
+    members = list(layout.struct(struct_name)._fields_)
+    place = [name for name, _ in members].index(field)
+    for other_place, (other, kind) in enumerate(members):
+        if other == field or kind is not members[place][1] or other in INDISTINGUISHABLE.get(field, ()):
+            continue
+        swapped = list(members)
+        swapped[place], swapped[other_place] = (other, kind), (field, kind)
+        with monkeypatch.context() as patch:
+            _corrupt(patch, struct_name, swapped)
+            with pytest.raises(LayoutError):
+                _check()
+
+
+@pytest.mark.parametrize("compiled", [control.compiled, hill.compiled_hill])
+def test_nothing_is_compiled_from_a_wrong_layout(compiled, monkeypatch):
+    members = list(layout.struct("mjData")._fields_)
+    _corrupt(monkeypatch, "mjData", [("added_by_a_new_version", ctypes.c_int64), *members])
+    with pytest.raises(LayoutError, match=f"MuJoCo {mujoco.__version__}: mjData"):
+        compiled.__wrapped__()

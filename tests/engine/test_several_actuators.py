@@ -1,0 +1,160 @@
+"""Our motors beside each other and beside foreign actuators: everything is found by its own address."""
+
+import mujoco
+import numpy as np
+import pytest
+from mujoco.batch import Batch
+
+from codrl_mj.actuators import Actuator
+from codrl_mj.engine import uninstall
+from codrl_mj.engine.families import slot_size
+from codrl_mj.physics import motors
+from codrl_mj.physics.mjcf import drive
+from tests.engine.models import FULL, STATE, changed, controls, trajectory
+from tests.reference import MotorSimulation
+
+pytestmark = pytest.mark.usefixtures("installed")
+
+# Bodies that do not touch: a motor's joint depends on its own actuators only.
+JOINTS = {"first": "hinge", "ball": "ball", "second": "hinge", "pid": "hinge", "third": "slide", "dc": "hinge"}
+OURS = {
+    "first": changed(FULL, kp=0.5),
+    "second": changed(FULL, arm_radius=0.2, ki=1.0),
+    "third": changed(FULL, inductance=0.1, max_voltage=1.5),
+}
+TIMESTEP = 0.01
+
+
+def _spec(with_ours=True):
+    """Foreign actuators of every shape, with our motors between them."""
+
+    def ours(name):
+        return f'<general name="{name}" joint="{name}"/>' if with_ours else ""
+
+    bodies = "".join(
+        f'<body><joint name="{name}" type="{kind}" axis="0 1 0"/><geom size="0.1" pos="0.2 0 0.1"/></body>'
+        for name, kind in JOINTS.items()
+    )
+    spec = mujoco.MjSpec.from_string(f"""
+    <mujoco>
+      <option timestep="{TIMESTEP}"><flag contact="disable"/></option>
+      <worldbody>{bodies}</worldbody>
+      <actuator>
+        <general joint="dc" dyntype="integrator"/>  <!-- a state before ours -->
+        {ours("first")}
+        <orientation joint="ball" kp="2" kv="0.1"/>  <!-- three controls and three outputs -->
+        {ours("second")}
+        <pid joint="pid" kp="3" kv="0.2" ki="1"/>  <!-- two controls, one state -->
+        {ours("third")}
+        <dcmotor joint="dc" motorconst="0.5 0.5" resistance="1" inductance="0.1" input="voltage"/>
+      </actuator>
+    </mujoco>""")
+    if with_ours:
+        for name, actuator in OURS.items():
+            drive(spec.actuator(name), actuator, 0.5 if name == "third" else None)
+        spec.actuator("second").group = 2
+    return spec
+
+
+def _model(with_ours=True):
+    return _spec(with_ours).compile()
+
+
+def test_the_counts_of_controls_outputs_activations_and_actuators_differ():
+    model = _model()
+    assert len({model.nu, model.nout, model.na, model.nactuator}) == 4
+    for name in ("second", "third"):
+        actuator = model.actuator(name).id
+        addresses = {model.actuator_ctrladr[actuator], model.actuator_actadr[actuator], actuator}
+        assert len(addresses) == 3
+    assert list(motors(model)) == [model.actuator(name).id for name in OURS]
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
+def test_every_motor_is_its_own_reference(integrator):
+    model = _model()
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    data = mujoco.MjData(model)
+    references = {name: MotorSimulation(actuator) for name, actuator in OURS.items()}
+    for ctrl in controls(100, model.nu):
+        data.ctrl[:] = ctrl
+        forces = {}
+        for name, reference in references.items():
+            arm = OURS[name].motor.arm_radius
+            wanted = ctrl[model.actuator_ctrladr[model.actuator(name).id]] / arm
+            if name == "third":
+                wanted = min(max(wanted, -0.5), 0.5)
+            forces[name] = reference.step(TIMESTEP, wanted, data.joint(name).qvel[0])
+        mujoco.mj_step(model, data)
+        for name, reference in references.items():
+            actuator = model.actuator(name).id
+            act = data.act[model.actuator_actadr[actuator] :][: slot_size(Actuator)]
+            np.testing.assert_allclose(act[STATE], reference.state, rtol=1e-10, atol=1e-11)
+            output = data.actuator_force[model.actuator_outadr[actuator]]
+            kt = OURS[name].motor.torque_constant
+            assert output == pytest.approx(kt * reference.current, rel=1e-10, abs=1e-11)
+            assert data.joint(name).qfrc_actuator[0] == pytest.approx(forces[name], rel=1e-10, abs=1e-11)
+
+
+def test_foreign_actuators_act_as_without_ours():
+    model = _model()
+    bare = _model(with_ours=False)
+    inputs = controls(100, model.nu)
+    data, alone = mujoco.MjData(model), mujoco.MjData(bare)
+    foreign = [index for index in range(model.nactuator) if index not in motors(model)]
+
+    def addresses(starts, counts, indices):
+        return [address for i in indices for address in range(starts[i], starts[i] + counts[i])]
+
+    def activations(of, indices):
+        return addresses(of.actuator_actadr, of.actuator_actnum, indices)
+
+    chosen = inputs[:, addresses(model.actuator_ctrladr, model.actuator_ctrlnum, foreign)]
+    trajectory(model, inputs, data)
+    uninstall()
+    trajectory(bare, chosen, alone)
+    everything = range(bare.nactuator)
+    np.testing.assert_allclose(
+        data.act[activations(model, foreign)], alone.act[activations(bare, everything)], rtol=1e-12
+    )
+    assert np.any(alone.act != 0.0)
+    for name in ("ball", "pid", "dc"):
+        np.testing.assert_allclose(data.joint(name).qpos, alone.joint(name).qpos, rtol=1e-12, atol=1e-12)
+        assert np.any(data.joint(name).qfrc_actuator != 0.0)
+
+
+def test_a_disabled_group_silences_one_motor_of_several():
+    model = _model()
+    model.opt.disableactuator = 1 << 2
+    data = mujoco.MjData(model)
+    trajectory(model, controls(20, model.nu), data)
+    for name in OURS:
+        act = data.act[model.actuator_actadr[model.actuator(name).id] :][: slot_size(Actuator)]
+        assert np.any(act != 0.0) == (name != "second")
+
+
+@pytest.mark.parametrize("index", [0, 1, -1])
+def test_a_bad_control_anywhere_counts_as_zero_everywhere_as_in_the_engine(index, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # the engine writes a log
+    model = _model()
+    inputs = controls(40, model.nu)
+    zeroed = inputs.copy()
+    inputs[20:30, index] = np.nan
+    zeroed[20:30] = 0.0
+    np.testing.assert_array_equal(trajectory(model, inputs), trajectory(model, zeroed))
+
+
+@pytest.mark.parametrize("nthread", [1, 2])
+def test_a_batch_of_many_motors_is_a_serial_loop_bit_for_bit(nthread):
+    model, simulations = _model(), 16
+    inputs = np.stack([controls(50, model.nu, seed=seed) for seed in range(simulations)], axis=1)
+    batch = Batch(model, nsim=simulations, nthread=nthread)
+    ctrl = batch.bind("ctrl")
+    for row in inputs:
+        ctrl[:] = row
+        batch.step()
+    for sim in range(simulations):
+        data = mujoco.MjData(model)
+        trajectory(model, inputs[:, sim], data)
+        np.testing.assert_array_equal(batch.bind("act")[sim], data.act)
+        np.testing.assert_array_equal(batch.bind("qpos")[sim], data.qpos)

@@ -1,0 +1,212 @@
+"""What Gymnasium's environments have as attributes, ours have: read and written with the same effect."""
+
+import copy
+import inspect
+
+import gymnasium
+import numpy as np
+import pytest
+
+from codrl_mj.envs.distributions import Uniform
+from codrl_mj.physics.registry import PHYSICS
+from codrl_mj.tasks import TASKS
+
+every_task = pytest.mark.parametrize("task", TASKS)
+NOT_OF_THE_TASK = {"last_u", "np_random", "np_random_seed", "state", "steps_beyond_terminated", "unwrapped"}
+NOT_OF_THE_TASK |= {"action_space", "high", "high_state", "low", "low_state", "metadata", "observation_space", "spec"}
+NOT_OF_THE_TASK |= {"action_arrow", "actions_num", "clock", "domain_fig", "isopen", "render_mode", "screen", "surf"}
+NOT_OF_THE_TASK |= {"SCREEN_DIM", "screen_dim", "screen_height", "screen_width"}
+
+WRITES = [
+    ("cartpole", {"gravity": 3.7}),
+    ("cartpole", {"gravity": 0.0}),
+    ("cartpole", {"length": 0.8, "polemass_length": 0.1 * 0.8}),
+    ("cartpole", {"masscart": 2.5, "total_mass": 2.5 + 0.1}),
+    ("cartpole", {"masspole": 0.3, "total_mass": 1.0 + 0.3, "polemass_length": 0.3 * 0.5}),
+    ("cartpole", {"length": 1.1, "masspole": 0.3, "total_mass": 1.0 + 0.3, "polemass_length": 0.3 * 1.1}),
+    ("cartpole", {"force_mag": 14.0}),
+    ("cartpole", {"tau": 0.01}),
+    ("pendulum", {"g": 3.7}),
+    ("pendulum", {"m": 0.4}),
+    ("pendulum", {"l": 1.7}),
+    ("pendulum", {"max_torque": 3.5}),
+    ("pendulum", {"dt": 0.02}),
+    ("acrobot", {"LINK_LENGTH_1": 1.3}),
+    ("acrobot", {"LINK_COM_POS_1": 0.6, "LINK_COM_POS_2": 0.3}),
+    ("acrobot", {"LINK_MASS_1": 1.4, "LINK_MASS_2": 0.6}),
+    ("acrobot", {"LINK_MOI": 0.7}),
+    ("acrobot", {"AVAIL_TORQUE": [-3.0, 0.5, 2.0]}),
+    ("acrobot", {"dt": 0.05}),
+    ("mountain_car", {"force": 0.0017}),
+    ("mountain_car", {"gravity": 0.003}),
+    ("mountain_car_continuous", {"power": 0.001}),
+]
+"""Task -> numbers that make a consistent model in Gymnasium, where sums and products are attributes of their own."""
+
+
+def _pair(task, **arguments):
+    """Ours and Gymnasium's, unwrapped, so that episodes go on beyond their end."""
+    made = gymnasium.make(TASKS[task].env_id, **{"actuator": "ideal", **arguments})
+    return made.unwrapped, gymnasium.make(TASKS[task].gymnasium_id).unwrapped
+
+
+def _run(env, task, seed):
+    """States over 50 steps, shape (50, n); continuous actions are float64, or Gymnasium computes in float32."""
+    generator = np.random.default_rng(seed)
+    env.reset(seed=seed)
+    states = []
+    for _ in range(50):
+        forces = TASKS[task].forces
+        env.step(generator.uniform(-4.0, 4.0, 1) if forces is None else generator.integers(len(forces)))
+        states.append(np.array(env.state, dtype=np.float64))
+    return np.array(states)
+
+
+@every_task
+def test_every_number_that_gymnasiums_environment_has_can_be_read(task):
+    ours, theirs = _pair(task)
+    names = [name for name in dir(theirs) if name[0] != "_" and name not in NOT_OF_THE_TASK]
+    expected = {name: value for name in names if not inspect.isroutine(value := getattr(theirs, name))}
+    assert len(expected) >= 6
+    assert {name: getattr(ours, name) for name in expected} == expected
+
+
+@pytest.mark.filterwarnings("ignore:.*already returned terminated")
+@pytest.mark.parametrize(
+    ("task", "values"), WRITES, ids=lambda given: given if isinstance(given, str) else "+".join(given)
+)
+def test_a_written_number_has_the_effect_that_it_has_in_gymnasium(task, values):
+    ours, theirs = _pair(task)
+    before = _run(theirs, task, seed=3)
+    state = ours.state = ours.state + 0.01
+    for name, value in values.items():
+        setattr(ours, name, value)
+        setattr(theirs, name, value)
+        assert getattr(ours, name) == pytest.approx(value, rel=1e-15)
+    np.testing.assert_array_equal(ours.state, state)
+    # Gymnasium's continuous car rounds its state to float32 in every step
+    tolerance = 1e-6 if task == "mountain_car_continuous" else 1e-9
+    for _ in range(2):  # what is written outlasts a reset
+        after = _run(theirs, task, seed=3)
+        np.testing.assert_allclose(_run(ours, task, seed=3), after, rtol=0, atol=tolerance)
+    assert not np.allclose(after, before, rtol=0, atol=1e-3)
+
+
+@every_task
+def test_a_state_that_is_set_is_the_one_that_the_next_step_starts_from(task):
+    ours, theirs = _pair(task)
+    state = np.linspace(0.02, 0.05, len(TASKS[task].state_names))
+    for env in (ours, theirs):
+        env.reset(seed=0)
+    ours.state, theirs.state = tuple(state), state.copy()
+    np.testing.assert_array_equal(ours.state, state)
+    action = np.array([0.5]) if TASKS[task].forces is None else 1
+    np.testing.assert_allclose(ours.step(action)[0], theirs.step(action)[0], rtol=0, atol=1e-6)
+    for wrong in (state[:-1], "here", None, state * np.nan):
+        with pytest.raises(ValueError, match=r"state = .* must be finite numbers, of shape"):
+            ours.state = wrong
+
+
+@pytest.mark.parametrize("physics", PHYSICS)
+def test_setting_the_state_leaves_the_motor_as_it_is(physics):
+    env = gymnasium.make("codrl_mj/CartPole-v0", physics=physics).unwrapped
+    env.reset(seed=0)
+    env.step(1)
+    other = copy.deepcopy(env)
+    env.state = other.state
+    for action in (1, 0, 1):
+        found, expected = env.step(action)[4], other.step(action)[4]
+        assert found == expected
+        assert found["current"] != 0.0
+
+
+def test_wrappers_reach_the_attributes():
+    env = gymnasium.make("codrl_mj/CartPole-v0", actuator="ideal")
+    assert env.has_wrapper_attr("gravity")
+    assert env.set_wrapper_attr("gravity", 10.0)
+    assert env.get_wrapper_attr("gravity") == env.unwrapped.gravity == 10.0
+    assert env.unwrapped.model.opt.gravity[2] == -10.0
+    assert not env.has_wrapper_attr("gravitation")
+    env.unwrapped.gravitation = 1  # any other attribute is just one
+    assert copy.deepcopy(env).unwrapped.gravity == 10.0
+
+
+@pytest.mark.filterwarnings("ignore:.*already returned terminated")
+@pytest.mark.parametrize("mode", ["sync", "vector_entry_point"])
+@pytest.mark.parametrize(
+    ("task", "name", "values"), [("cartpole", "gravity", [9.81, 3.72, 1.62]), ("pendulum", "l", [1.0, 1.5, 0.7])]
+)
+def test_environments_of_a_vector_have_values_of_their_own(task, mode, name, values):
+    arguments = {"actuator": "ideal", "num_envs": 3, "vectorization_mode": mode}
+    env = gymnasium.make_vec(TASKS[task].env_id, **arguments)
+    env.reset(seed=[5, 5, 5])
+    nominal = env.get_attr(name)
+    assert nominal == env.call(name) == (getattr(_pair(task)[1], name),) * 3
+    assert all(type(value) is float for value in nominal)
+    env.set_attr(name, values)
+    assert env.get_attr(name) == tuple(values)
+    action = np.full((3, 1), 0.5) if TASKS[task].forces is None else np.ones(3, dtype=np.int64)
+    for _ in range(8):
+        found = env.step(action)[0]
+    for row, value in enumerate(values):
+        theirs = _pair(task)[1]
+        setattr(theirs, name, value)
+        theirs.reset(seed=5)
+        for _ in range(8):
+            expected = theirs.step(action[row])[0]
+        np.testing.assert_allclose(found[row], expected, rtol=0, atol=1e-5)
+    env.set_attr(name, 2.0)
+    assert env.get_attr(name) == (2.0, 2.0, 2.0)
+    env.close()
+
+
+def test_the_states_of_a_vector_can_be_set():
+    env = gymnasium.make_vec("codrl_mj/CartPole-v0", actuator="ideal", num_envs=2)
+    env.reset(seed=0)
+    states = np.arange(8.0).reshape(2, 4) / 100
+    env.unwrapped.state = states
+    np.testing.assert_array_equal(env.unwrapped.get_attr("state"), states)
+    assert env.unwrapped.get_attr("num_envs") == (2, 2)
+    with pytest.raises(ValueError, match=r"of shape \(2, 4\)"):
+        env.unwrapped.state = states.T
+    with pytest.raises(AttributeError, match=r"tau = 0.1: the environments share it, as 0.02"):
+        env.unwrapped.tau = 0.1
+    with pytest.raises(ValueError, match="must be one number, or 2"):
+        env.unwrapped.gravity = [1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "why"),
+    [
+        ("x_threshold", 5.0, "2.4 here; it is compiled .* `gymnasium.Wrapper`"),
+        ("kinematics_integrator", "semi-implicit", "make an environment with integrator="),
+        ("total_mass", 3.0, "write masscart and masspole first"),
+    ],
+)
+def test_what_can_only_be_read_says_why_and_what_to_do(name, value, why):
+    env = _pair("cartpole")[0]
+    with pytest.raises(AttributeError, match=why):
+        setattr(env, name, value)
+    setattr(env, name, getattr(env, name))  # is no change
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name", "why"),
+    [
+        ({"actuator": "paper"}, "tau", "motor and disturbances were checked for this step"),
+        ({"actuator": "paper", "action": "current", "levels": (-1, 1)}, "force_mag", "action='force'"),
+        ({"randomize": {"model.gravity": Uniform(0.9, 1.1)}}, "masspole", "give `randomize` a distribution"),
+        ({"physics": "analytic"}, "gravity", "use physics='mujoco'"),
+    ],
+)
+def test_what_an_environment_cannot_change_it_refuses(arguments, name, why):
+    with pytest.raises(AttributeError, match=why):
+        setattr(_pair("cartpole", **arguments)[0], name, 0.5)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf, "heavy", None, [1.0, 2.0]])
+def test_impossible_masses_are_refused_and_nothing_is_changed(value):
+    env = _pair("cartpole")[0]
+    with pytest.raises(ValueError, match=r"masspole = .*: must be a finite number > 0"):
+        env.masspole = value
+    assert env.masspole == 0.1

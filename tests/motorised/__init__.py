@@ -1,0 +1,1 @@
+"""Motors in models of other people's, behind MuJoCo's plugin."""

@@ -1,0 +1,227 @@
+"""The control callback and the plugin run the same actuators: bit for bit, whatever happens in between."""
+
+import copy
+import pickle
+
+import mujoco
+import numpy as np
+import pytest
+from mujoco import rollout
+from mujoco.batch import Batch
+
+import codrl_mj
+from tests.motorised.models import (
+    ACTUATORS,
+    INTEGRATORS,
+    LOOP,
+    NOISY,
+    Worn,
+    arm,
+    behind_callback,
+    behind_plugin,
+    controls,
+    full_state,
+    trajectory,
+)
+
+pytestmark = pytest.mark.usefixtures("bare_engine")
+
+STEPS = 200
+
+
+def _both(actuators, integrator, kind="hinge"):
+    """Positions, speeds and signals at both doors after each step."""
+    found = []
+    inputs = controls(STEPS, 2)
+    for build in (behind_callback, behind_plugin):
+        model = build(arm(integrator, kind), actuators)
+        data, read, rows = mujoco.MjData(model), codrl_mj.Readout(model), []
+        codrl_mj.clear_motors(data, range(5, 5 + len(actuators)))
+        shaft = np.ones(2)
+        if build is behind_callback:  # where a control is the torque at the shaft
+            shaft[: len(actuators)] = [actuator.arm_radius for actuator in actuators.values()]
+        for desired in inputs:
+            data.ctrl[:] = desired * shaft
+            mujoco.mj_step(model, data)
+            seen = read(data)
+            # one door stores the force, the other makes it from the torque
+            np.testing.assert_allclose(seen.pop("desired_force"), desired[: len(actuators)], rtol=1e-15)
+            rows.append(np.concatenate((data.qpos, data.qvel, data.qfrc_actuator, *seen.values())))
+        assert list(codrl_mj.motors(model).values()) == list(actuators.values())
+        found.append(np.array(rows))
+    return found
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("name", ACTUATORS)
+def test_both_doors_agree(name, integrator):
+    callback, plugin = _both({"one": ACTUATORS[name]}, integrator)
+    np.testing.assert_array_equal(plugin, callback)
+    assert np.isfinite(plugin).all()
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_both_doors_agree_on_a_model_of_two_families_with_a_slide(integrator):
+    callback, plugin = _both({"one": NOISY, "two": Worn()}, integrator, "slide")
+    np.testing.assert_array_equal(plugin, callback)
+
+
+@pytest.mark.matrix
+@pytest.mark.parametrize("kind", ["hinge", "slide"])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("second", ACTUATORS)
+@pytest.mark.parametrize("first", ACTUATORS)
+def test_both_doors_agree_on_all_pairs(first, second, integrator, kind):
+    callback, plugin = _both({"one": ACTUATORS[first], "two": ACTUATORS[second]}, integrator, kind)
+    np.testing.assert_array_equal(plugin, callback)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_further_forward_calls_and_copies_of_the_data_change_nothing(integrator):
+    model = behind_plugin(arm(integrator), {"one": NOISY, "two": ACTUATORS["lag"]})
+    inputs = controls(STEPS, 2)
+    expected = trajectory(model, inputs)
+
+    def meddle(data):
+        for _ in range(3):
+            mujoco.mj_forward(model, data)
+        with_others = copy.copy(data)
+        mujoco.mj_step(model, with_others, 5)
+
+    np.testing.assert_array_equal(trajectory(model, inputs, before_step=meddle), expected)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("carry", ["state", "copy", "pickle", "integration"])
+def test_a_simulation_is_continued_from_what_is_saved_of_it(carry, integrator):
+    model = behind_plugin(arm(integrator), {"one": NOISY, "two": ACTUATORS["lag"]})
+    inputs = controls(STEPS, 2)
+    data = mujoco.MjData(model)
+    first = trajectory(model, inputs[:70], data)
+    if carry in ("state", "integration"):
+        what = mujoco.mjtState.mjSTATE_FULLPHYSICS if carry == "state" else mujoco.mjtState.mjSTATE_INTEGRATION
+        state = np.empty(mujoco.mj_stateSize(model, what))
+        mujoco.mj_getState(model, data, state, what)
+        other = mujoco.MjData(model)
+        mujoco.mj_setState(model, other, state, what)
+    else:
+        other = copy.copy(data) if carry == "copy" else pickle.loads(pickle.dumps(data))
+    mujoco.mj_step(model, data, 3)  # the first goes its own way
+    np.testing.assert_array_equal(
+        np.concatenate((first, trajectory(other.model, inputs[70:], other))), trajectory(model, inputs)
+    )
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_reset_and_a_keyframe_bring_motors_to_rest(integrator):
+    spec = arm(integrator)
+    spec.add_key(name="late", qpos=[0.1, -0.2], time=3.0)
+    model = behind_plugin(spec, {"one": LOOP, "two": ACTUATORS["lag"]})
+    inputs, fresh, used = controls(STEPS, 2), mujoco.MjData(model), mujoco.MjData(model)
+    trajectory(model, inputs, used)
+    mujoco.mj_resetData(model, used)
+    assert not used.plugin_state.any()
+    np.testing.assert_array_equal(trajectory(model, inputs, used), trajectory(model, inputs, fresh))
+    # the time of a keyframe is not that of the motors' rest: under RK4 the first step must be held as all others are
+    mujoco.mj_resetDataKeyframe(model, used, 0)
+    plain = mujoco.MjData(model)
+    plain.qpos[:] = used.qpos
+    np.testing.assert_allclose(trajectory(model, inputs, used), trajectory(model, inputs, plain), rtol=0, atol=1e-11)
+
+
+def test_several_families_of_one_model_are_each_as_if_alone():
+    """Two separate joints: what drives one has nothing to do with the other."""
+    spec = mujoco.MjSpec()
+    for name in ACTUATORS:
+        body = spec.worldbody.add_body(pos=[len(spec.bodies), 0, 0])
+        body.add_joint(name=name, axis=[0, 1, 0])
+        body.add_geom(size=[0.1, 0, 0], mass=1, pos=[0, 0, -0.2], contype=0, conaffinity=0)
+        spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    inputs = controls(STEPS, len(ACTUATORS))
+    together = trajectory(codrl_mj.motorise(spec, ACTUATORS).compile(), inputs)
+    count = len(ACTUATORS)
+    for index, (name, actuator) in enumerate(ACTUATORS.items()):
+        alone = trajectory(codrl_mj.motorise(spec, {name: actuator}).compile(), inputs)
+        for column in (index, count + index, 2 * count + index):
+            np.testing.assert_array_equal(together[:, column], alone[:, column])
+
+
+@pytest.mark.parametrize("nthread", [1, 2])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_batch_is_a_loop(integrator, nthread):
+    """Each simulation with its own motors."""
+    nsim, steps = 8, 60
+    resistances = np.linspace(0.8, 2.0, nsim)
+    actuators = [LOOP.replaced({"motor.resistance": value}) for value in resistances]
+    models = [behind_plugin(arm(integrator), {"one": one, "two": ACTUATORS["lag"]}) for one in actuators]
+    inputs = [controls(steps, 2, seed) for seed in range(nsim)]
+    batch = Batch(models[0], nsim=nsim, nthread=nthread)
+    batch.expand("actuator_user")[:] = [model.actuator_user for model in models]
+    ctrl, qpos, state = batch.bind("ctrl"), batch.bind("qpos"), batch.bind("plugin_state")
+    for step in range(steps):
+        ctrl[:] = [one[step] for one in inputs]
+        batch.step()
+    for sim, model in enumerate(models):
+        data = mujoco.MjData(model)
+        trajectory(model, inputs[sim], data)
+        np.testing.assert_array_equal(qpos[sim], data.qpos)
+        np.testing.assert_array_equal(state[sim], data.plugin_state)
+    assert len(np.unique(qpos[:, 0])) == nsim
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_rollout_is_a_loop(integrator):
+    model = behind_plugin(arm(integrator), {"one": NOISY, "two": ACTUATORS["torque_speed"]})
+    inputs = np.array([controls(50, 2, seed) for seed in range(6)])
+    start = full_state(mujoco.MjData(model))
+    states, _ = rollout.rollout(model, [mujoco.MjData(model) for _ in range(2)], start, inputs)
+    for sequence, found in zip(inputs, states, strict=True):
+        data = mujoco.MjData(model)
+        trajectory(model, sequence, data)
+        np.testing.assert_array_equal(found[-1], full_state(data))
+
+
+def test_a_set_state_needs_motors_cleared_and_then_they_are():
+    model = behind_plugin(arm("RK4"), {"one": NOISY, "two": ACTUATORS["lag"]})
+    inputs, used = controls(STEPS, 2), mujoco.MjData(model)
+    trajectory(model, inputs, used)
+    after = []
+    for cleared in (False, True):
+        data = copy.copy(used)
+        data.qpos[:], data.qvel[:], data.time = 0.0, 0.0, 0.25
+        data.qacc_warmstart[:] = 0.0
+        if cleared:
+            codrl_mj.clear_motors(data)
+        after.append(trajectory(model, inputs[:20], data))
+    fresh = mujoco.MjData(model)
+    fresh.time = 0.25
+    expected = trajectory(model, inputs[:20], fresh)
+    np.testing.assert_array_equal(after[1], expected)
+    assert not np.allclose(after[0], expected, atol=1e-3)
+
+
+def test_noise_has_the_key_that_it_is_given():
+    model = behind_plugin(arm(), {"one": NOISY, "two": NOISY})
+    inputs, ends = controls(50, 2), []
+    for keys in ((1, 2), (1, 2), (2, 1)):
+        data = mujoco.MjData(model)
+        codrl_mj.clear_motors(data, keys)
+        ends.append(trajectory(model, inputs, data))
+    np.testing.assert_array_equal(ends[0], ends[1])
+    assert not np.array_equal(ends[0], ends[2])
+    with pytest.raises(ValueError, match="there are 1, must be 2, one for each motor"):
+        codrl_mj.clear_motors(data, [1])
+
+
+def test_actuation_switched_off_and_on_again_is_the_same_at_both_doors():
+    found = []
+    for build in (behind_callback, behind_plugin):
+        model = build(arm(), {"one": LOOP.replaced({"motor.arm_radius": 1.0})})
+
+        def switch(data, model=model):
+            flag = mujoco.mjtDisableBit.mjDSBL_ACTUATION
+            step = round(data.time / model.opt.timestep)
+            model.opt.disableflags = flag if 20 <= step < 30 else 0
+
+        found.append(trajectory(model, controls(60, 2), before_step=switch)[:, :4])
+    np.testing.assert_array_equal(*found)

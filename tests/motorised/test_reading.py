@@ -1,0 +1,87 @@
+"""Reading motors and their signals from models and data, at both doors at once."""
+
+import mujoco
+import numpy as np
+import pytest
+
+import codrl_mj
+from codrl_mj.actuators import Lag, TorqueSpeed
+from codrl_mj.physics.mjcf import drive, install_callbacks
+from tests.motorised.models import LOOP, arm
+
+pytestmark = pytest.mark.usefixtures("bare_engine")
+
+LINE = TorqueSpeed(stall_torque=0.8, no_load_speed=3.0, max_torque=0.3)
+
+
+def _mixed():
+    """A model with a motor at each door, and an actuator that is nobody's."""
+    spec = arm()
+    spec.add_actuator(name="plain", target="lower", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    drive(spec.actuator("one"), LOOP, 1.0)
+    model = codrl_mj.motorise(spec, {"two": LINE}).compile()
+    install_callbacks(model)
+    return model
+
+
+def test_motors_of_both_doors_are_found():
+    model = _mixed()
+    assert codrl_mj.motors(model) == {0: LOOP, 1: LINE}
+    codrl_mj.check(model)
+    assert codrl_mj.motors(arm().compile()) == {}
+
+
+def test_signals_of_both_doors_are_read():
+    model = _mixed()
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 0.15, 0.5, 0.1
+    mujoco.mj_step(model, data, 3)
+    mujoco.mj_forward(model, data)
+    found = codrl_mj.signals(model, data)
+    gear = 1 / LOOP.arm_radius
+    assert list(found) == [
+        *("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated"),
+        *("lower_limit", "upper_limit"),
+    ]
+    np.testing.assert_allclose(found["desired_force"], [0.15 * gear, 0.5], rtol=1e-15)
+    kt = LOOP.motor.torque_constant
+    np.testing.assert_allclose(found["actual_force"], [kt * found["current"][0] * gear, 0.3], rtol=1e-15)
+    np.testing.assert_allclose(found["reference_current"], [0.15 / kt, np.nan])
+    np.testing.assert_array_equal(found["saturated"], [0.0, 1.0])
+    np.testing.assert_array_equal(found["upper_limit"], [np.nan, 0.3])
+    assert found["voltage"][0] != 0.0
+    np.testing.assert_allclose(data.qfrc_actuator, [found["actual_force"][0], 0.3 + 0.1])
+
+
+def test_a_model_without_motors_has_no_signals():
+    model = arm().compile()
+    assert {name: values.shape for name, values in codrl_mj.signals(model, mujoco.MjData(model)).items()} == {
+        "desired_force": (0,),
+        "actual_force": (0,),
+    }
+
+
+def test_desired_and_actual_force_are_before_the_models_own_gear():
+    spec = arm()
+    spec.actuator("one").gear = [50.0, 0, 0, 0, 0, 0]
+    model = codrl_mj.motorise(spec, {"one": Lag(time_constant=0.0)}).compile()
+    data = mujoco.MjData(model)
+    data.ctrl[0] = 0.25
+    mujoco.mj_forward(model, data)
+    assert {name: float(value[0]) for name, value in codrl_mj.signals(model, data).items()} == {
+        "desired_force": 0.25,
+        "actual_force": 0.25,
+    }
+    assert data.qfrc_actuator[0] == 12.5
+
+
+def test_clearing_motors_at_both_doors_brings_them_to_rest():
+    model = _mixed()
+    data = mujoco.MjData(model)
+    codrl_mj.clear_motors(data, [7, 8])
+    data.ctrl[:] = 0.15, 0.5, 0.1
+    mujoco.mj_step(model, data, 10)
+    assert codrl_mj.signals(model, data)["current"][0] != 0.0
+    codrl_mj.clear_motors(data)
+    states = np.concatenate((data.act, data.plugin_state))
+    assert states[states != 0.0].tolist() == [data.time, 7.0, data.time, 8.0]

@@ -1,0 +1,214 @@
+"""Motors in models that are copied, saved and loaded: the same motor, or a clear error."""
+
+import copy
+import os
+import pickle
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+import codrl_mj
+from codrl_mj.actuators import Lag, reference
+from codrl_mj.plugin import NAME, registered
+from tests.motorised.models import (
+    GYMNASIUM,
+    INTEGRATORS,
+    LOOP,
+    NOISY,
+    SUITE,
+    Worn,
+    arm,
+    behind_plugin,
+    controls,
+    own_controls,
+    trajectory,
+)
+
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # deprecated attributes in other people's models
+
+TWO = {"one": NOISY, "two": Worn()}
+
+
+def _reloaded(model, how, tmp_path):
+    if how == "copy":
+        return copy.copy(model)
+    if how == "deepcopy":
+        return copy.deepcopy(model)
+    if how == "pickle":
+        return pickle.loads(pickle.dumps(model))
+    mujoco.mj_saveModel(model, str(tmp_path / "model.mjb"), None)
+    return mujoco.MjModel.from_binary_path(str(tmp_path / "model.mjb"))
+
+
+@pytest.mark.parametrize("how", ["copy", "deepcopy", "pickle", "mjb"])
+def test_a_compiled_model_keeps_its_motors(how, tmp_path):
+    model = behind_plugin(arm(), TWO)
+    again = _reloaded(model, how, tmp_path)
+    codrl_mj.check(again)
+    assert codrl_mj.motors(again) == {0: NOISY, 1: Worn()}
+    inputs = controls(100, 2)
+    np.testing.assert_array_equal(trajectory(again, inputs), trajectory(model, inputs))
+
+
+def test_a_copied_spec_keeps_its_motors():
+    spec = codrl_mj.motorise(arm(), TWO)
+    inputs = controls(100, 2)
+    np.testing.assert_array_equal(trajectory(spec.copy().compile(), inputs), trajectory(spec.compile(), inputs))
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_an_xml_file_keeps_motors_to_its_six_digits(integrator, tmp_path):
+    """Numbers of at most six digits survive, and with them the actuator, its gain and its bias."""
+    spec = arm(integrator)
+    spec.actuator("two").set_to_position(kp=7.25, kv=0.5)
+    motorised = codrl_mj.motorise(spec, {"one": NOISY, "two": "lag"})
+    path = tmp_path / "model.xml"
+    path.write_text(motorised.to_xml())
+    model, again = motorised.compile(), mujoco.MjModel.from_xml_path(str(path))
+    assert codrl_mj.motors(again) == {0: NOISY, 1: Lag()}
+    inputs = controls(100, 2)
+    np.testing.assert_array_equal(trajectory(again, inputs), trajectory(model, inputs))
+    third = NOISY.replaced({"motor.resistance": 4 / 3})
+    again = mujoco.MjModel.from_xml_string(codrl_mj.motorise(spec, {"one": third}).to_xml())
+    assert codrl_mj.motors(again)[0].motor.resistance == 1.33333
+
+
+def test_gain_and_bias_are_in_the_xml_every_time():
+    """What is not initialised in MuJoCo is a matter of luck."""
+    for _ in range(40):
+        spec = arm().copy()
+        spec.actuator("two").set_to_position(kp=7.25, kv=0.5)
+        model = mujoco.MjModel.from_xml_string(codrl_mj.motorise(spec, {".*": "ideal"}).to_xml())
+        assert model.actuator_biasprm[1, :3].tolist() == [0.0, -7.25, -0.5]
+        assert model.actuator_gainprm[:, 0].tolist() == [1.0, 7.25]
+
+
+def _as_robots_in_xml_are(path, integrator, steps):
+    """Ideal actuators saved and loaded are what the model without them is, saved and loaded."""
+    spec = mujoco.MjSpec.from_file(str(path))
+    spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    spec.meshdir, spec.texturedir = (str(path.parent / folder) for folder in (spec.meshdir, spec.texturedir))
+    spec.compile()
+    plain = mujoco.MjModel.from_xml_string(spec.to_xml())
+    ours = mujoco.MjModel.from_xml_string(codrl_mj.motorise(spec, {".*": "ideal"}).to_xml())
+    inputs = own_controls(plain, steps)
+    np.testing.assert_array_equal(trajectory(ours, inputs), trajectory(plain, inputs))
+
+
+def test_a_robot_saved_and_loaded_is_as_before():
+    _as_robots_in_xml_are(next(path for path in GYMNASIUM if path.stem == "humanoid"), "implicitfast", 100)
+
+
+@pytest.mark.matrix
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("path", [*GYMNASIUM, *SUITE], ids=lambda path: f"{path.parent.name}-{path.stem}")
+def test_all_robots_saved_and_loaded_are_as_before(path, integrator):
+    _as_robots_in_xml_are(path, integrator, 500)
+
+
+_ANOTHER_PROCESS = """
+import mujoco, numpy as np, codrl_mj
+def final(model):
+    data = mujoco.MjData(model)
+    for index in range(50):
+        data.ctrl[:] = 0.1 * (index % 7)
+        mujoco.mj_step(model, data)
+    print(*data.qpos.tolist())
+try:
+    mujoco.MjModel.from_xml_path("somebody.xml")
+except ValueError as error:
+    print(repr(str(error)))
+final(mujoco.MjModel.from_binary_path("model.mjb"))
+final(mujoco.MjModel.from_xml_path("model.xml"))
+from tests.motorised.models import Worn
+codrl_mj.load_family(Worn)
+final(mujoco.MjModel.from_xml_path("somebody.xml"))
+"""
+
+
+def _python(code, folder):
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+
+
+def test_another_process_has_the_same_motors_and_imports_no_code_because_a_model_says_so(tmp_path):
+    inputs = 0.1 * (np.arange(50) % 7)[:, np.newaxis] * np.ones(2)
+    ours = codrl_mj.motorise(arm(), {"one": LOOP, "two": "torque_speed"})
+    somebodys = codrl_mj.motorise(arm(), {"one": Worn()})
+    (tmp_path / "model.xml").write_text(ours.to_xml())
+    (tmp_path / "somebody.xml").write_text(somebodys.to_xml())
+    mujoco.mj_saveModel(ours.compile(), str(tmp_path / "model.mjb"), None)
+    result = _python(_ANOTHER_PROCESS, tmp_path)
+    assert result.returncode == 0, result.stderr
+    refused, *found = result.stdout.splitlines()
+    assert "its family 'tests.motorised.models:Worn' is not loaded, and is not imported because a model" in refused
+    expected = []
+    for model in (ours.compile(), ours.compile(), somebodys.compile()):
+        data = mujoco.MjData(model)
+        trajectory(model, inputs, data)
+        expected.append(" ".join(map(repr, data.qpos.tolist())))
+    assert found == expected
+
+
+def test_another_process_without_us_has_mujocos_error(tmp_path):
+    (tmp_path / "model.xml").write_text(codrl_mj.motorise(arm(), {"one": LOOP}).to_xml())
+    result = _python('import mujoco; mujoco.MjModel.from_xml_path("model.xml")', tmp_path)
+    assert result.returncode == 1
+    assert "plugin codrl_mj.actuator not found" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ("250700 ", "2507 ", "user data do not begin with codrl_mj's signature"),
+        (reference(Lag), reference(type(LOOP)), "name different families"),
+        (reference(Lag), "codrl_mj.actuators:Nobody", "no attribute 'Nobody'"),
+        (" 0.3 0.007", "", "fewer numbers than the family has parameters"),
+    ],
+)
+def test_what_does_not_agree_is_refused_when_it_is_loaded(old, new, reason):
+    text = codrl_mj.motorise(arm(), {"one": Lag(time_constant=0.3, delay=0.007)}).to_xml()
+    text = re.sub(r'<size nuser_actuator="\d+"/>', "", text)  # so that it is as long as it has to be
+    mujoco.MjModel.from_xml_string(text)
+    assert old in text
+    with pytest.raises(ValueError, match=f"plugin->init failed(.|\n)*{NAME}: plugin instance 0: .*{reason}"):
+        mujoco.MjModel.from_xml_string(text.replace(old, new))
+
+
+def test_a_model_whose_plugin_has_another_slot_is_refused():
+    model = behind_plugin(arm(), TWO)
+    model.plugin[:] = 0  # as in an .mjb file from a process where plugins were registered in another order
+    slot = registered()[NAME][0]
+    with pytest.raises(ValueError, match=f"^one: plugin slot = 0: a motor of codrl_mj needs {slot}"):
+        codrl_mj.check(model)
+
+
+def test_a_model_whose_motors_do_not_agree_with_their_plugins_is_refused():
+    model = behind_plugin(arm(), TWO)
+    model.actuator_user[0, 0] = 1.0
+    with pytest.raises(ValueError, match=r"^one: its actuator's user data do not begin with codrl_mj's signature"):
+        codrl_mj.check(model)
+    model = behind_plugin(arm(), TWO)
+    model.actuator_user[:, 2] = model.actuator_user[::-1, 2]
+    with pytest.raises(ValueError, match=r"^one: family = 'codrl_mj.actuators.current_loop:Actuator' of its plugin"):
+        codrl_mj.check(model)
+    model.actuator_user[0, 2] = 123.0
+    with pytest.raises(ValueError, match=r"^one: family 123 is not known in this process: import its module and call"):
+        codrl_mj.check(model)
+    model = behind_plugin(arm(), TWO)
+    model.actuator_user[0, 4] = -1.0
+    with pytest.raises(ValueError, match=r"^one: Motor\.resistance = -1\.0: must be"):
+        codrl_mj.check(model)

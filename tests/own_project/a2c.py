@@ -1,0 +1,33 @@
+"""An agent of one's own: Stable-Baselines3's A2C, behind the settings that `train` takes."""
+
+import dataclasses
+from typing import Any, ClassVar
+
+from gymnasium import spaces
+
+from codrl_mj.agents.deep import DeepAgentConfig
+from codrl_mj.fields import integer, real
+
+
+@dataclasses.dataclass(frozen=True)
+class A2CConfig(DeepAgentConfig):
+    """Advantage actor-critic."""
+
+    name: ClassVar[str] = "a2c"
+    action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (spaces.Box, spaces.Discrete)
+
+    learning_rate: float = real(7e-4, above=0)
+    """RMSProp's step size, > 0."""
+    rollout_steps: int = integer(8, least=1)
+    """Steps of each environment between two updates, >= 1."""
+
+    def make_model(self, env: Any, seed: int) -> Any:
+        """See `AgentConfig.make_model`."""
+        from stable_baselines3 import A2C
+
+        return A2C("MlpPolicy", env, self.learning_rate, self.rollout_steps, seed=seed, device="cpu")
+
+    def _policy_class(self) -> Any:
+        from stable_baselines3.common.policies import ActorCriticPolicy
+
+        return ActorCriticPolicy

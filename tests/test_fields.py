@@ -1,0 +1,208 @@
+"""Fields that know their bounds: what they take, what they refuse, and that a refusal names field, value and bound."""
+
+import dataclasses
+import math
+import re
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from codrl_mj.fields import build, check, check_names, choice, factors, flag, integer, part, parts, real, reals, units
+
+BOUNDS = {
+    "above": (lambda value, limit: value > limit, ">"),
+    "least": (lambda value, limit: value >= limit, ">="),
+    "below": (lambda value, limit: value < limit, "<"),
+    "most": (lambda value, limit: value <= limit, "<="),
+}
+NOT_REAL = st.sampled_from([True, False, np.True_, "1", None, [1.0], (1.0,), 1j, {}]) | st.text(max_size=3)
+
+
+def _settings(field):
+    """A class of one field, checked when it is made."""
+    return dataclasses.make_dataclass(
+        "Settings", [("field", object, field)], frozen=True, namespace={"__post_init__": check}
+    )
+
+
+def _refusal(kind, value):
+    with pytest.raises(ValueError, match=rf"^Settings\.field = {re.escape(repr(value))}: must be ") as refused:
+        kind(field=value)
+    return str(refused.value).partition(": must be ")[2]
+
+
+@pytest.mark.parametrize("bound", BOUNDS)
+@given(value=st.floats(), limit=st.integers(-99, 99))
+def test_a_number_is_taken_exactly_within_its_bound(bound, value, limit):
+    holds, sign = BOUNDS[bound]
+    kind = _settings(real(limit, **{bound: limit}))
+    if math.isfinite(value) and holds(value, limit):
+        assert kind(field=value).field == value
+    else:
+        assert _refusal(kind, value) == f"a finite number {sign} {limit}"
+
+
+@given(value=st.floats() | st.integers(-5, 5).map(float))
+def test_two_bounds_hold_together(value):
+    kind = _settings(real(0.0, above=-2, most=3))
+    if -2 < value <= 3:
+        assert kind(field=value).field == value
+    else:
+        assert _refusal(kind, value) == "a finite number > -2 and <= 3"
+
+
+@given(value=st.floats())
+def test_where_infinity_is_taken_only_the_bound_counts(value):
+    kind = _settings(real(1.0, above=0.0, infinite=True))
+    if value > 0.0:
+        assert kind(field=value).field == value
+    else:
+        assert _refusal(kind, value) == "a number > 0"
+
+
+@given(value=st.integers(-50, 50), least=st.integers(-9, 9))
+def test_an_integer_is_taken_exactly_within_its_bound(value, least):
+    kind = _settings(integer(least, least=least))
+    for of_kind in (int, np.int32, np.int64):
+        if value >= least:
+            stored = kind(field=of_kind(value)).field
+            assert type(stored) is int
+            assert stored == value
+        else:
+            assert _refusal(kind, of_kind(value)) == f"an integer >= {least}"
+
+
+@given(value=st.floats() | NOT_REAL)
+def test_nothing_but_an_integer_is_one(value):
+    assume(value is not None)
+    assert _refusal(_settings(integer(1, least=1)), value) == "an integer >= 1"
+
+
+@given(value=NOT_REAL)
+def test_nothing_but_a_number_is_one(value):
+    assert _refusal(_settings(real(1.0)), value) == "a finite number"
+
+
+@pytest.mark.parametrize("of_kind", [int, float, np.float32, np.float64, np.int16])
+def test_numbers_of_every_kind_are_stored_as_pythons_own(of_kind):
+    stored = _settings(real(1.0))(field=of_kind(2)).field
+    assert type(stored) is float
+    assert stored == 2.0
+
+
+@pytest.mark.parametrize("field", [real(None), real(1.0, optional=True), integer(None, least=1)])
+def test_none_is_taken_where_it_may_be_and_said_where_it_is_not_given(field):
+    kind = _settings(field)
+    assert kind(field=None).field is None
+    assert _refusal(kind, "x").endswith(" or none")
+
+
+@given(value=NOT_REAL | st.floats() | st.integers())
+def test_a_flag_is_true_or_false(value):
+    kind = _settings(flag(True))
+    if isinstance(value, bool):
+        assert kind(field=value).field is value
+    else:
+        assert _refusal(kind, value) == "true or false"
+
+
+def test_a_choice_is_one_of_its_words():
+    kind = _settings(choice("one", "one", "two"))
+    assert kind(field="two").field == "two"
+    for wrong in ("three", "", 1, None):
+        assert _refusal(kind, wrong) == "one of one, two"
+
+
+@pytest.mark.parametrize(
+    ("field", "good", "bad", "bound"),
+    [
+        (units((64,)), [(1,), (), (2, 3)], [(0,), (1.5,), [64], (True,), 64], "a tuple of integers >= 1"),
+        (
+            factors(),
+            [(1.0, 2), None],
+            [(0.0,), (-1,), [1.0], (math.inf,), (math.nan,)],
+            "a tuple of finite numbers > 0 or none",
+        ),
+        (
+            reals(),
+            [(-1.0, 2), (), None],
+            [(math.nan,), [1.0], (math.inf,), ("1",)],
+            "a tuple of finite numbers or none",
+        ),
+    ],
+)
+def test_tuples_hold_what_they_say(field, good, bad, bound):
+    kind = _settings(field)
+    for value in good:
+        assert kind(field=value).field == value
+    for value in bad:
+        assert _refusal(kind, value) == bound
+
+
+# -- names and nested mappings ------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Inner:
+    """A part."""
+
+    gain: float = real(1.0, least=0.0)
+    limit: float = real(2.0, above=0.0)
+
+    __post_init__ = check
+
+
+@dataclasses.dataclass(frozen=True)
+class Outer:
+    """With a part that is there and one that may be."""
+
+    size: int = integer(1, least=1)
+    always: Inner = Inner()
+    maybe: Inner | None = part(Inner())
+
+    __post_init__ = check
+
+
+@given(st.floats(0, 10), st.integers(1, 9), st.none() | st.floats(0, 10))
+def test_nested_mappings_build_what_they_say(gain, size, other):
+    mapping = {"size": size, "always": {"gain": gain}, "maybe": None if other is None else {"gain": other}}
+    expected = Outer(size, Inner(gain), None if other is None else Inner(other))
+    assert build(Outer, mapping, "field") == expected
+    assert build(Outer, dataclasses.asdict(expected), "field") == expected
+    assert build(Outer, {}, "field") == Outer()
+
+
+def test_parts_are_the_fields_that_hold_dataclasses():
+    assert parts(Outer) == {"always": Inner, "maybe": Inner}
+    assert parts(Inner) == {}
+
+
+@pytest.mark.parametrize(
+    ("mapping", "message"),
+    [
+        ({"siez": 2}, r"unknown field siez; did you mean size\?"),
+        ({"always": {"gian": 2}}, r"unknown field always\.gian; did you mean always\.gain\?"),
+        ({"maybe": {"zzz": 2}}, r"unknown field maybe\.zzz; known: gain, limit"),
+        ({3: 2}, r"unknown field 3; known: size, always, maybe"),
+        ({"always": 2.0}, r"field 'always' = 2\.0: must be a mapping of Inner's fields"),
+        ({"maybe": [1]}, r"field 'maybe' = \[1\]: must be a mapping of Inner's fields"),
+        (None, r"field '' = None: must be a mapping of Outer's fields"),
+        ({"always": {"gain": -1.0}}, r"Inner\.gain = -1\.0: must be a finite number >= 0"),
+        ({"size": 1.0}, r"Outer\.size = 1\.0: must be an integer >= 1"),
+    ],
+)
+def test_what_no_mapping_of_fields_says_is_refused(mapping, message):
+    with pytest.raises(ValueError, match=message):
+        build(Outer, mapping, "field")
+
+
+@given(st.lists(st.text(max_size=5), max_size=4), st.lists(st.text(max_size=5), min_size=1, max_size=4))
+def test_names_are_refused_exactly_if_they_are_not_known(given_names, known):
+    wrong = [name for name in given_names if name not in known]
+    if not wrong:
+        check_names(given_names, known, "thing")
+        return
+    with pytest.raises(ValueError, match=re.escape(f"unknown thing in.{wrong[0]}; ")):
+        check_names(given_names, known, "thing", "in.")
