@@ -3,9 +3,13 @@
 import hypothesis
 import mujoco
 import pytest
+from gymnasium.envs.registration import registry
 
 from codrl_mj import engine
 from codrl_mj.actuators import Actuator
+from codrl_mj.tasks import TASKS
+
+OURS = frozenset(TASKS)
 
 hypothesis.settings.register_profile("deterministic", derandomize=True, deadline=None, max_examples=100, database=None)
 hypothesis.settings.load_profile("deterministic")
@@ -29,3 +33,11 @@ def installed(bare_engine):
     """MuJoCo with our motors' callbacks during the test, and without any after it."""
     engine.load_family(Actuator)
     engine.install()
+
+
+@pytest.fixture(autouse=True)
+def _only_our_tasks():
+    """Whatever task a test registers is forgotten after it: others go through all that are known."""
+    yield
+    for name in set(TASKS) - OURS:
+        registry.pop(TASKS.pop(name).env_id, None)

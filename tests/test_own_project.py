@@ -5,7 +5,6 @@ import sys
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.envs.registration import registry
 from gymnasium.vector import AutoresetMode
 from safetensors.numpy import load_file
 
@@ -20,13 +19,13 @@ ID, AGENT, SOFT = arm.TASK.env_id, "tests.own_project.a2c:A2CConfig", "tests.own
 DISTURBED = {"command_delay": 0.013, "pulse_force": 0.5, "pulse_duration": 0.05, "pulse_interval": 0.2}
 
 
-@pytest.fixture(scope="module", autouse=True)
+@pytest.fixture(autouse=True)
 def _registered():
     """Task and physics are known during these tests, and to no other test."""
     codrl_mj.register(arm.TASK)
     codrl_mj.register_physics("slow_motion", slow_motion.SlowMotion)
     yield
-    del codrl_mj.TASKS["arm"], registry[ID], PHYSICS["slow_motion"]
+    del PHYSICS["slow_motion"]
 
 
 def actions(steps, count, seed=0):

@@ -167,7 +167,9 @@ def functions():
         (id(owner), name): value
         for owner in [*modules, *classes]
         for name, value in vars(owner).items()
-        if callable(value) and not isinstance(value, type) and getattr(value, "__module__", "").startswith("codrl_mj")
+        if callable(value)
+        and not isinstance(value, type)
+        and (getattr(value, "__module__", None) or "").startswith("codrl_mj")
     }
 
 

@@ -144,9 +144,13 @@ def _make_current(renderer: mujoco.Renderer) -> bool:
 
 def _discard(renderer: mujoco.Renderer) -> None:
     """Free what a renderer holds, in its own context: in another's, the same names are that one's buffers."""
-    if _make_current(renderer):
-        renderer.close()
-    else:
+    try:
+        current = _make_current(renderer)
+        if current:
+            renderer.close()
+    except Exception:  # it could still be made current, but not be freed: its display has ended
+        current = False
+    if not current:
         _abandon(renderer)
 
 

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from codrl_mj.actuators import Actuator
+from codrl_mj.actuators import IDEAL, Actuator
 from codrl_mj.cli import main
 from codrl_mj.evaluation import evaluate
 from codrl_mj.evaluation.episodes import Episode
@@ -238,7 +238,7 @@ def made_up(arm, steps=30, inner_steps=3):
 def test_states_and_torques_are_drawn_of_every_task(task, tmp_path):
     episodes = [(arm, made_up(arm)) for arm in ARMS if arm.task == task and arm.physics == "mujoco"]
     figures.draw_states(tmp_path / "states.svg", task, episodes)
-    figures.draw_torque(tmp_path / "torque.svg", [one for one in episodes if one[0].actuator is not None])
+    figures.draw_torque(tmp_path / "torque.svg", [one for one in episodes if one[0].actuator != IDEAL])
     for name in ("states", "torque"):
         assert ElementTree.parse(tmp_path / f"{name}.svg").getroot().tag.endswith("svg")
 
