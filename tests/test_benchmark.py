@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.matrix import but
+
 SCRIPTS = Path(__file__).parent.parent / "scripts"
 
 
@@ -17,7 +19,10 @@ def _run(script, *arguments, folder):
 
 @pytest.mark.parametrize(
     ("group", "least", "own"),
-    [("vector: mountain_car_continuous", 3, 2), ("single: pendulum", 3, 2), ("engine: pendulum", 2, 0)],
+    but(
+        [("engine: pendulum", 2, 0)],
+        [("vector: mountain_car_continuous", 3, 2), ("single: pendulum", 3, 2), ("engine: pendulum", 2, 0)],
+    ),
 )
 def test_a_group_of_the_benchmark_is_measured_against_its_first_member(group, least, own, tmp_path):
     out = tmp_path / "bench.json"

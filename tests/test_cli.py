@@ -22,6 +22,7 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import make_env, run_episodes
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.training import TrainConfig, folder, load_config
+from tests.matrix import but
 
 PROGRAM = Path(sys.executable).with_name("codrl-mj")
 TINY = ["--total-steps", "500", "--num-envs", "2", "--agent", "ppo"]
@@ -349,7 +350,7 @@ def test_a_line_that_cannot_be_parsed_exits_with_2(capsys, line):
     assert "Traceback" not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("missing", ["torch", "stable_baselines3", "safetensors", "matplotlib"])
+@pytest.mark.parametrize("missing", but(["torch"], ["torch", "stable_baselines3", "safetensors", "matplotlib"]))
 def test_a_missing_extra_is_named_before_anything_is_written(tmp_path, missing):
     """In a process of its own, where nothing has been imported yet."""
     code = f"import sys; sys.modules[{missing!r}] = None; from codrl_mj.cli import main; sys.exit(main(sys.argv[1:]))"

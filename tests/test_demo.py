@@ -12,6 +12,8 @@ from codrl_mj.actuators import IDEAL
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.training import load_config
 
+pytestmark = pytest.mark.matrix
+
 DEMO = Path(__file__).parents[1] / "scripts" / "demo.py"
 RUNS = ("ideal-seed4", "weaker-seed4")
 

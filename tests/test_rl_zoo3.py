@@ -11,6 +11,8 @@ import pytest
 
 from codrl_mj.tasks import TASKS
 
+pytestmark = pytest.mark.matrix
+
 ALGORITHMS = ("ppo", "dqn", "ddpg", "td3", "sac")
 ENV_ID = "codrl_mj/CartPole-v0"
 EVERY_MODEL = """

@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from codrl_mj.runs.summaries import read_run
 
 SCRIPTS = Path(__file__).parent.parent / "scripts"
@@ -18,7 +20,7 @@ def run(name, *arguments):
 
 def test_a_training_and_its_rollouts(tmp_path):
     out, film = tmp_path / "run", tmp_path / "rollouts.gif"
-    printed = run("train.py", "pendulum", "sac", "lag", "--total-steps", 300, "--out", out)
+    printed = run("train.py", "cartpole", "ppo", "lag", "--total-steps", 300, "--out", out)
     assert f"wrote {out}" in printed
     summary = read_run(out)
     assert (summary.state, summary.actuator) == ("finished", "lag")
@@ -27,6 +29,7 @@ def test_a_training_and_its_rollouts(tmp_path):
     assert film.read_bytes()[:3] == b"GIF"
 
 
+@pytest.mark.matrix
 def test_the_cross_validation():
     printed = run("cross_validate.py", "mountain_car", "--quick").splitlines()
     assert len(printed) > 20

@@ -1,6 +1,7 @@
 """Reads and writes raw memory in functions that numba compiles: integer addresses become typed pointers."""
 
 import functools
+from collections import namedtuple
 from typing import Any
 
 import numba
@@ -79,6 +80,12 @@ def read(typing_context: Any, address: Any, kind: Any) -> Any:  # noqa: ARG001 -
         return context.make_tuple(builder, made, [builder.load(place) for place in places])
 
     return made(types.uintp, kind), codegen
+
+
+@functools.cache
+def entries_type(size: int) -> Any:
+    """A named tuple of so many entries, to `read` a row of an array with."""
+    return namedtuple("Entries", [f"entry{at}" for at in range(size)])
 
 
 @intrinsic

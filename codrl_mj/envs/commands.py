@@ -181,9 +181,9 @@ class Commands:
                 f"actions of shape {array.shape} and type {array.dtype}: must be a batch of elements of {space}, with "
                 f"one row an environment"
             )
-        wrong = (array < 0) | (array >= space.n) if isinstance(space, spaces.Discrete) else np.isnan(array).any(axis=1)
+        wrong = (array < 0) | (array >= space.n) if isinstance(space, spaces.Discrete) else np.isnan(array)
         if wrong.any():
-            row = int(np.argmax(wrong))
+            row = int(np.argmax(wrong.reshape(len(array), -1).any(axis=1)))
             raise ValueError(f"actions[{row}] = {array[row]}: not in {space} (environment {row})")
         if self.action_forces is not None:
             return self.action_forces[array]

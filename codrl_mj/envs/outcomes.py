@@ -13,7 +13,7 @@ import numpy as np
 from numba.np.unsafe.ndarray import to_fixed_tuple
 
 from codrl_mj.engine.families import jitable
-from codrl_mj.engine.memory import internal
+from codrl_mj.engine.memory import entries_type, internal, read
 from codrl_mj.physics.constrain import Compiled, is_fine
 from codrl_mj.tasks import Task
 
@@ -21,8 +21,8 @@ from codrl_mj.tasks import Task
 class Outcomes(NamedTuple):
     """Compiled functions.
 
-    States are float64 arrays (n,), or (N, n). Observations are float32 arrays (k,), or (N, k); entries beyond the
-    task's own are left alone. `options` is the vector of the task's options.
+    States are float64 arrays (n,), or (N, n) with rows whose entries are neighbours. Observations are float32 arrays
+    (k,), or (N, k); entries beyond the task's own are left alone. `options` is the vector of the task's options.
     """
 
     observe: Compiled
@@ -51,7 +51,8 @@ def compiled_outcomes(task: Task) -> Outcomes:
         task: the task.
     """
     jitable(task)
-    return _compiled(task.observation, task.reward, task.terminated, task.options)  # type: ignore[arg-type]
+    size = len(task.state_names)
+    return _compiled(task.observation, task.reward, task.terminated, task.options, size)  # type: ignore[arg-type]
 
 
 @functools.cache
@@ -60,10 +61,11 @@ def _compiled(
     reward: Callable[..., Any],
     terminated: Callable[..., Any],
     options_type: Callable[..., Any],
+    size: int,
 ) -> Outcomes:
     compiled = numba.njit(nogil=True, error_model="numpy")
     observation_of, reward_of, terminated_at = internal(observation), internal(reward), internal(terminated)
-    options_count = len(options_type._fields)  # type: ignore[attr-defined]
+    options_count, entries = len(options_type._fields), entries_type(size)  # type: ignore[attr-defined]
 
     @internal
     def observe(state: np.ndarray, observation: np.ndarray) -> None:
@@ -79,22 +81,32 @@ def _compiled(
     def ended(state: np.ndarray) -> bool:
         return bool(terminated_at(state))
 
+    @internal
+    def of_row(states: np.ndarray, row: int) -> Any:  # entries instead of a view, which costs several times the rest
+        return read(states.ctypes.data + row * states.strides[0], entries)
+
+    @internal
+    def observe_row(state: Any, observations: np.ndarray, row: int) -> None:
+        seen = observation_of(state)
+        for entry in range(len(seen)):
+            observations[row, entry] = seen[entry]
+
     @compiled
     def observe_all(states: np.ndarray, observations: np.ndarray) -> None:
         for row in range(len(states)):
-            observe(states[row], observations[row])
+            observe_row(of_row(states, row), observations, row)
 
     @compiled
     def reward_all(
         before: np.ndarray, forces: np.ndarray, after: np.ndarray, options: np.ndarray, rewards: np.ndarray
     ) -> None:
         for row in range(len(before)):
-            rewards[row] = rewarded(before[row], forces[row], after[row], options)
+            rewards[row] = rewarded(of_row(before, row), forces[row], of_row(after, row), options)
 
     @compiled
     def terminated_all(states: np.ndarray, terminated: np.ndarray) -> None:
         for row in range(len(states)):
-            terminated[row] = ended(states[row])
+            terminated[row] = ended(of_row(states, row))
 
     @compiled
     def judge(
@@ -113,14 +125,15 @@ def _compiled(
         broken = -1
         for row in range(len(before)):
             elapsed[row] += 1
-            observe(after[row], observations[row])
+            state = of_row(after, row)
+            observe_row(state, observations, row)
             if not stepping[row]:
                 rewards[row], terminated[row], truncated[row] = 0.0, False, False
                 continue
-            if broken < 0 and not is_fine(after[row]):
+            if broken < 0 and not is_fine(state):
                 broken = row
-            rewards[row] = rewarded(before[row], forces[row], after[row], options)
-            terminated[row] = ended(after[row])
+            rewards[row] = rewarded(of_row(before, row), forces[row], state, options)
+            terminated[row] = ended(state)
             truncated[row] = elapsed[row] >= limit
         return broken
 

@@ -11,7 +11,7 @@ import numba
 import numpy as np
 
 from codrl_mj.engine.families import jitable
-from codrl_mj.engine.memory import internal
+from codrl_mj.engine.memory import f64, internal
 from codrl_mj.physics.base import LARGEST
 from codrl_mj.tasks import Task
 
@@ -72,7 +72,7 @@ def _batch(read: Compiled, keep: Compiled | None, size: int, explicit: bool) -> 
     @numba.njit(nogil=True, error_model="numpy")
     def read_all(qpos: np.ndarray, qvel: np.ndarray, states: np.ndarray) -> None:
         for row in range(len(qpos)):
-            read(qpos[row], qvel[row], states[row])
+            read(place(qpos, row), place(qvel, row), place(states, row))
 
     @numba.njit(nogil=True, error_model="numpy")
     def move(qpos: np.ndarray, qvel: np.ndarray, moved: np.ndarray, timestep: float) -> None:
@@ -88,9 +88,15 @@ def _batch(read: Compiled, keep: Compiled | None, size: int, explicit: bool) -> 
                 for entry in range(qpos.shape[1]):
                     qpos[row, entry] = moved[row, entry]
             if bounded:
-                constrain(qpos[row], qvel[row], state, timestep)
+                constrain(place(qpos, row), place(qvel, row), state, timestep)
 
     return BatchKernels(read_all, move, correct)
+
+
+@internal
+def place(array: np.ndarray, row: int) -> Any:
+    """Pointer to a row's entries, which are neighbours: a view costs several times what is done with it."""
+    return f64(array.ctypes.data + row * array.strides[0])
 
 
 @internal

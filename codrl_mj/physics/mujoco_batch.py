@@ -198,27 +198,26 @@ class MujocoBatchPhysics:
         Returns:
             The signals, each an array of the same shape.
         """
-        command = desired_force.reshape(self.num_envs, -1)
+        given = command = desired_force.reshape(self.num_envs, -1)
         if self._disturber is None:
-            self._ctrl[:, self._controls] = command * self._arms
+            _write_columns(self._ctrl, self._controls, command, self._arms)
             self._integrate(self.inner_steps)
         else:
             for _ in range(self.inner_steps):
-                command = self._disturber.commands(desired_force.reshape(self.num_envs, -1))
+                command = self._disturber.commands(given)
                 self._load[:, self._dofs] = self._disturber.loads()
-                self._ctrl[:, self._controls] = command * self._arms
+                _write_columns(self._ctrl, self._controls, command, self._arms)
                 self._integrate(1)
-        shape, first = desired_force.shape, signals_at(self.family)
         names = self.family.Signals._fields  # type: ignore[attr-defined]
+        shown = np.zeros((1 + len(names), *command.shape))
         if self.motorised:
-            force = self._act[:, self._slots + TORQUE] / self._arms
-            shown = {name: self._act[:, self._slots + first + at] for at, name in enumerate(names)}
+            _read_signals(self._act, self._slots, signals_at(self.family), self._arms, shown)
         else:
-            force = command.copy()
-            shown = {name: np.zeros(command.shape) for name in names}
-        saturated = shown.pop("saturated", np.zeros(command.shape)) != 0.0
-        signals = {"desired_force": desired_force, "actual_force": force, **shown, "saturated": saturated}
-        return {name: values.reshape(shape) for name, values in signals.items()}
+            shown[0] = command
+        shape = desired_force.shape
+        signals = dict(zip(("actual_force", *names), shown.reshape(-1, *shape), strict=True))
+        saturated = signals.pop("saturated", np.zeros(shape)) != 0.0
+        return {"desired_force": desired_force, **signals, "saturated": saturated}
 
     def _integrate(self, steps: int) -> None:
         """Take integration steps."""
@@ -320,6 +319,22 @@ def _observe_all(
         for motor in range(len(actuators)):
             numbers, signals = user[row, actuators[motor], HEAD:].ctypes.data, shown[at, motor].ctypes.data
             fill(numbers, signals, timestep, times[row], act[row, keys[motor]], seen[at, motor].ctypes.data)
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def _write_columns(array: np.ndarray, columns: np.ndarray, values: np.ndarray, scales: np.ndarray) -> None:
+    for row in range(len(values)):
+        for at in range(len(columns)):
+            array[row, columns[at]] = values[row, at] * scales[row, at]
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def _read_signals(act: np.ndarray, slots: np.ndarray, first: int, arms: np.ndarray, shown: np.ndarray) -> None:
+    for row in range(len(act)):
+        for at in range(len(slots)):
+            shown[0, row, at] = act[row, slots[at] + TORQUE] / arms[row, at]
+            for signal in range(1, len(shown)):
+                shown[signal, row, at] = act[row, slots[at] + first + signal - 1]
 
 
 _ENGINE = ("_batch", "_kernels", "_qpos", "_qvel", "_ctrl", "_act", "_load", "_time")

@@ -17,6 +17,7 @@ from codrl_mj.envs import ActuatedEnv
 from codrl_mj.envs.compiled import compiled_env
 from codrl_mj.physics import SimulationDivergedError
 from codrl_mj.tasks import TASKS, named_actuator
+from tests.matrix import but
 from tests.tasks.faces import actions, desired_force, random_states
 
 every_task = pytest.mark.parametrize("task", TASKS)
@@ -29,7 +30,7 @@ SETUPS = {
     "sensing": {"observe_actuator": True, "actuator": NOISY},
     "voltage": {"observe_actuator": True, "action": "voltage", "actuator": NOISY},
 }
-every_setup = pytest.mark.parametrize("kind", SETUPS)
+every_setup = pytest.mark.parametrize("kind", but(["motor", "disturbed"], SETUPS))
 
 
 def _env(task, kind="motor", **more):

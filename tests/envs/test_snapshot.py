@@ -135,6 +135,7 @@ def test_a_training_s_environments_go_on_as_the_original(task, physics):
     np.testing.assert_array_equal(fresh.reset(), first)
 
 
+@pytest.mark.matrix
 def test_another_process_goes_on_as_the_original(tmp_path):
     expected = {}
     for task in ("cartpole", "mountain_car"):

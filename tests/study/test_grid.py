@@ -95,6 +95,7 @@ def test_a_failure_is_forgotten_when_the_cell_succeeds(tmp_path):
     assert list((tmp_path / "failures").iterdir()) == []
 
 
+@pytest.mark.matrix
 def test_ray_computes_the_same(computed, tmp_path):
     _, runs, _, _ = computed
     ray_runs, failures = train_cells(
@@ -105,6 +106,7 @@ def test_ray_computes_the_same(computed, tmp_path):
         assert weights(ray_runs[name]) == weights(runs[name])
 
 
+@pytest.mark.matrix
 def test_a_killed_grid_goes_on_where_it_was(computed, tmp_path):
     _, runs, _, _ = computed
     code = """

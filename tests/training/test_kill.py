@@ -14,6 +14,7 @@ import pytest
 from codrl_mj.cli import main
 from codrl_mj.runs import files, policies
 from codrl_mj.training import checkpoint, folder, history, watcher
+from tests.matrix import but
 from tests.training.interruptions import differing, kill_test, outcome
 
 PROGRAM = Path(sys.executable).with_name("codrl-mj")
@@ -86,8 +87,11 @@ MOMENTS = random.Random(7)
 @pytest.mark.parametrize(
     ("number", "steps", "wait"),
     [
-        (number, MOMENTS.randint(1, 2500), MOMENTS.uniform(0.0, 0.05))
-        for number in ("SIGKILL", "SIGTERM", "SIGINT", "SIGKILL", "SIGKILL")
+        pytest.param(number, MOMENTS.randint(1, 2500), MOMENTS.uniform(0.0, 0.05), marks=marks)
+        for number, *marks in (
+            ("SIGKILL",),
+            *((number, pytest.mark.matrix) for number in ("SIGTERM", "SIGINT", "SIGKILL", "SIGKILL")),
+        )
     ],
 )
 def test_a_training_killed_at_a_random_moment_comes_to_the_same_result(expected, number, steps, wait):
@@ -134,7 +138,7 @@ KILLED_WHILE = {
 }
 
 
-@pytest.mark.parametrize("moment", KILLED_WHILE)
+@pytest.mark.parametrize("moment", but(["writing a checkpoint"], KILLED_WHILE))
 def test_a_training_killed_while_writing_comes_to_the_same_result(expected, moment):
     line = ["train", *LINE.split(), "--out", "run"]
     assert status_of(in_a_process(line, KILLED_WHILE[moment])) == -9
@@ -144,6 +148,7 @@ def test_a_training_killed_while_writing_comes_to_the_same_result(expected, mome
         assert main(["train", "--resume", "run"]) == 2  # nothing was begun
 
 
+@pytest.mark.matrix
 def test_the_program_says_how_to_continue(expected):
     line = [str(PROGRAM), "train", *LINE.split(), "--out", "run"]
     with subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as program:

@@ -48,6 +48,7 @@ def done(tmp_path_factory):
     return plan, findings, out, write(findings, out), reported
 
 
+@pytest.mark.matrix
 def test_every_arm_is_trained_tested_and_read(done):
     plan, findings, _, _, reported = done
     assert (reported.count("training"), reported.count("test")) == (6, 5)
@@ -63,6 +64,7 @@ def test_every_arm_is_trained_tested_and_read(done):
         assert series.tested("returns") == [expected.returns.mean]
 
 
+@pytest.mark.matrix
 def test_what_failed_or_was_not_tried_is_said(done):
     _, findings, out, _, _ = done
     series = findings.evidence.series[BLOCKED.name]
@@ -75,6 +77,7 @@ def test_what_failed_or_was_not_tried_is_said(done):
     assert "A trial: every training was cut off after 2 episodes" in page
 
 
+@pytest.mark.matrix
 def test_the_page_has_every_claim_with_its_verdict(done):
     _, findings, out, _, _ = done
     page = (out / PAGE).read_text()
@@ -109,6 +112,7 @@ def test_a_claim_about_both_kinds_of_physics_is_counted_once(mujoco, analytic, c
     assert f"| the paper | {counted} |" in _verdicts(SimpleNamespace(claims=list(judged)))
 
 
+@pytest.mark.matrix
 def test_every_file_that_the_page_names_is_there_and_whole(done):
     _, _, out, files, _ = done
     page = (out / PAGE).read_text()
@@ -126,6 +130,7 @@ def test_every_file_that_the_page_names_is_there_and_whole(done):
     assert not [path for path in out.rglob("*") if path.is_file() and path not in files]
 
 
+@pytest.mark.matrix
 def test_the_tables_are_the_findings(done):
     _, findings, out, _, _ = done
     with (out / FOLDER / tables.RUNS).open() as file:
@@ -146,6 +151,7 @@ def test_the_tables_are_the_findings(done):
     assert [one["discount"] for one in content["value_iteration"]] == [0.85, 0.9, 0.95, 0.99, 0.999]
 
 
+@pytest.mark.matrix
 def test_written_again_from_the_run_folders_it_is_the_same(done, tmp_path):
     plan, _, out, files, _ = done
     again = write(gather(plan), tmp_path)
@@ -154,6 +160,7 @@ def test_written_again_from_the_run_folders_it_is_the_same(done, tmp_path):
         assert path.read_bytes() == other.read_bytes(), path
 
 
+@pytest.mark.matrix
 def test_the_page_includes_what_a_person_wrote(done, tmp_path):
     plan, _, _, _, _ = done
     written = tmp_path / "reproduction_conclusions.md"
@@ -163,6 +170,7 @@ def test_the_page_includes_what_a_person_wrote(done, tmp_path):
     assert written.read_text() == "What a person wrote.\n"
 
 
+@pytest.mark.matrix
 def test_finished_runs_are_not_trained_again(done):
     plan, _, _, _, _ = done
     hill = dataclasses.replace(plan, tasks=("mountain_car",), sarsa_seeds=1)
@@ -173,6 +181,7 @@ def test_finished_runs_are_not_trained_again(done):
     assert [path.stat().st_mtime_ns for path in results] == before
 
 
+@pytest.mark.matrix
 def test_costs_are_those_of_finished_runs_or_estimates(done):
     plan, findings, _, _, _ = done
     by_arm = {cost.arm.name: cost for cost in costs(plan)}
@@ -285,6 +294,7 @@ def test_a_page_can_be_written_of_nothing(tmp_path, capsys):
     assert not (tmp_path / "no").exists()
 
 
+@pytest.mark.matrix
 def test_failures_show_in_the_exit_status(done, tmp_path, capsys):
     plan, _, _, _, _ = done
     given = ["reproduce", "mountain_car", "--only-page", "--root", str(plan.root), "--out", str(tmp_path)]
@@ -292,6 +302,7 @@ def test_failures_show_in_the_exit_status(done, tmp_path, capsys):
     assert f"failed: {BLOCKED.name}, seed 0: " in capsys.readouterr().err
 
 
+@pytest.mark.matrix
 def test_a_test_that_failed_is_said(done, tmp_path):
     plan, _, _, _, _ = done
     folder = plan.folders()[HILL[0].name, 0]
