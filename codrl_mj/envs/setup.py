@@ -1,6 +1,7 @@
 """A task made ready: its actuators, its options, and what the agent commands and sees. Shared by every face."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -161,7 +162,7 @@ class Setup:
             physics.set_model(randomization.model_fields(values[np.newaxis], drawn=True))
         return alone(actuators)
 
-    @property
+    @functools.cached_property
     def random(self) -> bool:
         """Whether an episode's disturbances or sensors need a key."""
         drawn = () if self.randomization is None else self.randomization.names
