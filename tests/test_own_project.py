@@ -1,5 +1,10 @@
 """A project of somebody else's on every face and command, with no file of ours edited: family, task, agent, physics."""
 
+import dataclasses
+import json
+import math
+import pickle
+import subprocess
 import sys
 
 import gymnasium
@@ -12,8 +17,12 @@ import codrl_mj
 from codrl_mj.cli import main
 from codrl_mj.physics.registry import PHYSICS
 from codrl_mj.runs.summaries import read_run
-from codrl_mj.tasks import reference_of
+from codrl_mj.tasks import TASKS, reference_of
+from codrl_mj.tasks.attributes import Fixed
+from codrl_mj.tasks.trials import Trials
+from codrl_mj.validation import try_mutations, validate
 from tests.own_project import arm, series_elastic, slow_motion
+from tests.training.interruptions import TERMINATE, after, differing, outcome
 
 ID, AGENT, SOFT = arm.TASK.env_id, "tests.own_project.a2c:A2CConfig", "tests.own_project.series_elastic:SOFT"
 DISTURBED = {"command_delay": 0.013, "pulse_force": 0.5, "pulse_duration": 0.05, "pulse_interval": 0.2}
@@ -115,6 +124,42 @@ def test_dm_control_has_the_arm_too():
     assert len(step.observation) == len(expected)
 
 
+def test_attributes_of_a_task_that_is_registered_late_are_the_models():
+    env = gymnasium.make(ID, actuator="ideal", disable_env_checker=True).unwrapped
+    env.reset(seed=0)
+    assert (env.gravity, env.upper_mass, env.most, env.reach) == (9.81, 1.0, arm.MAX_TORQUES, 0.9)
+    env.gravity, env.upper_mass = 3.7, 2.0
+    assert env.model.opt.gravity[2] == -3.7
+    assert env.model.body("upper").mass[0] == 2.0
+    np.testing.assert_array_equal(env.model.body("upper").inertia, [0.06, 0.06, 0.002])
+    with pytest.raises(AttributeError, match="several motors"):
+        env.most = (9.0, 4.0)
+    with pytest.raises(AttributeError, match="compiled"):
+        env.reach = 1.0
+    vector = gymnasium.make_vec(ID, 2, "vector_entry_point", actuator="ideal")
+    vector.set_attr("upper_mass", [1.5, 2.5])
+    assert vector.get_attr("upper_mass") == (1.5, 2.5)
+    assert gymnasium.make("codrl_mj/CartPole-v0").unwrapped.gravity == 9.8
+    assert not hasattr(gymnasium.make("codrl_mj/CartPole-v0").unwrapped, "upper_mass")
+
+
+def test_a_pickled_environment_has_its_attributes_in_another_process():
+    env = gymnasium.make(ID, actuator="ideal", disable_env_checker=True).unwrapped
+    env.upper_mass = 2.0
+    code = "import pickle, sys; print(pickle.load(sys.stdin.buffer).upper_mass)"
+    done = subprocess.run([sys.executable, "-c", code], input=pickle.dumps(env), capture_output=True, timeout=120)
+    assert done.stdout.strip() == b"2.0", done.stderr
+
+
+def test_an_attribute_that_environments_have_already_is_refused():
+    for name in ("physics", "step", "state"):
+        task = dataclasses.replace(arm.TASK, name="other", env_id="own_project/Other-v0", attributes={name: Fixed(1)})
+        codrl_mj.register(task)
+        with pytest.raises(ValueError, match=f"'other': environments have a '{name}' of their own"):
+            gymnasium.make(task.env_id, task="other", actuator="ideal")
+        del TASKS["other"], gymnasium.registry[task.env_id]
+
+
 def codrl(*arguments):
     assert main([str(argument) for argument in arguments]) == 0
 
@@ -143,3 +188,144 @@ def test_a_run_that_names_somebodys_code_is_not_loaded_unasked(tmp_path, capsys)
     assert main(["evaluate", str(run), "--episodes", "1"]) == 2
     assert "--trust" in capsys.readouterr().err
     assert "tests.own_project.arm" in sys.modules
+
+
+def test_a_training_of_the_arm_that_was_stopped_comes_to_the_same_weights(tmp_path):
+    flags = ["--agent", AGENT, "--total-steps", 320, "--num-envs", 4, "--evaluation-episodes", 1, "--no-tensorboard"]
+    line = ["train", "tests.own_project.arm:TASK", "--actuator", SOFT, *flags, "--checkpoint-interval", 64, "--out"]
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    codrl(*line, whole)
+    with after(170, TERMINATE):
+        assert main([str(argument) for argument in (*line, stopped)]) != 0
+    assert read_run(stopped).state == "unfinished"
+    codrl("train", "--resume", stopped, "--trust")
+    assert read_run(stopped).state == "finished"
+    assert differing(outcome(whole), outcome(stopped)) == []
+
+
+# -- the certificate ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """What the command writes of the arm."""
+    folder = tmp_path_factory.mktemp("certificate")
+    codrl("validate", "tests.own_project.arm:TASK", "--quick", "--out", folder)
+    return folder
+
+
+def test_the_command_certifies_the_arm_and_says_what_it_left_out(written):
+    content = json.loads((written / "certificate.json").read_text())
+    assert (content["subject"], content["verdict"]) == ("arm", "passed")
+    names = {(check["group"], check["name"]) for check in content["checks"] if check["task"] == "arm"}
+    assert {("motor", f"{kind}: {motor}") for kind in ("stable", "steps") for motor in arm.TASK.motors} <= names
+    assert {("convergence", f"order, rk4, {case}") for case in ("ideal actuator", "motor in the loop")} <= names
+    assert {("energy", f"order, {kind} balance, rk4") for kind in ("electrical", "mechanical", "whole")} <= names
+    assert {("execution", name) for name in ("batched, 2 threads", "restored", "pickled, rk4")} <= names
+    reasons = {(skip["group"], skip["name"]): skip["reason"] for skip in content["skipped"] if skip["task"] == "arm"}
+    assert "rebuilds no environment" in reasons["dynamics", "all checks"]
+    assert "rebuilds no environment" in reasons["trajectories", "all checks"]
+    assert "default current loop" in reasons["motor", "the paper's actuators"]
+    page = (written / "certificate.html").read_text()
+    assert all(reason.replace("'", "&#39;") in page for reason in reasons.values())
+
+
+def test_python_finds_what_the_command_found(written):
+    found = {check.name: check.worst for check in validate("arm", quick=True, groups=["convergence", "energy"]).checks}
+    content = json.loads((written / "certificate.json").read_text())
+    assert found == {
+        check["name"]: check["worst"] for check in content["checks"] if check["group"] in ("convergence", "energy")
+    }
+
+
+def test_a_registered_task_changes_nothing_for_ours(monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.delitem(TASKS, "arm")
+        alone = validate("pendulum", quick=True, groups=["motor", "execution"]).checks
+    beside = validate(["arm", "pendulum"], quick=True, groups=["motor", "execution"]).checks
+    ours, expected = ([dataclasses.replace(check, plots=()) for check in checks] for checks in (beside, alone))
+    assert [check for check in ours if check.task != "arm"] == expected
+
+
+def test_the_arms_checks_can_fail(monkeypatch):
+    """Its integrator is not the one that it names; its loop lags; a joint is damped by what nobody knows of."""
+    from codrl_mj.physics import mujoco_single
+
+    build = mujoco_single.task_model
+
+    def wrong(*arguments, **options):
+        model = build(*arguments, **options)
+        model.opt.integrator = 0
+        model.dof_damping[:] += 0.3
+        return model
+
+    monkeypatch.setattr(mujoco_single, "task_model", wrong)
+    checks = {
+        check.name: check.passed for check in validate("arm", quick=True, groups=["convergence", "energy"]).checks
+    }
+    assert {name for name, passed in checks.items() if not passed} == {
+        "order, rk4, ideal actuator",
+        "order, rk4, motor in the loop",
+        "order, mechanical balance, rk4",
+        "order, whole balance, rk4",
+    }
+
+
+def variation(**fields):
+    return codrl_mj.register(dataclasses.replace(arm.TASK, name="other", env_id="own_project/Other-v0", **fields))
+
+
+def skipped(groups=("convergence", "energy")):
+    return [(skip.name, skip.reason) for skip in validate("other", quick=True, groups=groups).skipped]
+
+
+def test_a_run_that_is_not_smooth_is_left_out_and_said():
+    variation(constrain=lambda state, _: (state[0], state[1], np.minimum(state[2], 0.5), state[3]))
+    for name, reason in skipped():
+        assert name in ("all checks", "the balances of a whole run")
+        assert "meets the task's bounds: name another in Task.trials" in reason
+
+
+def test_a_hill_without_a_twin_has_no_ledger_and_says_so():
+    car = TASKS["mountain_car"]
+    codrl_mj.register(dataclasses.replace(car, name="other", env_id="own_project/Other-v0", twin=None, paper=()))
+    assert skipped(["energy"]) == [("all checks", "its model has a hill, whose height only a twin knows")]
+
+
+def test_a_run_of_ones_own_is_taken():
+    trials = Trials((math.pi,) * 4, ((0.0,),) * 4, start=(0.3, 0.1, 0.0, 0.0), steps=4, balanced_steps=2)
+    variation(trials=trials)
+    result = validate("other", quick=True, groups=["convergence"])
+    assert [skip.name for skip in result.skipped] == ["equations of motion that are not MuJoCo's"]
+    assert len(result.checks) == 3
+
+
+class Swing:
+    """Drives the pendulum's twin by a name of its own."""
+
+    def __new__(cls):
+        return TASKS["pendulum"].twin()
+
+
+def test_a_twin_without_paper_or_states_is_compared_where_it_can_be():
+    pendulum = dataclasses.replace(
+        TASKS["pendulum"], name="other", env_id="own_project/Other-v0", twin=Swing, paper=(), trials=None
+    )
+    codrl_mj.register(pendulum)
+    result = validate("other", quick=True, groups=["dynamics", "trajectories"])
+    assert result.passed
+    assert {check.name for check in result.checks} == {
+        "run, semi-implicit, ideal actuator",
+        "run against rounding, semi-implicit, ideal actuator",
+    }
+    assert [(skip.group, skip.name) for skip in result.skipped] == [
+        ("dynamics", "all checks"),
+        ("trajectories", "runs with the paper, weaker, starved actuators"),
+    ]
+
+
+def test_faults_are_made_in_our_own_tasks_alone(capsys):
+    with pytest.raises(ValueError, match="'arm': faults are made in these alone: pendulum"):
+        try_mutations("arm")
+    assert main(["validate", "tests.own_project.arm:TASK", "--mutations"]) == 2
+    assert "faults are made in these alone" in capsys.readouterr().err

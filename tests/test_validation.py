@@ -13,10 +13,11 @@ import mujoco
 import numpy as np
 import pytest
 
+import codrl_mj
 from codrl_mj import TASKS
 from codrl_mj.actuators import IDEAL, Actuator, Lag, TorqueSpeed
 from codrl_mj.cli import main
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError, needed_callbacks
 from codrl_mj.validation import (
     GROUPS,
     MUTATIONS,
@@ -40,6 +41,7 @@ from codrl_mj.validation.growth import Growth, lyapunov_exponent
 from codrl_mj.validation.mutations import edited, margin, unfailed, wrong_loop, wrong_loop_everywhere
 from codrl_mj.validation.svg_plot import svg
 from tests.engine.models import FULL, add_motor, changed, controls, rotor, rotor_spec, trajectory
+from tests.motorised.models import ACTUATORS, INTEGRATORS, LOOP, arm, behind_plugin
 
 OWN = ("dynamics", "trajectories", "execution")
 
@@ -362,12 +364,12 @@ def test_the_growth_near_an_unstable_equilibrium_is_its_eigenvalue():
 
 
 def test_the_grid_reaches_the_bounds_and_the_edges_lie_on_them():
-    for name, task in TASKS.items():
+    for task in TASKS.values():
         states = dynamics.grid(task, 5)
         assert len(states) == 5 ** len(task.state_names)
-        assert states.max(axis=0).tolist() == list(dynamics.STATE_BOUNDS[name])
-    assert {-1.2, 0.6} <= set(dynamics.EDGES["mountain_car"][0])
-    assert math.pi in dynamics.EDGES["acrobot"][0]
+        assert states.max(axis=0).tolist() == list(task.trials.bounds)
+    assert {-1.2, 0.6} <= set(TASKS["mountain_car"].trials.edges[0])
+    assert math.pi in TASKS["acrobot"].trials.edges[0]
 
 
 def test_bits_are_compared_and_not_values():
@@ -429,6 +431,38 @@ def test_actuators_of_other_families_are_checked_beside_motors():
     }
 
 
+SERVO = """
+<mujoco><option timestep="0.005"/><worldbody><body><joint name="a" axis="0 1 0" damping="0.1"/>
+<geom type="capsule" fromto="0 0 0 0 0 .5" size=".05"/></body></worldbody>
+<actuator><position name="servo" joint="a" kp="3" kv="0.2" timeconst="0.02" gear="2" forcerange="-0.5 0.5"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_motors_behind_the_plugin_are_put_through_the_same_checks(bare_engine, integrator):
+    model = behind_plugin(arm(integrator), {"one": ACTUATORS["noisy_current_loop"], "two": ACTUATORS["somebody's"]})
+    result = validate_model(model, quick=True)
+    assert [(check.name, check.worst, check.where) for check in result.checks if not check.passed] == []
+    assert {"steps: one", "steps: two", "stable: one", "step response", "restored"} <= {c.name for c in result.checks}
+    assert needed_callbacks(model) == ()
+
+
+def test_a_motorised_servo_and_an_ideal_actuator_are_checked_for_what_they_are(bare_engine):
+    servo = behind_plugin(mujoco.MjSpec.from_string(SERVO), {"servo": LOOP})
+    assert validate_model(servo, quick=True).passed
+    result = validate_model(behind_plugin(arm(), {"one": "lag", "two": "ideal"}), quick=True)
+    assert result.passed
+    assert [skip.name for skip in result.skipped if "ideal" in skip.reason] == ["steps: two"]
+
+
+def test_a_wrong_motor_behind_the_plugin_fails(bare_engine):
+    model = behind_plugin(arm(), {"one": LOOP})
+    with wrong_loop(("+ parameters.ki * integral", "- parameters.ki * integral")):
+        failed = {check.name for check in validate_model(model, quick=True).checks if not check.passed}
+    assert failed >= {"steps: one", "step response"}
+
+
 def test_an_actuator_that_its_family_would_refuse_is_not_stable():
     result = validate_model(rotor(Lag(delay=0.081)), quick=True)  # eight steps of 0.01 s are remembered
     (check,) = (check for check in result.checks if not check.passed)
@@ -466,7 +500,7 @@ def test_an_unknown_group_is_refused():
 
 def test_a_model_without_a_motor_is_refused():
     model = mujoco.MjModel.from_xml_string("<mujoco><worldbody/></mujoco>")
-    with pytest.raises(ValueError, match=r"no motor of codrl_mj among its 0 actuators.*mjcf.drive"):
+    with pytest.raises(ValueError, match=r"no motor of codrl_mj among its 0 actuators.*codrl_mj.motorise"):
         validate_model(model)
 
 
@@ -614,6 +648,14 @@ def test_the_command_prints_writes_and_exits_with_0(capsys, tmp_path):
     assert "passed: 13 of 13 checks" in text
     assert (out / "certificate.html").is_file()
     assert json.loads((out / "certificate.json").read_text())["verdict"] == "passed"
+
+
+def test_the_command_takes_a_motorised_model(capsys, bare_engine, tmp_path):
+    spec = codrl_mj.motorise(mujoco.MjSpec.from_string(SERVO), {"servo": LOOP})
+    spec.compile()
+    (tmp_path / "servo.xml").write_text(spec.to_xml())
+    assert main(["validate", "--model", str(tmp_path / "servo.xml"), "--quick"]) == 0
+    assert "steps: servo" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("worst", [1.0, math.nan])

@@ -19,10 +19,14 @@ class Validate:
 
     tasks: Annotated[
         tyro.conf.Positional[tuple[str, ...]],
-        tyro.conf.arg(metavar="{" + ",".join(TASKS) + "}", help="What to validate; all tasks if none is named."),
+        tyro.conf.arg(
+            metavar="{" + ",".join(TASKS) + "}",
+            help="What to validate, module:NAME of your own; all tasks if none is named.",
+        ),
     ] = ()
     model: Path | None = None
-    """MJCF file of your own with any number of our motors, to be put through the checks that apply to it."""
+    """MJCF file of your own with any number of our motors, motorised or behind the control callback, to be put through
+    the checks that apply to it."""
     quick: bool = False
     """Fewer states, runs and step sizes: seconds instead of minutes."""
     mutations: bool = False
@@ -34,10 +38,12 @@ class Validate:
         """Validate and print a table for each group."""
         from codrl_mj.cli.terminal import print_certificate, print_mutations, progress_bar
         from codrl_mj.validation import own_model, page, try_mutations, validate, validate_model
-        from codrl_mj.validation.mutations import unfailed
+        from codrl_mj.validation.mutations import faulty, unfailed
 
         if self.model is not None and (self.tasks or self.mutations):
             raise ValueError("--model: give a model or tasks, and no --mutations, which are faults of the tasks")
+        if self.mutations:
+            faulty(self.tasks)
         if self.out is not None:
             page.check_writable(self.out)
         model = None if self.model is None else own_model.load(self.model)

@@ -1,6 +1,6 @@
 """What compiled models and their data say of our actuators, at either door."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -112,14 +112,14 @@ def _behind_callback(model: mujoco.MjModel, index: int) -> ActuatorModel:
     return _made(family, user, HEAD, 1.0 / gear[0])
 
 
-def _slots(data: mujoco.MjData) -> list[tuple[Family, np.ndarray]]:
-    """The family of each motor, and a view of its state."""
-    model, found = data.model, []
-    for index, actuator in motors(model).items():
+def slots(data: mujoco.MjData, actuators: Mapping[int, ActuatorModel]) -> dict[int, np.ndarray]:
+    """A view of the state of each of these motors, by its index; a plugin's ends with the desired force [N]."""
+    model, found = data.model, {}
+    for index, actuator in actuators.items():
         instance, family = model.actuator_plugin[index], type(actuator)
         start = model.actuator_actadr[index] if instance < 0 else model.plugin_stateadr[instance]
         size = slot_size(family) + (0 if instance < 0 else EXTRA_STATES)
-        found.append((family, (data.act if instance < 0 else data.plugin_state)[start : start + size]))
+        found[index] = (data.act if instance < 0 else data.plugin_state)[start : start + size]
     return found
 
 
@@ -136,11 +136,11 @@ def clear_motors(data: mujoco.MjData, noise_keys: Sequence[int] | None = None) -
     Raises:
         ValueError: the model is not as `motors` wants it, or there are not as many keys as motors.
     """
-    slots = [slot for _, slot in _slots(data)]
-    keys = [slot[1] for slot in slots] if noise_keys is None else list(noise_keys)
-    if len(keys) != len(slots):
-        raise ValueError(f"noise_keys: there are {len(keys)}, must be {len(slots)}, one for each motor of the model")
-    for slot, key in zip(slots, keys, strict=True):
+    found = list(slots(data, motors(data.model)).values())
+    keys = [slot[1] for slot in found] if noise_keys is None else list(noise_keys)
+    if len(keys) != len(found):
+        raise ValueError(f"noise_keys: there are {len(keys)}, must be {len(found)}, one for each motor of the model")
+    for slot, key in zip(found, keys, strict=True):
         slot[:] = 0.0
         slot[:2] = data.time, key
 

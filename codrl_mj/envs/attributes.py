@@ -1,37 +1,40 @@
-"""The numbers that Gymnasium's environments have as attributes, of ours: `env.unwrapped.gravity = 3.7`.
+"""Attributes of environments, as Gymnasium's have them: `env.unwrapped.gravity = 3.7`.
 
-A task's table says where each of them lives in the MuJoCo model. One that is written changes the model and takes effect
-at once; state and motor stay as they are. What is written outlasts resets, and is not in a `snapshot`. What the task's
-compiled functions contain can be read only; writing the value that an attribute has is allowed everywhere.
+`Task.attributes` says where each of them lives. One that is written changes the model and takes effect at once; state
+and motor stay as they are. What is written outlasts resets, and is not in a `snapshot`. What the task's compiled
+functions contain can be read only; writing the value that an attribute has is allowed everywhere.
 """
 
 import dataclasses
 import math
 import numbers
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from codrl_mj.actuators import Ideal
 from codrl_mj.disturbances import OFF
-from codrl_mj.engine.hill import GRAVITY
 from codrl_mj.envs.setup import Setup
-from codrl_mj.physics.variation import Variation, write_fields
-from codrl_mj.tasks import Task, acrobot, cartpole, mountain_car, mountain_car_continuous, pendulum
+from codrl_mj.physics.variation import Variation, field_of, write_fields
+from codrl_mj.tasks import Task
+from codrl_mj.tasks.attributes import Attribute, Fixed, Follows, ModelNumber, Setting
 
 
-class Attribute(NamedTuple):
-    """One attribute of a task's environments; `model` is an `mjModel`."""
-
-    read: Callable[[Setup, Any], Any]
-    """(set-up, model) -> its value."""
-    write: Callable[[Setup, Any, Any], Setup] | None
-    """(set-up, model, value) -> the set-up to go on with: changes the model; None where it can be read only."""
-    remedy: str = ""
-    """What to do instead of writing it."""
-    shared: bool = False
+def shared(attribute: Attribute) -> bool:
     """Whether it is the set-up's: the environments of a vector share it."""
+    return isinstance(attribute, Fixed | Setting)
+
+
+def read(attribute: Attribute, setup: Setup, model: Any) -> Any:
+    """The value of an attribute of an environment with an `mjModel`."""
+    if isinstance(attribute, Fixed):
+        return attribute.value
+    if isinstance(attribute, Follows):
+        return attribute.of(*(read(setup.task.attributes[name], setup, model) for name in attribute.names))
+    if isinstance(attribute, Setting):
+        value = getattr(setup if attribute is Setting.INTEGRATOR else setup.task, attribute.value)
+        return list(value) if attribute is Setting.FORCES else value
+    return attribute.scale * float(_place(attribute, model)[0]) ** (-1 if attribute.inverse else 1)
 
 
 def written(attribute: Attribute, name: str, value: Any, setup: Setup, model: Any) -> Setup:
@@ -51,19 +54,15 @@ def written(attribute: Attribute, name: str, value: Any, setup: Setup, model: An
         AttributeError: it can be read only; the message says why and what to do instead.
         ValueError: the value is no number, or out of bounds.
     """
-    present, remedy = attribute.read(setup, model), attribute.remedy
+    present = read(attribute, setup, model)
     if np.array_equal(value, present):
         return setup
-    if attribute.write is not None and setup.randomization is not None:
-        remedy = "actuator and model are drawn at every reset: give `randomize` a distribution of it"
-    elif attribute.write is not None:
-        try:
-            return attribute.write(setup, model, value)
-        except ValueError as error:
-            raise ValueError(f"{name} = {value!r}: {error}") from None
-        except AttributeError as error:
-            remedy = str(error)
-    raise AttributeError(f"{name} = {value!r}: it can only be {present!r} here; {remedy}")
+    try:
+        return _write(attribute, value, setup, model)
+    except ValueError as error:
+        raise ValueError(f"{name} = {value!r}: {error}") from None
+    except AttributeError as error:
+        raise AttributeError(f"{name} = {value!r}: it can only be {present!r} here; {error}") from None
 
 
 def checked_states(states: Any, shape: tuple[int, ...]) -> np.ndarray:
@@ -81,6 +80,15 @@ def checked_states(states: Any, shape: tuple[int, ...]) -> np.ndarray:
     return array
 
 
+def _place(attribute: ModelNumber, model: Any) -> np.ndarray:
+    """The number where it is, live, shape (1,)."""
+    array, row = field_of(model, attribute.field), 0
+    if attribute.owner:
+        row = getattr(model, attribute.field.partition("_")[0])(attribute.owner).id
+    rows = array.reshape(len(array) if attribute.owner else 1, -1)
+    return rows[row, attribute.entry : attribute.entry + 1]
+
+
 def _number(value: Any, positive: bool) -> float:
     if isinstance(value, numbers.Real | np.ndarray) and np.size(value) == 1 and math.isfinite(value):  # type: ignore[arg-type]
         number = float(value)  # type: ignore[arg-type]
@@ -89,75 +97,58 @@ def _number(value: Any, positive: bool) -> float:
     raise ValueError("must be a finite number" + " > 0" * positive)
 
 
-def _entry(
-    entry: Callable[[Any], tuple[np.ndarray, int]],
-    scale: float = 1.0,
-    varies: tuple[str, ...] = (),
-    only: tuple[str, ...] = (),
-    inverse: bool = False,
-) -> Attribute:
-    """A number of the model.
-
-    Args:
-        entry: (model) -> the array that it is in, and where.
-        scale: Gymnasium's number for a 1 in the model.
-        varies: what is multiplied as the number is, as `randomize` names it; then the number must be > 0.
-        only: the fields of the model to which that is limited; all if empty.
-        inverse: whether Gymnasium has the number's inverse.
-    """
-
-    def read(setup: Setup, model: Any) -> float:  # noqa: ARG001 - an attribute's signature
-        array, index = entry(model)
-        return scale * float(array[index]) ** (-1 if inverse else 1)
-
-    def write(setup: Setup, model: Any, value: Any) -> Setup:
-        number = _number(value, positive=bool(varies))
-        if varies:
-            factor = (number / read(setup, model)) ** (-1 if inverse else 1)
-            fields = Variation(setup.task.name, varies, model).fields(np.full((1, len(varies)), factor), drawn=True)
-            write_fields(model, {name: rows for name, rows in fields.items() if not only or name in only})
-        array, index = entry(model)
-        array[index] = (number / scale) ** (-1 if inverse else 1)
+def _write(attribute: Attribute, value: Any, setup: Setup, model: Any) -> Setup:
+    """See `written`; the messages are the remedy, or what the value must be."""
+    if isinstance(attribute, Fixed):
+        raise AttributeError(attribute.remedy)
+    if isinstance(attribute, Follows):
+        raise AttributeError(f"write {' and '.join(attribute.names)} first")
+    if attribute is Setting.INTEGRATOR:
+        known = " or ".join(f"integrator={name!r}" for name in setup.task.integrators)
+        raise AttributeError(f"it is compiled into the step: make an environment with {known}")
+    if setup.randomization is not None:
+        raise AttributeError("actuator and model are drawn at every reset: give `randomize` a distribution of it")
+    if isinstance(attribute, ModelNumber):
+        _write_number(attribute, value, setup, model)
         return setup
-
-    return Attribute(read, write)
-
-
-def _force(forces: Callable[[Any], tuple[float, ...] | None], value_of: Callable[[Any], Any]) -> Attribute:
-    """The forces of the actions.
-
-    Args:
-        forces: (value) -> the task's forces; None where the action is the force, and the value its largest.
-        value_of: (task) -> the attribute's value.
-    """
-
-    def write(setup: Setup, model: Any, value: Any) -> Setup:
-        if setup.commands.name != "force" or setup.disturbances != OFF:
-            raise AttributeError(
-                "the forces are known to the current loop's table or to the drive's disturbances: make an environment "
-                "with action='force' and no disturbances"
-            )
-        task, table = setup.task, forces(value)
-        largest = _number(value if table is None else max(map(abs, table)), positive=True)
-        model.actuator_ctrlrange[0] *= largest / task.max_force
-        return _of_task(setup, dataclasses.replace(task, max_force=largest, forces=table))
-
-    return Attribute(lambda setup, model: value_of(setup.task), write, shared=True)  # noqa: ARG005
+    if attribute is Setting.STEP:
+        return _write_step(value, setup, model)
+    return _write_forces(value, setup, model, each=attribute is Setting.FORCES)
 
 
-def _of_task(setup: Setup, task: Task) -> Setup:
-    """The set-up with a changed task."""
-    commands = dataclasses.replace(setup.commands, task=task, max_forces=task.max_forces)
-    return dataclasses.replace(setup, task=task, commands=commands, view=dataclasses.replace(setup.view, task=task))
+def _write_number(attribute: ModelNumber, value: Any, setup: Setup, model: Any) -> None:
+    power, varies = -1 if attribute.inverse else 1, attribute.varies
+    number = _number(value, positive=bool(varies))
+    if varies:
+        factors = np.full((1, len(varies)), (number / read(attribute, setup, model)) ** power)
+        fields = Variation(setup.task.name, varies, model).fields(factors, drawn=True)
+        only = attribute.only or fields
+        write_fields(model, {name: rows for name, rows in fields.items() if name in only})
+    _place(attribute, model)[0] = (number / attribute.scale) ** power
 
 
-def _torques(value: Any) -> tuple[float, ...]:
-    if np.shape(value) != (3,):
-        raise ValueError("must be three numbers, one for each action")
-    return tuple(_number(torque, positive=False) for torque in value)
+def _write_forces(value: Any, setup: Setup, model: Any, each: bool) -> Setup:
+    """The forces of the actions, each or the largest of them."""
+    task = setup.task
+    if setup.commands.name != "force" or setup.disturbances != OFF or len(task.motors) > 1:
+        raise AttributeError(
+            "the forces are known to the current loop's table, to the drive's disturbances or to several motors: make "
+            "an environment of one motor with action='force' and no disturbances"
+        )
+    table = task.forces
+    if each:
+        if np.shape(value) != (len(table or ()),):
+            raise ValueError(f"must be {len(table or ())} numbers, one for each action")
+        table = tuple(_number(force, positive=False) for force in value)
+        value = max(map(abs, table))
+    largest = _number(value, positive=True)
+    if table is not None and not each:
+        table = tuple(largest * (force / task.max_force) for force in table)
+    model.actuator(task.motors[0]).ctrlrange[:] *= largest / task.max_force
+    return _of_task(setup, dataclasses.replace(task, max_force=largest, forces=table))
 
 
-def _set_step(setup: Setup, model: Any, value: Any) -> Setup:
+def _write_step(value: Any, setup: Setup, model: Any) -> Setup:
     duration = _number(value, positive=True)
     if not issubclass(setup.family, Ideal) or setup.disturbances != OFF:
         raise AttributeError("motor and disturbances were checked for this step: make an environment without them")
@@ -165,112 +156,10 @@ def _set_step(setup: Setup, model: Any, value: Any) -> Setup:
     return _of_task(setup, dataclasses.replace(setup.task, step_duration=duration))
 
 
-def _fixed(value: Any, remedy: str) -> Attribute:
-    return Attribute(lambda setup, model: value, None, remedy, shared=True)  # noqa: ARG005
-
-
-def _follows(read: Callable[[Any], float], remedy: str) -> Attribute:
-    return Attribute(lambda setup, model: read(model), None, remedy)  # noqa: ARG005
-
-
-_COMPILED = "it is compiled into the task's functions: limit or end episodes in a `gymnasium.Wrapper`"
-_UNKNOWN = "the MuJoCo model has no such thing"
-_WEIGHT = _entry(lambda model: (model.opt.gravity, 2), scale=-1.0)
-_STEP = Attribute(lambda setup, model: setup.task.step_duration, _set_step, shared=True)  # noqa: ARG005
-_LARGEST = _force(lambda value: None, lambda task: task.max_force)  # noqa: ARG005
-_ALONG = ("body_pos", "geom_pos", "geom_size")
-
-
-def _mass(body: str, only: tuple[str, ...] = (), inverse: bool = False) -> Attribute:
-    return _entry(lambda model: (model.body(body).mass, 0), varies=(f"model.mass.{body}",), only=only, inverse=inverse)
-
-
-def _centre(body: str, scale: float = 1.0, only: tuple[str, ...] = ()) -> Attribute:
-    """How far a body's centre of mass is from its joint."""
-    return _entry(lambda model: (model.body(body).ipos, 2), scale, varies=(f"model.length.{body}",), only=only)
-
-
-_CARTPOLE = {
-    "gravity": _WEIGHT,
-    "masscart": _mass("cart"),
-    "masspole": _mass("pole"),
-    "total_mass": _follows(
-        lambda model: float(model.body("pole").mass[0] + model.body("cart").mass[0]),
-        "write masscart and masspole first",
-    ),
-    "length": _centre("pole"),
-    "polemass_length": _follows(
-        lambda model: float(model.body("pole").mass[0] * model.body("pole").ipos[2]), "write masspole and length first"
-    ),
-    "force_mag": _force(
-        lambda value: (-_number(value, positive=True), float(value)),
-        lambda task: task.max_force,
-    ),
-    "tau": _STEP,
-    "kinematics_integrator": Attribute(
-        lambda setup, model: setup.integrator,  # noqa: ARG005
-        None,
-        "it is compiled into the step: make an environment with integrator='semi-implicit' or 'euler'",
-        shared=True,
-    ),
-    "theta_threshold_radians": _fixed(cartpole.ANGLE_LIMIT, _COMPILED),
-    "x_threshold": _fixed(cartpole.X_LIMIT, _COMPILED),
-}
-_PENDULUM = {
-    "max_speed": _fixed(pendulum.MAX_SPEED, _COMPILED),
-    "max_torque": _LARGEST,
-    "dt": _STEP,
-    "g": _WEIGHT,
-    "m": _mass("rod"),
-    "l": _centre("rod", scale=2.0),
-}
-_ACROBOT = {
-    "dt": _STEP,
-    "LINK_LENGTH_1": _entry(
-        lambda model: (model.body("lower").pos, 2), scale=-1.0, varies=("model.length.upper",), only=_ALONG
-    ),
-    "LINK_LENGTH_2": _fixed(1.0, "nothing but the picture depends on it, in Gymnasium too"),
-    "LINK_MASS_1": _mass("upper", only=("body_mass",)),
-    "LINK_MASS_2": _mass("lower", only=("body_mass",)),
-    "LINK_COM_POS_1": _centre("upper", scale=-1.0, only=("body_ipos",)),
-    "LINK_COM_POS_2": _centre("lower", scale=-1.0, only=("body_ipos",)),
-    "LINK_MOI": _entry(
-        lambda model: (model.body("upper").inertia, 1),
-        varies=("model.mass.upper", "model.mass.lower"),
-        only=("body_inertia",),
-    ),
-    "MAX_VEL_1": _fixed(acrobot.MAX_SPEED_1, _COMPILED),
-    "MAX_VEL_2": _fixed(acrobot.MAX_SPEED_2, _COMPILED),
-    "AVAIL_TORQUE": _force(_torques, lambda task: list(task.forces)),
-    "torque_noise_max": _fixed(0.0, "make an environment with disturbances"),
-    "book_or_nips": _fixed("book", _UNKNOWN),
-}
-_CAR = {
-    "min_position": _fixed(mountain_car.MIN_POSITION, _COMPILED),
-    "max_position": _fixed(mountain_car.MAX_POSITION, _COMPILED),
-    "max_speed": _fixed(mountain_car.MAX_SPEED, _COMPILED),
-    "goal_velocity": _fixed(0.0, _COMPILED),
-}
-
-ATTRIBUTES: Mapping[str, Mapping[str, Attribute]] = {
-    "cartpole": _CARTPOLE,
-    "pendulum": _PENDULUM,
-    "acrobot": _ACROBOT,
-    "mountain_car": {
-        **_CAR,
-        "goal_position": _fixed(mountain_car.GOAL, _COMPILED),
-        "force": _mass("car", inverse=True),
-        "gravity": _entry(lambda model: (model.joint("slider").user, GRAVITY)),
-    },
-    "mountain_car_continuous": {
-        **_CAR,
-        "goal_position": _fixed(mountain_car_continuous.GOAL, _COMPILED),
-        "power": _mass("car", inverse=True),
-        "min_action": _fixed(-mountain_car_continuous.FORCE, _COMPILED),
-        "max_action": _fixed(mountain_car_continuous.FORCE, _COMPILED),
-    },
-}
-"""Task name -> attribute name -> where it lives."""
+def _of_task(setup: Setup, task: Task) -> Setup:
+    """The set-up with a changed task."""
+    commands = dataclasses.replace(setup.commands, task=task, max_forces=task.max_forces)
+    return dataclasses.replace(setup, task=task, commands=commands, view=dataclasses.replace(setup.view, task=task))
 
 
 class _Access:
@@ -282,7 +171,7 @@ class _Access:
     def __get__(self, env: Any, owner: Any = None) -> Any:
         if env is None:
             return self
-        attribute = ATTRIBUTES.get(env.task.name, {}).get(self._name)
+        attribute = env.task.attributes.get(self._name)
         if attribute is not None:
             return env._read_attribute(attribute)
         if self._name in vars(env):
@@ -290,7 +179,7 @@ class _Access:
         raise AttributeError(f"{type(env).__name__} of {env.task.name!r} has no attribute {self._name!r}")
 
     def __set__(self, env: Any, value: Any) -> None:
-        attribute = ATTRIBUTES.get(env.task.name, {}).get(self._name)
+        attribute = env.task.attributes.get(self._name)
         if attribute is None:  # another task's
             vars(env)[self._name] = value
         else:
@@ -298,8 +187,22 @@ class _Access:
 
 
 class GymnasiumAttributes:
-    """Gives an environment with a `task` the attributes of the task's table."""
+    """Gives an environment the attributes of its task."""
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore, in this or another process."""
+        self.__dict__.update(state)
+        self._offer_attributes(self.task)  # type: ignore[attr-defined]
 
-for _name in {name for table in ATTRIBUTES.values() for name in table}:
-    setattr(GymnasiumAttributes, _name, _Access(_name))
+    def _offer_attributes(self, task: Task) -> None:
+        """Make the names of a task's attributes known to the class; called when an environment has been made.
+
+        Raises:
+            ValueError: environments have an attribute of that name.
+        """
+        for name in task.attributes:
+            if isinstance(vars(GymnasiumAttributes).get(name), _Access):
+                continue
+            if name in vars(self) or hasattr(type(self), name):
+                raise ValueError(f"attributes of task {task.name!r}: environments have a {name!r} of their own")
+            setattr(GymnasiumAttributes, name, _Access(name))

@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium.utils import seeding
 
 from codrl_mj.actuators import IDEAL
-from codrl_mj.envs.attributes import Attribute, GymnasiumAttributes, checked_states, written
+from codrl_mj.envs.attributes import GymnasiumAttributes, checked_states, read, written
 from codrl_mj.envs.compiled import arguments, compiled_kernels
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.setup import Setup
@@ -18,6 +18,7 @@ from codrl_mj.physics import MujocoPhysics
 from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
 from codrl_mj.physics.streams import set_words, words_of
 from codrl_mj.tasks import Task
+from codrl_mj.tasks.attributes import Attribute
 
 
 class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
@@ -85,6 +86,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         self._compiled: tuple[Any, tuple[Any, ...]] | None = (
             None  # its step, and the arguments that are this simulation
         )
+        self._offer_attributes(self.task)
 
     @property
     def task(self) -> Task:
@@ -121,7 +123,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         return self.physics.scene
 
     def _read_attribute(self, attribute: Attribute) -> Any:
-        return attribute.read(self.setup, self.model)
+        return read(attribute, self.setup, self.model)
 
     def _write_attribute(self, attribute: Attribute, name: str, value: Any) -> None:
         physics, model = self.physics, self.model

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from codrl_mj.actuators import ActuatorModel, Ideal, check_same_family
-from codrl_mj.envs.attributes import Attribute, GymnasiumAttributes, checked_states, written
+from codrl_mj.envs.attributes import GymnasiumAttributes, checked_states, read, shared, written
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.draws import Draws
 from codrl_mj.envs.setup import Setup
@@ -22,6 +22,7 @@ from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
 from codrl_mj.physics.streams import Streams
 from codrl_mj.physics.variation import DRAWN, VARIED, field_of, write_fields
 from codrl_mj.tasks import Task, find_task
+from codrl_mj.tasks.attributes import Attribute
 
 Array = np.ndarray
 
@@ -125,6 +126,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         self._renderer: OffscreenRenderer | None = None
         self._data: mujoco.MjData | None = None  # what is drawn
         self._looks: dict[str, Array] = {}  # fields of the models, where attributes were written
+        self._offer_attributes(self.task)
 
     @property
     def task(self) -> Task:
@@ -157,16 +159,16 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
 
     def _read_attribute(self, attribute: Attribute) -> Any:
         """One value where the environments share it, else shape (N,)."""
-        if attribute.shared:
-            return attribute.read(self.setup, self.physics.model)
-        return np.array([attribute.read(self.setup, model) for model in self.physics.models()])
+        if shared(attribute):
+            return read(attribute, self.setup, self.physics.model)
+        return np.array([read(attribute, self.setup, model) for model in self.physics.models()])
 
     def _write_attribute(self, attribute: Attribute, name: str, value: Any) -> None:
-        if attribute.shared and not np.array_equal(value, present := self._read_attribute(attribute)):
-            raise AttributeError(
-                f"{name} = {value!r}: the environments share it, as {present!r}; use vectorization_mode='sync'"
-            )
-        if attribute.shared:
+        if shared(attribute):
+            if not np.array_equal(value, present := self._read_attribute(attribute)):
+                raise AttributeError(
+                    f"{name} = {value!r}: the environments share it, as {present!r}; use vectorization_mode='sync'"
+                )
             return
         if np.shape(value) not in ((), (self.num_envs,)):
             raise ValueError(f"{name} = {value!r}: must be one number, or {self.num_envs}, one for each environment")

@@ -60,7 +60,8 @@ def needed_callbacks(model: mujoco.MjModel) -> tuple[str, ...]:
     Raises:
         ValueError: an actuator or joint carries our signature but not our layout.
     """
-    return tuple(part for part, needed in (("motor", motors(model)), ("hill", hills(model))) if needed)
+    called = [index for index in motors(model) if model.actuator_plugin[index] < 0]  # the others are plugins
+    return tuple(part for part, needed in (("motor", called), ("hill", hills(model))) if needed)
 
 
 def install_callbacks(model: mujoco.MjModel) -> None:

@@ -8,8 +8,8 @@ from codrl_mj.tasks.base import Task
 from codrl_mj.tasks.registration import TASKS, find_task, reference_of, register
 from codrl_mj.tasks.twin import Twin
 
-for _module in (pendulum, cartpole, acrobot, mountain_car, mountain_car_continuous):
-    register(_module.TASK)
+OURS = tuple(register(each.TASK) for each in (pendulum, cartpole, acrobot, mountain_car, mountain_car_continuous))
+"""The package's own tasks."""
 
 
 def resolve_actuators(given: Any, task: Task) -> tuple[Any, ...]:
@@ -49,6 +49,7 @@ def named_actuator(name: str, task: str) -> Any:
 
 
 __all__ = [
+    "OURS",
     "TASKS",
     "Task",
     "Twin",

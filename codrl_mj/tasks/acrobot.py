@@ -57,8 +57,10 @@ from gymnasium import spaces
 from gymnasium.envs.classic_control import utils
 
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.tasks.attributes import Fixed, ModelNumber, Setting, centre, mass
 from codrl_mj.tasks.base import Entries, Task
-from codrl_mj.tasks.twin import gymnasium_env
+from codrl_mj.tasks.trials import Trials, around
+from codrl_mj.tasks.twin import GymnasiumTwin
 
 # Gymnasium's Acrobot-v1
 TORQUE = 1.0  # N*m
@@ -118,31 +120,26 @@ def reward(state: Entries, force: Any, next_state: Entries, options: Options) ->
 _HIGH = np.array([1.0, 1.0, 1.0, 1.0, MAX_SPEED_1, MAX_SPEED_2], dtype=np.float32)
 
 
-class Twin:
+class Twin(GymnasiumTwin):
     """`AcrobotEnv`: the torques to choose from and the time step are attributes."""
 
+    env_id = "Acrobot-v1"
     _LARGEST = 400.0  # N*m*s^2
 
-    def __init__(self) -> None:
-        """Make the Gymnasium environment."""
-        self._env = gymnasium_env("Acrobot-v1")
-
-    def __call__(
-        self,
-        state: np.ndarray,
-        force: float,
-        timestep: float,
-        integrator: str,  # noqa: ARG002 - it has one only
-    ) -> np.ndarray:
+    def __call__(self, state: np.ndarray, force: float, timestep: float, integrator: str) -> np.ndarray:
         """One `step` with the torque as the only one to choose from."""
+        del integrator  # it has one only
         if not abs(force) * timestep**2 < self._LARGEST:  # Gymnasium wraps angles turn by turn: it would not come back
             return np.full(4, np.nan)
-        env = self._env
-        env.AVAIL_TORQUE = [force]
-        env.dt = timestep
-        env.state = state
-        env.step(0)
-        return env.state
+        return self.after(state, 0, AVAIL_TORQUE=[force], dt=timestep)
+
+    def derivative(self, state: np.ndarray, force: float) -> np.ndarray:
+        """The environment's own equations of motion."""
+        return np.array(self.env._dsdt([*state, force]))[: len(state)]
+
+
+_LINK = ("body_mass",)
+_CENTRE = ("body_ipos",)
 
 
 TASK = Task(
@@ -178,4 +175,39 @@ TASK = Task(
     helpers=(_rounded, _wrapped, terminated),
     # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
     paper=(Actuator(Motor(), CurrentLoop(kp=1.0, ki=10.0, kd=1e-6)),),
+    wrapped=(0, 1),
+    attributes={
+        "dt": Setting.STEP,
+        "LINK_LENGTH_1": ModelNumber(
+            *("body_pos", "lower", 2, -1.0),
+            varies=("model.length.upper",),
+            only=("body_pos", "geom_pos", "geom_size"),
+        ),
+        "LINK_LENGTH_2": Fixed(1.0, "nothing but the picture depends on it, in Gymnasium too"),
+        "LINK_MASS_1": mass("upper", only=_LINK),
+        "LINK_MASS_2": mass("lower", only=_LINK),
+        "LINK_COM_POS_1": centre("upper", -1.0, only=_CENTRE),
+        "LINK_COM_POS_2": centre("lower", -1.0, only=_CENTRE),
+        "LINK_MOI": ModelNumber(
+            *("body_inertia", "upper", 1),
+            varies=("model.mass.upper", "model.mass.lower"),
+            only=("body_inertia",),
+        ),
+        "MAX_VEL_1": Fixed(MAX_SPEED_1),
+        "MAX_VEL_2": Fixed(MAX_SPEED_2),
+        "AVAIL_TORQUE": Setting.FORCES,
+        "torque_noise_max": Fixed(0.0, "make an environment with disturbances"),
+        "book_or_nips": Fixed("book", "the MuJoCo model has no such thing"),
+    },
+    trials=Trials(
+        # at the task's limits, twice as fast, one RK4 step of Gymnasium amplifies rounding to 1e-12
+        bounds=(np.pi, np.pi, 2 * np.pi, 4 * np.pi),
+        # on the cut of the angles, and faster than the first link may turn after the step
+        edges=((*around(math.pi), 0.0), (*around(math.pi), 0.0), (-4 * math.pi, -1.0, 4 * math.pi), (-6.0, 6.0)),
+        # a large swing, angles within half a turn, speeds below 4 pi
+        start=(2.0, 0.5, 0.0, 0.0),
+        steps=7,
+        balanced_steps=5,
+        horizon=100,
+    ),
 )

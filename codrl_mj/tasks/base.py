@@ -1,13 +1,15 @@
 """What a task is: a model file, a few numbers, and pure functions of a state's entries."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.actuators import Actuator
+from codrl_mj.tasks.attributes import Attribute
+from codrl_mj.tasks.trials import Trials
 from codrl_mj.tasks.twin import Twin
 
 Options = Any
@@ -102,6 +104,12 @@ class Task:
     paper: tuple[Actuator, ...] = ()
     """The paper's actuators, one for each motor, of which other named actuators are variations; none where there are
     none."""
+    wrapped: tuple[int, ...] = ()
+    """State entries that `constrain` wraps to [-pi, pi]: a rounding error at the cut is one, and not a whole turn."""
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)
+    """Numbers that environments of the task have as attributes, by their names, and where they live."""
+    trials: Trials | None = None
+    """What the certificate tries the task in; without it, the checks that need states of the task's are left out."""
 
     @property
     def max_forces(self) -> np.ndarray:

@@ -46,6 +46,8 @@ trains with 0.1. (Gymnasium's `sutton_barto_reward` is not offered.) One integra
 without a motor (the paper's choice). Two integrators: `euler` (explicit, Gymnasium's default) and `semi-implicit`.
 """
 
+import math
+import operator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -53,8 +55,10 @@ from gymnasium import spaces
 from gymnasium.envs.classic_control import utils
 
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.tasks.attributes import GRAVITY, Fixed, Follows, Setting, centre, mass
 from codrl_mj.tasks.base import Entries, Task
-from codrl_mj.tasks.twin import gymnasium_env
+from codrl_mj.tasks.trials import Trials, around
+from codrl_mj.tasks.twin import GymnasiumTwin
 
 # Gymnasium's CartPole-v1
 FORCE = 10.0  # N
@@ -98,23 +102,15 @@ def reward(state: Entries, force: Any, next_state: Entries, options: Options) ->
 _HIGH = np.array([X_LIMIT * 2, np.inf, ANGLE_LIMIT * 2, np.inf], dtype=np.float32)
 
 
-class Twin:
+class Twin(GymnasiumTwin):
     """`CartPoleEnv`: the force magnitude, the time step and the integrator are attributes."""
 
-    def __init__(self) -> None:
-        """Make the Gymnasium environment."""
-        self._env = gymnasium_env("CartPole-v1")
+    env_id = "CartPole-v1"
 
     def __call__(self, state: np.ndarray, force: float, timestep: float, integrator: str) -> np.ndarray:
-        """One `step` with `force_mag` set to the force."""
-        env = self._env
-        env.force_mag = force
-        env.tau = timestep
-        env.kinematics_integrator = integrator
-        env.state = state
-        env.steps_beyond_terminated = None  # the end of an episode is the task's to judge
-        env.step(1)
-        return env.state
+        """One `step` with `force_mag` set to the force; the end of an episode is the task's to judge."""
+        settings = {"tau": timestep, "kinematics_integrator": integrator, "steps_beyond_terminated": None}
+        return self.after(state, 1, force_mag=force, **settings)
 
 
 TASK = Task(
@@ -146,4 +142,31 @@ TASK = Task(
     terminated=terminated,
     # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
     paper=(Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=4.3, ki=1.0, kd=1e-6, kff=0.6)),),
+    attributes={
+        "gravity": GRAVITY,
+        "masscart": mass("cart"),
+        "masspole": mass("pole"),
+        "total_mass": Follows(("masscart", "masspole"), operator.add),
+        "length": centre("pole"),
+        "polemass_length": Follows(("masspole", "length"), operator.mul),
+        "force_mag": Setting.LARGEST_FORCE,
+        "tau": Setting.STEP,
+        "kinematics_integrator": Setting.INTEGRATOR,
+        "theta_threshold_radians": Fixed(ANGLE_LIMIT),
+        "x_threshold": Fixed(X_LIMIT),
+    },
+    trials=Trials(
+        # beyond what an episode can reach: all angles, and speeds of a falling pole
+        bounds=(4.8, 10.0, np.pi, 10.0),
+        edges=(
+            (-4.8, -2.4, 0.0, 2.4, 4.8),
+            (-10.0, 0.0, 10.0),
+            (*around(math.pi), 0.0, math.pi / 2, 0.2094),
+            (-10.0, 0.0, 10.0),
+        ),
+        # the pole falls to about a right angle
+        start=(0.1, -0.2, 0.1, 0.3),
+        steps=30,
+        balanced_steps=10,
+    ),
 )

@@ -50,8 +50,10 @@ from gymnasium import spaces
 from gymnasium.envs.classic_control import utils
 
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.tasks.attributes import Attribute, Fixed, ModelNumber, mass
 from codrl_mj.tasks.base import Entries, Task
-from codrl_mj.tasks.twin import gymnasium_env
+from codrl_mj.tasks.trials import Trials, around
+from codrl_mj.tasks.twin import GymnasiumTwin, gymnasium_env
 
 # Gymnasium's MountainCar-v0 and, but for the goal, its MountainCarContinuous-v0
 FORCE = 1.0  # N
@@ -101,36 +103,45 @@ def reward(state: Entries, force: Any, next_state: Entries, options: Options) ->
 _LOW, _HIGH = np.array([[MIN_POSITION, -MAX_SPEED], [MAX_POSITION, MAX_SPEED]], dtype=np.float32)
 
 
-class Twin:
+class Twin(GymnasiumTwin):
     """`MountainCarEnv`: its step has no duration, but force, gravity and speed limit are attributes.
 
     One step is v += force - gravity cos(3 x), x += v. With w = v dt for its v, and force and gravity times dt^2, it is
     a step of any duration dt.
     """
 
-    _source, _strength = "MountainCar-v0", "force"
+    env_id = "MountainCar-v0"
+    _source, _strength = env_id, "force"
 
     def __init__(self) -> None:
         """Make the Gymnasium environment; remember what it is before it is driven."""
+        super().__init__()
         self._acceleration = getattr(gymnasium_env(self._source), self._strength)  # m/s^2 per N
-        self._env = gymnasium_env("MountainCar-v0")
-        self._gravity, self._max_speed = self._env.gravity, self._env.max_speed
+        self._gravity, self._max_speed = self.env.gravity, self.env.max_speed
 
-    def __call__(
-        self,
-        state: np.ndarray,
-        force: float,
-        timestep: float,
-        integrator: str,  # noqa: ARG002 - it has one only
-    ) -> np.ndarray:
+    def __call__(self, state: np.ndarray, force: float, timestep: float, integrator: str) -> np.ndarray:
         """One `step` to the right with `force` set to the force's effect, of either sign."""
-        env = self._env
-        env.force = force * self._acceleration * timestep**2
-        env.gravity = self._gravity * timestep**2
-        env.max_speed = self._max_speed * timestep
-        env.state = (state[0], state[1] * timestep)
-        env.step(2)
-        return np.array([env.state[0], env.state[1] / timestep])
+        del integrator  # it has one only
+        position, change = self.after(
+            (state[0], state[1] * timestep),
+            2,
+            force=force * self._acceleration * timestep**2,
+            gravity=self._gravity * timestep**2,
+            max_speed=self._max_speed * timestep,
+        )
+        return np.array([position, change / timestep])
+
+
+def attributes(goal: float, strength: str) -> dict[str, Attribute]:
+    """What both mountain cars have: `strength` [m/s^2 per N] is the inverse of the car's mass."""
+    return {
+        "min_position": Fixed(MIN_POSITION),
+        "max_position": Fixed(MAX_POSITION),
+        "max_speed": Fixed(MAX_SPEED),
+        "goal_position": Fixed(goal),
+        "goal_velocity": Fixed(0.0),
+        strength: mass("car", inverse=True),
+    }
 
 
 TASK = Task(
@@ -164,4 +175,13 @@ TASK = Task(
     goal=terminated,
     # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
     paper=(Actuator(Motor(), CurrentLoop(kp=1.0, ki=1.0, kd=1e-2)),),
+    attributes={**attributes(GOAL, "force"), "gravity": ModelNumber("jnt_user", "slider", 2)},
+    trials=Trials(
+        bounds=(1.2, MAX_SPEED),
+        edges=((-1.2, -1.2 + 1e-9, -1.19, -0.5, 0.0, 0.5, 0.59, 0.6), (*around(MAX_SPEED), 1e-9, -1e-9, 0.0)),
+        # between the walls, below 0.07 m/s
+        start=(-0.5, 0.02),
+        steps=12,
+        balanced_steps=2,
+    ),
 )

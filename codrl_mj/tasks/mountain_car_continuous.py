@@ -52,6 +52,7 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor
 from codrl_mj.tasks import mountain_car
+from codrl_mj.tasks.attributes import Fixed
 from codrl_mj.tasks.base import Entries
 
 # Gymnasium's MountainCarContinuous-v0
@@ -103,4 +104,9 @@ TASK = dataclasses.replace(
     helpers=(terminated,),
     # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
     paper=(Actuator(Motor(), CurrentLoop(kp=0.1, ki=10.0, kd=1e-3)),),
+    attributes={
+        **mountain_car.attributes(GOAL, "power"),
+        "min_action": Fixed(-FORCE),
+        "max_action": Fixed(FORCE),
+    },
 )

@@ -46,6 +46,7 @@ One integration step an environment step, with and without a motor (the paper's 
 the installed Gymnasium (the paper says explicit).
 """
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -53,8 +54,10 @@ from gymnasium import spaces
 from gymnasium.envs.classic_control import utils
 
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.tasks.attributes import GRAVITY, Fixed, Setting, centre, mass
 from codrl_mj.tasks.base import Entries, Task
-from codrl_mj.tasks.twin import gymnasium_env
+from codrl_mj.tasks.trials import Trials, around
+from codrl_mj.tasks.twin import GymnasiumTwin
 
 # Gymnasium's Pendulum-v1
 MAX_TORQUE = 2.0  # N*m
@@ -116,27 +119,15 @@ def reward(state: Entries, force: Any, next_state: Entries, options: Options) ->
 _HIGH = np.array([1.0, 1.0, MAX_SPEED], dtype=np.float32)
 
 
-class Twin:
+class Twin(GymnasiumTwin):
     """`PendulumEnv`: the torque limit and the time step are attributes, the action is the torque."""
 
-    def __init__(self) -> None:
-        """Make the Gymnasium environment, without a torque limit."""
-        self._env = gymnasium_env("Pendulum-v1")
-        self._env.max_torque = np.inf
+    env_id = "Pendulum-v1"
 
-    def __call__(
-        self,
-        state: np.ndarray,
-        force: float,
-        timestep: float,
-        integrator: str,  # noqa: ARG002 - it has one only
-    ) -> np.ndarray:
+    def __call__(self, state: np.ndarray, force: float, timestep: float, integrator: str) -> np.ndarray:
         """One `step` with the torque as a float64 action, which Gymnasium does not round."""
-        env = self._env
-        env.dt = timestep
-        env.state = state
-        env.step(np.array([force]))
-        return env.state
+        del integrator  # it has one only
+        return self.after(state, np.array([force]), dt=timestep, max_torque=np.inf)
 
 
 TASK = Task(
@@ -172,4 +163,20 @@ TASK = Task(
     helpers=(upright_angle,),
     # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
     paper=(Actuator(Motor(), CurrentLoop(kp=1.0, ki=20.0, kd=1e-6)),),
+    attributes={
+        "max_speed": Fixed(MAX_SPEED),
+        "max_torque": Setting.LARGEST_FORCE,
+        "dt": Setting.STEP,
+        "g": GRAVITY,
+        "m": mass("rod"),
+        "l": centre("rod", 2.0),
+    },
+    trials=Trials(
+        bounds=(2 * np.pi, MAX_SPEED),
+        edges=((*around(math.pi), 0.0, math.pi / 2, -2 * math.pi), (*around(MAX_SPEED), 0.0)),
+        # swings below 8 rad/s
+        start=(2.0, 0.5),
+        steps=20,
+        balanced_steps=8,
+    ),
 )

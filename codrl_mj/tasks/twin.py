@@ -6,7 +6,11 @@ import numpy as np
 
 
 class Twin(Protocol):
-    """Drives an environment that is not ours by one integration step at a time. Made without arguments."""
+    """Drives an environment that is not ours by one integration step at a time. Made without arguments.
+
+    Where the environment has its equations of motion as a function, `derivative(state, force)` may return the state's
+    time derivative, shape (n,): the certificate then compares with that.
+    """
 
     def __call__(self, state: np.ndarray, force: Any, timestep: float, integrator: str) -> np.ndarray:
         """The state one integration step later.
@@ -17,6 +21,24 @@ class Twin(Protocol):
             timestep: integration step [s].
             integrator: one of the task's.
         """
+
+
+class GymnasiumTwin:
+    """What drives one of Gymnasium's environments: a subclass says which, and how a force gets into its `step`."""
+
+    env_id: str
+
+    def __init__(self) -> None:
+        """Make the environment."""
+        self.env = gymnasium_env(self.env_id)
+
+    def after(self, state: Any, action: Any, **attributes: Any) -> Any:
+        """The state after one `step` from a state, with attributes set before."""
+        for name, value in attributes.items():
+            setattr(self.env, name, value)
+        self.env.state = state
+        self.env.step(action)
+        return self.env.state
 
 
 def gymnasium_env(env_id: str) -> Any:

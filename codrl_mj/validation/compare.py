@@ -1,22 +1,21 @@
-"""How states are compared: relative to their size, angles on the circle, a NaN worse than anything."""
+"""What is compared, and how: relative to its size, angles on the circle, a NaN worse than anything."""
 
 import math
 from typing import Any
 
 import numpy as np
 
-from codrl_mj.actuators import ActuatorModel
+from codrl_mj.actuators import Actuator, ActuatorModel, CurrentLoop, spectral_radius
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, trace_names
 from codrl_mj.physics.base import inner_step_count
-from codrl_mj.tasks import TASKS, Task
+from codrl_mj.tasks import Task, resolve_actuators
+from codrl_mj.tasks.trials import Trials
 
-CERTIFIED: dict[str, Task] = {
-    name: TASKS[name] for name in ("pendulum", "cartpole", "acrobot", "mountain_car", "mountain_car_continuous")
-}
-"""The tasks of the certificate: the package's own, for which it has states, runs and bounds."""
-
-WRAPPED: dict[str, tuple[int, ...]] = {"acrobot": (0, 1)}
-"""State entries that a task wraps to [-pi, pi]: a rounding error at the cut is one, and not a whole turn."""
+NO_TWIN = "it rebuilds no environment of Gymnasium's: there is no second implementation of its mechanics"
+SEVERAL_MOTORS = "it has several motors, and commands are made for one"
+PHYSICS = (("MuJoCo", MujocoPhysics), ("analytic", AnalyticPhysics))
+STAND_IN = "default current loop"
+"""What stands in for the paper's actuator where a task has none."""
 
 
 class Worst:
@@ -45,7 +44,7 @@ def differences(task: Task, ours: np.ndarray, oracle: np.ndarray) -> np.ndarray:
         Shape (..., n). Entries that the task wraps are compared on the circle while both lie within [-pi, pi].
     """
     gap = np.abs(ours - oracle)
-    for entry in WRAPPED.get(task.name, ()):
+    for entry in task.wrapped:
         inside = np.maximum(np.abs(ours[..., entry]), np.abs(oracle[..., entry])) <= np.pi
         turn = np.abs(2 * np.pi - gap[..., entry])
         gap[..., entry] = np.where(inside, np.minimum(gap[..., entry], turn), gap[..., entry])
@@ -72,9 +71,46 @@ def both(
 
 
 def twin_of(task: Task) -> Any:
-    """The Gymnasium environment that a task of the certificate rebuilds, driven by any force."""
+    """The environment that a task rebuilds, driven by any force; it must have one."""
     assert task.twin is not None
     return task.twin()
+
+
+def trials_of(task: Task) -> Trials:
+    """What a task is tried in; it must say so."""
+    assert task.trials is not None
+    return task.trials
+
+
+def physics_of(task: Task) -> tuple[tuple[str, type], ...]:
+    """The physics that a task can be simulated by, MuJoCo first."""
+    return PHYSICS if task.twin is not None else PHYSICS[:1]
+
+
+def actuators_named(name: str, task: Task) -> tuple[Any, ...]:
+    """One actuator for each motor of a task: a named one, or `STAND_IN`, sampled as often as it needs to be stable."""
+    if name != STAND_IN:
+        return resolve_actuators(name, task)
+    timestep, actuator = task.step_duration / task.motor_inner_steps, Actuator()
+    while not spectral_radius(actuator, timestep) < 1.0:
+        actuator = Actuator(controller=CurrentLoop(substeps=2 * actuator.controller.substeps))
+    return (actuator,) * len(task.motors)
+
+
+def actuators_of(task: Task) -> tuple[Actuator, ...]:
+    """The paper's actuators of a task, one for each motor; of a task that has none, those that stand in for them."""
+    return task.paper or actuators_named(STAND_IN, task)
+
+
+def forces_of(task: Task, shares: np.ndarray) -> np.ndarray:
+    """Desired forces, row by row what `Physics.step` takes.
+
+    Args:
+        task: the task.
+        shares: of the largest forces, shape (steps * motors,).
+    """
+    forces = task.max_forces * shares.reshape(-1, len(task.motors))
+    return forces[:, 0] if len(task.motors) == 1 else forces
 
 
 def last_signals(physics: MujocoPhysics | AnalyticPhysics) -> dict[str, float]:

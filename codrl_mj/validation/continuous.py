@@ -1,31 +1,57 @@
-"""The continuous equations behind a task, taken from the installed Gymnasium, and solved by scipy to 12 digits."""
+"""The continuous equations behind a task, taken from its twin where it has one, and solved by scipy to 12 digits."""
 
 import math
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
+import mujoco
 import numpy as np
 from scipy import integrate
 
-from codrl_mj.actuators import Actuator, ActuatorModel
+from codrl_mj.actuators import IDEAL, Actuator, ActuatorModel
+from codrl_mj.physics import install_callbacks
+from codrl_mj.physics.mjcf import task_model
 from codrl_mj.tasks import Task
 from codrl_mj.validation.compare import twin_of
 
-Equations = Callable[[np.ndarray, float], np.ndarray]
-"""(mechanical state, force [N or N*m]) -> its time derivative."""
+Equations = Callable[[np.ndarray, Any], np.ndarray]
+"""(mechanical state, force [N or N*m], of several motors an array) -> its time derivative."""
+
+
+def equations_of(task: Task) -> tuple[Equations, str]:
+    """The right-hand side of a task's equations of motion, and whose it is."""
+    if task.twin is None:
+        return engine_equations(task), "MuJoCo's own accelerations"
+    return gymnasium_equations(task), f"the equations of Gymnasium {task.gymnasium_id}"
+
+
+def engine_equations(task: Task) -> Equations:
+    """The accelerations that MuJoCo's `mj_forward` finds, whatever its integrator makes of them."""
+    model = task_model(task, (IDEAL,) * len(task.motors), task.step_duration, np.full(len(task.motors), 1e9))
+    install_callbacks(model)
+    data, qpos, qvel = mujoco.MjData(model), list(task.qpos), list(task.qvel)
+    controls = [model.actuator_ctrladr[model.actuator(name).id] for name in task.motors]
+
+    def derivative(state: np.ndarray, force: Any) -> np.ndarray:
+        data.qpos[:], data.qvel[:], data.ctrl[controls] = state[qpos], state[qvel], force
+        mujoco.mj_forward(model, data)
+        change = np.empty_like(state)
+        change[qpos], change[qvel] = state[qvel], data.qacc
+        return change
+
+    return derivative
 
 
 def gymnasium_equations(task: Task) -> Equations:
     """The right-hand side of the task's equations of motion, read off the unmodified environment.
 
-    No equation is written down here. Acrobot's environment has its right-hand side as a method. The others take Euler
+    No equation is written down here. A twin may have its right-hand side as a method (Acrobot). The others take Euler
     steps, whose new velocity is v + a*dt, linear in dt: one step of the environment gives a = (v_new - v)/dt, and the
     derivative of a position is its velocity. dt is a power of two and no longer than a quarter of an environment step.
     """
-    if task.name == "acrobot":
-        derivatives = twin_of(task)._env._dsdt
-        return lambda state, force: np.array(derivatives([*state, force]))[: len(state)]
     driver = twin_of(task)
+    if hasattr(driver, "derivative"):
+        return driver.derivative
     dt = 2.0 ** math.floor(math.log2(task.step_duration / 4))
     qpos, qvel, integrator = list(task.qpos), list(task.qvel), task.integrators[0]
 
@@ -44,10 +70,12 @@ class Solution(NamedTuple):
     states: np.ndarray
     """Mechanical states, shape (steps, n)."""
     currents: np.ndarray
-    """Motor currents [A], shape (steps,); zeros without a motor."""
+    """Motor currents [A], shape (steps, motors); zeros without a motor."""
 
 
-def solve(task: Task, start: np.ndarray, forces: np.ndarray, actuator: ActuatorModel) -> Solution:
+def solve(
+    task: Task, equations: Equations, start: np.ndarray, forces: np.ndarray, actuators: Sequence[ActuatorModel]
+) -> Solution:
     """Solve the continuous equations by scipy's DOP853 at a relative tolerance of 1e-12.
 
     With a motor they are joined by those of its circuit and its analogue PI loop,
@@ -55,32 +83,35 @@ def solve(task: Task, start: np.ndarray, forces: np.ndarray, actuator: ActuatorM
 
     Args:
         task: the task.
-        start: initial mechanical state; the motor starts at rest.
-        forces: desired force, held over each environment step.
-        actuator: the ideal one, or a motor under a loop without derivative gain and filters, and never saturated.
+        equations: its equations of motion.
+        start: initial mechanical state; the motors start at rest.
+        forces: desired forces, held over each environment step.
+        actuators: one for each motor: ideal, or motors under loops without derivative gain and filters, and never
+            saturated.
     """
-    equations = gymnasium_equations(task)
-    size, speed = len(start), task.speeds[0]
+    size, motors = len(start), [one for one in actuators if isinstance(one, Actuator)]
 
-    def derivative(_: float, state: np.ndarray, desired: float) -> np.ndarray:
-        if not isinstance(actuator, Actuator):
-            return equations(state, desired)
-        motor, loop = actuator.motor, actuator.controller
-        current, integral = state[size:]
-        reference = desired * motor.arm_radius / motor.torque_constant
-        back_emf = motor.back_emf_constant * state[speed] / motor.arm_radius
-        error = reference - current
-        voltage = loop.kp * error + loop.ki * integral + loop.kff * reference + loop.bemf_compensation * back_emf
-        slope = (voltage - back_emf - motor.resistance * current) / motor.inductance
-        mechanical = equations(state[:size], motor.torque_constant * current / motor.arm_radius)
-        return np.concatenate([mechanical, [slope, error]])
+    def derivative(_: float, state: np.ndarray, desired: np.ndarray) -> np.ndarray:
+        delivered, electrical = [*desired], []
+        for at, actuator in enumerate(motors):
+            motor, loop = actuator.motor, actuator.controller
+            current, integral = state[size + 2 * at : size + 2 * at + 2]
+            reference = desired[at] * motor.arm_radius / motor.torque_constant
+            back_emf = motor.back_emf_constant * state[task.speeds[at]] / motor.arm_radius
+            error = reference - current
+            voltage = loop.kp * error + loop.ki * integral + loop.kff * reference + loop.bemf_compensation * back_emf
+            electrical += [(voltage - back_emf - motor.resistance * current) / motor.inductance, error]
+            delivered[at] = motor.torque_constant * current / motor.arm_radius
+        force = delivered[0] if len(delivered) == 1 else np.array(delivered)
+        return np.concatenate([equations(state[:size], force), electrical])
 
-    motorised = isinstance(actuator, Actuator)
-    state, rows = np.concatenate([start, [0.0, 0.0] if motorised else []]), []
+    state, rows = np.concatenate([start, np.zeros(2 * len(motors))]), []
     span = (0.0, task.step_duration)
     for force in forces:
-        found = integrate.solve_ivp(derivative, span, state, "DOP853", rtol=1e-12, atol=1e-15, args=(float(force),))
+        found = integrate.solve_ivp(
+            derivative, span, state, "DOP853", rtol=1e-12, atol=1e-15, args=(np.atleast_1d(force),)
+        )
         state = found.y[:, -1]
         rows.append(state)
     solved = np.array(rows)
-    return Solution(solved[:, :size], solved[:, size] if motorised else np.zeros(len(forces)))
+    return Solution(solved[:, :size], solved[:, size::2] if motors else np.zeros((len(forces), len(actuators))))

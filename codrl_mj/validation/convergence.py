@@ -1,6 +1,7 @@
 """As the step shrinks, MuJoCo and Gymnasium's dynamics become one solution, at the order their integrators promise.
 
-The solution is scipy's, of equations taken from Gymnasium (`codrl_mj.validation.continuous`). With the ideal actuator
+The solution is scipy's, of equations taken from Gymnasium (`codrl_mj.validation.continuous`), or, of a task that has no
+twin there, of the accelerations that MuJoCo finds: that checks its integrator and the motors. With the ideal actuator
 the Euler variants promise first order and RK4, under a force held over the step, fourth. With a motor all promise first
 order: its winding takes Euler steps, and its torque is held over the mechanical step.
 
@@ -14,32 +15,34 @@ the actuated task approaches Gymnasium's at first order in tau.
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
 from codrl_mj.actuators import IDEAL, Actuator, ActuatorModel, CurrentLoop, Motor
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError
-from codrl_mj.tasks import Task
-from codrl_mj.validation.compare import CERTIFIED
-from codrl_mj.validation.continuous import solve
-from codrl_mj.validation.free_runs import RUNS, commands
+from codrl_mj.physics import SimulationDivergedError
+from codrl_mj.tasks import Task, find_task
+from codrl_mj.validation.compare import NO_TWIN, actuators_of, physics_of
+from codrl_mj.validation.continuous import equations_of, solve
+from codrl_mj.validation.free_runs import free_run, obstacle
 from codrl_mj.validation.order import Family, order_check
-from codrl_mj.validation.outcome import Check, Plot
-
-PHYSICS = (("MuJoCo", MujocoPhysics), ("analytic", AnalyticPhysics))
+from codrl_mj.validation.outcome import Check, Plot, Skipped
 
 
-def _states(kind: type, task: Task, actuator: ActuatorModel, inner_steps: int, integrator: str) -> np.ndarray:
+def _states(
+    kind: type, task: Task, actuators: Sequence[ActuatorModel], inner_steps: int, integrator: str
+) -> np.ndarray:
     """Mechanical states after each environment step of the task's free run."""
-    physics = kind(task, [actuator], inner_steps, integrator)
-    physics.reset(np.array(RUNS[task.name].start))
+    start, forces, _ = free_run(task)
+    physics = kind(task, actuators, inner_steps, integrator)
+    physics.reset(start)
     rows = []
-    for force in commands(task):
+    for force in forces:
         try:
-            physics.step(float(force))
+            physics.step(force)
         except SimulationDivergedError:
-            return np.full((RUNS[task.name].steps, len(task.state_names)), np.nan)
+            return np.full((len(forces), len(start)), np.nan)
         rows.append(physics.state)
     return np.array(rows)
 
@@ -49,34 +52,48 @@ def _error(states: np.ndarray, solution: np.ndarray) -> float:
     return float((np.abs(states - solution).max(axis=0) / np.abs(solution).max(axis=0)).max())
 
 
-def analogue(actuator: Actuator) -> Actuator:
-    """An actuator without derivative, limit and back-EMF compensation: its loop has a smooth limit of small steps.
+def _finer(task: Task) -> int:
+    """How many times steps are halved in a run that nobody chose."""
+    return 2 if task.trials is None else 0
+
+
+def ideals(task: Task) -> tuple[ActuatorModel, ...]:
+    """One for each motor."""
+    return (IDEAL,) * len(task.motors)
+
+
+def analogues(task: Task) -> tuple[Actuator, ...]:
+    """The task's actuators without derivative, limit and back-EMF compensation: their loops have a smooth limit.
 
     The paper's kD is a difference of two samples, whose limit is an impulse wherever the command jumps; the
     compensation would hide the back-EMF.
     """
-    loop = dataclasses.replace(
-        actuator.controller, kd=0.0, max_voltage=math.inf, bemf_compensation=False, integral_leak=0.0
+    smooth: dict[str, Any] = {"kd": 0.0, "max_voltage": math.inf, "bemf_compensation": False, "integral_leak": 0.0}
+    return tuple(
+        dataclasses.replace(one, controller=dataclasses.replace(one.controller, **smooth)) for one in actuators_of(task)
     )
-    return dataclasses.replace(actuator, controller=loop)
 
 
-def _order_check(task: Task, integrator: str, actuator: ActuatorModel, solution: np.ndarray, quick: bool) -> Check:
-    promised = 4.0 if integrator == "rk4" and actuator is IDEAL else 1.0
+def _order_check(
+    task: Task, integrator: str, actuators: Sequence[ActuatorModel], solution: np.ndarray, whose: str, quick: bool
+) -> Check:
+    motors = [actuator.motor for actuator in actuators if isinstance(actuator, Actuator)]
+    finer = _finer(task)
+    promised = 4.0 if integrator == "rk4" and not motors else 1.0
     if promised == 4.0:
-        counts = 2 ** np.arange(2, 6 if quick else 7)
-    elif not isinstance(actuator, Actuator):
-        counts = 2 ** (np.arange(3, 7) if quick else np.arange(4, 9))
+        counts = 2 ** (np.arange(2, 6 if quick else 7) + finer)
+    elif not motors:
+        counts = 2 ** ((np.arange(3, 7) if quick else np.arange(4, 9)) + finer)
     else:  # a quarter of the winding's time constant, and shorter
-        resolved = task.step_duration / (actuator.motor.electrical_time_constant / 4)
+        resolved = task.step_duration / (min(motor.electrical_time_constant for motor in motors) / 4)
         counts = 2 ** (math.ceil(math.log2(max(resolved, 4))) + (np.arange(0, 4) if quick else np.arange(1, 6)))
     families = []
-    for label, kind in PHYSICS:
-        errors = [_error(_states(kind, task, actuator, int(count), integrator), solution) for count in counts]
+    for label, kind in physics_of(task):
+        errors = [_error(_states(kind, task, actuators, int(count), integrator), solution) for count in counts]
         families.append(Family(label, task.step_duration / counts, np.array(errors)))
-    oracle = f"DOP853 at 1e-12 on the equations of Gymnasium {task.gymnasium_id}"
-    case = "ideal actuator" if actuator is IDEAL else "motor in the loop"
-    oracle += "" if actuator is IDEAL else " and of the motor"
+    oracle = f"DOP853 at 1e-12 on {whose}"
+    case = "motor in the loop" if motors else "ideal actuator"
+    oracle += " and of the motor" if motors else ""
     plot = Plot(
         f"{task.name}, {integrator}, {case}", "integration step [s]", "largest error of the state [relative]", ()
     )
@@ -85,41 +102,49 @@ def _order_check(task: Task, integrator: str, actuator: ActuatorModel, solution:
 
 def _bandwidth_check(task: Task, quick: bool) -> Check:
     """The lag is resolved by two integration steps at every bandwidth; both runs take the same steps."""
-    lags = task.step_duration / 2 ** (np.arange(3, 7) if quick else np.arange(4, 9))  # tau [s]
-    integrator, motor = task.integrators[0], Motor(arm_radius=task.paper[0].motor.arm_radius)
-    errors: tuple[list[float], ...] = ([], [])
+    lags = task.step_duration / 2 ** ((np.arange(3, 7) if quick else np.arange(4, 9)) + _finer(task))  # tau [s]
+    integrator, physics = task.integrators[0], physics_of(task)
+    motors = [Motor(arm_radius=actuator.motor.arm_radius) for actuator in actuators_of(task)]
+    errors: dict[str, list[float]] = {label: [] for label, _ in physics}
     for lag in lags:
         count = round(2 * task.step_duration / lag)
-        kp = motor.inductance / lag
-        loop = CurrentLoop(kp=kp, ki=kp * motor.resistance / motor.inductance, max_voltage=math.inf)
-        ideal = _states(AnalyticPhysics, task, IDEAL, count, integrator)
-        for found, (_, kind) in zip(errors, PHYSICS, strict=True):
-            found.append(_error(_states(kind, task, Actuator(motor, loop), count, integrator), ideal))
+        kp = motors[0].inductance / lag
+        loop = CurrentLoop(kp=kp, ki=kp * motors[0].resistance / motors[0].inductance, max_voltage=math.inf)
+        actuators = [Actuator(motor, loop) for motor in motors]
+        ideal = _states(physics[-1][1], task, ideals(task), count, integrator)
+        for label, kind in physics:
+            errors[label].append(_error(_states(kind, task, actuators, count, integrator), ideal))
     bandwidth = 1 / (2 * np.pi * lags)
-    families = [Family(label, bandwidth, np.array(found)) for found, (label, _) in zip(errors, PHYSICS, strict=True)]
+    families = [Family(label, bandwidth, np.array(found)) for label, found in errors.items()]
     plot = Plot(
         f"{task.name}: the actuated task approaches the ideal one",
         "bandwidth of the current loop [Hz]",
         "largest difference of the state [relative]",
         (),
     )
-    oracle = f"Gymnasium {task.gymnasium_id} with the desired force itself"
+    whose = "MuJoCo" if task.twin is None else f"Gymnasium {task.gymnasium_id}"
+    oracle = f"{whose} with the desired force itself"
     return order_check("rate in the loop's bandwidth", oracle, families, -1.0, plot, "convergence", task.name)
 
 
-def checks(task_name: str | None, quick: bool = False) -> Iterator[Check]:
+def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     """The checks of convergence.
 
     Args:
-        task_name: the task; None checks all tasks.
+        task_name: the task.
         quick: fewer and coarser steps.
-
-    Raises:
-        KeyError: no such task.
     """
-    for task in CERTIFIED.values() if task_name is None else [CERTIFIED[task_name]]:
-        for actuator in (IDEAL, analogue(task.paper[0])):
-            solution = solve(task, np.array(RUNS[task.name].start), commands(task), actuator).states
-            for integrator in task.integrators:
-                yield _order_check(task, integrator, actuator, solution, quick)
-        yield _bandwidth_check(task, quick)
+    task = find_task(task_name)
+    reason = obstacle(task)
+    if reason:
+        yield Skipped("all checks", reason, "convergence", task.name)
+        return
+    if task.twin is None:
+        yield Skipped("equations of motion that are not MuJoCo's", NO_TWIN, "convergence", task.name)
+    equations, whose = equations_of(task)
+    start, forces, _ = free_run(task)
+    for actuators in (ideals(task), analogues(task)):
+        solution = solve(task, equations, start, forces, actuators).states
+        for integrator in task.integrators:
+            yield _order_check(task, integrator, actuators, solution, whose, quick)
+    yield _bandwidth_check(task, quick)

@@ -13,8 +13,8 @@ import numpy as np
 from codrl_mj.actuators import IDEAL
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError
 from codrl_mj.tasks import Task, find_task
-from codrl_mj.validation.compare import Worst, both, largest, twin_of
-from codrl_mj.validation.outcome import Check
+from codrl_mj.validation.compare import NO_TWIN, SEVERAL_MOTORS, Worst, both, largest, trials_of, twin_of
+from codrl_mj.validation.outcome import Check, Skipped
 
 TOLERANCE = 1e-12
 """One step rounds some tens of numbers to 1e-16; an RK4 step at the speed limits amplifies that a hundredfold."""
@@ -22,43 +22,10 @@ TOLERANCE = 1e-12
 EXTREME = 10.0
 """Extreme forces are this many times the largest that a task asks for."""
 
-STATE_BOUNDS: dict[str, tuple[float, ...]] = {
-    # beyond what an episode can reach: all angles, and speeds of a falling pole
-    "pendulum": (2 * np.pi, 8.0),
-    "cartpole": (4.8, 10.0, np.pi, 10.0),
-    # at the task's limits, twice as fast, one RK4 step of Gymnasium amplifies rounding to 1e-12
-    "acrobot": (np.pi, np.pi, 2 * np.pi, 4 * np.pi),
-    "mountain_car": (1.2, 0.07),
-    "mountain_car_continuous": (1.2, 0.07),
-}
-"""States are drawn uniformly within plus and minus these, in the units of the task's state."""
-
-
-def _around(value: float) -> tuple[float, ...]:
-    """A bound, the numbers next to it on both sides, and one just inside; and all of them negated."""
-    numbers = (value, math.nextafter(value, math.inf), math.nextafter(value, 0.0), 0.999 * value)
-    return (*numbers, *(-number for number in numbers))
-
-
-EDGES: dict[str, tuple[tuple[float, ...], ...]] = {
-    "pendulum": ((*_around(math.pi), 0.0, math.pi / 2, -2 * math.pi), (*_around(8.0), 0.0)),
-    "cartpole": (
-        (-4.8, -2.4, 0.0, 2.4, 4.8),
-        (-10.0, 0.0, 10.0),
-        (*_around(math.pi), 0.0, math.pi / 2, 0.2094),
-        (-10.0, 0.0, 10.0),
-    ),
-    # on the cut of the angles, and faster than the first link may turn after the step
-    "acrobot": ((*_around(math.pi), 0.0), (*_around(math.pi), 0.0), (-4 * math.pi, -1.0, 4 * math.pi), (-6.0, 6.0)),
-    "mountain_car": ((-1.2, -1.2 + 1e-9, -1.19, -0.5, 0.0, 0.5, 0.59, 0.6), (*_around(0.07), 1e-9, -1e-9, 0.0)),
-}
-"""States on the walls, on the speed limits, on the cut of wrapped angles, and beside them: values of each entry."""
-EDGES["mountain_car_continuous"] = EDGES["mountain_car"]
-
 
 def grid(task: Task, points: int) -> np.ndarray:
-    """States on a dense grid over `STATE_BOUNDS`, both ends included: shape (points to the power n, n)."""
-    axes = [np.linspace(-bound, bound, points) for bound in STATE_BOUNDS[task.name]]
+    """States on a dense grid over the task's bounds, both ends included: shape (points to the power n, n)."""
+    axes = [np.linspace(-bound, bound, points) for bound in trials_of(task).bounds]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
 
 
@@ -100,7 +67,7 @@ def one_step(task: Task, integrator: str, samples: int, seed: int = 0) -> Check:
         seed: of the states and forces.
     """
     generator = np.random.default_rng(seed)
-    bounds = np.array(STATE_BOUNDS[task.name])
+    bounds = np.array(trials_of(task).bounds)
     states = generator.uniform(-bounds, bounds, (samples, len(bounds)))
     forces = generator.uniform(-task.max_force, task.max_force, samples)
     ours, oracle = (_after_one_step(physics, states, forces) for physics in both(task, IDEAL, integrator))
@@ -108,7 +75,7 @@ def one_step(task: Task, integrator: str, samples: int, seed: int = 0) -> Check:
 
 
 def one_step_at_the_bounds(task: Task, integrator: str, stride: int = 1) -> Check:
-    """One step from `EDGES` under no, full and extreme forces, which MuJoCo is allowed here.
+    """One step from the task's edges under no, full and extreme forces, which MuJoCo is allowed here.
 
     Args:
         task: the task.
@@ -116,7 +83,7 @@ def one_step_at_the_bounds(task: Task, integrator: str, stride: int = 1) -> Chec
         stride: take every so many of the states.
     """
     states, forces = _crossed(
-        np.array(list(itertools.product(*EDGES[task.name])))[::stride],
+        np.array(list(itertools.product(*trials_of(task).edges)))[::stride],
         task.max_force * np.array([-EXTREME, -1.0, 0.0, 1.0, EXTREME]),
     )
     physics = both(task, IDEAL, integrator, max_force=EXTREME * task.max_force)
@@ -145,9 +112,9 @@ class _GymnasiumAcceleration:
     def __init__(self, task: Task) -> None:
         self._driver = twin_of(task)
         self._velocities = list(task.qvel)
-        self._env = env = self._driver._env
-        self._derivative = getattr(env, "_dsdt", None)  # Acrobot's own equations of motion
+        self._derivative = getattr(self._driver, "derivative", None)
         if self._derivative is None:
+            env = getattr(self._driver, "env", None)
             # one explicit step of 1 s changes the velocities by the accelerations, where nothing bounds them
             for owner, name, value in (
                 (env, "max_speed", math.inf),
@@ -160,7 +127,7 @@ class _GymnasiumAcceleration:
 
     def __call__(self, state: np.ndarray, force: float) -> np.ndarray:
         if self._derivative is not None:
-            return np.array(self._derivative(np.append(state, force)))[self._velocities]
+            return self._derivative(state, force)[self._velocities]
         after = np.array(self._driver(state, force, 1.0, "euler"))
         return (after - state)[self._velocities]
 
@@ -191,16 +158,18 @@ def accelerations(task: Task, points: int) -> Check:
     return Check("accelerations", source, len(states), worst.value, TOLERANCE, worst.where, "dynamics", task.name)
 
 
-def checks(task_name: str | None, quick: bool = False) -> Iterator[Check]:
+def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     """The checks of this group.
 
     Args:
-        task_name: the task; None, which has no dynamics, has no checks.
+        task_name: the task.
         quick: fewer states.
     """
-    if task_name is None:
-        return
     task = find_task(task_name)
+    missing = NO_TWIN if task.twin is None else SEVERAL_MOTORS if len(task.motors) > 1 else ""
+    if missing or task.trials is None:
+        yield Skipped("all checks", missing or "it names no states to try it in: Task.trials", "dynamics", task.name)
+        return
     flat = len(task.state_names) == 2
     points = (9 if flat else 3) if quick else (51 if flat else 7)
     yield accelerations(task, points)

@@ -13,9 +13,8 @@ import numpy as np
 from mujoco.batch import Batch
 
 from codrl_mj.physics import MujocoPhysics, install_callbacks, motors
-from codrl_mj.physics.base import inner_step_count
 from codrl_mj.tasks import Task, find_task
-from codrl_mj.validation.compare import Worst
+from codrl_mj.validation.compare import Worst, actuators_of, forces_of
 from codrl_mj.validation.outcome import Check
 
 UNIT = "64-bit floats that differ"
@@ -37,7 +36,7 @@ def commands(model: mujoco.MjModel, steps: int, seed: int) -> np.ndarray:
 
 
 def _state(data: mujoco.MjData) -> np.ndarray:
-    return np.concatenate([[data.time], data.qpos, data.qvel, data.act])
+    return np.concatenate([[data.time], data.qpos, data.qvel, data.act, data.plugin_state])
 
 
 def _advance(model: mujoco.MjModel, data: mujoco.MjData, controls: np.ndarray) -> np.ndarray:
@@ -72,7 +71,7 @@ def batched(model: mujoco.MjModel, threads: int, simulations: int, steps: int, t
     inputs = np.stack([commands(model, steps, seed) for seed in range(simulations)], axis=1)
     batch = Batch(model, nsim=simulations, nthread=threads)
     bound = batch.bind("ctrl").reshape(simulations, -1)
-    fields = [batch.bind(name).reshape(simulations, -1) for name in ("time", "qpos", "qvel", "act")]
+    fields = [batch.bind(name).reshape(simulations, -1) for name in ("time", "qpos", "qvel", "act", "plugin_state")]
     ours = []
     for control in inputs:
         bound[:] = control
@@ -107,18 +106,18 @@ def restored(model: mujoco.MjModel, steps: int, task: str = "", state: mujoco.mj
 
 
 def forward_passes(model: mujoco.MjModel, steps: int, task: str = "") -> Check:
-    """Between any two steps, three forward passes leave the activations, the motors' state, as one does."""
-    inputs = commands(model, steps, seed=2)
+    """Between any two steps, three forward passes leave activations and plugins' states, the motors', as one does."""
+    inputs, moving = commands(model, steps, seed=2), 1 + model.nq + model.nv
     data = mujoco.MjData(model)
     once, often = [], []
     for control in inputs:
         data.ctrl[:] = control
         looked_at = copy.copy(data)
         mujoco.mj_forward(model, looked_at)
-        once.append(looked_at.act.copy())
+        once.append(_state(looked_at)[moving:])
         for _ in range(2):
             mujoco.mj_forward(model, looked_at)
-        often.append(looked_at.act.copy())
+        often.append(_state(looked_at)[moving:])
         mujoco.mj_step(model, data)
     return _check("forward passes", "one forward pass", np.array(often), np.array(once), task)
 
@@ -126,7 +125,7 @@ def forward_passes(model: mujoco.MjModel, steps: int, task: str = "") -> Check:
 def model_checks(
     model: mujoco.MjModel, task: str = "", quick: bool = False, state: mujoco.mjtState | None = None
 ) -> Iterator[Check]:
-    """The checks that any model can be put through; its motors' callbacks must be installed.
+    """The checks that any model can be put through; callbacks that its motors need must be installed.
 
     Args:
         model: any model.
@@ -148,7 +147,7 @@ def model_checks(
 def _episode(physics: MujocoPhysics, forces: np.ndarray) -> np.ndarray:
     """The motor's and the mechanical state after each environment step."""
     states = []
-    for force in forces.tolist():
+    for force in forces:
         physics.step(force)
         states.append(np.concatenate([physics.state, physics.data.act]))
     return np.array(states)
@@ -156,10 +155,10 @@ def _episode(physics: MujocoPhysics, forces: np.ndarray) -> np.ndarray:
 
 def _simulation(task: Task, integrator: str, seed: int, steps: int) -> tuple[MujocoPhysics, np.ndarray, np.ndarray]:
     generator = np.random.default_rng(seed)
-    physics = MujocoPhysics(task, task.paper, inner_step_count(task, task.paper[0], None, None), integrator)
+    physics = MujocoPhysics(task, actuators_of(task), task.motor_inner_steps, integrator)
     initial = task.initial(generator, None)
     physics.reset(initial)
-    return physics, initial, task.max_force * generator.uniform(-1.0, 1.0, steps)
+    return physics, initial, forces_of(task, generator.uniform(-1.0, 1.0, steps * len(task.motors)))
 
 
 def pickled(task: Task, integrator: str, steps: int) -> Check:
@@ -185,7 +184,7 @@ def looked_at(task: Task, integrator: str, steps: int) -> Check:
     oracle = _episode(physics, forces)
     physics.reset(initial)
     states = []
-    for force in forces.tolist():
+    for force in forces:
         physics.step(force)
         states.append(np.concatenate([physics.state, physics.data.act]))
         mujoco.mj_forward(physics.model, physics.data)
@@ -195,15 +194,13 @@ def looked_at(task: Task, integrator: str, steps: int) -> Check:
 TASK_CHECKS: tuple[Callable[[Task, str, int], Check], ...] = (pickled, repeated, looked_at)
 
 
-def checks(task_name: str | None, quick: bool = False) -> Iterator[Check]:
+def checks(task_name: str, quick: bool = False) -> Iterator[Check]:
     """The checks of this group.
 
     Args:
-        task_name: the task; None has no checks.
+        task_name: the task.
         quick: fewer simulations and steps.
     """
-    if task_name is None:
-        return
     task = find_task(task_name)
     physics, _, _ = _simulation(task, task.integrators[0], 0, 1)
     assert motors(physics.model)

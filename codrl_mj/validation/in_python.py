@@ -24,6 +24,7 @@ from codrl_mj.actuators import (
 )
 from codrl_mj.engine import load_family
 from codrl_mj.engine.families import SLOT, Slot
+from codrl_mj.engine.reading import slots
 from codrl_mj.validation.execution import UNIT, commands, differing
 from codrl_mj.validation.motor_loops import EVERY_FEATURE
 from codrl_mj.validation.outcome import Check
@@ -42,10 +43,11 @@ def beside(
 ) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     """Run a model from rest, and each actuator in Python under the inputs that the engine had for it.
 
-    The actuators in Python start at rest and are never corrected.
+    The actuators in Python start at rest and are never corrected. At the plugin's door the desired force is what the
+    engine made of the model's actuator; at the callback's it is the control itself.
 
     Args:
-        model: any, with its callbacks installed.
+        model: any, with the callbacks that it needs installed.
         actuators: those of ours to compare, by index.
         controls: of each step, shape (steps, nu).
 
@@ -53,12 +55,13 @@ def beside(
         By index, what was found in the engine and in Python, each of shape (steps, k) with columns as in `entries`.
     """
     data = mujoco.MjData(model)
+    slot_of = slots(data, actuators)
     kinds: dict[int, Family] = {at: type(one) for at, one in actuators.items()}
     parameters = {at: parameters_type(kinds[at])(*one.numbers) for at, one in actuators.items()}
     states = {at: kind.State(*[0.0] * len(kind.State._fields)) for at, kind in kinds.items()}
     found = {at: np.empty((2, len(controls), len(entries(one)))) for at, one in actuators.items()}
     for at in actuators:
-        data.act[model.actuator_actadr[at] + KEY] = at + 1.0
+        slot_of[at][KEY] = at + 1.0
     for step, control in enumerate(controls):
         data.ctrl[:] = control
         before = copy.copy(data)
@@ -66,12 +69,14 @@ def beside(
         mujoco.mj_step(model, data)
         for at, actuator in actuators.items():
             output = model.actuator_outadr[at]
-            moving = float(before.actuator_length[output]), float(before.actuator_velocity[output])
-            inputs = Inputs(_clamped(model, at, control), *moving, before.time, at + 1.0)
+            arm = 1.0 if model.actuator_plugin[at] < 0 else actuator.arm_radius  # the callback's is in the gear
+            moving = float(before.actuator_length[output]) / arm, float(before.actuator_velocity[output]) / arm
+            desired = _clamped(model, at, control) if model.actuator_plugin[at] < 0 else float(slot_of[at][-1]) * arm
+            inputs = Inputs(desired, *moving, before.time, at + 1.0)
             states[at], torque, signals = actuator.advance(parameters[at], model.opt.timestep, states[at], inputs)
-            oracle = [*states[at], *signals, _limited(model, at, torque)]
-            after = model.actuator_actadr[at] + SLOT + len(states[at])  # the candidate state, then the signals
-            found[at][0, step] = *data.act[after : after + len(oracle) - 1], before.actuator_force[output]
+            oracle = [*states[at], *signals, _limited(model, at, torque / arm)]
+            after = SLOT + len(states[at])  # the candidate state, then the signals
+            found[at][0, step] = *slot_of[at][after : after + len(oracle) - 1], before.actuator_force[output]
             found[at][1, step] = oracle
     return {at: (both[0], both[1]) for at, both in found.items()}
 

@@ -1,43 +1,60 @@
 """Where the energy went: the flows of one run, from supply to moving mass, step by step."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
 
 from codrl_mj.actuators import Actuator, ActuatorModel, Motor
+from codrl_mj.physics import hills, trace_names
 from codrl_mj.tasks import Task
 from codrl_mj.tasks.assets import asset_path
-from codrl_mj.validation.compare import last_signals
 from codrl_mj.validation.continuous import gymnasium_equations
-
-HILL_TASKS = ("mountain_car", "mountain_car_continuous")
-"""Tasks whose hill is a force of ours, which MuJoCo's potential energy does not know."""
 
 
 class Meter:
     """Kinetic and potential energy of a task's states: MuJoCo's own, on the model file as it is shipped.
 
-    MuJoCo's `mj_energyPos` and `mj_energyVel` see gravity and motion. The hill's potential is minus the integral of the
-    force that *Gymnasium's* environment shows along it: a Chebyshev interpolant of 48 samples, exact to rounding.
+    MuJoCo's `mj_energyPos` and `mj_energyVel` see gravity, springs and motion. A hill is a force of ours, which they do
+    not know: its potential is minus the integral of the force that *Gymnasium's* environment shows along it, a
+    Chebyshev interpolant of 48 samples, exact to rounding.
     """
 
     def __init__(self, task: Task) -> None:
-        """Compile the model."""
+        """Compile the model.
+
+        Raises:
+            ValueError: it has a hill, and no twin to say how high it is.
+        """
         self._model = mujoco.MjModel.from_xml_path(str(asset_path(task.asset)))
         self._data = mujoco.MjData(self._model)
         self._qpos, self._qvel = list(task.qpos), list(task.qvel)
-        self._hill = hill_potential(task, float(self._model.body_mass[-1])) if task.name in HILL_TASKS else None
+        hilly = bool(hills(self._model))
+        if hilly and task.twin is None:
+            raise ValueError("its model has a hill, whose height only a twin knows")
+        self._hill = hill_potential(task, float(self._model.body_mass[-1])) if hilly else None
+        options = self._model.opt
+        self.lossy = bool(self._model.dof_damping.any() or options.density or options.viscosity)
+        """Whether joints are damped, or there is a medium."""
 
     def __call__(self, state: np.ndarray) -> float:
         """Energy of the state [J], up to a constant."""
-        model, data = self._model, self._data
-        data.qpos[:], data.qvel[:] = state[self._qpos], state[self._qvel]
-        mujoco.mj_fwdPosition(model, data)
+        model, data = self._at(state)
         mujoco.mj_energyPos(model, data)
         mujoco.mj_energyVel(model, data)
         return float(data.energy.sum()) + (0.0 if self._hill is None else float(self._hill(state[0])))
+
+    def loss(self, state: np.ndarray) -> float:
+        """What dampers and the medium take in the state [W]."""
+        model, data = self._at(state)
+        mujoco.mj_fwdVelocity(model, data)
+        return -float((data.qfrc_damper + data.qfrc_fluid) @ data.qvel)
+
+    def _at(self, state: np.ndarray) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        self._data.qpos[:], self._data.qvel[:] = state[self._qpos], state[self._qvel]
+        mujoco.mj_fwdPosition(self._model, self._data)
+        return self._model, self._data
 
 
 def hill_potential(task: Task, mass: float) -> Callable[[float], float]:
@@ -56,7 +73,8 @@ class Ledger:
     time: np.ndarray
     """The times, ends of integration steps [s]."""
     supplied: np.ndarray
-    """Integral of u*i; the voltage is held over a step, the current is taken linear in it."""
+    """Integral of u*i; the voltage is held over a step, the current is taken linear in it. Sums over
+    the motors, here and below."""
     copper: np.ndarray
     """Integral of R*i^2, by the trapezoidal rule."""
     magnetic: np.ndarray
@@ -67,6 +85,8 @@ class Ledger:
     """Sum of force times displacement: the exact work of a force that is held over a step."""
     mechanical: np.ndarray
     """Kinetic and potential energy, less that at the start."""
+    lost: np.ndarray
+    """Integral of what dampers and the medium take, by the trapezoidal rule; zeros where there are none."""
     identity: float
     """Largest |(u - kE*omega - R*i)*(i + i')*dt/2 - L*(i'^2 - i^2)/2| of a step over the largest energy supplied."""
 
@@ -77,19 +97,19 @@ class Ledger:
 
     @property
     def mechanical_residual(self) -> np.ndarray:
-        """The shaft's work, less the change of kinetic and potential energy [J]; no run has any other loss."""
-        return self.shaft - self.mechanical
+        """The shaft's work, less the change of kinetic and potential energy, and what was lost [J]."""
+        return self.shaft - self.mechanical - self.lost
 
     @property
     def whole_residual(self) -> np.ndarray:
-        """Supplied, less copper loss, magnetic energy and the change of kinetic and potential energy [J]."""
-        return self.supplied - self.copper - self.magnetic - self.mechanical
+        """Supplied, less copper loss, magnetic energy, the change of kinetic and potential energy, and losses [J]."""
+        return self.supplied - self.copper - self.magnetic - self.mechanical - self.lost
 
 
 def keep(
     kind: type,
     task: Task,
-    actuator: ActuatorModel,
+    actuators: Sequence[ActuatorModel],
     start: np.ndarray,
     forces: np.ndarray,
     inner_steps: int,
@@ -101,7 +121,7 @@ def keep(
     Args:
         kind: `MujocoPhysics` or `AnalyticPhysics`.
         task: the task; its own bounds should not be reached: what they take is no entry of the ledger.
-        actuator: a motor under its loop; with the ideal one all electrical entries are zero.
+        actuators: motors under their loops; with ideal ones all electrical entries are zero.
         start: initial state.
         forces: desired forces, each held for one environment step.
         inner_steps: integration steps to an environment step.
@@ -110,37 +130,46 @@ def keep(
     """
     timestep = task.step_duration / inner_steps
     # an environment step of one integration step shows each of them, and leaves the motor as it is in between
-    physics = kind(dataclasses.replace(task, step_duration=timestep), [actuator], 1, integrator)
+    physics = kind(dataclasses.replace(task, step_duration=timestep), actuators, 1, integrator)
     physics.reset(start)
-    rows = []
-    for force in forces.repeat(inner_steps):
-        physics.step(float(force))
-        signals = last_signals(physics)
-        rows.append((signals["current"], signals["voltage"], signals["actual_force"], *physics.state))
-    current, voltage, force, *states = np.array(rows).T
-    current, state = np.concatenate([[0.0], current]), np.vstack([start, np.array(states).T])
+    traces, states = [], [start]
+    for desired in forces.repeat(inner_steps, axis=0):
+        physics.step(desired)
+        traces.append(physics.trace[-1].T.copy())
+        states.append(physics.state)
+    columns = np.array(traces).swapaxes(0, 1)  # each of shape (steps, motors)
+    signals = dict(zip(trace_names(physics.family), columns, strict=True))
+    current, voltage, force = signals["current"], signals["voltage"], signals["actual_force"]
+    current, state = np.vstack([np.zeros_like(current[:1]), current]), np.array(states)
 
-    motor, speed = actuator.motor if isinstance(actuator, Actuator) else Motor(), task.speeds[0]
-    position = task.qpos[task.qvel.index(speed)]
-    back_emf = motor.back_emf_constant * state[:, speed] / motor.arm_radius
+    motors = [actuator.motor if isinstance(actuator, Actuator) else Motor() for actuator in actuators]
+    resistance, inductance, constant, arm = (
+        np.array([getattr(motor, name) for motor in motors])
+        for name in ("resistance", "inductance", "back_emf_constant", "arm_radius")
+    )
+    speeds = list(task.speeds)
+    positions = [task.qpos[task.qvel.index(speed)] for speed in speeds]
+    back_emf = constant * state[:, speeds] / arm
     mean = (current[1:] + current[:-1]) / 2
-    magnetic = motor.inductance * current**2 / 2
-    supplied = np.cumsum(voltage * mean) * timestep
-    winding = (voltage - back_emf[:-1] - motor.resistance * current[:-1]) * mean * timestep
+    magnetic = inductance * current**2 / 2
+    supplied = np.cumsum(voltage * mean, axis=0).sum(axis=1) * timestep
+    winding = (voltage - back_emf[:-1] - resistance * current[:-1]) * mean * timestep
     meter, every = Meter(task), inner_steps // entries
     kept = slice(every - 1, None, every)
+    lost = np.array([[meter.loss(row)] for row in state]) if meter.lossy else np.zeros((len(state), 1))
     return Ledger(
         time=timestep * np.arange(1, len(force) + 1)[kept],
         supplied=supplied[kept],
-        copper=motor.resistance * _integral(current**2, timestep)[kept],
-        magnetic=magnetic[1:][kept],
-        converted=_integral(back_emf * current, timestep)[kept],
-        shaft=np.cumsum(force * np.diff(state[:, position]))[kept],
+        copper=(resistance * _integral(current**2, timestep)).sum(axis=1)[kept],
+        magnetic=magnetic[1:].sum(axis=1)[kept],
+        converted=_integral(back_emf * current, timestep).sum(axis=1)[kept],
+        shaft=np.cumsum(force * np.diff(state[:, positions], axis=0), axis=0).sum(axis=1)[kept],
         mechanical=np.array([meter(row) for row in state[1:][kept]]) - meter(state[0]),
-        identity=float(np.abs(winding - np.diff(magnetic)).max() / max(np.abs(supplied).max(), 1e-300)),
+        lost=_integral(lost, timestep)[kept, 0],
+        identity=float(np.abs(winding - np.diff(magnetic, axis=0)).max() / max(np.abs(supplied).max(), 1e-300)),
     )
 
 
 def _integral(values: np.ndarray, timestep: float) -> np.ndarray:
-    """The trapezoidal rule up to each step."""
-    return np.cumsum(values[1:] + values[:-1]) * (timestep / 2)
+    """The trapezoidal rule up to each step, of each column."""
+    return np.cumsum(values[1:] + values[:-1], axis=0) * (timestep / 2)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor
-from codrl_mj.validation.compare import CERTIFIED
+from codrl_mj.tasks import OURS
 from codrl_mj.validation.rotors import HELD, Record, drive, motors_on
 
 
@@ -40,8 +40,8 @@ EVERY_FEATURE = Loop(
 
 
 def standard_loops() -> dict[str, Loop]:
-    """The paper's loop of each task at the task's inner step, and one with every feature."""
-    paper = {name: Loop(task.paper[0], task.step_duration / task.motor_inner_steps) for name, task in CERTIFIED.items()}
+    """The paper's loop of each of our tasks at the task's inner step, and one with every feature."""
+    paper = {task.name: Loop(task.paper[0], task.step_duration / task.motor_inner_steps) for task in OURS}
     return {**paper, "every feature": EVERY_FEATURE}
 
 

@@ -25,8 +25,8 @@ from codrl_mj.engine import control
 from codrl_mj.engine.families import SLOT, replaced
 from codrl_mj.engine.hill import GRAVITY
 from codrl_mj.physics import MujocoPhysics, constrain, mjcf
+from codrl_mj.tasks import OURS, find_task
 from codrl_mj.validation.certificate import WITHOUT_TASK, validate
-from codrl_mj.validation.compare import CERTIFIED
 from codrl_mj.validation.outcome import Check
 
 Fault = contextlib.AbstractContextManager[None]
@@ -252,15 +252,15 @@ class Mutation:
     """Makes it, for the length of a `with` block."""
     groups: tuple[str, ...]
     """The groups of checks that it is shown to."""
-    tasks: tuple[str, ...] = tuple(CERTIFIED)
+    tasks: tuple[str, ...] = tuple(task.name for task in OURS)
     """The tasks in which it is a fault."""
 
 
 _PHYSICS = ("dynamics", "trajectories")
 _LOOP = ("trajectories", "motor")
-_UNEQUAL_GAINS = tuple(task for task in CERTIFIED if task != "mountain_car")  # whose kp = ki
-_BOUNDED = tuple(name for name, task in CERTIFIED.items() if task.constrain is not None)
-_RUNGE_KUTTA = tuple(name for name, task in CERTIFIED.items() if "rk4" in task.integrators)
+_UNEQUAL_GAINS = tuple(task.name for task in OURS if task.paper[0].controller.kp != task.paper[0].controller.ki)
+_BOUNDED = tuple(task.name for task in OURS if task.constrain is not None)
+_RUNGE_KUTTA = tuple(task.name for task in OURS if "rk4" in task.integrators)
 
 
 def _in_model(name: str, change: Callable[[mujoco.MjModel], None], *groups: str) -> Mutation:
@@ -268,7 +268,7 @@ def _in_model(name: str, change: Callable[[mujoco.MjModel], None], *groups: str)
 
 
 def _in_loop(
-    name: str, edit: Edit, groups: tuple[str, ...] = _LOOP, tasks: tuple[str, ...] = tuple(CERTIFIED)
+    name: str, edit: Edit, groups: tuple[str, ...] = _LOOP, tasks: tuple[str, ...] = Mutation.tasks
 ) -> Mutation:
     return Mutation(f"{name}, in the callback", lambda: wrong_loop(edit), groups, tasks)
 
@@ -347,6 +347,19 @@ def _ignore(message: str) -> None:
     """Take the place of the engine's own handler, which prints and writes a file."""
 
 
+def faulty(tasks: str | Sequence[str] | None = None) -> list[str]:
+    """The names of the tasks that faults are made in: those given, or all that there are.
+
+    Raises:
+        ValueError: an unknown task, or one of somebody else's.
+    """
+    names = [tasks] if isinstance(tasks, str) else list(tasks or Mutation.tasks)
+    for name in names:
+        if find_task(name) not in OURS:
+            raise ValueError(f"task {name!r}: faults are made in these alone: {', '.join(Mutation.tasks)}")
+    return names
+
+
 def try_mutations(
     tasks: str | Sequence[str] | None = None,
     mutations: Sequence[Mutation] = MUTATIONS,
@@ -355,11 +368,14 @@ def try_mutations(
     """Make each fault in turn and see which checks of the quick certificate fail.
 
     Args:
-        tasks: a task, several, or None for all of them.
+        tasks: a task of ours, several, or None for all of them.
         mutations: the faults.
         on_part: called as each begins, with (done, in all, name).
+
+    Raises:
+        ValueError: see `faulty`.
     """
-    names = [tasks] if isinstance(tasks, str) else list(tasks or CERTIFIED)
+    names = faulty(tasks)
     results = []
     for index, mutation in enumerate(mutations):
         if on_part is not None:

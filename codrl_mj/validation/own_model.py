@@ -1,4 +1,4 @@
-"""The checks that apply to a user's own model with any number of our motors."""
+"""The checks that apply to a user's own model, or a task's, with any number of our motors at either door."""
 
 import copy
 import dataclasses
@@ -8,10 +8,12 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from codrl_mj.actuators import Actuator, ActuatorModel, spectral_radius
+from codrl_mj.actuators import Actuator, ActuatorModel, Ideal, spectral_radius
 from codrl_mj.physics import install_callbacks, motors
+from codrl_mj.physics.mjcf import task_model
+from codrl_mj.tasks import find_task
 from codrl_mj.validation import execution
-from codrl_mj.validation.compare import Worst
+from codrl_mj.validation.compare import STAND_IN, Worst, actuators_of
 from codrl_mj.validation.in_python import beside, entries
 from codrl_mj.validation.outcome import Check, Skipped
 
@@ -42,8 +44,8 @@ def prepare(model: mujoco.MjModel) -> mujoco.MjModel:
     """
     if not motors(model):
         raise ValueError(
-            f"the model has no motor of codrl_mj among its {model.nactuator} actuators: put one in with "
-            "codrl_mj.physics.mjcf.drive, or write its user data in the MJCF"
+            f"the model has no motor of codrl_mj among its {model.nactuator} actuators: put some in with "
+            "codrl_mj.motorise"
         )
     subject = copy.copy(model)
     subject.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
@@ -62,7 +64,7 @@ def skipped(model: mujoco.MjModel, name: str) -> list[Skipped]:
         Skipped("all checks", "the losses of joints, contacts and constraints are not modelled here", "energy", name),
     ]
     if foreign:
-        reason = "not motors of codrl_mj: the callbacks leave them alone"
+        reason = "not motors of codrl_mj, which leaves them alone"
         found.append(Skipped(f"actuators {', '.join(foreign)}", reason, "motor", name))
     return found
 
@@ -95,7 +97,7 @@ def motor_steps(model: mujoco.MjModel, name: str, steps: int) -> Iterator[Check]
     The Python motor starts at rest and is never corrected; states and signals are compared after every step, and so is
     the torque that the engine applied.
     """
-    named = {index: found for index, found in _names(model).items() if not _disabled(model, index)}
+    named = {index: found for index, found in _names(model).items() if not _idle(model, index, found[1])}
     actuators = {index: actuator for index, (_, actuator) in named.items()}
     for index, (ours, oracle) in beside(model, actuators, execution.commands(model, steps, seed=7)).items():
         gaps = np.abs(ours - oracle) / np.maximum(1.0, np.abs(oracle))
@@ -109,18 +111,38 @@ def motor_steps(model: mujoco.MjModel, name: str, steps: int) -> Iterator[Check]
         )
 
 
-def _disabled(model: mujoco.MjModel, index: int) -> bool:
+def _idle(model: mujoco.MjModel, index: int, actuator: ActuatorModel) -> str:
+    """Why a motor has no steps to look at; empty if it has."""
     group = int(model.actuator_group[index])
-    return 0 <= group < mujoco.mjNGROUP and bool(model.opt.disableactuator >> group & 1)
+    if 0 <= group < mujoco.mjNGROUP and bool(model.opt.disableactuator >> group & 1):
+        return "its actuator group is disabled: it never runs"
+    return "it is ideal: there is nothing to step" if isinstance(actuator, Ideal) else ""
 
 
 def _motor(model: mujoco.MjModel, name: str, quick: bool) -> Iterator[Check | Skipped]:
-    for index, (motor, _) in _names(model).items():
-        if _disabled(model, index):
-            yield Skipped(f"steps: {motor}", "its actuator group is disabled: it never runs", "motor", name)
+    for index, (motor, actuator) in _names(model).items():
+        if reason := _idle(model, index, actuator):
+            yield Skipped(f"steps: {motor}", reason, "motor", name)
     yield from stability(model, name)
     yield from motor_steps(model, name, 200 if quick else 2000)
     yield from _alone(model, name, quick)
+
+
+def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
+    """The checks of a task's own motors, in its model.
+
+    Args:
+        task_name: the task.
+        quick: fewer steps.
+    """
+    task = find_task(task_name)
+    if not task.paper:
+        yield Skipped(
+            "the paper's actuators", f"it has none: the {STAND_IN} is in their place, in all groups", "motor", task.name
+        )
+    model = task_model(task, actuators_of(task), task.step_duration / task.motor_inner_steps)
+    install_callbacks(model)
+    yield from _motor(model, task.name, quick)
 
 
 def _alone(model: mujoco.MjModel, name: str, quick: bool) -> Iterator[Check | Skipped]:

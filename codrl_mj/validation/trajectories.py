@@ -15,9 +15,9 @@ import numpy as np
 from codrl_mj.actuators import Actuator, ActuatorModel, Ideal
 from codrl_mj.physics import SimulationDivergedError
 from codrl_mj.tasks import Task, find_task, named_actuator
-from codrl_mj.validation.compare import Worst, both, differences, last_signals
+from codrl_mj.validation.compare import NO_TWIN, SEVERAL_MOTORS, Worst, both, differences, last_signals
 from codrl_mj.validation.growth import ROUNDING, Growth, lyapunov_exponent
-from codrl_mj.validation.outcome import Check, Curve, Plot
+from codrl_mj.validation.outcome import Check, Curve, Plot, Skipped
 
 TOLERANCE = 1e-9
 """Of the difference: rounding (1e-16), a thousand steps, and the growth of tasks that are not chaotic."""
@@ -25,19 +25,8 @@ ROUNDINGS = 30.0
 """Largest difference in standard deviations of the oracle's own accumulated rounding, of 2e-16 for each entry and step;
 a step rounds some tens of numbers."""
 
-EPISODE_STEPS: dict[str, int] = {
-    "pendulum": 200,
-    "cartpole": 500,
-    "acrobot": 500,
-    "mountain_car": 200,
-    "mountain_car_continuous": 999,
-}
-"""Environment steps of a whole episode, Gymnasium's time limit."""
-
-HORIZON: dict[str, int] = EPISODE_STEPS | {"acrobot": 100}
-"""Environment steps over which the difference itself must stay below 1e-9: a whole episode, but for the acrobot, whose
-rounding errors, 1e-16 * exp(lambda t), pass 1e-9 within one."""
-
+UNLIMITED_STEPS = 200
+"""Environment steps of a run of a task without a time limit."""
 STARVED = "starved"
 ACTUATORS = ("ideal", "paper", "weaker", STARVED)
 
@@ -134,7 +123,8 @@ def episodes(task: Task, actuator_name: str, integrator: str, seeds: range, long
     """
     actuator = starved(task) if actuator_name == STARVED else named_actuator(actuator_name, task.name)
     oracle = f"Gymnasium {task.gymnasium_id}" + ("" if isinstance(actuator, Ideal) else " and the motor in Python")
-    steps, horizon = (min(longest, known[task.name]) for known in (EPISODE_STEPS, HORIZON))
+    steps = min(longest, task.max_episode_steps or UNLIMITED_STEPS)
+    horizon = min(steps, (task.trials and task.trials.horizon) or steps)
     runs = [_run(task, actuator, integrator, steps, seed) for seed in seeds]
     described = f"{integrator}, {actuator_name} actuator"
     for name, length, in_roundings, tolerance, unit in (
@@ -147,18 +137,23 @@ def episodes(task: Task, actuator_name: str, integrator: str, seeds: range, long
         yield Check(name, oracle, count, worst.value, tolerance, worst.where, "trajectories", task.name, unit, plots)
 
 
-def checks(task_name: str | None, quick: bool = False) -> Iterator[Check]:
+def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     """The checks of this group.
 
     Args:
-        task_name: the task; None, which has no episodes, has no checks.
+        task_name: the task.
         quick: one shorter run each instead of two whole episodes.
     """
-    if task_name is None:
-        return
     task = find_task(task_name)
-    for actuator in ACTUATORS:
+    if task.twin is None or len(task.motors) > 1:
+        yield Skipped("all checks", NO_TWIN if task.twin is None else SEVERAL_MOTORS, "trajectories", task.name)
+        return
+    actuators = ACTUATORS if task.paper else ACTUATORS[:1]
+    if not task.paper:
+        reason = "they are variations of the paper's actuator, of which it has none"
+        yield Skipped(f"runs with the {', '.join(ACTUATORS[1:])} actuators", reason, "trajectories", task.name)
+    for actuator in actuators:
         for integrator in task.integrators:
             shorter = 100 if task.motor_inner_steps > 1 else 200
-            seeds, longest = (range(1), shorter) if quick else (range(2), EPISODE_STEPS[task.name])
+            seeds, longest = (range(1), shorter) if quick else (range(2), 999)
             yield from episodes(task, actuator, integrator, seeds, longest)

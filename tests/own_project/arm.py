@@ -7,6 +7,7 @@ import numpy as np
 from gymnasium import spaces
 
 from codrl_mj import Task
+from codrl_mj.tasks.attributes import GRAVITY, Fixed, Setting, mass
 
 MAX_TORQUES = (8.0, 3.0)  # N*m
 
@@ -75,4 +76,5 @@ TASK = Task(
     helpers=(error,),
     motors=("shoulder", "elbow"),
     speeds=(2, 3),
+    attributes={"gravity": GRAVITY, "upper_mass": mass("upper"), "most": Setting.LARGEST_FORCE, "reach": Fixed(0.9)},
 )

@@ -8,11 +8,12 @@ from codrl_mj import TASKS
 from codrl_mj.engine.hill import GRAVITY
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError
 from codrl_mj.validation import energy
-from codrl_mj.validation.ledger import HILL_TASKS, Meter, hill_potential, keep
+from codrl_mj.validation.ledger import Meter, hill_potential, keep
 from tests.validation.mutations import failed, looks_complete, scaled, scaled_motor, wrong_model
 
 pytestmark = pytest.mark.usefixtures("bare_engine")
 
+HILL_TASKS = ("mountain_car", "mountain_car_continuous")
 STEPS = "winding, step by step"
 
 
@@ -150,7 +151,7 @@ def test_the_hills_potential_is_the_integral_of_gymnasiums_force(task):
 def test_a_loaded_spring_of_a_motor_pays_for_everything():
     """Signs: a motor that accelerates a load draws more than it heats; what it gives back is negative."""
     task = TASKS["mountain_car"]
-    ledger = keep(MujocoPhysics, task, task.paper[0], np.array([-0.5, 0.0]), np.ones(20), 20, "semi-implicit", 20)
+    ledger = keep(MujocoPhysics, task, task.paper, np.array([-0.5, 0.0]), np.ones(20), 20, "semi-implicit", 20)
     assert ledger.supplied[-1] > ledger.copper[-1] > 0
     assert ledger.magnetic[-1] > 0
     assert ledger.shaft[-1] > 0
