@@ -9,6 +9,7 @@ import codrl_mj  # isort: skip - before mujoco, which chooses its OpenGL platfor
 import argparse
 import os
 import platform
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -36,6 +37,7 @@ ENVPOOL = {  # of its dm_control swing-ups Pendulum's alone: a thousand of the o
     "mountain_car": ("MountainCar-v0",),
     "mountain_car_continuous": ("MountainCarContinuous-v0",),
 }
+APART = ("mountain_car", "mountain_car_continuous")  # whose walls need a call of the engine for each step of it
 DM_CONTROL = {"pendulum": "swingup", "cartpole": "swingup", "acrobot": "swingup"}
 
 
@@ -44,6 +46,9 @@ def groups(quick: bool) -> dict[str, Makers]:
     found: dict[str, Makers] = {}
     for task in TASKS:
         found[f"engine: {task}"] = [partial(subjects.engine, task, False), partial(subjects.engine, task, True)]
+    for count in (1, 6, 17):
+        drivers = (None, "ideal", "torque_speed", "lag", "current_loop")
+        found[f"motorised: {count} motors"] = [partial(subjects.chain, count, driver) for driver in drivers]
     for task, definition in TASKS.items():
         assert definition.gymnasium_id is not None
         members: Makers = [partial(subjects.theirs, definition.gymnasium_id)]
@@ -60,6 +65,9 @@ def groups(quick: bool) -> dict[str, Makers]:
         members += [partial(subjects.vector, task, NUM_ENVS, 1, actuator) for actuator in ("paper", "ideal")]
         members += [partial(subjects.envpool, name, NUM_ENVS, 1) for name in ENVPOOL[task]]
         found[f"vector: {task}"] = members
+        apart = task in APART
+        members = [partial(subjects.raw_batch, task, NUM_ENVS, 2, apart), partial(subjects.vector, task, NUM_ENVS, 2)]
+        found[f"two threads: {task}"] = members
     sizes = [(num_envs, threads) for num_envs in (1024, 1, 64, 16384) for threads in (1, 2)]
     found["sizes: pendulum"] = [partial(subjects.vector, "pendulum", *size) for size in sizes]
     if not quick:
@@ -150,6 +158,15 @@ def learning(quick: bool) -> dict[str, dict[str, float]]:
     return found
 
 
+def families() -> dict[str, float]:
+    """Seconds until a family runs in the engine, the first one's and the others'; they are compiled once a process."""
+    code = "import time, codrl_mj\nfrom codrl_mj.actuators import FAMILIES\nfor name, family in FAMILIES.items():\n"
+    code += "    if name != 'ideal':\n        start = time.perf_counter()\n        codrl_mj.load_family(family)\n"
+    code += "        print(name, time.perf_counter() - start)"
+    lines = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    return dict(zip(lines[::2], map(float, lines[1::2]), strict=True))
+
+
 def report(title: str, results: dict[str, dict[str, list[float]]]) -> None:
     """Print a group's table."""
     table = Table(title=title, title_justify="left")
@@ -182,6 +199,10 @@ def main() -> int:
         if options.only in title:
             results[title] = measure(build(makers), turns, turn_duration)
             report(f"{title}, {turns} alternating turns: median (least to most)", results[title])
+    if options.only in "families":
+        results["families"] = families()
+        text = ", ".join(f"{name} {duration:.2f} s" for name, duration in results["families"].items())
+        console().print(f"families, in a process of their own, one after the other: {text}")
     if options.only in "learning":
         results["learning"] = learning(options.quick)
         for name, numbers in results["learning"].items():

@@ -56,6 +56,30 @@ def engine(task: str, with_callbacks: bool) -> Subject:
     return Subject(name, lambda calls: mujoco.mj_step(model, data, calls), prepare)
 
 
+def chain(motors: int, actuator: str | None, substeps: int = 10) -> Subject:
+    """`mj_step` of a chain of links with a motor in every joint; None leaves MuJoCo's own."""
+    spec = mujoco.MjSpec()
+    body = spec.worldbody
+    for index in range(motors):
+        body = body.add_body(pos=[0.0, 0.0, -0.1])
+        joint = body.add_joint(name=f"joint{index}", axis=[0.0, 1.0, 0.0], damping=[0.1, 0.0, 0.0])
+        body.explicitinertial, body.mass, body.inertia = True, 0.1, [0.01, 0.01, 0.01]
+        motor = spec.add_actuator(name=f"motor{index}", target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        motor.set_to_motor()
+    given: Any = {"current_loop": codrl_mj.Actuator(controller=codrl_mj.CurrentLoop(ki=1.0, substeps=substeps))}
+    if actuator is not None:
+        spec = codrl_mj.motorise(spec, {".*": given.get(actuator, actuator)})
+    model = spec.compile()
+    data = mujoco.MjData(model)
+
+    def prepare() -> None:
+        mujoco.mj_resetData(model, data)
+        data.ctrl[:] = 0.1
+
+    name = f"{motors} motors, {'as they are' if actuator is None else actuator}"
+    return Subject(name, lambda calls: mujoco.mj_step(model, data, calls), prepare)
+
+
 def single(name: str, env: Any) -> Subject:
     """Steps of a Gymnasium environment under random actions, with resets."""
     env.action_space.seed(0)
