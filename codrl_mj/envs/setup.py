@@ -163,6 +163,11 @@ class Setup:
         return alone(actuators)
 
     @functools.cached_property
+    def initial_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """`Task.initial_bounds` without reset options."""
+        return self.task.initial_bounds(None)
+
+    @functools.cached_property
     def random(self) -> bool:
         """Whether an episode's disturbances or sensors need a key."""
         drawn = () if self.randomization is None else self.randomization.names

@@ -234,7 +234,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         Returns:
             The infos of the reset: what was drawn.
         """
-        low, high = self.setup.task.initial_bounds(options)
+        low, high = self.setup.task.initial_bounds(options) if options else self.setup.initial_bounds
         draws = low + (high - low) * self._streams.random(rows, len(low))
         states = self.setup.task.initial_states(draws)
         infos = {} if self._draws is None else self._draws.draw(self._streams, rows)
@@ -441,10 +441,12 @@ def _infos(signals: Signals, stepping: Array) -> dict[str, Any]:
     """The signals as Gymnasium's vector infos: zero, and masked, where an environment was reset instead of stepped."""
     if not stepping.any():
         return {}
-    every = stepping.all()
+    reset = np.flatnonzero(~stepping)
     infos: dict[str, Any] = {}
     for name, values in signals.items():
-        mask = stepping.reshape(-1, *[1] * (values.ndim - 1))
-        infos[name] = values if every else np.where(mask, values, np.zeros((), values.dtype))
+        infos[name] = values
+        if len(reset):
+            infos[name] = values.copy()
+            infos[name][reset] = 0
         infos[f"_{name}"] = stepping.copy()
     return infos

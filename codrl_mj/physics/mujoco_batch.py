@@ -70,6 +70,7 @@ class MujocoBatchPhysics:
         self._dofs = np.array([int(one.dof) for one in self._wiring])
         self._slots = np.array([int(one.act) for one in self._wiring])
         self._controls = np.array([int(one.ctrl) for one in self._wiring])
+        self._positions, self._velocities = np.array(task.qpos), np.array(task.qvel)
         self._size = self.num_envs, num_threads
         self._varied = False  # whether the models differ in more than their actuators
         self._fields: dict[str, np.ndarray] = {}
@@ -159,7 +160,10 @@ class MujocoBatchPhysics:
 
     @state.setter
     def state(self, states: np.ndarray) -> None:
-        self._qpos[:], self._qvel[:] = states[:, list(self.task.qpos)], states[:, list(self.task.qvel)]
+        self._place(slice(None), states)
+
+    def _place(self, rows: np.ndarray | slice, states: np.ndarray) -> None:
+        self._qpos[rows], self._qvel[rows] = states[:, self._positions], states[:, self._velocities]
 
     def models(self) -> Iterator[mujoco.MjModel]:
         """One model, which has each simulation's fields in turn; what is only drawn is the first one's."""
@@ -181,8 +185,7 @@ class MujocoBatchPhysics:
         """
         self._install()  # raises if somebody replaced ours since the last episodes
         self._batch.state[rows] = self._rest
-        self._qpos[rows] = states[:, list(self.task.qpos)]
-        self._qvel[rows] = states[:, list(self.task.qvel)]
+        self._place(rows, states)
         if self.motorised:
             for at, slot in enumerate(self._slots):
                 self._act[rows, slot + NOISE_KEY] = keys + at
