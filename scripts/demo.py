@@ -9,13 +9,14 @@ import functools
 import sys
 from pathlib import Path
 
-from codrl_mj.cli.terminal import print_checks, print_evaluations, progress_bar, train_with_bars
+from codrl_mj.cli.terminal import print_checks, print_evaluations, progress_bar, training_bars
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import make_env, run_episodes, summarize
 from codrl_mj.films.film import Panel, film
 from codrl_mj.runs.policies import load_policy
+from codrl_mj.study.grid import train_runs
 from codrl_mj.tasks import named_actuator
-from codrl_mj.training import TrainConfig, finished, load_config
+from codrl_mj.training import TrainConfig, TrainingStoppedError, finished, load_config
 from codrl_mj.validation import validate
 
 TASK, REAL = "cartpole", "weaker"
@@ -59,7 +60,12 @@ def main() -> int:
         else:
             waiting[f"trained on {actuator}"] = (config, out)
     if waiting:
-        train_with_bars(waiting, resume=True, accept_changes=True)
+        with training_bars(waiting):
+            failures = train_runs({out: config for config, out in waiting.values()}, accept_changes=True)
+        for out, failure in failures.items():
+            print(f"demo: {out}: {failure.error} (see {failure.record})", file=sys.stderr)
+        if failures:
+            return 1
 
     print(f"\n3/4  Deploy both on {REAL!r}, under Gymnasium's own reward: 500 is full marks")
     evaluations, panels = {}, []
@@ -89,4 +95,8 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except TrainingStoppedError as stopped:
+        print(f"demo: {stopped}", file=sys.stderr)
+        sys.exit(128 + stopped.signal_number)

@@ -82,7 +82,7 @@ def page(task_name: str) -> str:
         "environment step": f"{task.step_duration:g} s",
         "integration steps in it": f"{task.motor_inner_steps} with a motor, 1 without",
         "integrators": ", ".join(f"`{name}`" for name in task.integrators),
-        "options of its own": ", ".join(f"`{name}` (default {value:g})" for name, value in own) or "none",
+        "options of its own": ", ".join(f"`{name}` (default {value})" for name, value in own) or "none",
         "time limit": f"{task.max_episode_steps} steps",
         "solved at": "not defined" if task.reward_threshold is None else f"a return of {task.reward_threshold:g}",
         "`paper` actuator": f"R {motor.resistance:g} Ω, L {motor.inductance:g} H, kT {motor.torque_constant:g} N·m/A, "

@@ -150,6 +150,7 @@ def test_training_leaves_a_run_folder_and_says_what_is_next(capsys, tmp_path):
 def test_fields_are_set_over_the_named_actuator(tmp_path):
     flags = "--actuator weaker --actuator.controller.kp 0.3 --actuator.motor.inductance 0.07 --env.center-radius 0.1"
     more = "--actuator.controller.max-voltage inf --actuator.controller.bemf-compensation False --env.inner-steps 2"
+    more += " --env.sutton-barto-reward True"
     assert main(["train", "cartpole", *flags.split(), *more.split(), *TINY, "--out", "run"]) == 0
     config = json.loads((tmp_path / "run" / "config.json").read_text())["train"]["env"]
     weaker = named_actuator("weaker", "cartpole").as_mapping()
@@ -159,7 +160,7 @@ def test_fields_are_set_over_the_named_actuator(tmp_path):
         "bemf_compensation": False,
     }
     assert config["actuator"]["motor"] == weaker["motor"] | {"inductance": 0.07}
-    assert config["options"] == {"center_radius": 0.1}
+    assert config["options"] == {"center_radius": 0.1, "sutton_barto_reward": True}
     assert config["inner_steps"] == 2
 
 

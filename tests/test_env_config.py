@@ -138,7 +138,11 @@ def configurations(draw):
         "disturbances": st.builds(Disturbances, POSITIVE, POSITIVE, POSITIVE, POSITIVE, POSITIVE, POSITIVE),
         "joint": st.builds(Joint, POSITIVE, POSITIVE, POSITIVE),
         "randomize": st.just(RANDOMIZE),
-        **({"options": st.fixed_dictionaries({"center_radius": POSITIVE})} if task == "cartpole" else {}),
+        **(
+            {"options": st.fixed_dictionaries({"center_radius": POSITIVE, "sutton_barto_reward": st.booleans()})}
+            if task == "cartpole"
+            else {}
+        ),
     }
     return EnvConfig(task, draw(ACTUATORS), **draw(st.fixed_dictionaries({}, optional=fields)))
 
@@ -172,7 +176,7 @@ def test_every_face_is_built_from_it():
     for setup in (single.unwrapped.setup, many.env.setup, theirs.task.setup):
         assert (setup.actuators, setup.inner_steps) == (config.actuators, 2)
         assert (setup.disturbances, setup.joint) == (config.disturbances, config.joint)
-        assert setup.view.option_values == (0.02,)
+        assert setup.view.options == (0.02, False)
     assert single.spec.max_episode_steps == many.env.max_episode_steps == 7
     theirs.reset()
     assert [theirs.step(0).last() for _ in range(7)] == [False] * 6 + [True]
@@ -204,6 +208,8 @@ def test_fields_are_set_over_another_one_s():
             "unknown option 'center_radius' of pendulum: it has none",
         ),
         ({"task": "cartpole", "center_radius": -1.0}, "center_radius = -1.0: must be a number > 0"),
+        ({"task": "cartpole", "sutton_barto_reward": 1}, "sutton_barto_reward = 1: must be True or False"),
+        ({"task": "cartpole", "center_radius": True}, "center_radius = True: must be a number > 0"),
         ({"inner_steps": 3}, "it has no task"),
         ("cartpole", "env = 'cartpole': must be a mapping"),
     ],

@@ -66,7 +66,7 @@ FOREIGN = {
     "physics": {"mujoco", "numba", "numpy", "gymnasium"},
     "envs.distributions": {"numpy"},
     "envs.config": {"gymnasium"},
-    "envs": {"gymnasium", "numpy", "numba", "mujoco", "stable_baselines3"},
+    "envs": {"gymnasium", "numpy", "numba", "mujoco", "stable_baselines3", "pygame"},
     "evaluation.measures": {"numpy", "scipy"},
     "runs.files": set(),
     "runs.summaries": set(),

@@ -8,6 +8,7 @@ films and evaluations read it. docs/actuators.md builds one.
 import contextlib
 import contextvars
 import dataclasses
+import difflib
 import functools
 import hashlib
 import importlib
@@ -208,7 +209,7 @@ class ActuatorModel:
         """A copy with other values of some fields.
 
         Args:
-            values: by dotted path, such as `motor.inductance`.
+            values: by dotted path, such as `motor.inductance`; in a part that is None, over what stands for it.
 
         Raises:
             ValueError: a value is out of bounds.
@@ -222,9 +223,7 @@ class ActuatorModel:
             else:
                 changes[name] = _of_kind(type(self), name, value)
         for name, inner in nested.items():
-            owner = getattr(self, name)
-            if owner is None:
-                raise ValueError(f"{type(self).__name__}.{name} = None: give it before setting its fields")
+            owner = _get(self, name)
             kinds = {field: _of_kind(type(owner), field, value) for field, value in inner.items()}
             changes[name] = dataclasses.replace(owner, **kinds)
         return dataclasses.replace(self, **changes)
@@ -377,3 +376,25 @@ def load_object(text: str) -> Any:
         return functools.reduce(getattr, name.split("."), importlib.import_module(module))
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(f"{text!r}: {error}; must be module:NAME, of a module that Python finds") from None
+
+
+def look_up(name: str, known: Mapping[str, Any], what: str, anybodys: bool = True) -> Any:
+    """What a name stands for: a value of `known`, or what stands at `module:NAME`.
+
+    Args:
+        name: the name.
+        known: ours, by name.
+        what: what to call one in messages.
+        anybodys: whether to import what is not ours.
+
+    Raises:
+        ValueError: unknown name; the nearest known one is suggested. Or as for `load_object`.
+    """
+    if name in known:
+        return known[name]
+    if anybodys and ":" in str(name):
+        return load_object(name)
+    near = difflib.get_close_matches(str(name), known, n=1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    own = ", or module:NAME of your own" if anybodys else ""
+    raise ValueError(f"unknown {what} {name!r}: {hint}Known: {', '.join(known)}{own}")

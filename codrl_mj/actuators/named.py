@@ -1,7 +1,6 @@
 """Families and actuators by name, and whatever a user may write for an actuator."""
 
 import dataclasses
-import difflib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,7 @@ from typing import Any
 from codrl_mj.actuators.current_loop import Actuator, CurrentLoop
 from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.lag import Lag
-from codrl_mj.actuators.model import ActuatorModel, Family, load_object
+from codrl_mj.actuators.model import ActuatorModel, Family, look_up
 from codrl_mj.actuators.torque_speed import TorqueSpeed
 
 FAMILIES: dict[str, Family] = {kind.family: kind for kind in (Actuator, Ideal, Lag, TorqueSpeed)}
@@ -45,16 +44,10 @@ def find_family(name: str) -> Family:
     Raises:
         ValueError: there is none; the nearest known name is suggested.
     """
-    if name in FAMILIES:
-        return FAMILIES[name]
-    if ":" in name:
-        family = load_object(name)
-        if isinstance(family, type) and issubclass(family, ActuatorModel):
-            return family
-        raise ValueError(f"family {name!r}: {family!r} is no subclass of codrl_mj.ActuatorModel")
-    near = difflib.get_close_matches(str(name), FAMILIES, n=1)
-    hint = f"did you mean {near[0]!r}? " if near else ""
-    raise ValueError(f"unknown family {name!r}: {hint}Known: {', '.join(FAMILIES)}, or module:Class of your own")
+    family = look_up(name, FAMILIES, "family")
+    if isinstance(family, type) and issubclass(family, ActuatorModel):
+        return family
+    raise ValueError(f"family {name!r}: {family!r} is no subclass of codrl_mj.ActuatorModel")
 
 
 def actuator_from_mapping(mapping: Mapping[str, Any]) -> Any:
@@ -106,20 +99,13 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
                 f"{', '.join(FAMILIES)}"
             )
         return NAMED[given][1](paper)
-    if given in FAMILIES:
-        return FAMILIES[given]()
-    if Path(given).suffix in (".yaml", ".yml", ".json"):
+    if given not in FAMILIES and Path(given).suffix in (".yaml", ".yml", ".json"):
         return actuator_from_file(Path(given))
-    if ":" in given:
-        found = load_object(given)
-        made = found() if isinstance(found, type) and issubclass(found, ActuatorModel) else found
-        if isinstance(made, ActuatorModel):
-            return made
-        raise ValueError(f"actuator = {given!r}: {found!r} is neither an actuator nor a family of them")
-    known = [*NAMED, *(name for name in FAMILIES if name not in NAMED)]
-    near = difflib.get_close_matches(given, known, n=1)
-    hint = f"did you mean {near[0]!r}? " if near else ""
-    raise ValueError(f"unknown actuator {given!r}: {hint}Known actuators: {', '.join(known)}")
+    found = look_up(given, NAMED | FAMILIES, "actuator")
+    made = found() if isinstance(found, type) and issubclass(found, ActuatorModel) else found
+    if isinstance(made, ActuatorModel):
+        return made
+    raise ValueError(f"actuator = {given!r}: {found!r} is neither an actuator nor a family of them")
 
 
 def actuator_from_file(path: Path) -> Any:

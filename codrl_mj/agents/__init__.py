@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from codrl_mj.actuators.model import load_object
+from codrl_mj.actuators.model import look_up
 from codrl_mj.agents.base import AgentConfig
 from codrl_mj.agents.ddpg import DDPGConfig
 from codrl_mj.agents.dqn import DQNConfig
@@ -41,14 +41,10 @@ def find_agent(name: str) -> type[AgentConfig]:
     Raises:
         ValueError: unknown agent.
     """
-    if name in AGENTS:
-        return AGENTS[name]
-    if ":" in name:
-        found = load_object(name)
-        if isinstance(found, type) and issubclass(found, AgentConfig):
-            return found
-        raise ValueError(f"agent = {name!r}: {found!r} is no subclass of codrl_mj.agents.AgentConfig")
-    raise ValueError(f"agent = {name!r}: must be one of {', '.join(AGENTS)}, or module:Class of your own")
+    found = look_up(name, AGENTS, "agent")
+    if isinstance(found, type) and issubclass(found, AgentConfig):
+        return found
+    raise ValueError(f"agent = {name!r}: {found!r} is no subclass of codrl_mj.agents.AgentConfig")
 
 
 def agent_from_mapping(mapping: Mapping[str, Any]) -> AgentConfig:

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, actuator, environment
+from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, environment
 from codrl_mj.cli.subject import Source
 
 
@@ -38,13 +38,12 @@ class Evaluate:
         from codrl_mj.evaluation import evaluate
 
         subject = self.source.load(self.policy)
-        task = subject.env.task
-        motor = actuator(self.actuator_name, self.actuator_fields, task, subject.env.actuator)
+        env = environment(self, subject.env.task, self.actuator_name, subject.env.actuator)
         with progress_bar("{task.completed}/{task.total} episodes") as bar:
             row = bar.add_task("evaluating", total=self.episodes)
             evaluation = evaluate(
                 subject.policy,
-                environment(self.env, task, motor).seen_as(subject.env),
+                env.seen_as(subject.env),
                 self.episodes,
                 self.seed,
                 not self.stochastic,

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.actuators import FAMILIES, NAMED, Actuator, Family, Ideal, actuator_over
+from codrl_mj.actuators import FAMILIES, NAMED, Actuator, Ideal, actuator_over
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import parts
 from codrl_mj.runs.layout import CONFIG
@@ -45,79 +45,38 @@ def field_docs(kind: type) -> Mapping[str, str]:
     return docs
 
 
-def optional(kind: type, otherwise: str) -> Any:
-    """The dataclass with every field optional, also in its parts: what a user may set over what is known only later.
+def flags(kind: type, defaults: Any = None, leaving_out: tuple[str, ...] = (), adding: Sequence[Any] = ()) -> Any:
+    """A dataclass without its validation, which the verb makes up for: errors while parsing look like bugs.
 
     Args:
-        kind: the dataclass.
-        otherwise: what an unset field is, for the help.
-    """
-    docs, hints, nested = field_docs(kind), typing.get_type_hints(kind), parts(kind)
-    fields: list[Any] = []
-    for field in dataclasses.fields(kind):
-        text = docs.get(field.name, "")
-        if field.name in nested:
-            inner = optional(nested[field.name], otherwise)
-            fields.append((field.name, Annotated[inner, tyro.conf.arg(help=text)], inner()))
-        else:
-            setting = tyro.conf.arg(help=f"{text} Default: {otherwise}.".strip(), help_behavior_hint="")
-            fields.append((field.name, Annotated[hints[field.name] | None, setting], None))
-    return dataclasses.make_dataclass(f"{kind.__name__}Fields", fields, frozen=True)
-
-
-def unchecked(defaults: Any, leaving_out: tuple[str, ...] = (), adding: Sequence[Any] = ()) -> Any:
-    """An instance's dataclass without its validation, which the verb makes up for: errors while parsing look like bugs.
-
-    Args:
-        defaults: the instance: its values are the defaults; fields that are dataclasses are treated likewise.
+        kind: the dataclass; its fields that are dataclasses are treated likewise.
+        defaults: its instance with the default values; None makes all optional: set over what is known only later.
         leaving_out: names of fields that get no flag.
         adding: fields to come last, as `dataclasses.make_dataclass` takes them.
     """
-    docs, hints = field_docs(type(defaults)), typing.get_type_hints(type(defaults))  # type: ignore[arg-type]
+    docs, hints, nested = field_docs(kind), typing.get_type_hints(kind), parts(kind)
     fields: list[Any] = []
-    for field in dataclasses.fields(defaults):
-        value = getattr(defaults, field.name)
-        if field.name in leaving_out:
-            continue
-        if dataclasses.is_dataclass(value):
-            nested = unchecked(value)
-            fields.append((field.name, Annotated[nested, tyro.conf.arg(help=docs.get(field.name, ""))], nested()))
-        else:
-            fields.append(
-                (field.name, Annotated[hints[field.name], tyro.conf.arg(help=docs.get(field.name, ""))], value)
-            )
-    return dataclasses.make_dataclass(f"{type(defaults).__name__}Fields", [*fields, *adding], frozen=True)
+    for name in (field.name for field in dataclasses.fields(kind) if field.name not in leaving_out):
+        hint, value = hints[name], getattr(defaults, name, None)
+        setting: dict[str, Any] = {"help": docs.get(name, "")}
+        if name in nested:
+            hint = flags(nested[name], value)
+            value = hint()
+        elif defaults is None:
+            hint, text = hint | None, f"{setting['help']} Default: the named actuator's.".strip()
+            setting = {"help": text, "help_behavior_hint": ""}
+        fields.append((name, Annotated[hint, tyro.conf.arg(**setting)], value))
+    return dataclasses.make_dataclass(f"{kind.__name__}Fields", [*fields, *adding], frozen=True)
 
 
-def env_fields(defaults: EnvConfig) -> Any:
-    """Flags for an environment but its task and actuator, and for the options of all tasks."""
-    options = defaults.as_mapping()["options"]
-    return unchecked(
-        defaults,
-        ("task", "actuator", "options"),
-        [
-            (name, Annotated[float | None, tyro.conf.arg(help=text)], options.get(name))
-            for name, text in _task_options().items()
-        ],
-    )
-
-
-def _task_options() -> dict[str, str]:
-    """Name -> description of every option that a task has."""
+def _task_options() -> dict[str, tuple[Any, str]]:
+    """Name -> type and description of every option that a task has."""
     kinds: dict[str, Any] = {name: task.options for name, task in TASKS.items()}
-    return {option: f"{task}: {field_docs(kind)[option]}" for task, kind in kinds.items() for option in kind._fields}
-
-
-def environment(fields: Any, task: str, actuator: Any) -> EnvConfig:
-    """The environment that the flags describe.
-
-    Raises:
-        ValueError: a value is out of bounds.
-    """
-    given: dict[str, Any] = dict(vars(fields))
-    nested: dict[str, Any] = {name: vars(given.pop(name)) for name in ("disturbances", "joint")}
-    options = {name: value for name in _task_options() if (value := given.pop(name, None)) is not None}
-    return EnvConfig(task, actuator, options=options, **given, **nested)
+    return {
+        option: (hint, f"{task}: {field_docs(kind)[option]}")
+        for task, kind in kinds.items()
+        for option, hint in typing.get_type_hints(kind).items()
+    }
 
 
 ActuatorName = Annotated[
@@ -136,28 +95,55 @@ AS_TRAINED, AS_CONFIGURED = "as-trained", "as-configured"
 """Instead of a name: the actuator that the policy was trained on; that of the configuration file or run."""
 
 
-def actuator_fields(chosen: Family) -> Any:
-    """Flags for single fields over an actuator of a family; over the ideal one those of a current loop, to be refused.
-
-    Returns:
-        The field for `dataclasses.make_dataclass`.
-    """
-    fields = optional(Actuator if issubclass(chosen, Ideal) else chosen, "the named actuator's")
-    return "actuator_fields", Annotated[fields, tyro.conf.arg(name="actuator", help="Single fields over it.")], fields()
-
-
-def family(name: str | None, task: str, known: Family = Actuator) -> Family:
-    """The family of the actuator that a command line names.
+def environment_fields(defaults: EnvConfig, name: str | None, task: str) -> list[Any]:
+    """Flags for an environment: single fields over its actuator, all else but its task, and the options of all tasks.
 
     Args:
-        name: what `--actuator` says; None if it is not there.
+        defaults: the environment whose values are the defaults.
+        name: what `--actuator` says; None if it is not there. Its family has the fields, of the ideal one a current
+            loop, to be refused.
         task: the task whose actuators the names vary.
-        known: what it is where the name does not say it, or is none: the verb refuses that later.
+
+    Returns:
+        Fields for `dataclasses.make_dataclass`; `environment` reads them.
     """
+    options = defaults.as_mapping()["options"]
+    of_tasks = [
+        (option, Annotated[hint | None, tyro.conf.arg(help=text)], options.get(option))
+        for option, (hint, text) in _task_options().items()
+    ]
+    env = flags(EnvConfig, defaults, ("task", "actuator", "options"), of_tasks)
+    family: Any = type(defaults.actuators[0])
     if name not in (None, AS_TRAINED, AS_CONFIGURED):
-        with contextlib.suppress(ValueError, OSError):
-            return type(resolve_actuators(name, find_task(task))[0])
-    return known
+        with contextlib.suppress(ValueError, OSError):  # the verb says so better
+            family = type(resolve_actuators(name, find_task(task))[0])
+    over = flags(Actuator if issubclass(family, Ideal) else family)
+    return [
+        ("actuator_fields", Annotated[over, tyro.conf.arg(name="actuator", help="Single fields over it.")], over()),
+        ("env", Annotated[env, tyro.conf.arg(help="The environment.")], env()),
+    ]
+
+
+def environment(verb: Any, task: str, name: str, known: Any = None) -> EnvConfig:
+    """The environment that a verb's flags describe.
+
+    Args:
+        verb: has the fields of `environment_fields`.
+        task: the task's name.
+        name: a named actuator, or `AS_TRAINED` or `AS_CONFIGURED`.
+        known: what these stand for.
+
+    Raises:
+        ValueError: unknown name, value out of bounds, or fields set over the ideal actuator, which has none.
+    """
+    given: dict[str, Any] = dict(vars(verb.env))
+    nested: dict[str, Any] = {name: vars(given.pop(name)) for name in ("disturbances", "joint")}
+    options = {name: value for name in _task_options() if (value := given.pop(name, None)) is not None}
+    base = known if name in (AS_TRAINED, AS_CONFIGURED) else named_actuator(name, task)
+    changed = [
+        actuator_over(one, _given(verb.actuator_fields)) for one in (base if isinstance(base, tuple) else [base])
+    ]
+    return EnvConfig(task, changed, options=options, **given, **nested)
 
 
 def scan(arguments: Sequence[str], *names: str) -> argparse.Namespace:
@@ -192,39 +178,18 @@ def with_environment(verb: Any, arguments: Sequence[str]) -> Any:
     """
     from codrl_mj.training.folder import load_config
 
-    chosen, known = scan(arguments, "actuator"), FAMILIES[Actuator.family]
+    chosen = scan(arguments, "actuator")
+    known: Any = Actuator()
     with contextlib.suppress(ValueError):  # the verb says so better
         find_task(chosen.task or "cartpole")  # its options are flags
     for run in map(Path, arguments):
         if (run / CONFIG).is_file():
             with contextlib.suppress(ValueError, OSError):  # the verb says so better
-                known = type(load_config(run, chosen.trust).env.actuators[0])
-    env = env_fields(EnvConfig(next(iter(TASKS))))
-    fields = [
-        actuator_fields(family(chosen.actuator, chosen.task or "cartpole", known)),
-        ("env", Annotated[env, tyro.conf.arg(help="The environment.")], env()),
-    ]
+                known = load_config(run, chosen.trust).env.actuators[0]
+    fields = environment_fields(EnvConfig("cartpole", known), chosen.actuator, chosen.task or "cartpole")
     made = dataclasses.make_dataclass(verb.__name__, fields, bases=(verb,), frozen=True)
     made.__doc__ = verb.__doc__
     return made
-
-
-def actuator(name: str, fields: Any, task: str, known: Any = None) -> Any:
-    """The actuator that the flags describe.
-
-    Args:
-        name: a named actuator, or `AS_TRAINED` or `AS_CONFIGURED`.
-        fields: single fields over it.
-        task: the task whose actuators the names vary.
-        known: what `AS_TRAINED` or `AS_CONFIGURED` stands for.
-
-    Raises:
-        ValueError: unknown name, value out of bounds, or fields set over the ideal actuator, which has none.
-    """
-    base = known if name in (AS_TRAINED, AS_CONFIGURED) else named_actuator(name, task)
-    if isinstance(base, tuple):
-        return tuple(actuator_over(one, _given(fields)) for one in base)
-    return actuator_over(base, _given(fields))
 
 
 def _given(fields: Any) -> dict[str, Any]:

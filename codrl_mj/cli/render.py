@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, actuator, environment, is_task
+from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, environment, is_task
 from codrl_mj.cli.subject import Source
 
 
@@ -50,13 +50,12 @@ class Render:
 
         if is_task(self.subject):
             task, name = self.subject, "paper" if self.actuator_name == AS_TRAINED else self.actuator_name
-            env = environment(self.env, task, actuator(name, self.actuator_fields, task))
+            env = environment(self, task, name)
             policy: Policy = RandomPolicy(env.make().action_space, self.seed)
         else:
             loaded, name = self.source.load(Path(self.subject)), self.actuator_name
             task, policy = loaded.env.task, loaded.policy
-            motor = actuator(name, self.actuator_fields, task, loaded.env.actuator)
-            env = environment(self.env, task, motor).seen_as(loaded.env)
+            env = environment(self, task, name, loaded.env.actuator).seen_as(loaded.env)
         (episode,) = run_episodes(policy, env.make, 1, self.seed)
         title = f"{Path(self.subject).name} on {name}: return {episode.total:.0f}"
         panel = Panel(title, task, env.actuator, episode)

@@ -1,15 +1,10 @@
 """What a person sees in a terminal: progress bars and tables."""
 
-import concurrent.futures
+import contextlib
 import math
-import multiprocessing
-import multiprocessing.connection
-import multiprocessing.managers
-import os
-import queue
 import sys
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +14,10 @@ from rich.table import Table
 
 from codrl_mj.cli.tables import comparison_tables, evaluation_tables, run_table
 from codrl_mj.evaluation import Evaluation
-from codrl_mj.runs.summaries import Comparison, RunSummary
-from codrl_mj.training import TrainConfig, train
+from codrl_mj.runs.layout import PROGRESS
+from codrl_mj.runs.summaries import Comparison, RunSummary, last_report
+from codrl_mj.training import TrainConfig
+from codrl_mj.training.history import REPORT_COLUMNS
 from codrl_mj.validation import GROUPS, Caught, Certificate, Check
 from codrl_mj.validation.mutations import margin
 from codrl_mj.validation.page import margin_text
@@ -44,94 +41,49 @@ def progress_bar(*columns: str) -> Progress:
     )
 
 
-def train_with_bars(runs: Mapping[str, tuple[TrainConfig, Path]], **options: Any) -> None:
-    """Train, showing a bar for each run; several runs go side by side in processes of their own.
+@contextlib.contextmanager
+def training_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> Iterator[None]:
+    """Show a bar for each training while the block runs, by what the run folders say, whatever process writes them.
 
     Args:
         runs: description -> (configuration, run folder).
-        **options: as for `codrl_mj.training.train`.
-
-    Raises:
-        Exception: whatever `codrl_mj.training.train` raises, in the first run that fails.
     """
     columns = (
         "{task.completed:,}/{task.total:,} {task.fields[unit]}",
-        "return {task.fields[back]:.1f}",
-        "length {task.fields[length]:.0f}",
-        "torque err {task.fields[error]:.2g} N·m",
-        "{task.fields[speed]:.0f}/s",
+        "return {task.fields[mean_return]:.1f}",
+        "length {task.fields[mean_length]:.0f}",
+        "torque err {task.fields[torque_error]:.2g} N·m",
+        "{task.fields[steps_per_second]:.0f}/s",
     )
     with progress_bar(*columns) as bar:
-        nothing: dict[str, Any] = {"back": math.nan, "length": math.nan, "error": math.nan, "speed": math.nan}
-        rows = {
-            name: bar.add_task(
-                name,
-                total=config.total_episodes or config.total_steps,
-                unit="episodes" if config.total_episodes else "steps",
-                **nothing,
+        rows = {}
+        for name, (config, folder) in runs.items():
+            unit, total = (
+                ("episodes", config.total_episodes) if config.total_episodes else ("steps", config.total_steps)
             )
-            for name, (config, _) in runs.items()
-        }
+            nothing: dict[str, Any] = dict.fromkeys(REPORT_COLUMNS, math.nan)
+            rows[bar.add_task(name, total=total, unit=unit, **nothing)] = folder / PROGRESS, unit, total or 0
 
-        def show(name: str, progress: Any) -> None:
-            config, _ = runs[name]
-            total = config.total_episodes or config.total_steps or 0
-            bar.update(
-                rows[name],
-                completed=min(progress.episodes if config.total_episodes else progress.steps, total),
-                back=progress.mean_return,
-                length=progress.mean_length,
-                error=progress.torque_error,
-                speed=progress.steps_per_second,
-            )
+        def show() -> None:
+            for row, (file, unit, total) in rows.items():
+                report: dict[str, Any] = {name: float(value) for name, value in last_report(file, []).items()}
+                if report:
+                    bar.update(row, completed=min(int(report[unit]), total), **report)
 
-        if len(runs) == 1:
-            ((name, (config, out)),) = runs.items()
-            train(config, out, lambda progress: show(name, progress), **options)
-        else:
-            _train_side_by_side(runs, show, options)
+        ended = threading.Event()
 
+        def follow() -> None:
+            while not ended.wait(0.2):
+                show()
 
-def _train_side_by_side(
-    runs: Mapping[str, tuple[TrainConfig, Path]], show: Callable[[str, Any], None], options: Mapping[str, Any]
-) -> None:
-    context = multiprocessing.get_context("spawn")
-    manager = multiprocessing.managers.SyncManager(ctx=context)
-    manager.start(_end_with_parent)
-    with (
-        manager,
-        concurrent.futures.ProcessPoolExecutor(len(runs), context, initializer=_end_with_parent) as pool,
-    ):
-        reports = manager.Queue()
-        futures = [
-            pool.submit(_train_reporting, name, config, out, reports, dict(options))
-            for name, (config, out) in runs.items()
-        ]
-        while not all(future.done() for future in futures):
-            try:
-                show(*reports.get(timeout=0.2))
-            except queue.Empty:
-                continue
-        while not reports.empty():
-            show(*reports.get())
-        for future in futures:
-            future.result()
-
-
-def _end_with_parent() -> None:
-    """Have this process end when its parent does, even if that is killed: it would wait for work forever."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def watch() -> None:
-        multiprocessing.connection.wait([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-def _train_reporting(name: str, config: TrainConfig, out: Path, reports: Any, options: dict[str, Any]) -> None:
-    train(config, out, lambda progress: reports.put((name, progress)), **options)
+        follower = threading.Thread(target=follow)
+        follower.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            follower.join()
+            show()
 
 
 def print_evaluations(evaluations: Mapping[str, Evaluation], details: bool = True) -> None:

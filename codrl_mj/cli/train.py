@@ -13,14 +13,11 @@ from codrl_mj.agents.presets import SETTINGS
 from codrl_mj.cli.fields import (
     AS_CONFIGURED,
     ActuatorName,
-    actuator,
-    actuator_fields,
-    env_fields,
     environment,
-    family,
+    environment_fields,
+    flags,
     scan,
 )
-from codrl_mj.cli.fields import unchecked as flags_of
 from codrl_mj.runs.layout import finished
 from codrl_mj.tasks import TASKS, find_task
 from codrl_mj.training.config import TrainConfig, default_agent, read_config
@@ -44,8 +41,8 @@ def train_verb(arguments: list[str]) -> Any:
     base = _base(chosen)
     resuming = chosen.resume is not None
     configured = resuming or chosen.config is not None
-    agent_flags, env_flags = flags_of(base.agent), env_fields(base.env)
-    rest = flags_of(base, leaving_out=_OWN_FLAGS)
+    agent_flags = flags(type(base.agent), base.agent)
+    rest = flags(TrainConfig, base, _OWN_FLAGS)
     task_known = configured or chosen.task is not None
     tasks: Any = Literal[tuple(dict.fromkeys([*TASKS, base.task, chosen.task or base.task]))]
     agents: Any = Literal[tuple(dict.fromkeys([*AGENTS, base.agent.known_as()]))]
@@ -66,54 +63,24 @@ def train_verb(arguments: list[str]) -> Any:
         ),
         (
             "settings",
-            Annotated[Literal[SETTINGS], tyro.conf.arg(help=_SETTINGS_HELP)],  # type: ignore[valid-type]
+            Annotated[
+                Literal[SETTINGS],  # type: ignore[valid-type]
+                tyro.conf.arg(
+                    help="Where the defaults come from: `default` (ours), `paper` (as printed), or `repaired` (the "
+                    "paper's, with what makes it fail changed)."
+                ),
+            ],
             chosen.settings if chosen.settings in SETTINGS else "default",
         ),
         ("actuator_name", ActuatorName, AS_CONFIGURED if configured else "paper"),
-        actuator_fields(family(chosen.actuator, base.task, type(base.env.actuators[0]))),
         *((field.name, field.type, field.default) for field in dataclasses.fields(rest)),
         ("agent", Annotated[agent_flags, tyro.conf.arg(help="The agent's settings.")], agent_flags()),
-        ("env", Annotated[env_flags, tyro.conf.arg(help="The environment.")], env_flags()),
-        (
-            "config",
-            Annotated[Path | None, tyro.conf.arg(help=_CONFIG_HELP)],
-            None,
-        ),
-        ("out", Annotated[Path | None, tyro.conf.arg(help=_OUT_HELP)], None),
-        ("resume", Annotated[Path | None, tyro.conf.arg(help=_RESUME_HELP)], None),
-        ("accept_changes", Annotated[bool, tyro.conf.arg(help=_ACCEPT_HELP)], False),
-        ("trust", Annotated[bool, tyro.conf.arg(help=_TRUST_HELP)], False),
-        ("tensorboard", Annotated[bool, tyro.conf.arg(help="Write events for TensorBoard, if it is installed.")], True),
-        (
-            "wandb",
-            Annotated[str | None, tyro.conf.arg(help="Weights & Biases project to report to as well.")],
-            None,
-        ),
+        *environment_fields(base.env, chosen.actuator, base.task),
     ]
-    verb: Any = dataclasses.make_dataclass("Train", fields, bases=(Train,), frozen=True)
+    verb: Any = dataclasses.make_dataclass("Train", fields, bases=(Train,), frozen=True, kw_only=True)
     verb.__doc__ = Train.__doc__
     verb.base = base
     return verb
-
-
-_SETTINGS_HELP = (
-    "Where the defaults come from: `default` (ours), `paper` (as printed), or `repaired` (the paper's, with what makes "
-    "it fail changed)."
-)
-_CONFIG_HELP = (
-    "YAML file with the configuration: the keys are the flags' names, nested at the dots, with underscores (agent: "
-    "{name: ppo, gamma: 0.98}). Flags win over it. A run's config.json will do as well."
-)
-_OUT_HELP = "Run folder to make; the default is runs/TASK-AGENT-ACTUATOR-SEED."
-_RESUME_HELP = (
-    "Run folder of a training that was interrupted, to be continued from its last checkpoint to the result that it "
-    "would have had. Needs no other flags."
-)
-_TRUST_HELP = (
-    "Import the module of an actuator of somebody's own that the file or the run names as module:NAME, which executes "
-    "whatever its author wants."
-)
-_ACCEPT_HELP = "Continue even if the code or a package is no longer the one that the run was started with."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,9 +94,28 @@ class Train:
     interruption codrl-mj train --resume runs/through-weaker
     """
 
+    config: Path | None = None
+    """YAML file with the configuration: the keys are the flags' names, nested at the dots, with underscores (agent:
+    {name: ppo, gamma: 0.98}). Flags win over it. A run's config.json will do as well."""
+    out: Path | None = None
+    """Run folder to make; the default is runs/TASK-AGENT-ACTUATOR-SEED."""
+    resume: Path | None = None
+    """Run folder of a training that was interrupted, to be continued from its last checkpoint to the result that it
+    would have had. Needs no other flags."""
+    accept_changes: bool = False
+    """Continue even if the code or a package is no longer the one that the run was started with."""
+    trust: bool = False
+    """Import the module of an actuator of somebody's own that the file or the run names as module:NAME, which executes
+    whatever its author wants."""
+    tensorboard: bool = True
+    """Write events for TensorBoard, if it is installed."""
+    wandb: str | None = None
+    """Weights & Biases project to report to as well."""
+
     def run(self: Any) -> int:
         """Train, with a progress bar."""
-        from codrl_mj.cli.terminal import train_with_bars
+        from codrl_mj.cli.terminal import training_bars
+        from codrl_mj.training import train
 
         if find_task(self.task) is not find_task(self.base.task) and self.resume is None:
             raise ValueError(f"name the task before the flags, as in codrl-mj train {self.task} --seed 1")
@@ -137,11 +123,7 @@ class Train:
             raise ValueError(f"--out {self.out}: a run continues in its own folder, {self.resume}: leave --out out")
         config = dataclasses.replace(
             self.base,
-            env=environment(
-                self.env,
-                self.task,
-                actuator(self.actuator_name, self.actuator_fields, self.task, self.base.actuator),
-            ),
+            env=environment(self, self.task, self.actuator_name, self.base.actuator),
             agent=type(self.base.agent)(**vars(self.agent)),
             **{
                 field.name: getattr(self, field.name)
@@ -152,26 +134,20 @@ class Train:
         if self.resume is not None and finished(self.resume) and config == load_config(self.resume, self.trust):
             print(f"{self.resume} is finished already; next: codrl-mj evaluate {self.resume}")
             return 0
-        out = (
-            self.resume
-            or self.out
-            or Path("runs")
-            / "-".join(map(_word, [config.task, config.agent.name, self.actuator_name, str(config.seed)]))
-        )
-        train_with_bars(
-            {f"{config.agent.name.upper()} on {config.task}": (config, out)},
-            resume=self.resume is not None,
-            accept_changes=self.accept_changes,
-            tensorboard=self.tensorboard,
-            wandb=self.wandb,
-        )
+        parts = config.task, config.agent.name, self.actuator_name, str(config.seed)
+        name = "-".join(re.sub(r"[^\w.]+", "_", part) for part in parts)
+        out = self.resume or self.out or Path("runs") / name
+        with training_bars({f"{config.agent.name.upper()} on {config.task}": (config, out)}):
+            train(
+                config,
+                out,
+                resume=self.resume is not None,
+                accept_changes=self.accept_changes,
+                tensorboard=self.tensorboard,
+                wandb=self.wandb,
+            )
         print(f"wrote {out}: see {out / 'learning_curve.png'}; next: codrl-mj evaluate {out}")
         return 0
-
-
-def _word(name: str) -> str:
-    """A name, or where something is from, as a part of a folder's name."""
-    return re.sub(r"[^\w.]+", "_", name)
 
 
 def _base(chosen: argparse.Namespace) -> TrainConfig:

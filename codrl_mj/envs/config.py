@@ -65,7 +65,8 @@ class EnvConfig:
     model.mass.BODY, model.length.BODY, model.gravity and model.damping.JOINT. In Python and in files a mapping of
     fields to distributions will do as well. What was drawn is in the reset's info, `randomization`."""
     options: Any = None
-    """The task's own options, a mapping (CartPole: `center_radius`); kept as the task's `NamedTuple`."""
+    """The task's own options, a mapping (CartPole: `center_radius`, `sutton_barto_reward`); kept as the task's
+    `NamedTuple`."""
 
     def __post_init__(self) -> None:
         """Validate, and turn what files and users write into what it stands for."""
@@ -219,12 +220,12 @@ def upgraded(configuration: Mapping[str, Any]) -> dict[str, Any]:
     return given
 
 
-def _options(task: Task, given: Mapping[str, float]) -> Any:
+def _options(task: Task, given: Mapping[str, Any]) -> Any:
     """The task's options, checked.
 
     Raises:
         UnknownOptionError: unknown option.
-        ValueError: one that is not a number > 0.
+        ValueError: one that is not a number > 0, or not True or False where its default is either.
     """
     known = task.options._fields
     for name, value in given.items():
@@ -233,12 +234,13 @@ def _options(task: Task, given: Mapping[str, float]) -> Any:
             raise UnknownOptionError(
                 f"unknown option {name!r} of {task.name}: it has {has} (unexpected keyword argument {name!r})"
             )
-        if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
-            raise ValueError(f"{name} = {value!r}: must be a number > 0")
-    return task.options(**{name: float(value) for name, value in given.items()})
+        flag = isinstance(task.options._field_defaults[name], bool)
+        if isinstance(value, bool) != flag or not isinstance(value, int | float) or not (flag or value > 0):
+            raise ValueError(f"{name} = {value!r}: must be {'True or False' if flag else 'a number > 0'}")
+    return task.options(**{name: value if isinstance(value, bool) else float(value) for name, value in given.items()})
 
 
-def _changed(options: Any) -> dict[str, float]:
+def _changed(options: Any) -> dict[str, Any]:
     """Those of a task's options that are not at their defaults."""
     return {name: value for name, value in options._asdict().items() if value != options._field_defaults[name]}
 

@@ -14,6 +14,7 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.setup import Setup
 from codrl_mj.envs.snapshots import check_snapshot
 from codrl_mj.envs.views import signals_of
+from codrl_mj.envs.window import Window
 from codrl_mj.physics import MujocoPhysics
 from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
 from codrl_mj.physics.streams import set_words, words_of
@@ -34,7 +35,10 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     desired. With several motors each is an array (n,).
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - as Gymnasium has it
+    metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium has it
+        "render_modes": ["human", "rgb_array"],
+        "render_fps": 50,
+    }
 
     def __init__(
         self,
@@ -54,22 +58,21 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
             task: the task's name, such as `cartpole`.
             actuator: what the force goes through, as `EnvConfig.actuator` says.
             physics: `mujoco`, `analytic` (Gymnasium's own equations), or one's own.
-            render_mode: None or `rgb_array`.
+            render_mode: None; `rgb_array`: `render` returns images; `human`: pygame shows every step in a window.
+                Others, of which `gymnasium.make` warns, are refused when they are rendered.
             width: width of rendered images [px].
             height: height of rendered images [px].
             camera: a camera of the model: `fixed` or `close`.
             pretty: shadows, reflections and multisampling.
             **arguments: the other fields of `codrl_mj.envs.config.EnvConfig`: `integrator`, `inner_steps`, `timestep`,
                 `allow_unstable`, `action`, `levels`, `observe_actuator`, `disturbances`, `joint`, `randomize`; and the
-                task's own options (CartPole: `center_radius`).
+                task's own options (CartPole: `center_radius`, `sutton_barto_reward`).
 
         Raises:
             ValueError: an argument is unknown or out of bounds, or the current loop is unstable; the message names it.
             CallbackInUseError: another library's MuJoCo callback is installed.
         """
         self.setup = Setup.build(EnvConfig.of(task, actuator, arguments))
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"render_mode = {render_mode!r}: must be None or 'rgb_array'")
         self.physics = self.setup.simulate(physics)
         self._actuator = self.setup.actuator
         self._randomization: dict[str, Any] = {}
@@ -77,6 +80,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         self.metadata = {**self.metadata, "render_fps": self.setup.task.render_fps}
         self._view = {"width": width, "height": height, "camera": camera, "pretty": pretty}
         self._renderer: OffscreenRenderer | None = None
+        self._window: Window | None = None
         self._drawn: Any = None
         if render_mode is not None:
             check_view(self._scene().scene[0], width, height, camera)
@@ -145,6 +149,8 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         self._actuator, info = self.setup.start(self.physics, self.np_random, options)
         self._randomization = info.get("randomization", {})
         seen = self.physics.observed(np.zeros_like(self.physics.trace[-1])) if self.setup.view.sensors else None
+        if self.render_mode == "human":
+            self.render()
         return self.setup.view.observation(self.physics.state, seen), info
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -168,6 +174,8 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         reward, terminated, fine = step(force, observation, *simulation)
         if not fine:
             self.physics.check_finite()  # type: ignore[attr-defined]
+        if self.render_mode == "human":
+            self.render()
         return observation, reward, terminated, False, self._info(force)
 
     def _step_apart(self, force: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -178,6 +186,8 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         info, after = self._info(force), physics.state
         seen = physics.observed(physics.trace[-1]) if view.sensors else None
         reward = view.reward(before, info["actual_force"], after)
+        if self.render_mode == "human":
+            self.render()
         return view.observation(after, seen), reward, view.terminated(after), False, info
 
     def _info(self, force: Any) -> dict[str, Any]:
@@ -232,20 +242,30 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         self.np_random = generator
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """The present state as an image, shape (height, width, 3), uint8; None if there is no render mode.
+        """The present state as an image, shape (height, width, 3), uint8; None in a window or without a render mode.
 
         Raises:
+            ValueError: unknown render mode.
+            DependencyNotInstalled: a window needs pygame.
             RenderingUnavailableError: no OpenGL context can be made here; the message has the remedy.
         """
         if self.render_mode is None:
             gymnasium.logger.warn("render() without a render mode: pass render_mode='rgb_array' when making it")
             return None
+        if self.render_mode not in self.metadata["render_modes"]:
+            raise ValueError(f"render_mode = {self.render_mode!r}: must be None, 'human' or 'rgb_array'")
         scene = self._scene()
         model, data = scene.scene
         if self._renderer is None:
             self._renderer = OffscreenRenderer(model, **self._view)  # type: ignore[arg-type]
         scene.show(self.physics.state)
-        return self._renderer.render(data)
+        image = self._renderer.render(data)
+        if self.render_mode == "rgb_array":
+            return image
+        if self._window is None:
+            self._window = Window(image.shape[1], image.shape[0])
+        self._window.show(image, self.metadata["render_fps"])
+        return None
 
     def _scene(self) -> Any:
         """What is drawn: the simulation itself, or the task's ideal model where the physics has none."""
@@ -256,11 +276,12 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         return self._drawn
 
     def close(self) -> None:
-        """Free the OpenGL context."""
-        if self._renderer is not None:
-            self._renderer.close()
-        self._renderer = self._drawn = None
+        """Free the OpenGL context, and close the window."""
+        for shown in (self._renderer, self._window):
+            if shown is not None:
+                shown.close()
+        self._renderer = self._window = self._drawn = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but the renderer and the compiled step, which a copy makes anew."""
-        return self.__dict__ | {"_renderer": None, "_drawn": None, "_compiled": None}
+        """Everything but the renderer, the window and the compiled step, which a copy makes anew."""
+        return self.__dict__ | {"_renderer": None, "_window": None, "_drawn": None, "_compiled": None}

@@ -37,7 +37,10 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
     `SAME_STEP` mode, `final_obs` and `final_info` hold what the episodes that ended saw last.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - as Gymnasium has it
+    metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium has it
+        "render_modes": ["rgb_array", "rgb_array_list"],
+        "render_fps": 50,
+    }
 
     def __init__(
         self,
@@ -67,7 +70,8 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
                 by the caller (`DISABLED`), with `reset(options={"reset_mask": ...})`.
             num_threads: threads of the engine; 0 uses every CPU. Results do not depend on it.
             physics: `mujoco`; the analytic physics steps one Gymnasium environment at a time and cannot be batched.
-            render_mode: None or `rgb_array`: `render` then draws every environment, `image` one of them.
+            render_mode: None or `rgb_array`: `render` then draws every environment, `image` one of them. So it does in
+                `rgb_array_list`, as Gymnasium's vector wrappers expect.
             width: width of rendered images [px].
             height: height of rendered images [px].
             camera: a camera of the model.

@@ -1,9 +1,9 @@
 """The physics that an environment can be built on, by name."""
 
-import difflib
 from collections.abc import Callable
 from typing import Any
 
+from codrl_mj.actuators.model import look_up
 from codrl_mj.physics.analytic import AnalyticPhysics
 from codrl_mj.physics.base import Physics
 from codrl_mj.physics.mujoco_single import MujocoPhysics
@@ -33,8 +33,4 @@ def find_physics(name: str) -> Callable[..., Physics]:
     Raises:
         ValueError: unknown name; the nearest known one is suggested.
     """
-    if name not in PHYSICS:
-        near = difflib.get_close_matches(str(name), PHYSICS, n=1)
-        hint = f"did you mean {near[0]!r}? It " if near else ""
-        raise ValueError(f"physics = {name!r}: {hint}must be one of {', '.join(PHYSICS)}")
-    return PHYSICS[name]
+    return look_up(name, PHYSICS, "physics", anybodys=False)

@@ -111,7 +111,7 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
     config = upgraded(config)
     env = config.get("env")
     env = env if isinstance(env, Mapping) else {}
-    progress = _last_report(path / PROGRESS, problems)
+    progress = last_report(path / PROGRESS, problems)
     result = _mapping(path / RESULT, "result of a run", problems)
     evaluation = _mapping(path / EVALUATION, "policy evaluation", problems)
     missing = [file for file in POLICY_FILES if not (path / file).is_file()]
@@ -160,8 +160,13 @@ def _mapping(path: Path, what: str, problems: list[str]) -> Mapping[str, Any] | 
     return content
 
 
-def _last_report(path: Path, problems: list[str]) -> Mapping[str, Any]:
-    """The last whole row of a training's progress; empty if there is none. A last row may be half written."""
+def last_report(path: Path, problems: list[str]) -> Mapping[str, Any]:
+    """The last whole row of a training's progress, as text; empty if there is none. A last row may be half written.
+
+    Args:
+        path: the table.
+        problems: gets what is wrong with it.
+    """
     try:
         with path.open(newline="") as file:
             rows = list(csv.DictReader(file))

@@ -4,48 +4,22 @@ A grid that was killed goes on where it was: what is finished is left alone, tra
 from their checkpoints.
 """
 
-import contextlib
 import dataclasses
 import hashlib
 import json
-import os
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.runs.files import read_json, write_json
+from codrl_mj.study.parallel import Workers, compute
 from codrl_mj.training import RunInUseError, TrainConfig, TrainingStoppedError, finished, load_config, train
 
-BACKENDS = ("local", "ray")
-"""Where cells are computed: in processes of this machine, or on a Ray cluster."""
 _FAILURES, _DEPLOYMENTS = "failures", "deployments"
 _PATIENCE = 120.0  # s to wait for a run folder that a dying process of a killed grid still holds
-
-
-@dataclasses.dataclass(frozen=True)
-class Workers:
-    """What computes the cells.
-
-    Raises:
-        ValueError: unknown backend, or an impossible number of jobs.
-    """
-
-    jobs: int = -1
-    """Cells at once, >= 1; -1 for one on each CPU (of the cluster)."""
-    backend: str = "local"
-    """`local`: processes of this machine; `ray`: a Ray cluster, whose machines all see the run folders."""
-    address: str | None = None
-    """Of the Ray cluster, such as `auto` or `ray://head:10001`; None starts Ray on this machine."""
-
-    def __post_init__(self) -> None:
-        """Validate."""
-        if self.backend not in BACKENDS:
-            raise ValueError(f"backend = {self.backend!r}: must be one of {', '.join(BACKENDS)}")
-        if isinstance(self.jobs, bool) or not isinstance(self.jobs, int) or (self.jobs < 1 and self.jobs != -1):
-            raise ValueError(f"jobs = {self.jobs!r}: must be an integer >= 1, or -1 for one on each CPU")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,7 +90,7 @@ def _note(cell: Path | Deployment, error: Exception | None, about: dict[str, Any
 def train_cells(
     cells: Mapping[str, TrainConfig],
     root: Path,
-    workers: Workers = Workers(),
+    workers: Workers = Workers(),  # noqa: B008 - frozen
     accept_changes: bool = False,
     on_cell: Callable[[str], None] | None = None,
 ) -> tuple[dict[str, Path], dict[str, Failure]]:
@@ -142,28 +116,56 @@ def train_cells(
     called: dict[Path, list[str]] = {}
     for name, folder in folders.items():
         called.setdefault(folder, []).append(name)
-    waiting = [folder for folder in called if not finished(folder)]
     report = on_cell or (lambda _: None)
-    for name, folder in folders.items():
-        if folder not in waiting:
-            report(name)
-    parent = os.getpid() if workers.backend == "local" else None
-    work = [(cells[called[folder][0]], folder, accept_changes, parent) for folder in waiting]
-    failures: dict[Path, Failure] = {}
-    for folder, failure in _compute(_train_cell, work, workers):
-        if failure is not None:
-            failures[folder] = failure
+
+    def ended(folder: Path) -> None:
         for name in called[folder]:
             report(name)
+
+    runs = {folder: cells[names[0]] for folder, names in called.items()}
+    failures = train_runs(runs, workers, ended, accept_changes=accept_changes, tensorboard=False)
     return (
         {name: folder for name, folder in folders.items() if folder not in failures},
         {name: failures[folder] for name, folder in folders.items() if folder in failures},
     )
 
 
+def train_runs(
+    runs: Mapping[Path, TrainConfig],
+    workers: Workers = Workers(),  # noqa: B008 - frozen
+    on_run: Callable[[Path], None] = lambda _: None,
+    **options: Any,
+) -> dict[Path, Failure]:
+    """Train every run that is not finished; one that fails does not stop the others.
+
+    Args:
+        runs: configurations by their run folders.
+        workers: what computes them.
+        on_run: called with a folder when it is finished or has failed; those finished before come first.
+        **options: `accept_changes` and `tensorboard`, as for `codrl_mj.training.train`.
+
+    Returns:
+        The failures. A failure's record stays in `failures` beside the run folder until the run is finished.
+
+    Raises:
+        ValueError: Ray is asked for and not installed.
+        TrainingStoppedError: a signal asked to stop.
+    """
+    waiting = [folder for folder in runs if not finished(folder)]
+    for folder in runs:
+        if folder not in waiting:
+            on_run(folder)
+    failures = {}
+    for folder, failure in compute(_train_run, [(runs[folder], folder, options) for folder in waiting], workers):
+        if failure is not None:
+            failures[folder] = failure
+        on_run(folder)
+    return failures
+
+
 def deploy_cells(
     deployments: Mapping[str, Deployment],
-    workers: Workers = Workers(),
+    workers: Workers = Workers(),  # noqa: B008 - frozen
     on_cell: Callable[[str], None] | None = None,
 ) -> tuple[dict[str, dict[str, Any]], dict[str, Failure]]:
     """Evaluate policies; what was evaluated before is not evaluated again, and one that fails does not stop the others.
@@ -186,7 +188,7 @@ def deploy_cells(
         if name not in waiting:
             report(name)
     failures = {}
-    for name, failure in _compute(_deploy_cell, list(waiting.items()), workers):
+    for name, failure in compute(_deploy_cell, list(waiting.items()), workers):
         if failure is not None:
             failures[name] = failure
         report(name)
@@ -197,25 +199,17 @@ def deploy_cells(
     }, failures
 
 
-def _train_cell(
-    config: TrainConfig, folder: Path, accept_changes: bool, parent: int | None
-) -> tuple[Path, Failure | None]:
-    """Train one cell: its folder, and what went wrong, of which a record is kept."""
-    error = _try_to_train(config, folder, accept_changes, parent)
-    return folder, _note(folder, error, {"train": config.as_mapping()})
+def _train_run(config: TrainConfig, folder: Path, options: Mapping[str, Any]) -> tuple[Path, Failure | None]:
+    """Train one run: its folder, and what went wrong, of which a record is kept."""
+    return folder, _note(folder, _try_to_train(config, folder, options), {"train": config.as_mapping()})
 
 
-def _try_to_train(config: TrainConfig, folder: Path, accept_changes: bool, parent: int | None) -> Exception | None:
+def _try_to_train(config: TrainConfig, folder: Path, options: Mapping[str, Any]) -> Exception | None:
     """Train, waiting for a folder that somebody else holds; what went wrong."""
-
-    def stop_if_orphaned(_: Any) -> None:
-        if parent is not None and os.getppid() != parent and os.getpid() != parent:
-            os._exit(1)  # the grid was killed: another one may want to go on
-
     start = time.monotonic()
     while True:
         try:
-            train(config, folder, stop_if_orphaned, resume=True, accept_changes=accept_changes, tensorboard=False)
+            train(config, folder, resume=True, **options)
             return None
         except TrainingStoppedError:
             raise
@@ -248,46 +242,6 @@ def _deploy(deployment: Deployment) -> None:
         deployment.seed,
     )
     write_json(deployment.record, result.as_mapping())
-
-
-def _compute(function: Callable[..., Any], work: Iterable[tuple[Any, ...]], workers: Workers) -> Iterator[Any]:
-    """Results of calls, as they come."""
-    calls = list(work)
-    if not calls:
-        return
-    import joblib
-
-    with _backend(workers) as backend:
-        # joblib hands results of Ray over when all are there
-        order = "list" if backend == "ray" else "generator_unordered"
-        parallel = joblib.Parallel(n_jobs=workers.jobs, backend=backend, batch_size=1, return_as=order)
-        yield from parallel(joblib.delayed(function)(*call) for call in calls)
-
-
-@contextlib.contextmanager
-def _backend(workers: Workers) -> Iterator[str]:
-    """The name in joblib of the backend, which is up while the block runs.
-
-    Raises:
-        ValueError: Ray is asked for and not installed.
-    """
-    if workers.backend == "local":
-        yield "loky"
-        return
-    try:
-        import ray
-        from ray.util.joblib import register_ray
-    except ModuleNotFoundError:
-        raise ValueError("backend = 'ray': Ray is not installed: pip install 'codrl-mj[ray]'") from None
-    ours = not ray.is_initialized()
-    if ours:
-        ray.init(address=workers.address, log_to_driver=False)
-    register_ray()
-    try:
-        yield "ray"
-    finally:
-        if ours:
-            ray.shutdown()
 
 
 def _digest(content: Any) -> str:

@@ -13,7 +13,8 @@ from codrl_mj.runs.files import read_json
 from codrl_mj.study.arrivals import Arrivals, ends_at_goal, read_arrivals
 from codrl_mj.study.conditions import check_condition
 from codrl_mj.study.experiments import EXPERIMENTS
-from codrl_mj.study.grid import Deployment, Workers, cell_folder, deploy_cells, read_failure, train_cells
+from codrl_mj.study.grid import Deployment, cell_folder, deploy_cells, read_failure, train_cells
+from codrl_mj.study.parallel import Workers
 from codrl_mj.study.plan import AGENTS, Plan, Trial
 from codrl_mj.training import EVALUATION_SEED, TrainConfig, finished
 
@@ -166,7 +167,7 @@ def compute(
         config: what to compute.
         workers: what computes it.
         accept_changes: continue begun trainings even if code or packages have changed since.
-        on_cell: called with (`training` or `testing`, name) when one is finished or has failed.
+        on_cell: called with (`training` or `test`, name) when one is finished or has failed.
 
     Raises:
         ValueError: Ray is asked for and not installed.
@@ -179,7 +180,7 @@ def compute(
         for seed, deployment in by_seed.items()
         if finished(deployment.run)
     }
-    deploy_cells(waiting, workers, lambda name: report("testing", name))
+    deploy_cells(waiting, workers, lambda name: report("test", name))
 
 
 def collect(config: MismatchConfig) -> Results:

@@ -13,7 +13,7 @@ from codrl_mj.tasks.trials import Trials
 from codrl_mj.tasks.twin import Twin
 
 Options = Any
-"""A task's options: a `NamedTuple` of floats whose fields have defaults."""
+"""A task's options: a `NamedTuple` of floats and flags whose fields have defaults."""
 Entries = Any
 """A sequence of numbers, or of arrays with one number for each of N states."""
 

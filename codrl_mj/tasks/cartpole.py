@@ -25,7 +25,8 @@ The bounds are twice those at which an episode ends. The observation is the stat
 ## Reward
 
 1 a step, the last one included. With `center_radius` a step that ends farther than that from the centre of the track
-earns 0, and the episode goes on.
+earns 0, and the episode goes on. With `sutton_barto_reward` the step that ends the episode earns -1, and with
+`center_radius` so does one that ends farther out; all others earn 0.
 
 ## Start
 
@@ -41,9 +42,9 @@ An episode succeeds if it lasts until the time limit.
 
 ## Arguments
 
-Those of `codrl_mj.envs.ActuatedEnv`, and one of its own: `center_radius` [m], > 0, no limit by default; the paper
-trains with 0.1. (Gymnasium's `sutton_barto_reward` is not offered.) One integration step an environment step, with and
-without a motor (the paper's choice). Two integrators: `euler` (explicit, Gymnasium's default) and `semi-implicit`.
+Those of `codrl_mj.envs.ActuatedEnv`, and two of its own: `center_radius` [m], > 0, no limit by default; the paper
+trains with 0.1; and Gymnasium's `sutton_barto_reward`, False by default. One integration step an environment step, with
+and without a motor (the paper's choice). Two integrators: `euler` (explicit, Gymnasium's default) and `semi-implicit`.
 """
 
 import math
@@ -71,6 +72,8 @@ class Options(NamedTuple):
 
     center_radius: float = np.inf
     """Distance from the centre [m] beyond which a step earns nothing; the paper uses 0.1."""
+    sutton_barto_reward: bool = False
+    """Gymnasium's option: -1 for the step that ends the episode and 0 for all others, instead of 1 for every step."""
 
 
 def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
@@ -95,8 +98,11 @@ def terminated(state: Entries) -> Any:
 
 
 def reward(state: Entries, force: Any, next_state: Entries, options: Options) -> Any:
-    """1 a step, the last one included; 0 outside `center_radius`."""
-    return 1.0 * (np.abs(next_state[0]) <= options.center_radius)
+    """1 a step, 0 outside `center_radius`; or Sutton and Barto's 0, and -1 outside it or at the end."""
+    outside = np.abs(next_state[0]) > options.center_radius
+    if options.sutton_barto_reward:
+        return 0.0 - (terminated(next_state) | outside)
+    return 1.0 - outside
 
 
 _HIGH = np.array([X_LIMIT * 2, np.inf, ANGLE_LIMIT * 2, np.inf], dtype=np.float32)
@@ -140,6 +146,7 @@ TASK = Task(
     observation=observation,
     reward=reward,
     terminated=terminated,
+    helpers=(terminated,),
     # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
     paper=(Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=4.3, ki=1.0, kd=1e-6, kff=0.6)),),
     attributes={

@@ -1,12 +1,11 @@
 """The tasks that are known, ours and anybody's, and their registration with Gymnasium."""
 
-import difflib
 import sys
 
 from gymnasium.envs.registration import register as register_with_gymnasium
 from gymnasium.envs.registration import registry
 
-from codrl_mj.actuators.model import load_object
+from codrl_mj.actuators.model import look_up
 from codrl_mj.tasks.base import Task
 
 TASKS: dict[str, Task] = {}
@@ -66,12 +65,5 @@ def find_task(name: str) -> Task:
     Raises:
         ValueError: unknown name; the nearest known one is suggested.
     """
-    if name in TASKS:
-        return TASKS[name]
-    if ":" in str(name):
-        return register(load_object(name))
-    near = difflib.get_close_matches(str(name), TASKS, n=1)
-    hint = f"did you mean {near[0]!r}? " if near else ""
-    raise ValueError(
-        f"unknown task {name!r}: {hint}Known tasks: {', '.join(TASKS)}; of your own: module:NAME, as my_module:TASK"
-    )
+    task: Task = look_up(name, TASKS, "task")
+    return task if name in TASKS else register(task)

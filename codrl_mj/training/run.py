@@ -90,7 +90,7 @@ def train(
     torch.set_num_threads(1)  # networks this small run several times slower on two
     with contextlib.closing(_make_envs(config)) as envs:
         model = config.agent.make_model(envs, config.seed)
-        with folder.owned(out), _stopping() as stop, _reporting_to(wandb, out, config):
+        with folder.owned(out), stopping(signal.SIGINT, signal.SIGTERM) as stop, _reporting_to(wandb, out, config):
             if (out / folder.CONFIG).exists() != exists or finished(out):
                 raise RunInUseError(f"{out}: another process trained in it in the meantime; start again")
             folder.remove_leftovers(out)
@@ -153,8 +153,8 @@ def _saying_how_to_continue(out: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _stopping() -> Iterator[Stop]:
-    """Turn the first SIGINT or SIGTERM within the block into a wish; a second SIGINT raises KeyboardInterrupt."""
+def stopping(*signals: int) -> Iterator[Stop]:
+    """Turn the first of some signals within the block into a wish; a second SIGINT raises KeyboardInterrupt."""
     stop = Stop()
     if threading.current_thread() is not threading.main_thread():
         yield stop  # only the main thread may handle signals
@@ -165,7 +165,7 @@ def _stopping() -> Iterator[Stop]:
             raise KeyboardInterrupt
         stop.signal = number
 
-    before = {number: signal.signal(number, wish) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, wish) for number in signals}
     try:
         yield stop
     finally:

@@ -153,9 +153,9 @@ def test_settings_survive_json(agent, task, settings):
 def test_an_unknown_setting_or_agent_is_named():
     with pytest.raises(ValueError, match=r"^agent\.momentum: dqn has no such setting; it has .*learning_rate"):
         agent_from_mapping({"name": "dqn", "momentum": 1})
-    with pytest.raises(ValueError, match=r"^agent = 'reinforce': must be one of ppo, ddpg, dqn"):
+    with pytest.raises(ValueError, match=r"^unknown agent 'reinforce': Known: ppo, ddpg, dqn"):
         find_agent("reinforce")
-    with pytest.raises(ValueError, match=r"^agent = 'None'"):
+    with pytest.raises(ValueError, match=r"^unknown agent 'None'"):
         agent_from_mapping({"gamma": 0.9})
 
 

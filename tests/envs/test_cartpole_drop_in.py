@@ -4,6 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+from codrl_mj import make_sb3_vec_env, suite
 from codrl_mj.physics.registry import PHYSICS
 
 SEEDS = range(20)
@@ -55,6 +56,40 @@ def test_an_episode_is_truncated_after_five_hundred_steps():
             assert not terminated
             assert truncated == (step == 500)
         assert total == 500.0
+
+
+@pytest.mark.parametrize("physics", PHYSICS)
+def test_sutton_and_bartos_reward_is_gymnasiums(physics):
+    theirs = gymnasium.make("CartPole-v1", sutton_barto_reward=True)
+    ours = gymnasium.make("codrl_mj/CartPole-v0", actuator="ideal", physics=physics, sutton_barto_reward=True)
+    for env in (ours, theirs):
+        env.reset(seed=5)
+    count, terminated, _ = _compare((ours, theirs), [1] * 500)  # rewards included
+    assert terminated
+    assert count > 5
+
+
+def test_sutton_and_bartos_reward_is_the_same_in_every_face():
+    arguments = {"actuator": "ideal", "sutton_barto_reward": True}
+    many = make_sb3_vec_env("codrl_mj/CartPole-v0", 3, **arguments)
+    many.seed(0)
+    many.reset()
+    rewards, ended = np.array([many.step(np.ones(3, dtype=int))[1:3] for _ in range(40)]).swapaxes(0, 1)
+    np.testing.assert_array_equal(rewards, -ended)
+    assert ended.any(axis=0).all()
+    theirs = suite.load("cartpole", **arguments)
+    theirs.reset()
+    steps = [theirs.step(1)]
+    while not steps[-1].last():
+        steps.append(theirs.step(1))
+    assert [step.reward for step in steps] == [0.0] * (len(steps) - 1) + [-1.0]
+
+
+def test_a_step_outside_the_radius_counts_as_a_failure():
+    env = gymnasium.make("codrl_mj/CartPole-v0", actuator="ideal", sutton_barto_reward=True, center_radius=0.1)
+    env.reset(seed=0)
+    env.unwrapped.state = [0.0, 2.0, 0.0, 0.0]  # 0.04 m a step
+    assert [env.step(step % 2)[1] for step in range(4)] == [0.0, 0.0, -1.0, -1.0]
 
 
 @pytest.mark.parametrize("options", [{"low": -0.2, "high": 0.2}, {"low": 0.01, "high": 0.02}, {"high": 0.1}, None])

@@ -407,6 +407,29 @@ def test_a_winding_too_fast_for_its_supply_is_rejected():
         assert drawn["rejected"].any() == (ohms > 0)
 
 
+@pytest.mark.parametrize("supply", [None, Supply()])
+def test_a_supply_is_drawn_over_that_of_the_controller(supply):
+    """No supply is one without resistance at `max_voltage`: a supply's voltage limits the terminal's as that does."""
+    nominal = dataclasses.replace(named_actuator("paper", "cartpole"), supply=supply)
+    drawn = ActuatedEnv(
+        "cartpole", nominal, randomize={"supply.voltage": Choice([0.5]), "supply.resistance": Choice([0.0])}
+    )
+    limited = dataclasses.replace(nominal, controller=dataclasses.replace(nominal.controller, max_voltage=0.5))
+    fixed = ActuatedEnv("cartpole", limited)
+    for env in (drawn, fixed):
+        env.reset(seed=1)
+    drawn.state = fixed.state
+    assert drawn.actuator.supply == Supply(0.5, 0.0)
+    for action in (1, 1, 0, 1, 0, 0):
+        found, expected = drawn.step(action), fixed.step(action)
+        np.testing.assert_array_equal(found[0], expected[0])
+        assert found[4] == expected[4]
+        assert abs(found[4]["voltage"]) <= 0.5
+    sagging = ActuatedEnv("cartpole", nominal, randomize={"supply.resistance": Uniform(1.0, 2.0)})
+    sagging.reset(seed=1)
+    assert math.isinf(sagging.actuator.supply.voltage)
+
+
 def test_unstable_draws_are_kept_on_request():
     nominal, randomize = _proportional()
     env = batched("cartpole", 200, actuator=nominal, randomize=randomize, allow_unstable=True)

@@ -8,7 +8,9 @@ import warnings
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.error import DependencyNotInstalled
 
+from codrl_mj.envs.window import Window
 from codrl_mj.physics.registry import PHYSICS
 from codrl_mj.tasks import TASKS
 
@@ -125,6 +127,58 @@ def test_cameras_and_prettiness_make_different_images(make):
         images.append(env.render())
     assert np.any(images[0] != images[1])
     assert np.any(images[0] != images[2])
+
+
+@pytest.mark.parametrize("physics", PHYSICS)
+def test_every_step_of_the_human_mode_is_shown_in_a_window(monkeypatch, physics):
+    shown = []
+
+    class Screen:
+        def __init__(self, width, height):
+            shown.append((width, height))
+
+        def show(self, image, rate):
+            shown.append((image, rate))
+
+        def close(self):
+            shown.append("closed")
+
+    monkeypatch.setattr("codrl_mj.envs.single.Window", Screen)
+    view = {"width": 64, "height": 48, "physics": physics, "disable_env_checker": True}
+    ours, pictures = (
+        gymnasium.make("codrl_mj/Pendulum-v0", render_mode=mode, **view) for mode in ("human", "rgb_array")
+    )
+    assert "HumanRendering" not in str(ours)
+    expected = []
+    for env in (ours, pictures):
+        env.reset(seed=0)
+        for step in range(4):
+            if env is pictures:
+                expected.append(env.render())
+            if step < 3:
+                env.step(np.array([2.0], np.float32))
+    ours.close()
+    assert (shown[0], shown[-1]) == ((64, 48), "closed")
+    for (image, rate), picture in zip(shown[1:-1], expected, strict=True):
+        np.testing.assert_array_equal(image, picture)
+        assert rate == 30
+
+
+def test_a_window_shows_an_image(monkeypatch):
+    pygame = pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    window = Window(3, 2)
+    image = np.arange(18, dtype=np.uint8).reshape(2, 3, 3)
+    window.show(image, 1000.0)
+    np.testing.assert_array_equal(pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1), image)
+    window.close()
+    assert not pygame.display.get_init()
+
+
+def test_a_window_says_what_it_needs(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(DependencyNotInstalled, match="pip install pygame-ce"):
+        Window(3, 2)
 
 
 def test_without_a_render_mode_there_is_a_warning_and_no_image(make):

@@ -202,7 +202,7 @@ def test_a_pickled_one_continues():
         ({"env_id": "Pendulum-v1"}, "env_id = 'Pendulum-v1': must be one of codrl_mj/Pendulum-v0"),
         ({"env_id": "codrl_mj/Pendulum-v0", "num_envs": 0}, "num_envs = 0"),
         ({"env_id": "codrl_mj/Pendulum-v0", "num_envs": 0, "physics": "analytic"}, "num_envs = 0"),
-        ({"env_id": "codrl_mj/Pendulum-v0", "physics": "newton"}, "physics = 'newton'"),
+        ({"env_id": "codrl_mj/Pendulum-v0", "physics": "newton"}, "unknown physics 'newton'"),
     ],
 )
 def test_bad_arguments_are_refused(arguments, message):

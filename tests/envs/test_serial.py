@@ -110,7 +110,7 @@ def test_rendering_shows_the_first_environment():
         ({"num_envs": 0}, "num_envs = 0: must be an integer >= 1"),
         ({"num_envs": 2.0}, "num_envs = 2.0: must be an integer >= 1"),
         ({"max_episode_steps": 0}, "max_episode_steps = 0: must be an integer >= 1"),
-        ({"physics": "newton"}, "physics = 'newton'"),
+        ({"physics": "newton"}, "unknown physics 'newton'"),
         ({"actuator": [named_actuator("weak", "pendulum")] * 3}, "actuator: 3 actuators for 2 environments"),
         ({"center_radius": 1.0}, "unknown option 'center_radius' of pendulum"),
     ],

@@ -173,11 +173,12 @@ def test_spaces_spec_and_metadata_are_those_of_gymnasiums_loop(task):
         assert getattr(ours, name) == getattr(theirs, name), name
     assert ours.spec.id == theirs.spec.id == TASKS[task].env_id
     assert ours.spec.kwargs["vectorization_mode"] == "vector_entry_point"
-    assert ours.metadata == theirs.metadata
+    modes = ["rgb_array", "rgb_array_list"]  # no window: Gymnasium's wrapper has one for many
+    assert ours.metadata == theirs.metadata | {"render_modes": modes}
     assert ours.unwrapped.max_episode_steps == TASKS[task].max_episode_steps
     assert gymnasium.make_vec(ours.spec).num_envs == 3
     assert gymnasium.make_vec(TASKS[task].env_id, 2).unwrapped.num_envs == 2  # the default mode is ours
-    assert ActuatedVectorEnv.metadata["render_modes"] == ["rgb_array"]
+    assert ActuatedVectorEnv.metadata["render_modes"] == modes
 
 
 @every_mode
@@ -345,6 +346,14 @@ def test_rendering_shows_every_environment_and_leaves_the_episode_alone():
     assert env.image().dtype == np.uint8
     for one in (env, twin, *singles):
         one.close()
+
+
+def test_a_list_of_images_is_one_of_each_environment():
+    view = {"width": 64, "height": 48}
+    lists, images = (batched("cartpole", 2, render_mode=mode, **view) for mode in ("rgb_array_list", "rgb_array"))
+    for env in (lists, images):
+        env.reset(seed=0)
+    np.testing.assert_array_equal(lists.render(), images.render())
 
 
 def test_without_a_render_mode_there_is_a_warning_and_no_image():

@@ -15,7 +15,8 @@ from codrl_mj.agents import PPOConfig
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import evaluate
 from codrl_mj.runs.policies import load_policy
-from codrl_mj.study.grid import Deployment, Workers, cell_folder, deploy_cells, read_failure, train_cells
+from codrl_mj.study.grid import Deployment, cell_folder, deploy_cells, read_failure, train_cells
+from codrl_mj.study.parallel import Workers, compute
 from codrl_mj.training import TrainConfig, finished, load_config
 
 PPO = PPOConfig(rollout_steps=256, batch_size=64, epochs=1, hidden=(8,))
@@ -126,6 +127,44 @@ train_cells(CELLS, Path(sys.argv[1]), Workers(jobs=2))
     assert failures == {}
     for name in CELLS:
         assert weights(resumed[name]) == weights(runs[name])
+
+
+def test_a_ctrl_c_lets_trainings_write_their_checkpoints(tmp_path):
+    """As a terminal does it: to the grid and all its processes. One of them has nothing to do, a cell is not begun."""
+    code = """
+import dataclasses, sys
+from pathlib import Path
+from codrl_mj.study.grid import train_runs
+from codrl_mj.training import TrainingStoppedError
+from tests.study.test_grid import TINY, Workers
+long = dataclasses.replace(TINY, total_steps=10**7, checkpoint_interval=10**6)
+root = Path(sys.argv[1])
+runs = {root / str(seed): dataclasses.replace(long, seed=seed) for seed in range(int(sys.argv[2]))}
+try:
+    train_runs(runs | {root / "short": TINY}, Workers(jobs=2))
+except TrainingStoppedError as stopped:
+    print(stopped)
+    sys.exit(128 + stopped.signal_number)
+"""
+    for count in (1, 3):
+        root = tmp_path / str(count)
+        line = [sys.executable, "-c", code, str(root), str(count)]
+        with subprocess.Popen(line, start_new_session=True, stdout=subprocess.PIPE, text=True) as grid:
+            expected = ["0/progress.csv", "short/result.json" if count == 1 else "1/progress.csv"]
+            while not all((root / file).exists() for file in expected):
+                assert grid.poll() is None
+                time.sleep(0.05)
+            os.killpg(grid.pid, signal.SIGINT)
+            text, _ = grid.communicate(timeout=60)
+        assert (grid.returncode, text) == (130, "stopped: the same command goes on from the last checkpoints\n")
+        for run in ("0", "1")[:count]:
+            assert list((root / run / "checkpoints").iterdir())
+        assert not (root / "2").exists()
+
+
+def test_what_a_call_raises_is_raised():
+    with pytest.raises(ZeroDivisionError):
+        list(compute(divmod, [(1, 1), (1, 0)], Workers(jobs=2)))
 
 
 def test_deployments_are_evaluations_that_are_made_once(computed):

@@ -13,9 +13,10 @@ from scipy.stats import mannwhitneyu, trim_mean
 from codrl_mj.cli import main
 from codrl_mj.study.arrivals import ends_at_goal
 from codrl_mj.study.cost import costs, seeds_finished
-from codrl_mj.study.grid import Workers, cell_folder
+from codrl_mj.study.grid import cell_folder
 from codrl_mj.study.mismatch import MismatchConfig, cells, collect, compute, deployments, trials
 from codrl_mj.study.page import write
+from codrl_mj.study.parallel import Workers
 from codrl_mj.study.summaries import LEAST_RUNS, judge, summarize
 from codrl_mj.tasks import TASKS
 from codrl_mj.training import finished, load_config
@@ -59,7 +60,7 @@ def real(tmp_path_factory):
 
 def test_a_study_trains_every_cell_and_tests_it_on_every_actuator(real):
     config, _, seen = real
-    assert [kind for kind, _ in seen] == ["training"] * 4 + ["testing"] * 8
+    assert [kind for kind, _ in seen] == ["training"] * 4 + ["test"] * 8
     results = collect(config)
     assert (results.runs, results.untrained, results.untested, dict(results.failures)) == (4, (), (), {})
     for run in (cell_folder(config.root, cell) for cell in cells(config).values()):

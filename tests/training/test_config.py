@@ -174,7 +174,7 @@ def test_a_runs_configuration_is_a_configuration_file(tmp_path):
         ("task: cartpole\nactuator: {name: weaker, controller: {kq: 1}}", "unknown actuator field controller.kq"),
         ("task: cartpole\nactuator: {name: ideal, controller: {kp: 1}}", "ideal actuator has no motor"),
         ("task: cartpole\nagent: {gamma: 0.9}", "must be an agent's name"),
-        ("task: cartpole\nagent: pppo", "agent = 'pppo': must be one of ppo"),
+        ("task: cartpole\nagent: pppo", "unknown agent 'pppo': did you mean 'ppo'"),
         ("task: cartpole\nagent: {name: ppo, gamma: 1.5}", "PPOConfig.gamma = 1.5"),
         ("task: cartpole\nsettings: printed", "settings = 'printed'"),
         ("task: cartpole\nenv: 5", "env = 5: must be a mapping"),

@@ -240,7 +240,7 @@ def test_an_existing_folder_is_refused_and_untouched(tmp_path, holds):
         ({"agent": dataclasses.replace(TINY_PPO, batch_size=96)}, "multiple of batch_size = 96"),
         ({"env": within(integrator="rk4").env}, "integrator = 'rk4'"),
         ({"env": within(inner_steps=0).env}, "inner_steps = 0"),
-        ({"env": within(physics="newton").env}, "physics = 'newton'"),
+        ({"env": within(physics="newton").env}, "unknown physics 'newton'"),
     ],
 )
 def test_what_cannot_be_trained_is_refused_with_nothing_written(tmp_path, changes, message):

@@ -2,7 +2,6 @@
 
 import dataclasses
 import difflib
-import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -10,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from codrl_mj.runs.files import read_json
-from codrl_mj.study.grid import Deployment, Workers, cell_folder, deploy_cells, read_failure, train_cells
+from codrl_mj.study.grid import Deployment, cell_folder, deploy_cells, read_failure, train_cells
+from codrl_mj.study.parallel import Workers
 from codrl_mj.study.reproduction.arms import TASKS, Arm, arms_of
 from codrl_mj.study.reproduction.claims import Claim, Evidence, claims_of
 from codrl_mj.study.reproduction.series import Series, Trained, read_trained
@@ -205,8 +205,3 @@ def costs(plan: Reproduction) -> list[Cost]:
         seconds = float(np.mean(list(took.values()))) if took else arm.seconds
         found.append(Cost(arm, tuple(took), missing, seconds))
     return found
-
-
-def cores(jobs: int) -> int:
-    """Processors that so many jobs use on this machine; -1 jobs use all."""
-    return (os.cpu_count() or 1) if jobs == -1 else jobs

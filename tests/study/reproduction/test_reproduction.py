@@ -16,7 +16,7 @@ from codrl_mj.evaluation import evaluate
 from codrl_mj.evaluation.episodes import Episode
 from codrl_mj.physics import trace_names
 from codrl_mj.runs.policies import load_policy
-from codrl_mj.study.grid import Workers
+from codrl_mj.study.parallel import Workers
 from codrl_mj.study.reproduction import figures, tables
 from codrl_mj.study.reproduction.arms import ARMS, TASKS
 from codrl_mj.study.reproduction.claims import CLAIMS
