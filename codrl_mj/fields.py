@@ -59,8 +59,9 @@ def flag(default: bool) -> Any:
 
 
 def choice(default: str, *options: str) -> Any:
-    """A field for one of some words."""
-    return _bounded(default, lambda value: value in options, f"one of {', '.join(options)}")
+    """A field for one of some words; where it has to be a number, its place among them."""
+    made = _bounded(default, lambda value: value in options, f"one of {', '.join(options)}")
+    return dataclasses.field(default=default, metadata={**made.metadata, "options": options})
 
 
 def units(default: tuple[int, ...]) -> Any:

@@ -1,6 +1,7 @@
 """Actuators as mathematics: what one is, the families of them, stability, names. No MuJoCo."""
 
 from codrl_mj.actuators.current_loop import Actuator, CurrentLoop, Motor, Supply, electrical_step
+from codrl_mj.actuators.drive import Drive, GearMotor, SampledLoop
 from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.lag import Lag
 from codrl_mj.actuators.model import (
@@ -39,13 +40,16 @@ __all__ = [
     "ActuatorModel",
     "Command",
     "CurrentLoop",
+    "Drive",
     "Family",
+    "GearMotor",
     "Ideal",
     "Inputs",
     "JointAdditions",
     "Lag",
     "Motor",
     "Nothing",
+    "SampledLoop",
     "Supply",
     "TorqueSpeed",
     "actuator_from_mapping",

@@ -251,17 +251,22 @@ def _family(actuator: Any) -> Any:
 
 
 def _get(owner: Any, path: str) -> Any:
-    """What stands at a dotted path; in a part that is None, what stands for it."""
+    """What stands at a dotted path, a word as its number; in a part that is None, what stands for it."""
     for name in path.split("."):
-        absent = next((f.metadata.get("absent") for f in dataclasses.fields(owner) if f.name == name), None)
+        metadata: Mapping[str, Any] = next((f.metadata for f in dataclasses.fields(owner) if f.name == name), {})
         value = getattr(owner, name)
-        owner = absent if value is None else value
+        if "options" in metadata:
+            return metadata["options"].index(value)
+        owner = metadata.get("absent") if value is None else value
     return owner
 
 
 def _of_kind(cls: type, name: str, value: Any) -> Any:
-    """A number as the field's own type: whole numbers and flags come as floats from arrays."""
-    default = next(field.default for field in dataclasses.fields(cls) if field.name == name)
+    """A number as the field's own type: whole numbers, flags and words come as floats from arrays."""
+    field = next(field for field in dataclasses.fields(cls) if field.name == name)
+    default, options = field.default, field.metadata.get("options", ())
+    if options and not isinstance(value, str) and value in range(len(options)):
+        return options[int(value)]
     if isinstance(default, bool) and value in (0.0, 1.0):
         return bool(value)
     if isinstance(default, int) and isinstance(value, float) and value.is_integer():

@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from codrl_mj.actuators.current_loop import Actuator, CurrentLoop
+from codrl_mj.actuators.drive import Drive
 from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.lag import Lag
 from codrl_mj.actuators.model import ActuatorModel, Family, look_up
 from codrl_mj.actuators.torque_speed import TorqueSpeed
 
-FAMILIES: dict[str, Family] = {kind.family: kind for kind in (Actuator, Ideal, Lag, TorqueSpeed)}
+FAMILIES: dict[str, Family] = {kind.family: kind for kind in (Actuator, Drive, Ideal, Lag, TorqueSpeed)}
 """Our families by name; anybody else's is found as `module:Class`."""
 
 

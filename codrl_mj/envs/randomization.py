@@ -238,4 +238,10 @@ def _check(name: str, distribution: Distribution, actuator: ActuatorModel, comma
     elif any(isinstance(value, bool) for value in distribution.extremes):
         raise ValueError(f"{name} must be a number")
     for value in distribution.extremes:
-        actuator.replaced({name: value})  # the field's own bounds
+        drawn = actuator.replaced({name: value})  # the field's own bounds
+        arm = actuator.arm_radius if name.rpartition(".")[2] != "arm_radius" else drawn.arm_radius
+        if (drawn.additions, drawn.arm_radius) != (actuator.additions, arm):
+            raise ValueError(
+                f"{name} = {value:g}: changes what the actuator adds to its joint, or its gear, and these are built "
+                "into the model; draw other fields, or make environments with different actuators"
+            )

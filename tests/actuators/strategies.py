@@ -4,7 +4,18 @@ import dataclasses
 
 from hypothesis import strategies as st
 
-from codrl_mj.actuators import IDEAL, Actuator, CurrentLoop, Lag, Motor, Supply, TorqueSpeed
+from codrl_mj.actuators import (
+    IDEAL,
+    Actuator,
+    CurrentLoop,
+    Drive,
+    GearMotor,
+    Lag,
+    Motor,
+    SampledLoop,
+    Supply,
+    TorqueSpeed,
+)
 
 
 def between(low, high):
@@ -56,8 +67,34 @@ every_actuator = st.builds(
     zero_or(1e-3, 5),
 )
 """Current loops with everything that they can have."""
+gear_motors = st.builds(
+    GearMotor,
+    resistance=between(0.01, 20),
+    inductance=between(1e-5, 1e-2),
+    torque_constant=between(1e-3, 2),
+    back_emf_constant=zero_or(1e-3, 2),
+    rotor_inertia=zero_or(1e-8, 1e-2),
+    gear_ratio=between(0.5, 200),
+    coulomb_friction=zero_or(1e-5, 0.1),
+    viscous_friction=zero_or(1e-7, 1e-3),
+    arm_radius=between(0.01, 3),
+)
+sampled_loops = st.builds(
+    SampledLoop,
+    sample_rate=st.sampled_from([1e3, 1e4, 2e4, 4e4]),
+    bandwidth=zero_or(1.0, 150.0),
+    kp=zero_or(1e-3, 0.5),
+    ki=zero_or(1e-3, 50),
+    anti_windup=st.sampled_from(["back_calculation", "clamping", "none"]),
+    delayed=st.booleans(),
+    bemf_compensation=st.booleans(),
+    max_current=between(0.1, 100) | st.just(float("inf")),
+)
+drives = st.builds(Drive, gear_motors, sampled_loops, st.none() | st.builds(Supply, between(1, 60), zero_or(1e-3, 0.1)))
+"""Motors that could be bought."""
 of_every_family = st.one_of(
     every_actuator,
+    drives,
     st.just(IDEAL),
     st.builds(Lag, time_constant=zero_or(1e-3, 5), delay=zero_or(1e-3, 5)),
     st.builds(

@@ -10,7 +10,19 @@ import pytest
 from mujoco.batch import Batch
 
 from codrl_mj import engine
-from codrl_mj.actuators import Actuator, ActuatorModel, Inputs, Lag, Supply, TorqueSpeed, family_number, parameters_type
+from codrl_mj.actuators import (
+    Actuator,
+    ActuatorModel,
+    Drive,
+    GearMotor,
+    Inputs,
+    Lag,
+    SampledLoop,
+    Supply,
+    TorqueSpeed,
+    family_number,
+    parameters_type,
+)
 from codrl_mj.actuators.noise import philox, standard_normal, unit
 from codrl_mj.engine.families import HEAD, SLOT, Slot, loaded_families, signals_at, slot_size, user_head
 from codrl_mj.fields import flag, integer, part, real
@@ -107,6 +119,8 @@ ALL = [
     Lag(0.02, 0.033),
     Lag(0.0, 0.08),
     TorqueSpeed(0.4, 3.0, 0.3),
+    Drive(GearMotor(torque_constant=0.5, gear_ratio=2.0), SampledLoop(10e3, max_current=0.3), Supply(2.0)),
+    Drive(GearMotor(torque_constant=0.5), SampledLoop(10e3, anti_windup="clamping", delayed=True), Supply(2.0, 0.5)),
     FULL,
     dataclasses.replace(changed(FULL, current_noise=0.2, current_bias=0.1), supply=Supply(5.0, 0.7)),
     FULL.commands()["voltage"].actuator,

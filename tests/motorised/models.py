@@ -9,7 +9,19 @@ import mujoco
 import numpy as np
 
 import codrl_mj
-from codrl_mj.actuators import Actuator, ActuatorModel, CurrentLoop, JointAdditions, Lag, Motor, Supply, TorqueSpeed
+from codrl_mj.actuators import (
+    Actuator,
+    ActuatorModel,
+    CurrentLoop,
+    Drive,
+    GearMotor,
+    JointAdditions,
+    Lag,
+    Motor,
+    SampledLoop,
+    Supply,
+    TorqueSpeed,
+)
 from codrl_mj.fields import real
 from codrl_mj.physics.mjcf import drive, install_callbacks
 
@@ -67,6 +79,9 @@ ACTUATORS = {
     "current_loop": LOOP,
     "noisy_current_loop": NOISY,
     "lag": Lag(time_constant=0.03, delay=0.007),
+    "drive": Drive(
+        GearMotor(gear_ratio=5.0, coulomb_friction=1e-3, viscous_friction=1e-5), SampledLoop(10e3), Supply(3.0)
+    ),
     "torque_speed": TorqueSpeed(stall_torque=0.8, no_load_speed=3.0, max_torque=0.6),
     "somebody's": Worn(),
 }

@@ -1,0 +1,347 @@
+"""A motor that one can buy behind a drive that one can buy, family `drive`: gear, rotor, friction, a sampled PI loop.
+
+Where the paper's `current_loop` takes one or a few Euler steps of a slow winding, a bench motor's winding has a time
+constant of 0.1 to 5 ms under a loop that samples at 10 to 40 kHz. The winding is exact here, the loop has a sample rate
+of its own, its integrator does not wind up, and what is delivered over a mechanical step is the *mean* torque of it:
+the current at the end of a step says little of what moved the load.
+
+The speed, and with it the back-EMF, is held over the mechanical step, as everywhere in the package.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from codrl_mj.actuators import sampled, stability
+from codrl_mj.actuators.current_loop import Supply
+from codrl_mj.actuators.model import ActuatorModel, Command, Inputs, JointAdditions, parameters_type
+from codrl_mj.fields import check, choice, flag, part, real
+
+DEFAULT_BANDWIDTH = 0.349 / (2 * math.pi)
+"""Bandwidth of the loop over its sample rate: 60 degrees of phase margin with one and a half samples of delay."""
+
+
+@dataclasses.dataclass(frozen=True)
+class GearMotor:
+    """A DC motor, or a brushless one seen from its drive, with its gear: what a datasheet says.
+
+    Brushless motors: terminal quantities, line to line, of the equivalent DC motor.
+
+    Raises:
+        ValueError: a field is out of bounds; the message names field, value and bound.
+    """
+
+    resistance: float = real(8.4, above=0.0, unit="ohm")
+    """Terminal resistance R [ohm], > 0. The defaults are the Quanser QUBE-Servo 2's motor."""
+    inductance: float = real(1.16e-3, above=0.0, unit="H")
+    """Terminal inductance L [H], > 0."""
+    torque_constant: float = real(0.042, above=0.0, unit="N*m/A")
+    """Torque constant kT [N*m/A] at the rotor, > 0."""
+    back_emf_constant: float = real(0.042, least=0.0, unit="V*s/rad")
+    """Back-EMF constant kE [V*s/rad] at the rotor, >= 0; equal to kT in SI units but for losses."""
+    rotor_inertia: float = real(4.0e-6, least=0.0, unit="kg*m^2")
+    """Inertia J [kg*m^2] of the rotor, >= 0: the joint gets J*n^2."""
+    gear_ratio: float = real(1.0, above=0.0, unit="")
+    """Turns n of the rotor for a turn of the output shaft, > 0."""
+    coulomb_friction: float = real(0.0, least=0.0, unit="N*m")
+    """Coulomb friction [N*m] at the rotor, >= 0: the joint's `frictionloss`."""
+    viscous_friction: float = real(0.0, least=0.0, unit="N*m*s/rad")
+    """Viscous friction [N*m*s/rad] at the rotor, >= 0: the joint's `damping`."""
+    arm_radius: float = real(1.0, above=0.0, unit="m")
+    """Radius [m] of the wheel, drum or pinion on the output shaft that moves a slide, > 0; on a hinge 1."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        check(self)
+
+    @property
+    def electrical_time_constant(self) -> float:
+        """L/R [s]."""
+        return self.inductance / self.resistance
+
+    @property
+    def mechanical_time_constant(self) -> float:
+        """R*J/(kT*kE) [s] of the motor alone, without its gear and load; infinite without a back-EMF."""
+        product = self.torque_constant * self.back_emf_constant
+        return self.resistance * self.rotor_inertia / product if product > 0.0 else math.inf
+
+
+@dataclasses.dataclass(frozen=True)
+class SampledLoop:
+    """The PI current loop of a drive, at a sample rate of its own.
+
+    Raises:
+        ValueError: a field is out of bounds, or the bandwidth is beyond what the sample rate allows.
+    """
+
+    sample_rate: float = real(20e3, above=0.0, unit="Hz")
+    """Samples a second [Hz], > 0; a mechanical step must hold a whole number of them."""
+    bandwidth: float = real(0.0, least=0.0, unit="Hz")
+    """Bandwidth [Hz] that the gains are designed for by pole-zero cancellation, >= 0. 0: 0.0555 of the sample rate,
+    60 degrees of phase margin with `delayed`."""
+    kp: float = real(0.0, least=0.0, unit="V/A")
+    """Proportional gain [V/A], >= 0. It and `ki` replace the designed gains where one of them is not 0."""
+    ki: float = real(0.0, least=0.0, unit="V/(A*s)")
+    """Integral gain [V/(A*s)], >= 0."""
+    anti_windup: str = choice("back_calculation", "back_calculation", "clamping", "none")
+    """What the integrator does while the voltage saturates: it follows what was possible (`back_calculation`, with the
+    tracking time kp/ki), it stands still (`clamping`), or it goes on (`none`)."""
+    delayed: bool = flag(False)
+    """Whether the voltage that a sample computes is applied in the next one, as most digital drives do."""
+    bemf_compensation: bool = flag(True)
+    """Add the back-EMF kE*omega to the voltage."""
+    max_current: float = real(math.inf, above=0.0, unit="A", infinite=True)
+    """Largest current [A] that the drive asks for, > 0; `inf` for none."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        check(self)
+        most = self.sample_rate / (2 * math.pi)
+        if self.bandwidth > most:
+            raise ValueError(
+                f"SampledLoop.bandwidth = {self.bandwidth:g}: must be <= {most:g} Hz at sample_rate = "
+                f"{self.sample_rate:g} Hz, where a delay of one sample leaves 4 degrees of phase margin; lower it, or "
+                "raise the sample rate"
+            )
+
+
+class State(NamedTuple):
+    """What the drive remembers."""
+
+    current: float
+    """Motor current [A]."""
+    integral: float
+    """The controller's integral [V]."""
+    pending: float
+    """Voltage [V] that a delayed loop applies in the next sample."""
+
+
+class Signals(NamedTuple):
+    """What can be seen of a step."""
+
+    current: float
+    """Mean current [A] over the step: times kT, the torque that was delivered."""
+    reference_current: float
+    """Current asked of the loop [A], within `max_current`."""
+    voltage: float
+    """Mean terminal voltage [V] over the step."""
+    saturated: float
+    """1 where the voltage, or the current asked for, was at its limit in some sample."""
+
+
+def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Signals]:
+    """Advance winding and loop by the samples of one mechanical step: at once where that has a closed form.
+
+    The sums that it needs telescope: with S the sum of the current over the samples' starts, the mean of (u - b)/R is
+    (S + (i_n - i_0)/(1 - e))/n, and that of the current, the mean of every sample included,
+    (S + (1 - m)/(1 - e)*(i_n - i_0))/n with m = (1 - e)/x and x = R*T/L.
+
+    Args:
+        parameters: named as the fields of `Drive` and its parts.
+        timestep: mechanical step [s].
+        state: as the step before left it.
+        inputs: desired torque [N*m] and speed [rad/s] at the rotor.
+    """
+    sample_time = 1.0 / parameters.sample_rate
+    samples = max(int(timestep * parameters.sample_rate + 0.5), 1)
+    resistance, voltage = parameters.resistance, parameters.supply_voltage
+    x = resistance * sample_time / parameters.inductance
+    asked = inputs.desired_torque / parameters.torque_constant
+    reference = min(max(asked, -parameters.max_current), parameters.max_current)
+    back_emf = parameters.back_emf_constant * inputs.speed
+    compensated = back_emf if parameters.bemf_compensation != 0.0 else 0.0
+    designed = parameters.kp == 0.0 and parameters.ki == 0.0
+    share = parameters.bandwidth * sample_time if parameters.bandwidth > 0.0 else DEFAULT_BANDWIDTH
+    y = 2.0 * math.pi * share
+    pending = 0.0
+    if designed and parameters.anti_windup == 0.0 and parameters.delayed == 0.0 and parameters.supply_resistance == 0.0:
+        offset = back_emf - compensated
+        current, integral, total, saturated = sampled.jump(
+            state.current,
+            (state.integral - offset) / resistance,
+            reference,
+            (-voltage - back_emf) / resistance,
+            (voltage - back_emf) / resistance,
+            samples,
+            x,
+            y,
+        )
+        integral = integral * resistance + offset
+    else:
+        kp, ki = parameters.kp, parameters.ki * sample_time
+        if designed:
+            kp, ki = sampled.designed_gains(resistance, parameters.inductance, sample_time, y * parameters.sample_rate)
+        current, integral, pending, total, saturated = sampled.run_samples(
+            state.current,
+            state.integral,
+            state.pending,
+            reference,
+            back_emf,
+            compensated,
+            voltage,
+            parameters.supply_resistance,
+            samples,
+            resistance,
+            math.exp(-x),
+            kp,
+            ki,
+            parameters.anti_windup,
+            parameters.delayed,
+        )
+    lost = -math.expm1(-x)
+    change = (current - state.current) / lost
+    mean = (total + (1.0 - lost / x) * change) / samples
+    mean_voltage = back_emf + resistance * (total + change) / samples
+    at_limit = 1.0 if saturated > 0 or reference != asked else 0.0
+    signals = Signals(mean, reference, mean_voltage, at_limit)
+    return State(current, integral, pending), parameters.torque_constant * mean, signals
+
+
+def observe(parameters: Any, timestep: float, signals: Signals, inputs: Inputs) -> tuple[float, float]:  # noqa: ARG001
+    """The mean current [A] of the last step, which is what a drive reports, and its reference."""
+    return signals.current, signals.reference_current
+
+
+@dataclasses.dataclass(frozen=True)
+class Drive(ActuatorModel):
+    """A motor with its gear, the drive's current loop and the supply: a bench motor.
+
+    Raises:
+        ValueError: a field is out of bounds.
+    """
+
+    family: ClassVar[str] = "drive"
+    State: ClassVar[type] = State
+    Signals: ClassVar[type] = Signals
+    SIGNAL_UNITS: ClassVar[Mapping[str, str]] = {"current": "A", "reference_current": "A", "voltage": "V"}
+    OBSERVED: ClassVar[tuple[str, ...]] = ("current", "reference_current")
+    helpers: ClassVar[tuple[Any, ...]] = (
+        sampled.until,
+        sampled.jump,
+        sampled.run_samples,
+        sampled.designed_gains,
+    )
+    advance: ClassVar = staticmethod(advance)
+    observe: ClassVar = staticmethod(observe)
+
+    motor: GearMotor = GearMotor()
+    """The motor and its gear."""
+    controller: SampledLoop = SampledLoop()
+    """The current loop."""
+    supply: Supply | None = part(Supply(voltage=24.0))
+    """What feeds the drive; None: 24 V without a resistance."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        for name, kind in (("motor", GearMotor), ("controller", SampledLoop), ("supply", Supply)):
+            if not isinstance(getattr(self, name), kind) and not (name == "supply" and self.supply is None):
+                raise ValueError(
+                    f"Drive.{name} = {getattr(self, name)!r}: must be a {kind.__name__}; to build a drive from nested "
+                    "mappings use Drive.from_mapping"
+                )
+
+    @property
+    def arm_radius(self) -> float:
+        """Arm [m] between the rotor and the load: the gear is part of it."""
+        return self.motor.arm_radius / self.motor.gear_ratio
+
+    @property
+    def additions(self) -> JointAdditions:
+        """Rotor inertia and friction, seen from the load."""
+        arm, motor = self.arm_radius, self.motor
+        return JointAdditions(
+            motor.rotor_inertia / (arm * arm), motor.viscous_friction / (arm * arm), motor.coulomb_friction / arm
+        )
+
+    @property
+    def winding(self) -> tuple[float, float]:
+        """Resistance [ohm] and inductance [H]."""
+        return self.motor.resistance, self.motor.inductance
+
+    @property
+    def voltage_limit(self) -> float:
+        """The supply's voltage [V]."""
+        return 24.0 if self.supply is None else self.supply.voltage
+
+    @classmethod
+    def from_numbers(cls, numbers: Any, arm_radius: float = 1.0) -> Any:
+        """As `ActuatorModel.from_numbers`: the arm is that between rotor and load, the gear's ratio among the numbers.
+
+        Args:
+            numbers: shape (p,).
+            arm_radius: [m].
+
+        Raises:
+            ValueError: a number is out of its field's bounds.
+        """
+        family: Any = cls
+        return super().from_numbers(numbers, arm_radius * parameters_type(family)(*numbers).gear_ratio)
+
+    def commands(self) -> Mapping[str, Command]:
+        """A reference `current` [A] within `max_current`."""
+        limit, torque = self.controller.max_current, self.motor.torque_constant
+        why = "it would change what an action means"
+        fixed = dict.fromkeys(("motor.torque_constant", "motor.gear_ratio", "motor.arm_radius"), why)
+        return {"current": Command("A", self, torque, limit if math.isfinite(limit) else None, fixed)}
+
+    def check(self, timestep: float) -> None:
+        """Refuse a step without a whole number of samples, and a loop that is unstable.
+
+        Raises:
+            ValueError: with the numbers and a remedy.
+        """
+        controller, samples = self.controller, timestep * self.controller.sample_rate
+        if abs(samples - round(samples)) > 1e-6 * samples or samples < 0.5:
+            nearest = max(round(samples), 1) / timestep
+            raise ValueError(
+                f"SampledLoop.sample_rate = {controller.sample_rate:g}: a mechanical step of {timestep:g} s holds "
+                f"{samples:g} samples, must be a whole number of them; the nearest rate is {nearest:.8g} Hz"
+            )
+        radius = float(_radii(type(self), np.array([self.numbers]))[0])
+        if not radius < 1.0:
+            raise ValueError(
+                f"actuator: the current loop is unstable: spectral radius {radius:.4g} over a sample, must be < 1. "
+                f"Lower controller.kp = {controller.kp:g} and controller.ki = {controller.ki:g}, or leave both 0 to "
+                "have them designed; lower supply.resistance; or pass allow_unstable=True to study it as it is"
+            )
+
+    @classmethod
+    def instability(cls, numbers: np.ndarray, timestep: float) -> np.ndarray:
+        """The spectral radius of the loop over a sample; infinite where a step holds no whole number of samples.
+
+        Args:
+            numbers: shape (m, p), rows as `numbers` returns them.
+            timestep: mechanical step [s].
+        """
+        samples = timestep * stability.columns(cls, numbers).sample_rate
+        whole = (abs(samples - np.round(samples)) <= 1e-6 * samples) & (samples >= 0.5)
+        return np.where(whole, _radii(cls, numbers), np.inf)
+
+
+def _radii(cls: Any, numbers: np.ndarray) -> np.ndarray:
+    """Spectral radii over one sample, unsaturated and saturated, shape (m,)."""
+    columns = stability.columns(cls, numbers)
+    sample_time, resistance = 1.0 / columns.sample_rate, columns.resistance
+    x = resistance * sample_time / columns.inductance
+    decay = np.exp(-x)
+    share = np.where(columns.bandwidth > 0.0, columns.bandwidth * sample_time, DEFAULT_BANDWIDTH)
+    step = -np.expm1(-2.0 * math.pi * share)
+    designed = (columns.kp == 0.0) & (columns.ki == 0.0)
+    kp = np.where(designed, resistance * step / np.expm1(x), columns.kp)
+    ki = np.where(designed, resistance * step, columns.ki * sample_time)
+    effect = (1.0 - decay) / resistance  # of a volt, in a sample
+    nothing, one, late = np.zeros(len(numbers)), np.ones(len(numbers)), columns.delayed != 0.0
+    integrates = ki > 0.0  # else the integral is no part of the loop
+    voltage = -(kp + ki), np.where(integrates, one, 0.0), nothing  # of (current, integral, pending)
+    rows = [
+        [decay + np.where(late, 0.0, effect * voltage[0]), np.where(late, 0.0, effect * voltage[1]), late * effect],
+        [-ki, np.where(integrates, one, 0.0), nothing],
+        [late * voltage[0], late * voltage[1], nothing],
+    ]
+    matrices = np.array(rows).transpose(2, 0, 1)
+    radii = np.abs(np.linalg.eigvals(matrices).astype(np.complex128)).max(axis=1)
+    # at its limit the voltage follows the current through the supply's resistance
+    return np.maximum(radii, np.abs(decay - effect * columns.supply_resistance))

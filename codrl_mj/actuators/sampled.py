@@ -1,0 +1,162 @@
+"""A sampled current loop over a winding that is solved exactly, many samples at a time: the mathematics of `Drive`.
+
+Within a sample of length T the voltage u and the back-EMF b are held, and the winding's current is exact:
+i+ = v + (i - v)*e with v = (u - b)/R and e = exp(-R*T/L).
+
+With the discrete pole-zero cancellation of `designed_gains` and back-calculation with the tracking time kp/ki, a whole
+step of n samples has a closed form, saturated or not. Take the integral as a current, c = (integral - b')/R with b' the
+back-EMF that is not compensated; then, with P = 1 - exp(-wc*T) and G = P/(1 - e), the voltage asked for is b + R*q,
+
+    q = G*(i_ref - i) + c,
+
+and i - c decays as e^k whether the voltage saturates or not. Unsaturated, q - i_ref decays as (1 - P)^k, so it reaches
+a limit once at most; saturated, i and c approach v as e^k, so it leaves the limit once at most.
+"""
+
+import math
+from typing import Any
+
+
+def designed_gains(resistance: Any, inductance: Any, sample_time: Any, bandwidth: Any) -> tuple[Any, Any]:
+    """Proportional gain [V/A] and integral gain per sample [V/A] of the loop whose zero cancels the winding's pole.
+
+    kp = R*P*e/(1 - e) and ki*T = R*P: the loop from reference to current is P/(z - 1 + P).
+
+    Args:
+        resistance: R [ohm]; it and the others may be arrays where `math` is not needed.
+        inductance: L [H].
+        sample_time: T [s].
+        bandwidth: wc [rad/s].
+    """
+    x = resistance * sample_time / inductance
+    step = -math.expm1(-bandwidth * sample_time)
+    return resistance * step / math.expm1(x), resistance * step
+
+
+def jump(
+    current: float,
+    integral: float,
+    reference: float,
+    low: float,
+    high: float,
+    samples: int,
+    x: float,
+    y: float,
+) -> tuple[float, float, float, int]:
+    """A designed loop over many samples in closed form; all in amperes, as the module's docstring has it.
+
+    Args:
+        current: i [A].
+        integral: c [A].
+        reference: i_ref [A].
+        low: the lowest (u - b)/R [A].
+        high: the highest.
+        samples: n.
+        x: R*T/L.
+        y: wc*T.
+
+    Returns:
+        i, c, the sum of i over the samples' starts [A], and how many samples were saturated.
+    """
+    lost, step = -math.expm1(-x), -math.expm1(-y)  # 1 - e and P
+    gain = step / lost
+    total, saturated, left = 0.0, 0, samples
+    while left > 0:
+        asked = gain * (reference - current) + integral
+        held = left
+        if low <= asked <= high:
+            if reference > high:
+                held = until(reference - high, reference - asked, y, left)
+            elif reference < low:
+                held = until(low - reference, asked - reference, y, left)
+            before, lag = reference - current, current - integral
+            slow, fast = min(x, y), max(x, y)
+            # (P' ** n - e ** n) / (P' - e) with P' = 1 - P, without cancellation
+            ratio = float(held)
+            if fast > slow:
+                ratio = math.expm1(-held * (fast - slow)) / math.expm1(slow - fast)
+            ratio *= math.exp(-(held - 1) * slow)
+            error = before * math.exp(-held * y) + lost * lag * ratio
+            lag_after = lag * math.exp(-held * x)
+            total += held * reference - (before - error + lag - lag_after) / step
+            current = reference - error
+            integral = current - lag_after
+        else:
+            reached = high if asked > high else low
+            final = gain * (reference - reached) + reached  # what is asked for in the end
+            if (final < high) if asked > high else (final > low):
+                held = until(reached - final, asked - final, x, left)
+            decay = math.exp(-held * x)
+            after = reached + (current - reached) * decay
+            total += held * reached + (current - after) / lost
+            current, integral = after, reached + (integral - reached) * decay
+            saturated += held
+        left -= held
+    return current, integral, total, saturated
+
+
+def until(bound: float, start: float, rate: float, most: int) -> int:
+    """The first k >= 1 at which start*exp(-rate*k) is within bound, of the same sign; at most `most`."""
+    ratio = bound / start
+    if ratio <= 0.0:
+        return most
+    return min(max(math.ceil(-math.log(ratio) / rate), 1), most)
+
+
+def run_samples(
+    current: float,
+    integral: float,
+    pending: float,
+    reference: float,
+    back_emf: float,
+    compensated: float,
+    voltage: float,
+    sag: float,
+    samples: int,
+    resistance: float,
+    decay: float,
+    kp: float,
+    ki: float,
+    anti_windup: float,
+    delayed: float,
+) -> tuple[float, float, float, float, int]:
+    """Any PI loop, sample by sample.
+
+    Args:
+        current: i [A].
+        integral: of the controller [V].
+        pending: the voltage [V] computed in the sample before, which a delayed loop applies now.
+        reference: i_ref [A].
+        back_emf: b [V].
+        compensated: the part of it [V] that is added to the voltage.
+        voltage: the supply's [V].
+        sag: its resistance [ohm].
+        samples: n.
+        resistance: R [ohm].
+        decay: exp(-R*T/L).
+        kp: proportional gain [V/A].
+        ki: integral gain per sample [V/A].
+        anti_windup: 0 back-calculation with the tracking time kp/ki, 1 clamping, 2 none.
+        delayed: 1 if a sample's voltage is applied in the next one.
+
+    Returns:
+        i, integral, pending voltage, the sum of i over the samples' starts [A], and how many samples were saturated.
+    """
+    total, saturated, gain = 0.0, 0, kp + ki
+    tracking = ki / gain if gain > 0.0 else 0.0
+    for _ in range(samples):
+        limit = max(voltage - sag * abs(current), 0.0) if sag > 0.0 else voltage
+        error = reference - current
+        asked = gain * error + integral + compensated
+        applied = min(max(asked, -limit), limit)
+        if anti_windup == 0.0:
+            integral += ki * error + tracking * (applied - asked)
+        elif anti_windup == 2.0 or applied == asked or (asked - applied) * error < 0.0:
+            integral += ki * error
+        saturated += applied != asked
+        if delayed != 0.0:
+            applied, pending = min(max(pending, -limit), limit), applied
+        total += current
+        reached = (applied - back_emf) / resistance
+        current = reached + (current - reached) * decay
+    return current, integral, pending, total, saturated

@@ -1,0 +1,267 @@
+"""The drive: exact winding, closed form and stepping, margins, anti-windup, what a bench would measure."""
+
+import dataclasses
+import math
+
+import control
+import gymnasium
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from codrl_mj import Uniform
+from codrl_mj.actuators import Drive, GearMotor, Inputs, SampledLoop, Supply, parameters_type
+from codrl_mj.actuators.drive import DEFAULT_BANDWIDTH
+from codrl_mj.actuators.sampled import designed_gains, jump, run_samples
+
+# R [ohm], L [H], K [N*m/A], V [V]: maxon EC45 flat, DCX22L; Faulhaber 1331T; T-motor AK80-6; QUBE-Servo 2; PMG-132
+WINDINGS = {
+    "ec45": (0.464, 0.322e-3, 25.1e-3, 24.0),
+    "dcx22l": (0.168, 0.018e-3, 6.95e-3, 9.0),
+    "1331t": (2.83, 70e-6, 5.35e-3, 6.0),
+    "ak80-6": (0.170, 57e-6, 0.091, 24.0),
+    "qube": (8.4, 1.16e-3, 0.042, 18.0),
+    "pmg132": (0.016, 19e-6, 0.165, 60.0),
+}
+RATES = (10e3, 20e3, 40e3)
+every_winding = pytest.mark.parametrize("name", WINDINGS)
+
+
+def drive(name, rate=20e3, **loop):
+    resistance, inductance, constant, voltage = WINDINGS[name]
+    return Drive(
+        GearMotor(resistance, inductance, constant, constant, rotor_inertia=1e-6),
+        SampledLoop(rate, **loop),
+        Supply(voltage),
+    )
+
+
+def responses(one, timestep, torques, speeds):
+    """States, torques and signals of steps under held torques and speeds at the rotor."""
+    parameters, state = parameters_type(Drive)(*one.numbers), one.State(0.0, 0.0, 0.0)
+    found = []
+    for torque, speed in zip(torques, speeds, strict=True):
+        state, delivered, signals = one.advance(parameters, timestep, state, Inputs(torque, 0.0, speed, 0.0, 0.0))
+        found.append((state, delivered, signals))
+    return found
+
+
+@every_winding
+def test_the_winding_is_exact_and_what_is_delivered_is_its_mean(name):
+    """Against the matrix exponential of current and charge, sample by sample, under the voltages of the same loop."""
+    resistance, inductance, constant, voltage = WINDINGS[name]
+    one, timestep, rng = drive(name), 0.002, np.random.default_rng(0)
+    torques = rng.uniform(-2, 2, 20) * constant * voltage / resistance
+    speeds = rng.uniform(-1, 1, 20) * voltage / constant
+    kp, ki = designed_gains(resistance, inductance, 1 / 20e3, 2 * math.pi * DEFAULT_BANDWIDTH * 20e3)
+    a, b = -resistance / inductance, 1 / inductance
+    exact = expm(np.array([[a, 0, b], [1, 0, 0], [0, 0, 0]]) / 20e3)  # of current, charge, voltage
+    current, integral = 0.0, 0.0
+    for (state, delivered, signals), torque, speed in zip(
+        responses(one, timestep, torques, speeds), torques, speeds, strict=True
+    ):
+        charge, volts, back_emf = 0.0, 0.0, constant * speed
+        for _ in range(40):
+            error = torque / constant - current
+            asked = kp * error + ki * (integral + error) + back_emf
+            applied = min(max(asked, -voltage), voltage)
+            integral += error + (applied - asked) / (kp + ki)
+            current, charge, _ = exact @ (current, charge, applied - back_emf)
+            volts += applied
+        scale = voltage / resistance
+        assert abs(state.current - current) < 1e-12 * scale
+        assert abs(delivered - constant * charge / timestep) < 1e-12 * constant * scale
+        assert abs(signals.current - charge / timestep) < 1e-12 * scale
+        assert abs(signals.voltage - volts / 40) < 1e-12 * voltage
+
+
+_share = st.floats(0.0, 1.0)
+
+
+@settings(max_examples=300, deadline=None)
+@example("pmg132", 40e3, 0.349, 40, [(1.0, 1.0)] * 3, 10.0)
+@example("1331t", 10e3, 1.0, 1, [(0.6, 0.2), (0.4, 0.9)], 1.0)
+@given(
+    st.sampled_from(sorted(WINDINGS)),
+    st.sampled_from(RATES),
+    st.sampled_from([0.262, 0.349]) | st.floats(0.01, 1.0),
+    st.integers(1, 400),
+    st.lists(st.tuples(_share, _share), min_size=1, max_size=8),
+    st.sampled_from([0.1, 0.5, 1.0, 2.0, 10.0]),
+)
+def test_the_closed_form_is_the_stepping(name, rate, bandwidth, samples, commands, amplitude):
+    """From nothing saturated to everything."""
+    resistance, inductance, _, voltage = WINDINGS[name]
+    x = resistance / rate / inductance
+    kp, ki = designed_gains(resistance, inductance, 1 / rate, bandwidth * rate)
+    current, integral, stepped, volts = 0.0, 0.0, 0.0, 0.0
+    for reference, back_emf in commands:
+        reference, back_emf = ((2 * one - 1) * amplitude * voltage for one in (reference, 0.4 * back_emf))
+        reference /= resistance
+        limits = ((sign * voltage - back_emf) / resistance for sign in (-1, 1))
+        current, integral, total, _ = jump(current, integral, reference, *limits, samples, x, bandwidth)
+        winding = (voltage, 0.0, samples, resistance, math.exp(-x))
+        stepped, volts, _, expected, _ = run_samples(
+            stepped, volts, 0.0, reference, back_emf, back_emf, *winding, kp, ki, 0.0, 0.0
+        )
+        unit = voltage / resistance * max(1.0, amplitude)
+        assert abs(current - stepped) <= 1e-13 * unit
+        assert abs(integral - volts / resistance) <= 1e-13 * unit
+        assert abs(total - expected) <= 1e-13 * unit * samples
+
+
+@every_winding
+def test_an_uncompensated_back_emf_is_the_same_in_closed_form_and_by_stepping(name):
+    one = drive(name, bemf_compensation=False)
+    stepping = dataclasses.replace(one, supply=dataclasses.replace(one.supply, resistance=1e-300))
+    torques, speeds = np.random.default_rng(1).uniform(-1, 1, (2, 30))
+    resistance, _, constant, voltage = WINDINGS[name]
+    torques, speeds = torques * constant * voltage / resistance, speeds * voltage / constant
+    for one_step, other in zip(*(responses(each, 0.002, torques, speeds) for each in (one, stepping)), strict=True):
+        np.testing.assert_allclose(one_step[0], other[0], atol=1e-11 * voltage)
+        np.testing.assert_allclose(one_step[2][:3], other[2][:3], atol=1e-11 * voltage / min(resistance, 1.0))
+
+
+def loop_of(one, gains):
+    """Open loop of the current as python-control has it."""
+    motor, time = one.motor, 1 / one.controller.sample_rate
+    kp, ki = gains
+    decay = math.exp(-motor.resistance * time / motor.inductance)
+    plant = control.TransferFunction([(1 - decay) / motor.resistance], [1, -decay], time)
+    pi = control.TransferFunction([kp + ki, -kp], [1, -1], time)
+    return pi * plant * control.TransferFunction([1], [1, 0] if one.controller.delayed else [1], time)
+
+
+@every_winding
+@pytest.mark.parametrize("rate", RATES)
+def test_the_margins_are_those_of_the_design(name, rate):
+    """Phase margin of some 60 degrees with the delay; the simulated loop's amplitude and phase are those computed."""
+    one = drive(name, rate, delayed=True)
+    motor = one.motor
+    bandwidth = 2 * math.pi * DEFAULT_BANDWIDTH * rate
+    computed = loop_of(one, designed_gains(motor.resistance, motor.inductance, 1 / rate, bandwidth))
+    gain_margin, phase_margin, *_ = control.margin(computed)
+    assert 60 < phase_margin < 70
+    assert 3.2 < gain_margin < 3.6
+    closed = control.feedback(computed, 1)
+    for share in (0.3, 1.0, 2.0):
+        omega = share * bandwidth
+        times = np.arange(4000) / rate
+        # one sample a step: a frequency sweep of the loop itself
+        torques = 1e-3 * motor.torque_constant * np.sin(omega * times)
+        currents = [step[0].current for step in responses(one, 1 / rate, torques, np.zeros(4000))]
+        late = slice(2000, None)
+        basis = np.stack([np.sin(omega * times[late]), np.cos(omega * times[late])], axis=1)
+        real, imaginary = np.linalg.lstsq(basis, np.array(currents)[late] / 1e-3, rcond=None)[0]
+        # the state is that at the step's end: one sample ahead
+        expected = closed(np.exp(1j * omega / rate)) * np.exp(1j * omega / rate)
+        assert abs(complex(real, imaginary) - expected) < 1e-6
+
+
+@every_winding
+def test_the_bandwidth_is_the_one_asked_for(name):
+    one = drive(name, 40e3, bandwidth=500.0)
+    closed = control.feedback(
+        loop_of(one, designed_gains(one.motor.resistance, one.motor.inductance, 1 / 40e3, 2 * math.pi * 500.0)), 1
+    )
+    assert abs(closed(np.exp(2j * math.pi * 500.0 / 40e3))) == pytest.approx(1 / math.sqrt(2), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("anti_windup", "least", "most"), [("back_calculation", 0, 1), ("clamping", 0, 3), ("none", 15, 60)]
+)
+def test_after_what_could_not_be_reached_it_recovers_within_a_millisecond_or_not(anti_windup, least, most):
+    """20 ms of a current that the voltage cannot make at this speed, then one that it can."""
+    resistance, _, constant, voltage = WINDINGS["qube"]
+    one, speed = drive("qube", anti_windup=anti_windup), 0.5 * voltage / constant
+    amperes = voltage / resistance * np.array([0.9] * 400 + [0.2] * 2000)
+    currents = np.array([step[0].current for step in responses(one, 1 / 20e3, constant * amperes, [speed] * 2400)])
+    wrong = np.abs(currents[400:] / amperes[400:] - 1.0) > 0.05
+    assert least <= np.flatnonzero(wrong)[-1] / 20 <= most  # [ms]
+
+
+@every_winding
+def test_stall_and_no_load_are_the_datasheet_s(name):
+    resistance, _, constant, voltage = WINDINGS[name]
+    one = drive(name)
+    stall = responses(one, 0.02, [1e3] * 50, [0.0] * 50)[-1]
+    assert stall[1] == pytest.approx(constant * voltage / resistance, rel=1e-6)
+    assert stall[2].saturated == 1.0
+    no_load = responses(one, 0.02, [1e3] * 50, [voltage / constant] * 50)[-1]
+    assert abs(no_load[1]) < 1e-6 * stall[1]
+
+
+def test_the_gear_turns_torque_speed_inertia_and_friction():
+    motor = GearMotor(rotor_inertia=2e-6, gear_ratio=10.0, coulomb_friction=1e-3, viscous_friction=1e-5)
+    one = Drive(motor)
+    assert one.arm_radius == 0.1
+    np.testing.assert_allclose(one.additions, (2e-4, 1e-3, 1e-2))
+    np.testing.assert_allclose(Drive(dataclasses.replace(motor, arm_radius=0.5)).additions, (8e-4, 4e-3, 2e-2))
+
+
+def test_the_largest_current_is_kept():
+    one = drive("qube", max_current=0.3)
+    steps = responses(one, 0.002, [1.0, -1.0, 0.042 * 0.2], [0.0] * 3)
+    assert [step[2].reference_current for step in steps] == [0.3, -0.3, pytest.approx(0.2)]
+    assert [step[2].saturated for step in steps[:2]] == [1.0, 1.0]
+    assert abs(steps[0][0].current) <= 0.3
+
+
+def test_numbers_are_the_drive():
+    one = Drive(GearMotor(gear_ratio=7.0, arm_radius=0.3), SampledLoop(10e3, anti_windup="clamping", delayed=True))
+    assert Drive.from_numbers(one.numbers, one.arm_radius) == one
+    assert Drive.from_mapping({name: part for name, part in one.as_mapping().items() if name != "family"}) == one
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: GearMotor(gear_ratio=0), r"GearMotor\.gear_ratio = 0: must be a finite number > 0"),
+        (
+            lambda: SampledLoop(anti_windup="yes"),
+            r"anti_windup = 'yes': must be one of back_calculation, clamping, none",
+        ),
+        (lambda: SampledLoop(10e3, bandwidth=5e3), r"bandwidth = 5000: must be <= 1591.55 Hz at sample_rate = 10000"),
+        (lambda: Drive(supply=24.0), r"Drive\.supply = 24\.0: must be a Supply"),
+        (
+            lambda: Drive().check(0.00123),
+            r"holds 24\.6 samples, must be a whole number of them; the nearest rate is 20325",
+        ),
+        (
+            lambda: Drive(controller=SampledLoop(kp=500.0)).check(0.002),
+            r"spectral radius .* Lower controller\.kp = 500",
+        ),
+        (lambda: Drive(supply=Supply(24.0, 1e4)).check(0.002), r"lower supply\.resistance"),
+    ],
+)
+def test_bad_input_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_many_are_judged_as_one():
+    good, unstable = Drive(), Drive(controller=SampledLoop(kp=500.0))
+    late = Drive(controller=SampledLoop(delayed=True))
+    radii = Drive.instability(np.array([one.numbers for one in (good, unstable, late)]), 0.002)
+    np.testing.assert_array_equal(radii < 1.0, [True, False, True])
+    assert np.isinf(Drive.instability(np.array([good.numbers]), 0.00123)).all()
+
+
+@pytest.mark.parametrize("field", ["motor.rotor_inertia", "motor.gear_ratio", "motor.coulomb_friction"])
+def test_what_is_built_into_the_model_is_not_drawn(field):
+    with pytest.raises(ValueError, match=rf"{field} = 2: changes what the actuator adds to its joint, or its gear"):
+        gymnasium.make("codrl_mj/Pendulum-v0", actuator=drive("qube"), randomize={field: Uniform(2.0, 3.0)})
+
+
+def test_a_vector_of_drives_is_the_drives_alone_and_their_windings_are_drawn():
+    arguments = {"actuator": drive("qube"), "randomize": {"motor.resistance": Uniform(4.0, 12.0)}}
+    ours = gymnasium.make_vec("codrl_mj/Acrobot-v0", 3, "vector_entry_point", **arguments)
+    alone = gymnasium.make_vec("codrl_mj/Acrobot-v0", 3, "sync", **arguments)
+    np.testing.assert_array_equal(ours.reset(seed=3)[0], alone.reset(seed=3)[0])
+    for action in np.random.default_rng(0).integers(3, size=(40, 3)):
+        (*one, infos), (*other, expected) = ours.step(action), alone.step(action)
+        np.testing.assert_array_equal(one[0], other[0])
+        for name in ("current", "voltage", "actual_force", "saturated"):
+            np.testing.assert_array_equal(infos[name], expected[name])
