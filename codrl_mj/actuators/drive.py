@@ -156,7 +156,7 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
     designed = parameters.kp == 0.0 and parameters.ki == 0.0
     share = parameters.bandwidth * sample_time if parameters.bandwidth > 0.0 else DEFAULT_BANDWIDTH
     y = 2.0 * math.pi * share
-    pending = 0.0
+    lost, pending = -math.expm1(-x), 0.0
     if designed and parameters.anti_windup == 0.0 and parameters.delayed == 0.0 and parameters.supply_resistance == 0.0:
         offset = back_emf - compensated
         current, integral, total, saturated = sampled.jump(
@@ -168,6 +168,7 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
             samples,
             x,
             y,
+            lost,
         )
         integral = integral * resistance + offset
     else:
@@ -185,13 +186,12 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
             parameters.supply_resistance,
             samples,
             resistance,
-            math.exp(-x),
+            1.0 - lost,
             kp,
             ki,
             parameters.anti_windup,
             parameters.delayed,
         )
-    lost = -math.expm1(-x)
     change = (current - state.current) / lost
     mean = (total + (1.0 - lost / x) * change) / samples
     mean_voltage = back_emf + resistance * (total + change) / samples

@@ -42,6 +42,7 @@ def jump(
     samples: int,
     x: float,
     y: float,
+    lost: float,
 ) -> tuple[float, float, float, int]:
     """A designed loop over many samples in closed form; all in amperes, as the module's docstring has it.
 
@@ -54,12 +55,13 @@ def jump(
         samples: n.
         x: R*T/L.
         y: wc*T.
+        lost: 1 - exp(-x).
 
     Returns:
         i, c, the sum of i over the samples' starts [A], and how many samples were saturated.
     """
-    lost, step = -math.expm1(-x), -math.expm1(-y)  # 1 - e and P
-    gain = step / lost
+    step = -math.expm1(-y)  # P
+    gain, apart = step / lost, lost - step
     total, saturated, left = 0.0, 0, samples
     while left > 0:
         asked = gain * (reference - current) + integral
@@ -70,14 +72,15 @@ def jump(
             elif reference < low:
                 held = until(low - reference, asked - reference, y, left)
             before, lag = reference - current, current - integral
-            slow, fast = min(x, y), max(x, y)
-            # (P' ** n - e ** n) / (P' - e) with P' = 1 - P, without cancellation
-            ratio = float(held)
-            if fast > slow:
-                ratio = math.expm1(-held * (fast - slow)) / math.expm1(slow - fast)
-            ratio *= math.exp(-(held - 1) * slow)
-            error = before * math.exp(-held * y) + lost * lag * ratio
-            lag_after = lag * math.exp(-held * x)
+            slower, faster = math.exp(-held * y), math.exp(-held * x)
+            if abs(apart) > 0.1 * lost or held * abs(x - y) > 50.0:
+                ratio = (slower - faster) / apart
+            elif x != y:  # without cancellation
+                ratio = faster * math.expm1(held * (x - y)) / ((1.0 - lost) * math.expm1(x - y))
+            else:
+                ratio = held * faster / (1.0 - lost)
+            error = before * slower + lost * lag * ratio
+            lag_after = lag * faster
             total += held * reference - (before - error + lag - lag_after) / step
             current = reference - error
             integral = current - lag_after

@@ -101,7 +101,9 @@ def test_the_closed_form_is_the_stepping(name, rate, bandwidth, samples, command
         reference, back_emf = ((2 * one - 1) * amplitude * voltage for one in (reference, 0.4 * back_emf))
         reference /= resistance
         limits = ((sign * voltage - back_emf) / resistance for sign in (-1, 1))
-        current, integral, total, _ = jump(current, integral, reference, *limits, samples, x, bandwidth)
+        current, integral, total, _ = jump(
+            current, integral, reference, *limits, samples, x, bandwidth, -math.expm1(-x)
+        )
         winding = (voltage, 0.0, samples, resistance, math.exp(-x))
         stepped, volts, _, expected, _ = run_samples(
             stepped, volts, 0.0, reference, back_emf, back_emf, *winding, kp, ki, 0.0, 0.0
