@@ -46,6 +46,10 @@ class GearMotor:
     """Inertia J [kg*m^2] of the rotor, >= 0: the joint gets J*n^2."""
     gear_ratio: float = real(1.0, above=0.0, unit="")
     """Turns n of the rotor for a turn of the output shaft, > 0."""
+    gear_efficiency: float = real(1.0, above=0.0, most=1.0)
+    """Share of the torque that the gear passes on when it drives, in (0, 1]; driven, it brakes with 1/efficiency - 1 of
+    the torque. Part of what is delivered, by an implicit step: it never turns the rotor back, and so is the smaller the
+    closer the rotor is to standstill, where nothing is held by it (holding is `coulomb_friction`'s)."""
     coulomb_friction: float = real(0.0, least=0.0, unit="N*m")
     """Coulomb friction [N*m] at the rotor, >= 0: the joint's `frictionloss`."""
     viscous_friction: float = real(0.0, least=0.0, unit="N*m*s/rad")
@@ -123,7 +127,7 @@ class Signals(NamedTuple):
     """What can be seen of a step."""
 
     current: float
-    """Mean current [A] over the step: times kT, the torque that was delivered."""
+    """Mean current [A] over the step: times kT, the torque of the motor."""
     reference_current: float
     """Current asked of the loop [A], within `max_current`."""
     voltage: float
@@ -195,9 +199,17 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
     change = (current - state.current) / lost
     mean = (total + (1.0 - lost / x) * change) / samples
     mean_voltage = back_emf + resistance * (total + change) / samples
+    torque = parameters.torque_constant * mean
+    if parameters.gear_efficiency < 1.0:
+        driving = torque * inputs.speed > 0.0
+        share = 1.0 - parameters.gear_efficiency if driving else 1.0 / parameters.gear_efficiency - 1.0
+        loss = share * abs(torque)
+        if parameters.rotor_inertia > 0.0:  # no more than stops the rotor alone, and so never more than stops all
+            loss = min(loss, parameters.rotor_inertia * abs(inputs.speed) / timestep)
+        torque -= math.copysign(loss, inputs.speed)
     at_limit = 1.0 if saturated > 0 or reference != asked else 0.0
     signals = Signals(mean, reference, mean_voltage, at_limit)
-    return State(current, integral, pending), parameters.torque_constant * mean, signals
+    return State(current, integral, pending), torque, signals
 
 
 def observe(parameters: Any, timestep: float, signals: Signals, inputs: Inputs) -> tuple[float, float]:  # noqa: ARG001

@@ -75,6 +75,7 @@ gear_motors = st.builds(
     back_emf_constant=zero_or(1e-3, 2),
     rotor_inertia=zero_or(1e-8, 1e-2),
     gear_ratio=between(0.5, 200),
+    gear_efficiency=between(0.1, 1.0),
     coulomb_friction=zero_or(1e-5, 0.1),
     viscous_friction=zero_or(1e-7, 1e-3),
     arm_radius=between(0.01, 3),

@@ -203,6 +203,22 @@ def test_the_gear_turns_torque_speed_inertia_and_friction():
     np.testing.assert_allclose(Drive(dataclasses.replace(motor, arm_radius=0.5)).additions, (8e-4, 4e-3, 2e-2))
 
 
+@pytest.mark.parametrize("speed", [200.0, -200.0])
+@pytest.mark.parametrize(("direction", "share"), [(1.0, 0.8), (-1.0, 1.25)], ids=["driving", "driven"])
+def test_a_gear_passes_on_a_share_and_brakes_what_drives_it(speed, direction, share):
+    lossy = Drive(GearMotor(gear_efficiency=0.8), supply=Supply(48.0))
+    torque = math.copysign(0.01, speed) * direction
+    step = responses(lossy, 0.01, [torque] * 5, [speed] * 5)[-1]
+    assert step[1] == pytest.approx(share * 0.042 * step[2].current, rel=1e-12)
+
+
+def test_near_standstill_a_gear_s_loss_only_stops():
+    lossy = Drive(GearMotor(gear_efficiency=0.5))
+    for speed in (1e-3, -1e-3):
+        step = responses(lossy, 0.01, [0.02] * 5, [speed] * 5)[-1]
+        assert step[1] - 0.042 * step[2].current == pytest.approx(-4e-6 * speed / 0.01)
+
+
 def test_the_largest_current_is_kept():
     one = drive("qube", max_current=0.3)
     steps = responses(one, 0.002, [1.0, -1.0, 0.042 * 0.2], [0.0] * 3)
