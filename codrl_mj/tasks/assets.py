@@ -1,4 +1,4 @@
-"""Finds the MJCF files: in a checkout they lie in `assets/`, in a wheel inside the package."""
+"""Finds the MJCF files and the motors: in a checkout they lie in `assets/`, in a wheel inside the package."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ _PACKAGE = Path(__file__).parents[1]
 
 
 def asset_folder() -> Path:
-    """The folder of the MJCF files.
+    """The folder of the MJCF files and of `motors/`.
 
     Raises:
         FileNotFoundError: neither the checkout nor the wheel has it.

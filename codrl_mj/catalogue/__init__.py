@@ -1,0 +1,15 @@
+"""Motors that one can buy: datasheets as they are printed, the numbers that follow from them, and a catalogue."""
+
+from codrl_mj.catalogue.datasheet import Datasheet, from_datasheet
+from codrl_mj.catalogue.derivation import Disagreement, MotorNumbers
+from codrl_mj.catalogue.entries import MotorEntry, motor_entry, motor_names
+
+__all__ = [
+    "Datasheet",
+    "from_datasheet",
+    "MotorNumbers",
+    "Disagreement",
+    "MotorEntry",
+    "motor_entry",
+    "motor_names",
+]

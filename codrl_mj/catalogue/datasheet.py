@@ -1,0 +1,140 @@
+"""A motor's datasheet, as it is printed."""
+
+import dataclasses
+from typing import Any
+
+from codrl_mj.catalogue.derivation import MotorNumbers, derive
+from codrl_mj.catalogue.units import Kind, read
+from codrl_mj.fields import check_names
+
+
+def _printed(unit: str, example: str, power: int = 0, zero: bool = False) -> Any:
+    return dataclasses.field(default=None, metadata={"kind": Kind(unit, example, power, zero)})
+
+
+@dataclasses.dataclass(frozen=True)
+class Datasheet:
+    """What a datasheet prints, each value as text with its unit; what it does not print is left out.
+
+    Any sufficient combination will do: the nominal voltage with stall torque, stall current, no-load speed and no-load
+    current; or resistance and torque constant (or back-EMF constant, or speed constant); or both, which are then
+    compared. The inductance, or an electrical time constant, is needed in any case.
+
+    Electrical values are those at the two terminals. Of a three-phase motor these are resistance and inductance between
+    two phases (what maxon, T-Motor and most makers print), with the voltage between the phases and the torque constant
+    that goes with it; of a star whose phase is printed, write `2 * 0.3 ohm`.
+
+    Torques, speeds, inertias and friction are at `shaft`, unless the value ends in `at motor` or `at output`.
+    """
+
+    shaft: str = "motor"
+    """At which shaft mechanical values are printed: `motor`, or `output`, past the gear."""
+    nominal_voltage: str | None = _printed("V", "12 V")
+    """Voltage that the values below are at."""
+    stall_torque: str | None = _printed("N*m", "2.42 N*m", -1)
+    """Torque of the blocked shaft, friction already taken off."""
+    stall_current: str | None = _printed("A", "133 A")
+    """Current of the blocked motor."""
+    no_load_speed: str | None = _printed("rad/s", "5310 rpm", 1)
+    """Speed of the free shaft."""
+    no_load_current: str | None = _printed("A", "2.7 A", zero=True)
+    """Current of the free motor, which overcomes its friction."""
+    continuous_torque: str | None = _printed("N*m", "91.1 mN*m", -1)
+    """Torque that it bears for ever; many call it nominal or rated."""
+    continuous_current: str | None = _printed("A", "2.52 A")
+    """Current that it bears for ever."""
+    continuous_speed: str | None = _printed("rad/s", "5170 rpm", 1)
+    """Speed at the nominal voltage and the continuous current."""
+    peak_current: str | None = _printed("A", "24 A")
+    """Largest current of motor or drive."""
+    resistance: str | None = _printed("ohm", "0.464 ohm")
+    """Resistance between the terminals."""
+    inductance: str | None = _printed("H", "0.322 mH")
+    """Inductance between the terminals."""
+    electrical_time_constant: str | None = _printed("s", "0.5 ms")
+    """Inductance over resistance."""
+    torque_constant: str | None = _printed("N*m/A", "25.1 mN*m/A", -1)
+    """Torque per current; at the output, of a gear without losses."""
+    back_emf_constant: str | None = _printed("V*s/rad", "0.56 mV/rpm", -1)
+    """Voltage per speed."""
+    speed_constant: str | None = _printed("rad/s/V", "380 rpm/V", 1)
+    """Speed per voltage, Kv."""
+    rotor_inertia: str | None = _printed("kg*m^2", "135 g*cm^2", -2)
+    """Inertia of the rotor; at the output, the reflected one (`armature`)."""
+    mechanical_time_constant: str | None = _printed("s", "9.92 ms")
+    """How fast the free rotor follows a step of voltage: R*J/(kT*kE)."""
+    gear_ratio: str | float | None = _printed("", "30")
+    """Turns of the motor for a turn of the output."""
+    gear_efficiency: str | float | None = _printed("", "0.74")
+    """Share of the torque that the gear passes on."""
+    coulomb_friction: str | None = _printed("N*m", "0.12 mN*m", -1, zero=True)
+    """Friction torque at any speed."""
+    viscous_friction: str | None = _printed("N*m*s/rad", "1.5e-4 N*m*s/rad", -2, zero=True)
+    """Friction torque per speed."""
+    thermal_resistance_winding: str | None = _printed("K/W", "8.28 K/W")
+    """From winding to housing."""
+    thermal_resistance_housing: str | None = _printed("K/W", "1.57 K/W")
+    """From housing to ambient."""
+    thermal_time_constant_winding: str | None = _printed("s", "28.8 s")
+    """Of the winding against the housing."""
+    thermal_time_constant_housing: str | None = _printed("s", "78.3 s")
+    """Of the housing against the ambient."""
+    max_winding_temperature: str | None = _printed("degC", "125 degC")
+    """Largest permissible temperature of the winding."""
+
+    def __post_init__(self) -> None:
+        """Read every value once, so that a datasheet that exists can be read."""
+        if self.shaft not in ("motor", "output"):
+            raise ValueError(f"datasheet.shaft = {self.shaft!r}: must be motor or output")
+        self.readings()
+
+    def readings(self) -> dict[str, Any]:
+        """The values that are printed, each a `Reading` in the SI unit of its field, at the shaft it is printed at.
+
+        Raises:
+            ValueError: a value has no unit or a wrong one, is not positive, or an efficiency is above 1.
+        """
+        found = {}
+        for name, kind in KINDS.items():
+            printed = getattr(self, name)
+            if printed is not None:
+                reading = read(name, printed, kind)
+                found[name] = reading._replace(shaft=reading.shaft or self.shaft)
+        if "gear_efficiency" in found and found["gear_efficiency"].value > 1.0:
+            raise ValueError(
+                f"datasheet.gear_efficiency = {self.gear_efficiency!r}: must be a finite number > 0 and <= 1; "
+                'write percent as "74 %"'
+            )
+        return found
+
+    def numbers(self, strict: bool = True, tolerance: float = 0.2) -> MotorNumbers:
+        """The motor's numbers in SI; see `from_datasheet`."""
+        return derive(self.readings(), KINDS, strict, tolerance)
+
+
+KINDS: dict[str, Kind] = {f.name: f.metadata["kind"] for f in dataclasses.fields(Datasheet) if "kind" in f.metadata}
+"""The printed fields and what each may hold."""
+
+
+def from_datasheet(*, strict: bool = True, tolerance: float = 0.2, **printed: Any) -> MotorNumbers:
+    """A motor's numbers in SI, from what its datasheet prints.
+
+        >>> cim = from_datasheet(
+        ...     nominal_voltage="12 V", stall_torque="2.42 N*m", stall_current="133 A", no_load_speed="5310 rpm",
+        ...     no_load_current="2.7 A", inductance="59 uH",
+        ... )
+        >>> cim.derived["resistance"]
+        'resistance = nominal_voltage / stall_current = 12 V / 133 A = 0.09023 ohm'
+
+    Args:
+        strict: refuse a datasheet that contradicts itself; False: only list it in `disagreements`.
+        tolerance: relative difference above which two values contradict each other. 0.2 lets pass what makers round,
+            print of a warm motor or of one with saturated iron, and catches slips of units.
+        printed: the fields of `Datasheet`.
+
+    Raises:
+        ValueError: a field is unknown, is without its unit, has a wrong one or is out of bounds; the fields do not
+            suffice; or two of them contradict each other. The message names field, value and remedy.
+    """
+    check_names(printed, ("shaft", *KINDS), "datasheet field")
+    return Datasheet(**printed).numbers(strict, tolerance)

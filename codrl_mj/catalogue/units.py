@@ -1,0 +1,103 @@
+"""Reads what datasheets print: a number, its unit, and the shaft that it is meant at."""
+
+import functools
+import math
+import re
+from typing import Any, NamedTuple
+
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_PRINTED = re.compile(rf"\s*({_NUMBER}(?:\s*\*\s*{_NUMBER})*)\s*(.*?)\s*(?:\bat\s+(?:the\s+)?(motor|output))?\s*", re.S)
+_ANGLES = {"radian", "degree", "turn", "revolution", "revolutions_per_minute", "revolutions_per_second"}
+_SPELLINGS = (
+    (r"([mkµμ]?N)([cm]?)m\b", r"\1*\2m"),  # mNm, Nm, Ncm
+    (r"(k?g)([cm]?)m(?:\^2|\*\*2|²|2)", r"\1*\2m**2"),  # gcm2, kgm²
+    (r"\bmin(?:\^-1|⁻¹|-¹|-1)", "rpm"),
+)
+
+
+class Kind(NamedTuple):
+    """What may be printed in a field."""
+
+    unit: str
+    """Its SI unit."""
+    example: str
+    """How it may be printed, for messages."""
+    power: int = 0
+    """A value v at the output of a gear N is v*N**power at the motor's shaft."""
+    zero: bool = False
+    """It may be zero."""
+
+
+class Reading(NamedTuple):
+    """A printed value, read."""
+
+    value: float
+    """In the SI unit of its kind."""
+    printed: str
+    """As it was printed, without the shaft."""
+    shaft: str | None
+    """`motor`, `output`, or None where it does not say."""
+
+
+def read(name: str, printed: Any, kind: Kind) -> Reading:
+    """A printed value in SI.
+
+    Args:
+        name: of the field, for messages.
+        printed: such as `25.1 mN*m/A`, `2 * 0.3 ohm` or `2.42 N*m at output`; where the kind has no unit, a number too.
+        kind: what it has to be.
+
+    Raises:
+        ValueError: it has no unit, a wrong or unknown one, more than one number, or it is not positive.
+    """
+    if not kind.unit and isinstance(printed, int | float) and not isinstance(printed, bool):
+        printed = str(printed)
+    if not kind.unit and isinstance(printed, str):
+        printed = re.sub(r"\s*:\s*1\s*$", "", printed)  # 30:1
+    match = _PRINTED.fullmatch(printed) if isinstance(printed, str) else None
+    remedy = f'write a number and its unit, such as {name} = "{kind.example}"'
+    if match is None:
+        raise ValueError(f"datasheet.{name} = {printed!r}: must be a number with its unit, as text; {remedy}")
+    factors, unit, shaft = match.groups()
+    if re.match(r"[,:\d]", unit):
+        raise ValueError(
+            f"datasheet.{name} = {printed!r}: must be one number, without a space or a comma in it; {remedy}"
+        )
+    value = _si(name, printed, math.prod(map(float, factors.split("*"))), unit, kind, remedy)
+    bound = "a finite number >= 0" if kind.zero else "a finite number > 0"
+    if not (math.isfinite(value) and (value > 0.0 or (value == 0.0 and kind.zero))):
+        raise ValueError(f"datasheet.{name} = {printed!r}: must be {bound}; give its magnitude, or leave the field out")
+    return Reading(value, f"{factors} {unit}".strip(), shaft)
+
+
+def _si(name: str, printed: str, number: float, unit: str, kind: Kind, remedy: str) -> float:
+    for spelling, plain in _SPELLINGS:
+        unit = re.sub(spelling, plain, unit)
+    if not unit and kind.unit:
+        raise ValueError(f"datasheet.{name} = {printed!r}: has no unit; {remedy}")
+    registry = _registry()
+    try:
+        quantity = registry.Quantity(number, unit)
+    except (
+        Exception
+    ) as error:  # pint raises what its parser stumbles over: AttributeError, TypeError, AssertionError ...
+        raise ValueError(f"datasheet.{name} = {printed!r}: its unit {unit!r} is not known; {remedy}") from error
+    if quantity.dimensionality != registry.Quantity(1.0, kind.unit).dimensionality:
+        raise ValueError(
+            f"datasheet.{name} = {printed!r}: {unit!r} is no unit of this quantity, which is in "
+            f"{kind.unit or 'no unit'}; {remedy}"
+        )
+    units = {unit for unit, _ in quantity.unit_items()}
+    if any(unit.endswith("hertz") for unit in units) or (kind.unit.startswith("rad") and not units & _ANGLES):
+        raise ValueError(
+            f"datasheet.{name} = {printed!r}: turns or radians? Hz and 1/s leave it open; write rpm, turn/s or rad/s"
+        )
+    return float(quantity.to(kind.unit).magnitude)
+
+
+@functools.cache
+def _registry() -> Any:
+    """Pint's units; half a second, so not before they are needed."""
+    import pint
+
+    return pint.UnitRegistry(autoconvert_offset_to_baseunit=True)

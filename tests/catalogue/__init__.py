@@ -1,0 +1,1 @@
+"""Datasheets and the catalogue of motors."""

@@ -1,0 +1,286 @@
+"""Datasheets: what is printed comes back as the motor that it was printed of, and slips are refused."""
+
+import math
+import subprocess
+import sys
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from codrl_mj.catalogue import Datasheet, derivation, from_datasheet, rules
+from codrl_mj.catalogue.datasheet import KINDS
+
+UNITS = {  # by definition: SI value of one unit
+    "V": {"V": 1.0, "mV": 1e-3, "kV": 1e3},
+    "A": {"A": 1.0, "mA": 1e-3},
+    "s": {"s": 1.0, "ms": 1e-3},
+    "N*m": {
+        "N*m": 1.0,
+        "mN*m": 1e-3,
+        "mNm": 1e-3,
+        "Ncm": 1e-2,
+        "N·m": 1.0,
+        "kgf*cm": 9.80665e-2,
+        "ozf*in": 0.45359237 * 9.80665 / 16.0 * 0.0254,
+    },
+    "rad/s": {
+        "rad/s": 1.0,
+        "rpm": math.tau / 60.0,
+        "min^-1": math.tau / 60.0,
+        "turn/s": math.tau,
+        "deg/s": math.pi / 180,
+    },
+    "rad/s/V": {"rad/s/V": 1.0, "rpm/V": math.tau / 60.0},
+    "V*s/rad": {"V*s/rad": 1.0, "V/rpm": 60.0 / math.tau, "mV/rpm": 0.06 / math.tau, "Wb": 1.0},
+    "N*m/A": {"N*m/A": 1.0, "mNm/A": 1e-3, "Ncm/A": 1e-2},
+    "kg*m^2": {"kg*m^2": 1.0, "g*cm^2": 1e-7, "gcm²": 1e-7, "kgm2": 1.0},
+    "ohm": {"ohm": 1.0, "Ω": 1.0, "mohm": 1e-3},
+    "H": {"H": 1.0, "mH": 1e-3, "µH": 1e-6, "uH": 1e-6},
+}
+SIZES = st.floats(1e-3, 1e3)
+CIM = {
+    "nominal_voltage": "12 V",
+    "stall_torque": "2.42 N*m",
+    "stall_current": "133 A",
+    "no_load_speed": "5310 rpm",
+    "no_load_current": "2.7 A",
+    "inductance": "59 uH",
+}
+
+
+@st.composite
+def _motors(draw):
+    """An ideal motor, and what a datasheet would print of it, in SI at the motor's shaft."""
+    voltage, resistance, constant, inertia = draw(SIZES), draw(SIZES), draw(SIZES), draw(SIZES)
+    stall = voltage / resistance
+    free = stall * draw(st.floats(0.0, 0.3))
+    motor = {"resistance": resistance, "torque_constant": constant, "rotor_inertia": inertia, "voltage": voltage}
+    printed = {
+        "nominal_voltage": voltage,
+        "stall_torque": constant * (stall - free),
+        "stall_current": stall,
+        "no_load_speed": (voltage - resistance * free) / constant,
+        "no_load_current": free,
+        "mechanical_time_constant": resistance * inertia / constant**2,
+        "electrical_time_constant": draw(SIZES) / resistance,
+    }
+    return motor, printed
+
+
+@st.composite
+def _print(draw, printed):
+    """The values as text, each in a unit of its own."""
+    text = {}
+    for name, value in printed.items():
+        unit, size = draw(st.sampled_from(sorted(UNITS[KINDS[name].unit].items())))
+        text[name] = f"{value / size!r} {unit}"
+    return text
+
+
+@given(st.data())
+def test_a_motor_comes_back_from_its_stall_and_free_points(data):
+    motor, printed = data.draw(_motors())
+    numbers = from_datasheet(**data.draw(_print(printed)))
+    for name, value in motor.items():
+        assert getattr(numbers, name) == pytest.approx(value, rel=1e-12), name
+    assert numbers.back_emf_constant == pytest.approx(motor["torque_constant"], rel=1e-12)
+    assert numbers.inductance == pytest.approx(printed["electrical_time_constant"] * motor["resistance"], rel=1e-12)
+    assert numbers.coulomb_friction == pytest.approx(motor["torque_constant"] * printed["no_load_current"], rel=1e-12)
+    assert numbers.viscous_friction == 0.0
+    assert numbers.disagreements == ()
+
+
+@given(st.data(), st.floats(1.0, 500.0), st.floats(0.25, 0.99))
+def test_a_geared_motor_comes_back_from_its_output(data, ratio, efficiency):
+    motor, printed = data.draw(_motors())
+    printed["stall_torque"] *= ratio * efficiency
+    printed["no_load_speed"] /= ratio
+    printed["rotor_inertia"] = motor["rotor_inertia"] * ratio**2
+    text = data.draw(_print(printed))
+    numbers = from_datasheet(shaft="output", gear_ratio=ratio, **text)
+    assert numbers.gear_efficiency == pytest.approx(efficiency, rel=1e-11)
+    for name, value in motor.items():
+        assert getattr(numbers, name) == pytest.approx(value, rel=1e-12), name
+    del text["no_load_speed"]  # then the constant follows from the torque, if the efficiency is printed
+    told = from_datasheet(
+        shaft="output", gear_ratio=f"{ratio!r}:1", gear_efficiency=f"{efficiency * 100.0!r} %", **text
+    )
+    assert told.torque_constant == pytest.approx(motor["torque_constant"], rel=1e-12)
+
+
+@given(st.data())
+def test_a_motor_comes_back_from_its_constants(data):
+    motor, printed = data.draw(_motors())
+    constant, ohms = motor["torque_constant"], motor["resistance"]
+    inertia, henries = motor["rotor_inertia"], printed["electrical_time_constant"] * ohms
+    one = data.draw(
+        st.sampled_from(
+            [{"torque_constant": constant}, {"back_emf_constant": constant}, {"speed_constant": 1 / constant}]
+        )
+    )
+    numbers = from_datasheet(
+        **data.draw(_print({"resistance": ohms, "inductance": henries, "rotor_inertia": inertia, **one}))
+    )
+    expected = (ohms, henries, constant, constant, inertia)
+    found = (numbers.resistance, numbers.inductance, numbers.torque_constant, numbers.back_emf_constant)
+    assert (*found, numbers.rotor_inertia) == pytest.approx(expected, rel=1e-12)
+    assert numbers.voltage is numbers.coulomb_friction is numbers.continuous_current is None
+
+
+@given(st.data(), st.floats(0.35, 0.9))
+def test_a_motor_comes_back_from_two_points_of_its_line(data, load):
+    motor, printed = data.draw(_motors())
+    current = load * printed["stall_current"]
+    point = {
+        "continuous_current": current,
+        "continuous_speed": (motor["voltage"] - motor["resistance"] * current) / motor["torque_constant"],
+        "continuous_torque": motor["torque_constant"] * (current - printed["no_load_current"]),
+    }
+    free = {name: printed[name] for name in ("nominal_voltage", "no_load_speed", "no_load_current")}
+    numbers = from_datasheet(inductance="1 mH", **data.draw(_print(free | point)))
+    assert numbers.resistance == pytest.approx(motor["resistance"], rel=1e-12)
+    assert numbers.torque_constant == pytest.approx(motor["torque_constant"], rel=1e-11)
+
+
+@given(st.floats(0.01, 0.9))
+def test_printed_friction_takes_its_part_of_the_no_load_current(share):
+    free = {"resistance": "1 ohm", "inductance": "1 mH", "torque_constant": "0.1 N*m/A", "no_load_current": "1 A"}
+    coulomb = from_datasheet(**free, no_load_speed="100 rad/s", coulomb_friction=f"{0.1 * share!r} N*m")
+    assert coulomb.viscous_friction == pytest.approx(0.1 * (1.0 - share) / 100.0)
+    more = from_datasheet(**free, no_load_speed="100 rad/s", coulomb_friction=f"{0.1 + 0.01 * share!r} N*m")
+    assert more.viscous_friction == 0.0
+    more = from_datasheet(**free, no_load_speed="100 rad/s", viscous_friction=f"{1e-3 + 1e-4 * share!r} N*m*s/rad")
+    assert more.coulomb_friction == 0.0
+    viscous = from_datasheet(**free, no_load_speed="100 rad/s", viscous_friction=f"{1e-3 * share!r} N*m*s/rad")
+    assert viscous.coulomb_friction == pytest.approx(0.1 * (1.0 - share))
+
+
+@pytest.mark.parametrize("known", ["torque_constant", "back_emf_constant", "speed_constant"])
+def test_constants_at_the_output_are_reflected_by_the_ratio(known):
+    value = {"torque_constant": "3 N*m/A", "back_emf_constant": "3 V*s/rad", "speed_constant": "1 rad/s/V"}[known]
+    seen = 1.0 if known == "speed_constant" else 3.0
+    numbers = from_datasheet(resistance="1 ohm", inductance="1 mH", gear_ratio=30, shaft="output", **{known: value})
+    assert (numbers.torque_constant, numbers.back_emf_constant) == pytest.approx((seen / 30.0, seen / 30.0))
+
+
+def test_without_a_no_load_current_none_is_taken_off():
+    numbers = from_datasheet(**{name: value for name, value in CIM.items() if name != "no_load_current"})
+    assert numbers.torque_constant == pytest.approx(2.42 / 133.0)
+    assert numbers.back_emf_constant == pytest.approx(12.0 / (5310.0 * math.tau / 60.0))
+    assert numbers.coulomb_friction is numbers.viscous_friction is None
+
+
+def test_a_gear_gains_nothing():
+    """Rounding may make a gear of 1.05, which is 1 and a disagreement; more than the tolerance is refused."""
+    geared = {"resistance": "1 ohm", "inductance": "1 mH", "torque_constant": "0.1 N*m/A", "gear_ratio": 10}
+    numbers = from_datasheet(**geared, continuous_current="2 A", continuous_torque="2.1 N*m at output")
+    assert numbers.gear_efficiency == 1.0
+    assert numbers.disagreements[0].difference == pytest.approx(2.0 / 2.1 - 1.0)
+    with pytest.raises(ValueError, match=r"gear_efficiency = 1\.5"):
+        from_datasheet(**geared, continuous_current="2 A", continuous_torque="3 N*m at output")
+
+
+def test_the_torque_that_a_gear_bears_for_ever_gives_the_current():
+    geared = {"resistance": "1 ohm", "inductance": "1 mH", "torque_constant": "0.1 N*m/A", "gear_ratio": 10}
+    numbers = from_datasheet(**geared, gear_efficiency=0.5, continuous_torque="2 N*m at output", no_load_current="1 A")
+    assert numbers.continuous_current == pytest.approx(2.0 / (10.0 * 0.5 * 0.1) + 1.0)
+    assert numbers.disagreements == ()
+
+
+def test_every_number_says_how_it_came_about():
+    numbers = from_datasheet(
+        **CIM,
+        max_winding_temperature="125 °C",
+        thermal_resistance_winding="3 °C/W",
+        thermal_resistance_housing="2 degC/W",
+    )
+    assert numbers.derived["resistance"] == "resistance = nominal_voltage / stall_current = 12 V / 133 A = 0.09023 ohm"
+    assert numbers.derived["voltage"] == "voltage = 12 V, printed as nominal_voltage"
+    assert (numbers.max_temperature, numbers.thermal_resistance_winding) == pytest.approx((125.0, 3.0))
+    assert numbers.thermal_resistance_housing == pytest.approx(2.0)
+    for name in vars(numbers):
+        known = getattr(numbers, name) is not None and name not in ("derived", "disagreements")
+        assert (name in numbers.derived) == known
+
+
+def test_a_disagreement_has_both_values_and_what_to_make_of_it():
+    (found,) = from_datasheet(**CIM).disagreements
+    assert found.quantity == "torque_constant"
+    assert found.printed == pytest.approx(2.42 / (133.0 - 2.7))
+    assert found.computed == pytest.approx((12.0 - 12.0 / 133.0 * 2.7) / (5310.0 * math.tau / 60.0))
+    assert found.difference == pytest.approx(found.computed / found.printed - 1.0)
+    assert "equal in SI" in str(found)
+
+
+def test_a_phase_of_a_star_may_be_written_as_a_product():
+    assert Datasheet(resistance="2 * 0.3 ohm").readings()["resistance"].value == pytest.approx(0.6)
+
+
+REFUSED = {
+    "no unit": ({"resistance": "25.1"}, "resistance", "25.1", 'resistance = "0.464 ohm"'),
+    "a number": ({"resistance": 25.1}, "resistance", "25.1", 'resistance = "0.464 ohm"'),
+    "wrong dimension": ({"stall_torque": "25.1 mN"}, "stall_torque", "25.1 mN", "N*m"),
+    "mass for force": ({"stall_torque": "140 kg*mm"}, "stall_torque", "140 kg*mm", "N*m"),
+    "unknown unit": ({"inductance": "3 henrys of iron"}, "inductance", "henrys", 'inductance = "0.322 mH"'),
+    "code": ({"inductance": "3 __import__('os')"}, "inductance", "__import__", 'inductance = "0.322 mH"'),
+    "a thousand's space": (
+        {"no_load_speed": "10 600 rpm"},
+        "no_load_speed",
+        "10 600 rpm",
+        'no_load_speed = "5310 rpm"',
+    ),
+    "a decimal comma": ({"resistance": "0,46 ohm"}, "resistance", "0,46 ohm", "must be one number"),
+    "turns or radians": ({"no_load_speed": "100 Hz"}, "no_load_speed", "100 Hz", "rpm"),
+    "volts per hertz": ({"back_emf_constant": "0.4 V/Hz"}, "back_emf_constant", "0.4 V/Hz", "rpm"),
+    "gear of zero": ({"gear_ratio": 0}, "gear_ratio", "0", "> 0"),
+    "negative": ({"resistance": "-1 ohm"}, "resistance", "-1 ohm", "> 0"),
+    "not finite": ({"resistance": "1e999 ohm"}, "resistance", "1e999", "finite"),
+    "efficiency": ({"gear_efficiency": "140 %"}, "gear_efficiency", "140 %", "<= 1"),
+    "misspelt": ({"resistence": "1 ohm"}, "resistence", "datasheet field", "did you mean resistance?"),
+    "shaft": ({"shaft": "wheel"}, "shaft", "wheel", "motor or output"),
+    "no gear": ({"torque_constant": "1 N*m/A at output"}, "torque_constant", "1 N*m/A", "gear_ratio = 30"),
+    "no inductance": ({**CIM, "inductance": None}, "inductance", "not printed", 'inductance = "0.3 mH"'),
+    "nothing": ({"inductance": "1 mH"}, "resistance", "not printed", "nominal_voltage and stall_current"),
+    "milli": ({**CIM, "stall_torque": "2.42 mN*m"}, "torque_constant", "1.857e-05", "units of stall_torque"),
+    "stall current": ({**CIM, "resistance": "0.9 ohm"}, "stall_current", "133 A", "units of stall_current"),
+    "speed constant": (
+        {**CIM, "torque_constant": "0.0211 N*m/A", "speed_constant": "45.2 rpm/V"},
+        *("torque_constant", "0.0211 N*m/A", "units of torque_constant, speed_constant"),
+    ),
+    "free above stall": ({**CIM, "no_load_current": "140 A"}, "torque_constant", "140 A", "must be > 0"),
+    "free at stall": ({**CIM, "no_load_current": "133 A"}, "torque_constant", "133 A", "divides by 0"),
+    "gear of milli": (
+        {**CIM, "shaft": "output", "gear_ratio": 30, "stall_torque": "2.42 mN*m", "no_load_speed": "177 rpm"},
+        *("gear_efficiency", "0.00242 N*m", "check the units"),
+    ),
+    "tolerance": ({**CIM, "tolerance": 0}, "tolerance", "0", "> 0"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_slip_is_refused_with_field_value_and_remedy(case):
+    printed, *words = REFUSED[case]
+    with pytest.raises(ValueError) as error:  # noqa: PT011 - the words are the match
+        from_datasheet(**printed)
+    for word in words:
+        assert word in str(error.value)
+
+
+def test_without_strictness_a_contradiction_is_only_listed():
+    numbers = from_datasheet(**CIM | {"stall_torque": "2.42 mN*m"}, strict=False)
+    assert numbers.disagreements[0].quantity == "torque_constant"
+    assert abs(numbers.disagreements[0].difference) > 100.0
+
+
+def test_the_rules_speak_of_fields_and_take_what_they_name():
+    values = dict.fromkeys((*KINDS, *derivation._UNITS), 2.0)
+    for rule in (*rules.RULES, *(check for check, _ in rules.CHECKS)):
+        expected = eval(rule.formula, {}, values | {"no_load_current": 1.0, "no_load_speed": 3.0})
+        given = [{"no_load_current": 1.0, "no_load_speed": 3.0}.get(name, values[name]) for name in rule.needs]
+        assert rule.function(*given) == pytest.approx(expected), rule.formula
+
+
+def test_pint_is_imported_only_when_a_datasheet_is_read():
+    script = "import sys, codrl_mj.catalogue.entries; assert 'pint' not in sys.modules"
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=120)

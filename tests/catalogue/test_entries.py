@@ -1,0 +1,142 @@
+"""The catalogue: every motor loads, has a source for every value, and agrees with itself or says why not."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gym_electric_motor.physical_systems.electric_motors import DcPermanentlyExcitedMotor
+
+from codrl_mj.catalogue import motor_entry, motor_names
+from codrl_mj.catalogue.datasheet import KINDS
+
+NAMES = motor_names()
+EXPLAINED = {  # disagreements above 5 % -> what the notes say of them
+    ("cubemars-ak80-6", "speed_constant"): "5 % off the back-EMF",
+    ("cubemars-ak80-6", "no_load_speed"): "the speed at 24 V follows the former",
+    ("frc-cim", "torque_constant"): "12 % below the back-EMF constant",
+    ("heinzmann-pmg-132", "continuous_speed"): "18 % more",
+    ("maxon-ec45-flat-50w", "continuous_speed"): "11 % more",
+    ("maxon-ec45-flat-50w", "continuous_torque"): "10 % less",
+    ("quanser-qube-servo-3", "continuous_speed"): "15 % slower",
+    ("rev-neo", "torque_constant"): "27 % above",
+}
+OWN = """
+manufacturer = "mine"
+product = "one"
+kind = "brushed"
+[datasheet]
+resistance = "1 ohm"
+torque_constant = "0.1 N*m/A"
+inductance = "1 mH"
+[estimated]
+inductance = "measured on another"
+[sources]
+"my bench" = "the rest"
+"""
+
+
+def test_there_are_motors_of_many_kinds():
+    assert len(NAMES) >= 12
+    kinds = {motor_entry(name).kind for name in NAMES}
+    assert {"brushed", "brushless", "brushless, geared", "brushed, geared", "brushed, coreless"} <= kinds
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_value_has_a_source_or_a_reason(name):
+    entry = motor_entry(name)
+    printed = {field for field in KINDS if getattr(entry.datasheet, field) is not None}
+    assert entry.sources.keys() | entry.estimated.keys() == printed
+    assert not entry.sources.keys() & entry.estimated.keys()
+    assert all(len(text) > 20 for text in (*entry.sources.values(), *entry.estimated.values()))
+    assert set(entry.estimated) <= {"inductance", "electrical_time_constant"}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_motor_agrees_with_itself_or_its_notes_say_why_not(name):
+    entry = motor_entry(name)
+    large = {one.quantity for one in entry.numbers.disagreements if abs(one.difference) > 0.05 - 1e-4}
+    assert large == {quantity for motor, quantity in EXPLAINED if motor == name}
+    for quantity in large:
+        assert EXPLAINED[name, quantity] in " ".join(entry.notes.split())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_model_stands_at_the_printed_points(name):
+    """Two equations, winding and shaft, solved for the free motor; and the blocked one."""
+    entry = motor_entry(name)
+    numbers, printed = entry.numbers, entry.datasheet.readings()
+    friction = (numbers.coulomb_friction or 0.0), (numbers.viscous_friction or 0.0)
+    if {"no_load_speed", "nominal_voltage"} <= printed.keys():
+        matrix = [[numbers.resistance, numbers.back_emf_constant], [numbers.torque_constant, -friction[1]]]
+        _, speed = np.linalg.solve(matrix, [numbers.voltage, friction[0]])
+        ratio = numbers.gear_ratio if printed["no_load_speed"].shaft == "output" else 1.0
+        assert speed / ratio == pytest.approx(printed["no_load_speed"].value, rel=0.05)
+    if "stall_torque" in printed:
+        past_gear = printed["stall_torque"].shaft == "output"
+        current = numbers.voltage / numbers.resistance
+        torque = numbers.torque_constant * (
+            current - printed["no_load_current"].value if "no_load_current" in printed else current
+        )
+        torque *= numbers.gear_ratio * numbers.gear_efficiency if past_gear else 1.0
+        assert torque == pytest.approx(printed["stall_torque"].value, rel=0.05)
+    if "mechanical_time_constant" in printed:
+        constant = numbers.resistance * numbers.rotor_inertia / (numbers.torque_constant * numbers.back_emf_constant)
+        assert constant == pytest.approx(printed["mechanical_time_constant"].value, rel=0.05)
+
+
+def test_the_pmg_132_is_gym_electric_motors():
+    theirs, ours = DcPermanentlyExcitedMotor._default_motor_parameter, motor_entry("heinzmann-pmg-132").numbers
+    assert (ours.resistance, ours.inductance) == pytest.approx((theirs["r_a"], theirs["l_a"]))
+    assert (ours.torque_constant, ours.rotor_inertia) == pytest.approx((theirs["psi_e"], theirs["j_rotor"]))
+
+
+def test_a_file_of_ones_own_is_an_entry(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(OWN)
+    entry = motor_entry(str(path))
+    assert (entry.name, entry.numbers.inductance) == ("mine", pytest.approx(1e-3))
+    assert entry.sources == {"resistance": "my bench", "torque_constant": "my bench"}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('kind = "brushed"', "", "kind is missing"),
+        ('kind = "brushed"', 'sort = "brushed"', "unknown entry sort"),
+        (
+            '"1 ohm"',
+            '"1"',
+            "datasheet.resistance = '1': has no unit; write a number and its unit, such as resistance = \"0.464 ohm\"",
+        ),
+        ("resistance =", "resistanse =", "did you mean datasheet.resistance?"),
+        ('= "the rest"', '= ["resistance"]', "not one for torque_constant"),
+        ('= "the rest"', '= ["inductance"]', "unknown entry sources"),
+        ("[estimated]\ninductance", "[estimated]\nrotor_inertia", "unknown entry estimated.rotor_inertia"),
+        ("[estimated]\ninductance =", "estimated =", "is no TOML|unknown entry|must be a table"),
+        ("[datasheet]", "[datasheet", "is no TOML file"),
+    ],
+)
+def test_a_file_that_lacks_something_is_refused(tmp_path, old, new, words):
+    path = tmp_path / "mine.toml"
+    path.write_text(OWN.replace(old, new))
+    with pytest.raises(ValueError, match=r"mine\.toml") as error:
+        motor_entry(str(path))
+    assert any(word in str(error.value) for word in words.split("|"))
+
+
+def test_an_unknown_motor_is_refused_with_the_nearest():
+    with pytest.raises(ValueError, match="did you mean maxon-re65"):
+        motor_entry("maxon-re-65")
+
+
+def test_the_page_has_every_motor_and_its_examples_run(tmp_path, capsys):
+    page = (Path(__file__).parents[2] / "docs" / "motors.md").read_text()
+    assert re.findall(r"^\| `([\w-]+)`", page, re.M) == NAMES
+    names = {}
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(block, names)
+    assert "gear_efficiency = stall_torque_at_output" in capsys.readouterr().out
+    path = tmp_path / "my_motor.toml"
+    path.write_text(re.search(r"```toml\n(.*?)```", page, re.DOTALL)[1])
+    assert motor_entry(str(path)).numbers.rotor_inertia == pytest.approx(5.4e-7)
