@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).parent.parent / "codrl_mj"
 ALLOWED = {
     # a layer: a room, a module at the top, or a module that stands lower than its room -> the layers it may import
     "fields": set(),
-    "actuators": {"fields"},
+    "actuators": {"catalogue", "fields"},
     "disturbances": {"actuators", "fields"},
     "tasks": {"actuators", "tasks.assets"},
     "tasks.assets": set(),

@@ -61,6 +61,31 @@ class GearMotor:
         """Validate."""
         check(self)
 
+    @classmethod
+    def from_datasheet(cls, **printed: Any) -> "GearMotor":
+        """A motor from what its datasheet prints, each value as text with its unit.
+
+            >>> GearMotor.from_datasheet(resistance="0.464 ohm", inductance="0.322 mH", torque_constant="25.1 mN*m/A",
+            ...                          rotor_inertia="135 g*cm^2").torque_constant
+            0.0251
+
+        Args:
+            printed: as for `codrl_mj.catalogue.from_datasheet`, which also says how each number came about.
+
+        Raises:
+            ValueError: the datasheet does not suffice, or contradicts itself; the message has values and remedy.
+        """
+        from codrl_mj.catalogue import from_datasheet
+
+        return cls.of(from_datasheet(**printed))
+
+    @classmethod
+    def of(cls, numbers: Any) -> "GearMotor":
+        """A motor of `codrl_mj.catalogue.MotorNumbers`; what they do not know is left at 0, an efficiency at 1."""
+        known = {field.name: getattr(numbers, field.name, None) for field in dataclasses.fields(cls)}
+        known |= {name: 0.0 for name in _UNKNOWN if known[name] is None}
+        return cls(**{name: value for name, value in known.items() if value is not None})
+
     @property
     def electrical_time_constant(self) -> float:
         """L/R [s]."""
@@ -71,6 +96,10 @@ class GearMotor:
         """R*J/(kT*kE) [s] of the motor alone, without its gear and load; infinite without a back-EMF."""
         product = self.torque_constant * self.back_emf_constant
         return self.resistance * self.rotor_inertia / product if product > 0.0 else math.inf
+
+
+_UNKNOWN = ("rotor_inertia", "coulomb_friction", "viscous_friction")
+"""What a datasheet may leave open, and is 0 then."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -254,6 +283,13 @@ class Drive(ActuatorModel):
                     f"Drive.{name} = {getattr(self, name)!r}: must be a {kind.__name__}; to build a drive from nested "
                     "mappings use Drive.from_mapping"
                 )
+
+    @classmethod
+    def of(cls, numbers: Any) -> "Drive":
+        """A drive for a motor of `codrl_mj.catalogue.MotorNumbers`, at its voltage (or 24 V) and its largest current."""
+        most, voltage = numbers.max_current, numbers.voltage
+        loop = SampledLoop() if most is None else SampledLoop(max_current=most)
+        return cls(GearMotor.of(numbers), loop, None if voltage is None else Supply(voltage))
 
     @property
     def arm_radius(self) -> float:

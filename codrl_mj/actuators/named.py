@@ -70,8 +70,9 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
     """Turn whatever a user may write for an actuator into an `ActuatorModel`.
 
     Args:
-        given: a name of `NAMED` or `FAMILIES`, `module:NAME` of an actuator or a family, a YAML or JSON file of fields,
-            an actuator, a mapping of its fields (with a `name`, over that actuator's), or None (ideal).
+        given: a name of `NAMED`, `FAMILIES` or the catalogue of motors, a motor's TOML file, `module:NAME` of an
+            actuator or a family, a YAML or JSON file of fields, an actuator, a mapping of its fields (with a `name`,
+            over that actuator's), or None (ideal).
         paper: the actuator that the names vary; None where there is none.
         whose: whose it is, for messages.
 
@@ -102,7 +103,11 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
         return NAMED[given][1](paper)
     if given not in FAMILIES and Path(given).suffix in (".yaml", ".yml", ".json"):
         return actuator_from_file(Path(given))
-    found = look_up(given, NAMED | FAMILIES, "actuator")
+    from codrl_mj.catalogue import motor_entry, motor_names
+
+    if given in motor_names() or Path(given).suffix == ".toml":
+        return Drive.of(motor_entry(given).numbers)
+    found = look_up(given, NAMED | FAMILIES | dict.fromkeys(motor_names()), "actuator")
     made = found() if isinstance(found, type) and issubclass(found, ActuatorModel) else found
     if isinstance(made, ActuatorModel):
         return made
