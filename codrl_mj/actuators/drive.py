@@ -286,7 +286,7 @@ class Drive(ActuatorModel):
 
     @classmethod
     def of(cls, numbers: Any) -> "Drive":
-        """A drive for a motor of `codrl_mj.catalogue.MotorNumbers`, at its voltage (or 24 V) and its largest current."""
+        """A drive for a motor of `codrl_mj.catalogue.MotorNumbers`: its voltage (or 24 V), its peak current."""
         most, voltage = numbers.max_current, numbers.voltage
         loop = SampledLoop() if most is None else SampledLoop(max_current=most)
         return cls(GearMotor.of(numbers), loop, None if voltage is None else Supply(voltage))
