@@ -5,7 +5,8 @@ constant of 0.1 to 5 ms under a loop that samples at 10 to 40 kHz. The winding i
 of its own, its integrator does not wind up, and what is delivered over a mechanical step is the *mean* torque of it:
 the current at the end of a step says little of what moved the load.
 
-The speed, and with it the back-EMF, is held over the mechanical step, as everywhere in the package.
+The speed, and with it the back-EMF, is held over the mechanical step, as everywhere in the package, unless the drive is
+told what it moves (`load_inertia`).
 """
 
 import dataclasses
@@ -54,6 +55,9 @@ class GearMotor:
     """Coulomb friction [N*m] at the rotor, >= 0: the joint's `frictionloss`."""
     viscous_friction: float = real(0.0, least=0.0, unit="N*m*s/rad")
     """Viscous friction [N*m*s/rad] at the rotor, >= 0: the joint's `damping`."""
+    load_inertia: float = real(0.0, least=0.0, unit="kg*m^2")
+    """Inertia [kg*m^2] of what the output shaft moves, >= 0, so that its speed can change within a step; 0: it is held.
+    Nothing is added to the model by it."""
     arm_radius: float = real(1.0, above=0.0, unit="m")
     """Radius [m] of the wheel, drum or pinion on the output shaft that moves a slide, > 0; on a hinge 1."""
 
@@ -150,6 +154,12 @@ class State(NamedTuple):
     """The controller's integral [V]."""
     pending: float
     """Voltage [V] that a delayed loop applies in the next sample."""
+    torque: float
+    """Torque [N*m] delivered in the last step."""
+    speed: float
+    """Speed [rad/s] of the rotor at its beginning."""
+    started: float
+    """1 once there was a step."""
 
 
 class Signals(NamedTuple):
@@ -165,36 +175,40 @@ class Signals(NamedTuple):
     """1 where the voltage, or the current asked for, was at its limit in some sample."""
 
 
-def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Signals]:
-    """Advance winding and loop by the samples of one mechanical step: at once where that has a closed form.
+def run(
+    parameters: Any, samples: int, current: float, integral: float, pending: float, reference: float, speed: float
+) -> tuple[float, float, float, float, float, int]:
+    """Winding and loop over some samples at a held speed: at once where that has a closed form.
 
     The sums that it needs telescope: with S the sum of the current over the samples' starts, the mean of (u - b)/R is
     (S + (i_n - i_0)/(1 - e))/n, and that of the current, the mean of every sample included,
     (S + (1 - m)/(1 - e)*(i_n - i_0))/n with m = (1 - e)/x and x = R*T/L.
 
     Args:
-        parameters: named as the fields of `Drive` and its parts.
-        timestep: mechanical step [s].
-        state: as the step before left it.
-        inputs: desired torque [N*m] and speed [rad/s] at the rotor.
+        parameters: as for `advance`.
+        samples: n.
+        current: i_0 [A].
+        integral: the controller's [V].
+        pending: voltage [V] of the sample before, for a delayed loop.
+        reference: current asked for [A].
+        speed: of the rotor [rad/s].
+
+    Returns:
+        The three afterwards, the mean current [A], the mean voltage [V], and how many samples were saturated.
     """
-    sample_time = 1.0 / parameters.sample_rate
-    samples = max(int(timestep * parameters.sample_rate + 0.5), 1)
+    sample_time, first = 1.0 / parameters.sample_rate, current
     resistance, voltage = parameters.resistance, parameters.supply_voltage
     x = resistance * sample_time / parameters.inductance
-    asked = inputs.desired_torque / parameters.torque_constant
-    reference = min(max(asked, -parameters.max_current), parameters.max_current)
-    back_emf = parameters.back_emf_constant * inputs.speed
+    lost = -math.expm1(-x)
+    back_emf = parameters.back_emf_constant * speed
     compensated = back_emf if parameters.bemf_compensation != 0.0 else 0.0
     designed = parameters.kp == 0.0 and parameters.ki == 0.0
-    share = parameters.bandwidth * sample_time if parameters.bandwidth > 0.0 else DEFAULT_BANDWIDTH
-    y = 2.0 * math.pi * share
-    lost, pending = -math.expm1(-x), 0.0
+    y = 2.0 * math.pi * (parameters.bandwidth * sample_time if parameters.bandwidth > 0.0 else DEFAULT_BANDWIDTH)
     if designed and parameters.anti_windup == 0.0 and parameters.delayed == 0.0 and parameters.supply_resistance == 0.0:
         offset = back_emf - compensated
         current, integral, total, saturated = sampled.jump(
-            state.current,
-            (state.integral - offset) / resistance,
+            current,
+            (integral - offset) / resistance,
             reference,
             (-voltage - back_emf) / resistance,
             (voltage - back_emf) / resistance,
@@ -209,9 +223,9 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
         if designed:
             kp, ki = sampled.designed_gains(resistance, parameters.inductance, sample_time, y * parameters.sample_rate)
         current, integral, pending, total, saturated = sampled.run_samples(
-            state.current,
-            state.integral,
-            state.pending,
+            current,
+            integral,
+            pending,
             reference,
             back_emf,
             compensated,
@@ -225,20 +239,62 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
             parameters.anti_windup,
             parameters.delayed,
         )
-    change = (current - state.current) / lost
+    change = (current - first) / lost
     mean = (total + (1.0 - lost / x) * change) / samples
-    mean_voltage = back_emf + resistance * (total + change) / samples
-    torque = parameters.torque_constant * mean
-    if parameters.gear_efficiency < 1.0:
-        driving = torque * inputs.speed > 0.0
-        share = 1.0 - parameters.gear_efficiency if driving else 1.0 / parameters.gear_efficiency - 1.0
-        loss = share * abs(torque)
-        if parameters.rotor_inertia > 0.0:  # no more than stops the rotor alone, and so never more than stops all
-            loss = min(loss, parameters.rotor_inertia * abs(inputs.speed) / timestep)
-        torque -= math.copysign(loss, inputs.speed)
+    return current, integral, pending, mean, back_emf + resistance * (total + change) / samples, saturated
+
+
+def gear_loss(parameters: Any, timestep: float, torque: float, speed: float) -> float:
+    """Torque [N*m] that a gear takes from the motor's torque [N*m] at a speed [rad/s]: against the motion."""
+    driving = torque * speed > 0.0
+    share = 1.0 - parameters.gear_efficiency if driving else 1.0 / parameters.gear_efficiency - 1.0
+    loss = share * abs(torque)
+    if parameters.rotor_inertia > 0.0:  # no more than stops the rotor alone, and so never more than stops all
+        loss = min(loss, parameters.rotor_inertia * abs(speed) / timestep)
+    return math.copysign(loss, speed)
+
+
+def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Signals]:
+    """Advance winding and loop by the samples of one mechanical step.
+
+    Where a saturated voltage meets a light load, the speed cannot be held over the step: c = h*kT*kE/(R*J), J the
+    inertia of rotor and load, is the share of the speed that the back-EMF takes off in a step h; above 1 it rings,
+    above 2 it grows. With a `load_inertia` the step is cut into 2*c pieces, and the rotor's speed goes on from piece to
+    piece by the motor's torque and by what else moved the load in the step before.
+
+    Args:
+        parameters: named as the fields of `Drive` and its parts.
+        timestep: mechanical step [s].
+        state: as the step before left it.
+        inputs: desired torque [N*m] and speed [rad/s] at the rotor.
+    """
+    samples = max(int(timestep * parameters.sample_rate + 0.5), 1)
+    asked = inputs.desired_torque / parameters.torque_constant
+    reference = min(max(asked, -parameters.max_current), parameters.max_current)
+    inertia, pieces, others = 0.0, 1, 0.0
+    if parameters.load_inertia > 0.0:
+        inertia = parameters.rotor_inertia + parameters.load_inertia / (parameters.gear_ratio * parameters.gear_ratio)
+        braking = parameters.torque_constant * parameters.back_emf_constant / parameters.resistance
+        pieces = min(max(math.ceil(2.0 * timestep * braking / inertia), 1), samples)
+        if state.started > 0.0:
+            others = (inputs.speed - state.speed) / timestep - state.torque / inertia
+    current, integral, pending, speed = state.current, state.integral, state.pending, inputs.speed
+    amperes, volts, torque, saturated, left = 0.0, 0.0, 0.0, 0, samples
+    for piece in range(pieces):
+        count = left // (pieces - piece)
+        current, integral, pending, mean, voltage, limited = run(
+            parameters, count, current, integral, pending, reference, speed
+        )
+        left, saturated = left - count, saturated + limited
+        share, delivered = count / samples, parameters.torque_constant * mean
+        if parameters.gear_efficiency < 1.0:
+            delivered -= gear_loss(parameters, timestep, delivered, speed)
+        amperes, volts, torque = amperes + share * mean, volts + share * voltage, torque + share * delivered
+        if pieces > 1:
+            speed += share * timestep * (delivered / inertia + others)
     at_limit = 1.0 if saturated > 0 or reference != asked else 0.0
-    signals = Signals(mean, reference, mean_voltage, at_limit)
-    return State(current, integral, pending), torque, signals
+    after = State(current, integral, pending, torque, inputs.speed, 1.0)
+    return after, torque, Signals(amperes, reference, volts, at_limit)
 
 
 def observe(parameters: Any, timestep: float, signals: Signals, inputs: Inputs) -> tuple[float, float]:  # noqa: ARG001
@@ -264,6 +320,8 @@ class Drive(ActuatorModel):
         sampled.jump,
         sampled.run_samples,
         sampled.designed_gains,
+        run,
+        gear_loss,
     )
     advance: ClassVar = staticmethod(advance)
     observe: ClassVar = staticmethod(observe)

@@ -44,7 +44,7 @@ def drive(name, rate=20e3, **loop):
 
 def responses(one, timestep, torques, speeds):
     """States, torques and signals of steps under held torques and speeds at the rotor."""
-    parameters, state = parameters_type(Drive)(*one.numbers), one.State(0.0, 0.0, 0.0)
+    parameters, state = parameters_type(Drive)(*one.numbers), one.State(*[0.0] * 6)
     found = []
     for torque, speed in zip(torques, speeds, strict=True):
         state, delivered, signals = one.advance(parameters, timestep, state, Inputs(torque, 0.0, speed, 0.0, 0.0))
@@ -126,7 +126,7 @@ def test_an_uncompensated_back_emf_is_the_same_in_closed_form_and_by_stepping(na
     resistance, _, constant, voltage = WINDINGS[name]
     torques, speeds = torques * constant * voltage / resistance, speeds * voltage / constant
     for one_step, other in zip(*(responses(each, 0.002, torques, speeds) for each in (one, stepping)), strict=True):
-        np.testing.assert_allclose(one_step[0], other[0], atol=1e-11 * voltage)
+        np.testing.assert_allclose(one_step[0][:2], other[0][:2], atol=1e-11 * voltage)
         np.testing.assert_allclose(one_step[2][:3], other[2][:3], atol=1e-11 * voltage / min(resistance, 1.0))
 
 
@@ -342,3 +342,61 @@ def test_a_datasheet_makes_a_motor():
         resistance="0.464 ohm", inductance="0.322 mH", torque_constant="25.1 mN*m/A", rotor_inertia="135 g*cm^2"
     )
     assert dataclasses.astuple(motor)[:5] == pytest.approx((0.464, 0.322e-3, 0.0251, 0.0251, 1.35e-5), rel=1e-12)
+
+
+# name: gear ratio, rotor inertia, and a load [kg*m^2] that is light for it: its speed cannot be held for 20 ms
+STIFF = {"dcx22l": (35.0, 9.37e-7, 2e-3), "ak80-6": (6.0, 6.07e-5, 2e-2), "1331t": (43.0, 0.71e-7, 2e-4)}
+
+
+def chain(name, timestep, loads):
+    """Links about one another's ends, each with a motor that is told what it moves [kg*m^2]."""
+    resistance, inductance, constant, voltage = WINDINGS[name]
+    ratio, inertia, load = STIFF[name]
+    spec = mujoco.MjSpec()
+    spec.option.timestep, body = timestep, spec.worldbody
+    actuators = {}
+    for link, told in enumerate(loads):
+        body = body.add_body(pos=[0.0, 0.0, -0.12 * link])
+        body.explicitinertial, body.mass, body.inertia = True, 0.05, [load / len(loads)] * 3
+        body.add_joint(name=f"joint{link}", axis=[0.0, 1.0, 0.0])
+        spec.add_actuator(target=f"joint{link}", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
+        motor = GearMotor(resistance, inductance, constant, constant, inertia, gear_ratio=ratio, load_inertia=told)
+        actuators[f"joint{link}"] = Drive(motor, SampledLoop(20e3), Supply(voltage))
+    return codrl_mj.motorise(spec, actuators).compile()
+
+
+def reversals(name, timestep, loads):
+    """Speeds [rad/s] of links whose motors are asked to and fro for nearly all they can; and the no-load speed."""
+    resistance, _, constant, voltage = WINDINGS[name]
+    ratio = STIFF[name][0]
+    model = chain(name, timestep, loads)
+    data, speeds = mujoco.MjData(model), []
+    for step in range(round(1.0 / timestep)):
+        data.ctrl[:] = (-1) ** int((step + 0.5) * timestep / 0.2) * 0.9 * constant * ratio * voltage / resistance
+        mujoco.mj_step(model, data)
+        speeds.append(data.qvel.copy())
+    return np.array(speeds), voltage / (constant * ratio)
+
+
+@pytest.mark.parametrize("name", STIFF)
+def test_a_light_load_turns_as_in_short_steps_once_the_drive_is_told_of_it(name):
+    fine, fastest = reversals(name, 5e-5, [0.0])
+    held, _ = reversals(name, 0.02, [0.0])
+    assert np.abs(held - fine[399::400]).mean() > 0.04 * fastest
+    for timestep in (0.002, 0.01, 0.02):
+        every = round(timestep / 5e-5)
+        told, _ = reversals(name, timestep, [STIFF[name][2]])
+        assert np.abs(told - fine[every - 1 :: every]).mean() < 0.02 * fastest
+
+
+def test_an_arm_of_two_light_links_is_finite_at_20_ms():
+    """A joint moves 1/(M^-1)_jj, less the rotor; what couples the joints is known a step late, so they are told less."""
+    model = chain("dcx22l", 0.02, [0.0, 0.0])
+    data, inertia = mujoco.MjData(model), np.zeros((2, 2))
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, inertia)
+    loads = 1.0 / np.diag(np.linalg.inv(inertia)) - model.dof_armature
+    held, fastest = reversals("dcx22l", 0.02, [0.0, 0.0])
+    assert np.abs(held).max() > 100.0 * fastest
+    told, _ = reversals("dcx22l", 0.02, 0.6 * loads)
+    assert np.abs(told).max() < 3.0 * fastest
