@@ -390,7 +390,7 @@ def test_a_light_load_turns_as_in_short_steps_once_the_drive_is_told_of_it(name)
 
 
 def test_an_arm_of_two_light_links_is_finite_at_20_ms():
-    """A joint moves 1/(M^-1)_jj, less the rotor; what couples the joints is known a step late, so they are told less."""
+    """A joint moves 1/(M^-1)_jj, less the rotor; it is told less, for what couples joints is known a step late."""
     model = chain("dcx22l", 0.02, [0.0, 0.0])
     data, inertia = mujoco.MjData(model), np.zeros((2, 2))
     mujoco.mj_forward(model, data)

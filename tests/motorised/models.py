@@ -80,7 +80,9 @@ ACTUATORS = {
     "noisy_current_loop": NOISY,
     "lag": Lag(time_constant=0.03, delay=0.007),
     "drive": Drive(
-        GearMotor(gear_ratio=5.0, coulomb_friction=1e-3, viscous_friction=1e-5), SampledLoop(10e3), Supply(3.0)
+        GearMotor(rotor_inertia=0.0, gear_ratio=5.0, gear_efficiency=0.9, load_inertia=0.01),
+        SampledLoop(10e3),
+        Supply(3.0),
     ),
     "torque_speed": TorqueSpeed(stall_torque=0.8, no_load_speed=3.0, max_torque=0.6),
     "somebody's": Worn(),
