@@ -121,7 +121,7 @@ def register() -> None:
 
 def complain(text: str) -> None:
     """Say why a model is refused, where MuJoCo says such things: all that a plugin can tell it is that it failed."""
-    library().mju_warning(b"%s", f"{NAME}: {text}".encode())
+    library().mju_warning(f"{NAME}: {text}".replace("%", "%%").encode())
 
 
 def _door() -> Any:

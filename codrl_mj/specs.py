@@ -52,14 +52,13 @@ def motorise(spec: mujoco.MjSpec, actuators: Mapping[str, Any], allow_unstable: 
     # MuJoCo 3.17 copies default classes without their numbers, and forgets those that are added then; this numbers them
     new.delete(new.add_default(NAME, new.default))
     for index, (pattern, actuator) in sorted(_chosen(new, actuators).items()):
-        reason = _refusal(model, new.actuators[index], index)
+        reason = _refusal(model, new.actuators[index], index, actuator)
         if reason:
             raise ValueError(f"{_call(new.actuators[index], index)}: cannot be motorised: {reason}")
-        if not allow_unstable:
-            try:
-                actuator.check(model.opt.timestep)
-            except ValueError as error:
-                raise ValueError(f"{pattern!r}: {error}") from None
+        try:
+            actuator.check_at(model.opt.timestep, allow_unstable)
+        except ValueError as error:
+            raise ValueError(f"{pattern!r}: {error}") from None
         load_family(type(actuator))
         _drive(new, model, index, actuator)
     new.nuser_actuator = -1  # as many as are needed
@@ -75,7 +74,15 @@ def _chosen(spec: mujoco.MjSpec, actuators: Mapping[str, Any]) -> dict[int, tupl
     """Index -> (pattern, actuator)."""
     found: dict[int, tuple[str, ActuatorModel]] = {}
     names = [[name for name in (target.name, target.target) if name] for target in spec.actuators]
+    if not isinstance(actuators, Mapping):
+        raise ValueError(f"actuators = {actuators!r}: must be a mapping of patterns, such as {{'.*': 'lag'}}")
     for pattern, given in actuators.items():
+        try:
+            re.compile(pattern)
+        except (re.error, TypeError) as error:
+            raise ValueError(
+                f"{pattern!r}: must be a regular expression ({error}); '.*' is any name, 'leg.*' a leg's"
+            ) from None
         actuator = resolve(given, None, f"the model {spec.modelname!r}")
         matched = [index for index, own in enumerate(names) if any(re.fullmatch(pattern, name) for name in own)]
         if not matched:
@@ -101,7 +108,7 @@ def _chosen(spec: mujoco.MjSpec, actuators: Mapping[str, Any]) -> dict[int, tupl
     return found
 
 
-def _refusal(model: mujoco.MjModel, target: mujoco.MjsActuator, index: int) -> str:
+def _refusal(model: mujoco.MjModel, target: mujoco.MjsActuator, index: int, actuator: ActuatorModel) -> str:
     """Why an actuator of a model cannot be motorised; empty if it can."""
     transmission, dynamics = mujoco.mjtTrn(model.actuator_trntype[index]), mujoco.mjtDyn(model.actuator_dyntype[index])
     gain, bias = mujoco.mjtGain(model.actuator_gaintype[index]), mujoco.mjtBias(model.actuator_biastype[index])
@@ -121,6 +128,8 @@ def _refusal(model: mujoco.MjModel, target: mujoco.MjsActuator, index: int) -> s
         return "its tendon limits the force of its actuators (actuatorfrclimited), which MuJoCo does not do for plugins"
     if model.actuator_delay[index]:
         return "its control is delayed (delay), which MuJoCo does not tell plugins"
+    if actuator.additions.friction and transmission not in (*_JOINT, mujoco.mjtTrn.mjTRN_TENDON):
+        return "it drives neither a joint nor a tendon, which the friction that its motor brings would need"
     if model.actuator_user[index].any():
         return "it has user data, where its motor's parameters have to go"
     return ""

@@ -27,6 +27,7 @@ def script():
     del sys.modules["train_custom_agent"]
 
 
+@pytest.mark.matrix
 def test_it_learns_to_balance_and_the_file_holds_what_was_evaluated(script, tmp_path, capsys):
     out = tmp_path / "new" / "agent.safetensors"
     arguments = ["--total-steps", "40000", "--num-envs", "16", "--rollout", "128", "--eval-episodes", "20"]

@@ -8,6 +8,7 @@ import pytest
 
 from codrl_mj.runs.summaries import read_run
 
+pytestmark = pytest.mark.matrix
 SCRIPTS = Path(__file__).parent.parent / "scripts"
 
 
@@ -29,7 +30,6 @@ def test_a_training_and_its_rollouts(tmp_path):
     assert film.read_bytes()[:3] == b"GIF"
 
 
-@pytest.mark.matrix
 def test_the_cross_validation():
     printed = run("cross_validate.py", "mountain_car", "--quick").splitlines()
     assert len(printed) > 20

@@ -1,6 +1,6 @@
 """Actuators as mathematics: what one is, the families of them, stability, names. No MuJoCo."""
 
-from codrl_mj.actuators.current_loop import Actuator, CurrentLoop, Motor, Supply, electrical_step
+from codrl_mj.actuators.current_loop import Actuator, CurrentLoop, Motor, Supply, VoltageDriven, electrical_step
 from codrl_mj.actuators.drive import Drive, GearMotor, SampledLoop
 from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.lag import Lag
@@ -29,7 +29,7 @@ from codrl_mj.actuators.named import (
     mapping_of,
     resolve,
 )
-from codrl_mj.actuators.stability import check_stable, closed_loop_matrix, spectral_radii, spectral_radius
+from codrl_mj.actuators.stability import check_stable, spectral_radii, spectral_radius
 from codrl_mj.actuators.torque_speed import TorqueSpeed
 
 __all__ = [
@@ -52,11 +52,11 @@ __all__ = [
     "SampledLoop",
     "Supply",
     "TorqueSpeed",
+    "VoltageDriven",
     "actuator_from_mapping",
     "actuator_over",
     "check_same_family",
     "check_stable",
-    "closed_loop_matrix",
     "electrical_step",
     "family_name",
     "family_number",

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from codrl_mj.actuators import noise, stability
-from codrl_mj.actuators.model import ActuatorModel, Command, Inputs
+from codrl_mj.actuators.model import ActuatorModel, Command, Inputs, UnstableError
 from codrl_mj.fields import check, flag, integer, part, real
 
 
@@ -299,7 +299,7 @@ class Actuator(ActuatorModel):
             substeps = self.controller.substeps
             bound = 2.0 * self.motor.inductance * substeps / timestep - self.motor.resistance
             if not self.supply.resistance < bound:
-                raise ValueError(
+                raise UnstableError(
                     f"actuator: supply.resistance = {self.supply.resistance:g}: must be < 2*L/dt - R = {bound:g} ohm "
                     f"at an electrical step of {timestep / substeps:g} s, or a saturated motor's current oscillates "
                     "from step to step. Raise controller.substeps, or pass allow_unstable=True"

@@ -18,7 +18,7 @@ import numpy as np
 
 from codrl_mj.actuators import sampled, stability
 from codrl_mj.actuators.current_loop import Supply
-from codrl_mj.actuators.model import ActuatorModel, Command, Inputs, JointAdditions, parameters_type
+from codrl_mj.actuators.model import ActuatorModel, Command, Inputs, JointAdditions, UnstableError, parameters_type
 from codrl_mj.fields import check, choice, flag, part, real
 
 DEFAULT_BANDWIDTH = 0.349 / (2 * math.pi)
@@ -408,7 +408,7 @@ class Drive(ActuatorModel):
             )
         radius = float(_radii(type(self), np.array([self.numbers]))[0])
         if not radius < 1.0:
-            raise ValueError(
+            raise UnstableError(
                 f"actuator: the current loop is unstable: spectral radius {radius:.4g} over a sample, must be < 1. "
                 f"Lower controller.kp = {controller.kp:g} and controller.ki = {controller.ki:g}, or leave both 0 to "
                 "have them designed; lower supply.resistance; or pass allow_unstable=True to study it as it is"

@@ -36,6 +36,10 @@ class Inputs(NamedTuple):
     """Key of the episode's random numbers, a whole number: see `codrl_mj.actuators.noise`."""
 
 
+class UnstableError(ValueError):
+    """An actuator that is not stable at a step; `allow_unstable=True` simulates it all the same."""
+
+
 class Nothing(NamedTuple):
     """No states, or no signals."""
 
@@ -168,8 +172,21 @@ class ActuatorModel:
         """Refuse what cannot be simulated at a mechanical step [s].
 
         Raises:
-            ValueError: the reason, with its number, and a remedy.
+            UnstableError: it is unstable there; the reason, with its number, and a remedy.
+            ValueError: it cannot be simulated at all, likewise.
         """
+
+    def check_at(self, timestep: float, allow_unstable: bool) -> None:
+        """`check`, but what is only unstable may be allowed.
+
+        Raises:
+            ValueError: see `check`.
+        """
+        try:
+            self.check(timestep)
+        except UnstableError:
+            if not allow_unstable:
+                raise
 
     @classmethod
     def instability(cls, numbers: np.ndarray, timestep: float) -> np.ndarray:
@@ -214,6 +231,7 @@ class ActuatorModel:
         Raises:
             ValueError: a value is out of bounds.
         """
+        fields.check_names(values, field_paths(_family(self)), "actuator field")
         changes: dict[str, Any] = {}
         nested: dict[str, dict[str, Any]] = {}
         for path, value in values.items():
@@ -379,7 +397,7 @@ def load_object(text: str) -> Any:
         )
     try:
         return functools.reduce(getattr, name.split("."), importlib.import_module(module))
-    except (ImportError, AttributeError, ValueError) as error:
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
         raise ValueError(f"{text!r}: {error}; must be module:NAME, of a module that Python finds") from None
 
 
@@ -395,7 +413,7 @@ def look_up(name: str, known: Mapping[str, Any], what: str, anybodys: bool = Tru
     Raises:
         ValueError: unknown name; the nearest known one is suggested. Or as for `load_object`.
     """
-    if name in known:
+    if isinstance(name, str) and name in known:
         return known[name]
     if anybodys and ":" in str(name):
         return load_object(name)

@@ -5,38 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.actuators.model import Inputs, parameters_type
+from codrl_mj.actuators.model import UnstableError, parameters_type
 
 
 def columns(family: Any, numbers: np.ndarray) -> Any:
     """Parameters of m actuators at once, each an array (m,), from rows of numbers (m, p)."""
     return parameters_type(family)(*numbers.T)
-
-
-def closed_loop_matrix(actuator: Any, timestep: float) -> np.ndarray:
-    """Transition matrix of the unsaturated loop over one mechanical step, at zero reference and speed.
-
-    Only the states that some gain reads are part of the loop: the current always, the integral if ki > 0 and the
-    previous error if kd > 0. The matrix is read off `advance` itself, a linear map while the voltage does not saturate.
-
-    Args:
-        actuator: motor and gains.
-        timestep: mechanical step [s].
-
-    Returns:
-        Square matrix, shape (n, n) with n in 1..3.
-    """
-    family: Any = type(actuator)
-    parameters = parameters_type(family)(*actuator.numbers)._replace(
-        max_voltage=np.inf, supply_voltage=np.inf, supply_resistance=0.0, current_bias=0.0, current_noise=0.0
-    )
-    states = [0]
-    states += [1] if actuator.controller.ki > 0 else []
-    states += [2] if actuator.controller.kd > 0 else []
-    units = np.eye(3)[states]
-    rest = Inputs(0.0, 0.0, 0.0, 0.0, 0.0)
-    after = [actuator.advance(parameters, timestep, actuator.State(*unit), rest)[0] for unit in units]
-    return np.array(after).T[states]
 
 
 class _Unlimited:
@@ -148,7 +122,7 @@ def check_stable(actuator: Any, timestep: float) -> None:
     radius = spectral_radius(actuator, timestep)
     if radius < 1.0:
         return
-    raise ValueError(
+    raise UnstableError(
         f"actuator: the current loop is unstable at a step of {timestep:g} s: spectral radius {radius:.4g}, must be "
         f"< 1. {_remedy(actuator, timestep)}, or pass allow_unstable=True to study it as it is"
     )

@@ -179,14 +179,14 @@ def with_environment(verb: Any, arguments: Sequence[str]) -> Any:
     from codrl_mj.training.folder import load_config
 
     chosen = scan(arguments, "actuator")
-    known: Any = Actuator()
+    known = EnvConfig("cartpole", Actuator())
     with contextlib.suppress(ValueError):  # the verb says so better
         find_task(chosen.task or "cartpole")  # its options are flags
     for run in map(Path, arguments):
         if (run / CONFIG).is_file():
             with contextlib.suppress(ValueError, OSError):  # the verb says so better
-                known = load_config(run, chosen.trust).env.actuators[0]
-    fields = environment_fields(EnvConfig("cartpole", known), chosen.actuator, chosen.task or "cartpole")
+                known = load_config(run, chosen.trust).evaluation_env
+    fields = environment_fields(known, chosen.actuator, chosen.task or "cartpole")
     made = dataclasses.make_dataclass(verb.__name__, fields, bases=(verb,), frozen=True)
     made.__doc__ = verb.__doc__
     return made

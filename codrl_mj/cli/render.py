@@ -8,6 +8,7 @@ import tyro
 
 from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, environment, is_task
 from codrl_mj.cli.subject import Source
+from codrl_mj.tasks import find_task
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +50,8 @@ class Render:
         from codrl_mj.runs.policies import Policy
 
         if is_task(self.subject):
-            task, name = self.subject, "paper" if self.actuator_name == AS_TRAINED else self.actuator_name
+            task, name = self.subject, self.actuator_name
+            name = find_task(task).default_actuator if name == AS_TRAINED else name
             env = environment(self, task, name)
             policy: Policy = RandomPolicy(env.make().action_space, self.seed)
         else:

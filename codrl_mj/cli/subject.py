@@ -77,4 +77,4 @@ class Source:
             raise ValueError(f"{path} does not say which algorithm made it: name it with --agent, such as --agent ppo")
         else:
             policy = load_sb3_zip(path, self.agent or "", self.trust)
-        return Subject(policy, EnvConfig(self.task, "paper" if find_task(self.task).paper else "ideal"))
+        return Subject(policy, EnvConfig(self.task, find_task(self.task).default_actuator))

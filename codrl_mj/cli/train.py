@@ -72,7 +72,7 @@ def train_verb(arguments: list[str]) -> Any:
             ],
             chosen.settings if chosen.settings in SETTINGS else "default",
         ),
-        ("actuator_name", ActuatorName, AS_CONFIGURED if configured else "paper"),
+        ("actuator_name", ActuatorName, AS_CONFIGURED if configured else find_task(base.task).default_actuator),
         *((field.name, field.type, field.default) for field in dataclasses.fields(rest)),
         ("agent", Annotated[agent_flags, tyro.conf.arg(help="The agent's settings.")], agent_flags()),
         *environment_fields(base.env, chosen.actuator, base.task),
@@ -166,4 +166,4 @@ def _base(chosen: argparse.Namespace) -> TrainConfig:
     task = chosen.task or "cartpole"
     agent = chosen.agent if chosen.agent in AGENTS or ":" in str(chosen.agent) else default_agent(task)
     settings = chosen.settings if chosen.settings in SETTINGS else "default"
-    return TrainConfig.preset(task, agent, settings, "paper" if find_task(task).paper else "ideal")
+    return TrainConfig.preset(task, agent, settings, find_task(task).default_actuator)

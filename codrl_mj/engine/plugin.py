@@ -15,8 +15,7 @@ import mujoco
 import numba
 from numba import types
 
-from codrl_mj.actuators import Ideal, family_number, reference
-from codrl_mj.actuators.model import load_object
+from codrl_mj.actuators import FAMILIES, Ideal, VoltageDriven, family_number, reference
 from codrl_mj.engine.commands import COMMAND_DATA_FIELDS, COMMAND_MODEL_FIELDS, clip, commands
 from codrl_mj.engine.families import (
     HEAD,
@@ -37,8 +36,9 @@ from codrl_mj.plugin import FAMILY, NAME, complain, library, registered
 
 PLUGIN_HEAD = HEAD + 1
 """The `user` data begin with `Head` and the actuator's arm [m]."""
-EXTRA_STATES = 1
-"""After the actuator's slot: the desired force [N], at the joint's side of the arm."""
+EXTRA_STATES = 2
+"""After the actuator's slot: the desired force [N], at the joint's side of the arm; and 1 between a step's first call
+and its end, where further calls within it are stages of RK4."""
 
 MODEL_FIELDS = (
     *COMMAND_MODEL_FIELDS,
@@ -169,13 +169,14 @@ def compiled() -> Functions:
             number, arm = int(f64(user)[2]), f64(user)[HEAD]
             gear = 1.0 / arm  # as at the other door, which multiplies by it
             # stages 2 to 4 of RK4: a drive is sampled once a step, and its torque held
-            held = own[0] < time <= own[0] + timestep and i32(model + integrator_at)[0] == rk4 and number != ideal
+            within = own[0] < time <= own[0] + timestep and own[size_of(number) + 1] != 0.0
+            held = within and i32(model + integrator_at)[0] == rk4 and number != ideal
             if not held:
                 length = f64(array(data, length_at))[out]
                 velocity = f64(array(data, velocity_at))[out]
                 force = engine_force(model, data, actuator, length, velocity)
                 own[0] = time  # of the committed state, also after somebody set the time
-                own[size_of(number)] = force
+                own[size_of(number)], own[size_of(number) + 1] = force, 1.0
                 parameters = user + 8 * PLUGIN_HEAD
                 advance_slot(number, parameters, timestep, slot, force * arm, length * gear, velocity * gear, time)
             f64(array(data, force_at))[out] = own[2] * gear
@@ -184,8 +185,9 @@ def compiled() -> Functions:
     def advance(model: int, data: int, instance: int) -> None:
         for actuator in range(i64(model + nactuator_at)[0]):
             if i32(array(model, plugin_at))[actuator] == instance:
-                number = int(f64(user_of(model, actuator))[2])
-                commit_slot(number, slot_of(model, data, instance), f64(data + time_at)[0])
+                number, slot = int(f64(user_of(model, actuator))[2]), slot_of(model, data, instance)
+                commit_slot(number, slot, f64(data + time_at)[0])
+                f64(slot)[size_of(number) + 1] = 0.0
 
     @numba.cfunc(types.void(types.uintp, types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")
     def reset(model: int, state: int, data: int, instance: int) -> None:  # noqa: ARG001
@@ -254,7 +256,8 @@ def states_of(model: int, instance: int) -> int:
 
 
 def _configuration(model: int, instance: int) -> str:
-    text = _configuration_function()(model, instance, ctypes.addressof(ctypes.create_string_buffer(FAMILY.encode())))
+    attribute = ctypes.create_string_buffer(FAMILY.encode())  # held until it has been read
+    text = _configuration_function()(model, instance, ctypes.addressof(attribute))
     return ctypes.string_at(text).decode() if text else ""
 
 
@@ -264,11 +267,9 @@ def _family(name: str) -> Any:
     Raises:
         ValueError: it is somebody else's and was not loaded.
     """
-    for family in loaded_families():
+    for family in (*loaded_families(), *FAMILIES.values(), VoltageDriven):
         if reference(family) == name:
             return family
-    if name.startswith("codrl_mj."):
-        return load_object(name)
     raise ValueError(
         f"its family {name!r} is not loaded, and is not imported because a model says so: import its module and call "
         "codrl_mj.load_family with it before the model is loaded"

@@ -25,7 +25,7 @@ class Draws:
             physics: the N simulations.
             actuators: the nominal ones of each.
         """
-        self._randomization = randomization
+        self._randomization, self._actuators = randomization, actuators
         self._physics = physics
         count = physics.num_envs
         self._nominal, self._arms = nominal_parameters(actuators)
@@ -75,9 +75,11 @@ class Draws:
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
         """Bring back the values, and the simulations to them; to be followed by a restoring of the simulations."""
         self._values[:], self._rejected[:] = snapshot["drawn"], snapshot["rejected"]
-        rows = np.flatnonzero(~np.isnan(self._values).any(axis=1))
-        if len(rows):
-            self._apply(rows)
+        undrawn = np.flatnonzero(np.isnan(self._values).any(axis=1))
+        for row in undrawn.tolist():
+            self._values[row] = self._randomization.nominal_values(self._actuators[row])
+        self._apply(np.arange(len(self._values)))
+        self._values[undrawn] = np.nan
 
     def show(self, row: int) -> None:
         """Give the model that is drawn the lengths of one environment."""

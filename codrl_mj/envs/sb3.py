@@ -157,7 +157,7 @@ class ActuatedVecEnv(VecEnv):
         """
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise ValueError(f"set_attr({attr_name!r}): the environments share it; it can only be set for all of them")
-        setattr(self.env, attr_name, value)
+        self.env.set_attr(attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
         """Call a method of the vector environment once; its result stands for each of the environments asked for."""

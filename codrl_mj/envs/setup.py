@@ -65,9 +65,8 @@ class Setup:
                 "model.damping, not both"
             )
         drawn = randomization is not None and randomization.draws_actuator  # then every draw is checked
-        if not config.allow_unstable and not drawn:
-            for one in commands.simulated:
-                one.check(timestep)
+        for one in commands.simulated if not drawn else ():
+            one.check_at(timestep, config.allow_unstable)
         return cls(
             task=definition,
             actuators=actuators,

@@ -91,7 +91,8 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
                 "environment at a time: use vectorization_mode='sync' for it"
             )
         if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"render_mode = {render_mode!r}: must be None or 'rgb_array'")
+            modes = ", ".join(self.metadata["render_modes"])
+            raise ValueError(f"render_mode = {render_mode!r}: must be one of None, {modes}")
         self.num_envs = int(num_envs)
         self.setup, actuators = _set_up(self.num_envs, task, actuator, arguments)
         self.physics = MujocoBatchPhysics(
@@ -298,9 +299,10 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         if self.setup.view.sensors:
             seen = self.physics.observed(signals)
             self._observations[:, -len(self.setup.view.sensors) :] = seen.reshape(self.num_envs, -1)
-        if broken >= 0:
-            self.physics.check_finite(after, stepping)
         self.signals = signals
+        if broken >= 0:
+            self._ended |= terminated | truncated  # what is to be reset still is
+            self.physics.check_finite(after, stepping)
         infos = _infos(signals, stepping)
         if not stepping.all():
             infos |= self._restart(np.flatnonzero(~stepping), None)

@@ -112,6 +112,11 @@ class Task:
     """What the certificate tries the task in; without it, the checks that need states of the task's are left out."""
 
     @property
+    def default_actuator(self) -> str:
+        """The name of the actuator where none is asked for."""
+        return "paper" if self.paper else "ideal"
+
+    @property
     def max_forces(self) -> np.ndarray:
         """Largest desired forces [N] or torques [N*m], shape (n,)."""
         return np.broadcast_to(np.array(self.max_force, dtype=np.float64), (len(self.motors),)).copy()

@@ -15,7 +15,6 @@ from codrl_mj.actuators import (
     Inputs,
     Motor,
     check_stable,
-    closed_loop_matrix,
     parameters_type,
     spectral_radii,
     spectral_radius,
@@ -51,6 +50,22 @@ plain_loops = st.builds(
     max_voltage=between(0.1, 100),
     bemf_compensation=st.booleans(),
 )
+
+
+def closed_loop_matrix(actuator, timestep):
+    """Transition matrix of the unsaturated loop over one mechanical step, read off `advance` itself.
+
+    Only the states that some gain reads are part of the loop: the current always, the integral if ki > 0 and the
+    previous error if kd > 0.
+    """
+    parameters = parameters_type(Actuator)(*actuator.numbers)._replace(
+        max_voltage=np.inf, supply_voltage=np.inf, supply_resistance=0.0, current_bias=0.0, current_noise=0.0
+    )
+    states = [0, *[1] * (actuator.controller.ki > 0), *[2] * (actuator.controller.kd > 0)]
+    rest = Inputs(0.0, 0.0, 0.0, 0.0, 0.0)
+    units = np.eye(3)[states]
+    after = [actuator.advance(parameters, timestep, actuator.State(*unit), rest)[0] for unit in units]
+    return np.array(after).T[states]
 
 
 def _with(actuator, **gains):

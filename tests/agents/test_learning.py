@@ -9,6 +9,7 @@ import pytest
 
 from codrl_mj.agents import DDPGConfig, DQNConfig, PPOConfig, SACConfig, TD3Config
 from tests.agents.small import make_envs, make_model
+from tests.matrix import but
 
 _FAST = {"learning_rate": 3e-3, "gamma": 0.95, "tau": 0.02, "train_every": None}
 _NOISE = {"noise_sigma": 0.3, "noise_theta": 1.0, "noise_dt": 1.0}
@@ -74,7 +75,7 @@ def mean_return(policy, task, episodes=20):
     return np.mean(list(returns.values()))
 
 
-@pytest.mark.parametrize("agent", LEARNERS)
+@pytest.mark.parametrize("agent", but(["ppo"], LEARNERS))
 def test_an_agent_learns(agent):
     config, task, num_envs, steps, least = LEARNERS[agent]
     model = make_model(config, task, seed=2, num_envs=num_envs)

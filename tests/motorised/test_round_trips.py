@@ -175,7 +175,7 @@ def test_another_process_without_us_has_mujocos_error(tmp_path):
     [
         ("250700 ", "2507 ", "user data do not begin with codrl_mj's signature"),
         (reference(Lag), reference(type(LOOP)), "name different families"),
-        (reference(Lag), "codrl_mj.actuators:Nobody", "no attribute 'Nobody'"),
+        (reference(Lag), "codrl_mj.actuators:Nobody", "'codrl_mj.actuators:Nobody' is not loaded"),
         (" 0.3 0.007", "", "fewer numbers than the family has parameters"),
     ],
 )

@@ -129,6 +129,7 @@ train_cells(CELLS, Path(sys.argv[1]), Workers(jobs=2))
         assert weights(resumed[name]) == weights(runs[name])
 
 
+@pytest.mark.matrix
 def test_a_ctrl_c_lets_trainings_write_their_checkpoints(tmp_path):
     """As a terminal does it: to the grid and all its processes. One of them has nothing to do, a cell is not begun."""
     code = """
