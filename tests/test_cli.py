@@ -19,7 +19,7 @@ from codrl_mj.actuators import NAMED
 from codrl_mj.agents.presets import PRESETS
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.evaluation import make_env, run_episodes
+from codrl_mj.evaluation import evaluate, make_env, run_episodes
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.training import TrainConfig, folder, load_config
 from tests.matrix import but
@@ -203,6 +203,17 @@ def test_commands_and_observations_are_those_of_the_training(capsys, tmp_path):
     film = ["--out", "film.gif", "--width", "200", "--height", "120", "--env.max-episode-steps", "2"]
     assert main(["render", "volts", *film]) == 0
     assert main(["render", "cartpole", *levels, *film]) == 0
+
+
+def test_a_run_is_evaluated_in_the_environment_of_its_training(tmp_path):
+    assert main(["train", "cartpole", "--env.disturbances.command-delay", "0.1", *TINY, "--out", "late"]) == 0
+    at_once = ["--env.disturbances.command-delay", "0"]
+    assert main(["evaluate", "late", "--episodes", "3", "--out", "as_trained.json"]) == 0
+    assert main(["evaluate", "late", "--episodes", "3", *at_once, "--out", "0.json"]) == 0
+    found = [json.loads((tmp_path / name).read_text()) for name in ("as_trained.json", "0.json")]
+    expected = evaluate(load_policy(tmp_path / "late"), load_config(tmp_path / "late").evaluation_env, 3)
+    assert found[0] == json.loads(json.dumps(expected.as_mapping()))
+    assert found[1] != found[0]
 
 
 def test_sampled_actions_differ_from_the_most_likely(trained, tmp_path):

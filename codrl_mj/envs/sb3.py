@@ -146,18 +146,24 @@ class ActuatedVecEnv(VecEnv):
         return self.env.image()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """The attribute of the vector environment, once for each of the environments asked for."""
-        return [getattr(self.env, attr_name) for _ in self._get_indices(indices)]
+        """The attribute of the vector environment, once for each environment asked for, or else their own."""
+        shared = hasattr(self.env, attr_name)
+        values = [getattr(self.env, attr_name)] * self.num_envs if shared else self.env.get_attr(attr_name)
+        return [values[index] for index in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of the vector environment, which all its environments share.
+        """Set an attribute of the vector environment, which all its environments share, or else that of each of them.
 
         Raises:
             ValueError: only some of the environments were named.
         """
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise ValueError(f"set_attr({attr_name!r}): the environments share it; it can only be set for all of them")
-        self.env.set_attr(attr_name, value)
+        owners: list[Any] = [self.env]
+        if isinstance(self.env, SerialVectorEnv) and not hasattr(self.env, attr_name):
+            owners = [one.unwrapped for one in self.env.envs]
+        for owner in owners:
+            setattr(owner, attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
         """Call a method of the vector environment once; its result stands for each of the environments asked for."""

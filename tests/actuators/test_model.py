@@ -177,3 +177,9 @@ def test_the_current_loop_says_what_it_is_made_of():
     assert actuator.arm_radius == 0.15
     assert actuator.voltage_limit == math.inf
     assert actuator.motor.electrical_time_constant == 0.15
+
+
+@pytest.mark.parametrize("path", ["motor.inductanc", "motr.inductance", "gain"])
+def test_an_unknown_field_is_not_replaced(path):
+    with pytest.raises(ValueError, match=f"unknown actuator field {path}"):
+        Actuator().replaced({path: 1.0})

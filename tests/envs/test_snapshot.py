@@ -211,3 +211,14 @@ def test_other_numbers_of_environments_are_refused(physics):
         with pytest.raises(ValueError, match=r"^snapshot\['\w+'\] is "):
             three.restore(wrong)
     assert_same(three.snapshot(), before)
+
+
+def test_before_the_first_reset_the_motors_are_the_nominal_ones_again():
+    arguments = {"actuator": "paper", "randomize": {"motor.inductance": Uniform(0.15, 0.3)}}
+    envs = gymnasium.make_vec("codrl_mj/Pendulum-v0", 2, "vector_entry_point", **arguments).unwrapped
+    before, nominal = envs.snapshot(), envs.physics.field("actuator_user").copy()
+    envs.reset(seed=0)
+    assert (envs.physics.field("actuator_user") != nominal).any()
+    envs.restore(before)
+    np.testing.assert_array_equal(envs.physics.field("actuator_user"), nominal)
+    assert np.isnan(envs.randomization["motor.inductance"]).all()

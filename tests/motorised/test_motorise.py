@@ -215,3 +215,29 @@ def test_motorised_models_are_attached_to_others():
     both, one = trajectory(model, np.tile(inputs, 2)), trajectory(alone, inputs)
     np.testing.assert_allclose(both[:, :2], one[:, :2], rtol=0, atol=1e-12)
     np.testing.assert_allclose(both[:, 2:4], one[:, :2], rtol=0, atol=1e-12)
+
+
+RUBBING = codrl_mj.Drive(codrl_mj.GearMotor(coulomb_friction=1e-3))
+
+
+def test_friction_needs_a_joint_or_a_tendon():
+    with pytest.raises(ValueError, match="it drives neither a joint nor a tendon, which the friction"):
+        codrl_mj.motorise(_spec('<general name="push" site="here" gear="1 0 0 0 0 0"/>'), {"push": RUBBING})
+
+
+@pytest.mark.parametrize(
+    ("patterns", "message"),
+    [
+        ({"*": "lag"}, r"'\*': must be a regular expression \(nothing to repeat"),
+        ({3: "lag"}, "3: must be a regular expression"),
+        ([".*"], r"actuators = \['\.\*'\]: must be a mapping of patterns"),
+    ],
+)
+def test_patterns_that_are_none_are_refused(patterns, message):
+    with pytest.raises(ValueError, match=message):
+        codrl_mj.motorise(arm(), patterns)
+
+
+def test_what_cannot_be_simulated_is_not_allowed_with_what_is_unstable():
+    with pytest.raises(ValueError, match=r"'one': Lag\.delay = 5: must be <= 0\.04 s"):
+        codrl_mj.motorise(arm(), {"one": Lag(delay=5.0)}, allow_unstable=True)
