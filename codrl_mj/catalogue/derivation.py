@@ -86,7 +86,7 @@ class MotorNumbers:
 _UNITS = {"stall_torque_at_output": "N*m", "continuous_torque_at_output": "N*m"}
 _LEAST_EFFICIENCY = 0.2
 """No gear that one can buy for a servo is worse: a derived efficiency below it is a slip of units."""
-_OTHER_NAMES = {
+OTHER_NAMES = {
     "max_current": "peak_current",
     "voltage": "nominal_voltage",
     "max_temperature": "max_winding_temperature",
@@ -125,7 +125,7 @@ def derive(readings: Mapping[str, Reading], kinds: Mapping[str, Kind], strict: b
             f"datasheet.{worst.quantity} contradicts the rest by more than {tolerance:.0%}: {worst}. Check the values "
             f"and units of {', '.join(behind)}; raise tolerance, or pass strict=False, if the maker does print them so"
         )
-    for name, field in _OTHER_NAMES.items():
+    for name, field in OTHER_NAMES.items():
         if field in printed:
             known[name], how[name] = known[field], how[field].replace(field, name, 1) + f" as {field}"
     fields = [f.name for f in dataclasses.fields(MotorNumbers) if f.name not in ("derived", "disagreements")]

@@ -10,6 +10,7 @@ import tyro
 
 from codrl_mj.cli.evaluate import Evaluate
 from codrl_mj.cli.fields import with_environment
+from codrl_mj.cli.motor import Motor
 from codrl_mj.cli.render import Render
 from codrl_mj.cli.reproduce import Reproduce
 from codrl_mj.cli.runs import Runs
@@ -23,6 +24,7 @@ VERBS: dict[str, Any] = {
     "evaluate": Evaluate,
     "runs": Runs,
     "render": Render,
+    "motor": Motor,
     "validate": Validate,
     "study": Study,
     "reproduce": Reproduce,
@@ -65,8 +67,8 @@ def _run(arguments: list[str]) -> int:
         return 2
     except ModuleNotFoundError as error:
         print(
-            f"codrl-mj: error: {error}. Training and evaluation need the extra 'train', videos the extra 'render', "
-            "certificates the extra 'validate': pip install 'codrl-mj[all]'",
+            f"codrl-mj: error: {error}. Training and evaluation need the extra 'train', videos and "
+            "pictures the extra 'render', certificates and margins the extra 'validate': pip install 'codrl-mj[all]'",
             file=sys.stderr,
         )
         return 2

@@ -1,0 +1,156 @@
+"""`codrl-mj motor feasible` and `codrl-mj motor choose`."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+Asked = Annotated[
+    tyro.conf.Positional[str],
+    tyro.conf.arg(
+        metavar="TASK|RUN",
+        help="A task, which a scripted controller drives; a run folder, trained on the ideal actuator; or an .npz file "
+        "with the arrays time [s], torque [N*m] and speed [rad/s] of a joint.",
+    ),
+]
+Trust = Annotated[
+    bool, tyro.conf.arg(help="Import the modules of a run folder's task or agent if these are somebody's own.")
+]
+
+
+@dataclasses.dataclass(frozen=True)
+class Feasible:
+    """Ask whether a motor can do a task, before anything is trained: surely, surely not, or try it. docs/motors.md.
+
+    Exit status 1 if surely not. Example: codrl-mj motor feasible maxon-ec45-flat-50w pendulum --gear-ratio 20
+    """
+
+    name: Annotated[
+        tyro.conf.Positional[str],
+        tyro.conf.arg(metavar="NAME", help="A motor of the catalogue (codrl-mj motor list), or a file or module:NAME."),
+    ]
+    asked: Asked
+    gear_ratio: float | None = None
+    """Turns of the rotor for a turn of the joint, or radians for a metre; the motor's own unless given."""
+    voltage: float | None = None
+    """Voltage of the supply [V]."""
+    out: Path | None = None
+    """Folder for torque_speed.png: what was asked for over what the motor can do."""
+    trust: Trust = False
+
+    def run(self) -> int:
+        """Print the bounds, and the verdict last."""
+        from codrl_mj.cli.terminal import console
+        from codrl_mj.sizing import SURELY_NOT, catalogued, demand_of, feasibility
+
+        drive, continuous, unknown = catalogued(self.name, self.gear_ratio, self.voltage)
+        demand = demand_of(self.asked, trust=self.trust)
+        found = feasibility(drive, demand, continuous)
+        table = _table(f"{self.name}, gear {1.0 / drive.arm_radius:.4g}, {drive.voltage_limit:g} V: {demand.source}")
+        for header in ("bound", "of", "needs", "has", "unit", "", "says"):
+            table.add_column(header, justify="right" if header in ("needs", "has") else "left")
+        for bound in found.bounds:
+            numbers = f"{bound.needed:.4g}", f"{bound.available:.4g}"
+            table.add_row(bound.name, bound.formula, *numbers, bound.unit, _mark(bound.holds), bound.verdict)
+        console().print(table)
+        asked = found.operation
+        lines = [
+            f"{asked.energy_drawn:.3g} J drawn and {asked.copper_loss:.3g} J of heat in an episode, "
+            f"{asked.rms_current:.3g} A rms; rotor and friction add up to {asked.own_share:.0%} of the largest load",
+            *(f"{bound.name}: {bound.remedy}" for bound in found.bounds if not bound.holds),
+        ]
+        if unknown:
+            lines.append(f"not in the datasheet, and not counted: {', '.join(unknown)}")
+        for line in lines:
+            console().print(line, markup=False, highlight=False)
+        if self.out is not None:
+            _draw(drive, demand, self.name, self.out / "torque_speed.png")
+        console().print(found.verdict, markup=False, highlight=False)
+        return 1 if found.verdict == SURELY_NOT else 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Choose:
+    """Rank the catalogue's motors for a task, each at its best gear, and say what is wrong with those that fail.
+
+    Example: codrl-mj motor choose pendulum --top 5 --out chosen
+    """
+
+    asked: Asked
+    top: int = 5
+    """How many to show; of the others only those that fail are told, and why."""
+    voltage: float | None = None
+    """Voltage of the supply [V]; each motor's own unless given."""
+    out: Path | None = None
+    """Folder for NAME.png of those shown: what was asked for over what the motor can do."""
+    trust: Trust = False
+
+    def run(self) -> int:
+        """Print the ranking."""
+        from codrl_mj.cli.terminal import console
+        from codrl_mj.sizing import SURELY, choose, demand_of
+
+        if self.top < 1:
+            raise ValueError(f"--top {self.top}: must be >= 1")
+        demand = demand_of(self.asked, trust=self.trust)
+        choices = choose(demand, voltage=self.voltage)
+        shown, console_ = choices[: self.top], console()
+        console_.print(_ranking(shown, demand.source))
+        for choice in shown:
+            if choice.unknown:
+                text = f"{choice.name}: not in its datasheet, and not counted: {', '.join(choice.unknown)}"
+                console_.print(text, markup=False, highlight=False)
+        for choice in choices:
+            if choice.feasibility.verdict != SURELY:
+                text = (
+                    f"{choice.name} at gear {choice.ratio:.4g}: {choice.feasibility.verdict}. {choice.feasibility.why}"
+                )
+                console_.print(text, markup=False, highlight=False)
+        for choice in shown if self.out is not None else ():
+            assert self.out is not None
+            _draw(choice.drive, demand, choice.name, self.out / f"{Path(choice.name).stem}.png")
+        return 0
+
+
+def _ranking(choices: Sequence[Any], source: str) -> Any:
+    table = _table(f"largest margin first: {source}")
+    columns = ("motor", "gear", "supply\n[V]", "verdict", "margin", "rotor's\nshare", "peak\n[A]", "rms\n[A]")
+    for header in (*columns, "drawn\n[J]", "heat\n[J]"):
+        table.add_column(header, justify="left" if header in ("motor", "verdict") else "right", no_wrap=True)
+    for choice in choices:
+        asked = choice.feasibility.operation
+        numbers = abs(asked.current).max(), asked.rms_current, asked.energy_drawn, asked.copper_loss
+        table.add_row(
+            *(choice.name, f"{choice.ratio:.4g}", f"{choice.drive.voltage_limit:g}", choice.feasibility.verdict),
+            *(f"{choice.feasibility.margin:.0%}", f"{asked.own_share:.0%}", *(f"{number:.3g}" for number in numbers)),
+        )
+    return table
+
+
+def _table(title: str) -> Any:
+    from rich import box
+    from rich.markup import escape
+    from rich.table import Table
+
+    return Table(title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+
+
+def _mark(holds: bool) -> str:
+    return "[green]holds" if holds else "[red]fails"
+
+
+def _draw(drive: Any, demand: Any, name: str, path: Path) -> None:
+    """The torque-speed diagram with what the demand asks at the gear's output, the rotor's inertia included."""
+    import numpy as np
+
+    from codrl_mj.motor_design.drives import find_entry
+    from codrl_mj.motor_design.figures import save, torque_speed_diagram
+
+    radius, entry = drive.motor.arm_radius, find_entry(name)
+    torque = radius * (demand.torque + drive.additions.armature * demand.acceleration)
+    points = np.column_stack([demand.speed / radius, torque])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save(torque_speed_diagram(drive, None if entry is None else entry.numbers, points), path)
+    print(f"wrote {path}")

@@ -1,0 +1,42 @@
+"""Motors on paper: what a drive can do, its current loop's gains and margins, step responses, and pictures of all."""
+
+from codrl_mj.motor_design.drives import Abilities, abilities, find_drive, find_entry, torque_limits
+from codrl_mj.motor_design.figures import bode_diagram, step_diagram, torque_speed_diagram
+from codrl_mj.motor_design.loop import (
+    LoopDesign,
+    Response,
+    closed_loop,
+    design,
+    designs,
+    gains,
+    open_loop,
+    respond,
+    small_step,
+)
+from codrl_mj.motor_design.overview import catalogue_rows, explain
+from codrl_mj.motor_design.windup import Recovery, Steps, step
+
+__all__ = [
+    "catalogue_rows",
+    "explain",
+    "find_drive",
+    "find_entry",
+    "Abilities",
+    "abilities",
+    "torque_limits",
+    "LoopDesign",
+    "design",
+    "designs",
+    "gains",
+    "open_loop",
+    "closed_loop",
+    "Response",
+    "respond",
+    "small_step",
+    "Steps",
+    "Recovery",
+    "step",
+    "torque_speed_diagram",
+    "bode_diagram",
+    "step_diagram",
+]

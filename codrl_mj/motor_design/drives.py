@@ -1,0 +1,137 @@
+"""Drives by name, and what they can do: closed forms of V = R*I + kE*omega, at the output of the gear.
+
+Source: maxon, *Key information on maxon DC and EC motors*; the same relations that `codrl_mj.catalogue` derives by.
+Friction is the rotor's, c + b*|omega|, and opposes the speed. What it leaves of kT*I passes the gear, which loses
+1 - efficiency of it where it drives and brakes with 1/efficiency - 1 more where it is driven. All here is past both:
+the torque that moves the load.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from codrl_mj.actuators import Drive, GearMotor, actuator_over, resolve
+from codrl_mj.catalogue import MotorEntry, motor_entry, motor_names
+
+
+def find_drive(
+    name: Any,
+    gear_ratio: float | None = None,
+    sample_rate: float | None = None,
+    bandwidth: float | None = None,
+    voltage: float | None = None,
+    delayed: bool | None = None,
+    max_current: float | None = None,
+) -> Drive:
+    """A drive by name, with single fields set over it; None leaves a field as it is.
+
+    Args:
+        name: whatever `codrl_mj.actuators.resolve` takes, such as a motor of the catalogue.
+        gear_ratio: turns of the rotor for a turn of the output.
+        sample_rate: of the current loop [Hz].
+        bandwidth: that the loop's gains are designed for [Hz].
+        voltage: of the supply [V].
+        delayed: whether a sample's voltage is applied in the next one.
+        max_current: that the drive asks for [A].
+
+    Raises:
+        ValueError: there is no such actuator (the nearest is suggested), it is no drive, or a value is out of bounds.
+    """
+    loop = {"sample_rate": sample_rate, "bandwidth": bandwidth, "delayed": delayed, "max_current": max_current}
+    changes = {"motor": {"gear_ratio": gear_ratio}, "controller": loop, "supply": {"voltage": voltage}}
+    base = resolve(name, None, "a motor on its own")
+    if not isinstance(base, Drive):
+        raise ValueError(
+            f"motor = {name!r}: no motor behind a drive, but the actuator family {base.family}; name a motor of the "
+            "catalogue (codrl-mj motor list), a TOML file with a datasheet, or an actuator of the family drive"
+        )
+    given = {part: {key: value for key, value in to.items() if value is not None} for part, to in changes.items()}
+    return actuator_over(base, given)
+
+
+def find_entry(name: Any) -> MotorEntry | None:
+    """The datasheet that a name of `find_drive` stands for; None where it is not one's."""
+    known = isinstance(name, str) and (name in motor_names() or name.endswith(".toml"))
+    return motor_entry(name) if known else None
+
+
+class Abilities(NamedTuple):
+    """What a drive can do at its supply's voltage, `max_current` aside."""
+
+    stall_torque: float
+    """Of the blocked output [N*m]."""
+    stall_current: float
+    """Of the blocked motor [A]: V/R."""
+    no_load_speed: float
+    """Of the free output [rad/s]; infinite without back-EMF and viscous friction."""
+    no_load_current: float
+    """Of the free motor [A], which overcomes its friction."""
+    electrical_time_constant: float
+    """L/R [s]."""
+    mechanical_time_constant: float
+    """Of the free motor's speed [s], R*J/(kT*kE), at the rotor; NaN where its inertia is not known: 0."""
+
+
+ABILITY_UNITS = dict(zip(Abilities._fields, ("N*m", "A", "rad/s", "A", "s", "s"), strict=True))
+"""Their units."""
+
+
+def abilities(drive: Drive) -> Abilities:
+    """What a drive can do."""
+    motor, resistance = drive.motor, _resistance(drive)
+    per_torque = resistance / motor.torque_constant  # [V/(N*m)]
+    slope = motor.back_emf_constant + per_torque * motor.viscous_friction
+    left = max(drive.voltage_limit - per_torque * motor.coulomb_friction, 0.0)
+    speed = left / slope if slope > 0.0 else math.inf
+    friction = motor.coulomb_friction + (motor.viscous_friction * speed if motor.viscous_friction > 0.0 else 0.0)
+    stall = drive.voltage_limit / resistance
+    return Abilities(
+        float(_at_output(motor, np.array(stall), np.array(0.0))),
+        stall,
+        speed / motor.gear_ratio,
+        friction / motor.torque_constant,
+        motor.electrical_time_constant,
+        motor.mechanical_time_constant if motor.rotor_inertia > 0.0 else math.nan,
+    )
+
+
+def torque_limits(drive: Drive, speeds: Any, current: float = math.inf) -> tuple[np.ndarray, np.ndarray]:
+    """The lowest and the highest steady torque [N*m] at the output, by voltage and current.
+
+    Above the no-load speed the back-EMF alone drives a current, whatever the limit of it.
+
+    Args:
+        drive: whose.
+        speeds: of the output [rad/s], any shape.
+        current: within plus and minus this [A], such as the drive's `max_current`.
+    """
+    speeds = np.asarray(speeds, dtype=float)
+    back_emf = drive.motor.back_emf_constant * drive.motor.gear_ratio * speeds
+    lowest, highest = -_highest_current(drive, -back_emf), _highest_current(drive, back_emf)
+    low, high = (np.clip(bound, lowest, highest) for bound in (-current, current))
+    return _at_output(drive.motor, low, speeds), _at_output(drive.motor, high, speeds)
+
+
+def _resistance(drive: Drive) -> float:
+    """Of winding and supply [ohm]."""
+    return drive.motor.resistance + (0.0 if drive.supply is None else drive.supply.resistance)
+
+
+def _highest_current(drive: Drive, back_emf: np.ndarray) -> np.ndarray:
+    """Highest steady current [A]: that of u = max(V - Rs*|i|, 0), as the drive has it."""
+    resistance, voltage = drive.motor.resistance, drive.voltage_limit
+    sag = _resistance(drive) - resistance
+    driven = (voltage - back_emf) / (resistance + np.where(back_emf > voltage, -min(sag, 0.999 * resistance), sag))
+    return np.maximum(driven, -back_emf / resistance)
+
+
+def _at_output(motor: GearMotor, current: np.ndarray, speed: np.ndarray) -> np.ndarray:
+    """Torque [N*m] that a current [A] leaves at the output, at its speed [rad/s]."""
+    torque = motor.torque_constant * current
+    friction = motor.coulomb_friction + motor.viscous_friction * motor.gear_ratio * np.abs(speed)
+    moved = torque - friction * np.sign(speed)
+    still = np.sign(torque) * np.maximum(np.abs(torque) - friction, 0.0)
+    left = np.where(speed == 0.0, still, moved)
+    share = np.where(left * speed >= 0.0, motor.gear_efficiency, 1.0 / motor.gear_efficiency)
+    return motor.gear_ratio * share * left

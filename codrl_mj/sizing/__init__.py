@@ -1,0 +1,30 @@
+"""Can this motor, with this gear and supply, do that task? Answered before anything is trained; docs/motors.md."""
+
+from codrl_mj.sizing.bounds import SURELY, SURELY_NOT, TRY_IT, Bound, Feasibility, feasibility
+from codrl_mj.sizing.choice import Catalogued, Choice, catalogued, choose
+from codrl_mj.sizing.demand import Demand, demand_of, recorded
+from codrl_mj.sizing.operation import Operation, best_ratio, operation
+from codrl_mj.sizing.swing import Swing, least_gain, least_pumped, least_voltage
+
+__all__ = [
+    "Demand",
+    "demand_of",
+    "recorded",
+    "Bound",
+    "Feasibility",
+    "feasibility",
+    "SURELY",
+    "SURELY_NOT",
+    "TRY_IT",
+    "Choice",
+    "choose",
+    "Catalogued",
+    "catalogued",
+    "Operation",
+    "operation",
+    "best_ratio",
+    "Swing",
+    "least_gain",
+    "least_pumped",
+    "least_voltage",
+]

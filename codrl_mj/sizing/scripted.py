@@ -1,0 +1,80 @@
+"""Controllers that nobody has to train: they show what a task asks of an actuator."""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from codrl_mj.tasks import Task
+
+Law = Callable[[np.ndarray], np.ndarray]
+"""(states (N, n)) -> forces [N] or torques [N*m], shape (N,), to be clipped to the task's largest."""
+
+HOLD_ANGLE, HOLD_SPEED = 0.5, 3.0
+"""Within these [rad, rad/s] of upright the pendulum is held, beyond them swung up."""
+
+
+def swing_up_and_hold(states: np.ndarray) -> np.ndarray:
+    """Pendulum: pump energy up to the top's (Astrom and Furuta 2000, at full torque), then hold by 12 theta + 4 omega.
+
+    The rod's energy over the top is omega^2/6 + 5 (cos(theta) - 1) J.
+    """
+    angle, speed = (states[:, 0] + np.pi) % (2 * np.pi) - np.pi, states[:, 1]
+    missing = 5.0 * (1.0 - np.cos(angle)) - speed**2 / 6.0
+    pump = np.inf * np.sign(missing) * np.where(speed < 0.0, -1.0, 1.0)
+    held = (np.abs(angle) < HOLD_ANGLE) & (np.abs(speed) < HOLD_SPEED)
+    return np.where(held, -12.0 * angle - 4.0 * speed, np.nan_to_num(pump))
+
+
+def balance(states: np.ndarray) -> np.ndarray:
+    """CartPole: push the cart to where the pole falls."""
+    return np.inf * (states @ np.array([0.1, 0.4, 5.0, 1.5]))
+
+
+class Pumping:
+    """Full force in the direction in which the actuated joint moves; at rest in one drawn at random."""
+
+    def __init__(self, task: Task, seed: int = 0) -> None:
+        """Seed the draws."""
+        self._speed, self._generator = task.speeds[0], np.random.default_rng(seed)
+
+    def __call__(self, states: np.ndarray) -> np.ndarray:
+        """The forces."""
+        kick = self._generator.choice([-1.0, 1.0], len(states))
+        speed = states[:, self._speed]
+        return np.inf * np.where(np.abs(speed) > 1e-6, speed, kick)
+
+
+class Scripted:
+    """A law as a policy: it is shown states, and answers with the task's actions."""
+
+    def __init__(self, task: Task) -> None:
+        """The law for a task: its own, or energy pumping."""
+        laws: dict[str, tuple[str, Law]] = {
+            "pendulum": ("scripted swing-up and hold", swing_up_and_hold),
+            "cartpole": ("scripted balancing", balance),
+        }
+        self.description, self._law = laws.get(task.name, ("scripted energy pumping", Pumping(task)))
+        self._task = task
+
+    def predict(
+        self,
+        observation: np.ndarray,
+        *,
+        deterministic: bool = False,  # noqa: ARG002 - the protocol's
+    ) -> tuple[np.ndarray, Any]:
+        """Actions for states (N, n)."""
+        force = np.clip(self._law(observation), -self._task.max_forces[0], self._task.max_forces[0])
+        if self._task.forces is None:
+            return force[:, np.newaxis].astype(np.float32), None
+        return np.abs(np.array(self._task.forces) - force[:, np.newaxis]).argmin(axis=1), None
+
+
+class StateObserved(gymnasium.ObservationWrapper[Any, Any, Any]):
+    """An environment that shows its mechanical state."""
+
+    def observation(self, observation: Any) -> np.ndarray:  # noqa: ARG002 - it is replaced
+        """The state, in the task's order."""
+        core: Any = self.env.unwrapped
+        return core.physics.state

@@ -1,0 +1,1 @@
+"""Tests of motors on paper and of their command."""

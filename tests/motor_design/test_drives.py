@@ -1,0 +1,125 @@
+"""What a drive can do: datasheets, and the drive itself when more is asked of it than it can give."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from codrl_mj.actuators import Drive, GearMotor, SampledLoop, Supply
+from codrl_mj.catalogue import motor_entry, motor_names
+from codrl_mj.motor_design import abilities, catalogue_rows, explain, find_drive, find_entry, respond, torque_limits
+
+
+@pytest.mark.parametrize("name", motor_names())
+def test_stall_and_no_load_are_what_the_datasheet_prints(name):
+    entry = motor_entry(name)
+    can, printed = abilities(Drive.of(entry.numbers)), entry.datasheet.readings()
+    ratio = entry.numbers.gear_ratio
+    for field, ours in (("stall_torque", can.stall_torque), ("no_load_speed", can.no_load_speed)):
+        if field in printed:
+            at_motor = printed[field].shaft == "motor"
+            seen = printed[field].value * (ratio if field == "stall_torque" else 1 / ratio) ** at_motor
+            assert ours == pytest.approx(seen, rel=entry.tolerance), field
+
+
+def test_a_motor_of_which_nothing_is_printed_twice_does_exactly_what_is_printed():
+    can = abilities(find_drive("pololu-37d-30"))
+    assert can.stall_torque == pytest.approx(140e-3 * 9.80665, rel=1e-9)  # 140 kgf*mm
+    assert can.no_load_speed == pytest.approx(330 * 2 * math.pi / 60, rel=1e-9)  # 330 rpm
+    assert can.no_load_current == pytest.approx(0.2, rel=1e-9)
+    assert math.isnan(can.mechanical_time_constant)
+
+
+@pytest.mark.parametrize("most", [math.inf, 1.0], ids=["voltage alone", "and current"])
+@pytest.mark.parametrize("sag", [0.0, 2.0])
+def test_the_limits_are_where_the_drive_ends_up(most, sag):
+    """In all four quadrants, and beyond the no-load speed, where the back-EMF drives the current."""
+    drive = Drive(GearMotor(gear_ratio=3.0), SampledLoop(max_current=most), Supply(24.0, sag))
+    speeds = np.linspace(-1.3, 1.3, 14) * 24.0 / 0.042
+    for bound, ask in zip(torque_limits(drive, speeds / 3.0, most), (-1e3, 1e3), strict=True):
+        ends = [respond(drive, np.full(400, ask), speed).current[-1] for speed in speeds]
+        np.testing.assert_allclose(bound, 3.0 * 0.042 * np.array(ends), rtol=1e-6, atol=1e-9)
+
+
+def test_friction_and_gear_take_from_what_drives_and_add_to_what_brakes():
+    drive = Drive(GearMotor(gear_ratio=10.0, gear_efficiency=0.8, coulomb_friction=2e-3, viscous_friction=1e-5))
+    low, high = torque_limits(drive, [-20.0, 0.0, 20.0], 0.1)
+    friction = 2e-3 + 1e-5 * 200.0
+    driving, braking = 8.0 * (0.0042 - friction), 12.5 * (0.0042 + friction)
+    np.testing.assert_allclose(high, [braking, 8.0 * (0.0042 - 2e-3), driving], rtol=1e-12)
+    np.testing.assert_allclose(low, -high[::-1], rtol=1e-12)
+
+
+def test_the_limits_cross_zero_at_the_no_load_speed():
+    for name in motor_names():
+        drive = find_drive(name)
+        can = abilities(drive)
+        assert abs(torque_limits(drive, can.no_load_speed)[1]) < 1e-9 * can.stall_torque
+        assert torque_limits(drive, 0.0)[1] == pytest.approx(can.stall_torque, rel=1e-12)
+
+
+def test_a_motor_without_back_emf_has_no_end_of_its_speed():
+    can = abilities(Drive(GearMotor(back_emf_constant=0.0)))
+    assert can.no_load_speed == math.inf
+    assert can.no_load_current == 0.0
+
+
+def test_flags_are_set_over_the_named_drive(tmp_path):
+    drive = find_drive("maxon-ec45-flat-50w", 12.0, 40e3, 1e3, 12.0, True, 8.0)
+    assert (drive.motor.gear_ratio, drive.voltage_limit, drive.motor.rotor_inertia) == (
+        12.0,
+        12.0,
+        pytest.approx(135e-7),
+    )
+    assert drive.controller == SampledLoop(40e3, 1e3, delayed=True, max_current=8.0)
+    own = tmp_path / "own.yaml"
+    own.write_text("family: drive\ncontroller: {delayed: true}\n")
+    assert find_drive(str(own)) == Drive(controller=SampledLoop(delayed=True))
+    assert not find_drive(str(own), delayed=False).controller.delayed
+    assert find_drive(drive) == drive
+    assert find_entry(str(own)) is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("maxon-ec45-flat-50",), "did you mean 'maxon-ec45-flat-50w'"),
+        (("ideal",), "motor = 'ideal': no motor behind a drive, but the actuator family ideal; name a motor of the"),
+        (("current_loop",), "no motor behind a drive, but the actuator family current_loop"),
+        (("rev-neo", 0.0), r"GearMotor\.gear_ratio = 0\.0: must be a finite number > 0"),
+        (("rev-neo", None, 10e3, 2e3), r"bandwidth = 2000: must be <= 1591\.55 Hz at sample_rate = 10000"),
+        (("rev-neo", None, None, None, -1.0), r"Supply\.voltage = -1\.0: must be"),
+    ],
+)
+def test_bad_input_is_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        find_drive(*arguments)
+
+
+def test_the_catalogue_in_rows_is_sorted_with_what_is_not_known_last():
+    rows = catalogue_rows("mechanical_time_constant")
+    assert sorted(row["name"] for row in rows) == motor_names()
+    known = [row["mechanical_time_constant"] for row in rows if row["mechanical_time_constant"] is not None]
+    assert known == sorted(known, reverse=True)
+    assert rows[-1]["mechanical_time_constant"] is None
+    row = next(row for row in rows if row["name"] == "quanser-qube-servo-2")
+    assert row["electrical_time_constant"] == pytest.approx(1.16e-3 / 8.4, rel=1e-12)
+    assert row["mechanical_time_constant"] == pytest.approx(8.4 * 4e-6 / 0.042**2, rel=1e-12)
+    with pytest.raises(ValueError, match=r"unknown column stall_torqe; did you mean stall_torque\?"):
+        catalogue_rows("stall_torqe")
+
+
+@pytest.mark.parametrize("name", motor_names())
+def test_every_number_is_explained(name):
+    entry = motor_entry(name)
+    found = explain(Drive.of(entry.numbers), entry)
+    shown = {row["name"]: row for row in found["numbers"]}
+    fields = {field.name for field in dataclasses.fields(entry.numbers)} - {"derived", "disagreements"}
+    assert shown.keys() | set(found["unknown"]) == fields
+    assert shown["inductance"]["unit"] == "H"
+    for field, row in shown.items():
+        assert row["how"] == entry.numbers.derived[field]
+        if "printed" in row["how"] and not row["how"].endswith("is printed") and field not in entry.estimated:
+            assert row["sources"], field
+    assert len(found["disagreements"]) == len(entry.numbers.disagreements)

@@ -1,0 +1,1 @@
+"""Whether a motor can do a task."""

@@ -1,0 +1,280 @@
+"""Whether a motor can do a task: formulas against closed forms, and predictions against simulations."""
+
+import dataclasses
+import json
+import math
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from codrl_mj import Drive, GearMotor, Ideal, SampledLoop, Supply
+from codrl_mj.actuators import Inputs, parameters_type
+from codrl_mj.cli import main
+from codrl_mj.evaluation import make_env
+from codrl_mj.sizing import (
+    SURELY,
+    SURELY_NOT,
+    TRY_IT,
+    best_ratio,
+    catalogued,
+    choose,
+    demand_of,
+    feasibility,
+    least_gain,
+    least_pumped,
+    least_voltage,
+    operation,
+    recorded,
+)
+from codrl_mj.sizing.scripted import Scripted
+from codrl_mj.tasks import TASKS
+
+PAPER = GearMotor(resistance=1.0, inductance=0.01, torque_constant=1.0, back_emf_constant=1.0, rotor_inertia=0.0)
+MOTOR = GearMotor(resistance=2.0, inductance=1e-3, torque_constant=0.05, back_emf_constant=0.04, rotor_inertia=1e-5)
+
+
+def drive(motor=PAPER, voltage=24.0, **loop):
+    return Drive(motor, SampledLoop(**loop), Supply(voltage))
+
+
+def steady(torque, speed, count=11):
+    return recorded(0.1 * np.arange(count), np.full(count, torque), np.full(count, speed))
+
+
+def bounds(found):
+    return {bound.name: bound for bound in found.bounds}
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    return demand_of("pendulum")
+
+
+def from_hanging(actuator, steps=400):
+    """States of the scripted swing-up on an actuator, from almost hanging, shape (steps + 1, 2)."""
+    env, policy = make_env("pendulum", actuator, max_episode_steps=steps), Scripted(TASKS["pendulum"])
+    env.reset(seed=0)
+    env.unwrapped.physics.state = np.array([np.pi - 0.05, 0.0])
+    states = [env.unwrapped.physics.state]
+    for _ in range(steps):
+        env.step(policy.predict(states[-1][np.newaxis])[0][0])
+        states.append(env.unwrapped.physics.state)
+    return np.array(states)
+
+
+def swings_up(actuator):
+    return bool(np.cos(from_hanging(actuator)[-40:, 0]).min() > 0.99)
+
+
+# formulas
+
+
+def test_a_steady_load_takes_what_the_motor_equation_says():
+    motor = dataclasses.replace(MOTOR, gear_ratio=20.0, coulomb_friction=1e-3, viscous_friction=1e-6)
+    asked = operation(steady(1.5, 8.0), drive(motor))
+    torque = 1.5 / 20.0 + 1e-3 + 1e-6 * 160.0
+    assert asked.torque == pytest.approx(torque)
+    assert asked.voltage == pytest.approx(2.0 * torque / 0.05 + 0.04 * 160.0)
+    assert asked.rms_current == pytest.approx(torque / 0.05)
+    assert asked.copper_loss == pytest.approx(1.1 * 2.0 * (torque / 0.05) ** 2)
+    assert asked.energy_drawn == pytest.approx(1.1 * asked.voltage[0] * torque / 0.05)
+
+
+def test_rotor_and_gear_are_part_of_the_load():
+    time = np.linspace(0.0, 2.0, 2001)
+    motor = dataclasses.replace(MOTOR, gear_ratio=30.0, gear_efficiency=0.8)
+    asked = operation(recorded(time, np.zeros_like(time), 5.0 * np.sin(4.0 * time)), drive(motor))
+    driving = np.cos(4.0 * time) * np.sin(4.0 * time) > 0.0
+    expected = 1e-5 * 30.0 * 20.0 * np.cos(4.0 * time) / np.where(driving, 0.8, 1.0)
+    assert asked.torque[1:-1] == pytest.approx(expected[1:-1], abs=1e-7)
+
+
+def test_the_best_gear_takes_the_least_voltage():
+    ratio = best_ratio(1.5, 8.0, MOTOR)
+    assert ratio == pytest.approx(math.sqrt(2.0 * 1.5 / (0.05 * 0.04 * 8.0)))
+    light = dataclasses.replace(MOTOR, rotor_inertia=0.0)
+
+    def voltage(gear):
+        return operation(steady(1.5, 8.0), drive(dataclasses.replace(light, gear_ratio=gear))).voltage[0]
+
+    assert voltage(ratio) == pytest.approx(2.0 * math.sqrt(2.0 * 12.0 * 0.04 / 0.05))
+    assert voltage(ratio) < min(voltage(0.95 * ratio), voltage(1.05 * ratio))
+    (chosen,) = choose(steady(1.5, 8.0), ["quanser-qube-servo-2"])
+    motor = chosen.drive.motor
+    assert chosen.ratio == pytest.approx(float(best_ratio(1.5, 8.0, motor)), rel=0.02)
+
+
+def test_power_is_a_quarter_of_what_a_blocked_motor_burns():
+    bound = bounds(feasibility(drive(voltage=8.0), steady(2.0, 8.0)))["power"]
+    assert (bound.needed, bound.available) == pytest.approx((16.0, 16.0))
+    weaker = bounds(feasibility(drive(voltage=7.9), steady(2.0, 8.0)))["power"]
+    assert not weaker.holds
+    assert weaker.verdict == SURELY_NOT
+    assert "raise the supply to 8 V" in weaker.remedy
+    limited = bounds(feasibility(drive(voltage=8.0, max_current=1.0), steady(2.0, 8.0)))["power"]
+    assert limited.available == pytest.approx(7.0)
+
+
+def test_stall_and_heat():
+    found = bounds(feasibility(drive(voltage=24.0, max_current=3.0), steady(2.0, 1.0), continuous_current=1.9))
+    assert found["stall"].available == pytest.approx(3.0)
+    assert (found["heat"].needed, found["heat"].verdict) == (pytest.approx(2.0), TRY_IT)
+    stiff = dataclasses.replace(PAPER, coulomb_friction=30.0)
+    assert bounds(feasibility(drive(stiff), dataclasses.replace(steady(2.0, 1.0), exact=False)))["stall"].verdict == (
+        SURELY_NOT
+    )
+
+
+def test_what_is_recorded_is_to_be_delivered_and_what_a_policy_asks_may_be_asked_otherwise():
+    asked = steady(2.0, 8.0)
+    assert feasibility(drive(voltage=10.0), asked).verdict == SURELY
+    assert feasibility(drive(voltage=9.9), asked).verdict == SURELY_NOT
+    assert feasibility(drive(voltage=9.9), dataclasses.replace(asked, exact=False)).verdict == TRY_IT
+
+
+# predictions
+
+
+def test_the_scripted_swing_up_reaches_upright_and_says_so(pendulum):
+    assert pendulum.source == "scripted swing-up and hold of pendulum, 10 of 10 episodes at the goal"
+    assert len(pendulum.torque) == len(pendulum.speed) == len(pendulum.acceleration) == 2000
+    assert np.abs(pendulum.torque).max() == 2.0
+
+
+def test_the_supply_that_a_swing_up_takes_is_predicted_and_found(pendulum):
+    """5.17 V at least for any controller, 5.59 V by the energy of swings; the slower the winding, the more."""
+    least = least_voltage(pendulum.swing, drive(), least_gain)
+    assert least == pytest.approx(5.17, abs=0.02)
+    assert least_voltage(pendulum.swing, drive(), least_pumped) == pytest.approx(5.59, abs=0.02)
+    assert feasibility(drive(voltage=5.1), pendulum).verdict == SURELY_NOT
+    assert feasibility(drive(voltage=5.5), pendulum).verdict == TRY_IT
+    slow = dataclasses.replace(PAPER, inductance=0.1)
+    assert not swings_up(drive(voltage=5.1))
+    assert not swings_up(drive(slow, 5.5))
+    assert swings_up(drive(voltage=6.0))
+    assert swings_up(drive(slow, 6.0))
+
+
+def test_a_motor_that_one_can_buy_swings_up_a_little_above_the_supply_that_is_predicted(pendulum):
+    motor = catalogued("faulhaber-1331-006", 160.0).drive
+    least = least_voltage(pendulum.swing, motor, least_gain)
+    assert not swings_up(dataclasses.replace(motor, supply=Supply(0.97 * least)))
+    assert swings_up(dataclasses.replace(motor, supply=Supply(1.1 * least)))
+
+
+def test_friction_and_damping_make_a_swing_up_harder(pendulum):
+    light = least_gain(pendulum.swing, drive(voltage=5.5))
+    rough = dataclasses.replace(PAPER, coulomb_friction=0.1)
+    assert least_gain(pendulum.swing, drive(rough, 5.5)) < light
+    assert least_gain(pendulum.swing._replace(damping=0.05), drive(voltage=5.5)) < light
+    assert least_pumped(pendulum.swing._replace(largest=6.0), drive()) == math.inf
+
+
+def test_what_is_surely_enough_changes_nothing(pendulum):
+    """10 V for 2 N*m at 8 rad/s: the run on the ideal actuator, but for what a winding of L/R = 0.1 ms delays."""
+    assert operation(pendulum, drive()).voltage.max() <= 10.0
+    quick = drive(dataclasses.replace(PAPER, inductance=1e-4), 10.0)
+    assert feasibility(quick, pendulum).verdict == SURELY
+    assert np.abs(from_hanging(quick) - from_hanging(Ideal())).max() < 0.005
+
+
+def test_the_first_choice_delivers_what_was_asked(pendulum):
+    first = choose(pendulum)[0]
+    assert first.feasibility.verdict == SURELY
+    asked, family, state, delivered = first.feasibility.operation, type(first.drive), Drive.State(0.0, 0.0, 0.0), []
+    parameters = parameters_type(family)(*first.drive.numbers)
+    for torque, speed in zip(asked.torque, asked.speed, strict=True):
+        state, made, _ = Drive.advance(parameters, 0.05, state, Inputs(torque, 0.0, speed, 0.0, 0.0))
+        delivered.append(made)
+    error = np.array(delivered) - asked.torque
+    assert np.abs(error).max() < 0.02 * np.abs(asked.torque).max()
+
+
+def test_choices_are_ranked_and_those_that_fail_say_why(pendulum):
+    choices = choose(pendulum)
+    margins = [one.feasibility.margin for one in choices if one.feasibility.verdict == SURELY]
+    assert margins == sorted(margins, reverse=True)
+    assert min(margins) >= 0.0
+    failed = {one.name: one for one in choices if one.feasibility.verdict != SURELY}
+    assert "no gear helps: raise the supply to 15.01 V" in failed["dynamixel-mx-64"].feasibility.why
+    assert failed["dynamixel-mx-64"].ratio == 200.0
+    assert "rotor inertia" in failed["pololu-37d-30"].unknown
+    assert [one.feasibility.why for one in choices[: len(margins)]] == [""] * len(margins)
+
+
+def test_on_a_slide_a_geared_motor_gets_a_wheel():
+    demand = demand_of("cartpole", episodes=1)
+    assert demand.linear
+    (choice,) = choose(demand, ["pololu-37d-30"])
+    assert choice.drive.motor.gear_ratio == 30.0
+    assert choice.ratio == pytest.approx(30.0 / choice.drive.motor.arm_radius)
+    assert choice.drive.motor.arm_radius != 1.0
+
+
+# bad input
+
+
+@pytest.mark.parametrize(
+    ("call", "match"),
+    [
+        (lambda: demand_of("pendulun"), "did you mean 'pendulum'"),
+        (lambda: catalogued("frc-kim"), "did you mean 'frc-cim'"),
+        (lambda: catalogued("frc-cim", gear_ratio=0.0), "gear_ratio = 0"),
+        (lambda: catalogued("frc-cim", voltage=-1.0), "voltage = -1"),
+        (lambda: catalogued("lag"), "no motor behind a drive"),
+        (lambda: recorded([0.0, 1.0], [1.0], [1.0, 1.0]), "torque: shape"),
+        (lambda: recorded([0.0, 0.0], [1.0, 1.0], [1.0, 1.0]), r"time\[1\] = 0 s"),
+        (lambda: recorded([0.0, 1.0], [1.0, math.nan], [1.0, 1.0]), r"torque\[1\] = nan"),
+        (lambda: feasibility(Ideal(), steady(1.0, 1.0)), "must be a codrl_mj.Drive"),
+    ],
+)
+def test_bad_input_is_refused_with_a_remedy(call, match):
+    with pytest.raises(ValueError, match=match):
+        call()
+
+
+def test_a_file_that_is_no_recording_is_refused(tmp_path):
+    np.savez(tmp_path / "half.npz", time=np.arange(3.0), torque=np.ones(3))
+    with pytest.raises(ValueError, match=r"half.npz: no recording .* speed"):
+        demand_of(tmp_path / "half.npz")
+
+
+# the command line
+
+
+def test_the_command_judges_a_recording_and_draws_it(tmp_path, capsys):
+    np.savez(tmp_path / "joint.npz", time=np.arange(3.0), torque=np.full(3, 1.0), speed=np.full(3, 8.0))
+    judge = ["motor", "feasible", "maxon-ec45-flat-50w", str(tmp_path / "joint.npz"), "--gear-ratio"]
+    assert main([*judge, "20", "--out", str(tmp_path / "out")]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "surely"
+    assert (tmp_path / "out" / "torque_speed.png").read_bytes().startswith(b"\x89PNG")
+    assert main([*judge, "20", "--voltage", "4"]) == 1
+    printed = capsys.readouterr().out
+    assert "voltage: raise the supply to" in printed
+    assert printed.splitlines()[-1] == "surely not"
+    assert main([*judge, "0"]) == 2
+    assert "gear_ratio = 0" in capsys.readouterr().err
+
+
+def test_the_command_chooses_and_says_what_is_wrong_with_the_rest(tmp_path, capsys):
+    assert main(["motor", "choose", "pendulum", "--top", "2", "--out", str(tmp_path)]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "largest margin first" in printed
+    assert "quanser-srv02 at gear 70: try it" in printed
+    assert len(list(tmp_path.glob("*.png"))) == 2
+
+
+def test_runs_count_where_they_were_trained_on_the_ideal_actuator(tmp_path, capsys):
+    earlier, run = Path(__file__).parents[1] / "fixtures" / "earlier" / "cartpole", tmp_path / "run"
+    assert main(["motor", "choose", str(earlier)]) == 2
+    assert "was trained on current_loop: must be ideal" in capsys.readouterr().err
+    shutil.copytree(earlier, run)
+    config = json.loads((run / "config.json").read_text())
+    config["train"]["actuator"] = None
+    (run / "config.json").write_text(json.dumps(config))
+    demand = demand_of(run, episodes=2)
+    assert demand.source.startswith("the policy run of cartpole")
+    assert set(np.abs(demand.torque)) == {10.0}
+    assert demand.episodes == 2
