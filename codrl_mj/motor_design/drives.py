@@ -119,10 +119,11 @@ def _resistance(drive: Drive) -> float:
 
 
 def _highest_current(drive: Drive, back_emf: np.ndarray) -> np.ndarray:
-    """Highest steady current [A]: that of u = max(V - Rs*|i|, 0), as the drive has it."""
+    """Highest steady current [A]: that of u = max(V - Rs*|i|, 0), as the drive has it; at u = 0 it is -b/R."""
     resistance, voltage = drive.motor.resistance, drive.voltage_limit
     sag = _resistance(drive) - resistance
-    driven = (voltage - back_emf) / (resistance + np.where(back_emf > voltage, -min(sag, 0.999 * resistance), sag))
+    against = max(resistance - sag, 1e-9 * resistance)  # where i < 0, beyond the no-load speed
+    driven = (voltage - back_emf) / np.where(back_emf > voltage, against, resistance + sag)
     return np.maximum(driven, -back_emf / resistance)
 
 

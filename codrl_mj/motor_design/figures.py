@@ -88,7 +88,8 @@ def bode_diagram(drive: Drive) -> Any:
     from matplotlib.ticker import MultipleLocator
 
     found, rate = design(drive), drive.controller.sample_rate
-    frequencies = np.geomspace(1e-3, 0.49999, 1500) * rate
+    lowest = np.nanmin([1e-3 * rate, 0.02 * found.crossover])
+    frequencies = np.geomspace(lowest, 0.49999 * rate, 1500)
     figure, (gain, phase) = _figure(2, (8.0, 6.4), sharex=True)
     loops = (("open loop", open_loop(drive), BLUE), ("closed loop", closed_loop(drive), RED))
     for label, loop, colour in loops:
@@ -97,18 +98,22 @@ def bode_diagram(drive: Drive) -> Any:
         phase.semilogx(frequencies, np.degrees(np.unwrap(np.angle(values))), color=colour)
     gain.axhline(0.0, color="0.5", linewidth=0.8)
     phase.axhline(-180.0, color="0.5", linewidth=0.8)
-    at = _phase_crossover(drive, frequencies)
     decibels = 20.0 * math.log10(found.gain_margin)
-    gain.plot([at, at], [-decibels, 0.0], color=GREEN, linewidth=2.5, label=f"gain margin, {decibels:.1f} dB")
+    gain.plot(
+        [found.phase_crossover] * 2,
+        [-decibels, 0.0],
+        color=GREEN,
+        linewidth=2.5,
+        label=f"gain margin, {decibels:.1f} dB",
+    )
     if math.isfinite(found.phase_margin):
         label = f"phase margin, {found.phase_margin:.1f}° at {found.crossover:.4g} Hz"
         low = -180.0, found.phase_margin - 180.0
         phase.plot([found.crossover] * 2, low, color=BLACK, linewidth=2.5, label=label)
         gain.axvline(found.crossover, color=BLACK, linewidth=0.8, linestyle=":")
     if math.isfinite(found.bandwidth):
-        gain.plot(
-            found.bandwidth, -3.0103, "o", color=RED, label=f"bandwidth, {found.bandwidth:.4g} Hz at \N{MINUS SIGN}3 dB"
-        )
+        label = f"bandwidth, {found.bandwidth:.4g} Hz at \N{MINUS SIGN}3 dB"
+        gain.plot(found.bandwidth, -3.0103, "o", color=RED, label=label)
     late = "a sample of delay" if found.delayed else "no delay"
     title = f"Current loop at {rate / 1e3:g} kHz, {late}: kp = {found.kp:.4g} V/A, ki = {found.ki:,.5g} V/(A·s)"
     gain.set(ylabel="gain [dB]", title=title)
@@ -116,13 +121,6 @@ def bode_diagram(drive: Drive) -> Any:
     phase.yaxis.set_major_locator(MultipleLocator(45.0))
     figure.legend(loc="outside lower center", ncols=3, fontsize="small")
     return figure
-
-
-def _phase_crossover(drive: Drive, frequencies: np.ndarray) -> float:
-    """Where the open loop's phase first passes -180 degrees [Hz], or half the sample rate, where it is real."""
-    values = open_loop(drive)(np.exp(2j * math.pi * frequencies / drive.controller.sample_rate))
-    below = np.flatnonzero(np.unwrap(np.angle(values)) < -math.pi)
-    return float(frequencies[below[0]]) if len(below) else 0.5 * drive.controller.sample_rate
 
 
 def step_diagram(drive: Drive, steps: Steps) -> Any:

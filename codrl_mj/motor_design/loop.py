@@ -7,7 +7,6 @@ of Dynamic Systems*, ch. 4; `codrl_mj.actuators.sampled` has the design.
 
 import dataclasses
 import math
-import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -101,7 +100,7 @@ def small_step(drive: Drive) -> Response:
     """The step from rest to a current that does not saturate.
 
     It is a tenth of V/R, or what half the voltage makes at once, or `max_current`, whichever is smallest. It lasts 20
-    time constants of the designed loop, or of the winding under given gains.
+    time constants of the designed loop, or of the winding under given gains, and 100 to 20000 samples.
     """
     (kp, ki), loop = gains(drive), drive.controller
     at_once = 0.5 * drive.voltage_limit / (kp + ki / loop.sample_rate)
@@ -128,8 +127,10 @@ class LoopDesign:
     """Factor on the gain at which the loop oscillates."""
     phase_margin: float
     """Phase [deg] that is left at the crossover."""
+    phase_crossover: float
+    """Where the open loop's phase is -180 degrees [Hz]: the gain margin is read there."""
     crossover: float
-    """Where the open loop's gain is 1 [Hz]."""
+    """Where the open loop's gain is 1 [Hz]: the phase margin is read there."""
     bandwidth: float
     """Where the closed loop's gain falls to 1/sqrt(2) [Hz]."""
     settling_time: float
@@ -139,21 +140,19 @@ class LoopDesign:
 
 
 def design(drive: Drive) -> LoopDesign:
-    """Judge a drive's current loop: margins by python-control, the step by the drive itself.
+    """Judge a drive's current loop: margins of its transfer function, a step of the drive itself.
 
     Raises:
         ValueError: the loop is unstable; the message has the spectral radius and a remedy.
     """
     loop = drive.controller
     drive.check(1.0 / loop.sample_rate)
-    opened = open_loop(drive)
     step = small_step(drive)
     return LoopDesign(
         loop.sample_rate,
         loop.delayed,
         *gains(drive),
-        *_margins(opened, loop.sample_rate),
-        _bandwidth(closed_loop(drive), loop.sample_rate),
+        *_margins(drive),
         step.settling_time(),
         step.overshoot,
     )
@@ -177,35 +176,34 @@ def designs(drive: Drive, rates: Any = None) -> dict[tuple[float, bool], LoopDes
     return found
 
 
-def _margins(opened: Any, sample_rate: float) -> tuple[float, float, float]:
-    """Gain margin, phase margin [deg] and crossover [Hz].
+def _margins(drive: Drive) -> tuple[float, float, float, float, float]:
+    """Gain margin, phase margin [deg], phase crossover, crossover and bandwidth [Hz].
 
-    python-control looks for crossings between the poles at standstill and half the sample rate: at both ends rounding
-    decides whether it sees one. At standstill there is none, and at half the sample rate, z = -1, the loop is real.
+    They are searched for on the unit circle, which slow loops and the pole at z = 1 leave exact; python-control's
+    margins, by the roots of polynomials, are not. At half the sample rate, z = -1, the loop is real: without a
+    crossing before, the gain margin is read there.
     """
-    import control
-
-    with warnings.catch_warnings():  # of a division by zero, where it looks at the pole
-        warnings.simplefilter("ignore", RuntimeWarning)
-        gain, phase, _, phase_at, gain_at, _ = control.stability_margins(opened, returnall=True)
-    inside = (phase_at > 1e-6 * sample_rate) & (phase_at < (1.0 - 1e-6) * math.pi * sample_rate)
-    last = float(opened(-1.0).real)
-    factors = np.append(gain[inside], -1.0 / last if last < 0.0 else math.inf)
-    if not len(phase):
-        return float(factors.min()), math.nan, math.nan
-    worst = int(np.argmin(np.abs(phase)))
-    return float(factors.min()), float(phase[worst]), float(gain_at[worst]) / (2.0 * math.pi)
+    rate, opened, closed = drive.controller.sample_rate, open_loop(drive), closed_loop(drive)
+    turned = _first_below(lambda z: -opened(z).imag, rate)
+    turned = 0.5 * rate if math.isnan(turned) else turned
+    crossover = _first_below(lambda z: abs(opened(z)) - 1.0, rate)
+    bandwidth = _first_below(lambda z: abs(closed(z)) - math.sqrt(0.5), rate)
+    left = 180.0 + math.degrees(np.angle(opened(_point(crossover, rate)))) if crossover > 0.0 else math.nan
+    return float(1.0 / abs(opened(_point(turned, rate)))), left, turned, crossover, bandwidth
 
 
-def _bandwidth(closed: Any, sample_rate: float) -> float:
-    """First frequency [Hz] at which the gain falls to 1/sqrt(2); NaN for none."""
+def _point(frequency: Any, rate: float) -> Any:
+    """On the unit circle: the z of a frequency [Hz]."""
+    return np.exp(2j * math.pi * frequency / rate)
+
+
+def _first_below(function: Any, rate: float) -> float:
+    """The first frequency [Hz] at which a function of z falls below 0; NaN where it never does, or always is."""
     from scipy.optimize import brentq
 
-    def excess(frequency: float) -> float:
-        return float(abs(closed(np.exp(2j * math.pi * frequency / sample_rate)))) - math.sqrt(0.5)
-
-    frequencies = np.geomspace(1e-4, 0.5, 2000) * sample_rate
-    below = np.flatnonzero(np.abs(closed(np.exp(2j * math.pi * frequencies / sample_rate))) < math.sqrt(0.5))
+    frequencies = np.geomspace(1e-7, 0.49999, 4000) * rate
+    below = np.flatnonzero(function(_point(frequencies, rate)) < 0.0)
     if not len(below) or below[0] == 0:
         return math.nan
-    return float(brentq(excess, frequencies[below[0] - 1], frequencies[below[0]]))
+    around = frequencies[below[0] - 1], frequencies[below[0]]
+    return float(brentq(lambda frequency: float(function(_point(frequency, rate))), *around))

@@ -48,9 +48,11 @@ def step(drive: Drive) -> Steps:
     In saturation 1.8 times of what the voltage can make at `Steps.speed` is asked for, then 0.4 times of it.
 
     Raises:
-        ValueError: the loop is unstable; the message has the spectral radius and a remedy.
+        ValueError: the loop is unstable, the message has the spectral radius and a remedy; or its samples are too few.
     """
     loop = drive.controller
+    if loop.sample_rate < 1e3:
+        raise ValueError(f"SampledLoop.sample_rate = {loop.sample_rate:g}: must be >= 1000 Hz, to see a step; raise it")
     drive.check(1.0 / loop.sample_rate)
     speed, unreachable = _out_of_reach(drive)
     reachable = 0.4 / 1.8 * unreachable

@@ -32,7 +32,7 @@ def test_a_motor_of_which_nothing_is_printed_twice_does_exactly_what_is_printed(
 
 
 @pytest.mark.parametrize("most", [math.inf, 1.0], ids=["voltage alone", "and current"])
-@pytest.mark.parametrize("sag", [0.0, 2.0])
+@pytest.mark.parametrize("sag", [0.0, 2.0, 10.0])
 def test_the_limits_are_where_the_drive_ends_up(most, sag):
     """In all four quadrants, and beyond the no-load speed, where the back-EMF drives the current."""
     drive = Drive(GearMotor(gear_ratio=3.0), SampledLoop(max_current=most), Supply(24.0, sag))

@@ -36,6 +36,7 @@ def test_the_design_is_that_of_the_closed_forms(name, rate, delayed):
     share = -math.expm1(-2 * math.pi * 0.05)
     crossover = 2 * math.asin(share / 2)  # angle of a sample [rad]
     assert found.gain_margin == pytest.approx((1 if delayed else 2) / share, rel=1e-6)
+    assert found.phase_crossover == pytest.approx(rate / 6 if delayed else rate / 2, rel=1e-6)
     phase = math.pi / 2 - crossover * (1.5 if delayed else 0.5)
     assert found.phase_margin == pytest.approx(math.degrees(phase), abs=1e-4)
     assert found.crossover == pytest.approx(crossover / (2 * math.pi) * rate, rel=1e-6)
@@ -79,11 +80,16 @@ def test_the_simulated_step_is_python_control_s(delayed, own):
     assert (found.kp, found.ki) == gains(drive)
 
 
-def test_given_gains_have_the_margins_that_python_control_finds():
-    drive = Drive(controller=SampledLoop(kp=9.0, ki=2e4, delayed=True))
-    gain_margin, phase_margin, *_ = control.margin(open_loop(drive))
+@with_and_without_delay
+@pytest.mark.parametrize("own", [{"kp": 9.0, "ki": 2e4}, {"kp": 2.0, "ki": 6e4}, {"bandwidth": 800.0}])
+def test_the_margins_are_those_that_python_control_finds(own, delayed):
+    drive = Drive(controller=SampledLoop(delayed=delayed, **own))
+    gain_margin, phase_margin, gain_at, phase_at = control.margin(open_loop(drive))
     found = design(drive)
-    assert (found.gain_margin, found.phase_margin) == pytest.approx((gain_margin, phase_margin), rel=1e-6)
+    assert (found.phase_margin, found.crossover) == pytest.approx((phase_margin, phase_at / 2 / math.pi), rel=1e-6)
+    if delayed:  # without, the crossing is where it does not look
+        expected = pytest.approx((gain_margin, gain_at / 2 / math.pi), rel=1e-6)
+        assert (found.gain_margin, found.phase_crossover) == expected
 
 
 def test_other_rates_are_designed_where_they_allow_the_bandwidth():
@@ -92,6 +98,14 @@ def test_other_rates_are_designed_where_they_allow_the_bandwidth():
     assert "must be <= 1591.55 Hz" in found[10e3, False]
     assert found[40e3, True].phase_margin > found[20e3, True].phase_margin
     assert found[40e3, False].phase_margin > found[40e3, True].phase_margin
+
+
+def test_a_slow_loop_has_a_bandwidth_too_and_does_not_settle_within_sight():
+    found = design(find_drive("quanser-qube-servo-2", bandwidth=0.1))
+    assert found.bandwidth == pytest.approx(0.1, rel=1e-3)
+    assert math.isnan(found.settling_time)
+    with pytest.raises(ValueError, match=r"sample_rate = 500: must be >= 1000 Hz"):
+        step(find_drive("quanser-qube-servo-2", sample_rate=500.0))
 
 
 def test_an_unstable_loop_is_refused():
