@@ -60,7 +60,7 @@ def torque_speed_diagram(drive: Drive, numbers: Any = None, points: Any = None) 
         for bound, text in zip(torque_limits(drive, speeds, current), (None, label), strict=True):
             axes.plot(speeds, bound, style, color=colour, label=text, linewidth=1.6)
     off = " (off the picture)" if can.stall_torque > height else ""
-    stall = f"stall, {can.stall_torque:.3g} N·m, {can.stall_current:.3g} A{off}"
+    stall = f"stall, {can.stall_torque:,.4g} N·m, {can.stall_current:,.4g} A{off}"
     axes.plot([0, 0], [can.stall_torque, -can.stall_torque], "s", color=BLACK, label=stall)
     free = f"no load, {can.no_load_speed:.4g} rad/s"
     axes.plot([can.no_load_speed, -can.no_load_speed], [0, 0], "o", color=BLACK, label=free)

@@ -53,7 +53,7 @@ def closed_loop(drive: Drive) -> Any:
 
 
 class Response(NamedTuple):
-    """A drive's currents over time, from rest; entry 0 is the start."""
+    """A drive's currents over time; entry 0 is the start."""
 
     time: np.ndarray
     """[s]"""
@@ -78,7 +78,7 @@ class Response(NamedTuple):
 
 
 def respond(drive: Drive, references: Any, speed: float = 0.0) -> Response:
-    """Step a drive one sample at a time, through `Drive.advance`.
+    """Step a drive one sample at a time, through `Drive.advance`, from where it has held a current of 0 at its speed.
 
     Args:
         drive: which.
@@ -86,7 +86,8 @@ def respond(drive: Drive, references: Any, speed: float = 0.0) -> Response:
         speed: of the rotor [rad/s], held.
     """
     parameters, time = parameters_type(Drive)(*drive.numbers), 1.0 / drive.controller.sample_rate
-    state: Any = drive.State(0.0, 0.0, 0.0)
+    back_emf = drive.motor.back_emf_constant * speed
+    state: Any = drive.State(0.0, 0.0 if drive.controller.bemf_compensation else back_emf, back_emf)
     rows = []
     for reference in references:
         before = state.current

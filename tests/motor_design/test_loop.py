@@ -131,6 +131,13 @@ def test_anti_windup_is_what_makes_it_come_back(name):
     assert reached == pytest.approx(within, rel=0.01)
 
 
+@pytest.mark.parametrize("compensated", [True, False])
+@with_and_without_delay
+def test_it_starts_from_a_current_of_zero_at_speed(compensated, delayed):
+    drive = Drive(controller=SampledLoop(delayed=delayed, bemf_compensation=compensated))
+    np.testing.assert_allclose(respond(drive, np.zeros(20), 300.0).current, 0.0, atol=1e-12)
+
+
 @every_motor
 def test_the_small_step_does_not_saturate(name):
     for delayed in (False, True):
