@@ -87,7 +87,8 @@ def respond(drive: Drive, references: Any, speed: float = 0.0) -> Response:
     """
     parameters, time = parameters_type(Drive)(*drive.numbers), 1.0 / drive.controller.sample_rate
     back_emf = drive.motor.back_emf_constant * speed
-    state: Any = drive.State(0.0, 0.0 if drive.controller.bemf_compensation else back_emf, back_emf)
+    integral = 0.0 if drive.controller.bemf_compensation else back_emf
+    state: Any = drive.State(0.0, integral, back_emf, torque=0.0, speed=speed, started=0.0)
     rows = []
     for reference in references:
         before = state.current
