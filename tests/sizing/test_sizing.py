@@ -183,7 +183,12 @@ def test_what_is_surely_enough_changes_nothing(pendulum):
 def test_the_first_choice_delivers_what_was_asked(pendulum):
     first = choose(pendulum)[0]
     assert first.feasibility.verdict == SURELY
-    asked, family, state, delivered = first.feasibility.operation, type(first.drive), Drive.State(*[0.0] * len(Drive.State._fields)), []
+    asked, family, state, delivered = (
+        first.feasibility.operation,
+        type(first.drive),
+        Drive.State(*[0.0] * len(Drive.State._fields)),
+        [],
+    )
     parameters = parameters_type(family)(*first.drive.numbers)
     for torque, speed in zip(asked.torque, asked.speed, strict=True):
         state, made, _ = Drive.advance(parameters, 0.05, state, Inputs(torque, 0.0, speed, 0.0, 0.0))
