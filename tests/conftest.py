@@ -15,6 +15,20 @@ hypothesis.settings.register_profile("deterministic", derandomize=True, deadline
 hypothesis.settings.load_profile("deterministic")
 
 
+REPRESENTATIVES = ("pendulum", "cartpole", "mountain_car")
+"""Of products of the tasks with something else `make test` runs these: a continuous, an unbounded and a walled one."""
+
+
+def pytest_collection_modifyitems(items):
+    """Leave the other tasks' rows of such products to `make check`."""
+    for item in items:
+        parameters = getattr(item, "callspec", None)
+        if parameters and len(parameters.params) > 1:
+            task = parameters.params.get("task")
+            if isinstance(task, str) and task in OURS and task not in REPRESENTATIVES:
+                item.add_marker(pytest.mark.matrix)
+
+
 def _remove_callbacks():
     for name in ("control", "act_bias", "act_gain", "act_dyn", "passive"):
         getattr(mujoco, f"set_mjcb_{name}")(None)

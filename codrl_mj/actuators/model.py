@@ -231,7 +231,8 @@ class ActuatorModel:
         Raises:
             ValueError: a value is out of bounds.
         """
-        fields.check_names(values, field_paths(_family(self)), "actuator field")
+        whole = [field.name for field in dataclasses.fields(self)]
+        fields.check_names(values, [*field_paths(_family(self)), *whole], "actuator field")
         changes: dict[str, Any] = {}
         nested: dict[str, dict[str, Any]] = {}
         for path, value in values.items():

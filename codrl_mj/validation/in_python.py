@@ -26,7 +26,7 @@ from codrl_mj.actuators import (
     parameters_type,
 )
 from codrl_mj.engine import load_family
-from codrl_mj.engine.families import SLOT, Slot
+from codrl_mj.engine.families import SLOT, Slot, slot_size
 from codrl_mj.engine.reading import slots
 from codrl_mj.validation.execution import UNIT, commands, differing
 from codrl_mj.validation.motor_loops import EVERY_FEATURE
@@ -74,7 +74,10 @@ def beside(
             output = model.actuator_outadr[at]
             arm = 1.0 if model.actuator_plugin[at] < 0 else actuator.arm_radius  # the callback's is in the gear
             moving = float(before.actuator_length[output]) / arm, float(before.actuator_velocity[output]) / arm
-            desired = _clamped(model, at, control) if model.actuator_plugin[at] < 0 else float(slot_of[at][-1]) * arm
+            if model.actuator_plugin[at] < 0:
+                desired = _clamped(model, at, control)
+            else:
+                desired = float(slot_of[at][slot_size(kinds[at])]) * arm
             inputs = Inputs(desired, *moving, before.time, at + 1.0)
             states[at], torque, signals = actuator.advance(parameters[at], model.opt.timestep, states[at], inputs)
             oracle = [*states[at], *signals, _limited(model, at, torque / arm)]

@@ -34,7 +34,7 @@ BAD = {
     "physics": ({"physics": "analytic"}, "one Gymnasium environment at a time: use vectorization_mode='sync' for it"),
     "mode": ({"autoreset_mode": "Sometimes"}, "'Sometimes' is not a valid AutoresetMode"),
     "task": ({"task": "pendulm"}, "unknown task 'pendulm': did you mean 'pendulum'"),
-    "render mode": ({"render_mode": "human"}, "render_mode = 'human': must be None or 'rgb_array'"),
+    "render mode": ({"render_mode": "human"}, "render_mode = 'human': must be one of None, rgb_array"),
     "camera": ({"render_mode": "rgb_array", "camera": "far"}, "camera = 'far'"),
     "option": ({"centre_radius": 0.1}, "unknown option 'centre_radius' of pendulum: it has none"),
     "integrator": ({"integrator": "rk45"}, "integrator = 'rk45': pendulum has semi-implicit"),
