@@ -44,6 +44,7 @@ def test_a_group_of_the_benchmark_is_measured_against_its_first_member(group, le
         assert not wanted or here or f"skipped: {library}" in finished.stdout
 
 
+@pytest.mark.matrix
 def test_a_short_soak_finds_nothing_wrong_on_one_and_two_threads(tmp_path):
     finished = _run("soak.py", "--task", "cartpole", "--num-envs", 64, "--steps", 6400, folder=tmp_path)
     assert finished.returncode == 0, finished.stdout + finished.stderr

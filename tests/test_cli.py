@@ -494,6 +494,7 @@ def test_a_verb_is_no_task_and_an_unknown_subject_is_no_run(capsys):
 # -- as a program -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.matrix
 def test_the_program_trains_and_renders(tmp_path):
     for line in (
         "train cartpole --actuator weaker --out run " + " ".join(TINY),

@@ -142,7 +142,7 @@ def caught():
 def some_caught():
     """What a few of the faults do there."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mutations, "MUTATIONS", mutations.MUTATIONS[::9])
+        patch.setattr(mutations, "MUTATIONS", mutations.MUTATIONS[::16])
         return try_mutations("pendulum")
 
 

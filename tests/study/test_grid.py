@@ -42,6 +42,7 @@ def computed(tmp_path_factory):
     return root, runs, failures, reported
 
 
+@pytest.mark.matrix
 def test_a_cell_that_fails_is_recorded_and_does_not_stop_the_others(computed):
     root, runs, failures, reported = computed
     assert set(runs) == {*CELLS, "again"}
@@ -58,6 +59,7 @@ def test_a_cell_that_fails_is_recorded_and_does_not_stop_the_others(computed):
     assert read_failure(runs["seed 0"]) is None
 
 
+@pytest.mark.matrix
 def test_a_cell_is_an_ordinary_run_folder_keyed_by_its_configuration(computed):
     root, runs, _, _ = computed
     for name, config in CELLS.items():
@@ -73,6 +75,7 @@ def test_a_cell_is_an_ordinary_run_folder_keyed_by_its_configuration(computed):
     assert len({cell_folder(root, config) for config in [TINY, *changed]}) == 5
 
 
+@pytest.mark.matrix
 def test_finished_cells_are_left_alone(computed):
     root, runs, _, _ = computed
     before = {path: path.stat().st_mtime_ns for run in runs.values() for path in run.rglob("*")}
@@ -168,6 +171,7 @@ def test_what_a_call_raises_is_raised():
         list(compute(divmod, [(1, 1), (1, 0)], Workers(jobs=2)))
 
 
+@pytest.mark.matrix
 def test_deployments_are_evaluations_that_are_made_once(computed):
     _, runs, _, _ = computed
     deployments = {
@@ -186,6 +190,7 @@ def test_deployments_are_evaluations_that_are_made_once(computed):
     assert deploy_cells({"short": other}, ONE)[0]["short"]["length"]["mean"] == 5.0
 
 
+@pytest.mark.matrix
 def test_a_deployment_that_fails_is_recorded_and_does_not_stop_the_others(computed):
     root, runs, _, _ = computed
     good, bad = (Deployment(runs["seed 1"], env, episodes=2, seed=3) for env in (IDEAL, UNSTABLE))
@@ -205,6 +210,7 @@ def test_a_deployment_that_fails_is_recorded_and_does_not_stop_the_others(comput
     assert read_failure(runs["seed 1"]) is None
 
 
+@pytest.mark.matrix
 def test_a_failure_of_a_deployment_is_forgotten_when_it_succeeds(computed):
     _, runs, _, _ = computed
     deployment, policy = Deployment(runs["seed 2"], IDEAL, episodes=2), runs["seed 2"] / "policy.json"
