@@ -37,7 +37,7 @@ def test_the_commands_are_understood(command, monkeypatch):
     for verb in cli.VERBS.values():
         monkeypatch.setattr(verb, "run", lambda self: parsed.append(self) or 0)
     with contextlib.suppress(SystemExit):
-        assert cli.main(shlex.split(command)) == 0
+        assert cli.main(shlex.split(command, comments=True)) == 0
     assert len(parsed) == 1
 
 
