@@ -25,6 +25,9 @@ for env_id in sorted(name for name in gym.registry if name.startswith("codrl_mj/
 """
 
 
+pytestmark = pytest.mark.matrix
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
     """The wheel, built from the checkout."""
@@ -67,7 +70,6 @@ def test_the_training_and_rendering_libraries_are_extras(wheel):
     assert core == {"gymnasium", "mujoco", "numba", "numpy", "pint", "rich", "tyro"}
 
 
-@pytest.mark.matrix
 def test_the_unpacked_wheel_steps_and_draws_every_task_from_another_folder(wheel, tmp_path):
     site, elsewhere = tmp_path / "site", tmp_path / "elsewhere"
     zipfile.ZipFile(wheel).extractall(site)

@@ -58,6 +58,7 @@ def real(tmp_path_factory):
     return config, folder / "out", seen
 
 
+@pytest.mark.matrix
 def test_a_study_trains_every_cell_and_tests_it_on_every_actuator(real):
     config, _, seen = real
     assert [kind for kind, _ in seen] == ["training"] * 4 + ["test"] * 8
@@ -68,6 +69,7 @@ def test_a_study_trains_every_cell_and_tests_it_on_every_actuator(real):
         assert load_config(run).env.options.center_radius == 0.1
 
 
+@pytest.mark.matrix
 def test_the_numbers_are_those_of_the_evaluations_in_the_run_folders(real):
     """Read from the folders by what the files say themselves, and reduced by scipy and by counting."""
     config, out, _ = real
@@ -104,6 +106,7 @@ def shown(value):
     return f"{value:.1f}" if abs(value) < 100 else f"{value:.0f}"
 
 
+@pytest.mark.matrix
 def test_a_finished_study_is_not_computed_again(real):
     config, _, _ = real
     before = {path: path.stat().st_mtime_ns for path in config.root.rglob("*")}
@@ -111,6 +114,7 @@ def test_a_finished_study_is_not_computed_again(real):
     assert {path: path.stat().st_mtime_ns for path in config.root.rglob("*")} == before
 
 
+@pytest.mark.matrix
 def test_a_policy_that_cannot_be_tested_is_listed_and_stops_nothing(real, tmp_path, capsys):
     config, _, _ = real
     line = f"--root {config.root} --tasks cartpole --experiments matrix --conditions ideal weaker --seeds 2"
@@ -158,6 +162,7 @@ def test_the_default_study_is_as_large_as_documented():
     assert list(cells(config))[:2] == ["cartpole: ideal, seed 0", "cartpole: paper, seed 0"]
 
 
+@pytest.mark.matrix
 def test_page_tables_and_figures_are_written_whole(partial):
     _, out, files = partial
     assert all(path.is_file() for path in files)
@@ -171,6 +176,7 @@ def test_page_tables_and_figures_are_written_whole(partial):
     assert "nan" not in page.lower().split()
 
 
+@pytest.mark.matrix
 def test_a_page_is_written_alike_and_keeps_what_a_person_wrote(partial):
     config, out, files = partial
     before = {path: path.read_bytes() for path in [*files, out / "mismatch_conclusions.md"]}
@@ -179,6 +185,7 @@ def test_a_page_is_written_alike_and_keeps_what_a_person_wrote(partial):
     assert "## Conclusions\n\nWhat a person wrote.\n" in (out / "mismatch.md").read_text()
 
 
+@pytest.mark.matrix
 def test_every_trial_is_summarised_from_its_runs(partial):
     config, out, _ = partial
     content = read_results(out)
@@ -197,6 +204,7 @@ def test_every_trial_is_summarised_from_its_runs(partial):
         assert summary["measures"]["tracking_percent"] is None
 
 
+@pytest.mark.matrix
 def test_every_comparison_is_mann_whitneys(partial):
     config, _, _ = partial
     results = collect(config)
@@ -213,6 +221,7 @@ def test_every_comparison_is_mann_whitneys(partial):
             assert verdict.outcome == (outcome if enough else "undecided")
 
 
+@pytest.mark.matrix
 def test_comparisons_over_several_tests_are_their_mean(partial):
     config, _, _ = partial
     results = collect(config)
@@ -225,6 +234,7 @@ def test_comparisons_over_several_tests_are_their_mean(partial):
     assert together.runs == (3, 5)
 
 
+@pytest.mark.matrix
 def test_missing_runs_are_named_and_counted(partial):
     _, out, _ = partial
     page = (out / "mismatch.md").read_text()
@@ -237,6 +247,7 @@ def test_missing_runs_are_named_and_counted(partial):
     assert "undecided on `weaker`" in page  # three runs decide nothing, whatever they are
 
 
+@pytest.mark.matrix
 def test_the_findings_have_the_tables_numbers(partial):
     config, out, _ = partial
     page = (out / "mismatch.md").read_text()
@@ -317,6 +328,7 @@ def test_a_damaged_table_of_episodes_is_named(text, expected, tmp_path):
         collect(config)
 
 
+@pytest.mark.matrix
 def test_a_training_that_failed_is_listed_with_its_error(partial, tmp_path):
     config = dataclasses.replace(partial[0], experiments=("agents",))
     cell = cells(config)["cartpole: weaker, seed 0"]
@@ -333,6 +345,7 @@ def test_a_training_that_failed_is_listed_with_its_error(partial, tmp_path):
 # -- what it takes ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.matrix
 def test_the_cost_is_that_of_the_finished_runs(partial):
     config, _, _ = partial
     ppo, dqn = costs(config)
