@@ -142,12 +142,12 @@ def caught():
 def some_caught():
     """What a few of the faults do there."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mutations, "MUTATIONS", mutations.MUTATIONS[::16])
+        patch.setattr(mutations, "MUTATIONS", mutations.MUTATIONS[::24])
         return try_mutations("pendulum")
 
 
 def test_some_faults_are_caught_far_beyond_the_tolerance(some_caught):
-    assert len(some_caught) > 3
+    assert len(some_caught) >= 2
     assert all(outcome.failed and margin(outcome.clearest) > 5 for outcome in some_caught)
 
 
