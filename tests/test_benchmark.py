@@ -24,6 +24,7 @@ def _run(script, *arguments, folder):
         [("vector: mountain_car_continuous", 3, 2), ("single: pendulum", 3, 2), ("engine: pendulum", 2, 0)],
     ),
 )
+@pytest.mark.matrix
 def test_a_group_of_the_benchmark_is_measured_against_its_first_member(group, least, own, tmp_path):
     out = tmp_path / "bench.json"
     finished = _run("benchmark.py", "--quick", "--turns", 2, "--only", group, "--out", out, folder=tmp_path)
@@ -59,6 +60,7 @@ def test_a_short_soak_finds_nothing_wrong_on_one_and_two_threads(tmp_path):
         ("soak.py", ("--steps", 0), "--steps 0: must be >= 1"),
     ],
 )
+@pytest.mark.matrix
 def test_bad_arguments_are_refused(script, arguments, message, tmp_path):
     finished = _run(script, *arguments, folder=tmp_path)
     assert finished.returncode == 2

@@ -238,6 +238,7 @@ def test_python_finds_what_the_command_found(written):
     }
 
 
+@pytest.mark.matrix
 def test_a_registered_task_changes_nothing_for_ours(monkeypatch):
     with monkeypatch.context() as patch:
         patch.delitem(TASKS, "arm")

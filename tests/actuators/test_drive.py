@@ -366,7 +366,7 @@ def chain(name, timestep, loads):
 
 
 def reversals(name, timestep, loads):
-    """Speeds [rad/s] of links whose motors are asked to and fro for nearly all they can; and the no-load speed."""
+    """Speeds [rad/s] of links whose motors are asked back and forth for nearly all they can; and the no-load speed."""
     resistance, _, constant, voltage = WINDINGS[name]
     ratio = STIFF[name][0]
     model = chain(name, timestep, loads)

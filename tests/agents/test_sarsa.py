@@ -429,6 +429,7 @@ def test_the_papers_settings_are_the_papers():
     assert (agent.epsilon_decay, agent.trace_decay, preset.total_episodes) == (1.0, 0.0, 600)
 
 
+@pytest.mark.matrix
 def test_it_learns_to_leave_the_valley():
     """Acting at random takes all of the 200 steps."""
     model = SARSAConfig().make_model(_car(actuator="paper"), 0)

@@ -36,6 +36,7 @@ def _run(program):
     return done.stdout.split()
 
 
+@pytest.mark.matrix
 def test_after_the_display_has_ended_environments_close_and_render_again():
     program = "end_display(); one[0].close(); print(same(*two), same(*one), same(*made(64)))"
     assert _run(program) == ["True"] * 3

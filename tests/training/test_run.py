@@ -55,6 +55,7 @@ def mean_return(policy, actuator, episodes=20):
 # -- learning -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.matrix
 def test_ppo_learns_to_balance(tmp_path):
     ppo = PPOConfig(rollout_steps=1024, batch_size=128, learning_rate=3e-3, hidden=(32, 32))
     config = TrainConfig(EnvConfig("cartpole", "ideal"), ppo, seed=0, total_steps=16_000)
