@@ -434,10 +434,11 @@ def _radii(cls: Any, numbers: np.ndarray) -> np.ndarray:
     x = resistance * sample_time / columns.inductance
     decay = np.exp(-x)
     share = np.where(columns.bandwidth > 0.0, columns.bandwidth * sample_time, DEFAULT_BANDWIDTH)
-    step = -np.expm1(-2.0 * math.pi * share)
+    design = np.vectorize(sampled.designed_gains, otypes=[float, float])
+    gains = design(resistance, columns.inductance, sample_time, 2.0 * math.pi * share * columns.sample_rate)
     designed = (columns.kp == 0.0) & (columns.ki == 0.0)
-    kp = np.where(designed, resistance * step / np.expm1(x), columns.kp)
-    ki = np.where(designed, resistance * step, columns.ki * sample_time)
+    kp = np.where(designed, gains[0], columns.kp)
+    ki = np.where(designed, gains[1], columns.ki * sample_time)
     effect = (1.0 - decay) / resistance  # of a volt, in a sample
     nothing, one, late = np.zeros(len(numbers)), np.ones(len(numbers)), columns.delayed != 0.0
     integrates = ki > 0.0  # else the integral is no part of the loop

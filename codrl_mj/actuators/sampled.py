@@ -14,23 +14,22 @@ a limit once at most; saturated, i and c approach v as e^k, so it leaves the lim
 """
 
 import math
-from typing import Any
 
 
-def designed_gains(resistance: Any, inductance: Any, sample_time: Any, bandwidth: Any) -> tuple[Any, Any]:
+def designed_gains(resistance: float, inductance: float, sample_time: float, bandwidth: float) -> tuple[float, float]:
     """Proportional gain [V/A] and integral gain per sample [V/A] of the loop whose zero cancels the winding's pole.
 
     kp = R*P*e/(1 - e) and ki*T = R*P: the loop from reference to current is P/(z - 1 + P).
 
     Args:
-        resistance: R [ohm]; it and the others may be arrays where `math` is not needed.
+        resistance: R [ohm].
         inductance: L [H].
         sample_time: T [s].
         bandwidth: wc [rad/s].
     """
     x = resistance * sample_time / inductance
     step = -math.expm1(-bandwidth * sample_time)
-    return resistance * step / math.expm1(x), resistance * step
+    return resistance * step * math.exp(-x) / -math.expm1(-x), resistance * step  # exp(x) would overflow
 
 
 def jump(

@@ -400,3 +400,11 @@ def test_an_arm_of_two_light_links_is_finite_at_20_ms():
     assert np.abs(held).max() > 100.0 * fastest
     told, _ = reversals("dcx22l", 0.02, 0.6 * loads)
     assert np.abs(told).max() < 3.0 * fastest
+
+
+def test_a_winding_far_quicker_than_the_samples_has_gains_too():
+    """exp(R*T/L) is beyond floating point."""
+    quick = Drive(GearMotor(resistance=20.0, inductance=1e-5), SampledLoop(1e3, delayed=True), Supply(24.0))
+    assert quick.check(0.002) is None
+    state, *_ = responses(quick, 0.002, [0.042 * 0.5] * 200, [0.0] * 200)[-1]
+    assert state.current == pytest.approx(0.5)
