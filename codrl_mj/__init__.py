@@ -27,6 +27,8 @@ _PUBLIC = {
     "Ideal": "codrl_mj.actuators",
     "Lag": "codrl_mj.actuators",
     "Drive": "codrl_mj.actuators",
+    "Servo": "codrl_mj.actuators",
+    "ServoLoop": "codrl_mj.actuators",
     "GearMotor": "codrl_mj.actuators",
     "SampledLoop": "codrl_mj.actuators",
     "TorqueSpeed": "codrl_mj.actuators",

@@ -10,6 +10,7 @@ import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, reference, resolve
 from codrl_mj.engine.families import load_family, user_head
+from codrl_mj.engine.reading import check_shafts
 from codrl_mj.plugin import FAMILY, NAME
 
 _JOINT = {mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT}
@@ -51,7 +52,8 @@ def motorise(spec: mujoco.MjSpec, actuators: Mapping[str, Any], allow_unstable: 
     new, model = spec.copy(), spec.copy().compile()
     # MuJoCo 3.17 copies default classes without their numbers, and forgets those that are added then; this numbers them
     new.delete(new.add_default(NAME, new.default))
-    for index, (pattern, actuator) in sorted(_chosen(new, actuators).items()):
+    chosen = _chosen(new, actuators)
+    for index, (pattern, actuator) in sorted(chosen.items()):
         reason = _refusal(model, new.actuators[index], index, actuator)
         if reason:
             raise ValueError(f"{_call(new.actuators[index], index)}: cannot be motorised: {reason}")
@@ -62,6 +64,8 @@ def motorise(spec: mujoco.MjSpec, actuators: Mapping[str, Any], allow_unstable: 
         load_family(type(actuator))
         _drive(new, model, index, actuator)
     new.nuser_actuator = -1  # as many as are needed
+    if any(actuator.INERTIA for _, actuator in chosen.values()):
+        check_shafts(new.compile(), allow_unstable)
     return new
 
 
@@ -128,6 +132,8 @@ def _refusal(model: mujoco.MjModel, target: mujoco.MjsActuator, index: int, actu
         return "its tendon limits the force of its actuators (actuatorfrclimited), which MuJoCo does not do for plugins"
     if model.actuator_delay[index]:
         return "its control is delayed (delay), which MuJoCo does not tell plugins"
+    if actuator.MOTION and dynamics != mujoco.mjtDyn.mjDYN_NONE:
+        return "its control is filtered before it becomes what a servo is asked for"
     if actuator.additions.friction and transmission not in (*_JOINT, mujoco.mjtTrn.mjTRN_TENDON):
         return "it drives neither a joint nor a tendon, which the friction that its motor brings would need"
     if model.actuator_user[index].any():
@@ -156,6 +162,9 @@ def _drive(spec: mujoco.MjSpec, model: mujoco.MjModel, index: int, actuator: Act
     target.plugin.plugin_name, target.plugin.name, target.plugin.active = NAME, name, True
     target.userdata = [*user_head(type(actuator)), actuator.arm_radius, *actuator.numbers]
     added = actuator.additions
+    if actuator.MOTION:  # its own loops take the place of the model's
+        target.gaintype, target.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE
+        target.gainprm[:], target.biasprm[:] = [1.0] + [0.0] * (mujoco.mjNGAIN - 1), 0.0
     target.armature += added.armature
     target.damping[0] += added.damping
     if added.friction:

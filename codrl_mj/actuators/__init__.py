@@ -1,7 +1,8 @@
 """Actuators as mathematics: what one is, the families of them, stability, names. No MuJoCo."""
 
 from codrl_mj.actuators.current_loop import Actuator, CurrentLoop, Motor, Supply, VoltageDriven, electrical_step
-from codrl_mj.actuators.drive import Drive, GearMotor, SampledLoop
+from codrl_mj.actuators.drive import Drive, VoltageDrive
+from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.lag import Lag
 from codrl_mj.actuators.model import (
@@ -11,6 +12,7 @@ from codrl_mj.actuators.model import (
     Inputs,
     JointAdditions,
     Nothing,
+    UnstableError,
     family_name,
     family_number,
     field_paths,
@@ -20,6 +22,7 @@ from codrl_mj.actuators.model import (
     trusting,
 )
 from codrl_mj.actuators.named import (
+    BUILT_IN,
     FAMILIES,
     NAMED,
     actuator_from_mapping,
@@ -29,10 +32,13 @@ from codrl_mj.actuators.named import (
     mapping_of,
     resolve,
 )
+from codrl_mj.actuators.sampled_loop import SampledLoop
+from codrl_mj.actuators.servo import Servo, ServoLoop
 from codrl_mj.actuators.stability import check_stable, spectral_radii, spectral_radius
 from codrl_mj.actuators.torque_speed import TorqueSpeed
 
 __all__ = [
+    "BUILT_IN",
     "FAMILIES",
     "IDEAL",
     "NAMED",
@@ -50,8 +56,12 @@ __all__ = [
     "Motor",
     "Nothing",
     "SampledLoop",
+    "Servo",
+    "ServoLoop",
     "Supply",
     "TorqueSpeed",
+    "UnstableError",
+    "VoltageDrive",
     "VoltageDriven",
     "actuator_from_mapping",
     "actuator_over",

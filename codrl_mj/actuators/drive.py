@@ -4,145 +4,23 @@ Where the paper's `current_loop` takes one or a few Euler steps of a slow windin
 constant of 0.1 to 5 ms under a loop that samples at 10 to 40 kHz. The winding is exact here, the loop has a sample rate
 of its own, its integrator does not wind up, and what is delivered over a mechanical step is the *mean* torque of it:
 the current at the end of a step says little of what moved the load.
-
-The speed, and with it the back-EMF, is held over the mechanical step, as everywhere in the package, unless the drive is
-told what it moves (`load_inertia`).
 """
 
 import dataclasses
 import math
-from collections.abc import Mapping
+import warnings
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from codrl_mj.actuators import sampled, stability
+from codrl_mj.actuators import sampled, shaft, stability
 from codrl_mj.actuators.current_loop import Supply
+from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.model import ActuatorModel, Command, Inputs, JointAdditions, UnstableError, parameters_type
-from codrl_mj.fields import check, choice, flag, part, real
-
-DEFAULT_BANDWIDTH = 0.349 / (2 * math.pi)
-"""Bandwidth of the loop over its sample rate: 60 degrees of phase margin with one and a half samples of delay."""
-
-
-@dataclasses.dataclass(frozen=True)
-class GearMotor:
-    """A DC motor, or a brushless one seen from its drive, with its gear: what a datasheet says.
-
-    Brushless motors: terminal quantities, line to line, of the equivalent DC motor.
-
-    Raises:
-        ValueError: a field is out of bounds; the message names field, value and bound.
-    """
-
-    resistance: float = real(8.4, above=0.0, unit="ohm")
-    """Terminal resistance R [ohm], > 0. The defaults are the Quanser QUBE-Servo 2's motor."""
-    inductance: float = real(1.16e-3, above=0.0, unit="H")
-    """Terminal inductance L [H], > 0."""
-    torque_constant: float = real(0.042, above=0.0, unit="N*m/A")
-    """Torque constant kT [N*m/A] at the rotor, > 0."""
-    back_emf_constant: float = real(0.042, least=0.0, unit="V*s/rad")
-    """Back-EMF constant kE [V*s/rad] at the rotor, >= 0; equal to kT in SI units but for losses."""
-    rotor_inertia: float = real(4.0e-6, least=0.0, unit="kg*m^2")
-    """Inertia J [kg*m^2] of the rotor, >= 0: the joint gets J*n^2."""
-    gear_ratio: float = real(1.0, above=0.0, unit="")
-    """Turns n of the rotor for a turn of the output shaft, > 0."""
-    gear_efficiency: float = real(1.0, above=0.0, most=1.0)
-    """Share of the torque that the gear passes on when it drives, in (0, 1]; driven, it brakes with 1/efficiency - 1 of
-    the torque. Part of what is delivered, by an implicit step: it never turns the rotor back, and so is the smaller the
-    closer the rotor is to standstill, where nothing is held by it (holding is `coulomb_friction`'s)."""
-    coulomb_friction: float = real(0.0, least=0.0, unit="N*m")
-    """Coulomb friction [N*m] at the rotor, >= 0: the joint's `frictionloss`."""
-    viscous_friction: float = real(0.0, least=0.0, unit="N*m*s/rad")
-    """Viscous friction [N*m*s/rad] at the rotor, >= 0: the joint's `damping`."""
-    load_inertia: float = real(0.0, least=0.0, unit="kg*m^2")
-    """Inertia [kg*m^2] of what the output shaft moves, >= 0, so that its speed can change within a step; 0: it is held.
-    Nothing is added to the model by it."""
-    arm_radius: float = real(1.0, above=0.0, unit="m")
-    """Radius [m] of the wheel, drum or pinion on the output shaft that moves a slide, > 0; on a hinge 1."""
-
-    def __post_init__(self) -> None:
-        """Validate."""
-        check(self)
-
-    @classmethod
-    def from_datasheet(cls, **printed: Any) -> "GearMotor":
-        """A motor from what its datasheet prints, each value as text with its unit.
-
-            >>> GearMotor.from_datasheet(resistance="0.464 ohm", inductance="0.322 mH", torque_constant="25.1 mN*m/A",
-            ...                          rotor_inertia="135 g*cm^2").torque_constant
-            0.0251
-
-        Args:
-            printed: as for `codrl_mj.catalogue.from_datasheet`, which also says how each number came about.
-
-        Raises:
-            ValueError: the datasheet does not suffice, or contradicts itself; the message has values and remedy.
-        """
-        from codrl_mj.catalogue import from_datasheet
-
-        return cls.of(from_datasheet(**printed))
-
-    @classmethod
-    def of(cls, numbers: Any) -> "GearMotor":
-        """A motor of `codrl_mj.catalogue.MotorNumbers`; what they do not know is left at 0, an efficiency at 1."""
-        known = {field.name: getattr(numbers, field.name, None) for field in dataclasses.fields(cls)}
-        known |= {name: 0.0 for name in _UNKNOWN if known[name] is None}
-        return cls(**{name: value for name, value in known.items() if value is not None})
-
-    @property
-    def electrical_time_constant(self) -> float:
-        """L/R [s]."""
-        return self.inductance / self.resistance
-
-    @property
-    def mechanical_time_constant(self) -> float:
-        """R*J/(kT*kE) [s] of the motor alone, without its gear and load; infinite without a back-EMF."""
-        product = self.torque_constant * self.back_emf_constant
-        return self.resistance * self.rotor_inertia / product if product > 0.0 else math.inf
-
-
-_UNKNOWN = ("rotor_inertia", "coulomb_friction", "viscous_friction")
-"""What a datasheet may leave open, and is 0 then."""
-
-
-@dataclasses.dataclass(frozen=True)
-class SampledLoop:
-    """The PI current loop of a drive, at a sample rate of its own.
-
-    Raises:
-        ValueError: a field is out of bounds, or the bandwidth is beyond what the sample rate allows.
-    """
-
-    sample_rate: float = real(20e3, above=0.0, unit="Hz")
-    """Samples a second [Hz], > 0; a mechanical step must hold a whole number of them."""
-    bandwidth: float = real(0.0, least=0.0, unit="Hz")
-    """Bandwidth [Hz] that the gains are designed for by pole-zero cancellation, >= 0. 0: 0.0555 of the sample rate,
-    60 degrees of phase margin with `delayed`."""
-    kp: float = real(0.0, least=0.0, unit="V/A")
-    """Proportional gain [V/A], >= 0. It and `ki` replace the designed gains where one of them is not 0."""
-    ki: float = real(0.0, least=0.0, unit="V/(A*s)")
-    """Integral gain [V/(A*s)], >= 0."""
-    anti_windup: str = choice("back_calculation", "back_calculation", "clamping", "none")
-    """What the integrator does while the voltage saturates: it follows what was possible (`back_calculation`, with the
-    tracking time kp/ki), it stands still (`clamping`), or it goes on (`none`)."""
-    delayed: bool = flag(False)
-    """Whether the voltage that a sample computes is applied in the next one, as most digital drives do."""
-    bemf_compensation: bool = flag(True)
-    """Add the back-EMF kE*omega to the voltage."""
-    max_current: float = real(math.inf, above=0.0, unit="A", infinite=True)
-    """Largest current [A] that the drive asks for, > 0; `inf` for none."""
-
-    def __post_init__(self) -> None:
-        """Validate."""
-        check(self)
-        most = self.sample_rate / (2 * math.pi)
-        if self.bandwidth > most:
-            raise ValueError(
-                f"SampledLoop.bandwidth = {self.bandwidth:g}: must be <= {most:g} Hz at sample_rate = "
-                f"{self.sample_rate:g} Hz, where a delay of one sample leaves 4 degrees of phase margin; lower it, or "
-                "raise the sample rate"
-            )
+from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH, SampledLoop
+from codrl_mj.actuators.shaft import Means, Shaft, Winding
+from codrl_mj.fields import part
 
 
 class State(NamedTuple):
@@ -154,10 +32,14 @@ class State(NamedTuple):
     """The controller's integral [V]."""
     pending: float
     """Voltage [V] that a delayed loop applies in the next sample."""
-    torque: float
-    """Torque [N*m] delivered in the last step."""
+    rise: float
+    """How much warmer [K] the winding is than its surroundings."""
+    acceleration: float
+    """What the torque delivered in the last step did to the rotor's speed [rad/s^2]."""
     speed: float
     """Speed [rad/s] of the rotor at its beginning."""
+    others: float
+    """Acceleration [rad/s^2] of the rotor by all but the motor, as it was taken to be."""
     started: float
     """1 once there was a step."""
 
@@ -168,133 +50,68 @@ class Signals(NamedTuple):
     current: float
     """Mean current [A] over the step: times kT, the torque of the motor."""
     reference_current: float
-    """Current asked of the loop [A], within `max_current`."""
+    """Current asked of the loop [A], within its limits."""
     voltage: float
     """Mean terminal voltage [V] over the step."""
+    temperature: float
+    """Of the winding [degC], at the end of the step."""
     saturated: float
     """1 where the voltage, or the current asked for, was at its limit in some sample."""
 
 
-def run(
-    parameters: Any, samples: int, current: float, integral: float, pending: float, reference: float, speed: float
-) -> tuple[float, float, float, float, float, int]:
-    """Winding and loop over some samples at a held speed: at once where that has a closed form.
-
-    The sums that it needs telescope: with S the sum of the current over the samples' starts, the mean of (u - b)/R is
-    (S + (i_n - i_0)/(1 - e))/n, and that of the current, the mean of every sample included,
-    (S + (1 - m)/(1 - e)*(i_n - i_0))/n with m = (1 - e)/x and x = R*T/L.
-
-    Args:
-        parameters: as for `advance`.
-        samples: n.
-        current: i_0 [A].
-        integral: the controller's [V].
-        pending: voltage [V] of the sample before, for a delayed loop.
-        reference: current asked for [A].
-        speed: of the rotor [rad/s].
-
-    Returns:
-        The three afterwards, the mean current [A], the mean voltage [V], and how many samples were saturated.
-    """
-    sample_time, first = 1.0 / parameters.sample_rate, current
-    resistance, voltage = parameters.resistance, parameters.supply_voltage
-    x = resistance * sample_time / parameters.inductance
-    lost = -math.expm1(-x)
-    back_emf = parameters.back_emf_constant * speed
-    compensated = back_emf if parameters.bemf_compensation != 0.0 else 0.0
-    designed = parameters.kp == 0.0 and parameters.ki == 0.0
-    y = 2.0 * math.pi * (parameters.bandwidth * sample_time if parameters.bandwidth > 0.0 else DEFAULT_BANDWIDTH)
-    if designed and parameters.anti_windup == 0.0 and parameters.delayed == 0.0 and parameters.supply_resistance == 0.0:
-        offset = back_emf - compensated
-        current, integral, total, saturated = sampled.jump(
-            current,
-            (integral - offset) / resistance,
-            reference,
-            (-voltage - back_emf) / resistance,
-            (voltage - back_emf) / resistance,
-            samples,
-            x,
-            y,
-            lost,
-        )
-        integral = integral * resistance + offset
-    else:
-        kp, ki = parameters.kp, parameters.ki * sample_time
-        if designed:
-            kp, ki = sampled.designed_gains(resistance, parameters.inductance, sample_time, y * parameters.sample_rate)
-        current, integral, pending, total, saturated = sampled.run_samples(
-            current,
-            integral,
-            pending,
-            reference,
-            back_emf,
-            compensated,
-            voltage,
-            parameters.supply_resistance,
-            samples,
-            resistance,
-            1.0 - lost,
-            kp,
-            ki,
-            parameters.anti_windup,
-            parameters.delayed,
-        )
-    change = (current - first) / lost
-    mean = (total + (1.0 - lost / x) * change) / samples
-    return current, integral, pending, mean, back_emf + resistance * (total + change) / samples, saturated
+def limited(parameters: Any, timestep: float, rise: float, resistance: float, asked: float) -> float:
+    """The current [A] that the loop is given: what is asked for, within `max_current` and what the winding bears."""
+    most = parameters.max_current
+    if parameters.thermal_resistance > 0.0 and parameters.max_temperature < math.inf:
+        most = min(most, shaft.thermal_limit(parameters, timestep, rise, resistance))
+    return min(max(asked, -most), most)
 
 
-def gear_loss(parameters: Any, timestep: float, torque: float, speed: float) -> float:
-    """Torque [N*m] that a gear takes from the motor's torque [N*m] at a speed [rad/s]: against the motion."""
-    driving = torque * speed > 0.0
-    share = 1.0 - parameters.gear_efficiency if driving else 1.0 / parameters.gear_efficiency - 1.0
-    loss = share * abs(torque)
-    if parameters.rotor_inertia > 0.0:  # no more than stops the rotor alone, and so never more than stops all
-        loss = min(loss, parameters.rotor_inertia * abs(speed) / timestep)
-    return math.copysign(loss, speed)
+def begin(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[Winding, Shaft]:
+    """Winding and shaft at the beginning of a step."""
+    inertia, others = shaft.inertia_of(parameters, inputs.inertia), 0.0
+    if state.started > 0.0 and inertia < math.inf:
+        others = shaft.others_after(timestep, inputs.speed - state.speed, state.acceleration, state.others)
+    moving = Shaft(inertia, others, inputs.speed)
+    return Winding(state.current, state.integral, state.pending), moving
+
+
+def end(parameters: Any, timestep: float, rise: float, winding: Winding, moving: Shaft, means: Means) -> State:
+    """The state after a step, from the shaft at its beginning."""
+    if parameters.thermal_resistance > 0.0:
+        resistance = shaft.resistance_at(parameters, rise)
+        rise = shaft.rise_after(parameters, timestep, rise, means.current, resistance)
+    own = means.torque / moving.inertia
+    return State(winding.current, winding.integral, winding.pending, rise, own, moving.speed, moving.others, 1.0)
+
+
+def _advance(
+    parameters: Any, timestep: float, state: State, inputs: Inputs, closed: bool
+) -> tuple[State, float, Signals]:
+    """A step of a drive that a torque is asked of or, where the loop is not `closed`, a voltage: kT for a volt."""
+    asked = inputs.desired_torque / parameters.torque_constant
+    resistance = shaft.resistance_at(parameters, state.rise)
+    reference = limited(parameters, timestep, state.rise, resistance, asked) if closed else asked
+    winding, moving = begin(parameters, timestep, state, inputs)
+    samples = max(int(timestep * parameters.sample_rate + 0.5), 1)
+    winding, _, means = shaft.turn(parameters, resistance, timestep, samples, winding, moving, closed, reference)
+    after = end(parameters, timestep, state.rise, winding, moving, means)
+    temperature = parameters.ambient_temperature + after.rise
+    at_limit = 1.0 if means.saturated > 0.0 or reference != asked else 0.0
+    shown = reference if closed else means.current
+    return after, means.torque, Signals(means.current, shown, means.voltage, temperature, at_limit)
 
 
 def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Signals]:
-    """Advance winding and loop by the samples of one mechanical step.
-
-    Where a saturated voltage meets a light load, the speed cannot be held over the step: c = h*kT*kE/(R*J), J the
-    inertia of rotor and load, is the share of the speed that the back-EMF takes off in a step h; above 1 it rings,
-    above 2 it grows. With a `load_inertia` the step is cut into 2*c pieces, and the rotor's speed goes on from piece to
-    piece by the motor's torque and by what else moved the load in the step before.
+    """Advance winding, loop and shaft by one mechanical step.
 
     Args:
         parameters: named as the fields of `Drive` and its parts.
         timestep: mechanical step [s].
         state: as the step before left it.
-        inputs: desired torque [N*m] and speed [rad/s] at the rotor.
+        inputs: desired torque [N*m], speed [rad/s] and inertia [kg*m^2] at the rotor.
     """
-    samples = max(int(timestep * parameters.sample_rate + 0.5), 1)
-    asked = inputs.desired_torque / parameters.torque_constant
-    reference = min(max(asked, -parameters.max_current), parameters.max_current)
-    inertia, pieces, others = 0.0, 1, 0.0
-    if parameters.load_inertia > 0.0:
-        inertia = parameters.rotor_inertia + parameters.load_inertia / (parameters.gear_ratio * parameters.gear_ratio)
-        braking = parameters.torque_constant * parameters.back_emf_constant / parameters.resistance
-        pieces = min(max(math.ceil(2.0 * timestep * braking / inertia), 1), samples)
-        if state.started > 0.0:
-            others = (inputs.speed - state.speed) / timestep - state.torque / inertia
-    current, integral, pending, speed = state.current, state.integral, state.pending, inputs.speed
-    amperes, volts, torque, saturated, left = 0.0, 0.0, 0.0, 0, samples
-    for piece in range(pieces):
-        count = left // (pieces - piece)
-        current, integral, pending, mean, voltage, limited = run(
-            parameters, count, current, integral, pending, reference, speed
-        )
-        left, saturated = left - count, saturated + limited
-        share, delivered = count / samples, parameters.torque_constant * mean
-        if parameters.gear_efficiency < 1.0:
-            delivered -= gear_loss(parameters, timestep, delivered, speed)
-        amperes, volts, torque = amperes + share * mean, volts + share * voltage, torque + share * delivered
-        if pieces > 1:
-            speed += share * timestep * (delivered / inertia + others)
-    at_limit = 1.0 if saturated > 0 or reference != asked else 0.0
-    after = State(current, integral, pending, torque, inputs.speed, 1.0)
-    return after, torque, Signals(amperes, reference, volts, at_limit)
+    return _advance(parameters, timestep, state, inputs, True)
 
 
 def observe(parameters: Any, timestep: float, signals: Signals, inputs: Inputs) -> tuple[float, float]:  # noqa: ARG001
@@ -313,17 +130,18 @@ class Drive(ActuatorModel):
     family: ClassVar[str] = "drive"
     State: ClassVar[type] = State
     Signals: ClassVar[type] = Signals
-    SIGNAL_UNITS: ClassVar[Mapping[str, str]] = {"current": "A", "reference_current": "A", "voltage": "V"}
+    SIGNAL_UNITS: ClassVar[Mapping[str, str]] = {
+        "current": "A",
+        "reference_current": "A",
+        "voltage": "V",
+        "temperature": "degC",
+    }
     OBSERVED: ClassVar[tuple[str, ...]] = ("current", "reference_current")
-    helpers: ClassVar[tuple[Any, ...]] = (
-        sampled.until,
-        sampled.jump,
-        sampled.run_samples,
-        sampled.designed_gains,
-        run,
-        gear_loss,
-    )
-    advance: ClassVar = staticmethod(advance)
+    INERTIA: ClassVar[bool] = True
+    CLOSED: ClassVar[bool] = True
+    """Whether a current loop is closed around the winding."""
+    helpers: ClassVar[tuple[Any, ...]] = (*shaft.HELPERS, limited, begin, end, _advance)
+    advance: ClassVar[Callable[..., Any]] = staticmethod(advance)
     observe: ClassVar = staticmethod(observe)
 
     motor: GearMotor = GearMotor()
@@ -387,11 +205,17 @@ class Drive(ActuatorModel):
         return super().from_numbers(numbers, arm_radius * parameters_type(family)(*numbers).gear_ratio)
 
     def commands(self) -> Mapping[str, Command]:
-        """A reference `current` [A] within `max_current`."""
+        """A reference `current` [A] within `max_current`, or the terminal `voltage` [V]."""
         limit, torque = self.controller.max_current, self.motor.torque_constant
-        why = "it would change what an action means"
-        fixed = dict.fromkeys(("motor.torque_constant", "motor.gear_ratio", "motor.arm_radius"), why)
-        return {"current": Command("A", self, torque, limit if math.isfinite(limit) else None, fixed)}
+        fixed = dict.fromkeys(("motor.torque_constant", *ARM), "it would change what an action means")
+        driven = VoltageDrive(self.motor, self.controller, self.supply)
+        past = [f"controller.{name}" for name in _PAST_THE_LOOP]
+        return {
+            "current": Command("A", self, torque, limit if math.isfinite(limit) else None, fixed),
+            "voltage": Command(
+                "V", driven, torque, self.voltage_limit, fixed | dict.fromkeys(past, "the command goes past the loop")
+            ),
+        }
 
     def check(self, timestep: float) -> None:
         """Refuse a step without a whole number of samples, and a loop that is unstable.
@@ -414,6 +238,32 @@ class Drive(ActuatorModel):
                 "have them designed; lower supply.resistance; or pass allow_unstable=True to study it as it is"
             )
 
+    def check_shaft(self, timestep: float, inertia: float) -> None:
+        """Refuse a speed that the back-EMF of a saturated motor makes unstable; warn where it would be wrong.
+
+        Raises:
+            UnstableError: with the number and a remedy.
+        """
+        held = math.isinf(self.motor.load_inertia)
+        rotor = self.motor.rotor_inertia
+        if self.motor.load_inertia > 0.0 and not held:
+            inertia = rotor + self.motor.load_inertia / self.motor.gear_ratio**2
+        braking = self.motor.torque_constant * self.motor.back_emf_constant / self.motor.resistance
+        samples = 1.0 if held else max(round(timestep * self.controller.sample_rate), 1)
+        share = timestep / samples * braking / inertia
+        remedy = "leave motor.load_inertia 0, so that the speed is followed" if held else "raise controller.sample_rate"
+        text = (
+            f"motor.rotor_inertia = {rotor:g}: the back-EMF of a saturated motor takes {share:.3g} of the rotor's "
+            f"speed in {timestep / samples:g} s over which that is held"
+        )
+        if share >= 2.0:
+            raise UnstableError(
+                f"{text}, must be < 2; {remedy}, give the rotor its inertia (it moves {inertia:.3g} kg*m^2 in all), "
+                "shorten the step, or pass allow_unstable=True to study it as it is"
+            )
+        if share > 0.5:
+            warnings.warn(f"{text}: above 0.5 it is wrong, above 1 it rings; {remedy}", stacklevel=2)
+
     @classmethod
     def instability(cls, numbers: np.ndarray, timestep: float) -> np.ndarray:
         """The spectral radius of the loop over a sample; infinite where a step holds no whole number of samples.
@@ -425,6 +275,27 @@ class Drive(ActuatorModel):
         samples = timestep * stability.columns(cls, numbers).sample_rate
         whole = (abs(samples - np.round(samples)) <= 1e-6 * samples) & (samples >= 0.5)
         return np.where(whole, _radii(cls, numbers), np.inf)
+
+
+ARM = ("motor.gear_ratio", "motor.arm_radius")
+"""Fields that change what a torque at the rotor is at the joint."""
+_PAST_THE_LOOP = ("bandwidth", "kp", "ki", "anti_windup", "bemf_compensation", "max_current")
+"""What of a loop does not count where the agent commands the voltage."""
+
+
+def _advance_driven(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Signals]:
+    """`advance` past the loop; the current asks for itself, as an agent that commands voltages desires what follows."""
+    return _advance(parameters, timestep, state, inputs, False)
+
+
+@dataclasses.dataclass(frozen=True)
+class VoltageDrive(Drive):
+    """A drive under commanded terminal voltage; a desired torque of kT stands for a volt."""
+
+    family: ClassVar[str] = ""
+    tracks: ClassVar[bool] = False
+    CLOSED: ClassVar[bool] = False
+    advance: ClassVar = staticmethod(_advance_driven)
 
 
 def _radii(cls: Any, numbers: np.ndarray) -> np.ndarray:
@@ -439,6 +310,8 @@ def _radii(cls: Any, numbers: np.ndarray) -> np.ndarray:
     designed = (columns.kp == 0.0) & (columns.ki == 0.0)
     kp = np.where(designed, gains[0], columns.kp)
     ki = np.where(designed, gains[1], columns.ki * sample_time)
+    if not cls.CLOSED:
+        kp, ki = 0.0 * kp, 0.0 * ki
     effect = (1.0 - decay) / resistance  # of a volt, in a sample
     nothing, one, late = np.zeros(len(numbers)), np.ones(len(numbers)), columns.delayed != 0.0
     integrates = ki > 0.0  # else the integral is no part of the loop

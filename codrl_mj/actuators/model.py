@@ -12,6 +12,7 @@ import difflib
 import functools
 import hashlib
 import importlib
+import math
 from collections import namedtuple
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, ClassVar, NamedTuple
@@ -34,6 +35,9 @@ class Inputs(NamedTuple):
     """Time since the start of the episode [s], at the beginning of the step."""
     noise_key: float
     """Key of the episode's random numbers, a whole number: see `codrl_mj.actuators.noise`."""
+    inertia: float = math.inf
+    """Inertia at the shaft [kg*m^2], or mass [kg], of all that the model has it move, by the state at the beginning of
+    the step; `inf` for families that do not ask for it, and where nobody knows."""
 
 
 class UnstableError(ValueError):
@@ -103,6 +107,10 @@ class ActuatorModel:
     """Dotted paths of the fields that need the episode's key of random numbers where they are not 0."""
     tracks: ClassVar[bool] = True
     """Whether a torque is asked for at all; otherwise what is delivered counts as desired."""
+    INERTIA: ClassVar[bool] = False
+    """Whether it is told the inertia at its shaft, which takes the engine some time to find."""
+    MOTION: ClassVar[bool] = False
+    """Whether what is asked of it is a position or a speed of the shaft, in [rad] or [rad/s], in place of a torque."""
 
     def __post_init__(self) -> None:
         """Validate."""
@@ -174,6 +182,17 @@ class ActuatorModel:
         Raises:
             UnstableError: it is unstable there; the reason, with its number, and a remedy.
             ValueError: it cannot be simulated at all, likewise.
+        """
+
+    def check_shaft(self, timestep: float, inertia: float) -> None:
+        """Refuse what cannot be simulated on a shaft that moves so much; called for families that ask for `INERTIA`.
+
+        Args:
+            timestep: mechanical step [s].
+            inertia: at the shaft [kg*m^2], or mass [kg], the rotor's own included, in the model's initial position.
+
+        Raises:
+            UnstableError: it is unstable there; the reason, with its number, and a remedy.
         """
 
     def check_at(self, timestep: float, allow_unstable: bool) -> None:

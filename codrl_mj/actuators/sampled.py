@@ -114,6 +114,7 @@ def run_samples(
     compensated: float,
     voltage: float,
     sag: float,
+    deadband: float,
     samples: int,
     resistance: float,
     decay: float,
@@ -133,6 +134,7 @@ def run_samples(
         compensated: the part of it [V] that is added to the voltage.
         voltage: the supply's [V].
         sag: its resistance [ohm].
+        deadband: voltage [V] that the bridge loses.
         samples: n.
         resistance: R [ohm].
         decay: exp(-R*T/L).
@@ -158,6 +160,8 @@ def run_samples(
         saturated += applied != asked
         if delayed != 0.0:
             applied, pending = min(max(pending, -limit), limit), applied
+        if deadband > 0.0:
+            applied = math.copysign(max(abs(applied) - deadband, 0.0), applied)
         total += current
         reached = (applied - back_emf) / resistance
         current = reached + (current - reached) * decay

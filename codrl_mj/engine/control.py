@@ -6,6 +6,7 @@ all state is in `data.act`. Nothing is cached on disk: the structure offsets are
 
 import ctypes
 import functools
+import math
 from typing import Any, NamedTuple
 
 import mujoco
@@ -13,12 +14,23 @@ import numba
 from numba import types
 
 from codrl_mj.engine.commands import COMMAND_DATA_FIELDS, COMMAND_MODEL_FIELDS, commands
-from codrl_mj.engine.families import HEAD, SIGNATURE, advance_slot, commit_slot, is_compiled, parameter_count, size_of
+from codrl_mj.engine.families import (
+    HEAD,
+    SIGNATURE,
+    advance_slot,
+    asks_inertia,
+    commit_slot,
+    is_compiled,
+    parameter_count,
+    size_of,
+)
+from codrl_mj.engine.inertia import INERTIA_DATA_FIELDS, INERTIA_MODEL_FIELDS, inertia
 from codrl_mj.engine.layout import check_layout, offset
 from codrl_mj.engine.memory import array, f64, i32, i64, internal
 
 MODEL_FIELDS = (
     *COMMAND_MODEL_FIELDS,
+    *INERTIA_MODEL_FIELDS,
     "nactuator",
     "nuser_actuator",
     "opt.timestep",
@@ -29,7 +41,7 @@ MODEL_FIELDS = (
     "actuator_outadr",
     "actuator_user",
 )
-DATA_FIELDS = (*COMMAND_DATA_FIELDS, "time", "act", "actuator_length", "actuator_velocity")
+DATA_FIELDS = (*COMMAND_DATA_FIELDS, *INERTIA_DATA_FIELDS, "time", "act", "actuator_length", "actuator_velocity")
 PBASE_NEIGHBOURS = ("narena", "nbuffer", "pstack", "maxuse_stack")
 """Fields of mjData around `pbase`, which the bindings do not show."""
 
@@ -64,7 +76,7 @@ def compiled() -> Callbacks:
     act_at = data_at["act"]
     length_at, velocity_at = data_at["actuator_length"], data_at["actuator_velocity"]
     user_dynamics, user_bias = int(mujoco.mjtDyn.mjDYN_USER), int(mujoco.mjtBias.mjBIAS_USER)
-    command, is_disabled = commands()
+    (command, is_disabled), seen_from = commands(), inertia()
     first, second = SIGNATURE
 
     @internal(inline="always")
@@ -113,6 +125,7 @@ def compiled() -> Callbacks:
                 f64(array(data, length_at))[out],
                 f64(array(data, velocity_at))[out],
                 time,
+                seen_from(model, data, out) if asks_inertia(number) else math.inf,
             )
 
     @numba.cfunc(types.float64(types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")

@@ -52,8 +52,8 @@ HEAD, SLOT = len(Head._fields), len(Slot._fields)
 _ADDRESSES = np.zeros(10**6, dtype=np.uintp)
 """Address of a family's compiled function by its number; 0 where it has not been compiled. 8 MB that the system hands
 out page by page."""
-_SIZES = np.zeros((10**6, 3), dtype=np.int32)
-"""Numbers of states, signals and parameters, likewise."""
+_SIZES = np.zeros((10**6, 5), dtype=np.int32)
+"""Numbers of states, signals and parameters, and whether it asks for the inertia and is asked for motions, likewise."""
 _REFERENCES = np.zeros(10**6, dtype=np.uintp)
 """Address of its `reference`, as C has strings, likewise."""
 _COMPILED: dict[int, tuple[Family, Any]] = {}
@@ -62,7 +62,7 @@ _COMPILED: dict[int, tuple[Family, Any]] = {}
 ADDRESSES_AT, SIZES_AT, REFERENCES_AT = (table.ctypes.data for table in (_ADDRESSES, _SIZES, _REFERENCES))
 
 _F64, _AT = types.float64, types.uintp
-_FUNCTION = _F64(_AT, _F64, _AT, _AT, _AT, _F64, _F64, _F64, _F64, _F64)
+_FUNCTION = _F64(_AT, _F64, _AT, _AT, _AT, *(_F64,) * 6)
 
 
 def loaded_families() -> tuple[Family, ...]:
@@ -115,8 +115,9 @@ def load_family(family: Family) -> None:
 
 
 def family_sizes(family: Family) -> tuple[int, ...]:
-    """Numbers of a family's states, signals and parameters."""
-    return tuple(len(kind._fields) for kind in (family.State, family.Signals, parameters_type(family)))
+    """Numbers of a family's states, signals and parameters, and its `INERTIA` and `MOTION`."""
+    counts = (len(kind._fields) for kind in (family.State, family.Signals, parameters_type(family)))
+    return *counts, int(family.INERTIA), int(family.MOTION)
 
 
 @contextlib.contextmanager
@@ -166,12 +167,13 @@ def _compile(family: Any) -> Any:
         speed: float,
         time: float,
         key: float,
+        inertia: float,
     ) -> float:
         state, torque, outcome = advance(
             read(parameters, parameters_of),
             timestep,
             read(before, state_of),
-            Inputs(desired, position, speed, time, key),
+            Inputs(desired, position, speed, time, key, inertia),
         )
         write(state, after)
         write(outcome, seen)
@@ -189,19 +191,31 @@ def is_compiled(number: float) -> bool:
 @internal
 def state_count(number: int) -> int:
     """A family's number of states."""
-    return i32(SIZES_AT)[3 * number]
+    return i32(SIZES_AT)[5 * number]
 
 
 @internal
 def size_of(number: int) -> int:
     """`slot_size` by a family's number."""
-    return SLOT + 2 * i32(SIZES_AT)[3 * number] + i32(SIZES_AT)[3 * number + 1] + 1
+    return SLOT + 2 * i32(SIZES_AT)[5 * number] + i32(SIZES_AT)[5 * number + 1] + 1
 
 
 @internal(inline="always")
 def parameter_count(number: int) -> int:
     """A family's number of parameters."""
-    return i32(SIZES_AT)[3 * number + 2]
+    return i32(SIZES_AT)[5 * number + 2]
+
+
+@internal(inline="always")
+def asks_inertia(number: int) -> bool:
+    """A family's `INERTIA`."""
+    return i32(SIZES_AT)[5 * number + 3] != 0
+
+
+@internal(inline="always")
+def asked_motion(number: int) -> bool:
+    """A family's `MOTION`."""
+    return i32(SIZES_AT)[5 * number + 4] != 0
 
 
 @internal(inline="always")
@@ -226,7 +240,15 @@ def commit_slot(number: int, slot: int, time: float) -> None:
 
 @internal
 def advance_slot(
-    number: int, parameters: int, timestep: float, slot: int, desired: float, position: float, speed: float, time: float
+    number: int,
+    parameters: int,
+    timestep: float,
+    slot: int,
+    desired: float,
+    position: float,
+    speed: float,
+    time: float,
+    inertia: float,
 ) -> float:
     """Compute an actuator's candidate and signals from its committed state.
 
@@ -239,6 +261,7 @@ def advance_slot(
         position: of the shaft [rad].
         speed: of the shaft [rad/s].
         time: [s].
+        inertia: at the shaft [kg*m^2].
 
     Returns:
         The torque [N*m], which the slot keeps too.
@@ -248,6 +271,6 @@ def advance_slot(
     after = before + size
     own[2] = call_family(
         u64(ADDRESSES_AT)[number],
-        *(parameters, timestep, before, after, after + size, desired, position, speed, time, own[1]),
+        *(parameters, timestep, before, after, after + size, desired, position, speed, time, own[1], inertia),
     )
     return own[2]

@@ -106,6 +106,7 @@ _PROBE = """
         <inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
       </body>
       <body/>
+      <body/>
     </body>
   </worldbody>
   <actuator>
@@ -113,7 +114,7 @@ _PROBE = """
     <orientation joint="b" kp="1" input="quat"/>
     <motor joint="a"/>
     <motor joint="a"/>
-    <general joint="a" dyntype="user" actdim="11" biastype="user" user="41 42 43 44 45 46 47 48 49 50 51 52 53 54"/>
+    <general joint="a" dyntype="user" actdim="11" biastype="user" user="41 42 43 44 45 46 47 48 49 50 51 52 53 54 55"/>
     <plugin joint="a" plugin="mujoco.pid" instance="p"/>
   </actuator>
 </mujoco>

@@ -45,10 +45,11 @@ def call_family(
     speed: Any,  # noqa: ARG001
     time: Any,  # noqa: ARG001
     key: Any,  # noqa: ARG001
+    inertia: Any,  # noqa: ARG001
 ) -> Any:
     """Call a family's compiled function (see `codrl_mj.engine.families`) by its address; returns the torque [N*m]."""
     number, address = types.float64, types.uintp
-    kinds = (address, number, address, address, address, number, number, number, number, number)
+    kinds = (address, number, address, address, address, *(number,) * 6)
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
         llvm = [context.get_value_type(kind) for kind in kinds]

@@ -15,12 +15,14 @@ import mujoco
 import numba
 from numba import types
 
-from codrl_mj.actuators import FAMILIES, Ideal, VoltageDriven, family_number, reference
+from codrl_mj.actuators import BUILT_IN, Ideal, family_number, reference
 from codrl_mj.engine.commands import COMMAND_DATA_FIELDS, COMMAND_MODEL_FIELDS, clip, commands
 from codrl_mj.engine.families import (
     HEAD,
     SIGNATURE,
     advance_slot,
+    asked_motion,
+    asks_inertia,
     commit_slot,
     is_called,
     is_compiled,
@@ -30,6 +32,7 @@ from codrl_mj.engine.families import (
     size_of,
     slot_size,
 )
+from codrl_mj.engine.inertia import INERTIA_DATA_FIELDS, INERTIA_MODEL_FIELDS, inertia
 from codrl_mj.engine.layout import check_layout, offset
 from codrl_mj.engine.memory import array, f64, i32, i64, internal, u8
 from codrl_mj.plugin import FAMILY, NAME, complain, library, registered
@@ -42,6 +45,7 @@ and its end, where further calls within it are stages of RK4."""
 
 MODEL_FIELDS = (
     *COMMAND_MODEL_FIELDS,
+    *INERTIA_MODEL_FIELDS,
     *("nactuator", "nuser_actuator", "opt.timestep", "opt.integrator", "plugin_stateadr", "plugin_statenum"),
     *("actuator_plugin", "actuator_user", "actuator_outadr", "actuator_actadr", "actuator_actnum", "actuator_actearly"),
     *("actuator_actlimited", "actuator_actrange", "actuator_dyntype", "actuator_dynprm", "actuator_gaintype"),
@@ -49,6 +53,7 @@ MODEL_FIELDS = (
 )
 DATA_FIELDS = (
     *COMMAND_DATA_FIELDS,
+    *INERTIA_DATA_FIELDS,
     *("time", "act", "act_dot", "actuator_length", "actuator_velocity", "actuator_force"),
 )
 STATE_NEIGHBOURS = ("qacc_warmstart", "ctrl")
@@ -106,7 +111,7 @@ def compiled() -> Functions:
     affine_gain, affine_bias = int(mujoco.mjtGain.mjGAIN_AFFINE), int(mujoco.mjtBias.mjBIAS_AFFINE)
     exact_filter, least = int(mujoco.mjtDyn.mjDYN_FILTEREXACT), mujoco.mjMINVAL
     rk4 = int(mujoco.mjtIntegrator.mjINT_RK4)
-    command, is_disabled = commands()
+    (command, is_disabled), seen_from = commands(), inertia()
     first, second = SIGNATURE
     ideal = family_number(Ideal)
 
@@ -174,11 +179,19 @@ def compiled() -> Functions:
             if not held:
                 length = f64(array(data, length_at))[out]
                 velocity = f64(array(data, velocity_at))[out]
-                force = engine_force(model, data, actuator, length, velocity)
                 own[0] = time  # of the committed state, also after somebody set the time
-                own[size_of(number)], own[size_of(number) + 1] = force, 1.0
-                parameters = user + 8 * PLUGIN_HEAD
-                advance_slot(number, parameters, timestep, slot, force * arm, length * gear, velocity * gear, time)
+                motion, force = asked_motion(number), 0.0
+                if motion:
+                    asked = command(model, data, actuator) * gear
+                else:
+                    force = engine_force(model, data, actuator, length, velocity)
+                    asked = force * arm
+                load = seen_from(model, data, out) * (arm * arm) if asks_inertia(number) else math.inf
+                advance_slot(
+                    *(number, user + 8 * PLUGIN_HEAD, timestep, slot, asked),
+                    *(length * gear, velocity * gear, time, load),
+                )
+                own[size_of(number)], own[size_of(number) + 1] = own[2] * gear if motion else force, 1.0
             f64(array(data, force_at))[out] = own[2] * gear
 
     @numba.cfunc(types.void(types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")
@@ -267,7 +280,7 @@ def _family(name: str) -> Any:
     Raises:
         ValueError: it is somebody else's and was not loaded.
     """
-    for family in (*loaded_families(), *FAMILIES.values(), VoltageDriven):
+    for family in (*loaded_families(), *BUILT_IN):
         if reference(family) == name:
             return family
     raise ValueError(

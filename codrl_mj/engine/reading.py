@@ -6,8 +6,17 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from codrl_mj.actuators import FAMILIES, ActuatorModel, Family, family_number, parameters_type, reference
+from codrl_mj.actuators import (
+    BUILT_IN,
+    ActuatorModel,
+    Family,
+    UnstableError,
+    family_number,
+    parameters_type,
+    reference,
+)
 from codrl_mj.engine.families import HEAD, SIGNATURE, loaded_families, signals_at, slot_size
+from codrl_mj.engine.inertia import shaft_inertia
 from codrl_mj.engine.plugin import EXTRA_STATES, PLUGIN_HEAD, REASONS
 from codrl_mj.plugin import FAMILY, NAME, registered
 
@@ -57,7 +66,7 @@ def check(model: mujoco.MjModel) -> None:
 
 
 def _family(number: float) -> Family:
-    known = {family_number(family): family for family in (*FAMILIES.values(), *loaded_families())}
+    known = {family_number(family): family for family in (*BUILT_IN, *loaded_families())}
     if number not in known:
         raise ValueError(
             f"family {number:g} is not known in this process: import its module and call codrl_mj.load_family first"
@@ -143,6 +152,31 @@ def clear_motors(data: mujoco.MjData, noise_keys: Sequence[int] | None = None) -
     for slot, key in zip(found, keys, strict=True):
         slot[:] = 0.0
         slot[:2] = data.time, key
+
+
+def check_shafts(model: mujoco.MjModel, allow_unstable: bool = False) -> None:
+    """Refuse motors that what they move makes unstable (`ActuatorModel.check_shaft`), in the model's initial position.
+
+    Args:
+        model: any MuJoCo model.
+        allow_unstable: whether to let them be.
+
+    Raises:
+        ValueError: see `motors`; or a motor is refused: the message has its name, the number and a remedy.
+    """
+    asking = {index: one for index, one in motors(model).items() if one.INERTIA}
+    if not asking:
+        return
+    data = mujoco.MjData(model)
+    mujoco.mj_fwdPosition(model, data)
+    for index, actuator in asking.items():
+        arm = 1.0 if model.actuator_plugin[index] < 0 else actuator.arm_radius  # the callback's is in the gear
+        inertia = shaft_inertia(model, data, model.actuator_outadr[index])
+        try:
+            actuator.check_shaft(model.opt.timestep, arm * arm * inertia)
+        except UnstableError as error:
+            if not allow_unstable:
+                raise ValueError(f"{model.actuator(index).name or f'actuator {index}'}: {error}") from None
 
 
 class Readout:

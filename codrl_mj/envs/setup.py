@@ -10,12 +10,14 @@ import numpy as np
 from codrl_mj.actuators import ActuatorModel, Family
 from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint
+from codrl_mj.engine.reading import check_shafts
 from codrl_mj.envs.commands import Commands
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.randomization import Randomization, nominal_parameters
 from codrl_mj.envs.views import View
 from codrl_mj.physics import Physics, Signals
 from codrl_mj.physics.base import check_integrator, inner_step_count
+from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.registry import find_physics
 from codrl_mj.tasks import Task, find_task
 
@@ -67,6 +69,9 @@ class Setup:
         drawn = randomization is not None and randomization.draws_actuator  # then every draw is checked
         for one in commands.simulated if not drawn else ():
             one.check_at(timestep, config.allow_unstable)
+        if any(one.INERTIA for one in commands.simulated):
+            model = task_model(definition, commands.simulated, timestep, commands.max_forces, joint=config.joint)
+            check_shafts(model, config.allow_unstable)
         return cls(
             task=definition,
             actuators=actuators,

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from codrl_mj.actuators import Drive, Inputs, parameters_type
-from codrl_mj.actuators.drive import DEFAULT_BANDWIDTH
 from codrl_mj.actuators.sampled import designed_gains
+from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
 
 RATES = (10e3, 20e3, 40e3)
 """Sample rates [Hz] that drives commonly have."""
@@ -88,7 +88,7 @@ def respond(drive: Drive, references: Any, speed: float = 0.0) -> Response:
     parameters, time = parameters_type(Drive)(*drive.numbers), 1.0 / drive.controller.sample_rate
     back_emf = drive.motor.back_emf_constant * speed
     integral = 0.0 if drive.controller.bemf_compensation else back_emf
-    state: Any = drive.State(0.0, integral, back_emf, torque=0.0, speed=speed, started=0.0)
+    state: Any = drive.State(0.0, integral, back_emf, rise=0.0, acceleration=0.0, speed=speed, others=0.0, started=0.0)
     rows = []
     for reference in references:
         before = state.current

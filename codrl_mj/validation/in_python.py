@@ -5,6 +5,7 @@ A function of floats has one result, whoever compiled it: `compiled_checks` has 
 
 import copy
 import dataclasses
+import math
 from collections.abc import Iterator, Mapping
 
 import mujoco
@@ -27,6 +28,7 @@ from codrl_mj.actuators import (
 )
 from codrl_mj.engine import load_family
 from codrl_mj.engine.families import SLOT, Slot, slot_size
+from codrl_mj.engine.inertia import shaft_inertia
 from codrl_mj.engine.reading import slots
 from codrl_mj.validation.execution import UNIT, commands, differing
 from codrl_mj.validation.motor_loops import EVERY_FEATURE
@@ -78,7 +80,10 @@ def beside(
                 desired = _clamped(model, at, control)
             else:
                 desired = float(slot_of[at][slot_size(kinds[at])]) * arm
-            inputs = Inputs(desired, *moving, before.time, at + 1.0)
+                if actuator.MOTION:
+                    desired = _clamped(model, at, control) / arm
+            inertia = arm * arm * shaft_inertia(model, before, output) if actuator.INERTIA else math.inf
+            inputs = Inputs(desired, *moving, before.time, at + 1.0, inertia)
             states[at], torque, signals = actuator.advance(parameters[at], model.opt.timestep, states[at], inputs)
             oracle = [*states[at], *signals, _limited(model, at, torque / arm)]
             after = SLOT + len(states[at])  # the candidate state, then the signals

@@ -18,6 +18,8 @@ from codrl_mj.actuators import (
     Inputs,
     Lag,
     SampledLoop,
+    Servo,
+    ServoLoop,
     Supply,
     TorqueSpeed,
     family_number,
@@ -121,6 +123,16 @@ ALL = [
     TorqueSpeed(0.4, 3.0, 0.3),
     Drive(GearMotor(torque_constant=0.5, gear_ratio=2.0), SampledLoop(10e3, max_current=0.3), Supply(2.0)),
     Drive(GearMotor(torque_constant=0.5), SampledLoop(10e3, anti_windup="clamping", delayed=True), Supply(2.0, 0.5)),
+    Drive(
+        GearMotor(
+            torque_constant=0.5, gear_ratio=2.0, gear_efficiency=0.8, stribeck_friction=0.01, thermal_resistance=50.0
+        ),
+        SampledLoop(10e3, deadband=0.1, max_current=0.3),
+        Supply(2.0),
+    ),
+    Drive(GearMotor(torque_constant=0.5), SampledLoop(10e3), Supply(2.0)).commands()["voltage"].actuator,
+    Servo(GearMotor(torque_constant=0.5, gear_ratio=2.0), SampledLoop(10e3), Supply(2.0), ServoLoop(servo_rate=500.0)),
+    Servo(loop=ServoLoop("velocity", 50.0, velocity_integral_gain=2.0, inertia_feed_forward=0.01, max_torque=0.3)),
     FULL,
     dataclasses.replace(changed(FULL, current_noise=0.2, current_bias=0.1), supply=Supply(5.0, 0.7)),
     FULL.commands()["voltage"].actuator,
@@ -148,7 +160,9 @@ def test_a_family_runs_in_the_callback_bit_for_bit_as_in_python(actuator, integr
     assert gear == 1.0 / actuator.arm_radius
     torques = []
     for (ctrl,) in controls(STEPS, size=0.6):
-        inputs = Inputs(ctrl, gear * data.qpos[0], gear * data.qvel[0], data.time, KEY)
+        mujoco.mj_fwdPosition(model, data)
+        inertia = 1.0 / (gear * gear * data.qLDiagInv[0]) if family.INERTIA else math.inf
+        inputs = Inputs(ctrl, gear * data.qpos[0], gear * data.qvel[0], data.time, KEY, inertia)
         data.ctrl[:] = ctrl
         mujoco.mj_step(model, data)
         state, torque, signals = family.advance(parameters, timestep, state, inputs)

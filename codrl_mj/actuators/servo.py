@@ -1,0 +1,287 @@
+"""A drive with a velocity loop, and if need be a position loop, around its current loop: family `servo`.
+
+The cascade of industrial drives: a position loop P asks a velocity loop PI for a speed, that asks the current loop for
+a current. P and PD in one, u = kp*(q* - q) - kd*w, are `velocity_gain` kd, `position_gain` kp/kd and no integral.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from codrl_mj.actuators import drive, shaft
+from codrl_mj.actuators.drive import ARM, Drive
+from codrl_mj.actuators.model import Command, Inputs, UnstableError
+from codrl_mj.actuators.shaft import Means, Shaft
+from codrl_mj.fields import check, choice, real
+
+
+@dataclasses.dataclass(frozen=True)
+class ServoLoop:
+    """The outer loops of a servo, all as seen at the output shaft: at a hinge's joint, or the wheel that moves a slide.
+
+    Raises:
+        ValueError: a field is out of bounds.
+    """
+
+    controls: str = choice("position", "position", "velocity")
+    """What it is asked for."""
+    servo_rate: float = real(1e3, above=0.0, unit="Hz")
+    """Samples a second of these loops [Hz], > 0; the drive's `sample_rate` must be a multiple of it, and it or the
+    mechanical step's rate one of the other."""
+    position_gain: float = real(20.0, above=0.0, unit="1/s")
+    """Speed [rad/s] for an error of 1 rad, > 0."""
+    velocity_gain: float = real(0.1, above=0.0, unit="N*m*s/rad")
+    """Torque [N*m] for an error of 1 rad/s, > 0: for a bandwidth f, 2*pi*f times the inertia, the rotor's included."""
+    velocity_integral_gain: float = real(0.0, least=0.0, unit="1/s")
+    """What an error of 1 rad/s adds to the torque in a second, as a share of `velocity_gain` [1/s], >= 0. It stands
+    still while the current is at its limit."""
+    velocity_feed_forward: float = real(0.0, least=0.0, unit="")
+    """Share of the asked position's own speed that is added to the speed asked for, >= 0: for positions that are asked
+    for anew at every mechanical step."""
+    inertia_feed_forward: float = real(0.0, least=0.0, unit="kg*m^2")
+    """Torque [N*m] for 1 rad/s^2 of the speed that is asked for from outside, >= 0, likewise."""
+    max_velocity: float = real(math.inf, above=0.0, unit="rad/s", infinite=True)
+    """Largest speed [rad/s] that is asked of the velocity loop, > 0."""
+    max_torque: float = real(math.inf, above=0.0, unit="N*m", infinite=True)
+    """Largest torque [N*m] that it asks for, > 0, besides what the drive's `max_current` makes."""
+    max_position: float = real(math.pi, above=0.0, unit="rad")
+    """Largest position [rad] that an agent can ask for, > 0."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        check(self)
+
+
+class State(NamedTuple):
+    """What the servo remembers: the drive's, and its own."""
+
+    current: float
+    integral: float
+    pending: float
+    rise: float
+    acceleration: float
+    speed: float
+    others: float
+    started: float
+    velocity_integral: float
+    """Torque [N*m] at the rotor."""
+    target: float
+    """What was asked for in the last step, at the rotor [rad] or [rad/s]."""
+    asked: float
+    """Torque [N*m] at the rotor that the loops asked for last."""
+    waiting: float
+    """Mechanical steps until they are sampled again, where they are slower than those."""
+
+
+class Signals(NamedTuple):
+    """What can be seen of a step."""
+
+    current: float
+    """Mean current [A] over the step."""
+    reference_current: float
+    """Current asked of the current loop [A], within its limits, in the end."""
+    voltage: float
+    """Mean terminal voltage [V] over the step."""
+    temperature: float
+    """Of the winding [degC], at the end of the step."""
+    error: float
+    """What is asked for less what there is, at the output shaft [rad] or [rad/s], at the beginning of the step."""
+    saturated: float
+    """1 where the voltage or the current was at its limit at some time."""
+
+
+def demand(
+    parameters: Any, period: float, target: float, rate: float, position: float, speed: float, integral: float
+) -> tuple[float, float]:
+    """One sample of the outer loops, at the rotor.
+
+    Args:
+        parameters: a servo's.
+        period: time to the next sample [s].
+        target: what is asked for [rad] or [rad/s].
+        rate: its own rate of change [rad/s] or [rad/s^2].
+        position: [rad].
+        speed: [rad/s].
+        integral: torque [N*m] of the velocity loop's integral.
+
+    Returns:
+        The torque asked for [N*m], before it is limited, and the integral that would follow.
+    """
+    ratio = parameters.gear_ratio
+    gain, fastest = parameters.velocity_gain / (ratio * ratio), parameters.max_velocity * ratio
+    if parameters.controls == 0.0:
+        wanted = parameters.position_gain * (target - position) + parameters.velocity_feed_forward * rate
+        ahead = 0.0
+    else:
+        wanted, ahead = target, parameters.inertia_feed_forward / (ratio * ratio) * rate
+    error = min(max(wanted, -fastest), fastest) - speed
+    after = integral + parameters.velocity_integral_gain * gain * error * period
+    return gain * error + integral + ahead, after
+
+
+def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Signals]:
+    """Advance all loops by one mechanical step; between its samples the outer loops see the speed as it is predicted.
+
+    Args:
+        parameters: named as the fields of `Servo` and its parts.
+        timestep: mechanical step [s].
+        state: as the step before left it.
+        inputs: in place of the desired torque, position [rad] or speed [rad/s] of the rotor; and as for a drive.
+    """
+    of_drive = drive.State(
+        state.current,
+        state.integral,
+        state.pending,
+        state.rise,
+        state.acceleration,
+        state.speed,
+        state.others,
+        state.started,
+    )
+    winding, moving = drive.begin(parameters, timestep, of_drive, inputs)
+    resistance = shaft.resistance_at(parameters, state.rise)
+    target, constant = inputs.desired_torque, parameters.torque_constant
+    rate = (target - state.target) / timestep if state.started > 0.0 else 0.0
+    count = max(int(timestep * parameters.servo_rate + 0.5), 1)
+    every = max(int(1.0 / (timestep * parameters.servo_rate) + 0.5), 1)
+    period = timestep / count
+    samples = max(int(period * parameters.sample_rate + 0.5), 1)
+    most = parameters.max_torque / parameters.gear_ratio
+    integral, asked, waiting = state.velocity_integral, state.asked, state.waiting
+    position, speed, given = inputs.position, inputs.speed, 0.0
+    amperes, volts, torque, saturated = 0.0, 0.0, 0.0, 0.0
+    for _ in range(count):
+        if waiting <= 0.0:
+            asked, after = demand(parameters, period * every, target, rate, position, speed, integral)
+            waiting = float(every)
+        else:
+            after = integral
+        given = min(max(asked, -most), most) / constant
+        given = drive.limited(parameters, timestep, state.rise, resistance, given)
+        if given == asked / constant or (after - integral) * asked < 0.0:
+            integral = after  # it does not wind up
+        else:
+            saturated += 1.0
+        now = Shaft(moving.inertia, moving.others, speed)
+        winding, next_speed, means = shaft.turn(parameters, resistance, period, samples, winding, now, True, given)
+        position += 0.5 * period * (speed + next_speed)
+        speed = next_speed
+        saturated += means.saturated
+        amperes, volts = amperes + means.current / count, volts + means.voltage / count
+        torque += means.torque / count
+    waiting -= 1.0
+    mean = Means(amperes, volts, torque, saturated)
+    followed = drive.end(parameters, timestep, state.rise, winding, moving, mean)
+    temperature = parameters.ambient_temperature + followed.rise
+    error = (target - (inputs.position if parameters.controls == 0.0 else inputs.speed)) / parameters.gear_ratio
+    at_limit = 1.0 if saturated > 0.0 else 0.0
+    after_step = State(
+        followed.current,
+        followed.integral,
+        followed.pending,
+        followed.rise,
+        followed.acceleration,
+        followed.speed,
+        followed.others,
+        followed.started,
+        integral,
+        target,
+        asked,
+        waiting,
+    )
+    return after_step, torque, Signals(amperes, given, volts, temperature, error, at_limit)
+
+
+@dataclasses.dataclass(frozen=True)
+class Servo(Drive):
+    """A motor with gear, drive and supply that is asked for positions or speeds.
+
+    Raises:
+        ValueError: a field is out of bounds.
+    """
+
+    family: ClassVar[str] = "servo"
+    State: ClassVar[type] = State
+    Signals: ClassVar[type] = Signals
+    SIGNAL_UNITS: ClassVar[Mapping[str, str]] = {**Drive.SIGNAL_UNITS, "error": "rad or rad/s"}
+    tracks: ClassVar[bool] = False
+    MOTION: ClassVar[bool] = True
+    helpers: ClassVar[tuple[Any, ...]] = (*Drive.helpers, demand)
+    advance: ClassVar = staticmethod(advance)
+
+    loop: ServoLoop = ServoLoop()
+    """The loops around the drive's."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        super().__post_init__()
+        if not isinstance(self.loop, ServoLoop):
+            raise ValueError(f"Servo.loop = {self.loop!r}: must be a ServoLoop")
+
+    def commands(self) -> Mapping[str, Command]:
+        """A `position` [rad] or [m] within `loop.max_position`; or a `velocity` that is reached without a load."""
+        loop, motor, arm = self.loop, self.motor, self.arm_radius
+        fixed = dict.fromkeys((*ARM, "loop.controls"), "it would change what an action means")
+        if loop.controls == "position":
+            limit, unit = loop.max_position * motor.arm_radius, "rad"
+        else:
+            free = self.voltage_limit / motor.back_emf_constant if motor.back_emf_constant else math.inf
+            limit, unit = min(free * arm, loop.max_velocity * motor.arm_radius), "rad/s"
+        return {loop.controls: Command(unit, self, 1.0 / arm, limit, fixed)}
+
+    def check(self, timestep: float) -> None:
+        """Refuse rates that are no multiples of each other, besides what `Drive.check` refuses.
+
+        Raises:
+            ValueError: with the numbers and a remedy.
+        """
+        super().check(timestep)
+        in_step, rate = timestep * self.loop.servo_rate, self.loop.servo_rate
+        samples = self.controller.sample_rate / max(rate, 1.0 / timestep)
+        for name, multiple in (("samples of its loops in a step", max(in_step, 1.0 / in_step)), ("drive's", samples)):
+            if abs(multiple - round(multiple)) > 1e-6 * multiple or multiple < 0.5:
+                raise ValueError(
+                    f"ServoLoop.servo_rate = {rate:g}: with a mechanical step of {timestep:g} s and sample_rate = "
+                    f"{self.controller.sample_rate:g} Hz there are {multiple:g} {name} samples to one: must be a whole "
+                    f"number; try {1.0 / timestep:g} Hz"
+                )
+
+    def check_shaft(self, timestep: float, inertia: float) -> None:
+        """Refuse outer loops that are unstable on what they move, besides what `Drive.check_shaft` refuses.
+
+        Raises:
+            UnstableError: with the number and a remedy.
+        """
+        super().check_shaft(timestep, inertia)
+        radius = _outer_radius(self, timestep, inertia)
+        if not radius < 1.0:
+            loop, at_joint = self.loop, inertia * self.motor.gear_ratio**2
+            raise UnstableError(
+                f"loop.velocity_gain = {loop.velocity_gain:g}: the outer loops are unstable: spectral radius "
+                f"{radius:.4g} over a sample, must be < 1. It moves {at_joint:.3g} kg*m^2: for a bandwidth f the gain "
+                f"is 2*pi*f times that, f well below servo_rate = {loop.servo_rate:g} Hz, and position_gain = "
+                f"{loop.position_gain:g} well below 2*pi*f; or pass allow_unstable=True"
+            )
+
+
+def _outer_radius(servo: Servo, timestep: float, inertia: float) -> float:
+    """Spectral radius of the outer loops on a free inertia, over one of their samples, at the rotor."""
+    loop = servo.loop
+    held = math.isinf(servo.motor.load_inertia)  # what they see then is the speed at the beginning of the step
+    period = max(1.0 / loop.servo_rate, timestep if held else 0.0)
+    gain = loop.velocity_gain / servo.motor.gear_ratio**2
+    reacts = gain * np.array([-loop.position_gain if loop.controls == "position" else 0.0, -1.0])  # to angle and speed
+    adds = loop.velocity_integral_gain * period
+    speed, angle = period / inertia, 0.5 * period**2 / inertia  # of a torque
+    matrix = np.array(
+        [
+            [1.0 + angle * reacts[0], period + angle * reacts[1], angle],
+            [speed * reacts[0], 1.0 + speed * reacts[1], speed],
+            [adds * reacts[0], adds * reacts[1], 1.0],
+        ]
+    )
+    part = np.ix_(*[np.flatnonzero([loop.controls == "position", True, adds > 0.0])] * 2)
+    return float(np.abs(np.linalg.eigvals(matrix[part])).max())

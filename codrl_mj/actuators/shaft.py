@@ -1,0 +1,268 @@
+"""A drive's winding, gear and shaft over some time: the mathematics that `drive` and `servo` share.
+
+Within a mechanical step the shaft's speed changes by the motor's own torque, which is known, and by whatever else acts
+on the load, which is taken as it was in the step before: `others`. Where nobody knows the inertia the speed is held.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+from codrl_mj.actuators import sampled
+from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
+
+RATED_TEMPERATURE = 25.0
+"""Temperature [degC] at which datasheets give resistances."""
+
+
+class Winding(NamedTuple):
+    """Winding and loop at a moment."""
+
+    current: float
+    """[A]"""
+    integral: float
+    """The controller's integral [V]."""
+    pending: float
+    """Voltage [V] that a delayed loop applies in the next sample."""
+
+
+class Shaft(NamedTuple):
+    """The rotor at a moment, and what moves it besides the motor."""
+
+    inertia: float
+    """Inertia [kg*m^2] of all that the rotor moves, itself included; `inf` where its speed is held."""
+    others: float
+    """Acceleration [rad/s^2] by all but the motor's torque."""
+    speed: float
+    """[rad/s]"""
+
+
+class Means(NamedTuple):
+    """What there was of a stretch of time, in the mean of it."""
+
+    current: float
+    """[A]"""
+    voltage: float
+    """At the winding's terminals [V]."""
+    torque: float
+    """Delivered by the gear, at the rotor's side of it [N*m]."""
+    saturated: float
+    """How many samples were at the voltage's limit."""
+
+
+def resistance_at(parameters: Any, rise: float) -> float:
+    """Resistance [ohm] of the winding when it is so much [K] warmer than its surroundings."""
+    warmer = parameters.ambient_temperature + rise - RATED_TEMPERATURE
+    return parameters.resistance * (1.0 + parameters.resistance_coefficient * warmer)
+
+
+def kept_rise(parameters: Any, duration: float) -> float:
+    """Share of the winding's temperature rise that is left after some time [s] without a current."""
+    return math.exp(-duration / parameters.thermal_time_constant)
+
+
+def rise_after(parameters: Any, duration: float, rise: float, current: float, resistance: float) -> float:
+    """The winding's temperature rise [K] after some time [s] at a mean current [A]: exact for what heats evenly."""
+    kept = kept_rise(parameters, duration)
+    return rise * kept + parameters.thermal_resistance * resistance * current * current * (1.0 - kept)
+
+
+def thermal_limit(parameters: Any, duration: float, rise: float, resistance: float) -> float:
+    """The current [A] that takes the winding to `max_temperature` within some time [s], and no further.
+
+    While the winding is cold that is more than it can bear for long; at the limit it is the continuous current.
+    """
+    kept = kept_rise(parameters, duration)
+    room = parameters.max_temperature - parameters.ambient_temperature - rise * kept
+    return math.sqrt(max(room, 0.0) / (parameters.thermal_resistance * resistance * (1.0 - kept)))
+
+
+def inertia_of(parameters: Any, inertia: float) -> float:
+    """Inertia [kg*m^2] that the rotor moves, by `load_inertia` or the model's; `inf` where the speed is held."""
+    if parameters.load_inertia > 0.0:
+        inertia = parameters.rotor_inertia + parameters.load_inertia / (parameters.gear_ratio * parameters.gear_ratio)
+    return inertia if inertia > 0.0 else math.inf
+
+
+def others_after(timestep: float, change: float, own: float, others: float) -> float:
+    """Acceleration [rad/s^2] of the rotor by all but its motor, from what the last step showed.
+
+    Half of it is what was taken then: two joints that move each other, each with a stiff motor, would answer to what
+    the other did a step ago, back and forth.
+
+    Args:
+        timestep: [s].
+        change: of the rotor's speed in the step [rad/s].
+        own: its acceleration by the motor's torque in the step [rad/s^2].
+        others: what was taken for it in the step [rad/s^2].
+    """
+    return 0.5 * (change / timestep - own) + 0.5 * others
+
+
+def friction(parameters: Any, duration: float, torque: float, shaft: Shaft) -> float:
+    """Torque [N*m] that Stribeck friction and the gear take from the motor's, by an implicit step.
+
+    It is against the speed that the shaft would have without it, and at most what stops the shaft: so it never turns
+    the rotor back, and where the inertia is known it holds what pushes less than it: the rotor sticks. Where the speed
+    is held it stops no more than the rotor alone, and nothing sticks. Source: the friction of Duclusaud, Passault,
+    Padois, Ly, *Extended Friction Models for the Physics Simulation of Servo Actuators* (2024), sec. III.
+
+    Args:
+        parameters: a drive's.
+        duration: [s].
+        torque: of the motor [N*m].
+        shaft: at the beginning.
+    """
+    if shaft.inertia < math.inf:
+        free = shaft.speed + duration * (torque / shaft.inertia + shaft.others)
+        most = shaft.inertia * abs(free) / duration
+    else:
+        free, rotor = shaft.speed, parameters.rotor_inertia
+        most = rotor * abs(free) / duration if rotor > 0.0 else math.inf
+    efficiency = parameters.gear_efficiency
+    level = abs(torque) * (1.0 - efficiency if torque * free > 0.0 else 1.0 / efficiency - 1.0)
+    if parameters.stribeck_friction > 0.0:
+        ratio = shaft.speed / parameters.stribeck_speed
+        level += parameters.stribeck_friction * math.exp(-ratio * ratio)
+    return math.copysign(min(level, most), free) if free != 0.0 else 0.0
+
+
+def run_over(
+    parameters: Any, resistance: float, samples: int, winding: Winding, closed: bool, asked: float, speed: float
+) -> tuple[Winding, float, float, int]:
+    """Winding and loop over some samples at a held speed: at once where that has a closed form.
+
+    The sums that it needs telescope: with S the sum of the current over the samples' starts, the mean of (u - b)/R is
+    (S + (i_n - i_0)/(1 - e))/n, and that of the current, the mean of every sample included,
+    (S + (1 - m)/(1 - e)*(i_n - i_0))/n with m = (1 - e)/x and x = R*T/L.
+
+    Args:
+        parameters: a drive's.
+        resistance: of the winding at present [ohm].
+        samples: n.
+        winding: at the beginning.
+        closed: whether a current is asked for, and not a voltage.
+        asked: the current [A], or the voltage [V].
+        speed: of the rotor [rad/s].
+
+    Returns:
+        The winding afterwards, the mean current [A], the mean voltage [V], and how many samples were saturated.
+    """
+    sample_time, voltage = 1.0 / parameters.sample_rate, parameters.supply_voltage
+    stiff = parameters.delayed == 0.0 and parameters.supply_resistance == 0.0
+    if not closed and stiff:  # nothing changes from sample to sample
+        sample_time, samples = sample_time * samples, 1
+    x = resistance * sample_time / parameters.inductance
+    lost = -math.expm1(-x)
+    back_emf = parameters.back_emf_constant * speed
+    compensated = back_emf if parameters.bemf_compensation != 0.0 else 0.0
+    designed = parameters.kp == 0.0 and parameters.ki == 0.0
+    y = 2.0 * math.pi * (parameters.bandwidth * sample_time if parameters.bandwidth > 0.0 else DEFAULT_BANDWIDTH)
+    as_designed = closed and designed and parameters.anti_windup == 0.0 and resistance == parameters.resistance
+    if as_designed and stiff and parameters.deadband == 0.0:
+        offset = back_emf - compensated
+        current, integral, total, saturated = sampled.jump(
+            winding.current,
+            (winding.integral - offset) / resistance,
+            asked,
+            (-voltage - back_emf) / resistance,
+            (voltage - back_emf) / resistance,
+            samples,
+            x,
+            y,
+            lost,
+        )
+        after = Winding(current, integral * resistance + offset, winding.pending)
+    else:
+        kp, ki = parameters.kp, parameters.ki * sample_time
+        if not closed:
+            kp, ki, compensated, asked = 0.0, 0.0, asked, 0.0
+        elif designed:  # for the winding as its datasheet has it
+            kp, ki = sampled.designed_gains(
+                parameters.resistance, parameters.inductance, sample_time, y * parameters.sample_rate
+            )
+        current, integral, pending, total, saturated = sampled.run_samples(
+            winding.current,
+            winding.integral if closed else 0.0,
+            winding.pending,
+            asked,
+            back_emf,
+            compensated,
+            voltage,
+            parameters.supply_resistance,
+            parameters.deadband,
+            samples,
+            resistance,
+            1.0 - lost,
+            kp,
+            ki,
+            parameters.anti_windup,
+            parameters.delayed,
+        )
+        after = Winding(current, integral, pending)
+    change = (after.current - winding.current) / lost
+    mean = (total + (1.0 - lost / x) * change) / samples
+    return after, mean, back_emf + resistance * (total + change) / samples, saturated
+
+
+def turn(
+    parameters: Any,
+    resistance: float,
+    duration: float,
+    samples: int,
+    winding: Winding,
+    shaft: Shaft,
+    closed: bool,
+    asked: float,
+) -> tuple[Winding, float, Means]:
+    """Winding, loop and shaft over some time under a held command.
+
+    Where a saturated voltage meets a light load, the speed cannot be held: c = h*kT*kE/(R*J) is the share of it that
+    the back-EMF takes off in a time h; above 1 it rings, above 2 it grows. So the time is cut into 2*c pieces, and the
+    speed goes on from piece to piece.
+
+    Args:
+        parameters: a drive's.
+        resistance: of the winding at present [ohm].
+        duration: h [s].
+        samples: of the loop in it.
+        winding: at the beginning.
+        shaft: likewise.
+        closed: whether a current is asked for, and not a voltage.
+        asked: the current [A], or the voltage [V].
+
+    Returns:
+        The winding and the rotor's speed [rad/s] afterwards, and what there was in between.
+    """
+    braking = parameters.torque_constant * parameters.back_emf_constant / resistance
+    pieces = min(max(math.ceil(2.0 * duration * braking / shaft.inertia), 1), samples)
+    lossy = parameters.gear_efficiency < 1.0 or parameters.stribeck_friction > 0.0
+    amperes, volts, torque, saturated, left, speed = 0.0, 0.0, 0.0, 0, samples, shaft.speed
+    for piece in range(pieces):
+        count = left // (pieces - piece)
+        winding, mean, voltage, limited = run_over(parameters, resistance, count, winding, closed, asked, speed)
+        left, saturated = left - count, saturated + limited
+        share, delivered = count / samples, parameters.torque_constant * mean
+        if lossy:
+            now = Shaft(shaft.inertia, shaft.others, speed)
+            delivered -= friction(parameters, share * duration, delivered, now)
+        amperes, volts, torque = amperes + share * mean, volts + share * voltage, torque + share * delivered
+        speed += share * duration * (delivered / shaft.inertia + shaft.others)
+    return winding, speed, Means(amperes, volts, torque, float(saturated))
+
+
+HELPERS = (
+    sampled.until,
+    sampled.jump,
+    sampled.run_samples,
+    sampled.designed_gains,
+    resistance_at,
+    kept_rise,
+    rise_after,
+    thermal_limit,
+    inertia_of,
+    others_after,
+    friction,
+    run_over,
+    turn,
+)
+"""What a family whose `advance` calls these has to name, innermost first."""

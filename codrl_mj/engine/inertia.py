@@ -1,0 +1,65 @@
+"""The inertia at an actuator's shaft, from the engine's own factorisation of the inertia matrix. Compiled."""
+
+import functools
+import math
+from typing import Any
+
+import mujoco
+import numba
+import numpy as np
+
+from codrl_mj.engine.layout import check_layout, offset
+from codrl_mj.engine.memory import array, f64, i32, i64, internal
+
+INERTIA_MODEL_FIELDS = ("nv", "M_rownnz", "M_rowadr", "M_colind")
+INERTIA_DATA_FIELDS = ("qLD", "qLDiagInv", "moment_rownnz", "moment_rowadr", "moment_colind", "actuator_moment")
+
+
+@functools.cache
+def inertia() -> Any:
+    """A compiled function (model, data, output) -> inertia [kg*m^2] seen from an actuator's output.
+
+    With its moment m, a row of `actuator_moment`, and the inertia matrix M = L^T*D*L that `mj_fwdPosition` has
+    factorised, it is 1/(m*M^-1*m): how hard it is to turn with all other joints free. Infinite where nothing moves.
+    The layout of the fields above must have been checked.
+    """
+    nv_at, rownnz_at, rowadr_at, colind_at = (offset("mjModel", field) for field in INERTIA_MODEL_FIELDS)
+    qld_at, inverse_at, moment_nnz_at, moment_adr_at, moment_col_at, moment_at = (
+        offset("mjData", field) for field in INERTIA_DATA_FIELDS
+    )
+
+    @internal
+    def seen_from(model: int, data: int, output: int) -> float:
+        turned = np.zeros(i64(model + nv_at)[0])  # L^-T*m
+        start, last = i32(array(data, moment_adr_at))[output], 0
+        for entry in range(start, start + i32(array(data, moment_nnz_at))[output]):
+            last = max(last, i32(array(data, moment_col_at))[entry])
+            turned[i32(array(data, moment_col_at))[entry]] = f64(array(data, moment_at))[entry]
+        total = 0.0
+        for row in range(last, -1, -1):
+            if turned[row] == 0.0:
+                continue
+            total += turned[row] * turned[row] * f64(array(data, inverse_at))[row]
+            start = i32(array(model, rowadr_at))[row]
+            for entry in range(start, start + i32(array(model, rownnz_at))[row] - 1):  # its ancestors; then itself
+                turned[i32(array(model, colind_at))[entry]] -= f64(array(data, qld_at))[entry] * turned[row]
+        return 1.0 / total if total > 0.0 else math.inf
+
+    return seen_from
+
+
+def shaft_inertia(model: mujoco.MjModel, data: mujoco.MjData, output: int) -> float:
+    """What `inertia` finds of a simulation whose `mj_fwdPosition` has run."""
+    return float(_from_python()(model._address, data._address, output))
+
+
+@functools.cache
+def _from_python() -> Any:
+    check_layout(INERTIA_MODEL_FIELDS, INERTIA_DATA_FIELDS)
+    seen_from = inertia()
+
+    @numba.njit
+    def call(model: int, data: int, output: int) -> float:
+        return seen_from(model, data, output)
+
+    return call
