@@ -49,6 +49,11 @@ class Commands:
         """
         count = len(actuators)
         if name == "force":
+            if actuators[0].MOTION:
+                raise ValueError(
+                    f"action = 'force': a {type(actuators[0]).__name__} is not asked for forces; must be one of "
+                    f"{', '.join(actuators[0].commands())}"
+                )
             if levels is not None:
                 raise ValueError(f"levels = {levels!r}: only for action='current' and action='voltage'")
             return cls(task, name, actuators, np.ones(count), task.max_forces, {}, None)

@@ -1,0 +1,196 @@
+"""A servo's loops on an inertia, against linear models of them and statics; in an environment; in somebody's model."""
+
+import dataclasses
+import math
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+from scipy import signal
+
+import codrl_mj
+from codrl_mj import Servo, ServoLoop, Uniform
+from codrl_mj.actuators import GearMotor, SampledLoop, Supply
+
+INERTIA, RATIO = 0.02, 10.0
+MOTOR = GearMotor(gear_ratio=RATIO, rotor_inertia=1e-6)
+TOTAL = INERTIA + 1e-6 * RATIO**2
+
+
+def servo(supply=1e4, **loop):
+    return Servo(MOTOR, SampledLoop(20e3), Supply(supply), ServoLoop(**loop))
+
+
+def turned(one, targets, timestep, load=0.0):
+    """Positions [rad] and speeds [rad/s] of a hinge under targets, one a step, and a torque [N*m] besides."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep, spec.option.gravity, body = timestep, [0.0] * 3, spec.worldbody.add_body()
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    body.explicitinertial, body.mass, body.inertia = True, 1.0, [INERTIA] * 3
+    body.add_joint(name="shaft", axis=[0.0, 0.0, 1.0])
+    spec.add_actuator(target="shaft", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_position(kp=3.0, kv=1.0)
+    model = codrl_mj.motorise(spec, {"shaft": one}).compile()
+    data, rows = mujoco.MjData(model), []
+    data.qfrc_applied[:] = load
+    for target in targets:
+        data.ctrl[:] = target
+        mujoco.mj_step(model, data)
+        rows.append((data.qpos[0], data.qvel[0]))
+    return np.array(rows).T
+
+
+@pytest.mark.parametrize(("timestep", "rate"), [(0.0005, 2000.0), (0.001, 2000.0), (0.0005, 500.0)])
+def test_a_position_loop_is_the_linear_system_that_it_looks_like(timestep, rate):
+    """Torque g*(K*(q* - q) - w), held over a sample, on an inertia; the loop's rate may be that of the steps or not."""
+    one = servo(velocity_gain=1.5, position_gain=15.0, servo_rate=rate)
+    steps = round(0.5 / timestep)
+    positions, speeds = turned(one, [0.3] * steps, timestep)
+    plant = signal.cont2discrete(
+        (np.eye(2, k=1), np.array([[0.0], [1.0 / TOTAL]]), np.eye(2), np.zeros((2, 1))), 1 / rate
+    )
+    state, found = np.zeros(2), []
+    for _ in range(round(0.5 * rate)):
+        state = plant[0] @ state + plant[1][:, 0] * 1.5 * (15.0 * (0.3 - state[0]) - state[1])
+        found.append(state)
+    at = np.linspace(0.1, 0.5, 9)
+    ours = np.stack([positions, speeds])[:, np.round(at / timestep).astype(int) - 1]
+    theirs = np.array(found).T[:, np.round(at * rate).astype(int) - 1]
+    np.testing.assert_allclose(ours[0], theirs[0], atol=0.006 * 0.3)
+    np.testing.assert_allclose(ours[1], theirs[1], atol=0.006 * 0.3 * 15.0)
+    assert positions[-1] == pytest.approx(0.3, abs=1e-3)
+
+
+def test_what_the_model_s_own_servo_was_is_gone():
+    """That is `<position kp="3" kv="1">`, under an integrator that would use its derivative too."""
+    positions, _ = turned(servo(velocity_gain=1.5), [0.3] * 2000, 0.0005)
+    assert positions[-1] == pytest.approx(0.3, abs=1e-3)
+
+
+@pytest.mark.parametrize(("integral", "left"), [(0.0, 0.2 / 1.5), (20.0, 0.0)])
+def test_an_integral_takes_what_a_load_leaves(integral, left):
+    one = servo(controls="velocity", velocity_gain=1.5, velocity_integral_gain=integral)
+    _, speeds = turned(one, [2.0] * 2000, 0.001, load=-0.2)
+    assert speeds[-1] == pytest.approx(2.0 - left, abs=1e-3)
+
+
+def test_the_integral_does_not_wind_up():
+    """The shaft cannot follow for a second, and then can."""
+    one = servo(supply=4.0, controls="velocity", velocity_gain=1.5, velocity_integral_gain=20.0, max_torque=0.3)
+    targets = np.where(np.arange(3000) < 2000, 100.0, 3.0)
+    _, speeds = turned(one, targets, 0.001)
+    reached = -math.expm1(-2.0 * 0.042**2 / (8.4 * TOTAL / RATIO**2))  # of the no-load speed, in 2 s
+    assert speeds[1999] == pytest.approx(reached * 4.0 / (0.042 * RATIO), rel=1e-3)
+    assert (np.abs(speeds[2450:] - 3.0) < 0.05).all()
+
+
+def test_speed_and_torque_keep_their_limits():
+    one = servo(velocity_gain=1.5, max_velocity=2.0, max_torque=0.4)
+    _, speeds = turned(one, [3.0] * 1400, 0.001)
+    assert speeds[50] == pytest.approx(0.4 / TOTAL * 0.051, rel=0.02)
+    assert speeds[700] == pytest.approx(2.0, rel=1e-3)
+    assert speeds.max() < 2.01
+
+
+def test_feed_forward_takes_the_lag_away():
+    targets = 0.5 * np.arange(1, 2001) * 0.001
+    lags = [
+        targets[-1] - turned(servo(velocity_gain=1.5, velocity_feed_forward=share), targets, 0.001)[0][-1]
+        for share in (0.0, 1.0)
+    ]
+    assert lags[0] == pytest.approx(0.5 / 20.0, rel=0.05)
+    assert abs(lags[1]) < 0.05 * lags[0]
+    ramp = 2.0 * np.arange(1, 2001) * 0.001
+    for inertia, left in ((0.0, 2.0 * TOTAL / 1.5), (TOTAL, 0.0)):
+        one = servo(controls="velocity", velocity_gain=1.5, inertia_feed_forward=inertia)
+        _, speeds = turned(one, ramp, 0.001)
+        assert ramp[-1] - speeds[-1] == pytest.approx(left, abs=0.003)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"velocity_gain": 50.0}, r"outer loops are unstable: spectral radius .* It moves 0\.0201 kg\*m\^2"),
+        ({"position_gain": 9000.0}, r"position_gain = 9000 well below 2\*pi\*f"),
+        ({"servo_rate": 700.0}, r"servo_rate = 700: with a mechanical step of 0\.001 s .* must be a whole number"),
+        ({"controls": "force"}, r"controls = 'force': must be one of position, velocity"),
+    ],
+)
+def test_what_cannot_work_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        turned(servo(**{"velocity_gain": 1.5, **change}), [], 0.001)
+
+
+@pytest.mark.parametrize("rate", [500.0, 1000.0])
+@pytest.mark.parametrize("gains", [(20.0, 0.0), (60.0, 5.0), (40.0, 30.0)])
+def test_the_bound_of_stability_is_where_it_is(gains, rate):
+    """Just below the refused gain a small disturbance dies away, just above it it grows."""
+    position, integral = gains
+
+    def grows(gain):
+        one = servo(position_gain=position, velocity_gain=gain, velocity_integral_gain=integral, servo_rate=rate)
+        try:
+            one.check_shaft(0.001, TOTAL / RATIO**2)
+        except ValueError:
+            return True
+        return False
+
+    high = 100.0
+    while grows(high / 1.02):
+        high /= 1.02
+    low = high / 1.02
+    for gain, most, least in ((0.9 * low, 0.5, 0.0), (1.1 * high, np.inf, 2.0)):
+        one = servo(
+            supply=1e9, position_gain=position, velocity_gain=gain, velocity_integral_gain=integral, servo_rate=rate
+        )
+        one = dataclasses.replace(one, controller=SampledLoop(100e3))
+        spec_positions, _ = _free(one, 1e-6)
+        assert least * 1e-6 <= np.abs(spec_positions[-50:]).max() <= most * 1e-6
+
+
+def _free(one, start):
+    """As `turned`, let be unstable, with a target of 0 from a position beside it."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep, spec.option.gravity, body = 0.001, [0.0] * 3, spec.worldbody.add_body()
+    body.explicitinertial, body.mass, body.inertia = True, 1.0, [INERTIA] * 3
+    body.add_joint(name="shaft", axis=[0.0, 0.0, 1.0])
+    spec.add_actuator(target="shaft", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
+    model = codrl_mj.motorise(spec, {"shaft": one}, allow_unstable=True).compile()
+    data, rows = mujoco.MjData(model), []
+    data.qpos[:] = start
+    for _ in range(1500):
+        mujoco.mj_step(model, data)
+        rows.append((data.qpos[0], data.qvel[0]))
+    return np.array(rows).T
+
+
+def test_an_agent_asks_a_servo_for_positions_and_not_for_forces():
+    one = Servo(GearMotor(gear_ratio=20.0), SampledLoop(20e3), Supply(48.0), ServoLoop(velocity_gain=3.0))
+    env = gymnasium.make("codrl_mj/Pendulum-v0", actuator=one, action="position", max_episode_steps=500)
+    assert env.action_space.high == pytest.approx(math.pi)
+    env.reset(seed=0)
+    for _ in range(100):
+        _, _, _, _, info = env.step(np.array([1.0], np.float32))
+    # in the units of the joint, and held there against gravity by an error: no integral
+    angle = env.unwrapped.state[0] if hasattr(env.unwrapped, "state") else env.unwrapped.data.qpos[0]
+    assert info["error"] == pytest.approx(1.0 - angle, abs=1e-6)
+    assert abs(info["error"]) < 0.1
+    assert info["desired_force"] == info["actual_force"]
+    with pytest.raises(ValueError, match="a Servo is not asked for forces; must be one of position"):
+        gymnasium.make("codrl_mj/Pendulum-v0", actuator=one)
+
+
+def test_servos_in_a_vector_are_the_servos_alone():
+    one = Servo(GearMotor(gear_ratio=20.0), SampledLoop(20e3), Supply(48.0), ServoLoop("velocity", velocity_gain=3.0))
+    arguments = {
+        "actuator": one,
+        "action": "velocity",
+        "randomize": {"motor.resistance": Uniform(4.0, 12.0), "loop.velocity_gain": Uniform(1.0, 5.0)},
+    }
+    ours = gymnasium.make_vec("codrl_mj/Pendulum-v0", 3, "vector_entry_point", **arguments)
+    alone = gymnasium.make_vec("codrl_mj/Pendulum-v0", 3, "sync", **arguments)
+    np.testing.assert_array_equal(ours.reset(seed=3)[0], alone.reset(seed=3)[0])
+    for action in np.random.default_rng(0).uniform(-10, 10, size=(40, 3, 1)).astype(np.float32):
+        (*one_step, infos), (*other, expected) = ours.step(action), alone.step(action)
+        np.testing.assert_array_equal(one_step[0], other[0])
+        np.testing.assert_array_equal(infos["error"], expected["error"])

@@ -1,0 +1,189 @@
+"""What a bench adds to a drive: heat, friction that depends on speed and load, a dead band. Oracles are not ours."""
+
+import dataclasses
+import math
+
+import mujoco
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import codrl_mj
+from codrl_mj.actuators import Drive, GearMotor, Inputs, SampledLoop, Supply, parameters_type
+from codrl_mj.actuators.shaft import Shaft, friction
+
+HOT = GearMotor(thermal_resistance=20.0, thermal_time_constant=3.0, ambient_temperature=20.0)
+
+
+def advanced(one, timestep, torques, speed=0.0, inertia=math.inf):
+    """Signals of steps, and the last state."""
+    parameters, state = parameters_type(type(one))(*one.numbers), one.State(*[0.0] * len(one.State._fields))
+    found = []
+    for torque in torques:
+        state, _, signals = one.advance(
+            parameters, timestep, state, Inputs(torque, 0.0, speed, 0.0, 0.0, inertia=inertia)
+        )
+        found.append(signals)
+    return found, state
+
+
+def on_a_shaft(one, timestep, inertia=1e-3, weight=0.0):
+    """A compiled model of a hinge with so much inertia [kg*m^2], and gravity's torque [N*m] in its initial position."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep, body = timestep, spec.worldbody.add_body()
+    body.explicitinertial, body.mass, body.inertia = True, 1.0, [inertia] * 3
+    body.ipos = [weight / 9.81, 0.0, 0.0]
+    body.add_joint(name="shaft", axis=[0.0, -1.0, 0.0])
+    spec.add_actuator(target="shaft", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
+    return codrl_mj.motorise(spec, {"shaft": one}).compile()
+
+
+def test_a_winding_warms_and_its_resistance_with_it():
+    """A current that is held heats by its square and a resistance that grows: scipy integrates that."""
+    one, amperes = Drive(HOT, supply=Supply(48.0)), 1.0
+    found, _ = advanced(one, 0.002, [0.042 * amperes] * 5000)
+    hot = HOT.resistance
+
+    def warming(_, rise):
+        resistance = hot * (1.0 + 0.00393 * (20.0 + rise - 25.0))
+        return (amperes**2 * resistance * 20.0 - rise) / 3.0
+
+    times = 0.002 * np.arange(1, 5001)
+    exact = solve_ivp(warming, (0.0, 10.0), [0.0], t_eval=times, rtol=1e-10, atol=1e-10).y[0]
+    np.testing.assert_allclose([one.temperature for one in found], 20.0 + exact, atol=0.15)
+    volts = hot * (1.0 + 0.00393 * (exact - 5.0)) * amperes
+    np.testing.assert_allclose([one.voltage for one in found[100:]], volts[100:], rtol=2e-3)
+
+
+def test_current_and_temperature_are_those_of_mujoco_s_own_motor():
+    """A blocked shaft under voltages; `<dcmotor>` heats by the current at a step's end, which differs by the step."""
+    ends = {}
+    for timestep in (0.002, 0.001):
+        one = Drive(HOT, SampledLoop(10e3), Supply(48.0)).commands()["voltage"].actuator
+        ours = on_a_shaft(one, timestep, inertia=1e9)
+        spec = mujoco.MjSpec()
+        spec.option.timestep, body = timestep, spec.worldbody.add_body()
+        body.explicitinertial, body.mass, body.inertia = True, 1.0, [1e9] * 3
+        body.add_joint(name="shaft", axis=[0.0, -1.0, 0.0])
+        native = spec.add_actuator(target="shaft", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        native.set_to_dcmotor(
+            motorconst=[HOT.torque_constant] * 2,
+            resistance=HOT.resistance,
+            inductance=[HOT.inductance, 0.0],
+            thermal=[20.0, 3.0 / 20.0, 0.0, 0.00393, 25.0, 20.0],
+            ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_VOLTAGE),
+        )
+        theirs = spec.compile()
+        data, other, unequal = mujoco.MjData(ours), mujoco.MjData(theirs), []
+        for step in range(round(4.0 / timestep)):
+            volts = 12.0 if int(step * timestep / 0.5) % 2 == 0 else -4.0
+            data.ctrl[:], other.ctrl[:] = HOT.torque_constant * volts, volts
+            mujoco.mj_step(ours, data)
+            mujoco.mj_step(theirs, other)
+            read = codrl_mj.signals(ours, data)
+            unequal.append(abs(read["temperature"].item() - 20.0 - other.act[0]))
+        assert other.act[0] > 10.0
+        assert read["current"].item() == pytest.approx(other.act[1], rel=1e-3)
+        ends[timestep] = max(unequal)
+    assert ends[0.001] < 0.02 * other.act[0]
+    assert 1.5 < ends[0.002] / ends[0.001] < 2.5
+
+
+@pytest.mark.parametrize("step", [0.002, 0.02])
+def test_a_drive_keeps_the_winding_s_limit_and_then_gives_the_continuous_current(step):
+    motor = dataclasses.replace(HOT, max_temperature=100.0)
+    found, _ = advanced(Drive(motor, supply=Supply(48.0)), step, [0.042 * 3.0] * round(20.0 / step))
+    temperatures = np.array([one.temperature for one in found])
+    assert found[0].reference_current == pytest.approx(3.0)  # cold, it bears the peak
+    assert temperatures.max() < 100.0 + 0.1
+    continuous = math.sqrt(80.0 / (20.0 * 8.4 * (1.0 + 0.00393 * 75.0)))
+    assert found[-1].current == pytest.approx(continuous, rel=1e-3)
+    assert found[-1].saturated == 1.0
+    assert temperatures[-1] == pytest.approx(100.0, abs=0.1)
+
+
+def test_what_is_colder_than_its_surroundings_may_not_be_the_limit():
+    with pytest.raises(ValueError, match=r"max_temperature = 20: must be above ambient_temperature = 25 degC"):
+        GearMotor(max_temperature=20.0)
+
+
+def test_a_bridge_loses_its_dead_band():
+    """A resistor of 8.4 ohm in the steady state, under voltages."""
+    one = Drive(GearMotor(), SampledLoop(deadband=0.5), Supply(24.0)).commands()["voltage"].actuator
+    for volts, left in ((3.0, 2.5), (-3.0, -2.5), (0.4, 0.0), (-0.4, 0.0)):
+        found, _ = advanced(one, 0.02, [0.042 * volts] * 5)
+        assert found[-1].current == pytest.approx(left / 8.4, abs=1e-12)
+        assert found[-1].voltage == pytest.approx(left, abs=1e-12)
+
+
+def parameters_of(**motor):
+    return parameters_type(Drive)(*Drive(GearMotor(**motor)).numbers)
+
+
+@pytest.mark.parametrize("speed", [-20.0, -3.0, 3.0, 20.0])
+@pytest.mark.parametrize("torque", [-0.03, 0.0, 0.05])
+def test_friction_in_motion_is_the_sum_of_its_laws(speed, torque):
+    """Stribeck's, and the gear's on what the motor makes; nothing is stopped within so short a time."""
+    parameters = parameters_of(stribeck_friction=0.01, stribeck_speed=4.0, gear_efficiency=0.7)
+    taken = friction(parameters, 1e-6, torque, Shaft(1e-3, 0.0, speed))
+    share = 0.3 if torque * speed > 0.0 else 3.0 / 7.0
+    assert taken == pytest.approx(math.copysign(0.01 * math.exp(-((speed / 4.0) ** 2)) + share * abs(torque), speed))
+
+
+@pytest.mark.parametrize("step", [0.0005, 0.002])
+@pytest.mark.parametrize("ratio", [1.0, 20.0])
+def test_a_rotor_sticks_until_coulomb_and_stribeck_friction_are_overcome(step, ratio):
+    motor = GearMotor(
+        gear_ratio=ratio,
+        coulomb_friction=0.01 / ratio,
+        stribeck_friction=0.02 / ratio,
+        stribeck_speed=ratio,
+    )
+    one = Drive(motor, supply=Supply(48.0))
+    model = on_a_shaft(one, step)
+    data, moved = mujoco.MjData(model), None
+    while moved is None:
+        data.ctrl[:] = 0.02 * data.time
+        mujoco.mj_step(model, data)
+        moved = data.ctrl.item() if abs(data.qvel[0]) > 0.02 else None
+    assert moved == pytest.approx(0.03, rel=0.05)
+    for weight, slides in ((0.025, False), (0.035, True)):
+        model = on_a_shaft(one, step, weight=weight)
+        data = mujoco.MjData(model)
+        while data.time < 2.0:
+            mujoco.mj_step(model, data)
+        assert (abs(data.qpos[0]) > 1.0) == slides
+        assert slides or abs(data.qvel[0]) < 0.02  # MuJoCo's constraints creep
+    alone = on_a_shaft(
+        dataclasses.replace(one, motor=dataclasses.replace(motor, stribeck_friction=0.0)), step, 1e-3, 0.025
+    )
+    data = mujoco.MjData(alone)
+    while data.time < 2.0:
+        mujoco.mj_step(alone, data)
+    assert abs(data.qpos[0]) > 1.0
+
+
+@pytest.mark.parametrize(("efficiency", "holds"), [(0.6, True), (1.0, False)])
+def test_a_gear_that_loses_holds_what_its_motor_does_not(efficiency, holds):
+    """Gravity 0.012, motor 0.010: the difference is less than the gear's loss, 0.01*(1/0.6 - 1)."""
+    one = Drive(GearMotor(gear_ratio=20.0, gear_efficiency=efficiency), supply=Supply(48.0))
+    model = on_a_shaft(one, 0.002, weight=0.012)
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 0.010
+    while data.time < 1.0:
+        mujoco.mj_step(model, data)
+    assert (abs(data.qpos[0]) < 1e-3) == holds
+
+
+def test_friction_only_takes_energy():
+    """A rotor in motion without a command comes to rest, and stays there."""
+    one = Drive(GearMotor(gear_efficiency=0.6, stribeck_friction=0.002, stribeck_speed=5.0), supply=Supply(48.0))
+    model = on_a_shaft(one, 0.002)
+    data = mujoco.MjData(model)
+    data.qvel[:] = 4.0
+    speeds = []
+    while data.time < 5.0:
+        mujoco.mj_step(model, data)
+        speeds.append(data.qvel.item())
+    assert (np.diff(speeds) <= 1e-12).all()
+    assert abs(speeds[-1]) < 1e-6

@@ -1,0 +1,41 @@
+"""The inertia at a shaft, against MuJoCo's own solution with its inertia matrix."""
+
+from pathlib import Path
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+
+from codrl_mj.engine.inertia import shaft_inertia
+
+MODELS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+
+
+@pytest.mark.parametrize("name", ["humanoid.xml", "half_cheetah.xml", "ant.xml", "reacher.xml", "pusher_v5.xml"])
+def test_it_is_one_over_the_moment_through_the_inverse_inertia_matrix(name):
+    model = mujoco.MjModel.from_xml_path(str(MODELS / name))
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    for _ in range(3):
+        data.qpos[:] += rng.normal(scale=0.3, size=model.nq)
+        mujoco.mj_fwdPosition(model, data)
+        moments = np.zeros((model.nu, model.nv))
+        mujoco.mju_sparse2dense(
+            moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
+        )
+        solved = np.zeros_like(moments)
+        mujoco.mj_solveM(model, data, solved, moments)
+        expected = 1.0 / np.einsum("ij,ij->i", moments, solved)
+        found = [shaft_inertia(model, data, output) for output in range(model.nu)]
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_what_moves_nothing_has_no_end_of_inertia():
+    spec = mujoco.MjSpec.from_string(
+        "<mujoco><worldbody><body><joint name='a'/><geom size='1'/></body></worldbody></mujoco>"
+    )
+    spec.add_actuator(target="a", trntype=mujoco.mjtTrn.mjTRN_JOINT, gear=[0.0] * 6)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_fwdPosition(model, data)
+    assert np.isinf(shaft_inertia(model, data, 0))
