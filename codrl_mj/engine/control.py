@@ -125,7 +125,7 @@ def compiled() -> Callbacks:
                 f64(array(data, length_at))[out],
                 f64(array(data, velocity_at))[out],
                 time,
-                seen_from(model, data, out) if asks_inertia(number) else math.inf,
+                seen_from(model, data, out, 1.0) if asks_inertia(number) else math.inf,
             )
 
     @numba.cfunc(types.float64(types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")

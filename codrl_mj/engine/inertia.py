@@ -17,9 +17,9 @@ INERTIA_DATA_FIELDS = ("qLD", "qLDiagInv", "moment_rownnz", "moment_rowadr", "mo
 
 @functools.cache
 def inertia() -> Any:
-    """A compiled function (model, data, output) -> inertia [kg*m^2] seen from an actuator's output.
+    """A compiled function (model, data, output, gear) -> inertia [kg*m^2] seen from an actuator's output through a gear.
 
-    With its moment m, a row of `actuator_moment`, and the inertia matrix M = L^T*D*L that `mj_fwdPosition` has
+    With its moment m, the gear times a row of `actuator_moment`, and the inertia matrix M = L^T*D*L that `mj_fwdPosition` has
     factorised, it is 1/(m*M^-1*m): how hard it is to turn with all other joints free. Infinite where nothing moves.
     The layout of the fields above must have been checked.
     """
@@ -29,12 +29,12 @@ def inertia() -> Any:
     )
 
     @internal
-    def seen_from(model: int, data: int, output: int) -> float:
+    def seen_from(model: int, data: int, output: int, gear: float) -> float:
         turned = np.zeros(i64(model + nv_at)[0])  # L^-T*m
         start, last = i32(array(data, moment_adr_at))[output], 0
         for entry in range(start, start + i32(array(data, moment_nnz_at))[output]):
             last = max(last, i32(array(data, moment_col_at))[entry])
-            turned[i32(array(data, moment_col_at))[entry]] = f64(array(data, moment_at))[entry]
+            turned[i32(array(data, moment_col_at))[entry]] = gear * f64(array(data, moment_at))[entry]
         total = 0.0
         for row in range(last, -1, -1):
             if turned[row] == 0.0:
@@ -48,9 +48,9 @@ def inertia() -> Any:
     return seen_from
 
 
-def shaft_inertia(model: mujoco.MjModel, data: mujoco.MjData, output: int) -> float:
+def shaft_inertia(model: mujoco.MjModel, data: mujoco.MjData, output: int, gear: float) -> float:
     """What `inertia` finds of a simulation whose `mj_fwdPosition` has run."""
-    return float(_from_python()(model._address, data._address, output))
+    return float(_from_python()(model._address, data._address, output, gear))
 
 
 @functools.cache
@@ -59,7 +59,7 @@ def _from_python() -> Any:
     seen_from = inertia()
 
     @numba.njit
-    def call(model: int, data: int, output: int) -> float:
-        return seen_from(model, data, output)
+    def call(model: int, data: int, output: int, gear: float) -> float:
+        return seen_from(model, data, output, gear)
 
     return call

@@ -186,7 +186,7 @@ def compiled() -> Functions:
                 else:
                     force = engine_force(model, data, actuator, length, velocity)
                     asked = force * arm
-                load = seen_from(model, data, out) * (arm * arm) if asks_inertia(number) else math.inf
+                load = seen_from(model, data, out, gear) if asks_inertia(number) else math.inf
                 advance_slot(
                     *(number, user + 8 * PLUGIN_HEAD, timestep, slot, asked),
                     *(length * gear, velocity * gear, time, load),

@@ -171,9 +171,9 @@ def check_shafts(model: mujoco.MjModel, allow_unstable: bool = False) -> None:
     mujoco.mj_fwdPosition(model, data)
     for index, actuator in asking.items():
         arm = 1.0 if model.actuator_plugin[index] < 0 else actuator.arm_radius  # the callback's is in the gear
-        inertia = shaft_inertia(model, data, model.actuator_outadr[index])
+        inertia = shaft_inertia(model, data, model.actuator_outadr[index], 1.0 / arm)
         try:
-            actuator.check_shaft(model.opt.timestep, arm * arm * inertia)
+            actuator.check_shaft(model.opt.timestep, inertia)
         except UnstableError as error:
             if not allow_unstable:
                 raise ValueError(f"{model.actuator(index).name or f'actuator {index}'}: {error}") from None
@@ -194,6 +194,7 @@ class Readout:
         self.motors = motors(model)
         indices = np.array(list(self.motors), dtype=int)
         families: list[Family] = [type(actuator) for actuator in self.motors.values()]
+        self._tracks = np.array([family.tracks for family in families], dtype=bool)
         self._out = model.actuator_outadr[indices]
         self._control = model.actuator_ctrladr[indices]
         instances = model.actuator_plugin[indices]
@@ -227,7 +228,8 @@ class Readout:
         states = np.concatenate((data.act, data.plugin_state, [np.nan]))
         commanded = np.clip(data.ctrl[self._control], self._low, self._high) * self._gear
         desired = np.where(self._behind_plugin, states[self._desired], commanded)
-        forces: dict[str, Any] = {"desired_force": desired, "actual_force": data.actuator_force[self._out] * self._gear}
+        actual = data.actuator_force[self._out] * self._gear
+        forces: dict[str, Any] = {"desired_force": np.where(self._tracks, desired, actual), "actual_force": actual}
         return forces | {name: states[places] for name, places in self._places.items()}
 
 

@@ -82,7 +82,7 @@ def beside(
                 desired = float(slot_of[at][slot_size(kinds[at])]) * arm
                 if actuator.MOTION:
                     desired = _clamped(model, at, control) / arm
-            inertia = arm * arm * shaft_inertia(model, before, output) if actuator.INERTIA else math.inf
+            inertia = shaft_inertia(model, before, output, 1.0 / arm) if actuator.INERTIA else math.inf
             inputs = Inputs(desired, *moving, before.time, at + 1.0, inertia)
             states[at], torque, signals = actuator.advance(parameters[at], model.opt.timestep, states[at], inputs)
             oracle = [*states[at], *signals, _limited(model, at, torque / arm)]

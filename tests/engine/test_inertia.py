@@ -26,8 +26,8 @@ def test_it_is_one_over_the_moment_through_the_inverse_inertia_matrix(name):
         solved = np.zeros_like(moments)
         mujoco.mj_solveM(model, data, solved, moments)
         expected = 1.0 / np.einsum("ij,ij->i", moments, solved)
-        found = [shaft_inertia(model, data, output) for output in range(model.nu)]
-        np.testing.assert_allclose(found, expected, rtol=1e-12)
+        found = [shaft_inertia(model, data, output, 3.0) for output in range(model.nu)]
+        np.testing.assert_allclose(found, expected / 9.0, rtol=1e-12)
 
 
 def test_what_moves_nothing_has_no_end_of_inertia():
@@ -38,4 +38,4 @@ def test_what_moves_nothing_has_no_end_of_inertia():
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)
-    assert np.isinf(shaft_inertia(model, data, 0))
+    assert np.isinf(shaft_inertia(model, data, 0, 1.0))

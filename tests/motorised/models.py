@@ -19,6 +19,8 @@ from codrl_mj.actuators import (
     Lag,
     Motor,
     SampledLoop,
+    Servo,
+    ServoLoop,
     Supply,
     TorqueSpeed,
 )
@@ -80,9 +82,15 @@ ACTUATORS = {
     "noisy_current_loop": NOISY,
     "lag": Lag(time_constant=0.03, delay=0.007),
     "drive": Drive(
-        GearMotor(rotor_inertia=0.0, gear_ratio=5.0, gear_efficiency=0.9, load_inertia=0.01),
+        GearMotor(rotor_inertia=0.0, gear_ratio=5.0, gear_efficiency=0.9, stribeck_friction=1e-3),
         SampledLoop(10e3),
         Supply(3.0),
+    ),
+    "servo": Servo(
+        GearMotor(rotor_inertia=0.0, gear_ratio=5.0, thermal_resistance=30.0, max_temperature=30.0),
+        SampledLoop(10e3),
+        Supply(3.0),
+        ServoLoop(position_gain=2.0, velocity_gain=0.5, velocity_integral_gain=0.1),
     ),
     "torque_speed": TorqueSpeed(stall_torque=0.8, no_load_speed=3.0, max_torque=0.6),
     "somebody's": Worn(),
@@ -125,7 +133,7 @@ def behind_callback(spec, actuators):
     spec = spec.copy()
     for name, actuator in actuators.items():
         codrl_mj.load_family(type(actuator))
-        drive(spec.actuator(name), actuator, 1.0)
+        drive(spec.actuator(name), actuator, 1.0 / actuator.arm_radius**2 if actuator.MOTION else 1.0)
     model = spec.compile()
     install_callbacks(model)
     return model

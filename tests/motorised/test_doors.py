@@ -38,14 +38,18 @@ def _both(actuators, integrator, kind="hinge"):
         data, read, rows = mujoco.MjData(model), codrl_mj.Readout(model), []
         codrl_mj.clear_motors(data, range(5, 5 + len(actuators)))
         shaft = np.ones(2)
-        if build is behind_callback:  # where a control is the torque at the shaft
-            shaft[: len(actuators)] = [actuator.arm_radius for actuator in actuators.values()]
+        if build is behind_callback:  # where a control is the torque at the shaft, or the shaft's motion
+            arms = [(1 / one.arm_radius if one.MOTION else one.arm_radius) for one in actuators.values()]
+            shaft[: len(actuators)] = arms
         for desired in inputs:
             data.ctrl[:] = desired * shaft
             mujoco.mj_step(model, data)
             seen = read(data)
             # one door stores the force, the other makes it from the torque
-            np.testing.assert_allclose(seen.pop("desired_force"), desired[: len(actuators)], rtol=1e-15)
+            wanted = np.where(
+                [one.tracks for one in actuators.values()], desired[: len(actuators)], seen["actual_force"]
+            )
+            np.testing.assert_allclose(seen.pop("desired_force"), wanted, rtol=1e-15)
             rows.append(np.concatenate((data.qpos, data.qvel, data.qfrc_actuator, *seen.values())))
         assert list(codrl_mj.motors(model).values()) == list(actuators.values())
         found.append(np.array(rows))

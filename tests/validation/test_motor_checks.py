@@ -32,7 +32,10 @@ FAST, RK4 = "native <dcmotor>, implicitfast, order in the step", "RK4, locked ro
 GEM = "gym-electric-motor, order in the step"
 LOOP = {ORDER, LIMIT, SAMPLED, STEP, MAGNITUDE, PHASE}
 NATIVE = {MAP, SUB, FAST}
-COMPILED = {f"compiled advance: {kind}" for kind in ("Actuator", "VoltageDriven", "Drive", "Lag", "TorqueSpeed")}
+COMPILED = {
+    f"compiled advance: {kind}"
+    for kind in ("Actuator", "VoltageDriven", "Drive", "VoltageDrive", "Servo", "Lag", "TorqueSpeed")
+}
 EVERY = LOOP | {VOLTAGE, LINE, NO_LOAD, RK4, GEM} | NATIVE | COMPILED
 
 
