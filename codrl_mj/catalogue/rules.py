@@ -1,8 +1,8 @@
 """Which number of a motor follows from which, and which have to agree.
 
-The motor is V = R*I + kE*w with torque kT*I less friction; at no load kT*I0 is friction. The gear passes on
-`gear_efficiency` of the torque. Source of the relations: maxon's *Key information on maxon DC and EC motors*; they
-are those of any text on DC motors.
+The motor is V = R*I + kE*w with torque kT*I. The gear passes on `gear_efficiency` of it, and friction takes its part
+behind the gear, where the simulation has it: at no load it is gear_efficiency*kT*I0. Source of the relations: maxon's
+*Key information on maxon DC and EC motors*; they are those of any text on DC motors.
 """
 
 import re
@@ -163,8 +163,8 @@ CHECKS = (
     (
         _rule(
             "no_load_current",
-            "(coulomb_friction + viscous_friction * no_load_speed) / torque_constant",
-            lambda c, b, w0, kt: (c + b * w0) / kt,
+            "(coulomb_friction + viscous_friction * no_load_speed) / (gear_efficiency * torque_constant)",
+            lambda c, b, w0, eta, kt: (c + b * w0) / (eta * kt),
         ),
         "friction varies with temperature and from motor to motor",
     ),

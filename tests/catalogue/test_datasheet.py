@@ -100,6 +100,8 @@ def test_a_geared_motor_comes_back_from_its_output(data, ratio, efficiency):
     text = data.draw(_print(printed))
     numbers = from_datasheet(shaft="output", gear_ratio=ratio, **text)
     assert numbers.gear_efficiency == pytest.approx(efficiency, rel=1e-11)
+    free = efficiency * motor["torque_constant"] * printed["no_load_current"]  # what the gear leaves of the torque
+    assert numbers.coulomb_friction == pytest.approx(free, rel=1e-11)
     for name, value in motor.items():
         assert getattr(numbers, name) == pytest.approx(value, rel=1e-12), name
     del text["no_load_speed"]  # then the constant follows from the torque, if the efficiency is printed
