@@ -67,14 +67,16 @@ class MotorNumbers:
     """[A]"""
     voltage: float | None
     """Nominal supply [V]."""
+    thermal_resistance: float | None
+    """From winding to ambient [K/W]."""
     thermal_resistance_winding: float | None
     """From winding to housing [K/W]."""
     thermal_resistance_housing: float | None
     """From housing to ambient [K/W]."""
-    thermal_time_constant_winding: float | None
-    """[s]"""
+    thermal_time_constant: float | None
+    """Of the winding against the housing [s]."""
     thermal_time_constant_housing: float | None
-    """[s]"""
+    """Of the housing against the ambient [s]."""
     max_temperature: float | None
     """Of the winding [degC]."""
     derived: Mapping[str, str]
@@ -89,6 +91,7 @@ _LEAST_EFFICIENCY = 0.2
 OTHER_NAMES = {
     "max_current": "peak_current",
     "voltage": "nominal_voltage",
+    "thermal_time_constant": "thermal_time_constant_winding",
     "max_temperature": "max_winding_temperature",
 }
 """Numbers whose printed field is called otherwise."""

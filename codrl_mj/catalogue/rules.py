@@ -86,6 +86,7 @@ RULES = (
         "continuous_torque_at_output / (gear_ratio * gear_efficiency * torque_constant) + no_load_current",
         lambda t, n, eta, kt, i0: t / (n * eta * kt) + i0,
     ),
+    _rule("thermal_resistance", "thermal_resistance_winding + thermal_resistance_housing", lambda w, h: w + h),
 )
 _LOAD = "the shaft's torque is kT*(I - I0) here, many makers print kT*I; iron saturates at stall; warm motors give less"
 _SPEED = "iron losses and brushes are not in the model; many print a warm motor's speed, or a limit of the drive"
@@ -167,5 +168,9 @@ CHECKS = (
             lambda c, b, w0, eta, kt: (c + b * w0) / (eta * kt),
         ),
         "friction varies with temperature and from motor to motor",
+    ),
+    (
+        _rule("thermal_resistance", "thermal_resistance_winding + thermal_resistance_housing", lambda w, h: w + h),
+        "the housing's depends on what it is mounted on",
     ),
 )
