@@ -249,6 +249,17 @@ def test_a_motor_that_moves_itself_is_none_for_a_policy_and_any_for_a_recording(
     assert choose(swinging, name)[0].lacks == ""
 
 
+def test_the_gear_leaves_a_policy_its_load_and_a_recording_the_largest_margin():
+    time = np.linspace(0.0, 2.0, 2001)
+    recording = recorded(time, 0.1 * np.cos(4.0 * time), 10.0 * np.sin(4.0 * time))
+    free, bound = (
+        choose(one, ["maxon-ec45-flat-50w"])[0].feasibility
+        for one in (recording, dataclasses.replace(recording, exact=False))
+    )
+    assert bound.operation.own_share < 0.5 < 1.0 < free.operation.own_share
+    assert 0.5 < bound.margin < free.margin
+
+
 def arrivals(task, actuator, episodes=5):
     """How many scripted episodes of a task end at the goal."""
     env = EnvConfig(task, actuator, inner_steps=TASKS[task].motor_inner_steps)
