@@ -1,7 +1,8 @@
 """Writes docs/actuators_in_numbers.md and its two CSV files: what every actuator that has a name does on a bench.
 
-Everything is measured in the engine, on one hinge: blocked, turned slowly by a heavy load, or free. `make docs` runs
-it; a test compares the files with what it would write.
+Torques and speeds are measured in the engine, on one hinge: blocked, turned slowly by a heavy load, or free. The loops
+of the catalogue's motors and their continuous torques are `codrl_mj.motor_design`'s. `make docs` runs it; a
+test compares the files with what it would write.
 """
 
 import argparse
@@ -235,7 +236,9 @@ The joint is blocked, and the task's largest force is asked for, from rest.
 ## Motors of the catalogue, each at its own gear
 
 At the nominal voltage (24 V where none is printed), with a loop at 20 kHz of the default bandwidth. Torques are past
-friction, limits are those of the voltage and not of the drive's largest current; –: not printed, so not known.
+friction, limits are those of the voltage and not of the drive's largest current; –: not printed, so not known. Stall,
+no load and τm are measured in the engine; the loop's two columns and the continuous torque are
+`codrl_mj.motor_design`'s.
 
 - **2 %**: when the current of a small step comes to within that for good. **Bandwidth**: where the closed loop's gain
   is -3 dB. Both are alike, because gains are designed for the winding.
