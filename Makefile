@@ -39,8 +39,9 @@ results: $(STAMP)  ## docs/results/ anew: hours; what is finished in runs/ is no
 	@$(BIN)/codrl-mj reproduce
 	@$(BIN)/codrl-mj study mismatch
 
-docs: $(STAMP)  ## write docs/environments/ anew from the code
+docs: $(STAMP)  ## write docs/environments/ and docs/actuators_in_numbers.md anew from the code
 	@$(BIN)/python scripts/environment_pages.py
+	@$(BIN)/python scripts/actuator_numbers.py
 
 clean:  ## everything but what was trained
 	rm -rf .venv .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist

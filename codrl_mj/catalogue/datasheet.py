@@ -71,6 +71,8 @@ class Datasheet:
     """Friction torque at any speed."""
     viscous_friction: str | None = _printed("N*m*s/rad", "1.5e-4 N*m*s/rad", -2, zero=True)
     """Friction torque per speed."""
+    thermal_resistance: str | None = _printed("K/W", "9.85 K/W")
+    """From winding to ambient, where it is printed in one."""
     thermal_resistance_winding: str | None = _printed("K/W", "8.28 K/W")
     """From winding to housing."""
     thermal_resistance_housing: str | None = _printed("K/W", "1.57 K/W")

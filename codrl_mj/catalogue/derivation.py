@@ -67,14 +67,16 @@ class MotorNumbers:
     """[A]"""
     voltage: float | None
     """Nominal supply [V]."""
+    thermal_resistance: float | None
+    """From winding to ambient [K/W]."""
     thermal_resistance_winding: float | None
     """From winding to housing [K/W]."""
     thermal_resistance_housing: float | None
     """From housing to ambient [K/W]."""
-    thermal_time_constant_winding: float | None
-    """[s]"""
+    thermal_time_constant: float | None
+    """Of the winding against the housing [s]."""
     thermal_time_constant_housing: float | None
-    """[s]"""
+    """Of the housing against the ambient [s]."""
     max_temperature: float | None
     """Of the winding [degC]."""
     derived: Mapping[str, str]
@@ -89,6 +91,7 @@ _LEAST_EFFICIENCY = 0.2
 OTHER_NAMES = {
     "max_current": "peak_current",
     "voltage": "nominal_voltage",
+    "thermal_time_constant": "thermal_time_constant_winding",
     "max_temperature": "max_winding_temperature",
 }
 """Numbers whose printed field is called otherwise."""
@@ -236,18 +239,20 @@ def _settle_friction(known: dict[str, Any], how: dict[str, str], text: _Text, ha
     if not has_no_load:
         return
     coulomb, viscous = "coulomb_friction" in known, "viscous_friction" in known
-    total = known["torque_constant"] * known["no_load_current"]
+    total, free = known["torque_constant"] * known["no_load_current"], "torque_constant * no_load_current"
+    if known.get("gear_efficiency", 1.0) != 1.0:  # friction is behind the gear
+        total, free = known["gear_efficiency"] * total, f"gear_efficiency * {free}"
     if not coulomb and not viscous:
         known["coulomb_friction"], known["viscous_friction"] = total, 0.0
-        how["coulomb_friction"] = text.sentence("coulomb_friction", "torque_constant * no_load_current")
+        how["coulomb_friction"] = text.sentence("coulomb_friction", free)
         how["viscous_friction"] = "viscous_friction = 0: the no-load current is taken as Coulomb friction alone"
     elif coulomb != viscous and "no_load_speed" in known:
         speed = known["no_load_speed"]
         if coulomb:
-            name, formula = "viscous_friction", "(torque_constant * no_load_current - coulomb_friction) / no_load_speed"
+            name, formula = "viscous_friction", f"({free} - coulomb_friction) / no_load_speed"
             known[name] = max(0.0, (total - known["coulomb_friction"]) / speed)
         else:
-            name, formula = "coulomb_friction", "torque_constant * no_load_current - viscous_friction * no_load_speed"
+            name, formula = "coulomb_friction", f"{free} - viscous_friction * no_load_speed"
             known[name] = max(0.0, total - known["viscous_friction"] * speed)
         how[name] = text.sentence(name, formula) + ", not below 0"
 

@@ -1,8 +1,8 @@
 """Which number of a motor follows from which, and which have to agree.
 
-The motor is V = R*I + kE*w with torque kT*I less friction; at no load kT*I0 is friction. The gear passes on
-`gear_efficiency` of the torque. Source of the relations: maxon's *Key information on maxon DC and EC motors*; they
-are those of any text on DC motors.
+The motor is V = R*I + kE*w with torque kT*I. The gear passes on `gear_efficiency` of it, and friction takes its part
+behind the gear, where the simulation has it: at no load it is gear_efficiency*kT*I0. Source of the relations: maxon's
+*Key information on maxon DC and EC motors*; they are those of any text on DC motors.
 """
 
 import re
@@ -86,6 +86,7 @@ RULES = (
         "continuous_torque_at_output / (gear_ratio * gear_efficiency * torque_constant) + no_load_current",
         lambda t, n, eta, kt, i0: t / (n * eta * kt) + i0,
     ),
+    _rule("thermal_resistance", "thermal_resistance_winding + thermal_resistance_housing", lambda w, h: w + h),
 )
 _LOAD = "the shaft's torque is kT*(I - I0) here, many makers print kT*I; iron saturates at stall; warm motors give less"
 _SPEED = "iron losses and brushes are not in the model; many print a warm motor's speed, or a limit of the drive"
@@ -163,9 +164,13 @@ CHECKS = (
     (
         _rule(
             "no_load_current",
-            "(coulomb_friction + viscous_friction * no_load_speed) / torque_constant",
-            lambda c, b, w0, kt: (c + b * w0) / kt,
+            "(coulomb_friction + viscous_friction * no_load_speed) / (gear_efficiency * torque_constant)",
+            lambda c, b, w0, eta, kt: (c + b * w0) / (eta * kt),
         ),
         "friction varies with temperature and from motor to motor",
+    ),
+    (
+        _rule("thermal_resistance", "thermal_resistance_winding + thermal_resistance_housing", lambda w, h: w + h),
+        "the housing's depends on what it is mounted on",
     ),
 )

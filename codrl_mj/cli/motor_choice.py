@@ -73,14 +73,19 @@ class Feasible:
 
 @dataclasses.dataclass(frozen=True)
 class Choose:
-    """Rank the catalogue's motors for a task, each at its best gear, and say what is wrong with those that fail.
+    """Rank the catalogue's motors for a task, the smallest that does it first, and say what is wrong with the others.
+
+    Each is taken at its best gear. It does the task if voltage, largest current and heat hold with the margin, its heat
+    is known, and the rotor leaves half to the load; smallest means by the most mechanical power at its supply.
 
     Example: codrl-mj motor choose pendulum --top 5 --out chosen
     """
 
     asked: Asked
     top: int = 5
-    """How many to show; of the others only those that fail are told, and why."""
+    """How many to show in the table; of those that do not do it is told why."""
+    margin: float = 0.2
+    """Share of voltage, largest and continuous current that has to be left."""
     voltage: float | None = None
     """Voltage of the supply [V]; each motor's own unless given."""
     out: Path | None = None
@@ -90,23 +95,21 @@ class Choose:
     def run(self) -> int:
         """Print the ranking."""
         from codrl_mj.cli.terminal import console
-        from codrl_mj.sizing import SURELY, choose, demand_of
+        from codrl_mj.sizing import choose, demand_of
 
         if self.top < 1:
             raise ValueError(f"--top {self.top}: must be >= 1")
         demand = demand_of(self.asked, trust=self.trust)
-        choices = choose(demand, voltage=self.voltage)
+        choices = choose(demand, voltage=self.voltage, least_margin=self.margin)
         shown, console_ = choices[: self.top], console()
-        console_.print(_ranking(shown, demand.source))
+        console_.print(_ranking(shown, f"smallest that does it with {self.margin:.0%} left first: {demand.source}"))
         for choice in shown:
             if choice.unknown:
                 text = f"{choice.name}: not in its datasheet, and not counted: {', '.join(choice.unknown)}"
                 console_.print(text, markup=False, highlight=False)
         for choice in choices:
-            if choice.feasibility.verdict != SURELY:
-                text = (
-                    f"{choice.name} at gear {choice.ratio:.4g}: {choice.feasibility.verdict}. {choice.feasibility.why}"
-                )
+            if choice.lacks:
+                text = f"{choice.name} at gear {choice.ratio:.4g}: {choice.lacks}"
                 console_.print(text, markup=False, highlight=False)
         for choice in shown if self.out is not None else ():
             assert self.out is not None
@@ -114,16 +117,17 @@ class Choose:
         return 0
 
 
-def _ranking(choices: Sequence[Any], source: str) -> Any:
-    table = _table(f"largest margin first: {source}")
-    columns = ("motor", "gear", "supply\n[V]", "verdict", "margin", "rotor's\nshare", "peak\n[A]", "rms\n[A]")
-    for header in (*columns, "drawn\n[J]", "heat\n[J]"):
-        table.add_column(header, justify="left" if header in ("motor", "verdict") else "right", no_wrap=True)
+def _ranking(choices: Sequence[Any], title: str) -> Any:
+    table = _table(title)
+    columns = ("motor", "gear", "supply\n[V]", "power\n[W]", "does\nit", "margin", "rotor's\nshare", "peak\n[A]")
+    for header in (*columns, "rms\n[A]", "drawn\n[J]", "heat\n[J]"):
+        table.add_column(header, justify="left" if header in ("motor", "does\nit") else "right", no_wrap=True)
     for choice in choices:
         asked = choice.feasibility.operation
         numbers = abs(asked.current).max(), asked.rms_current, asked.energy_drawn, asked.copper_loss
         table.add_row(
-            *(choice.name, f"{choice.ratio:.4g}", f"{choice.drive.voltage_limit:g}", choice.feasibility.verdict),
+            *(choice.name, f"{choice.ratio:.4g}", f"{choice.drive.voltage_limit:g}", f"{choice.power:,.0f}"),
+            "[red]no" if choice.lacks else "[green]yes",
             *(f"{choice.feasibility.margin:.0%}", f"{asked.own_share:.0%}", *(f"{number:.3g}" for number in numbers)),
         )
     return table

@@ -17,11 +17,11 @@ INERTIA_DATA_FIELDS = ("qLD", "qLDiagInv", "moment_rownnz", "moment_rowadr", "mo
 
 @functools.cache
 def inertia() -> Any:
-    """A compiled function (model, data, output, gear) -> inertia [kg*m^2] seen from an actuator's output through a gear.
+    """A compiled function (model, data, output, gear) -> inertia [kg*m^2] at an actuator's output, through a gear.
 
-    With its moment m, the gear times a row of `actuator_moment`, and the inertia matrix M = L^T*D*L that `mj_fwdPosition` has
-    factorised, it is 1/(m*M^-1*m): how hard it is to turn with all other joints free. Infinite where nothing moves.
-    The layout of the fields above must have been checked.
+    With its moment m, the gear times a row of `actuator_moment`, and the inertia matrix M = L^T*D*L that
+    `mj_fwdPosition` has factorised, it is 1/(m*M^-1*m): how hard it is to turn with all other joints free. Infinite
+    where nothing moves. The layout of the fields above must have been checked.
     """
     nv_at, rownnz_at, rowadr_at, colind_at = (offset("mjModel", field) for field in INERTIA_MODEL_FIELDS)
     qld_at, inverse_at, moment_nnz_at, moment_adr_at, moment_col_at, moment_at = (

@@ -1,9 +1,9 @@
 """Drives by name, and what they can do: closed forms of V = R*I + kE*omega, at the output of the gear.
 
 Source: maxon, *Key information on maxon DC and EC motors*; the same relations that `codrl_mj.catalogue` derives by.
-Friction is the rotor's, c + b*|omega|, and opposes the speed. What it leaves of kT*I passes the gear, which loses
-1 - efficiency of it where it drives and brakes with 1/efficiency - 1 more where it is driven. All here is past both:
-the torque that moves the load.
+As in the simulation, kT*I passes the gear first, which loses 1 - efficiency of it where it drives and brakes with
+1/efficiency - 1 more where it is driven; friction, n*(c + n*b*|omega|) at the output, opposes the speed behind it. All
+here is past both: the torque that moves the load.
 """
 
 import math
@@ -60,7 +60,7 @@ class Abilities(NamedTuple):
     """What a drive can do at its supply's voltage, `max_current` aside."""
 
     stall_torque: float
-    """Of the blocked output [N*m]."""
+    """Of the output that just turns [N*m]; a gear does not lose anything where it stands still."""
     stall_current: float
     """Of the blocked motor [A]: V/R."""
     no_load_speed: float
@@ -80,7 +80,8 @@ ABILITY_UNITS = dict(zip(Abilities._fields, ("N*m", "A", "rad/s", "A", "s", "s")
 def abilities(drive: Drive) -> Abilities:
     """What a drive can do."""
     motor, resistance = drive.motor, _resistance(drive)
-    per_torque = resistance / motor.torque_constant  # [V/(N*m)]
+    passed = motor.torque_constant * motor.gear_efficiency  # [N*m/A]
+    per_torque = resistance / passed  # [V/(N*m)]
     slope = motor.back_emf_constant + per_torque * motor.viscous_friction
     left = max(drive.voltage_limit - per_torque * motor.coulomb_friction, 0.0)
     speed = left / slope if slope > 0.0 else math.inf
@@ -90,7 +91,7 @@ def abilities(drive: Drive) -> Abilities:
         float(_at_output(motor, np.array(stall), np.array(0.0))),
         stall,
         speed / motor.gear_ratio,
-        friction / motor.torque_constant,
+        friction / passed,
         motor.electrical_time_constant,
         motor.mechanical_time_constant if motor.rotor_inertia > 0.0 else math.nan,
     )
@@ -130,9 +131,7 @@ def _highest_current(drive: Drive, back_emf: np.ndarray) -> np.ndarray:
 def _at_output(motor: GearMotor, current: np.ndarray, speed: np.ndarray) -> np.ndarray:
     """Torque [N*m] that a current [A] leaves at the output, at its speed [rad/s]."""
     torque = motor.torque_constant * current
+    torque = torque * np.where(torque * speed >= 0.0, motor.gear_efficiency, 1.0 / motor.gear_efficiency)
     friction = motor.coulomb_friction + motor.viscous_friction * motor.gear_ratio * np.abs(speed)
-    moved = torque - friction * np.sign(speed)
     still = np.sign(torque) * np.maximum(np.abs(torque) - friction, 0.0)
-    left = np.where(speed == 0.0, still, moved)
-    share = np.where(left * speed >= 0.0, motor.gear_efficiency, 1.0 / motor.gear_efficiency)
-    return motor.gear_ratio * share * left
+    return motor.gear_ratio * np.where(speed == 0.0, still, torque - friction * np.sign(speed))

@@ -76,6 +76,14 @@ def margin(drive: Drive, asked: Operation, continuous_current: float | None) -> 
     )
 
 
+def most_power(drive: Drive) -> float:
+    """The most mechanical power [W] that a motor makes at its supply, i (V - R i) kT/kE; infinite without back-EMF."""
+    motor, limit = drive.motor, drive.voltage_limit
+    current = min(limit / motor.resistance / 2, drive.controller.max_current)
+    power = current * (limit - motor.resistance * current) * motor.torque_constant
+    return power / motor.back_emf_constant if motor.back_emf_constant else math.inf
+
+
 def feasibility(drive: Drive, demand: Demand, continuous_current: float | None = None) -> Feasibility:
     """Whether a motor can deliver what a run asked of the ideal actuator.
 
@@ -108,7 +116,7 @@ def _limits(
     remedy = f"raise the supply to {needed:.4g} V" + (
         f", or take a gear nearer to {ratio:.3g}" if least < limit else ""
     )
-    bounds = [_bound("voltage", "|R i + N kE omega|, largest", needed, limit, "V", (SURELY, unmet), remedy)]
+    bounds = [_bound("voltage", "|R i + L di/dt + N kE omega|, largest", needed, limit, "V", (SURELY, unmet), remedy)]
     largest, most = float(np.abs(asked.current).max()), drive.controller.max_current
     remedy = f"raise controller.max_current to {largest:.4g} A, or the gear {largest / most:.3g} times"
     bounds.append(_bound("current", "|i|, largest", largest, most, "A", (SURELY, unmet), remedy))
@@ -126,9 +134,7 @@ def _necessary(drive: Drive, demand: Demand, unmet: str) -> list[Bound]:
     largest = float(np.abs(demand.torque[power >= 0.0]).max(initial=0.0))
     current = min(limit / motor.resistance, most)
     still = motor.torque_constant * motor.gear_efficiency * current / drive.arm_radius - drive.additions.friction
-    needed, current = float(power.max(initial=0.0)) / motor.gear_efficiency, min(current, limit / motor.resistance / 2)
-    shaft = current * (limit - motor.resistance * current) * motor.torque_constant
-    shaft = shaft / motor.back_emf_constant if motor.back_emf_constant else math.inf
+    needed = float(power.max(initial=0.0)) / motor.gear_efficiency
     _, least = _at_most_power(drive, demand)
     return [
         _bound(
@@ -137,7 +143,7 @@ def _necessary(drive: Drive, demand: Demand, unmet: str) -> list[Bound]:
             "raise the supply, the largest current or the gear",
         ),
         _bound(
-            *("power", "tau omega / eta, largest", needed, shaft, "W", (TRY_IT, unmet)),
+            *("power", "tau omega / eta, largest", needed, most_power(drive), "W", (TRY_IT, unmet)),
             f"no gear helps: raise the supply to {least:.4g} V and the largest current, or take a stronger motor",
         ),
     ]

@@ -1,4 +1,4 @@
-"""Which motor of the catalogue, with which gear."""
+"""Which motor of the catalogue, with which gear: the smallest that does it with a margin."""
 
 import dataclasses
 import math
@@ -10,10 +10,14 @@ import numpy as np
 from codrl_mj.actuators import Drive
 from codrl_mj.catalogue import motor_names
 from codrl_mj.motor_design.drives import find_drive, find_entry
-from codrl_mj.sizing.bounds import VERDICTS, Feasibility, feasibility, margin
+from codrl_mj.sizing.bounds import SURELY, VERDICTS, Feasibility, feasibility, margin, most_power
 from codrl_mj.sizing.demand import Demand
 from codrl_mj.sizing.operation import best_ratio, operation
 
+MARGIN = 0.2
+"""Share of voltage and currents that a motor is to leave: a rule of thumb, for the tolerances of motor and supply."""
+MOST_SHARE = 0.5
+"""Largest share that rotor and friction may take of the largest load: in a task a policy can ask for no more."""
 _SPREAD = math.log(16.0)
 """Gears are tried up to this far, in logarithms, from that of the largest torque and the largest speed."""
 _WANTED = {
@@ -50,6 +54,13 @@ class Choice(NamedTuple):
     """What its datasheet leaves open, and is not counted."""
     feasibility: Feasibility
     """What it can do."""
+    lacks: str
+    """Why it is not to be taken; empty where it is."""
+
+    @property
+    def power(self) -> float:
+        """The most mechanical power [W] that the motor makes at its supply: its size, whatever its winding and gear."""
+        return most_power(self.drive)
 
     @property
     def ratio(self) -> float:
@@ -76,29 +87,59 @@ def catalogued(name: str, gear_ratio: float | None = None, voltage: float | None
     return Catalogued(drive, entry.numbers.continuous_current, tuple(one for one in unknown if one != given))
 
 
-def choose(demand: Demand, motors: Sequence[str] | None = None, voltage: float | None = None) -> list[Choice]:
-    """Motors at their best gears, by verdict and then by margin.
+def choose(
+    demand: Demand, motors: Sequence[str] | None = None, voltage: float | None = None, least_margin: float = MARGIN
+) -> list[Choice]:
+    """Motors at their best gears: those that do it, from the smallest; then the others by verdict and margin.
 
-    A motor with a gear of its own keeps it, and on a slide gets a wheel; the others get the gear of the largest margin.
+    A motor does it if voltage, largest current and heat hold with a margin, its heat is known, and it leaves to the
+    load what a policy can ask for; a recording asks for whatever it takes. More than enough of a motor is no merit:
+    it is dear and heavy, and moves itself. A motor with a gear of its own keeps it, and on a slide gets a wheel; the
+    others get the gear at which the tightest of these is widest.
 
     Args:
         demand: what is asked.
         motors: names; None: the whole catalogue.
         voltage: of the supply [V]; None: each motor's own.
+        least_margin: share of voltage, largest and continuous current that has to be left, in [0, 1).
 
     Raises:
-        ValueError: there is no such motor.
+        ValueError: there is no such motor, or the margin is out of bounds.
     """
+    if not 0.0 <= least_margin < 1.0:
+        raise ValueError(
+            f"least_margin = {least_margin:g}: must be >= 0 and < 1, the share that is to be left, such as {MARGIN:g}"
+        )
     choices = []
     for name in motor_names() if motors is None else motors:
         drive, continuous, unknown = catalogued(name, None, voltage)
         best = _geared(drive, demand, continuous)
-        choices.append(Choice(name, best, unknown, feasibility(best, demand, continuous)))
-    return sorted(choices, key=lambda c: (VERDICTS.index(c.feasibility.verdict), -c.feasibility.margin))
+        found = feasibility(best, demand, continuous)
+        choices.append(Choice(name, best, unknown, found, _lacks(found, demand, continuous, least_margin)))
+
+    def rank(choice: Choice) -> tuple[bool, int, float]:
+        found = choice.feasibility
+        return choice.lacks != "", VERDICTS.index(found.verdict), -found.margin if choice.lacks else choice.power
+
+    return sorted(choices, key=rank)
+
+
+def _lacks(found: Feasibility, demand: Demand, continuous: float | None, least: float) -> str:
+    """Why a motor is not to be taken."""
+    if found.verdict != SURELY:
+        return f"{found.verdict}. {found.why}"
+    if found.margin < least:
+        return f"surely, but with a margin of {found.margin:.0%}, must be {least:.0%}"
+    if not demand.exact and found.operation.own_share > MOST_SHARE:
+        share = f"{found.operation.own_share:.0%} of the largest load, must be <= {MOST_SHARE:.0%}"
+        return f"surely, but its rotor and friction take {share}: a policy cannot ask for so much more"
+    if continuous is None:
+        return "surely, but how long: its continuous current is not known"
+    return ""
 
 
 def _geared(drive: Drive, demand: Demand, continuous: float | None) -> Drive:
-    """The drive with the gear, or the wheel, whose margin is largest.
+    """The drive with the gear, or the wheel, whose margin is largest, the rotor's share considered.
 
     Each of the margin's parts is, but for friction, the largest of functions a/N + b*N, so it has one maximum over N.
     """
@@ -116,7 +157,9 @@ def _geared(drive: Drive, demand: Demand, continuous: float | None) -> Drive:
         return dataclasses.replace(drive, motor=dataclasses.replace(motor, **change))
 
     def load(logarithm: float) -> float:
-        return -margin(geared(logarithm), operation(demand, geared(logarithm)), continuous)
+        asked = operation(demand, geared(logarithm))
+        share = 0.0 if demand.exact else asked.own_share / MOST_SHARE
+        return max(1.0 - margin(geared(logarithm), asked, continuous), share)
 
     bounds = middle - _SPREAD, middle + _SPREAD
     found = minimize_scalar(load, bounds=bounds, method="bounded", options={"xatol": 0.01})

@@ -1,4 +1,4 @@
-"""What a demand asks of a motor at its shaft: torque, current, voltage, heat. Its inductance is not counted."""
+"""What a demand asks of a motor at its shaft: torque, current, voltage, heat."""
 
 import math
 from typing import Any, NamedTuple
@@ -39,10 +39,11 @@ def operation(demand: Demand, drive: Drive) -> Operation:
     With N turns of the rotor for one of the joint (1/arm on a slide),
 
         tau_rotor = (tau + N^2 (J alpha + b omega) + N tau_c sign(omega)) / (N eta),   i = tau_rotor / kT,
-        V >= |R i + N kE omega| + R_supply |i|.
+        V >= |R i + N kE omega| + R_supply |i|, and with L di/dt while i comes from its value in the step before.
 
-    Where the motor brakes, eta is 1: the gear helps then, but not at standstill. Energies are of the mean speed in a
-    step, all else of that at its start.
+    A change of the torque is to be made within a step of the demand; so is that from one episode to the next. Where
+    the motor brakes, eta is 1: the gear helps then, but not at standstill. Energies are of the mean speed in a step,
+    all else of that at its start.
     """
     motor, added, arm = drive.motor, drive.additions, drive.arm_radius
     own = added.armature * demand.acceleration + added.damping * demand.speed + added.friction * np.sign(demand.speed)
@@ -50,6 +51,7 @@ def operation(demand: Demand, drive: Drive) -> Operation:
     torque = arm * joint / np.where(joint * demand.speed >= 0.0, motor.gear_efficiency, 1.0)
     speed, current = demand.speed / arm, torque / motor.torque_constant
     terminal = motor.resistance * current + motor.back_emf_constant * speed
+    changing = terminal + motor.inductance * np.diff(current, prepend=current[:1]) / demand.duration
     supply = 0.0 if drive.supply is None else drive.supply.resistance
     mean_speed = speed + demand.acceleration * demand.duration / (2.0 * arm)
     power = (motor.resistance * current + motor.back_emf_constant * mean_speed) * current
@@ -58,7 +60,7 @@ def operation(demand: Demand, drive: Drive) -> Operation:
         torque=torque,
         speed=speed,
         current=current,
-        voltage=np.abs(terminal) + supply * np.abs(current),
+        voltage=np.maximum(np.abs(terminal), np.abs(changing)) + supply * np.abs(current),
         rms_current=math.sqrt(square / float(demand.duration.sum())),
         copper_loss=motor.resistance * square / demand.episodes,
         energy_drawn=float(np.maximum(power, 0.0) @ demand.duration) / demand.episodes,

@@ -18,7 +18,7 @@ from codrl_mj.actuators import Drive, GearMotor, Inputs, SampledLoop, Supply, pa
 from codrl_mj.actuators.named import resolve
 from codrl_mj.actuators.sampled import designed_gains, jump, run_samples
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
-from codrl_mj.catalogue import motor_entry, motor_names
+from codrl_mj.catalogue import motor_entry
 
 # R [ohm], L [H], K [N*m/A], V [V]: maxon EC45 flat, DCX22L; Faulhaber 1331T; T-motor AK80-6; QUBE-Servo 2; PMG-132
 WINDINGS = {
@@ -287,45 +287,6 @@ def test_a_vector_of_drives_is_the_drives_alone_and_their_windings_are_drawn():
         np.testing.assert_array_equal(one[0], other[0])
         for name in ("current", "voltage", "actual_force", "saturated"):
             np.testing.assert_array_equal(infos[name], expected[name])
-
-
-@pytest.mark.parametrize("name", motor_names())
-def test_every_motor_of_the_catalogue_turns_as_its_datasheet_says(name):
-    """Simulated under MuJoCo at the printed voltage: stall torque, no-load speed, mechanical time constant."""
-    entry = motor_entry(name)
-    one, numbers, printed = Drive.of(entry.numbers), entry.numbers, entry.datasheet.readings()
-    product = numbers.torque_constant * numbers.back_emf_constant
-    inertia = numbers.rotor_inertia or 0.02 * product / numbers.resistance
-    alone = dataclasses.replace(one.motor, rotor_inertia=inertia, gear_ratio=1.0, gear_efficiency=1.0)
-    one = dataclasses.replace(one, motor=alone)
-    one = dataclasses.replace(one, controller=SampledLoop(10e3, bemf_compensation=True))
-    time_constant = numbers.resistance * inertia / product
-    step = max(math.ceil(time_constant / 100 * 1e4), 1) / 1e4
-    spec = mujoco.MjSpec()
-    body = spec.worldbody.add_body(explicitinertial=True, mass=1.0, inertia=[1e-12] * 3)
-    body.add_joint(name="shaft", axis=[0.0, 0.0, 1.0])
-    spec.add_actuator(name="motor", target="shaft", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
-    spec.option.timestep, spec.compiler.boundmass = step, 0.0
-    model = codrl_mj.motorise(spec, {"motor": one}).compile()
-    data = mujoco.MjData(model)
-    data.ctrl[:] = 1e3
-    speeds = []
-    while data.time < 12 * time_constant:
-        mujoco.mj_step(model, data)
-        speeds.append(data.qvel[0])
-    voltage = one.supply.voltage if one.supply else 24.0
-    friction = numbers.coulomb_friction or 0.0
-    expected = (voltage - numbers.resistance * friction / numbers.torque_constant) / numbers.back_emf_constant
-    viscous = (numbers.viscous_friction or 0.0) * numbers.resistance / product
-    assert speeds[-1] == pytest.approx(expected / (1.0 + viscous), rel=0.01)
-    if "no_load_speed" in printed and printed["no_load_speed"].shaft == "motor":
-        assert speeds[-1] == pytest.approx(printed["no_load_speed"].value, rel=entry.tolerance if entry.notes else 0.05)
-    reached = step * (1 + np.flatnonzero(np.array(speeds) > (1 - math.exp(-1)) * speeds[-1])[0])
-    electrical = one.motor.electrical_time_constant
-    assert reached == pytest.approx(time_constant / (1.0 + viscous), rel=0.05, abs=2 * step + 2 * electrical)
-    data.qvel[:] = 0.0
-    stall = responses(one, 0.02, [1e3] * 20, [0.0] * 20)[-1][1]
-    assert stall == pytest.approx(numbers.torque_constant * voltage / numbers.resistance, rel=1e-6)
 
 
 def test_a_motor_is_asked_for_by_name_and_its_fields_are_set_over_it():

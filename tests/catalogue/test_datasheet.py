@@ -100,6 +100,8 @@ def test_a_geared_motor_comes_back_from_its_output(data, ratio, efficiency):
     text = data.draw(_print(printed))
     numbers = from_datasheet(shaft="output", gear_ratio=ratio, **text)
     assert numbers.gear_efficiency == pytest.approx(efficiency, rel=1e-11)
+    free = efficiency * motor["torque_constant"] * printed["no_load_current"]  # what the gear leaves of the torque
+    assert numbers.coulomb_friction == pytest.approx(free, rel=1e-11)
     for name, value in motor.items():
         assert getattr(numbers, name) == pytest.approx(value, rel=1e-12), name
     del text["no_load_speed"]  # then the constant follows from the torque, if the efficiency is printed
@@ -199,9 +201,24 @@ def test_every_number_says_how_it_came_about():
     assert numbers.derived["voltage"] == "voltage = 12 V, printed as nominal_voltage"
     assert (numbers.max_temperature, numbers.thermal_resistance_winding) == pytest.approx((125.0, 3.0))
     assert numbers.thermal_resistance_housing == pytest.approx(2.0)
+    assert numbers.derived["thermal_resistance"].endswith("= 3 K/W + 2 K/W = 5 K/W")
     for name in vars(numbers):
         known = getattr(numbers, name) is not None and name not in ("derived", "disagreements")
         assert (name in numbers.derived) == known
+
+
+def test_thermal_numbers_are_read_with_their_offsets_and_of_either_print():
+    """A temperature has an offset, a difference in K/W or degC/W has none."""
+    kelvin = from_datasheet(
+        **CIM, max_winding_temperature="398.15 K", thermal_resistance="5 K/W", thermal_time_constant_winding="0.5 min"
+    )
+    assert kelvin.max_temperature == pytest.approx(125.0)
+    assert from_datasheet(**CIM, max_winding_temperature="257 degF").max_temperature == pytest.approx(125.0)
+    assert (kelvin.thermal_resistance, kelvin.thermal_time_constant) == pytest.approx((5.0, 30.0))
+    assert kelvin.thermal_resistance_winding is from_datasheet(**CIM).thermal_resistance is None
+    parts = {"thermal_resistance_winding": "3 K/W", "thermal_resistance_housing": "2 K/W"}
+    with pytest.raises(ValueError, match=r"thermal_resistance = 9 K/W, but .* = 3 K/W \+ 2 K/W = 5 K/W"):
+        from_datasheet(**CIM, **parts, thermal_resistance="9 K/W")
 
 
 def test_a_disagreement_has_both_values_and_what_to_make_of_it():

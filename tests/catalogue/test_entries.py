@@ -85,6 +85,16 @@ def test_the_model_stands_at_the_printed_points(name):
         assert constant == pytest.approx(printed["mechanical_time_constant"].value, rel=0.05)
 
 
+@pytest.mark.parametrize("name", ["faulhaber-1331-006", "maxon-ec45-flat-50w", "maxon-re65"])
+def test_what_a_motor_bears_for_ever_is_what_its_thermal_numbers_bear(name):
+    """At 22 to 25 degC around it, with copper's 0.0039/K; some of the heat is friction's and the iron's."""
+    numbers = motor_entry(name).numbers
+    rise = numbers.max_temperature - 25.0
+    heat = numbers.continuous_current**2 * numbers.resistance * (1.0 + 0.0039 * rise)
+    assert 0.7 < numbers.thermal_resistance * heat / rise < 1.0
+    assert numbers.thermal_time_constant < numbers.thermal_time_constant_housing
+
+
 def test_the_pmg_132_is_gym_electric_motors():
     theirs, ours = DcPermanentlyExcitedMotor._default_motor_parameter, motor_entry("heinzmann-pmg-132").numbers
     assert (ours.resistance, ours.inductance) == pytest.approx((theirs["r_a"], theirs["l_a"]))

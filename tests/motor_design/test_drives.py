@@ -3,9 +3,11 @@
 import dataclasses
 import math
 
+import mujoco
 import numpy as np
 import pytest
 
+import codrl_mj
 from codrl_mj.actuators import Drive, GearMotor, SampledLoop, Supply
 from codrl_mj.catalogue import motor_entry, motor_names
 from codrl_mj.motor_design import abilities, catalogue_rows, explain, find_drive, find_entry, respond, torque_limits
@@ -42,13 +44,54 @@ def test_the_limits_are_where_the_drive_ends_up(most, sag):
         np.testing.assert_allclose(bound, 3.0 * 0.042 * np.array(ends), rtol=1e-6, atol=1e-9)
 
 
-def test_friction_and_gear_take_from_what_drives_and_add_to_what_brakes():
+def test_the_gear_takes_its_share_of_the_motor_s_torque_and_friction_of_what_is_left():
     drive = Drive(GearMotor(gear_ratio=10.0, gear_efficiency=0.8, coulomb_friction=2e-3, viscous_friction=1e-5))
     low, high = torque_limits(drive, [-20.0, 0.0, 20.0], 0.1)
-    friction = 2e-3 + 1e-5 * 200.0
-    driving, braking = 8.0 * (0.0042 - friction), 12.5 * (0.0042 + friction)
-    np.testing.assert_allclose(high, [braking, 8.0 * (0.0042 - 2e-3), driving], rtol=1e-12)
+    motor, friction = 0.042 * 0.1, 2e-3 + 1e-5 * 200.0
+    expected = [motor / 0.8 + friction, 0.8 * motor - 2e-3, 0.8 * motor - friction]
+    np.testing.assert_allclose(high, 10.0 * np.array(expected), rtol=1e-12)
     np.testing.assert_allclose(low, -high[::-1], rtol=1e-12)
+
+
+LOSSY = GearMotor(gear_ratio=20.0, gear_efficiency=0.7, coulomb_friction=3e-3, viscous_friction=4e-6)
+
+
+def hinge(drive, inertia):
+    """A hinge behind a motor that is asked for all it can [compiled model, its data]."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep, spec.compiler.boundmass = 5e-5, 0.0
+    body = spec.worldbody.add_body(explicitinertial=True, mass=1.0, inertia=[inertia] * 3)
+    body.add_joint(name="hinge", axis=[0.0, 0.0, 1.0])
+    spec.add_actuator(target="hinge", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
+    model = codrl_mj.motorise(spec, {"hinge": drive}).compile()
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 1e3
+    return model, data
+
+
+@pytest.mark.parametrize("most", [math.inf, 1.0], ids=["voltage alone", "and current"])
+@pytest.mark.parametrize("share", [-1.2, -0.5, 0.01, 0.5, 0.9, 1.2])
+def test_the_limits_are_what_moves_a_hinge_in_the_engine(share, most):
+    """At speeds that a heavy load keeps, as shares of the no-load speed."""
+    drive = Drive(LOSSY, SampledLoop(max_current=most))
+    model, data = hinge(drive, 100.0)
+    data.qvel[:] = share * abilities(drive).no_load_speed
+    mujoco.mj_step(model, data, 200)
+    speed = data.qvel[0]
+    mujoco.mj_step(model, data)
+    moved = data.qacc[0] * (100.0 + drive.additions.armature)
+    assert moved == pytest.approx(torque_limits(drive, speed, most)[1], rel=1e-5)
+    if share == 0.01 and most == math.inf:
+        assert moved == pytest.approx(abilities(drive).stall_torque, rel=0.02)
+
+
+def test_a_free_hinge_runs_at_the_no_load_speed_with_the_no_load_current():
+    drive = Drive(LOSSY)
+    model, data = hinge(drive, 1e-9)
+    mujoco.mj_step(model, data, 20_000)
+    can = abilities(drive)
+    assert data.qvel[0] == pytest.approx(can.no_load_speed, rel=1e-6)
+    assert codrl_mj.signals(model, data)["current"] == pytest.approx(can.no_load_current, rel=1e-5)
 
 
 def test_the_limits_cross_zero_at_the_no_load_speed():

@@ -1,0 +1,281 @@
+"""Writes docs/actuators_in_numbers.md and its two CSV files: what every actuator that has a name does on a bench.
+
+Torques and speeds are measured in the engine, on one hinge: blocked, turned slowly by a heavy load, or free. The loops
+of the catalogue's motors and their continuous torques are `codrl_mj.motor_design`'s. `make docs` runs it; a
+test compares the files with what it would write.
+"""
+
+import argparse
+import csv
+import dataclasses
+import functools
+import math
+import sys
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+import codrl_mj
+from codrl_mj.actuators import NAMED, Drive
+from codrl_mj.catalogue import motor_entry, motor_names
+from codrl_mj.motor_design import design, find_drive, torque_limits
+from codrl_mj.runs.files import writing
+from codrl_mj.tasks import TASKS, named_actuator
+
+FOLDER = Path(__file__).parent.parent / "docs"
+PAGE = "actuators_in_numbers.md"
+TABLES = {"tasks": "actuators_in_numbers_tasks.csv", "motors": "actuators_in_numbers_motors.csv"}
+BLOCKED = 1e12
+"""Inertia [kg*m^2] that nothing here turns."""
+LONG = 200.0
+"""Time [s] after which the slowest of the tasks' loops has settled."""
+
+
+class Bench:
+    """One hinge that an actuator drives.
+
+    Args:
+        actuator: any family's.
+        timestep: integration step [s].
+        inertia: of the load [kg*m^2].
+    """
+
+    def __init__(self, actuator: Any, timestep: float, inertia: float) -> None:
+        """Build it."""
+        spec = mujoco.MjSpec()
+        spec.option.timestep, spec.compiler.boundmass = timestep, 0.0
+        body = spec.worldbody.add_body(explicitinertial=True, mass=1.0, inertia=[inertia] * 3)
+        body.add_joint(name="hinge", axis=[0.0, 0.0, 1.0])
+        spec.add_actuator(target="hinge", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
+        self._model = codrl_mj.motorise(spec, {"hinge": actuator}).compile()
+        self._data = mujoco.MjData(self._model)
+        self._inertia = inertia + actuator.additions.armature
+
+    def run(self, torque: float, duration: float, speed: float = 0.0) -> np.ndarray:
+        """Ask for a torque from rest of the actuator.
+
+        Args:
+            torque: desired, at the joint [N*m].
+            duration: [s].
+            speed: of the joint at the start [rad/s].
+
+        Returns:
+            Shape (steps, 3): the actuator's torque [N*m] in each step, that which accelerates the hinge [N*m], and its
+            speed [rad/s] after the step.
+        """
+        model, data = self._model, self._data
+        mujoco.mj_resetData(model, data)
+        data.ctrl[:], data.qvel[:] = torque, speed
+        rows = np.empty((max(round(duration / model.opt.timestep), 1), 3))
+        for row in rows:
+            mujoco.mj_step(model, data)
+            row[:] = data.qfrc_actuator[0], data.qacc[0] * self._inertia, data.qvel[0]
+        return rows
+
+
+def settled(torques: np.ndarray, band: float) -> int:
+    """The first step from which on the torque, shape (steps,), stays within a share of its last."""
+    wrong = np.flatnonzero(np.abs(torques / torques[-1] - 1.0) > band)
+    return int(wrong[-1]) + 1 if len(wrong) else 0
+
+
+def free_run(actuator: Any, timestep: float, inertia: float, time_constant: float) -> tuple[float, float]:
+    """No-load speed [rad/s] of the joint and the time constant [s] in which it is reached.
+
+    That is the area between speed and no-load speed over the latter: the sum of all time constants less none of the
+    winding's, whatever its inductance; torque and back-EMF are of the speed at a step's start, and so is the sum.
+
+    Args:
+        actuator: whose.
+        timestep: [s].
+        inertia: of the load [kg*m^2].
+        time_constant: about the one to be found [s], for how long to look.
+    """
+    speeds = Bench(actuator, timestep, inertia).run(1e6, 20.0 * time_constant)[:, 2]
+    return float(speeds[-1]), float(timestep * (1.0 + np.sum(1.0 - speeds / speeds[-1])))
+
+
+def task_row(task: str, name: str) -> dict[str, Any]:
+    """What a named actuator does on a task's bench: a torque step to the task's largest force, stall, free run."""
+    spec, actuator = TASKS[task], named_actuator(name, task)
+    timestep, motor = spec.step_duration / spec.motor_inner_steps, actuator.motor
+    asked, blocked = float(spec.max_forces[0]), Bench(actuator, timestep, BLOCKED)
+    torques = blocked.run(asked, LONG)[:, 0]
+    row: dict[str, Any] = {"task": task, "actuator": name}
+    for band in (5, 2):
+        seconds = settled(torques, band / 100) * timestep
+        row |= {f"settled_{band}_steps": seconds / spec.step_duration, f"settled_{band}_s": seconds}
+    product = motor.torque_constant * motor.back_emf_constant / motor.resistance / actuator.arm_radius**2
+
+    return row | {
+        "first_step_percent": 100.0 * torques[spec.motor_inner_steps - 1] / asked,
+        "steady_error_percent": round(100.0 * (torques[-1] / asked - 1.0), 6) + 0.0,
+        "stall_torque": blocked.run(1e6, 50.0 * motor.electrical_time_constant)[-1, 0],
+        "no_load_speed": free_run(actuator, timestep, 50.0 * timestep * product, 50.0 * timestep)[0],
+        "slide": _on_a_slide(task),
+    }
+
+
+@functools.cache
+def _on_a_slide(task: str) -> bool:
+    environment: Any = codrl_mj.EnvConfig(task, "ideal").make()
+    model = environment.unwrapped.model
+    kind = model.jnt_type[model.actuator(TASKS[task].motors[0]).trnid[0]]
+    environment.close()
+    return bool(kind == mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+def motor_row(name: str) -> dict[str, Any]:
+    """What a motor of the catalogue does at its own gear, at the output, by its nominal voltage or 24 V."""
+    drive, numbers = find_drive(name), motor_entry(name).numbers
+    loop = design(drive)
+    free = dataclasses.replace(drive, controller=dataclasses.replace(drive.controller, max_current=math.inf))
+    speed, time_constant = _free(free)
+    continuous = numbers.continuous_current
+    return {
+        "motor": name,
+        "gear_ratio": numbers.gear_ratio,
+        "voltage": drive.voltage_limit,
+        "settled_2_ms": 1e3 * loop.settling_time,
+        "bandwidth_hz": loop.bandwidth,
+        "stall_torque": _stall(free, speed),
+        "no_load_speed": speed,
+        "continuous_torque": math.nan if continuous is None else float(torque_limits(free, 0.0, continuous)[1]),
+        "mechanical_time_constant_ms": math.nan if numbers.rotor_inertia is None else 1e3 * time_constant,
+    }
+
+
+def _free(drive: Drive) -> tuple[float, float]:
+    """`free_run` of the rotor alone; where its inertia is not known, of a load that takes 20 ms."""
+    motor, rate = drive.motor, drive.controller.sample_rate
+    product = motor.torque_constant * motor.back_emf_constant * motor.gear_efficiency / motor.resistance
+    known = motor.rotor_inertia > 0.0
+    time_constant = motor.rotor_inertia / product if known else 0.02
+    timestep = max(math.floor(time_constant / 100.0 * rate), 1) / rate
+    inertia = 1e-13 if known else 0.02 * product / drive.arm_radius**2
+    return free_run(drive, timestep, inertia, time_constant)
+
+
+def _stall(drive: Drive, no_load_speed: float) -> float:
+    """Torque [N*m] of the output that just turns, by its line through 1 and 2 % of the no-load speed."""
+    duration = max(50.0 * drive.motor.electrical_time_constant, 2e-3)
+    most = drive.motor.torque_constant * drive.voltage_limit / drive.motor.resistance / drive.arm_radius
+    bench = Bench(drive, 1.0 / drive.controller.sample_rate, 1e4 * most * duration / no_load_speed)
+    slow, less_slow = (bench.run(1e6, duration, share * no_load_speed)[-1, 1] for share in (0.01, 0.02))
+    return float(2.0 * slow - less_slow)
+
+
+def rows() -> dict[str, list[dict[str, Any]]]:
+    """Both tables."""
+    named = [name for name in NAMED if name != "ideal"]
+    return {
+        "tasks": [task_row(task, name) for task in TASKS for name in named],
+        "motors": [motor_row(name) for name in motor_names()],
+    }
+
+
+def _number(value: Any, digits: int = 3) -> str:
+    """A number for people: without the last digits, and – where there is none."""
+    value = float(value)
+    if not math.isfinite(value):
+        return "–"
+    return f"{value:,.0f}" if abs(value) >= 10**digits else f"{value + 0.0:.{digits}g}"
+
+
+def _table(heads: Iterable[str], body: Iterable[Iterable[str]]) -> str:
+    lines = [list(heads), *([["---"] * len(list(heads))]), *map(list, body)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def page(tables: Mapping[str, list[dict[str, str]]]) -> str:
+    """The Markdown page, from the rows of the CSV files."""
+    units = {"False": ("N·m", "rad/s"), "True": ("N", "m/s")}
+    tasks = []
+    for row in tables["tasks"]:
+        force, speed = units[row["slide"]]
+        numbers = [_number(row[f"settled_{band}_{unit}"]) for band in (5, 2) for unit in ("steps", "s")]
+        numbers += [_number(row[name]) for name in ("first_step_percent", "steady_error_percent")]
+        limits = f"{_number(row['stall_torque'])} {force}", f"{_number(row['no_load_speed'])} {speed}"
+        tasks.append([f"{row['task']}", f"`{row['actuator']}`", *numbers, *limits])
+    motors = [[f"`{row['motor']}`", *(_number(row[name]) for name in list(row)[1:])] for row in tables["motors"]]
+    heads = (
+        "task",
+        "actuator",
+        "5 % [steps]",
+        "[s]",
+        "2 % [steps]",
+        "[s]",
+        "first step [%]",
+        "steady error [%]",
+        "stall",
+        "no load",
+    )
+    motor_heads = ("motor", "gear", "V", "2 % [ms]", "bandwidth [Hz]", "stall [N·m]", "no load [rad/s]")
+    return f"""# Actuators in numbers
+
+Written by `make docs` from runs in the engine on a bench, one hinge. Raw numbers:
+[tasks]({TABLES["tasks"]}), [motors]({TABLES["motors"]}).
+
+## Named actuators, on each task
+
+The joint is blocked, and the task's largest force is asked for, from rest.
+
+- **5 %, 2 %**: when the force comes to within that of its last value for good, in steps of the policy and in seconds
+  after the first of them began; 0 is within the first integration step.
+- **First step**: what is there at the end of the policy's first step, of what was asked for.
+- **Steady error**: of the last value, after {LONG:g} s, against what was asked for.
+- **Stall**: the blocked joint's force when more is asked for than there is. **No load**: the free joint's speed then.
+
+`ideal` delivers all at once, without a limit.
+
+{_table(heads, tasks)}
+
+## Motors of the catalogue, each at its own gear
+
+At the nominal voltage (24 V where none is printed), with a loop at 20 kHz of the default bandwidth. Torques are past
+friction, limits are those of the voltage and not of the drive's largest current; –: not printed, so not known. Stall,
+no load and τm are measured in the engine; the loop's two columns and the continuous torque are
+`codrl_mj.motor_design`'s.
+
+- **2 %**: when the current of a small step comes to within that for good. **Bandwidth**: where the closed loop's gain
+  is -3 dB. Both are alike, because gains are designed for the winding.
+- **Stall**: torque of the output that just turns. **No load**: speed of the free output.
+- **Continuous**: torque of the output that just turns, at the current that the winding bears for good.
+- **τm**: time constant with which the free output comes up to speed, the area that is missing over the speed: of a
+  motor alone R·J/(kT·kE), behind a gear with losses longer.
+
+{_table((*motor_heads, "continuous [N·m]", "τm [ms]"), motors)}
+"""
+
+
+def _write(measured: list[dict[str, Any]], path: Path) -> list[dict[str, str]]:
+    """Write a table, and return its rows as they stand there."""
+    texts = [
+        {key: f"{value:.6g}" if isinstance(value, float) else f"{value}" for key, value in row.items()}
+        for row in measured
+    ]
+    with writing(path) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(texts[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(texts)
+    return texts
+
+
+def main() -> int:
+    """Write the page and its tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=FOLDER, help="folder for the files")
+    options = parser.parse_args()
+    tables = {kind: _write(measured, options.out / TABLES[kind]) for kind, measured in rows().items()}
+    with writing(options.out / PAGE) as temporary:
+        temporary.write_text(page(tables))
+    print("\n".join(f"wrote {options.out / name}" for name in TABLES.values()))
+    print(f"wrote {options.out / PAGE}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
