@@ -122,10 +122,14 @@ class EnvConfig:
         """The longest episode [environment steps]; None for any."""
         return self.max_episode_steps or find_task(self.task).max_episode_steps
 
+    @property
+    def interface(self) -> dict[str, Any]:
+        """The fields that say what a policy commands and observes: it can do nothing else once it is trained."""
+        return {name: getattr(self, name) for name in ("action", "levels", "observe_actuator")}
+
     def seen_as(self, trained: "EnvConfig") -> "EnvConfig":
         """This environment with the actions and observations of another: those that a policy was trained with."""
-        interface = {name: getattr(trained, name) for name in ("action", "levels", "observe_actuator")}
-        return dataclasses.replace(self, **interface)
+        return dataclasses.replace(self, **trained.interface)
 
     def as_arguments(self) -> dict[str, Any]:
         """The keyword arguments for `gymnasium.make` with the task's id, without those left at their defaults."""
