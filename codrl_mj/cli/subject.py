@@ -31,8 +31,8 @@ class Subject:
             if (value := env.interface[name]) != trained:
                 flag = f"--env.{name.replace('_', '-')}"
                 raise ValueError(
-                    f"{flag} = {value!r}: the policy of {self.run} was trained with {trained!r} and knows nothing else: "
-                    f"leave {flag} out, or train one with it"
+                    f"{flag} = {value!r}: the policy of {self.run} was trained with {trained!r} and knows nothing "
+                    f"else: leave {flag} out, or train one with it"
                 )
 
 

@@ -22,7 +22,6 @@ from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
 from codrl_mj.physics.streams import Streams
 from codrl_mj.physics.variation import DRAWN, VARIED, field_of, write_fields
 from codrl_mj.tasks import Task, find_task
-from codrl_mj.tasks.attributes import Attribute
 
 Array = np.ndarray
 
@@ -162,15 +161,15 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         value = getattr(self, name)
         return (value(*args, **kwargs),) * self.num_envs if callable(value) else self.get_attr(name)
 
-    def _read_attribute(self, attribute: Attribute) -> Any:
+    def _read_attribute(self, name: str) -> Any:
         """One value where the environments share it, else shape (N,)."""
-        if shared(attribute):
-            return read(attribute, self.setup, self.physics.model)
-        return np.array([read(attribute, self.setup, model) for model in self.physics.models()])
+        if shared(self.task.attributes[name]):
+            return read(name, self.setup, self.physics.model)
+        return np.array([read(name, self.setup, model) for model in self.physics.models()])
 
-    def _write_attribute(self, attribute: Attribute, name: str, value: Any) -> None:
-        if shared(attribute):
-            if not np.array_equal(value, present := self._read_attribute(attribute)):
+    def _write_attribute(self, name: str, value: Any) -> None:
+        if shared(self.task.attributes[name]):
+            if not np.array_equal(value, present := self._read_attribute(name)):
                 raise AttributeError(
                     f"{name} = {value!r}: the environments share it, as {present!r}; use vectorization_mode='sync'"
                 )
@@ -183,7 +182,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         numbers = np.broadcast_to(value, self.num_envs).tolist()
         for row, (model, number) in enumerate(zip(self.physics.models(), numbers, strict=True)):
             write_fields(model, looks, row)
-            written(attribute, name, number, self.setup, model)
+            written(name, number, self.setup, model)
             for field, rows in (fields | looks).items():
                 rows[row] = field_of(model, field)
         kept = self.physics.snapshot()
