@@ -71,8 +71,8 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
 
     Args:
         given: a name of `NAMED`, `FAMILIES` or the catalogue of motors, a motor's TOML file, `module:NAME` of an
-            actuator or a family, a YAML or JSON file of fields, an actuator, a mapping of its fields (with a `name`,
-            over that actuator's), or None (ideal).
+            actuator or a family, a YAML or JSON file of such a mapping, an actuator, a mapping of its fields (with a
+            `name`, over that actuator's), or None (ideal). Files may be given as a `pathlib.Path`.
         paper: the actuator that the names vary; None where there is none.
         whose: whose it is, for messages.
 
@@ -88,6 +88,8 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
         return actuator_over(resolve(given["name"], paper, whose), changes)
     if isinstance(given, Mapping):
         return actuator_from_mapping(given)
+    if isinstance(given, Path):
+        given = str(given)
     if not isinstance(given, str):
         raise ValueError(
             f"actuator = {given!r}: must be a name ({', '.join(NAMED)}), an actuator or a mapping of its fields"
@@ -101,8 +103,8 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
                 f"{', '.join(FAMILIES)}"
             )
         return NAMED[given][1](paper)
-    if given not in FAMILIES and Path(given).suffix in (".yaml", ".yml", ".json"):
-        return actuator_from_file(Path(given))
+    if given not in FAMILIES and Path(given).suffix in _FILES:
+        return actuator_from_file(Path(given), paper, whose)
     from codrl_mj.catalogue import motor_entry, motor_names
 
     if given in motor_names() or Path(given).suffix == ".toml":
@@ -114,8 +116,16 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
     raise ValueError(f"actuator = {given!r}: {found!r} is neither an actuator nor a family of them")
 
 
-def actuator_from_file(path: Path) -> Any:
+_FILES = (".yaml", ".yml", ".json")
+
+
+def actuator_from_file(path: Path, paper: Actuator | None, whose: str) -> Any:
     """Read an actuator from a YAML or JSON file that holds a mapping of its fields.
+
+    Args:
+        path: the file; a `name` in it is that of another actuator, but no other file.
+        paper: as for `resolve`.
+        whose: as for `resolve`.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -126,7 +136,12 @@ def actuator_from_file(path: Path) -> Any:
     if not path.is_file():
         raise FileNotFoundError(f"no actuator file at {path}")
     try:
-        return actuator_from_mapping(yaml.safe_load(path.read_text()))
+        fields = yaml.safe_load(path.read_text())
+        if not isinstance(fields, Mapping):
+            raise ValueError(f"{fields!r}: must be a mapping of an actuator's fields")
+        if Path(str(fields.get("name"))).suffix in _FILES:
+            raise ValueError(f"name = {fields['name']!r}: must be an actuator's name, and no file")
+        return resolve(fields, paper, whose)
     except (yaml.YAMLError, UnicodeDecodeError, ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
 
