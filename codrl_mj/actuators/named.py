@@ -45,10 +45,8 @@ def find_family(name: str) -> Family:
     Raises:
         ValueError: there is none; the nearest known name is suggested.
     """
-    family = look_up(name, FAMILIES, "family")
-    if isinstance(family, type) and issubclass(family, ActuatorModel):
-        return family
-    raise ValueError(f"family {name!r}: {family!r} is no subclass of codrl_mj.ActuatorModel")
+    family: Family = look_up(name, FAMILIES, "family", of=ActuatorModel)
+    return family
 
 
 def actuator_from_mapping(mapping: Mapping[str, Any]) -> Any:

@@ -236,8 +236,8 @@ def test_a_mapping_that_its_family_cannot_read_is_refused(mapping, message):
     [
         ("nowhere_at_all:Mine", "'nowhere_at_all:Mine': No module named 'nowhere_at_all'; must be module:NAME"),
         (f"{__name__}:Yours", "has no attribute 'Yours'; must be module:NAME, of a module that Python finds"),
-        (f"{__name__}:Motor", "is no subclass of codrl_mj.ActuatorModel"),
-        (f"{__name__}:MINE", "is no subclass of codrl_mj.ActuatorModel"),
+        (f"{__name__}:Motor", "is no subclass of codrl_mj's ActuatorModel"),
+        (f"{__name__}:MINE", "is no subclass of codrl_mj's ActuatorModel"),
     ],
 )
 def test_a_place_where_there_is_no_family_is_refused(place, message):
