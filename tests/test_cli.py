@@ -19,7 +19,7 @@ from codrl_mj.actuators import NAMED
 from codrl_mj.agents.presets import PRESETS
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.evaluation import evaluate, make_env, run_episodes
+from codrl_mj.evaluation import evaluate, run_episodes
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.training import TrainConfig, folder, load_config
 from tests.matrix import but
@@ -167,7 +167,7 @@ def test_fields_are_set_over_the_named_actuator(tmp_path):
 def test_evaluation_is_that_of_the_package(capsys, trained, tmp_path):
     assert main(["evaluate", str(trained), "--episodes", "7", "--seed", "5", "--out", "a/result.json"]) == 0
     result = json.loads((tmp_path / "a" / "result.json").read_text())
-    make = lambda: make_env("cartpole", "weaker")  # noqa: E731
+    make = EnvConfig("cartpole", "weaker").make
     totals = [episode.total for episode in run_episodes(load_policy(trained), make, 7, seed=5)]
     assert result["returns"]["mean"] == pytest.approx(np.mean(totals), rel=1e-12)
     assert result["returns"] == result["length"]  # 1 a step

@@ -31,7 +31,6 @@ from codrl_mj import (
 )
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig, upgraded
-from codrl_mj.evaluation import make_env
 
 PAGE = (Path(__file__).parent.parent / "docs" / "randomization.md").read_text()
 RANDOMIZE = {
@@ -73,7 +72,7 @@ def test_every_form_is_the_same_configuration(given):
 
 def test_environments_draw_from_it():
     ours = EnvConfig("cartpole", randomize=WRITTEN).make()
-    theirs = make_env("cartpole", "paper", randomize=RANDOMIZE)
+    theirs = gymnasium.make("codrl_mj/CartPole-v0", randomize=RANDOMIZE)
     assert ours.reset(seed=3)[1]["randomization"] == theirs.reset(seed=3)[1]["randomization"]
 
 
