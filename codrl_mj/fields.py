@@ -126,9 +126,18 @@ def check_names(given: Iterable[Any], known: Iterable[str], what: str, prefix: s
     known = list(known)
     for name in given:
         if name not in known:
-            near = difflib.get_close_matches(str(name), known, n=1)
+            near = _nearest(name, known)
             hint = f"did you mean {prefix}{near[0]}?" if near else f"known: {', '.join(known)}"
             raise ValueError(f"unknown {what} {prefix}{name}; {hint}")
+
+
+def did_you_mean(name: object, known: Iterable[str]) -> str:
+    """A question with the nearest known name and a space, for the message about an unknown one; or nothing."""
+    return "".join(f"did you mean {near!r}? " for near in _nearest(name, known))
+
+
+def _nearest(name: object, known: Iterable[str]) -> list[str]:
+    return difflib.get_close_matches(str(name), list(known), n=1)
 
 
 def build(cls: type, mapping: object, what: str, prefix: str = "") -> Any:

@@ -1,6 +1,5 @@
 """Puts actuators of ours into models of anybody's: `motorise`."""
 
-import difflib
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 from codrl_mj.actuators import ActuatorModel, reference, resolve
 from codrl_mj.engine.families import load_family, user_head
 from codrl_mj.engine.reading import check_shafts
+from codrl_mj.fields import did_you_mean
 from codrl_mj.plugin import FAMILY, NAME
 
 _JOINT = {mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT}
@@ -91,11 +91,9 @@ def _chosen(spec: mujoco.MjSpec, actuators: Mapping[str, Any]) -> dict[int, tupl
         matched = [index for index, own in enumerate(names) if any(re.fullmatch(pattern, name) for name in own)]
         if not matched:
             known = list(dict.fromkeys(name for own in names for name in own))
-            near = difflib.get_close_matches(pattern, known, n=1)
-            hint = f"did you mean {near[0]!r}? " if near else ""
             raise ValueError(
-                f"{pattern!r}: no actuator has such a name, nor drives anything that has; {hint}there are "
-                f"{', '.join(known) or 'none'}"
+                f"{pattern!r}: no actuator has such a name, nor drives anything that has; "
+                f"{did_you_mean(pattern, known)}there are {', '.join(known) or 'none'}"
             )
         joints: dict[str, int] = {}
         for index in matched:

@@ -29,8 +29,15 @@ from codrl_mj.tasks import TASKS
 _FULL_STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 
 TASK_NAME = "gym"
-ALL_TASKS = tuple((name, TASK_NAME) for name in TASKS)
-"""Every (domain, task) that `load` knows."""
+_PAPER = object()
+"""The actuator where none is given: `paper`, or a configuration's own."""
+
+
+def __getattr__(name: str) -> Any:
+    """`ALL_TASKS`: every (domain, task) that `load` knows by name at present, tasks of one's own included."""
+    if name == "ALL_TASKS":
+        return tuple((domain, TASK_NAME) for domain in TASKS)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 class Physics(dm_mujoco.Physics):
@@ -200,7 +207,7 @@ class GymTask(control.Task):
 def load(
     domain_name: str | EnvConfig,
     task_name: str = TASK_NAME,
-    actuator: Any = "paper",
+    actuator: Any = _PAPER,
     task_kwargs: Mapping[str, Any] | None = None,
     environment_kwargs: Mapping[str, Any] | None = None,
     **options: Any,
@@ -210,11 +217,12 @@ def load(
     Args:
         domain_name: task name, such as `pendulum`; or an environment's whole configuration.
         task_name: `gym`.
-        actuator: as for `codrl_mj.envs.ActuatedEnv`.
+        actuator: as for `codrl_mj.envs.ActuatedEnv`, `paper` unless given; over a configuration's.
         task_kwargs: `random`: a seed or a `numpy.random.Generator` for the initial states.
         environment_kwargs: arguments of `dm_control.rl.control.Environment`, such as `flat_observation`.
-        **options: the other fields of `codrl_mj.envs.config.EnvConfig`, and the task's own options. What was drawn for
-            an episode is in the attribute `randomization` of the environment's task.
+        **options: the other fields of `codrl_mj.envs.config.EnvConfig`, and the task's own options, over a
+            configuration's. What was drawn for an episode is in the attribute `randomization` of the environment's
+            task.
 
     Returns:
         The environment. An episode ends with discount 0 where the task says so and with discount 1 at the time limit,
@@ -228,7 +236,11 @@ def load(
     given = task_kwargs or {}
     if given.keys() - {"random"}:
         raise ValueError(f"task_kwargs = {dict(given)!r}: may only hold 'random'")
-    config = domain_name if isinstance(domain_name, EnvConfig) else EnvConfig.of(domain_name, actuator, options)
+    if isinstance(domain_name, EnvConfig):
+        over = options if actuator is _PAPER else {"actuator": actuator, **options}
+        config = EnvConfig.from_mapping(over, domain_name)
+    else:
+        config = EnvConfig.of(domain_name, "paper" if actuator is _PAPER else actuator, options)
     setup = Setup.build(config)
     simulation = setup.simulate(config.physics)
     if not isinstance(simulation, MujocoPhysics):

@@ -5,13 +5,12 @@ Cross-validates CartPole against Gymnasium, trains the same agent twice (on the 
 """
 
 import argparse
-import functools
 import sys
 from pathlib import Path
 
 from codrl_mj.cli.terminal import print_checks, print_evaluations, progress_bar, training_bars
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.evaluation import make_env, run_episodes, summarize
+from codrl_mj.evaluation import run_episodes, summarize
 from codrl_mj.films.film import Panel, film
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.study.grid import train_runs
@@ -73,7 +72,7 @@ def main() -> int:
         policy = load_policy(out)
         for deployed in ("ideal", REAL):
             motor = named_actuator(deployed, TASK)
-            episodes = run_episodes(policy, functools.partial(make_env, TASK, motor), options.episodes)
+            episodes = run_episodes(policy, EnvConfig(TASK, motor).make, options.episodes)
             evaluations[f"trained on {trained}, run on {deployed}"] = summarize(TASK, episodes)
             if deployed == REAL:
                 title = f"trained on {trained}: {episodes[0].total:.0f} of 500"

@@ -19,7 +19,7 @@ from codrl_mj.actuators import NAMED
 from codrl_mj.agents.presets import PRESETS
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.evaluation import evaluate, make_env, run_episodes
+from codrl_mj.evaluation import evaluate, run_episodes
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.training import TrainConfig, folder, load_config
 from tests.matrix import but
@@ -167,7 +167,7 @@ def test_fields_are_set_over_the_named_actuator(tmp_path):
 def test_evaluation_is_that_of_the_package(capsys, trained, tmp_path):
     assert main(["evaluate", str(trained), "--episodes", "7", "--seed", "5", "--out", "a/result.json"]) == 0
     result = json.loads((tmp_path / "a" / "result.json").read_text())
-    make = lambda: make_env("cartpole", "weaker")  # noqa: E731
+    make = EnvConfig("cartpole", "weaker").make
     totals = [episode.total for episode in run_episodes(load_policy(trained), make, 7, seed=5)]
     assert result["returns"]["mean"] == pytest.approx(np.mean(totals), rel=1e-12)
     assert result["returns"] == result["length"]  # 1 a step
@@ -203,6 +203,24 @@ def test_commands_and_observations_are_those_of_the_training(capsys, tmp_path):
     film = ["--out", "film.gif", "--width", "200", "--height", "120", "--env.max-episode-steps", "2"]
     assert main(["render", "volts", *film]) == 0
     assert main(["render", "cartpole", *levels, *film]) == 0
+    assert main(["evaluate", "volts", *levels, "--episodes", "2", "--out", "said.json"]) == 0
+    alone = tmp_path / "alone"  # without a run folder to say so, the flags do
+    alone.mkdir()
+    for name in ("policy.json", "policy.safetensors"):
+        shutil.copy(tmp_path / "volts" / name, alone)
+    flags = ["--task", "cartpole", "--actuator", "paper", *levels, "--episodes", "2", "--out", "alone.json"]
+    assert main(["evaluate", "alone", *flags]) == 0
+    results = [(tmp_path / f"{name}.json").read_text() for name in ("result", "said", "alone")]
+    assert results == results[:1] * 3
+
+
+@pytest.mark.parametrize("verb", ["evaluate", "render"])
+@pytest.mark.parametrize("flags", ["--env.action current", "--env.levels -1 1", "--env.observe-actuator"])
+def test_a_policy_commands_and_observes_nothing_but_what_it_was_trained_with(capsys, trained, verb, flags):
+    error = refused(capsys, verb, str(trained), *flags.split())
+    flag = flags.split()[0]
+    assert f"{flag} = " in error
+    assert f"leave {flag} out" in error
 
 
 def test_a_run_is_evaluated_in_the_environment_of_its_training(tmp_path):

@@ -61,8 +61,8 @@ EXPECTED = "must be uniform(LOW, HIGH), loguniform(LOW, HIGH) or choice(VALUE, .
     ("text", "message"),
     [
         ("gauss(0, 1)", f"'gauss(0, 1)' is no distribution: it {EXPECTED}"),
-        ("unifrom(0, 1)", f"'unifrom(0, 1)' is no distribution: did you mean uniform? It {EXPECTED}"),
-        ("Uniform(low=0.0, high=1.0)", "'Uniform(low=0.0, high=1.0)' is no distribution: did you mean uniform? It "),
+        ("unifrom(0, 1)", f"'unifrom(0, 1)' is no distribution: did you mean 'uniform'? it {EXPECTED}"),
+        ("Uniform(low=0.0, high=1.0)", "'Uniform(low=0.0, high=1.0)' is no distribution: did you mean 'uniform'? it "),
         ("", f"'' is no distribution: {EXPECTED}"),
         ("0.3", f"'0.3' is no distribution: {EXPECTED}"),
         ("uniform(0, 1", f"'uniform(0, 1' is no distribution: {EXPECTED}"),

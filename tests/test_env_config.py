@@ -31,7 +31,6 @@ from codrl_mj import (
 )
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig, upgraded
-from codrl_mj.evaluation import make_env
 
 PAGE = (Path(__file__).parent.parent / "docs" / "randomization.md").read_text()
 RANDOMIZE = {
@@ -73,7 +72,7 @@ def test_every_form_is_the_same_configuration(given):
 
 def test_environments_draw_from_it():
     ours = EnvConfig("cartpole", randomize=WRITTEN).make()
-    theirs = make_env("cartpole", "paper", randomize=RANDOMIZE)
+    theirs = gymnasium.make("codrl_mj/CartPole-v0", randomize=RANDOMIZE)
     assert ours.reset(seed=3)[1]["randomization"] == theirs.reset(seed=3)[1]["randomization"]
 
 
@@ -196,6 +195,65 @@ def test_fields_are_set_over_another_one_s():
         joint=Joint(damping=1.0, friction=0.5),
         options={"center_radius": 0.3},
     )
+
+
+def test_over_one_of_another_task_what_is_not_given_is_that_tasks():
+    pole = EnvConfig(
+        "cartpole",
+        "weak",
+        action="voltage",
+        levels=(-1, 1),
+        inner_steps=3,
+        integrator="semi-implicit",
+        max_episode_steps=9,
+        disturbances={"command_delay": 0.1},
+        joint={"damping": 1.0},
+        options={"center_radius": 0.3},
+    )
+    kept = {"action": "voltage", "disturbances": {"command_delay": 0.1}, "joint": {"damping": 1.0}}
+    assert EnvConfig.from_mapping({"task": "pendulum"}, pole) == EnvConfig("pendulum", "paper", **kept)
+    given = {"task": "pendulum", "actuator": "weaker", "inner_steps": 2, "joint": {"friction": 0.5}}
+    kept["joint"] = {"damping": 1.0, "friction": 0.5}
+    assert EnvConfig.from_mapping(given, pole) == EnvConfig("pendulum", "weaker", inner_steps=2, **kept)
+    assert EnvConfig.from_mapping({"task": "cartpole"}, pole) == pole
+
+
+def test_numpys_numbers_are_numbers():
+    given = EnvConfig(
+        "cartpole",
+        Actuator(Motor(np.float32(0.5))),
+        inner_steps=np.int64(4),
+        action="voltage",
+        levels=np.array([-1.5, 0.0, 1.5], dtype=np.float32),
+        observe_actuator=np.True_,
+        max_episode_steps=np.int32(7),
+        disturbances={"command_delay": np.float32(0.5)},
+        joint={"damping": np.float64(0.25)},
+        options={"center_radius": np.float32(0.5), "sutton_barto_reward": np.True_},
+    )
+    plain = EnvConfig(
+        "cartpole",
+        Actuator(Motor(0.5)),
+        inner_steps=4,
+        action="voltage",
+        levels=(-1.5, 0.0, 1.5),
+        observe_actuator=True,
+        max_episode_steps=7,
+        disturbances={"command_delay": 0.5},
+        joint={"damping": 0.25},
+        options={"center_radius": 0.5, "sutton_barto_reward": True},
+    )
+    assert (given, hash(given)) == (plain, hash(plain))
+    assert json.dumps(given.as_mapping()) == json.dumps(plain.as_mapping())
+    assert json.dumps(EnvConfig("cartpole", timestep=np.float64(0.01)).as_mapping())
+    listed = EnvConfig("cartpole", action="voltage", levels=[np.float64(-1), np.int64(1)])
+    assert json.dumps(listed.as_mapping()["levels"]) == "[-1.0, 1]"
+    assert EnvConfig("cartpole", action="voltage", levels=np.array([-1.0, 1.0])).make().action_space.n == 2
+    for number in (np.int64(0), np.float64(2.0), np.True_):
+        with pytest.raises(ValueError, match=rf"max_episode_steps = {number.item()!r}: must be an integer >= 1"):
+            EnvConfig("cartpole", max_episode_steps=number)
+    with pytest.raises(ValueError, match=r"center_radius = -1.0: must be a number > 0"):
+        EnvConfig("cartpole", options={"center_radius": np.float32(-1.0)})
 
 
 @pytest.mark.parametrize(

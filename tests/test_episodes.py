@@ -1,6 +1,5 @@
 """Episodes: they are those of single stepping, they repeat with their seeds, and files hold all of them."""
 
-import functools
 import pickle
 
 import gymnasium
@@ -9,7 +8,8 @@ import pytest
 
 from codrl_mj import TASKS, Actuator, Ideal, Supply, Uniform, named_actuator
 from codrl_mj.actuators import IDEAL
-from codrl_mj.evaluation.episodes import RandomPolicy, load_episode, make_env, run_episodes, save_episode
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.evaluation.episodes import RandomPolicy, load_episode, run_episodes, save_episode
 from codrl_mj.physics import signal_names, trace_names
 
 ARRAYS = ("time", "state", "observation", "action", "reward")
@@ -29,7 +29,7 @@ class Leaner:
 
 
 def cartpole(actuator="weaker", **options):
-    return lambda: make_env("cartpole", actuator, **options)
+    return EnvConfig("cartpole", actuator, **options).make
 
 
 def assert_same(first, second):
@@ -84,7 +84,7 @@ def test_an_episode_does_not_depend_on_how_many_run_beside_it():
 @pytest.mark.parametrize("actuator", ["ideal", "paper"])
 def test_an_episodes_arrays_have_the_shapes_that_it_states(task, actuator):
     definition = TASKS[task]
-    make = lambda: make_env(task, actuator, max_episode_steps=6)  # noqa: E731
+    make = EnvConfig(task, actuator, max_episode_steps=6).make
     for episode in run_episodes(RandomPolicy(task), make, episodes=2):
         assert episode.time.shape == episode.reward.shape == (6,)
         np.testing.assert_allclose(episode.time, [definition.step_duration * (step + 1) for step in range(6)])
@@ -167,7 +167,7 @@ def test_sampled_actions_repeat_with_their_seed_and_disturb_no_other():
 @pytest.mark.parametrize("task", list(TASKS))
 def test_the_trace_has_every_integration_step_and_ends_each_step_with_its_signals(task):
     count = max(3, TASKS[task].motor_inner_steps)
-    make = lambda: make_env(task, "paper", inner_steps=count, max_episode_steps=5)  # noqa: E731
+    make = EnvConfig(task, "paper", inner_steps=count, max_episode_steps=5).make
     (episode,) = run_episodes(RandomPolicy(task), make, 1, seed=2)
     env = make()
     env.reset(seed=2)
@@ -187,7 +187,7 @@ def test_the_trace_has_every_integration_step_and_ends_each_step_with_its_signal
 
 def test_episodes_know_what_was_drawn_for_them_and_what_was_commanded():
     drawn = {"motor.resistance": Uniform(0.5, 2.0)}
-    make = lambda: make_env("pendulum", "paper", randomize=drawn, action="current", max_episode_steps=3)  # noqa: E731
+    make = EnvConfig("pendulum", "paper", randomize=drawn, action="current", max_episode_steps=3).make
     policy = RandomPolicy(make().action_space)
     episodes = run_episodes(policy, make, 4)
     resistances = [episode.actuator.motor.resistance for episode in episodes]
@@ -256,7 +256,7 @@ def test_a_random_policy_needs_a_known_task_and_a_seed():
     "actuator", ["weaker", "ideal", {"motor": {"arm_radius": 0.1}, "controller": {"max_voltage": float("inf")}}]
 )
 def test_a_saved_episode_is_read_back_exactly(tmp_path, actuator):
-    make = functools.partial(make_env, "pendulum", actuator, max_episode_steps=7)
+    make = EnvConfig("pendulum", actuator, max_episode_steps=7).make
     (episode,) = run_episodes(RandomPolicy("pendulum"), make, 1)
     save_episode(episode, tmp_path / "new" / "swing.npz")
     again = load_episode(tmp_path / "new" / "swing.npz")
@@ -268,7 +268,7 @@ def test_a_saved_episode_is_read_back_exactly(tmp_path, actuator):
 
 
 def test_what_is_no_trajectory_is_refused(tmp_path):
-    make = functools.partial(make_env, "pendulum", "ideal", max_episode_steps=2)
+    make = EnvConfig("pendulum", "ideal", max_episode_steps=2).make
     (episode,) = run_episodes(RandomPolicy("pendulum"), make, 1)
     with pytest.raises(ValueError, match=r"swing\.csv: the suffix must be \.npz"):
         save_episode(episode, tmp_path / "swing.csv")

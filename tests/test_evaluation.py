@@ -4,6 +4,7 @@ import functools
 import json
 import math
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -16,7 +17,6 @@ from codrl_mj.evaluation import (
     Episode,
     RandomPolicy,
     evaluate,
-    make_env,
     run_episodes,
     summarize,
 )
@@ -219,7 +219,7 @@ def test_a_voltage_that_the_agent_commands_asks_for_no_torque():
 def test_the_saturated_share_is_that_of_voltages_at_the_limit(max_voltage):
     weaker = named_actuator("weaker", "cartpole")
     actuator = Actuator(weaker.motor, CurrentLoop(kp=0.2, ki=0.2, kff=0.5, max_voltage=max_voltage))
-    make = functools.partial(make_env, "cartpole", actuator, inner_steps=2)
+    make = EnvConfig("cartpole", actuator, inner_steps=2).make
     episodes = run_episodes(Leaner(), make, episodes=3)
     voltages = np.concatenate([episode.trace["voltage"] for episode in episodes])
     summary = summarize("cartpole", episodes)
@@ -257,7 +257,7 @@ def test_a_stalled_motor_is_measured_as_its_closed_form_says():
 def test_electrical_energy_balances_to_rounding(task, actuator):
     """An Euler step of the winding times the mean current: (u - kE*w - R*i)*(i + i')/2*dt = L*(i'^2 - i^2)/2."""
     resolved = named_actuator(actuator, task)
-    make = functools.partial(make_env, task, resolved, max_episode_steps=60)
+    make = EnvConfig(task, resolved, max_episode_steps=60).make
     episodes = run_episodes(RandomPolicy(task), make, episodes=2)
     result, motor = summarize(task, episodes), resolved.motor
     balance = 2 * (result.energy_drawn.mean - result.energy_returned.mean - result.magnetic_energy.mean)
@@ -336,7 +336,8 @@ def test_an_evaluation_is_the_summary_of_its_episodes_and_says_what_it_was_measu
     late = {"command_delay": 0.01}
     env = EnvConfig("cartpole", actuator, "analytic", inner_steps=2, disturbances=late)
     result = evaluate(Leaner(), env, episodes=3, seed=9)
-    make = functools.partial(make_env, "cartpole", actuator, physics="analytic", inner_steps=2, disturbances=late)
+    arguments = {"actuator": actuator, "physics": "analytic", "inner_steps": 2, "disturbances": late}
+    make = functools.partial(gymnasium.make, "codrl_mj/CartPole-v0", **arguments)
     expected = summarize("cartpole", run_episodes(Leaner(), make, 3, seed=9))
     for name in MEASURES:
         assert getattr(result, name) == getattr(expected, name), name
@@ -348,7 +349,9 @@ def test_an_evaluation_is_the_summary_of_its_episodes_and_says_what_it_was_measu
 def test_sampled_evaluations_repeat_with_their_seed():
     from stable_baselines3 import PPO
 
-    policy = PPO("MlpPolicy", make_env("cartpole", "paper"), n_steps=8, batch_size=8, seed=0, device="cpu").policy
+    policy = PPO(
+        "MlpPolicy", EnvConfig("cartpole", "paper").make(), n_steps=8, batch_size=8, seed=0, device="cpu"
+    ).policy
     run = functools.partial(evaluate, policy, EnvConfig("cartpole"), episodes=4, deterministic=False)
     assert run(seed=3) == run(seed=3)
     assert run(seed=3).returns != run(seed=4).returns

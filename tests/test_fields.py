@@ -9,7 +9,21 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from codrl_mj.fields import build, check, check_names, choice, factors, flag, integer, part, parts, real, reals, units
+from codrl_mj.fields import (
+    build,
+    check,
+    check_names,
+    choice,
+    did_you_mean,
+    factors,
+    flag,
+    integer,
+    part,
+    parts,
+    real,
+    reals,
+    units,
+)
 
 BOUNDS = {
     "above": (lambda value, limit: value > limit, ">"),
@@ -196,6 +210,12 @@ def test_parts_are_the_fields_that_hold_dataclasses():
 def test_what_no_mapping_of_fields_says_is_refused(mapping, message):
     with pytest.raises(ValueError, match=message):
         build(Outer, mapping, "field")
+
+
+def test_the_nearest_name_is_suggested_and_no_distant_one():
+    assert did_you_mean("pendulm", iter(["cartpole", "pendulum"])) == "did you mean 'pendulum'? "
+    assert did_you_mean(3, ["33", "cartpole"]) == "did you mean '33'? "
+    assert did_you_mean("x", ["cartpole", "pendulum"]) == did_you_mean("x", []) == ""
 
 
 @given(st.lists(st.text(max_size=5), max_size=4), st.lists(st.text(max_size=5), min_size=1, max_size=4))

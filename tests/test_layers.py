@@ -21,12 +21,12 @@ ALLOWED = {
     "plugin": set(),
     "__init__": {"plugin", "tasks"},
     "engine": {"actuators", "plugin"},
-    "specs": {"actuators", "engine", "plugin"},
-    "physics": {"actuators", "disturbances", "engine", "tasks", "tasks.assets"},
-    "envs.distributions": set(),
+    "specs": {"actuators", "engine", "fields", "plugin"},
+    "physics": {"actuators", "disturbances", "engine", "fields", "tasks", "tasks.assets"},
+    "envs.distributions": {"fields"},
     "envs.config": {"actuators", "disturbances", "envs.distributions", "fields", "tasks"},
     "envs": {
-        *("actuators", "disturbances", "engine", "envs.config", "envs.distributions", "physics", "tasks"),
+        *("actuators", "disturbances", "engine", "envs.config", "envs.distributions", "fields", "physics", "tasks"),
     },
     "suite": {"actuators", "envs", "envs.config", "physics", "tasks"},
     "agents": {"actuators", "envs", "envs.config", "fields", "physics"},
@@ -49,8 +49,8 @@ ALLOWED = {
     },
     "validation": {"actuators", "engine", "physics", "runs.files", "tasks", "tasks.assets"},
     "study": {
-        *("actuators", "disturbances", "envs.config", "evaluation", "evaluation.measures", "films", "runs.files"),
-        *("runs.policies", "tasks", "training"),
+        *("actuators", "disturbances", "envs.config", "evaluation", "evaluation.measures", "fields", "films"),
+        *("runs.files", "runs.policies", "tasks", "training"),
     },
     "rl_zoo3": set(),
     "motor_design": {"actuators", "catalogue", "fields", "runs.files"},
@@ -85,7 +85,7 @@ FOREIGN = {
     "specs": {"mujoco", "numpy"},
     "physics": {"mujoco", "numba", "numpy", "gymnasium"},
     "envs.distributions": {"numpy"},
-    "envs.config": {"gymnasium"},
+    "envs.config": {"gymnasium", "numpy"},
     "envs": {"gymnasium", "numpy", "numba", "mujoco", "stable_baselines3", "pygame"},
     "evaluation.measures": {"numpy", "scipy"},
     "runs.files": set(),
@@ -189,6 +189,10 @@ def test_nothing_imports_the_command_line():
 def test_nothing_hides_an_import_behind_type_checking():
     for path in EVERY_FILE:
         assert "TYPE_CHECKING" not in path.read_text(), path
+
+
+def test_names_are_suggested_in_one_place():
+    assert [path for path in EVERY_FILE if "difflib" in path.read_text()] == [PACKAGE / "fields.py"]
 
 
 def test_only_the_engines_room_touches_raw_memory():

@@ -15,9 +15,10 @@ from safetensors.numpy import load_file
 
 import codrl_mj
 from codrl_mj.cli import main
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.physics.registry import PHYSICS
 from codrl_mj.runs.summaries import read_run
-from codrl_mj.tasks import TASKS, reference_of
+from codrl_mj.tasks import OURS, TASKS, find_task, reference_of
 from codrl_mj.tasks.attributes import Fixed
 from codrl_mj.tasks.trials import Trials
 from codrl_mj.validation import try_mutations, validate
@@ -98,6 +99,29 @@ def test_a_task_without_a_twin_or_paper_says_so():
     with pytest.raises(ValueError, match="'weak': a variation of the paper's actuator, of which arm has none"):
         gymnasium.make(ID, actuator="weak")
     assert reference_of(arm.TASK) == "tests.own_project.arm:TASK"
+
+
+def test_a_variation_of_one_of_our_tasks_is_found_where_it_stands(monkeypatch):
+    made = dataclasses.replace(TASKS["pendulum"], name="mine", env_id="own_project/Mine-v0")
+    codrl_mj.register(made)
+    assert reference_of(made) == "mine"  # it stands nowhere
+    monkeypatch.setattr(slow_motion, "PENDULUM", made, raising=False)
+    assert EnvConfig("mine").task == "tests.own_project.slow_motion:PENDULUM"
+    assert find_task(EnvConfig("mine").task) is made
+    monkeypatch.setattr(sys.modules["__main__"], "PENDULUM", made, raising=False)
+    assert reference_of(made) == "tests.own_project.slow_motion:PENDULUM"
+    assert [reference_of(task) for task in OURS] == [task.name for task in OURS]
+
+
+def test_dm_control_lists_tasks_that_are_registered_late():
+    from codrl_mj import suite
+
+    assert ("arm", "gym") in suite.ALL_TASKS
+    codrl_mj.register(dataclasses.replace(TASKS["pendulum"], name="late", env_id="own_project/Late-v0"))
+    assert [domain for domain, _ in suite.ALL_TASKS] == list(TASKS)
+    assert ("late", "gym") in suite.ALL_TASKS
+    with pytest.raises(AttributeError, match="no attribute 'SOME_TASKS'"):
+        _ = suite.SOME_TASKS
 
 
 def test_the_physics_is_taken_by_name_and_is_another():

@@ -8,7 +8,8 @@ import pytest
 from PIL import Image
 
 from codrl_mj import TASKS, Actuator, Motor, named_actuator
-from codrl_mj.evaluation import Episode, RandomPolicy, make_env, run_episodes
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.evaluation import Episode, RandomPolicy, run_episodes
 from codrl_mj.films.film import Panel, film
 from codrl_mj.physics import signal_names
 from codrl_mj.physics.offscreen import OffscreenRenderer
@@ -23,7 +24,7 @@ SIGNALS = signal_names(Actuator)
 def played(task="cartpole", actuator="weaker", steps=20, seed=1):
     """A panel with an episode of random actions of at most `steps` steps."""
     resolved = named_actuator(actuator, task)
-    make = lambda: make_env(task, resolved, max_episode_steps=steps)  # noqa: E731
+    make = EnvConfig(task, resolved, max_episode_steps=steps).make
     (episode,) = run_episodes(RandomPolicy(task, seed), make, 1, seed)
     return Panel(f"{task} on {actuator}", task, resolved, episode)
 

@@ -17,11 +17,12 @@ from dm_control.suite.wrappers import pixels
 from dm_env import specs, test_utils
 
 from codrl_mj import suite
-from codrl_mj.actuators import NAMED, Actuator, CurrentLoop, Motor
+from codrl_mj.actuators import IDEAL, NAMED, Actuator, CurrentLoop, Motor
 from codrl_mj.engine.families import slot_size
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.views import View
 from codrl_mj.physics import SimulationDivergedError
-from codrl_mj.tasks import TASKS
+from codrl_mj.tasks import TASKS, named_actuator
 from tests.engine.models import FULL, changed
 
 VOLTAGES = (-12.0, -1.0, 0.0, 12.0)
@@ -69,6 +70,22 @@ for _domain, _task_name in suite.ALL_TASKS:
 def test_every_task_is_offered():
     assert [domain for domain, _ in suite.ALL_TASKS] == list(TASKS)
     assert {name for _, name in suite.ALL_TASKS} == {"gym"}
+
+
+def test_options_are_set_over_a_configuration():
+    config = EnvConfig("cartpole", "weak", inner_steps=4, options={"center_radius": 0.5}, max_episode_steps=7)
+    same = suite.load(config)
+    assert (same.task.setup.actuator, same.task.setup.inner_steps) == (config.actuator, 4)
+    assert same.task.setup.view.options.center_radius == 0.5
+    over = suite.load(config, actuator="weaker", inner_steps=2, sutton_barto_reward=True)
+    assert over.task.setup.actuator == named_actuator("weaker", "cartpole")
+    assert over.task.setup.inner_steps == 2
+    assert over.task.setup.view.options == (0.5, True)
+    assert suite.load(config, actuator=None).task.setup.actuator == IDEAL
+    over.reset(), same.reset()
+    assert [sum(not env.step(0).last() for _ in range(7)) for env in (over, same)] == [6, 6]
+    with pytest.raises(ValueError, match=r"unknown key env\.innersteps; did you mean env\.inner_steps"):
+        suite.load(config, innersteps=2)
 
 
 # -- the Gymnasium environment, bit for bit -----------------------------------------------------------------

@@ -8,7 +8,6 @@ films and evaluations read it. docs/actuators.md builds one.
 import contextlib
 import contextvars
 import dataclasses
-import difflib
 import functools
 import hashlib
 import importlib
@@ -421,7 +420,7 @@ def load_object(text: str) -> Any:
         raise ValueError(f"{text!r}: {error}; must be module:NAME, of a module that Python finds") from None
 
 
-def look_up(name: str, known: Mapping[str, Any], what: str, anybodys: bool = True) -> Any:
+def look_up(name: str, known: Mapping[str, Any], what: str, anybodys: bool = True, of: type | None = None) -> Any:
     """What a name stands for: a value of `known`, or what stands at `module:NAME`.
 
     Args:
@@ -429,15 +428,17 @@ def look_up(name: str, known: Mapping[str, Any], what: str, anybodys: bool = Tru
         known: ours, by name.
         what: what to call one in messages.
         anybodys: whether to import what is not ours.
+        of: the class that what is not ours has to be a subclass of; None for no matter what.
 
     Raises:
-        ValueError: unknown name; the nearest known one is suggested. Or as for `load_object`.
+        ValueError: unknown name; the nearest known one is suggested. Or no such subclass, or as for `load_object`.
     """
     if isinstance(name, str) and name in known:
         return known[name]
     if anybodys and ":" in str(name):
-        return load_object(name)
-    near = difflib.get_close_matches(str(name), known, n=1)
-    hint = f"did you mean {near[0]!r}? " if near else ""
+        found = load_object(name)
+        if of is None or (isinstance(found, type) and issubclass(found, of)):
+            return found
+        raise ValueError(f"{what} {name!r}: {found!r} is no subclass of codrl_mj's {of.__name__}")
     own = ", or module:NAME of your own" if anybodys else ""
-    raise ValueError(f"unknown {what} {name!r}: {hint}Known: {', '.join(known)}{own}")
+    raise ValueError(f"unknown {what} {name!r}: {fields.did_you_mean(name, known)}Known: {', '.join(known)}{own}")

@@ -48,10 +48,8 @@ def find_family(name: str) -> Family:
     Raises:
         ValueError: there is none; the nearest known name is suggested.
     """
-    family = look_up(name, FAMILIES, "family")
-    if isinstance(family, type) and issubclass(family, ActuatorModel):
-        return family
-    raise ValueError(f"family {name!r}: {family!r} is no subclass of codrl_mj.ActuatorModel")
+    family: Family = look_up(name, FAMILIES, "family", of=ActuatorModel)
+    return family
 
 
 def actuator_from_mapping(mapping: Mapping[str, Any]) -> Any:
@@ -74,8 +72,8 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
 
     Args:
         given: a name of `NAMED`, `FAMILIES` or the catalogue of motors, a motor's TOML file, `module:NAME` of an
-            actuator or a family, a YAML or JSON file of fields, an actuator, a mapping of its fields (with a `name`,
-            over that actuator's), or None (ideal).
+            actuator or a family, a YAML or JSON file of such a mapping, an actuator, a mapping of its fields (with a
+            `name`, over that actuator's), or None (ideal). Files may be given as a `pathlib.Path`.
         paper: the actuator that the names vary; None where there is none.
         whose: whose it is, for messages.
 
@@ -91,6 +89,8 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
         return actuator_over(resolve(given["name"], paper, whose), changes)
     if isinstance(given, Mapping):
         return actuator_from_mapping(given)
+    if isinstance(given, Path):
+        given = str(given)
     if not isinstance(given, str):
         raise ValueError(
             f"actuator = {given!r}: must be a name ({', '.join(NAMED)}), an actuator or a mapping of its fields"
@@ -104,8 +104,8 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
                 f"{', '.join(FAMILIES)}"
             )
         return NAMED[given][1](paper)
-    if given not in FAMILIES and Path(given).suffix in (".yaml", ".yml", ".json"):
-        return actuator_from_file(Path(given))
+    if given not in FAMILIES and Path(given).suffix in _FILES:
+        return actuator_from_file(Path(given), paper, whose)
     from codrl_mj.catalogue import motor_entry, motor_names
 
     if given in motor_names() or Path(given).suffix == ".toml":
@@ -117,8 +117,16 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
     raise ValueError(f"actuator = {given!r}: {found!r} is neither an actuator nor a family of them")
 
 
-def actuator_from_file(path: Path) -> Any:
+_FILES = (".yaml", ".yml", ".json")
+
+
+def actuator_from_file(path: Path, paper: Actuator | None, whose: str) -> Any:
     """Read an actuator from a YAML or JSON file that holds a mapping of its fields.
+
+    Args:
+        path: the file; a `name` in it is that of another actuator, but no other file.
+        paper: as for `resolve`.
+        whose: as for `resolve`.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -129,7 +137,12 @@ def actuator_from_file(path: Path) -> Any:
     if not path.is_file():
         raise FileNotFoundError(f"no actuator file at {path}")
     try:
-        return actuator_from_mapping(yaml.safe_load(path.read_text()))
+        fields = yaml.safe_load(path.read_text())
+        if not isinstance(fields, Mapping):
+            raise ValueError(f"{fields!r}: must be a mapping of an actuator's fields")
+        if Path(str(fields.get("name"))).suffix in _FILES:
+            raise ValueError(f"name = {fields['name']!r}: must be an actuator's name, and no file")
+        return resolve(fields, paper, whose)
     except (yaml.YAMLError, UnicodeDecodeError, ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
 

@@ -39,12 +39,10 @@ def find_agent(name: str) -> type[AgentConfig]:
         name: a key of `AGENTS`; or `module:Class` of somebody's `AgentConfig`, which is imported.
 
     Raises:
-        ValueError: unknown agent.
+        ValueError: unknown agent; the nearest known one is suggested.
     """
-    found = look_up(name, AGENTS, "agent")
-    if isinstance(found, type) and issubclass(found, AgentConfig):
-        return found
-    raise ValueError(f"agent = {name!r}: {found!r} is no subclass of codrl_mj.agents.AgentConfig")
+    agent: type[AgentConfig] = look_up(name, AGENTS, "agent", of=AgentConfig)
+    return agent
 
 
 def agent_from_mapping(mapping: Mapping[str, Any]) -> AgentConfig:

@@ -39,11 +39,12 @@ class Evaluate:
 
         subject = self.source.load(self.policy)
         env = environment(self, subject.env.task, self.actuator_name, subject.env.actuator)
+        subject.check_interface(env)
         with progress_bar("{task.completed}/{task.total} episodes") as bar:
             row = bar.add_task("evaluating", total=self.episodes)
             evaluation = evaluate(
                 subject.policy,
-                env.seen_as(subject.env),
+                env,
                 self.episodes,
                 self.seed,
                 not self.stochastic,

@@ -57,7 +57,8 @@ class Render:
         else:
             loaded, name = self.source.load(Path(self.subject)), self.actuator_name
             task, policy = loaded.env.task, loaded.policy
-            env = environment(self, task, name, loaded.env.actuator).seen_as(loaded.env)
+            env = environment(self, task, name, loaded.env.actuator)
+            loaded.check_interface(env)
         (episode,) = run_episodes(policy, env.make, 1, self.seed)
         title = f"{Path(self.subject).name} on {name}: return {episode.total:.0f}"
         panel = Panel(title, task, env.actuator, episode)

@@ -18,6 +18,22 @@ class Subject:
     """What chooses the actions."""
     env: EnvConfig
     """The environment it was trained in, as far as that is known."""
+    run: Path | None = None
+    """The run folder that says so; None if there is none."""
+
+    def check_interface(self, env: EnvConfig) -> None:
+        """Refuse an environment in which the policy would command or observe something else than in its training.
+
+        Raises:
+            ValueError: it does, by what its run folder says.
+        """
+        for name, trained in self.env.interface.items() if self.run is not None else ():
+            if (value := env.interface[name]) != trained:
+                flag = f"--env.{name.replace('_', '-')}"
+                raise ValueError(
+                    f"{flag} = {value!r}: the policy of {self.run} was trained with {trained!r} and knows nothing "
+                    f"else: leave {flag} out, or train one with it"
+                )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +82,7 @@ class Source:
                     f"{path}, or take its best one so far with --which best"
                 )
             policy = load_policy(path / BEST if self.which == "best" else path, self.trust)
-            return Subject(policy, config.env)
+            return Subject(policy, config.env, path)
         if self.which == "best":
             raise ValueError(f"--which best: {path} is no run folder and holds one policy alone: leave --which out")
         if self.task is None:

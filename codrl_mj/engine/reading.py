@@ -1,5 +1,6 @@
 """What compiled models and their data say of our actuators, at either door."""
 
+import numbers
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -15,6 +16,7 @@ from codrl_mj.actuators import (
     parameters_type,
     reference,
 )
+from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.engine.families import HEAD, SIGNATURE, loaded_families, signals_at, slot_size
 from codrl_mj.engine.inertia import shaft_inertia
 from codrl_mj.engine.plugin import EXTRA_STATES, PLUGIN_HEAD, REASONS
@@ -140,15 +142,21 @@ def clear_motors(data: mujoco.MjData, noise_keys: Sequence[int] | None = None) -
 
     Args:
         data: the simulation.
-        noise_keys: one for each motor, whole numbers below 2**53; None: those that they have, 0 after a reset.
+        noise_keys: one for each motor, whole numbers from 0 to 2**53 - 1; None: those that they have, 0 after a reset.
 
     Raises:
-        ValueError: the model is not as `motors` wants it, or there are not as many keys as motors.
+        ValueError: the model is not as `motors` wants it, there are not as many keys as motors, or a key is no such
+            number; no motor has been changed.
     """
     found = list(slots(data, motors(data.model)).values())
-    keys = [slot[1] for slot in found] if noise_keys is None else list(noise_keys)
+    keys = [slot[1] for slot in found] if noise_keys is None else np.ravel(np.array(noise_keys, dtype=object)).tolist()
     if len(keys) != len(found):
         raise ValueError(f"noise_keys: there are {len(keys)}, must be {len(found)}, one for each motor of the model")
+    for index, key in enumerate(keys):
+        if not (isinstance(key, numbers.Real) and 0 <= key < LARGEST_KEY and key % 1 == 0):  # type: ignore[operator]
+            raise ValueError(
+                f"noise_keys[{index}] = {key!r}: must be a whole number from 0 to 2**53 - 1, which a float64 holds"
+            )
     for slot, key in zip(found, keys, strict=True):
         slot[:] = 0.0
         slot[:2] = data.time, key
@@ -226,7 +234,10 @@ class Readout:
             motor's family has none of that name.
         """
         states = np.concatenate((data.act, data.plugin_state, [np.nan]))
-        commanded = np.clip(data.ctrl[self._control], self._low, self._high) * self._gear
+        controls = data.ctrl[self._control]
+        if not data.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
+            controls = np.clip(controls, self._low, self._high)
+        commanded = controls * self._gear
         desired = np.where(self._behind_plugin, states[self._desired], commanded)
         actual = data.actuator_force[self._out] * self._gear
         forces: dict[str, Any] = {"desired_force": np.where(self._tracks, desired, actual), "actual_force": actual}

@@ -1,8 +1,9 @@
 """Attributes of environments, as Gymnasium's have them: `env.unwrapped.gravity = 3.7`.
 
-`Task.attributes` says where each of them lives. One that is written changes the model and takes effect at once; state
-and motor stay as they are. What is written outlasts resets, and is not in a `snapshot`. What the task's compiled
-functions contain can be read only; writing the value that an attribute has is allowed everywhere.
+`Task.attributes` says where each of them lives; on the analytic physics numbers of the model are those of Gymnasium's
+own environment. One that is written takes effect at once; state and motor stay as they are. What is written outlasts
+resets, and is not in a `snapshot`. What the task's compiled functions contain can be read only; writing the value that
+an attribute has is allowed everywhere.
 """
 
 import dataclasses
@@ -10,11 +11,13 @@ import math
 import numbers
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from codrl_mj.actuators import Ideal
 from codrl_mj.disturbances import OFF
 from codrl_mj.envs.setup import Setup
+from codrl_mj.physics.analytic import AnalyticPhysics
 from codrl_mj.physics.variation import Variation, field_of, write_fields
 from codrl_mj.tasks import Task
 from codrl_mj.tasks.attributes import Attribute, Fixed, Follows, ModelNumber, Setting
@@ -25,27 +28,38 @@ def shared(attribute: Attribute) -> bool:
     return isinstance(attribute, Fixed | Setting)
 
 
-def read(attribute: Attribute, setup: Setup, model: Any) -> Any:
-    """The value of an attribute of an environment with an `mjModel`."""
+def read(name: str, setup: Setup, model: Any) -> Any:
+    """The value of an attribute of an environment.
+
+    Args:
+        name: its name.
+        setup: of the environment.
+        model: the `mjModel`; or the physics, where it has none.
+
+    Raises:
+        AttributeError: the physics is on no model, of MuJoCo or Gymnasium, that has the number.
+    """
+    attribute = setup.task.attributes[name]
     if isinstance(attribute, Fixed):
         return attribute.value
     if isinstance(attribute, Follows):
-        return attribute.of(*(read(setup.task.attributes[name], setup, model) for name in attribute.names))
+        return attribute.of(*(read(each, setup, model) for each in attribute.names))
     if isinstance(attribute, Setting):
         value = getattr(setup if attribute is Setting.INTEGRATOR else setup.task, attribute.value)
         return list(value) if attribute is Setting.FORCES else value
+    if not isinstance(model, mujoco.MjModel):
+        return getattr(_gymnasiums(model), name)
     return attribute.scale * float(_place(attribute, model)[0]) ** (-1 if attribute.inverse else 1)
 
 
-def written(attribute: Attribute, name: str, value: Any, setup: Setup, model: Any) -> Setup:
+def written(name: str, value: Any, setup: Setup, model: Any) -> Setup:
     """Write an attribute; to be followed by `mj_setConst`.
 
     Args:
-        attribute: which.
         name: its name.
         value: the new value.
         setup: of the environment.
-        model: the `mjModel`, which is changed.
+        model: as for `read`; it is changed.
 
     Returns:
         The set-up to go on with.
@@ -54,11 +68,11 @@ def written(attribute: Attribute, name: str, value: Any, setup: Setup, model: An
         AttributeError: it can be read only; the message says why and what to do instead.
         ValueError: the value is no number, or out of bounds.
     """
-    present = read(attribute, setup, model)
+    present = read(name, setup, model)
     if np.array_equal(value, present):
         return setup
     try:
-        return _write(attribute, value, setup, model)
+        return _write(name, value, setup, model)
     except ValueError as error:
         raise ValueError(f"{name} = {value!r}: {error}") from None
     except AttributeError as error:
@@ -89,6 +103,20 @@ def _place(attribute: ModelNumber, model: Any) -> np.ndarray:
     return rows[row, attribute.entry : attribute.entry + 1]
 
 
+def _gymnasiums(physics: Any) -> Any:
+    """The Gymnasium environment that a physics without a MuJoCo model drives.
+
+    Raises:
+        AttributeError: it drives none.
+    """
+    if not isinstance(physics, AnalyticPhysics) or not hasattr(physics.twin, "env"):
+        raise AttributeError(
+            f"{type(physics).__name__} has no MuJoCo model or data, and no environment of Gymnasium's, whose number it "
+            "is; use physics='mujoco'"
+        )
+    return physics.twin.env
+
+
 def _number(value: Any, positive: bool) -> float:
     if isinstance(value, numbers.Real | np.ndarray) and np.size(value) == 1 and math.isfinite(value):  # type: ignore[arg-type]
         number = float(value)  # type: ignore[arg-type]
@@ -97,8 +125,9 @@ def _number(value: Any, positive: bool) -> float:
     raise ValueError("must be a finite number" + " > 0" * positive)
 
 
-def _write(attribute: Attribute, value: Any, setup: Setup, model: Any) -> Setup:
+def _write(name: str, value: Any, setup: Setup, model: Any) -> Setup:
     """See `written`; the messages are the remedy, or what the value must be."""
+    attribute = setup.task.attributes[name]
     if isinstance(attribute, Fixed):
         raise AttributeError(attribute.remedy)
     if isinstance(attribute, Follows):
@@ -109,18 +138,24 @@ def _write(attribute: Attribute, value: Any, setup: Setup, model: Any) -> Setup:
     if setup.randomization is not None:
         raise AttributeError("actuator and model are drawn at every reset: give `randomize` a distribution of it")
     if isinstance(attribute, ModelNumber):
-        _write_number(attribute, value, setup, model)
+        _write_number(name, attribute, value, setup, model)
         return setup
     if attribute is Setting.STEP:
         return _write_step(value, setup, model)
     return _write_forces(value, setup, model, each=attribute is Setting.FORCES)
 
 
-def _write_number(attribute: ModelNumber, value: Any, setup: Setup, model: Any) -> None:
+def _write_number(name: str, attribute: ModelNumber, value: Any, setup: Setup, model: Any) -> None:
     power, varies = -1 if attribute.inverse else 1, attribute.varies
     number = _number(value, positive=bool(varies))
+    if not isinstance(model, mujoco.MjModel):
+        setattr(env := _gymnasiums(model), name, number)
+        for other, follows in setup.task.attributes.items():
+            if isinstance(follows, Follows) and name in follows.names:  # attributes of their own in Gymnasium
+                setattr(env, other, read(other, setup, model))
+        return
     if varies:
-        factors = np.full((1, len(varies)), (number / read(attribute, setup, model)) ** power)
+        factors = np.full((1, len(varies)), (number / read(name, setup, model)) ** power)
         fields = Variation(setup.task.name, varies, model).fields(factors, drawn=True)
         only = attribute.only or fields
         write_fields(model, {name: rows for name, rows in fields.items() if name in only})
@@ -144,7 +179,8 @@ def _write_forces(value: Any, setup: Setup, model: Any, each: bool) -> Setup:
     largest = _number(value, positive=True)
     if table is not None and not each:
         table = tuple(largest * (force / task.max_force) for force in table)
-    model.actuator(task.motors[0]).ctrlrange[:] *= largest / task.max_force
+    if isinstance(model, mujoco.MjModel):
+        model.actuator(task.motors[0]).ctrlrange[:] *= largest / task.max_force
     return _of_task(setup, dataclasses.replace(task, max_force=largest, forces=table))
 
 
@@ -152,7 +188,11 @@ def _write_step(value: Any, setup: Setup, model: Any) -> Setup:
     duration = _number(value, positive=True)
     if not issubclass(setup.family, Ideal) or setup.disturbances != OFF:
         raise AttributeError("motor and disturbances were checked for this step: make an environment without them")
-    model.opt.timestep = duration / setup.inner_steps
+    if isinstance(model, mujoco.MjModel):
+        model.opt.timestep = duration / setup.inner_steps
+    else:
+        _gymnasiums(model)
+        model.timestep = duration / setup.inner_steps
     return _of_task(setup, dataclasses.replace(setup.task, step_duration=duration))
 
 
@@ -173,7 +213,7 @@ class _Access:
             return self
         attribute = env.task.attributes.get(self._name)
         if attribute is not None:
-            return env._read_attribute(attribute)
+            return env._read_attribute(self._name)
         if self._name in vars(env):
             return vars(env)[self._name]
         raise AttributeError(f"{type(env).__name__} of {env.task.name!r} has no attribute {self._name!r}")
@@ -183,7 +223,7 @@ class _Access:
         if attribute is None:  # another task's
             vars(env)[self._name] = value
         else:
-            env._write_attribute(attribute, self._name, value)
+            env._write_attribute(self._name, value)
 
 
 class GymnasiumAttributes:

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
+import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, mapping_of
 from codrl_mj.disturbances import MOVED, OFF, PLAIN, Disturbances, Joint, resolve_disturbances, resolve_joint
@@ -69,13 +70,15 @@ class EnvConfig:
     `NamedTuple`."""
 
     def __post_init__(self) -> None:
-        """Validate, and turn what files and users write into what it stands for."""
+        """Validate, and turn what files and users write into what it stands for, and numpy's values into Python's."""
+        for field in dataclasses.fields(self):
+            self._set(field.name, _plain(getattr(self, field.name)))
         task = find_task(self.task)
         self._set("task", reference_of(task))
         actuators = resolve_actuators(self.actuator, task)
         self._set("actuator", actuators[0] if len(actuators) == 1 else actuators)
-        if isinstance(self.levels, list):  # JSON has lists
-            self._set("levels", tuple(self.levels))
+        if isinstance(self.levels, list | tuple):
+            self._set("levels", tuple(map(_plain, self.levels)))
         self._set("disturbances", resolve_disturbances(self.disturbances))
         self._set("joint", resolve_joint(self.joint))
         if self.randomize is not None:
@@ -122,10 +125,14 @@ class EnvConfig:
         """The longest episode [environment steps]; None for any."""
         return self.max_episode_steps or find_task(self.task).max_episode_steps
 
+    @property
+    def interface(self) -> dict[str, Any]:
+        """The fields that say what a policy commands and observes: it can do nothing else once it is trained."""
+        return {name: getattr(self, name) for name in ("action", "levels", "observe_actuator")}
+
     def seen_as(self, trained: "EnvConfig") -> "EnvConfig":
         """This environment with the actions and observations of another: those that a policy was trained with."""
-        interface = {name: getattr(trained, name) for name in ("action", "levels", "observe_actuator")}
-        return dataclasses.replace(self, **interface)
+        return dataclasses.replace(self, **trained.interface)
 
     def as_arguments(self) -> dict[str, Any]:
         """The keyword arguments for `gymnasium.make` with the task's id, without those left at their defaults."""
@@ -161,7 +168,8 @@ class EnvConfig:
 
         Args:
             mapping: the fields; the task's own options may stand among them.
-            base: what is not given is this one's; disturbances, joint and options by their fields.
+            base: what is not given is this one's; disturbances, joint and options by their fields. Of a base of another
+                task, the actuator and whatever else has a default of the task's are the task's.
 
         Raises:
             ValueError: a key is unknown (the nearest known one is suggested), or a value out of bounds.
@@ -171,12 +179,17 @@ class EnvConfig:
         given = dict(mapping) if base is None else {"task": base.task, **mapping}
         if "task" not in given:
             raise ValueError("it has no task")
-        own = find_task(given["task"]).options._fields
+        task = find_task(given["task"])
+        own = task.options._fields
         check_names(given, [*(field.name for field in dataclasses.fields(cls)), *own], "key", "env.")
         if options := {name: given.pop(name) for name in own if name in given}:
             given["options"] = {**(given.get("options") or {}), **options}
         if base is None:
             return cls(**given)
+        if reference_of(task) != base.task:
+            defaults: dict[str, Any] = {field.name: None for field in dataclasses.fields(cls) if field.default is None}
+            defaults |= {"task": given["task"], "actuator": task.default_actuator}
+            base = dataclasses.replace(base, **defaults)
         there = base.as_mapping()
         for name in ("disturbances", "joint", "options"):
             if isinstance(given.get(name), Mapping):
@@ -228,7 +241,8 @@ def _options(task: Task, given: Mapping[str, Any]) -> Any:
         ValueError: one that is not a number > 0, or not True or False where its default is either.
     """
     known = task.options._fields
-    for name, value in given.items():
+    plain = {name: _plain(value) for name, value in given.items()}
+    for name, value in plain.items():
         if name not in known:
             has = ", ".join(known) or "none"
             raise UnknownOptionError(
@@ -237,7 +251,12 @@ def _options(task: Task, given: Mapping[str, Any]) -> Any:
         flag = isinstance(task.options._field_defaults[name], bool)
         if isinstance(value, bool) != flag or not isinstance(value, int | float) or not (flag or value > 0):
             raise ValueError(f"{name} = {value!r}: must be {'True or False' if flag else 'a number > 0'}")
-    return task.options(**{name: value if isinstance(value, bool) else float(value) for name, value in given.items()})
+    return task.options(**{name: value if isinstance(value, bool) else float(value) for name, value in plain.items()})
+
+
+def _plain(value: Any) -> Any:
+    """A number or an array of numpy's as Python's own number or list."""
+    return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
 
 
 def _changed(options: Any) -> dict[str, Any]:

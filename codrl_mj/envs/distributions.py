@@ -4,7 +4,6 @@
 """
 
 import dataclasses
-import difflib
 import math
 import numbers
 import re
@@ -12,6 +11,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+
+from codrl_mj.fields import did_you_mean
 
 
 def _plain(number: Any) -> bool | int | float:
@@ -168,9 +169,7 @@ def parse(text: str) -> Distribution:
         raise ValueError(f"{text!r} is no distribution: must be {_expected()}")
     kind, inside = match.groups()
     if kind not in _FORMS:
-        near = difflib.get_close_matches(kind, _FORMS, n=1)
-        hint = f"did you mean {near[0]}? It " if near else "it "
-        raise ValueError(f"{text!r} is no distribution: {hint}must be {_expected()}")
+        raise ValueError(f"{text!r} is no distribution: {did_you_mean(kind, _FORMS)}it must be {_expected()}")
     values = [_number(text, word.strip()) for word in inside.split(",")] if inside.strip() else []
     if len(values) != 2 and kind != "choice":
         raise ValueError(f"{text!r} has {len(values)} values: must be {_FORMS[kind]}")

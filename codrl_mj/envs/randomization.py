@@ -1,7 +1,6 @@
 """Actuators and models drawn at every reset, from the environment's own generator."""
 
 import dataclasses
-import difflib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 from codrl_mj.actuators import Actuator, ActuatorModel, Family, Ideal, field_paths, parameter_paths
 from codrl_mj.envs.commands import Commands
 from codrl_mj.envs.distributions import Choice, Distribution
+from codrl_mj.fields import did_you_mean
 from codrl_mj.physics.variation import Variation, variable
 
 LIMIT = 1000
@@ -63,8 +63,7 @@ class Randomization:
         known = (*field_paths(family), *variable(task))
         for name, distribution in randomize.items():
             if name not in known:
-                near = difflib.get_close_matches(str(name), known, n=1, cutoff=0.5)
-                hint = f"did you mean {near[0]!r}? " if near else ""
+                hint = did_you_mean(name, known)
                 raise ValueError(f"randomize: unknown field {name!r}: {hint}{task} has {', '.join(known)}")
             if not isinstance(distribution, Distribution):
                 raise ValueError(f"randomize[{name!r}] = {distribution!r}: must be a Uniform, LogUniform or Choice")

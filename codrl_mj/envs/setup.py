@@ -113,8 +113,8 @@ class Setup:
         if made.scene is None and self.randomization is not None and self.randomization.variation is not None:
             names = ", ".join(self.randomization.variation.names)
             raise ValueError(
-                f"physics = {physics!r}: cannot draw {names}: Gymnasium's environments share no names for masses, "
-                "lengths and gravity, and have no damping; use physics='mujoco'"
+                f"physics = {physics!r}: cannot draw {names}: numbers of a MuJoCo model, which it has not; use "
+                "physics='mujoco'"
             )
         return made
 

@@ -19,7 +19,6 @@ from codrl_mj.physics import MujocoPhysics
 from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
 from codrl_mj.physics.streams import set_words, words_of
 from codrl_mj.tasks import Task
-from codrl_mj.tasks.attributes import Attribute
 
 
 class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
@@ -126,13 +125,17 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
             raise AttributeError(f"{type(self.physics).__name__} has no MuJoCo model or data; use physics='mujoco'")
         return self.physics.scene
 
-    def _read_attribute(self, attribute: Attribute) -> Any:
-        return read(attribute, self.setup, self.model)
+    def _model(self) -> Any:
+        """What has the numbers of the model, for `read` and `written`."""
+        return self.physics if self.physics.scene is None else self.physics.scene[0]
 
-    def _write_attribute(self, attribute: Attribute, name: str, value: Any) -> None:
-        physics, model = self.physics, self.model
+    def _read_attribute(self, name: str) -> Any:
+        return read(name, self.setup, self._model())
+
+    def _write_attribute(self, name: str, value: Any) -> None:
+        physics = self.physics
         kept = physics.snapshot()
-        self.setup = written(attribute, name, value, self.setup, model)
+        self.setup = written(name, value, self.setup, self._model())
         physics.set_model({})
         physics.restore(kept)
 
@@ -173,7 +176,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         observation = np.empty(self._observation_shape, np.float32)
         reward, terminated, fine = step(force, observation, *simulation)
         if not fine:
-            self.physics.check_finite()  # type: ignore[attr-defined]
+            self.physics.check_finite()
         if self.render_mode == "human":
             self.render()
         return observation, reward, terminated, False, self._info(force)

@@ -21,8 +21,7 @@ from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
 from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
 from codrl_mj.physics.streams import Streams
 from codrl_mj.physics.variation import DRAWN, VARIED, field_of, write_fields
-from codrl_mj.tasks import Task, find_task
-from codrl_mj.tasks.attributes import Attribute
+from codrl_mj.tasks import Task, find_task, resolve_actuators
 
 Array = np.ndarray
 
@@ -63,8 +62,8 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         Args:
             num_envs: how many, >= 1.
             task: the task's name.
-            actuator: as for `ActuatedEnv`; or a sequence of N actuators (with several motors, of tuples of them), one
-                for each environment.
+            actuator: as for `ActuatedEnv`; or a sequence of N of these (with several motors, of tuples of them), one
+                for each environment: all of one family, and not ideal.
             max_episode_steps: time limit of each environment [steps]; None for none.
             autoreset_mode: when an environment whose episode ended is reset: in the `NEXT_STEP`, in the `SAME_STEP`, or
                 by the caller (`DISABLED`), with `reset(options={"reset_mask": ...})`.
@@ -162,15 +161,15 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         value = getattr(self, name)
         return (value(*args, **kwargs),) * self.num_envs if callable(value) else self.get_attr(name)
 
-    def _read_attribute(self, attribute: Attribute) -> Any:
+    def _read_attribute(self, name: str) -> Any:
         """One value where the environments share it, else shape (N,)."""
-        if shared(attribute):
-            return read(attribute, self.setup, self.physics.model)
-        return np.array([read(attribute, self.setup, model) for model in self.physics.models()])
+        if shared(self.task.attributes[name]):
+            return read(name, self.setup, self.physics.model)
+        return np.array([read(name, self.setup, model) for model in self.physics.models()])
 
-    def _write_attribute(self, attribute: Attribute, name: str, value: Any) -> None:
-        if shared(attribute):
-            if not np.array_equal(value, present := self._read_attribute(attribute)):
+    def _write_attribute(self, name: str, value: Any) -> None:
+        if shared(self.task.attributes[name]):
+            if not np.array_equal(value, present := self._read_attribute(name)):
                 raise AttributeError(
                     f"{name} = {value!r}: the environments share it, as {present!r}; use vectorization_mode='sync'"
                 )
@@ -183,7 +182,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         numbers = np.broadcast_to(value, self.num_envs).tolist()
         for row, (model, number) in enumerate(zip(self.physics.models(), numbers, strict=True)):
             write_fields(model, looks, row)
-            written(attribute, name, number, self.setup, model)
+            written(name, number, self.setup, model)
             for field, rows in (fields | looks).items():
                 rows[row] = field_of(model, field)
         kept = self.physics.snapshot()
@@ -430,17 +429,18 @@ def _set_up(
     if arguments.get("action", "force") != "force":
         raise ValueError(f"action = {arguments['action']!r}: with an actuator for each environment only 'force'")
     setups: dict[Any, Setup] = {}
+    every: list[tuple[ActuatorModel, ...]] = []
     for index, one in enumerate(actuator):
-        each = one if isinstance(one, tuple) else (one,)
-        if not all(isinstance(model, ActuatorModel) and not isinstance(model, Ideal) for model in each):
+        try:
+            every.append(resolve_actuators(one, find_task(task)))
+            if every[-1] not in setups:
+                setups[every[-1]] = Setup.build(EnvConfig.of(task, every[-1], arguments))
+        except ValueError as error:
+            raise ValueError(f"actuator[{index}]: {error}") from None
+        if isinstance(every[-1][0], Ideal):
             raise ValueError(f"actuator[{index}] = {one!r}: must be an Actuator; the ideal one cannot be among others")
-        if one not in setups:
-            try:
-                setups[one] = Setup.build(EnvConfig.of(task, one, arguments))
-            except ValueError as error:
-                raise ValueError(f"actuator[{index}]: {error}") from None
     check_same_family([setup.actuators[0] for setup in setups.values()])
-    return dataclasses.replace(setups[actuator[0]]), [setups[one].actuators for one in actuator]
+    return dataclasses.replace(setups[every[0]]), every
 
 
 def _infos(signals: Signals, stepping: Array) -> dict[str, Any]:

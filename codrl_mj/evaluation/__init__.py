@@ -4,7 +4,6 @@ from codrl_mj.evaluation.episodes import (
     Episode,
     RandomPolicy,
     load_episode,
-    make_env,
     run_episodes,
     save_episode,
 )
@@ -21,7 +20,6 @@ __all__ = [
     "bootstrap_mean",
     "evaluate",
     "load_episode",
-    "make_env",
     "run_episodes",
     "save_episode",
     "summarize",

@@ -159,17 +159,6 @@ def _within(prefix: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarr
     return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
 
 
-def make_env(task: str, actuator: Any, **options: Any) -> gymnasium.Env[Any, Any]:
-    """One environment of a task by the task's name, through Gymnasium's registry.
-
-    Args:
-        task: name on the command line.
-        actuator: as `ActuatedEnv` takes it.
-        **options: anything else that `ActuatedEnv` or `gymnasium.make` takes.
-    """
-    return gymnasium.make(find_task(task).env_id, actuator=actuator, disable_env_checker=True, **options)
-
-
 class _Recording:
     """One environment, and what has happened in it since the reset."""
 

@@ -55,12 +55,12 @@ class AnalyticPhysics:
         self.family = check_same_family(actuators)
         self.inner_steps = inner_steps
         self._integrator = integrator
-        self._timestep = task.step_duration / inner_steps
-        self._twin = task.twin()
+        self.timestep = task.step_duration / inner_steps
+        self.twin = task.twin()
         self._actuators: list[tuple[float, Any]] = []
         self.set_actuators(actuators)
         limits = task.max_forces if max_forces is None else max_forces
-        self._disturber = disturber(disturbances, self._timestep, limits, 1)
+        self._disturber = disturber(disturbances, self.timestep, limits, 1)
         self.trace = np.zeros((inner_steps, len(actuators), len(trace_names(self.family))))
         self.reset(np.zeros(len(task.state_names)))
 
@@ -88,12 +88,12 @@ class AnalyticPhysics:
         """Gymnasium's environments have no such fields.
 
         Raises:
-            ValueError: always.
+            ValueError: any is given.
         """
-        raise ValueError(
-            f"physics = 'analytic': cannot set {', '.join(fields)}: Gymnasium's environments share no names for "
-            "masses, lengths and gravity, and have no damping; use physics='mujoco'"
-        )
+        if fields:
+            raise ValueError(
+                f"fields = {', '.join(fields)}: they are a MuJoCo model's, which 'analytic' has not; use 'mujoco'"
+            )
 
     def step(self, desired_force: Any) -> None:
         """Advance by one environment step, with the desired force (at most the task's `max_force`) held over it.
@@ -114,9 +114,17 @@ class AnalyticPhysics:
             if self._disturber is not None:
                 loads = self._disturber.loads()[0]
                 force = force + (loads if several else float(loads[0]))
-            self.state = self._twin(self.state, force, self._timestep, self._integrator)
-            self._time += self._timestep
+            self.state = self.twin(self.state, force, self.timestep, self._integrator)
+            self._time += self.timestep
             rows[:, -1] = self.state[speeds]
+        self.check_finite()
+
+    def check_finite(self) -> None:
+        """Raise if the state is not finite or beyond `LARGEST`, saying which entry and when.
+
+        Raises:
+            SimulationDivergedError: as it says.
+        """
         check_finite(self.task, self.state, self._time)
 
     def _advance(self, number: int, command: float) -> tuple[float, ...]:
@@ -126,7 +134,7 @@ class AnalyticPhysics:
         position, speed = self.state[[self.task.qpos[self.task.qvel.index(at)], at]].tolist()
         inputs = Inputs(command * arm, position / arm, speed / arm, self._time, self._key + number)
         self._states[number], torque, signals = self.family.advance(
-            parameters, self._timestep, self._states[number], inputs
+            parameters, self.timestep, self._states[number], inputs
         )
         return torque / arm, *signals
 
@@ -140,7 +148,7 @@ class AnalyticPhysics:
             [
                 self.family.observe(
                     parameters,
-                    self._timestep,
+                    self.timestep,
                     self.family.Signals(*signals[2:-1].tolist()),
                     Inputs(0.0, 0.0, 0.0, self._time, self._key + number),
                 )

@@ -56,7 +56,7 @@ class Physics(Protocol):
         """Change fields of the model, as `codrl_mj.physics.variation.Variation.fields` has them; then a reset follows.
 
         Raises:
-            ValueError: it has no such fields.
+            ValueError: it has no such fields, because it is not on a MuJoCo model; none at all is never refused.
         """
 
     def reset(self, state: np.ndarray, key: float = 0.0) -> None:
@@ -92,6 +92,13 @@ class Physics(Protocol):
 
         Raises:
             SimulationDivergedError: the state is no longer finite.
+        """
+
+    def check_finite(self) -> None:
+        """Raise if the present state is not finite or too large to be trusted; where `compiled` steps, they ask it.
+
+        Raises:
+            SimulationDivergedError: as it says.
         """
 
     def show(self, state: np.ndarray) -> None:

@@ -1,7 +1,6 @@
 """Off-screen rendering of a MuJoCo model, with errors that say what to do."""
 
 import atexit
-import difflib
 import functools
 import numbers
 import os
@@ -11,6 +10,8 @@ from typing import Any
 
 import mujoco
 import numpy as np
+
+from codrl_mj.fields import did_you_mean
 
 
 class RenderingUnavailableError(RuntimeError):
@@ -177,8 +178,7 @@ def check_view(model: mujoco.MjModel, width: int, height: int, camera: str) -> N
             raise ValueError(f"{name} = {value!r}: must be an integer from 1 to {largest} [px]")
     names = [model.camera(index).name for index in range(model.ncam)]
     if camera not in names:
-        near = difflib.get_close_matches(str(camera), names, n=1)
-        hint = f"did you mean {near[0]!r}? " if near else ""
+        hint = did_you_mean(camera, names)
         raise ValueError(f"camera = {camera!r}: {hint}The model's cameras are {', '.join(names) or 'none'}")
 
 

@@ -1,6 +1,5 @@
 """Variations of a task's model: masses, lengths, gravity and damping, of many simulations at once."""
 
-import difflib
 import functools
 from collections.abc import Mapping, Sequence
 
@@ -9,6 +8,7 @@ import numpy as np
 
 from codrl_mj.actuators import IDEAL
 from codrl_mj.engine.hill import GRAVITY
+from codrl_mj.fields import did_you_mean
 from codrl_mj.physics.mjcf import hills, task_model
 from codrl_mj.tasks import TASKS
 
@@ -70,8 +70,7 @@ class Variation:
         self._nominal: dict[str, np.ndarray] = {}
         for name in names:
             if name not in known:
-                near = difflib.get_close_matches(name, known, n=1)
-                raise ValueError(f"unknown {name!r}" + (f": did you mean {near[0]!r}?" if near else ""))
+                raise ValueError(f"unknown {name!r}: {did_you_mean(name, known)}{task} has {', '.join(known)}")
             for field in _FIELDS[name.split(".")[1]]:
                 self._nominal[field] = field_of(model, field).copy()
         self._bodies = {model.body(body).name: body for body in range(model.nbody)}

@@ -1,13 +1,13 @@
 """The actuators that the mismatch study trains and tests on, by name: each number with its reason."""
 
 import dataclasses
-import difflib
 from collections.abc import Iterable
 from typing import Any
 
 from codrl_mj.actuators import IDEAL, NAMED, Actuator, CurrentLoop, Supply
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.fields import did_you_mean
 from codrl_mj.tasks import Task, find_task, named_actuator
 
 
@@ -205,9 +205,7 @@ def check_condition(name: str, tasks: Iterable[str]) -> None:
     """
     known = list(dict.fromkeys(name for task in tasks for name in every_condition(task)))
     if name not in known:
-        near = difflib.get_close_matches(name, known, n=1)
-        hint = f"did you mean {near[0]!r}? " if near else ""
-        raise ValueError(f"unknown condition {name!r}: {hint}Known conditions: {', '.join(known)}")
+        raise ValueError(f"unknown condition {name!r}: {did_you_mean(name, known)}Known: {', '.join(known)}")
 
 
 def _task_and_paper(task: str) -> tuple[Task, Actuator]:

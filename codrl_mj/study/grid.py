@@ -9,11 +9,12 @@ import hashlib
 import json
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.fields import did_you_mean
 from codrl_mj.runs.files import read_json, write_json
 from codrl_mj.study.parallel import Workers, compute
 from codrl_mj.training import RunInUseError, TrainConfig, TrainingStoppedError, finished, load_config, train
@@ -53,6 +54,25 @@ class Deployment:
     def record(self) -> Path:
         """The JSON file of the result, in the run folder."""
         return self.run / _DEPLOYMENTS / f"{_digest(self._identity)}.json"
+
+
+def check_chosen(field: str, given: Sequence[str], known: Iterable[str]) -> None:
+    """Refuse a choice of nothing, or of what is not known.
+
+    Args:
+        field: what to call the choice.
+        given: the names that were chosen.
+        known: what they may be.
+
+    Raises:
+        ValueError: none is given, or one is unknown; the nearest known one is suggested.
+    """
+    known = list(known)
+    for name in given:
+        if name not in known:
+            raise ValueError(f"{field}: unknown {name!r}: {did_you_mean(name, known)}Known are {', '.join(known)}")
+    if not given:
+        raise ValueError(f"{field}: none is named: name one or more of {', '.join(known)}")
 
 
 def cell_folder(root: Path, config: TrainConfig) -> Path:

@@ -2,8 +2,7 @@
 
 import collections
 import dataclasses
-import difflib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from codrl_mj.runs.files import read_json
 from codrl_mj.study.arrivals import Arrivals, ends_at_goal, read_arrivals
 from codrl_mj.study.conditions import check_condition
 from codrl_mj.study.experiments import EXPERIMENTS
-from codrl_mj.study.grid import Deployment, cell_folder, deploy_cells, read_failure, train_cells
+from codrl_mj.study.grid import Deployment, cell_folder, check_chosen, deploy_cells, read_failure, train_cells
 from codrl_mj.study.parallel import Workers
 from codrl_mj.study.plan import AGENTS, Plan, Trial
 from codrl_mj.training import EVALUATION_SEED, TrainConfig, finished
@@ -45,7 +44,7 @@ class MismatchConfig:
     def __post_init__(self) -> None:
         """Validate."""
         for field, known in (("tasks", AGENTS), ("experiments", EXPERIMENTS)):
-            _check_names(field, getattr(self, field), known)
+            check_chosen(field, getattr(self, field), known)
         for name in self.conditions or ():
             check_condition(name, self.tasks)
         for field in ("seeds", "episodes", "total_steps"):
@@ -53,17 +52,6 @@ class MismatchConfig:
             whole = isinstance(value, int) and not isinstance(value, bool)
             if (not whole or value < 1) and not (field == "total_steps" and value is None):
                 raise ValueError(f"{field} = {value!r}: must be an integer >= 1")
-
-
-def _check_names(field: str, given: Iterable[str], known: Iterable[str]) -> None:
-    known = list(known)
-    for name in given:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean {near[0]!r}? " if near else ""
-            raise ValueError(f"{field}: unknown {name!r}: {hint}Known are {', '.join(known)}")
-    if not given:
-        raise ValueError(f"{field}: none is named: name one or more of {', '.join(known)}")
 
 
 def plans(config: MismatchConfig) -> dict[str, dict[str, Plan]]:

@@ -111,13 +111,12 @@ class Twin(GymnasiumTwin):
     """
 
     env_id = "MountainCar-v0"
-    _source, _strength = env_id, "force"
+    _source, _strength = env_id, "force"  # m/s^2 per N
 
     def __init__(self) -> None:
-        """Make the Gymnasium environment; remember what it is before it is driven."""
+        """Make the Gymnasium environment, with the strength of the one that it stands for."""
         super().__init__()
-        self._acceleration = getattr(gymnasium_env(self._source), self._strength)  # m/s^2 per N
-        self._gravity, self._max_speed = self.env.gravity, self.env.max_speed
+        setattr(self.env, self._strength, getattr(gymnasium_env(self._source), self._strength))
 
     def __call__(self, state: np.ndarray, force: float, timestep: float, integrator: str) -> np.ndarray:
         """One `step` to the right with `force` set to the force's effect, of either sign."""
@@ -125,9 +124,9 @@ class Twin(GymnasiumTwin):
         position, change = self.after(
             (state[0], state[1] * timestep),
             2,
-            force=force * self._acceleration * timestep**2,
-            gravity=self._gravity * timestep**2,
-            max_speed=self._max_speed * timestep,
+            force=force * getattr(self.env, self._strength) * timestep**2,
+            gravity=self.env.gravity * timestep**2,
+            max_speed=self.env.max_speed * timestep,
         )
         return np.array([position, change / timestep])
 

@@ -1,5 +1,6 @@
 """The tasks that are known, ours and anybody's, and their registration with Gymnasium."""
 
+import itertools
 import sys
 
 from gymnasium.envs.registration import register as register_with_gymnasium
@@ -46,14 +47,17 @@ def register(task: Task) -> Task:
 
 
 def reference_of(task: Task) -> str:
-    """What `find_task` finds a task by in any process: the name of ours, `module:NAME` of somebody's."""
-    module = task.reward.__module__
-    if module.startswith("codrl_mj."):
-        return task.name
-    names = (
-        (name for name, value in vars(sys.modules[module]).items() if value is task) if module in sys.modules else ()
-    )
-    return next((f"{module}:{name}" for name in names), task.name)
+    """What `find_task` finds a task by in any process: the name of ours, `module:NAME` of somebody's.
+
+    Of one that stands in no module it is the name, which only processes know that have registered it.
+    """
+    home, script = task.reward.__module__, "__main__"  # the first and the last choice where several modules have it
+    others = (module for module in list(sys.modules) if module not in (home, script, "__mp_main__"))
+    for module in itertools.chain([home], others, [script]):
+        for name, value in list(getattr(sys.modules.get(module), "__dict__", {}).items()):
+            if value is task:
+                return task.name if module.startswith("codrl_mj.") else f"{module}:{name}"
+    return task.name
 
 
 def find_task(name: str) -> Task:

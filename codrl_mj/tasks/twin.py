@@ -1,5 +1,6 @@
 """A task's twin: the Gymnasium environment that it rebuilds, unmodified, driven through its attributes."""
 
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -8,6 +9,7 @@ import numpy as np
 class Twin(Protocol):
     """Drives an environment that is not ours by one integration step at a time. Made without arguments.
 
+    Where it has the environment as `env`, this one's numbers can be read and written through the analytic physics.
     Where the environment has its equations of motion as a function, `derivative(state, force)` may return the state's
     time derivative, shape (n,): the certificate then compares with that.
     """
@@ -33,12 +35,19 @@ class GymnasiumTwin:
         self.env = gymnasium_env(self.env_id)
 
     def after(self, state: Any, action: Any, **attributes: Any) -> Any:
-        """The state after one `step` from a state, with attributes set before."""
+        """The state after one `step` from a state, with attributes set for it."""
+        kept = {name: getattr(self.env, name) for name in attributes}
+        try:
+            self._set(attributes)
+            self.env.state = state
+            self.env.step(action)
+        finally:
+            self._set(kept)
+        return self.env.state
+
+    def _set(self, attributes: Mapping[str, Any]) -> None:
         for name, value in attributes.items():
             setattr(self.env, name, value)
-        self.env.state = state
-        self.env.step(action)
-        return self.env.state
 
 
 def gymnasium_env(env_id: str) -> Any:

@@ -26,7 +26,6 @@ from codrl_mj.actuators import (
     mapping_of,
     resolve,
 )
-from codrl_mj.actuators.named import actuator_from_file
 from codrl_mj.fields import real
 from codrl_mj.tasks import TASKS, named_actuator, resolve_actuators
 from tests.actuators.strategies import of_every_family
@@ -237,8 +236,8 @@ def test_a_mapping_that_its_family_cannot_read_is_refused(mapping, message):
     [
         ("nowhere_at_all:Mine", "'nowhere_at_all:Mine': No module named 'nowhere_at_all'; must be module:NAME"),
         (f"{__name__}:Yours", "has no attribute 'Yours'; must be module:NAME, of a module that Python finds"),
-        (f"{__name__}:Motor", "is no subclass of codrl_mj.ActuatorModel"),
-        (f"{__name__}:MINE", "is no subclass of codrl_mj.ActuatorModel"),
+        (f"{__name__}:Motor", "is no subclass of codrl_mj's ActuatorModel"),
+        (f"{__name__}:MINE", "is no subclass of codrl_mj's ActuatorModel"),
     ],
 )
 def test_a_place_where_there_is_no_family_is_refused(place, message):
@@ -275,13 +274,29 @@ def test_a_file_holds_the_mapping(name, tmp_path):
     for actuator in (Lag(0.2, 0.01), Actuator(Motor(resistance=3.0), supply=Supply(12.0, 0.5)), MINE):
         path.write_text(json.dumps(actuator.as_mapping()))  # JSON is YAML
         assert resolve(str(path), None, "nobody") == actuator
-        assert actuator_from_file(path) == actuator
+        assert resolve(path, None, "nobody") == actuator
+
+
+def test_a_file_may_set_fields_over_a_named_actuator(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("name: weak\nmotor: {resistance: 2}\n")
+    motor = dataclasses.replace(CARTPOLE.paper[0].motor, resistance=2.0)
+    assert resolve_actuators(path, CARTPOLE) == (Actuator(motor, CurrentLoop(kp=1.0, ki=1.0)),)
+    with pytest.raises(ValueError, match=re.escape(f"{path}: actuator = 'weak': a variation of the paper's")):
+        resolve(path, None, "nobody")
+    path.write_text(f"name: {path}\n")
+    with pytest.raises(
+        ValueError, match=re.escape(f"{path}: name = '{path}': must be an actuator's name, and no file")
+    ):
+        resolve_actuators(path, CARTPOLE)
 
 
 def test_yaml_may_be_written_by_hand(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("motor: {resistance: 2}\ncontroller:\n  kp: 1.5  # V/A\n  max_voltage: .inf\n")
-    assert actuator_from_file(path) == Actuator(Motor(resistance=2.0), CurrentLoop(kp=1.5, max_voltage=float("inf")))
+    assert resolve(path, None, "nobody") == Actuator(
+        Motor(resistance=2.0), CurrentLoop(kp=1.5, max_voltage=float("inf"))
+    )
 
 
 @pytest.mark.parametrize(

@@ -155,6 +155,8 @@ def test_an_unknown_setting_or_agent_is_named():
         agent_from_mapping({"name": "dqn", "momentum": 1})
     with pytest.raises(ValueError, match=r"^unknown agent 'reinforce': Known: ppo, ddpg, dqn"):
         find_agent("reinforce")
+    with pytest.raises(ValueError, match=rf"^agent '{__name__}:json': .* is no subclass of codrl_mj's AgentConfig"):
+        find_agent(f"{__name__}:json")
     with pytest.raises(ValueError, match=r"^unknown agent 'None'"):
         agent_from_mapping({"gamma": 0.9})
 

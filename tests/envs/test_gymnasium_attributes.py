@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from codrl_mj.envs.distributions import Uniform
+from codrl_mj.physics.analytic import AnalyticPhysics
 from codrl_mj.physics.registry import PHYSICS
 from codrl_mj.tasks import TASKS
 
@@ -62,9 +63,12 @@ def _run(env, task, seed):
     return np.array(states)
 
 
+@pytest.mark.parametrize("physics", PHYSICS)
 @every_task
-def test_every_number_that_gymnasiums_environment_has_can_be_read(task):
-    ours, theirs = _pair(task)
+def test_every_number_that_gymnasiums_environment_has_can_be_read(task, physics):
+    ours, theirs = _pair(task, physics=physics)
+    ours.reset(seed=0)
+    ours.step(ours.action_space.sample())  # which drives the analytic physics through attributes
     names = [name for name in dir(theirs) if name[0] != "_" and name not in NOT_OF_THE_TASK]
     expected = {name: value for name in names if not inspect.isroutine(value := getattr(theirs, name))}
     assert len(expected) >= 6
@@ -75,8 +79,9 @@ def test_every_number_that_gymnasiums_environment_has_can_be_read(task):
 @pytest.mark.parametrize(
     ("task", "values"), WRITES, ids=lambda given: given if isinstance(given, str) else "+".join(given)
 )
-def test_a_written_number_has_the_effect_that_it_has_in_gymnasium(task, values):
-    ours, theirs = _pair(task)
+@pytest.mark.parametrize("physics", PHYSICS)
+def test_a_written_number_has_the_effect_that_it_has_in_gymnasium(task, values, physics):
+    ours, theirs = _pair(task, physics=physics)
     before = _run(theirs, task, seed=3)
     state = ours.state = ours.state + 0.01
     for name, value in values.items():
@@ -196,7 +201,7 @@ def test_what_can_only_be_read_says_why_and_what_to_do(name, value, why):
         ({"actuator": "paper"}, "tau", "motor and disturbances were checked for this step"),
         ({"actuator": "paper", "action": "current", "levels": (-1, 1)}, "force_mag", "action='force'"),
         ({"randomize": {"model.gravity": Uniform(0.9, 1.1)}}, "masspole", "give `randomize` a distribution"),
-        ({"physics": "analytic"}, "gravity", "use physics='mujoco'"),
+        ({"physics": "analytic", "actuator": "paper"}, "tau", "motor and disturbances were checked for this step"),
     ],
 )
 def test_what_an_environment_cannot_change_it_refuses(arguments, name, why):
@@ -204,9 +209,29 @@ def test_what_an_environment_cannot_change_it_refuses(arguments, name, why):
         setattr(_pair("cartpole", **arguments)[0], name, 0.5)
 
 
+@pytest.mark.parametrize("physics", PHYSICS)
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf, "heavy", None, [1.0, 2.0]])
-def test_impossible_masses_are_refused_and_nothing_is_changed(value):
-    env = _pair("cartpole")[0]
+def test_impossible_masses_are_refused_and_nothing_is_changed(value, physics):
+    env = _pair("cartpole", physics=physics)[0]
     with pytest.raises(ValueError, match=r"masspole = .*: must be a finite number > 0"):
         env.masspole = value
     assert env.masspole == 0.1
+
+
+def test_a_physics_of_ones_own_without_a_model_says_that_it_has_no_such_number(monkeypatch):
+    class Still(AnalyticPhysics):
+        """Goes nowhere."""
+
+        def __init__(self, *arguments, **options):
+            super().__init__(*arguments, **options)
+            self.twin = lambda state, *_: state
+
+    monkeypatch.setitem(PHYSICS, "still", Still)
+    env = _pair("cartpole", physics="still")[0]
+    assert env.x_threshold == 2.4
+    assert env.force_mag == 10.0
+    for name in ("gravity", "masspole"):
+        with pytest.raises(AttributeError, match=r"Still has no MuJoCo model or data.* use physics='mujoco'"):
+            getattr(env, name)
+    with pytest.raises(AttributeError, match="Still has no MuJoCo model or data"):
+        env.tau = 0.1

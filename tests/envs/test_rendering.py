@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import unittest.mock
 import warnings
 
 import gymnasium
@@ -164,7 +165,25 @@ def test_every_step_of_the_human_mode_is_shown_in_a_window(monkeypatch, physics)
         assert rate == 30
 
 
-def test_a_window_shows_an_image(monkeypatch):
+def test_a_window_shows_an_image_the_right_way_round(monkeypatch):
+    """By what it hands to pygame, whether that is there or not: its arrays have the axis to the right first."""
+    pygame = unittest.mock.MagicMock()
+    monkeypatch.setitem(sys.modules, "pygame", pygame)
+    image = np.arange(18, dtype=np.uint8).reshape(2, 3, 3)
+    window = Window(3, 2)
+    window.show(image, 30.0)
+    pygame.display.set_mode.assert_called_once_with((3, 2))
+    (array,) = pygame.surfarray.make_surface.call_args.args
+    assert [array[x, y].tolist() for y in range(2) for x in range(3)] == image.reshape(6, 3).tolist()
+    pygame.time.Clock().tick.assert_called_once_with(30.0)
+    drawn = [name for name, *_ in pygame.mock_calls]
+    assert drawn.index("display.set_mode().blit") < drawn.index("display.flip")
+    assert "display.quit" not in drawn
+    window.close()
+    pygame.display.quit.assert_called_once_with()
+
+
+def test_pygame_shows_an_image(monkeypatch):
     pygame = pytest.importorskip("pygame")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     window = Window(3, 2)
@@ -177,8 +196,10 @@ def test_a_window_shows_an_image(monkeypatch):
 
 def test_a_window_says_what_it_needs(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(DependencyNotInstalled, match="pip install pygame-ce"):
-        Window(3, 2)
+    env = gymnasium.make("codrl_mj/Pendulum-v0", render_mode="human", width=64, height=48)
+    with pytest.raises(DependencyNotInstalled, match=r"^render_mode = 'human' needs pygame: pip install pygame-ce$"):
+        env.reset(seed=0)
+    env.close()
 
 
 def test_without_a_render_mode_there_is_a_warning_and_no_image(make):

@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor
 from codrl_mj.envs import ActuatedEnv, ActuatedVectorEnv
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.envs.sb3 import make_sb3_vec_env
 from codrl_mj.envs.setup import Setup
 from codrl_mj.tasks import TASKS
 from tests.engine.models import FULL, changed
@@ -83,6 +84,17 @@ def test_each_environment_may_have_its_own_actuator(task, mode):
         assert_equal_episodes(ours, looped(task, 7, mode, **arguments), 30)
     currents = runs[0].unwrapped.signals["current"]
     assert len(np.unique(currents)) == 7  # the parameters arrive
+
+
+def test_actuators_of_the_environments_may_be_written_as_that_of_one(tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text("name: weak\ncontroller: {kp: 0.5}\n")
+    written = ["paper", file, {"name": "weaker", "motor": {"resistance": 2.0}}, str(file)]
+    each = [EnvConfig("pendulum", one).actuator for one in written]
+    assert len(set(each)) == 3
+    assert_equal_episodes(batched("pendulum", 4, actuator=written), looped("pendulum", 4, actuator=each), 20)
+    serial = make_sb3_vec_env(TASKS["pendulum"].env_id, 4, physics="analytic", actuator=written).env
+    assert [one.unwrapped.actuator for one in serial.envs] == each
 
 
 @every_task

@@ -42,6 +42,13 @@ BAD = {
     "too many actuators": ({"actuator": [STABLE] * 4}, "4 actuators for 3 environments: there must be one for each"),
     "no actuators": ({"actuator": []}, "0 actuators for 3 environments: there must be one for each"),
     "not an actuator": ({"actuator": [STABLE, "ideal", STABLE]}, "actuator[1] = 'ideal': must be an Actuator"),
+    "unknown name": (
+        {"actuator": ["weak", "weka", "weak"]},
+        "actuator[1]: unknown actuator 'weka': did you mean 'weak'?",
+    ),
+    "a number": ({"actuator": ["weak", "weak", 3]}, "actuator[2]: actuator = 3: must be a name"),
+    "two families": ({"actuator": ["weak", "lag", "weak"]}, "actuators of several families (Actuator, Lag)"),
+    "none among others": ({"actuator": ["weak", None, "weak"]}, "actuator[1] = None: must be an Actuator"),
     "unstable": ({"actuator": WILD}, "unstable at a step of 0.05 s: spectral radius"),
     "one unstable": ({"actuator": [STABLE, STABLE, WILD]}, "actuator[2]: "),
     "voltage for each": (

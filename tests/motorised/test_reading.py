@@ -1,5 +1,7 @@
 """Reading motors and their signals from models and data, at both doors at once."""
 
+import re
+
 import mujoco
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ import pytest
 import codrl_mj
 from codrl_mj.actuators import Lag, TorqueSpeed
 from codrl_mj.physics.mjcf import drive, install_callbacks
-from tests.motorised.models import LOOP, arm
+from tests.motorised.models import LOOP, arm, behind_callback, behind_plugin
 
 pytestmark = pytest.mark.usefixtures("bare_engine")
 
@@ -53,6 +55,22 @@ def test_signals_of_both_doors_are_read():
     np.testing.assert_allclose(data.qfrc_actuator, [found["actual_force"][0], 0.3 + 0.1])
 
 
+def test_controls_beyond_their_range_are_what_the_model_makes_of_them():
+    """A source without lag delivers what is desired, so the engine's own force says what that is."""
+    source = Lag(time_constant=0.0)
+    for build in (behind_callback, behind_plugin):
+        model = build(arm(), {"one": source, "two": source})
+        model.actuator_ctrllimited[:], model.actuator_ctrlrange[:] = True, (-0.4, 0.5)
+        data, readout = mujoco.MjData(model), codrl_mj.Readout(model)
+        data.ctrl[:] = 0.9, -0.7
+        for flags, expected in ((0, [0.5, -0.4]), (mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL, [0.9, -0.7])):
+            model.opt.disableflags = flags
+            mujoco.mj_step(model, data)
+            found = readout(data)
+            np.testing.assert_array_equal(found["desired_force"], expected)
+            np.testing.assert_array_equal(found["actual_force"], expected)
+
+
 def test_a_model_without_motors_has_no_signals():
     model = arm().compile()
     assert {name: values.shape for name, values in codrl_mj.signals(model, mujoco.MjData(model)).items()} == {
@@ -85,3 +103,20 @@ def test_clearing_motors_at_both_doors_brings_them_to_rest():
     codrl_mj.clear_motors(data)
     states = np.concatenate((data.act, data.plugin_state))
     assert states[states != 0.0].tolist() == [data.time, 7.0, data.time, 8.0]
+
+
+@pytest.mark.parametrize("key", [-1, 1.5, 2**53, np.nan, np.inf, "7", None])
+def test_a_key_that_is_no_key_is_refused_and_nothing_is_changed(key):
+    model = _mixed()
+    data = mujoco.MjData(model)
+    codrl_mj.clear_motors(data, np.array([2**53 - 1, 8]))
+    data.ctrl[:] = 0.15, 0.5, 0.1
+    mujoco.mj_step(model, data, 10)
+    before = np.concatenate((data.act, data.plugin_state))
+    assert before[1] == 2.0**53 - 1
+    message = f"noise_keys[1] = {key!r}: must be a whole number from 0 to 2**53 - 1"
+    with pytest.raises(ValueError, match=re.escape(message)):
+        codrl_mj.clear_motors(data, [3, key])
+    with pytest.raises(ValueError, match="there are 1, must be 2, one for each motor"):
+        codrl_mj.clear_motors(data, 7)
+    np.testing.assert_array_equal(np.concatenate((data.act, data.plugin_state)), before)

@@ -6,6 +6,7 @@ import pytest
 from codrl_mj.actuators import IDEAL, Actuator, Inputs
 from codrl_mj.physics import SimulationDivergedError
 from codrl_mj.physics.base import check_finite, check_integrator, inner_step_count
+from codrl_mj.physics.registry import PHYSICS
 from codrl_mj.tasks import TASKS
 
 
@@ -72,6 +73,23 @@ def test_divergence_names_every_broken_entry_and_the_time(task, bad):
             check_finite(task, broken, 1.25)
         assert f"{task.name}: the simulation diverged at t = 1.25 s: {name} = {bad:g}" in str(raised.value)
         assert "Reset the environment" in str(raised.value)
+
+
+@pytest.mark.parametrize("name", PHYSICS)
+def test_every_physics_checks_its_present_state_and_lets_no_fields_be_set(name):
+    physics = PHYSICS[name](TASKS["pendulum"], [IDEAL], 1, "semi-implicit")
+    physics.reset(np.array([0.3, 0.1]))
+    physics.check_finite()
+    physics.set_model({})
+    physics.state = np.array([0.3, 1.1e10])
+    with pytest.raises(SimulationDivergedError, match=r"pendulum: the simulation diverged at t = 0 s: theta_dot"):
+        physics.check_finite()
+
+
+def test_the_analytic_physics_refuses_fields_of_a_model_and_names_them():
+    physics = PHYSICS["analytic"](TASKS["pendulum"], [IDEAL], 1, "semi-implicit")
+    with pytest.raises(ValueError, match=r"fields = body_mass, .*: they are a MuJoCo model's, which .*use 'mujoco'"):
+        physics.set_model({"body_mass": np.ones((1, 2)), "body_ipos": np.zeros((1, 2, 3))})
 
 
 def test_the_ideal_actuator_delivers_what_is_desired_and_has_no_current():

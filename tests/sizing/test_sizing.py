@@ -13,7 +13,7 @@ from codrl_mj import Drive, GearMotor, Ideal, SampledLoop, Supply
 from codrl_mj.actuators import Inputs, parameters_type
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.evaluation import make_env, run_episodes
+from codrl_mj.evaluation import run_episodes
 from codrl_mj.sizing import (
     SURELY,
     SURELY_NOT,
@@ -57,7 +57,7 @@ def pendulum():
 
 def from_hanging(actuator, steps=400):
     """States of the scripted swing-up on an actuator, from almost hanging, shape (steps + 1, 2)."""
-    env, policy = make_env("pendulum", actuator, max_episode_steps=steps), Scripted(TASKS["pendulum"])
+    env, policy = EnvConfig("pendulum", actuator, max_episode_steps=steps).make(), Scripted(TASKS["pendulum"])
     env.reset(seed=0)
     env.unwrapped.physics.state = np.array([np.pi - 0.05, 0.0])
     states = [env.unwrapped.physics.state]

@@ -19,7 +19,7 @@ from codrl_mj import Actuator, CurrentLoop, Motor
 from codrl_mj.agents import PPOConfig
 from codrl_mj.agents.sarsa_episodes import CompiledEpisodes
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.evaluation import RandomPolicy, evaluate, make_env, run_episodes
+from codrl_mj.evaluation import RandomPolicy, evaluate, run_episodes
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.training import EVALUATION_SEED, TrainConfig, load_config, train
 
@@ -49,7 +49,7 @@ def same_weights(first, second):
 
 
 def mean_return(policy, actuator, episodes=20):
-    return np.mean([e.total for e in run_episodes(policy, lambda: make_env("cartpole", actuator), episodes, seed=1000)])
+    return np.mean([e.total for e in run_episodes(policy, EnvConfig("cartpole", actuator).make, episodes, seed=1000)])
 
 
 # -- learning -----------------------------------------------------------------------------------------------

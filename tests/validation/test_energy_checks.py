@@ -100,13 +100,13 @@ def test_a_wrong_force_on_the_analytic_physics_fails(monkeypatch):
 
     def stronger(self, *arguments, **options):
         make(self, *arguments, **options)
-        drive = self._twin
+        drive = self.twin
 
         class Stronger:
             def __call__(self, state, force, timestep, integrator):
                 return drive(state, 1.02 * force, timestep, integrator)
 
-        self._twin = Stronger()
+        self.twin = Stronger()
 
     monkeypatch.setattr(AnalyticPhysics, "__init__", stronger)
     checks = {check.name: check for check in energy.checks("pendulum", quick=True) if not check.passed}

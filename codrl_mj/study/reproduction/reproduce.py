@@ -1,7 +1,6 @@
 """Trains and tests what is missing, and gathers what there is: from run folders alone, whoever computed them."""
 
 import dataclasses
-import difflib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -9,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from codrl_mj.runs.files import read_json
-from codrl_mj.study.grid import Deployment, cell_folder, deploy_cells, read_failure, train_cells
+from codrl_mj.study.grid import Deployment, cell_folder, check_chosen, deploy_cells, read_failure, train_cells
 from codrl_mj.study.parallel import Workers
 from codrl_mj.study.reproduction.arms import TASKS, Arm, arms_of
 from codrl_mj.study.reproduction.claims import Claim, Evidence, claims_of
@@ -49,13 +48,7 @@ class Reproduction:
 
     def __post_init__(self) -> None:
         """Validate."""
-        if not self.tasks:
-            raise ValueError(f"tasks: none is named: name one or more of {', '.join(TASKS)}")
-        for task in self.tasks:
-            if task not in TASKS:
-                near = difflib.get_close_matches(task, TASKS, n=1)
-                hint = f"did you mean {near[0]!r}? " if near else ""
-                raise ValueError(f"tasks: unknown {task!r}: {hint}Known are {', '.join(TASKS)}")
+        check_chosen("tasks", self.tasks, TASKS)
         for name in ("seeds", "sarsa_seeds", "test_episodes", "episodes"):
             value = getattr(self, name)
             whole = isinstance(value, int) and not isinstance(value, bool)

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.evaluation.episodes import Episode, make_env, run_episodes
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.evaluation.measures import Interval, Quartiles, bootstrap_mean, quartiles
 from codrl_mj.tasks import TASKS
 
@@ -187,7 +188,7 @@ def optimum(model: Model, discount: float, episodes: int = 20) -> Optimum:
     """
     of_actions = iterate(model.rewards, model.transitions, discount)
     ran = run_episodes(
-        Greedy(model.grid, of_actions), lambda: make_env(TASK, None, physics="analytic"), episodes=episodes
+        Greedy(model.grid, of_actions), EnvConfig(TASK, None, physics="analytic").make, episodes=episodes
     )
     lengths = np.array([len(episode.reward) for episode in ran if episode.terminated])
     return Optimum(
