@@ -19,7 +19,7 @@ from codrl_mj.actuators.current_loop import Supply
 from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.model import ActuatorModel, Command, Inputs, JointAdditions, UnstableError, parameters_type
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH, SampledLoop
-from codrl_mj.actuators.shaft import Means, Shaft, Winding
+from codrl_mj.actuators.shaft import Heat, Means, Shaft, Winding
 from codrl_mj.fields import part
 
 
@@ -32,8 +32,10 @@ class State(NamedTuple):
     """The controller's integral [V]."""
     pending: float
     """Voltage [V] that a delayed loop applies in the next sample."""
-    rise: float
-    """How much warmer [K] the winding is than its surroundings."""
+    winding_rise: float
+    """How much warmer [K] the winding is than the housing."""
+    housing_rise: float
+    """How much warmer [K] the housing is than the surroundings."""
     acceleration: float
     """What the torque delivered in the last step did to the rotor's speed [rad/s^2]."""
     speed: float
@@ -59,30 +61,42 @@ class Signals(NamedTuple):
     """1 where the voltage, or the current asked for, was at its limit in some sample."""
 
 
-def limited(parameters: Any, timestep: float, rise: float, resistance: float, asked: float) -> float:
+def limited(parameters: Any, timestep: float, heat: Heat, resistance: float, asked: float) -> float:
     """The current [A] that the loop is given: what is asked for, within `max_current` and what the winding bears."""
     most = parameters.max_current
-    if parameters.thermal_resistance > 0.0 and parameters.max_temperature < math.inf:
-        most = min(most, shaft.thermal_limit(parameters, timestep, rise, resistance))
+    if parameters.max_temperature < math.inf and shaft.is_warming(parameters):
+        most = min(most, shaft.thermal_limit(parameters, timestep, heat, resistance))
     return min(max(asked, -most), most)
 
 
-def begin(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[Winding, Shaft]:
-    """Winding and shaft at the beginning of a step."""
+def begin(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[Winding, Heat, Shaft]:
+    """Winding, temperatures and shaft at the beginning of a step."""
     inertia, others = shaft.inertia_of(parameters, inputs.inertia), 0.0
     if state.started > 0.0 and inertia < math.inf:
         others = shaft.others_after(timestep, inputs.speed - state.speed, state.acceleration, state.others)
     moving = Shaft(inertia, others, inputs.speed)
-    return Winding(state.current, state.integral, state.pending), moving
+    winding = Winding(state.current, state.integral, state.pending)
+    return winding, Heat(state.winding_rise, state.housing_rise), moving
 
 
-def end(parameters: Any, timestep: float, rise: float, winding: Winding, moving: Shaft, means: Means) -> State:
-    """The state after a step, from the shaft at its beginning."""
-    if parameters.thermal_resistance > 0.0:
-        resistance = shaft.resistance_at(parameters, rise)
-        rise = shaft.rise_after(parameters, timestep, rise, means.current, resistance)
+def end(
+    parameters: Any, timestep: float, heat: Heat, resistance: float, winding: Winding, moving: Shaft, means: Means
+) -> State:
+    """The state after a step, from temperatures and shaft at its beginning: its mean current heats."""
+    if shaft.is_warming(parameters):
+        heat = shaft.heated(parameters, timestep, heat, resistance * means.current * means.current)
     own = means.torque / moving.inertia
-    return State(winding.current, winding.integral, winding.pending, rise, own, moving.speed, moving.others, 1.0)
+    return State(
+        winding.current,
+        winding.integral,
+        winding.pending,
+        heat.winding,
+        heat.housing,
+        own,
+        moving.speed,
+        moving.others,
+        1.0,
+    )
 
 
 def _advance(
@@ -90,13 +104,13 @@ def _advance(
 ) -> tuple[State, float, Signals]:
     """A step of a drive that a torque is asked of or, where the loop is not `closed`, a voltage: kT for a volt."""
     asked = inputs.desired_torque / parameters.torque_constant
-    resistance = shaft.resistance_at(parameters, state.rise)
-    reference = limited(parameters, timestep, state.rise, resistance, asked) if closed else asked
-    winding, moving = begin(parameters, timestep, state, inputs)
+    winding, heat, moving = begin(parameters, timestep, state, inputs)
+    resistance = shaft.resistance_at(parameters, shaft.temperature_of(parameters, heat))
+    reference = limited(parameters, timestep, heat, resistance, asked) if closed else asked
     samples = max(int(timestep * parameters.sample_rate + 0.5), 1)
     winding, _, means = shaft.turn(parameters, resistance, timestep, samples, winding, moving, closed, reference)
-    after = end(parameters, timestep, state.rise, winding, moving, means)
-    temperature = parameters.ambient_temperature + after.rise
+    after = end(parameters, timestep, heat, resistance, winding, moving, means)
+    temperature = shaft.temperature_of(parameters, Heat(after.winding_rise, after.housing_rise))
     at_limit = 1.0 if means.saturated > 0.0 or reference != asked else 0.0
     shown = reference if closed else means.current
     return after, means.torque, Signals(means.current, shown, means.voltage, temperature, at_limit)

@@ -44,10 +44,14 @@ class GearMotor:
     load_inertia: float = real(0.0, least=0.0, unit="kg*m^2", infinite=True)
     """Inertia [kg*m^2] of what the output shaft moves, >= 0, by which its speed changes within a step; 0: what it is in
     the model at each moment; `inf`: the speed is held over a step. Nothing is added to the model by it."""
-    thermal_resistance: float = real(0.0, least=0.0, unit="K/W")
-    """Thermal resistance [K/W] from the winding to the surroundings, >= 0; 0: the winding stays as cold as they are."""
-    thermal_time_constant: float = real(10.0, above=0.0, unit="s")
+    thermal_resistance_winding: float = real(0.0, least=0.0, unit="K/W")
+    """Thermal resistance [K/W] from the winding to the housing, >= 0; 0: the winding is as warm as the housing."""
+    thermal_time_constant_winding: float = real(10.0, above=0.0, unit="s")
     """Time constant [s] of the winding's temperature, > 0."""
+    thermal_resistance_housing: float = real(0.0, least=0.0, unit="K/W")
+    """Thermal resistance [K/W] from the housing to the surroundings, >= 0; 0: it stays as cold as they are."""
+    thermal_time_constant_housing: float = real(100.0, above=0.0, unit="s")
+    """Time constant [s] of the housing's temperature, > 0."""
     ambient_temperature: float = real(25.0, above=-273.15, unit="degC")
     """Temperature [degC] of the surroundings, and of the winding at the start of an episode."""
     max_temperature: float = real(math.inf, above=-273.15, unit="degC", infinite=True)
@@ -89,6 +93,8 @@ class GearMotor:
         """A motor of `codrl_mj.catalogue.MotorNumbers`; what they do not know is left at 0, an efficiency at 1."""
         known = {field.name: getattr(numbers, field.name, None) for field in dataclasses.fields(cls)}
         known |= {name: 0.0 for name in _UNKNOWN if known[name] is None}
+        if known["thermal_resistance_winding"] is None:  # a sheet that has the whole of it alone
+            known["thermal_resistance_winding"] = getattr(numbers, "thermal_resistance", None)
         return cls(**{name: value for name, value in known.items() if value is not None})
 
     @property

@@ -14,7 +14,7 @@ import numpy as np
 from codrl_mj.actuators import drive, shaft
 from codrl_mj.actuators.drive import ARM, Drive
 from codrl_mj.actuators.model import Command, Inputs, UnstableError
-from codrl_mj.actuators.shaft import Means, Shaft
+from codrl_mj.actuators.shaft import Heat, Means, Shaft
 from codrl_mj.fields import check, choice, real
 
 
@@ -61,7 +61,8 @@ class State(NamedTuple):
     current: float
     integral: float
     pending: float
-    rise: float
+    winding_rise: float
+    housing_rise: float
     acceleration: float
     speed: float
     others: float
@@ -135,14 +136,15 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
         state.current,
         state.integral,
         state.pending,
-        state.rise,
+        state.winding_rise,
+        state.housing_rise,
         state.acceleration,
         state.speed,
         state.others,
         state.started,
     )
-    winding, moving = drive.begin(parameters, timestep, of_drive, inputs)
-    resistance = shaft.resistance_at(parameters, state.rise)
+    winding, heat, moving = drive.begin(parameters, timestep, of_drive, inputs)
+    resistance = shaft.resistance_at(parameters, shaft.temperature_of(parameters, heat))
     target, constant = inputs.desired_torque, parameters.torque_constant
     rate = (target - state.target) / timestep if state.started > 0.0 else 0.0
     count = max(int(timestep * parameters.servo_rate + 0.5), 1)
@@ -160,7 +162,7 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
         else:
             after = integral
         given = min(max(asked, -most), most) / constant
-        given = drive.limited(parameters, timestep, state.rise, resistance, given)
+        given = drive.limited(parameters, timestep, heat, resistance, given)
         if given == asked / constant or (after - integral) * asked < 0.0:
             integral = after  # it does not wind up
         else:
@@ -174,15 +176,16 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
         torque += means.torque / count
     waiting -= 1.0
     mean = Means(amperes, volts, torque, saturated)
-    followed = drive.end(parameters, timestep, state.rise, winding, moving, mean)
-    temperature = parameters.ambient_temperature + followed.rise
+    followed = drive.end(parameters, timestep, heat, resistance, winding, moving, mean)
+    temperature = shaft.temperature_of(parameters, Heat(followed.winding_rise, followed.housing_rise))
     error = (target - (inputs.position if parameters.controls == 0.0 else inputs.speed)) / parameters.gear_ratio
     at_limit = 1.0 if saturated > 0.0 else 0.0
     after_step = State(
         followed.current,
         followed.integral,
         followed.pending,
-        followed.rise,
+        followed.winding_rise,
+        followed.housing_rise,
         followed.acceleration,
         followed.speed,
         followed.others,

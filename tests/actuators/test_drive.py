@@ -44,7 +44,7 @@ def drive(name, rate=20e3, **loop):
 
 def responses(one, timestep, torques, speeds):
     """States, torques and signals of steps under held torques and speeds at the rotor."""
-    parameters, state = parameters_type(Drive)(*one.numbers), one.State(*[0.0] * 8)
+    parameters, state = parameters_type(Drive)(*one.numbers), one.State(*[0.0] * 9)
     found = []
     for torque, speed in zip(torques, speeds, strict=True):
         state, delivered, signals = one.advance(parameters, timestep, state, Inputs(torque, 0.0, speed, 0.0, 0.0))

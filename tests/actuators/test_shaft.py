@@ -12,7 +12,7 @@ import codrl_mj
 from codrl_mj.actuators import Drive, GearMotor, Inputs, SampledLoop, Supply, parameters_type
 from codrl_mj.actuators.shaft import Shaft, friction
 
-HOT = GearMotor(thermal_resistance=20.0, thermal_time_constant=3.0, ambient_temperature=20.0)
+HOT = GearMotor(thermal_resistance_winding=20.0, thermal_time_constant_winding=3.0, ambient_temperature=20.0)
 
 
 def advanced(one, timestep, torques, speed=0.0, inertia=math.inf):
@@ -53,6 +53,17 @@ def test_a_winding_warms_and_its_resistance_with_it():
     np.testing.assert_allclose([one.temperature for one in found], 20.0 + exact, atol=0.15)
     volts = hot * (1.0 + 0.00393 * (exact - 5.0)) * amperes
     np.testing.assert_allclose([one.voltage for one in found[100:]], volts[100:], rtol=2e-3)
+
+
+def test_winding_and_housing_warm_one_after_the_other():
+    """Of a resistance that does not grow: the sum of two first-order responses."""
+    motor = dataclasses.replace(
+        HOT, thermal_resistance_housing=30.0, thermal_time_constant_housing=40.0, resistance_coefficient=0.0
+    )
+    found, _ = advanced(Drive(motor, supply=Supply(48.0)), 0.02, [0.042 * 0.5] * 3000)
+    times, watts = 0.02 * np.arange(1, 3001), 0.25 * 8.4
+    expected = 20.0 + watts * (20.0 * -np.expm1(-times / 3.0) + 30.0 * -np.expm1(-times / 40.0))
+    np.testing.assert_allclose([one.temperature for one in found], expected, atol=0.02)
 
 
 def test_current_and_temperature_are_those_of_mujoco_s_own_motor():
