@@ -251,7 +251,7 @@ def gear_loss(parameters: Any, timestep: float, torque: float, speed: float) -> 
     loss = share * abs(torque)
     if parameters.rotor_inertia > 0.0:  # no more than stops the rotor alone, and so never more than stops all
         loss = min(loss, parameters.rotor_inertia * abs(speed) / timestep)
-    return math.copysign(loss, speed)
+    return math.copysign(loss, speed) if speed != 0.0 else 0.0  # zeros have signs
 
 
 def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Signals]:

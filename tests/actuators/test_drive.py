@@ -223,6 +223,15 @@ def test_near_standstill_a_gear_s_loss_only_stops():
         assert step[1] - 0.042 * step[2].current == pytest.approx(-4e-6 * speed / 0.01)
 
 
+@pytest.mark.parametrize("inertia", [0.0, 4e-6])
+@pytest.mark.parametrize("speed", [0.0, -0.0])
+def test_at_standstill_a_gear_takes_and_adds_nothing(speed, inertia):
+    lossy = Drive(GearMotor(gear_efficiency=0.5, rotor_inertia=inertia))
+    for torque in (0.02, -0.02):
+        step = responses(lossy, 0.01, [torque] * 5, [speed] * 5)[-1]
+        assert step[1] == pytest.approx(0.042 * step[2].current, rel=1e-15)
+
+
 def test_the_largest_current_is_kept():
     one = drive("qube", max_current=0.3)
     steps = responses(one, 0.002, [1.0, -1.0, 0.042 * 0.2], [0.0] * 3)
