@@ -14,10 +14,12 @@ from codrl_mj.actuators.model import (
     family_name,
     family_number,
     field_paths,
+    field_values,
     parameter_paths,
     parameters_type,
     reference,
     trusting,
+    unchecked,
 )
 from codrl_mj.actuators.named import (
     FAMILIES,
@@ -61,6 +63,7 @@ __all__ = [
     "family_name",
     "family_number",
     "field_paths",
+    "field_values",
     "find_family",
     "mapping_of",
     "parameter_paths",
@@ -70,4 +73,5 @@ __all__ = [
     "spectral_radii",
     "spectral_radius",
     "trusting",
+    "unchecked",
 ]

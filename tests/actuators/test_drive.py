@@ -280,12 +280,6 @@ def test_many_are_judged_as_one():
     assert np.isinf(Drive.instability(np.array([good.numbers]), 0.00123)).all()
 
 
-@pytest.mark.parametrize("field", ["motor.rotor_inertia", "motor.gear_ratio", "motor.coulomb_friction"])
-def test_what_is_built_into_the_model_is_not_drawn(field):
-    with pytest.raises(ValueError, match=rf"{field} = 2: changes what the actuator adds to its joint, or its gear"):
-        gymnasium.make("codrl_mj/Pendulum-v0", actuator=drive("qube"), randomize={field: Uniform(2.0, 3.0)})
-
-
 def test_a_vector_of_drives_is_the_drives_alone_and_their_windings_are_drawn():
     arguments = {"actuator": drive("qube"), "randomize": {"motor.resistance": Uniform(4.0, 12.0)}}
     ours = gymnasium.make_vec("codrl_mj/Acrobot-v0", 3, "vector_entry_point", **arguments)
