@@ -91,6 +91,19 @@ def test_a_drawn_field_is_drawn_in_a_batch_as_alone_and_brought_back(name):
         assert_same(fresh.step(one), wanted)
 
 
+def test_before_the_first_draw_everything_is_nominal_and_can_be_again():
+    alone, many = ActuatedEnv("pendulum", ONE, randomize=DRAWN), batched("pendulum", 2, actuator=ONE, randomize=DRAWN)
+    starts = alone.snapshot(), many.snapshot()
+    for env, start in zip((alone, many), starts, strict=True):
+        env.reset(seed=0)
+        models = [alone.model] if env is alone else list(many.unwrapped.physics.models())
+        assert all(on_joint(model) != ONE.additions for model in models)
+        env.restore(start)
+    for model in (alone.model, *many.unwrapped.physics.models()):
+        assert on_joint(model) == ONE.additions
+        assert model.actuator("motor").gear[0] == 1.0 / ONE.arm_radius
+
+
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("task", ["pendulum", "cartpole"])
 def test_everything_drawn_moves_as_the_equations_say(task, seed):
