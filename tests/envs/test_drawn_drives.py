@@ -93,15 +93,18 @@ def test_a_drawn_field_is_drawn_in_a_batch_as_alone_and_brought_back(name):
 
 def test_before_the_first_draw_everything_is_nominal_and_can_be_again():
     alone, many = ActuatedEnv("pendulum", ONE, randomize=DRAWN), batched("pendulum", 2, actuator=ONE, randomize=DRAWN)
-    starts = alone.snapshot(), many.snapshot()
-    for env, start in zip((alone, many), starts, strict=True):
+
+    def mounted():
+        rows = [(on_joint(model), model.actuator("motor").gear[0]) for model in many.unwrapped.physics.models()]
+        return [(on_joint(alone.model), alone.model.actuator("motor").gear[0]), *rows]
+
+    nominal, starts = (ONE.additions, 1.0 / ONE.arm_radius), [env.snapshot() for env in (alone, many)]
+    for env in (alone, many):
         env.reset(seed=0)
-        models = [alone.model] if env is alone else list(many.unwrapped.physics.models())
-        assert all(on_joint(model) != ONE.additions for model in models)
+    assert len({nominal, *mounted()}) == 3  # the first of many is the one alone
+    for env, start in zip((alone, many), starts, strict=True):
         env.restore(start)
-    for model in (alone.model, *many.unwrapped.physics.models()):
-        assert on_joint(model) == ONE.additions
-        assert model.actuator("motor").gear[0] == 1.0 / ONE.arm_radius
+    assert mounted() == [nominal] * 3
 
 
 @pytest.mark.parametrize("seed", range(3))
