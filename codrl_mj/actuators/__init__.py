@@ -16,10 +16,12 @@ from codrl_mj.actuators.model import (
     family_name,
     family_number,
     field_paths,
+    field_values,
     parameter_paths,
     parameters_type,
     reference,
     trusting,
+    unchecked,
 )
 from codrl_mj.actuators.named import (
     BUILT_IN,
@@ -71,6 +73,7 @@ __all__ = [
     "family_name",
     "family_number",
     "field_paths",
+    "field_values",
     "find_family",
     "mapping_of",
     "parameter_paths",
@@ -80,4 +83,5 @@ __all__ = [
     "spectral_radii",
     "spectral_radius",
     "trusting",
+    "unchecked",
 ]
