@@ -37,10 +37,12 @@ class GearMotor:
     viscous_friction: float = real(0.0, least=0.0, unit="N*m*s/rad")
     """Viscous friction [N*m*s/rad] at the rotor, >= 0: the joint's `damping`."""
     stribeck_friction: float = real(0.0, least=0.0, unit="N*m")
-    """What friction has at standstill [N*m] at the rotor over the Coulomb friction, >= 0; of the speed w it falls as
-    exp(-(w/`stribeck_speed`)^2). Part of what is delivered (`codrl_mj.actuators.shaft.friction`)."""
+    """What friction has at standstill [N*m] at the rotor over the Coulomb friction, >= 0; with the speed w it falls as
+    exp(-|w/`stribeck_speed`|^`stribeck_exponent`). Part of what is delivered (`codrl_mj.actuators.shaft.friction`)."""
     stribeck_speed: float = real(1.0, above=0.0, unit="rad/s")
     """Speed [rad/s] of the rotor at which 1/e of it is left, > 0."""
+    stribeck_exponent: float = real(2.0, above=0.0, unit="")
+    """How abruptly it falls, > 0: 2 is the usual, fits to servos give 1.3 and more."""
     load_inertia: float = real(0.0, least=0.0, unit="kg*m^2", infinite=True)
     """Inertia [kg*m^2] of what the output shaft moves, >= 0, by which its speed changes within a step; 0: what it is in
     the model at each moment; `inf`: the speed is held over a step. Nothing is added to the model by it."""

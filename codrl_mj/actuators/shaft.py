@@ -157,8 +157,8 @@ def friction(parameters: Any, duration: float, torque: float, shaft: Shaft) -> f
     efficiency = parameters.gear_efficiency
     level = abs(torque) * (1.0 - efficiency if torque * free > 0.0 else 1.0 / efficiency - 1.0)
     if parameters.stribeck_friction > 0.0:
-        ratio = shaft.speed / parameters.stribeck_speed
-        level += parameters.stribeck_friction * math.exp(-ratio * ratio)
+        ratio = abs(shaft.speed) / parameters.stribeck_speed
+        level += parameters.stribeck_friction * math.exp(-(ratio**parameters.stribeck_exponent))
     return math.copysign(min(level, most), free) if free != 0.0 else 0.0
 
 

@@ -198,3 +198,59 @@ def test_friction_only_takes_energy():
         speeds.append(data.qvel.item())
     assert (np.diff(speeds) <= 1e-12).all()
     assert abs(speeds[-1]) < 1e-6
+
+
+MASS, LENGTH, ABOUT = 0.5, 0.15, 0.035  # a pendulum: [kg], [m] to its centre, [kg*m^2] about its hinge
+
+
+def servo_model(timestep, duration, start, friction_of, motor):
+    """A pendulum's angles [rad] as Duclusaud et al. (2024) simulate servos: what stops it, within what friction can."""
+    angle, speed, found = start, 0.0, []
+    for step in range(round(duration / timestep)):
+        pull = motor(step * timestep) - MASS * 9.81 * LENGTH * math.sin(angle)
+        stops = ABOUT * speed / timestep + pull
+        speed += timestep / ABOUT * (pull - math.copysign(min(abs(stops), friction_of(abs(speed))), stops))
+        angle += timestep * speed
+        found.append(angle)
+    return np.array(found)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 50.0])
+@pytest.mark.parametrize(
+    ("start", "motor", "far"),
+    [(-1.5, lambda _: 0.0, 0.1), (0.0, lambda time: 0.6 * math.sin(4.4 * time), 0.5)],
+    ids=["released", "driven"],
+)
+def test_coulomb_viscous_and_stribeck_friction_are_those_of_a_servo_model(ratio, start, motor, far):
+    """Numbers near those that were fitted to a Dynamixel MX-64; MuJoCo has the first two."""
+    coulomb, stribeck, at, exponent, viscous = 0.06, 0.05, 1.5, 1.3, 0.015
+    expected = servo_model(
+        0.001, 3.0, start, lambda w: coulomb + stribeck * math.exp(-((w / at) ** exponent)) + viscous * w, motor
+    )
+    one = GearMotor(
+        rotor_inertia=0.0,
+        gear_ratio=ratio,
+        coulomb_friction=coulomb / ratio,
+        viscous_friction=viscous / ratio**2,
+        stribeck_friction=stribeck / ratio,
+        stribeck_speed=at * ratio,
+        stribeck_exponent=exponent,
+    )
+    found = {}
+    for name, changed in (("with", one), ("without", dataclasses.replace(one, stribeck_friction=0.0))):
+        spec = mujoco.MjSpec()
+        spec.option.timestep, body = 0.001, spec.worldbody.add_body()
+        body.explicitinertial, body.mass, body.ipos = True, MASS, [0.0, 0.0, -LENGTH]
+        body.inertia = [ABOUT - MASS * LENGTH**2] * 3
+        body.add_joint(name="shaft", axis=[0.0, -1.0, 0.0])
+        spec.add_actuator(target="shaft", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
+        model = codrl_mj.motorise(spec, {"shaft": Drive(changed, supply=Supply(1e4))}).compile()
+        data, rows = mujoco.MjData(model), []
+        data.qpos[:] = start
+        for _ in expected:
+            data.ctrl[:] = motor(data.time)
+            mujoco.mj_step(model, data)
+            rows.append(data.qpos[0])
+        found[name] = np.abs(np.array(rows) - expected).max()
+    assert found["with"] < 0.015 * np.ptp(expected)
+    assert found["without"] > far

@@ -27,6 +27,7 @@ MOTOR = GearMotor(
     viscous_friction=1e-5,
     stribeck_friction=1e-3,
     stribeck_speed=20.0,
+    stribeck_exponent=1.5,
     load_inertia=0.3,
     thermal_resistance_winding=300.0,
     thermal_time_constant_winding=1.0,
