@@ -129,10 +129,13 @@ def _on_a_slide(task: str) -> bool:
 
 
 def motor_row(name: str) -> dict[str, Any]:
-    """What a motor of the catalogue does at its own gear, at the output, by its nominal voltage or 24 V."""
+    """What a motor of the catalogue does at its own gear, at the output, by its nominal voltage or 24 V, still cold."""
     drive, numbers = find_drive(name), motor_entry(name).numbers
     loop = design(drive)
-    free = dataclasses.replace(drive, controller=dataclasses.replace(drive.controller, max_current=math.inf))
+    cold = dataclasses.replace(drive.motor, thermal_resistance_winding=0.0, thermal_resistance_housing=0.0)
+    free = dataclasses.replace(
+        drive, motor=cold, controller=dataclasses.replace(drive.controller, max_current=math.inf)
+    )
     speed, time_constant = _free(free)
     continuous = numbers.continuous_current
     return {
