@@ -42,8 +42,8 @@ class State(NamedTuple):
     """Speed [rad/s] of the rotor at its beginning."""
     others: float
     """Acceleration [rad/s^2] of the rotor by all but the motor, as it was taken to be."""
-    started: float
-    """1 once there was a step."""
+    due: float
+    """When [s] the next step is to begin; 0 before the first."""
 
 
 class Signals(NamedTuple):
@@ -72,7 +72,7 @@ def limited(parameters: Any, timestep: float, heat: Heat, resistance: float, ask
 def begin(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[Winding, Heat, Shaft]:
     """Winding, temperatures and shaft at the beginning of a step."""
     inertia, others = shaft.inertia_of(parameters, inputs.inertia), 0.0
-    if state.started > 0.0 and inertia < math.inf:
+    if state.due > 0.0 and abs(inputs.time - state.due) < 0.5 * timestep and inertia < math.inf:
         others = shaft.others_after(timestep, inputs.speed - state.speed, state.acceleration, state.others)
     moving = Shaft(inertia, others, inputs.speed)
     winding = Winding(state.current, state.integral, state.pending)
@@ -80,7 +80,14 @@ def begin(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tup
 
 
 def end(
-    parameters: Any, timestep: float, heat: Heat, resistance: float, winding: Winding, moving: Shaft, means: Means
+    parameters: Any,
+    timestep: float,
+    time: float,
+    heat: Heat,
+    resistance: float,
+    winding: Winding,
+    moving: Shaft,
+    means: Means,
 ) -> State:
     """The state after a step, from temperatures and shaft at its beginning: its mean current heats."""
     if shaft.is_warming(parameters):
@@ -95,7 +102,7 @@ def end(
         own,
         moving.speed,
         moving.others,
-        1.0,
+        time + timestep,
     )
 
 
@@ -109,7 +116,7 @@ def _advance(
     reference = limited(parameters, timestep, heat, resistance, asked) if closed else asked
     samples = max(int(timestep * parameters.sample_rate + 0.5), 1)
     winding, _, means = shaft.turn(parameters, resistance, timestep, samples, winding, moving, closed, reference)
-    after = end(parameters, timestep, heat, resistance, winding, moving, means)
+    after = end(parameters, timestep, inputs.time, heat, resistance, winding, moving, means)
     temperature = shaft.temperature_of(parameters, Heat(after.winding_rise, after.housing_rise))
     at_limit = 1.0 if means.saturated > 0.0 or reference != asked else 0.0
     shown = reference if closed else means.current
@@ -170,8 +177,8 @@ class Drive(ActuatorModel):
         for name, kind in (("motor", GearMotor), ("controller", SampledLoop), ("supply", Supply)):
             if not isinstance(getattr(self, name), kind) and not (name == "supply" and self.supply is None):
                 raise ValueError(
-                    f"Drive.{name} = {getattr(self, name)!r}: must be a {kind.__name__}; to build a drive from nested "
-                    "mappings use Drive.from_mapping"
+                    f"{type(self).__name__}.{name} = {getattr(self, name)!r}: must be a {kind.__name__}; to build one "
+                    f"from nested mappings use {type(self).__name__}.from_mapping"
                 )
 
     @classmethod
@@ -223,7 +230,7 @@ class Drive(ActuatorModel):
         limit, torque = self.controller.max_current, self.motor.torque_constant
         fixed = dict.fromkeys(("motor.torque_constant", *ARM), "it would change what an action means")
         driven = VoltageDrive(self.motor, self.controller, self.supply)
-        past = [f"controller.{name}" for name in _PAST_THE_LOOP]
+        past = ["motor.max_temperature", *(f"controller.{name}" for name in _PAST_THE_LOOP)]
         return {
             "current": Command("A", self, torque, limit if math.isfinite(limit) else None, fixed),
             "voltage": Command(
@@ -252,20 +259,22 @@ class Drive(ActuatorModel):
                 "have them designed; lower supply.resistance; or pass allow_unstable=True to study it as it is"
             )
 
-    def check_shaft(self, timestep: float, inertia: float) -> None:
+    def check_shaft(self, timestep: float, inertia: float, held: bool = False) -> None:
         """Refuse a speed that the back-EMF of a saturated motor makes unstable; warn where it would be wrong.
 
         Raises:
             UnstableError: with the number and a remedy.
         """
-        held = math.isinf(self.motor.load_inertia)
-        rotor = self.motor.rotor_inertia
-        if self.motor.load_inertia > 0.0 and not held:
-            inertia = rotor + self.motor.load_inertia / self.motor.gear_ratio**2
+        rotor, told = self.motor.rotor_inertia, self.motor.load_inertia
+        held = held or math.isinf(told)
+        if 0.0 < told < math.inf:
+            inertia = rotor + told / self.motor.gear_ratio**2
         braking = self.motor.torque_constant * self.motor.back_emf_constant / self.motor.resistance
         samples = 1.0 if held else max(round(timestep * self.controller.sample_rate), 1)
         share = timestep / samples * braking / inertia
-        remedy = "leave motor.load_inertia 0, so that the speed is followed" if held else "raise controller.sample_rate"
+        remedy = "raise controller.sample_rate"
+        if held:
+            remedy = "shorten the step" if told == 0.0 else "leave motor.load_inertia 0, so that the speed is followed"
         text = (
             f"motor.rotor_inertia = {rotor:g}: the back-EMF of a saturated motor takes {share:.3g} of the rotor's "
             f"speed in {timestep / samples:g} s over which that is held"
@@ -277,6 +286,13 @@ class Drive(ActuatorModel):
             )
         if share > 0.5:
             warnings.warn(f"{text}: above 0.5 it is wrong, above 1 it rings; {remedy}", stacklevel=2)
+        elif share * samples > 3.0:
+            warnings.warn(
+                f"motor.rotor_inertia = {rotor:g}: the back-EMF of a saturated motor takes {share * samples:.3g} of "
+                f"the rotor's speed in a step of {timestep:g} s. That is followed on a free shaft; at a stop, under "
+                "friction or beside other joints the torque comes as many steps late; shorten the step",
+                stacklevel=2,
+            )
 
     @classmethod
     def instability(cls, numbers: np.ndarray, timestep: float) -> np.ndarray:
@@ -286,9 +302,13 @@ class Drive(ActuatorModel):
             numbers: shape (m, p), rows as `numbers` returns them.
             timestep: mechanical step [s].
         """
-        samples = timestep * stability.columns(cls, numbers).sample_rate
-        whole = (abs(samples - np.round(samples)) <= 1e-6 * samples) & (samples >= 0.5)
-        return np.where(whole, _radii(cls, numbers), np.inf)
+        columns = stability.columns(cls, numbers)
+        samples = timestep * columns.sample_rate
+        possible = (abs(samples - np.round(samples)) <= 1e-6 * samples) & (samples >= 0.5)
+        # what `GearMotor` and `SampledLoop` refuse of fields together
+        possible &= columns.max_temperature > columns.ambient_temperature
+        possible &= columns.bandwidth <= columns.sample_rate / (2.0 * math.pi)
+        return np.where(possible, _radii(cls, numbers), np.inf)
 
 
 ARM = ("motor.gear_ratio", "motor.arm_radius")

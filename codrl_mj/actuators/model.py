@@ -183,12 +183,14 @@ class ActuatorModel:
             ValueError: it cannot be simulated at all, likewise.
         """
 
-    def check_shaft(self, timestep: float, inertia: float) -> None:
+    def check_shaft(self, timestep: float, inertia: float, held: bool = False) -> None:
         """Refuse what cannot be simulated on a shaft that moves so much; called for families that ask for `INERTIA`.
 
         Args:
             timestep: mechanical step [s].
-            inertia: at the shaft [kg*m^2], or mass [kg], the rotor's own included, in the model's initial position.
+            inertia: at the shaft [kg*m^2], or mass [kg], the rotor's own included, in the model's initial position; its
+                share of it where several drive the same joint.
+            held: whether it will not be told the inertia, or not be alone in changing the speed.
 
         Raises:
             UnstableError: it is unstable there; the reason, with its number, and a remedy.
@@ -350,6 +352,16 @@ def _outline(cls: Family) -> tuple[tuple[str, Any], ...]:
     """The fields of a dataclass, each with its class where it is a part, else with None."""
     nested = fields.parts(cls)
     return tuple((field.name, nested.get(field.name)) for field in dataclasses.fields(cls))
+
+
+def options_of(cls: type, path: str) -> tuple[str, ...]:
+    """The words that a field at a dotted path can be; empty if it is a number."""
+    owner: Any = cls
+    for name in path.split("."):
+        field = next(field for field in dataclasses.fields(owner) if field.name == name)
+        owner = fields.parts(owner).get(name)
+    words: tuple[str, ...] = field.metadata.get("options", ())
+    return words
 
 
 def _is_arm(path: str) -> bool:

@@ -272,7 +272,8 @@ def turn(
     Returns:
         The winding and the rotor's speed [rad/s] afterwards, and what there was in between.
     """
-    braking = parameters.torque_constant * parameters.back_emf_constant / resistance
+    viscous = parameters.viscous_friction  # of the joint, which `others` has at the speed of the beginning
+    braking = parameters.torque_constant * parameters.back_emf_constant / resistance + viscous
     pieces = min(max(math.ceil(2.0 * duration * braking / shaft.inertia), 1), samples)
     lossy = parameters.gear_efficiency < 1.0 or parameters.stribeck_friction > 0.0
     amperes, volts, torque, saturated, left, speed = 0.0, 0.0, 0.0, 0, samples, shaft.speed
@@ -285,7 +286,8 @@ def turn(
             now = Shaft(shaft.inertia, shaft.others, speed)
             delivered -= friction(parameters, share * duration, delivered, now)
         amperes, volts, torque = amperes + share * mean, volts + share * voltage, torque + share * delivered
-        speed += share * duration * (delivered / shaft.inertia + shaft.others)
+        changed = delivered - viscous * (speed - shaft.speed)
+        speed += share * duration * (changed / shaft.inertia + shaft.others)
     return winding, speed, Means(amperes, volts, torque, float(saturated))
 
 

@@ -13,6 +13,7 @@ from codrl_mj.actuators import (
     Ideal,
     field_paths,
     field_values,
+    options_of,
     parameter_paths,
     unchecked,
 )
@@ -278,7 +279,12 @@ def _check(name: str, distribution: Distribution, actuator: ActuatorModel, comma
     if name in commands.fixed:
         raise ValueError(f"with action={commands.name!r} {commands.fixed[name]}; draw it with action='force'")
     kind = _kind(type(actuator), name)
-    if kind is not float:
+    words = options_of(type(actuator), name)
+    if words:
+        if not isinstance(distribution, Choice) or any(value not in range(len(words)) for value in distribution.values):
+            numbered = ", ".join(f"{place} for {word}" for place, word in enumerate(words))
+            raise ValueError(f"{name} is a word: draw it from a Choice of {numbered}")
+    elif kind is not float:
         if not isinstance(distribution, Choice) or any(type(value) is not kind for value in distribution.values):
             raise ValueError(f"{name} must be drawn from a Choice of {kind.__name__} values")
     elif any(isinstance(value, bool) for value in distribution.extremes):

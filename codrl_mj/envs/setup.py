@@ -67,7 +67,7 @@ class Setup:
             one.check_at(timestep, config.allow_unstable)
         if any(one.INERTIA for one in commands.simulated):
             model = task_model(definition, commands.simulated, timestep, commands.max_forces, joint=config.joint)
-            check_shafts(model, config.allow_unstable)
+            check_shafts(model, config.allow_unstable, held=config.physics == "analytic")
         return cls(
             task=definition,
             actuators=actuators,

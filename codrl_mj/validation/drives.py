@@ -38,7 +38,7 @@ FITTED = {
 }
 """Task -> a motor of the catalogue that can do it, its gear or wheel, and its drive's sample rate [Hz]. What a gear
 loses depends on what else moves the load, which the drive takes from the step before."""
-COLD = {"thermal_resistance_winding": 0.0, "thermal_resistance_housing": 0.0}
+COLD = {"thermal_resistance_winding": 0.0, "thermal_resistance_housing": 0.0, "max_temperature": math.inf}
 """A motor whose resistance stays."""
 
 

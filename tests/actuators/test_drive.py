@@ -356,6 +356,7 @@ def test_a_light_load_turns_as_in_short_steps(name, told):
         assert np.abs(followed - fine[every - 1 :: every]).mean() < 0.02 * fastest
 
 
+@pytest.mark.filterwarnings("ignore:motor.rotor_inertia")
 @pytest.mark.parametrize("name", STIFF)
 def test_an_arm_of_two_light_links_stays_bounded_at_20_ms_and_is_right_at_2(name):
     fine, fastest = reversals(name, 5e-5, [math.inf] * 2)
@@ -373,9 +374,46 @@ def test_a_speed_that_cannot_be_held_is_refused_and_one_that_is_wrong_warned_of(
         chain("dcx22l", 0.02, [math.inf])
     with pytest.warns(UserWarning, match=r"above 0\.5 it is wrong"):
         chain("1331t", 0.02, [math.inf])
+    with pytest.warns(UserWarning, match=r"takes 22\.4 of the rotor's speed .* shorten the step"):
+        chain("dcx22l", 0.2, [0.0])
     light = dataclasses.replace(Drive(), motor=GearMotor(rotor_inertia=0.0), controller=SampledLoop(500.0))
     with pytest.raises(ValueError, match=r"raise controller\.sample_rate"):
         light.check_shaft(0.002, 1e-7)
+
+
+def test_several_drives_on_a_joint_are_judged_together():
+    """None follows what the others do within a step."""
+    resistance, inductance, constant, voltage = WINDINGS["dcx22l"]
+    ratio, inertia, load = STIFF["dcx22l"]
+    spec = mujoco.MjSpec()
+    spec.option.timestep, body = 0.02, spec.worldbody.add_body()
+    body.explicitinertial, body.mass, body.inertia = True, 0.05, [load] * 3
+    body.add_joint(name="joint", axis=[0.0, 1.0, 0.0])
+    for name in "ab":
+        spec.add_actuator(name=name, target="joint", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
+    motor = GearMotor(resistance, inductance, constant, constant, inertia, gear_ratio=ratio)
+    one = Drive(motor, SampledLoop(20e3), Supply(voltage))
+    codrl_mj.motorise(spec, {"a": one})
+    with pytest.raises(ValueError, match=r"in 0\.02 s over which that is held, must be < 2; shorten the step"):
+        codrl_mj.motorise(spec, {"a": one, "b": one})
+
+
+def test_a_drive_that_was_switched_off_begins_anew():
+    """What its shaft did meanwhile is not taken for what pushes it."""
+    model = chain("dcx22l", 0.01, [0.0])
+    data, cleared = mujoco.MjData(model), mujoco.MjData(model)
+    model.opt.disableactuator = 1
+    data.qvel[:] = 5.0
+    for _ in range(20):
+        mujoco.mj_step(model, data)
+    model.opt.disableactuator = 0
+    cleared.qpos[:], cleared.qvel[:], cleared.time = data.qpos, data.qvel, data.time
+    codrl_mj.clear_motors(cleared)
+    for each in (data, cleared):
+        each.ctrl[:] = 0.3
+        mujoco.mj_step(model, each)
+    np.testing.assert_array_equal(data.qvel, cleared.qvel)
+    np.testing.assert_array_equal(data.actuator_force, cleared.actuator_force)
 
 
 def test_a_winding_far_quicker_than_the_samples_has_gains_too():

@@ -115,7 +115,22 @@ def test_a_drive_keeps_the_winding_s_limit_and_then_gives_the_continuous_current
 
 def test_what_is_colder_than_its_surroundings_may_not_be_the_limit():
     with pytest.raises(ValueError, match=r"max_temperature = 20: must be above ambient_temperature = 25 degC"):
-        GearMotor(max_temperature=20.0)
+        GearMotor(max_temperature=20.0, thermal_resistance_winding=1.0)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"max_temperature": 80.0}, r"max_temperature = 80: needs thermal_resistance_winding or"),
+        (
+            {"ambient_temperature": -260.0},
+            r"= -260: .* no resistance; must be above -229\.453 degC",
+        ),
+    ],
+)
+def test_a_limit_without_heat_and_a_winding_without_resistance_are_refused(fields, message):
+    with pytest.raises(ValueError, match=message):
+        GearMotor(**fields)
 
 
 def test_a_bridge_loses_its_dead_band():
