@@ -29,7 +29,7 @@ from codrl_mj.tasks import TASKS
 _FULL_STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 
 TASK_NAME = "gym"
-_PAPER = object()
+_DEFAULT = object()
 """The actuator where none is given: `paper`, or a configuration's own."""
 
 
@@ -207,7 +207,7 @@ class GymTask(control.Task):
 def load(
     domain_name: str | EnvConfig,
     task_name: str = TASK_NAME,
-    actuator: Any = _PAPER,
+    actuator: Any = _DEFAULT,
     task_kwargs: Mapping[str, Any] | None = None,
     environment_kwargs: Mapping[str, Any] | None = None,
     **options: Any,
@@ -237,10 +237,10 @@ def load(
     if given.keys() - {"random"}:
         raise ValueError(f"task_kwargs = {dict(given)!r}: may only hold 'random'")
     if isinstance(domain_name, EnvConfig):
-        over = options if actuator is _PAPER else {"actuator": actuator, **options}
+        over = options if actuator is _DEFAULT else {"actuator": actuator, **options}
         config = EnvConfig.from_mapping(over, domain_name)
     else:
-        config = EnvConfig.of(domain_name, "paper" if actuator is _PAPER else actuator, options)
+        config = EnvConfig.of(domain_name, "default" if actuator is _DEFAULT else actuator, options)
     setup = Setup.build(config)
     simulation = setup.simulate(config.physics)
     if not isinstance(simulation, MujocoPhysics):

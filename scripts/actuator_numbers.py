@@ -23,12 +23,14 @@ from codrl_mj.actuators import NAMED, Drive
 from codrl_mj.catalogue import motor_entry, motor_names
 from codrl_mj.motor_design import design, find_drive, torque_limits
 from codrl_mj.runs.files import writing
-from codrl_mj.tasks import TASKS, named_actuator
+from codrl_mj.tasks import OURS, named_actuator
 from codrl_mj.validation.drives import COLD
 
 FOLDER = Path(__file__).parent.parent / "docs"
 PAGE = "actuators_in_numbers.md"
 TABLES = {"tasks": "actuators_in_numbers_tasks.csv", "motors": "actuators_in_numbers_motors.csv"}
+TASKS = {task.name: task for task in OURS}
+"""Those that have the paper's actuators."""
 BLOCKED = 1e12
 """Inertia [kg*m^2] that nothing here turns."""
 LONG = 200.0

@@ -26,7 +26,7 @@ from rich.table import Table
 
 from codrl_mj.cli.terminal import console
 from codrl_mj.runs.files import write_json
-from codrl_mj.tasks import TASKS
+from codrl_mj.tasks import OURS
 
 Makers = list[Callable[[], Subject]]
 NUM_ENVS = 1024
@@ -37,6 +37,7 @@ ENVPOOL = {  # of its dm_control swing-ups Pendulum's alone: a thousand of the o
     "mountain_car": ("MountainCar-v0",),
     "mountain_car_continuous": ("MountainCarContinuous-v0",),
 }
+TASKS = {task.name: task for task in OURS}
 APART = ("mountain_car", "mountain_car_continuous")  # whose walls need a call of the engine for each step of it
 DM_CONTROL = {"pendulum": "swingup", "cartpole": "swingup", "acrobot": "swingup"}
 

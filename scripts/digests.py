@@ -20,10 +20,13 @@ import numpy as np
 from gymnasium.spaces import Discrete
 from safetensors.numpy import load_file
 
-from codrl_mj import TASKS, Actuator, CurrentLoop, Ideal, Motor, Supply, Uniform, named_actuator
+from codrl_mj import Actuator, CurrentLoop, Ideal, Motor, Supply, Uniform, named_actuator
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.runs.files import read_json, write_json
+from codrl_mj.tasks import OURS
 from codrl_mj.training import TrainConfig, train
+
+TASKS = {task.name: task for task in OURS}
 
 _COMMAND = {"command_delay": 0.027, "command_quantum": 0.3, "command_rate": 1.5}
 _PULSE = {"pulse_force": 0.7, "pulse_duration": 0.13, "pulse_interval": 0.4}

@@ -11,6 +11,7 @@ import re
 import sys
 from pathlib import Path
 
+from codrl_mj.actuators import Drive
 from codrl_mj.cli.fields import field_docs
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.envs.config import EnvConfig
@@ -69,30 +70,45 @@ def page(task_name: str) -> str:
     task = TASKS[task_name]
     summary, body = _documentation(task_name)
     own = task.options()._asdict().items()
-    actuator = named_actuator("paper", task_name)
-    motor, loop = actuator.motor, actuator.controller
     facts = {
         "make it": f'`gymnasium.make("{task.env_id}")`, on the command line `{task_name}`',
-        "rebuilds": f"Gymnasium's `{task.gymnasium_id}`",
+        "rebuilds": f"Gymnasium's `{task.gymnasium_id}`" if task.gymnasium_id else "nothing of Gymnasium's",
         "model": f"`assets/{task.asset}`",
         "action space": f"`{_space(task.action_space)}`",
         "observation space": f"`{_space(task.observation_space)}`",
         "observation names": ", ".join(f"`{name}`" for name in task.observation_names),
         "state": ", ".join(task.state_names),
         "environment step": f"{task.step_duration:g} s",
-        "integration steps in it": f"{task.motor_inner_steps} with a motor, 1 without",
+        "integration steps in it": f"{task.motor_inner_steps} with a motor, {task.ideal_inner_steps} without",
         "integrators": ", ".join(f"`{name}`" for name in task.integrators),
         "options of its own": ", ".join(f"`{name}` (default {value})" for name, value in own) or "none",
         "time limit": f"{task.max_episode_steps} steps",
         "solved at": "not defined" if task.reward_threshold is None else f"a return of {task.reward_threshold:g}",
-        "`paper` actuator": f"R {motor.resistance:g} Ω, L {motor.inductance:g} H, kT {motor.torque_constant:g} N·m/A, "
-        f"kE {motor.back_emf_constant:g} V·s/rad, arm {motor.arm_radius:g}; kP {loop.kp:g}, kI {loop.ki:g}, "
-        f"kD {loop.kd:g}, kFF {loop.kff:g}, {loop.max_voltage:g} V",
+        f"`{task.default_actuator}` actuator": _actuator(task_name),
     }
     rows = "\n".join(f"| {name} | {value} |" for name, value in facts.items())
     return (
         f"# {_title(task_name)}\n\n{summary}\n\n| | |\n| --- | --- |\n{rows}\n\n{body}\n\n"
         f"## Arguments of every environment\n\n{common_arguments()}\n"
+    )
+
+
+def _actuator(task_name: str) -> str:
+    """The numbers of a task's own actuator."""
+    actuator = named_actuator("default", task_name)
+    motor, loop = actuator.motor, actuator.controller
+    constants = (
+        f"R {motor.resistance:g} Ω, L {motor.inductance:g} H, kT {motor.torque_constant:g} N·m/A, "
+        f"kE {motor.back_emf_constant:g} V·s/rad"
+    )
+    if isinstance(actuator, Drive):
+        return (
+            f"{constants}, rotor {motor.rotor_inertia:g} kg·m²; loop at {loop.sample_rate / 1e3:g} kHz, "
+            f"{loop.max_current:g} A, {actuator.voltage_limit:g} V"
+        )
+    return (
+        f"{constants}, arm {motor.arm_radius:g}; kP {loop.kp:g}, kI {loop.ki:g}, kD {loop.kd:g}, kFF {loop.kff:g}, "
+        f"{loop.max_voltage:g} V"
     )
 
 

@@ -23,7 +23,7 @@ from gymnasium.vector import AutoresetMode
 from codrl_mj import LogUniform, named_actuator, spectral_radius
 from codrl_mj.cli.terminal import console
 from codrl_mj.envs import ActuatedVectorEnv
-from codrl_mj.tasks import TASKS
+from codrl_mj.tasks import OURS, TASKS
 
 GROWTH = 4 * 2**20
 """Largest growth of resident memory after the first tenth [bytes]: 4 MiB, less than 5 bytes a step."""
@@ -137,7 +137,7 @@ def soak(task: str, num_envs: int, steps: int) -> int:
 def main() -> int:
     """Run the soak."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--task", choices=list(TASKS), default="cartpole")
+    parser.add_argument("--task", choices=[task.name for task in OURS], default="cartpole")
     parser.add_argument("--num-envs", type=int, default=1024)
     parser.add_argument(
         "--steps", type=int, default=1_000_000, help="environment steps in all, on each of 1 and 2 threads"

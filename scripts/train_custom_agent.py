@@ -36,7 +36,7 @@ class Options:
 
     task: Literal[tuple(TASKS)] = "cartpole"  # type: ignore[valid-type]
     """What to learn."""
-    actuator: str = "paper"
+    actuator: str = "default"
     """What the force goes through: ideal, paper, weak, weaker or open_loop."""
     num_envs: int = 64
     """Environments side by side, >= 1."""

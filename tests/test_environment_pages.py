@@ -15,6 +15,7 @@ import pytest
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.tasks import TASKS
+from tests.tasks.faces import every_rebuilt
 
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "docs" / "environments"
@@ -132,7 +133,7 @@ def test_the_action_space_is_named(task):
     assert np.prod(TASKS[task].observation_space.shape) == facts["observation names"].count("`") / 2
 
 
-@every_task
+@every_rebuilt
 def test_the_time_limit_is_the_registered_one_and_gymnasiums(task):
     ours, theirs = gymnasium.spec(TASKS[task].env_id), gymnasium.spec(TASKS[task].gymnasium_id)
     assert ours.max_episode_steps == theirs.max_episode_steps == TASKS[task].max_episode_steps
@@ -150,7 +151,7 @@ def test_the_time_limit_is_the_registered_one_and_gymnasiums(task):
 def test_the_integration_steps_are_those_of_the_environment(task):
     facts = {row[0]: row[1] for row in _table((FOLDER / f"{task}.md").read_text())}
     with_motor, without = map(int, re.findall(r"\d+", facts["integration steps in it"]))
-    for actuator, count in (("paper", with_motor), ("ideal", without)):
+    for actuator, count in (("default", with_motor), ("ideal", without)):
         env = ActuatedEnv(task, actuator)
         assert env.physics.inner_steps == count
         assert env.model.opt.timestep == pytest.approx(float(facts["environment step"].split()[0]) / count)

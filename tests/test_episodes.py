@@ -11,6 +11,7 @@ from codrl_mj.actuators import IDEAL
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation.episodes import RandomPolicy, load_episode, run_episodes, save_episode
 from codrl_mj.physics import signal_names, trace_names
+from tests.tasks.faces import every_rebuilt
 
 ARRAYS = ("time", "state", "observation", "action", "reward")
 FAMILY = {"ideal": Ideal, "paper": Actuator, "weaker": Actuator}
@@ -80,7 +81,7 @@ def test_an_episode_does_not_depend_on_how_many_run_beside_it():
     assert not np.array_equal(five[0].state[0], five[1].state[0])
 
 
-@pytest.mark.parametrize("task", list(TASKS))
+@every_rebuilt
 @pytest.mark.parametrize("actuator", ["ideal", "paper"])
 def test_an_episodes_arrays_have_the_shapes_that_it_states(task, actuator):
     definition = TASKS[task]
@@ -164,7 +165,7 @@ def test_sampled_actions_repeat_with_their_seed_and_disturb_no_other():
 # -- whatever the environment -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("task", list(TASKS))
+@every_rebuilt
 def test_the_trace_has_every_integration_step_and_ends_each_step_with_its_signals(task):
     count = max(3, TASKS[task].motor_inner_steps)
     make = EnvConfig(task, "paper", inner_steps=count, max_episode_steps=5).make

@@ -21,6 +21,7 @@ from codrl_mj.evaluation import (
     summarize,
 )
 from codrl_mj.physics import trace_names
+from tests.tasks.faces import every_rebuilt
 
 TRACE = trace_names(Actuator)
 ROW = ("actual_force", "current", "voltage", "speed", "saturated")
@@ -252,7 +253,7 @@ def test_a_stalled_motor_is_measured_as_its_closed_form_says():
     assert result.energy_drawn.mean == pytest.approx(exact, abs=transient * dt / constant)
 
 
-@pytest.mark.parametrize("task", list(TASKS))
+@every_rebuilt
 @pytest.mark.parametrize("actuator", ["paper", "weaker", "open_loop"])
 def test_electrical_energy_balances_to_rounding(task, actuator):
     """An Euler step of the winding times the mean current: (u - kE*w - R*i)*(i + i')/2*dt = L*(i'^2 - i^2)/2."""

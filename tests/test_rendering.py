@@ -100,7 +100,7 @@ def test_a_gif_is_of_the_stated_size_rate_and_length_and_repeats(tmp_path):
 
 @pytest.mark.parametrize("task", list(TASKS))
 def test_every_task_can_be_filmed_at_its_frame_rate(tmp_path, task):
-    out = film([played(task, "paper", steps=4)], tmp_path / "film.mp4", WIDTH, HEIGHT)
+    out = film([played(task, "default", steps=4)], tmp_path / "film.mp4", WIDTH, HEIGHT)
     rate = TASKS[task].render_fps
     with imageio.get_reader(out) as reader:
         assert reader.get_meta_data()["fps"] == (rate if rate <= 30 else rate / 2)

@@ -9,7 +9,7 @@ import imageio
 import numpy as np
 import pytest
 
-from codrl_mj.tasks import TASKS
+from codrl_mj.tasks import OURS
 
 pytestmark = pytest.mark.matrix
 
@@ -92,7 +92,7 @@ def test_every_setting_that_we_ship_makes_a_model(tmp_path):
     built = [line.split() for line in printed.splitlines() if line.startswith("built ")]
     assert all(kind.lower() == algorithm and asked == "True" for _, algorithm, _, kind, asked, _ in built)
     covered = {(algorithm, env_id) for _, algorithm, env_id, *_ in built}
-    every = {registered.env_id for registered in TASKS.values()}
+    every = {registered.env_id for registered in OURS}
     continuous = {"codrl_mj/Pendulum-v0", "codrl_mj/MountainCarContinuous-v0"}
     assert covered == (
         {("ppo", env_id) for env_id in every}

@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.policies import ActorCriticPolicy, ContinuousCritic
 from stable_baselines3.common.torch_layers import FlattenExtractor, create_mlp
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
@@ -33,6 +33,20 @@ class ScaledObservation(FlattenExtractor):
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """Observations (N, k) times the factors (k,)."""
         return super().forward(observations) * self.factors
+
+
+class UnitActionPolicy(ActorCriticPolicy):
+    """Its actor's mean and noise are in units of the largest action: a torque of 0.08 N*m or a voltage of 18 V is 1."""
+
+    def _build(self, lr_schedule: Any) -> None:
+        if not isinstance(self.action_space, spaces.Box):
+            raise ValueError(f"unit_actions = True: must be False for discrete actions, which {self.action_space} has")
+        super()._build(lr_schedule)
+        self.register_buffer("largest", torch.as_tensor(self.action_space.high), persistent=False)
+
+    def _get_action_dist_from_latent(self, latent_pi: torch.Tensor) -> Any:
+        mean = self.action_net(latent_pi) * self.largest
+        return self.action_dist.proba_distribution(mean, self.log_std + self.largest.log())
 
 
 class TwoStreams(nn.Module):

@@ -56,6 +56,19 @@ class PPOConfig(DeepAgentConfig):
     noise_steps: int | None = integer(None, least=1)
     """Steps between two draws of that noise, >= 1; None: one draw a rollout."""
 
+    unit_actions: bool = flag(False)
+    """Continuous actions: the actor's mean and noise are in units of the largest action, so that one setting learns by
+    torque, current or voltage. Not with `state_dependent_noise`."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        super().__post_init__()
+        if self.unit_actions and self.state_dependent_noise:
+            raise ValueError(
+                "PPOConfig.unit_actions = True: must be False with state_dependent_noise, which has a scale of its "
+                "own: set one of them"
+            )
+
     def make_model(self, env: Any, seed: int) -> Any:
         """See `AgentConfig.make_model`.
 
@@ -101,7 +114,9 @@ class PPOConfig(DeepAgentConfig):
     def _policy_class(self) -> Any:
         from stable_baselines3.common.policies import ActorCriticPolicy
 
-        return ActorCriticPolicy
+        from codrl_mj.agents.networks import UnitActionPolicy
+
+        return UnitActionPolicy if self.unit_actions else ActorCriticPolicy
 
     def _policy_arguments(self) -> dict[str, Any]:
         return {"use_sde": self.state_dependent_noise, **self._network()}

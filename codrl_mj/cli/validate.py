@@ -42,8 +42,7 @@ class Validate:
 
         if self.model is not None and (self.tasks or self.mutations):
             raise ValueError("--model: give a model or tasks, and no --mutations, which are faults of the tasks")
-        if self.mutations:
-            faulty(self.tasks)
+        tasks = faulty(self.tasks) if self.mutations else self.tasks
         if self.out is not None:
             page.check_writable(self.out)
         model = None if self.model is None else own_model.load(self.model)
@@ -56,8 +55,8 @@ class Validate:
             if model is not None:
                 certificate = validate_model(model, str(self.model), quick=self.quick, on_part=show)
             else:
-                certificate = validate(self.tasks, quick=self.quick, on_part=show)
-            caught = try_mutations(self.tasks, on_part=show) if self.mutations else []
+                certificate = validate(tasks, quick=self.quick, on_part=show)
+            caught = try_mutations(tasks, on_part=show) if self.mutations else []
         print_certificate(certificate)
         blind = unfailed(certificate.checks, caught) if caught else []
         if caught:

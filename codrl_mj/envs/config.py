@@ -32,17 +32,18 @@ class EnvConfig:
 
     task: str
     """Task name, such as `cartpole`; or `module:NAME` of one's own."""
-    actuator: Any = "paper"
-    """What the force goes through: a name (`ideal`, `paper`, `weak`, `weaker`, `open_loop`, or a family's), an
-    `ActuatorModel`, a mapping of its fields (with a `name`, over that actuator's), a file of them, `module:NAME`, or
-    None (ideal). With several motors all get it, or it is a list with one for each. Kept as an `ActuatorModel`, or as a
-    tuple of several."""
+    actuator: Any = "default"
+    """What the force goes through: a name (`default`, the task's own: the paper's where there is one; `ideal`, `paper`,
+    `weak`, `weaker`, `open_loop`, or a family's or a motor's), an `ActuatorModel`, a mapping of its fields (with a
+    `name`, over that actuator's), a file of them, `module:NAME`, or None (ideal). With several motors all get it, or it
+    is a list with one for each. Kept as an `ActuatorModel`, or as a tuple of several."""
     physics: str = "mujoco"
-    """`mujoco`; `analytic`: Gymnasium's own equations; or one's own, as registered."""
+    """`mujoco`; `analytic`: Gymnasium's own equations, Furuta's closed form; or one's own, as registered."""
     integrator: str | None = None
     """One of the task's integrators (CartPole: `euler` or `semi-implicit`); the default is Gymnasium's."""
     inner_steps: int | None = None
-    """Integration steps per environment step; the default is the paper's inner loop with a motor and 1 without."""
+    """Integration steps per environment step; the default is the paper's inner loop with a motor and Gymnasium's one
+    without. Furuta: 10."""
     timestep: float | None = None
     """Instead of inner_steps, the integration step [s], which must divide the environment step."""
     action: str = "force"

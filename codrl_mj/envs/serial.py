@@ -30,7 +30,7 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
         self,
         num_envs: int,
         task: str,
-        actuator: Any = "paper",
+        actuator: Any = "default",
         max_episode_steps: int | None = None,
         **arguments: Any,
     ) -> None:

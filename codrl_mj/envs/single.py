@@ -42,7 +42,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     def __init__(
         self,
         task: str,
-        actuator: Any = "paper",
+        actuator: Any = "default",
         physics: str = "mujoco",
         render_mode: str | None = None,
         width: int = 480,
@@ -56,7 +56,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         Args:
             task: the task's name, such as `cartpole`.
             actuator: what the force goes through, as `EnvConfig.actuator` says.
-            physics: `mujoco`, `analytic` (Gymnasium's own equations), or one's own.
+            physics: `mujoco`, `analytic` (Gymnasium's own equations, or a closed form), or one's own.
             render_mode: None; `rgb_array`: `render` returns images; `human`: pygame shows every step in a window.
                 Others, of which `gymnasium.make` warns, are refused when they are rendered.
             width: width of rendered images [px].

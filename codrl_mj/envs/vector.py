@@ -45,7 +45,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         self,
         num_envs: int,
         task: str,
-        actuator: Any = "paper",
+        actuator: Any = "default",
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         num_threads: int = 0,

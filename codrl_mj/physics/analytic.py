@@ -47,7 +47,7 @@ class AnalyticPhysics:
             for name, value in zip(("armature", "damping", "friction"), _added(added), strict=True):
                 if value:
                     raise ValueError(
-                        f"joint.{name} = {value:g}: Gymnasium's equations have no place for it; use physics='mujoco'"
+                        f"joint.{name} = {value:g}: the equations have no place for it; use physics='mujoco'"
                     )
         if task.twin is None:
             raise ValueError(f"physics = 'analytic': {task.name} rebuilds no environment of Gymnasium's; use 'mujoco'")

@@ -140,7 +140,7 @@ def inner_step_count(task: Task, actuator: ActuatorModel, inner_steps: int | Non
 
     Args:
         task: the task, whose `step_duration` they divide.
-        actuator: unless it is ideal the default is the paper's inner loop, else Gymnasium's single step.
+        actuator: whether it is ideal decides on the task's default.
         inner_steps: their number, or None.
         timestep: the integration step [s], or None; give at most one of the two.
 
@@ -160,7 +160,7 @@ def inner_step_count(task: Task, actuator: ActuatorModel, inner_steps: int | Non
             )
         return count
     if inner_steps is None:
-        return 1 if isinstance(actuator, Ideal) else task.motor_inner_steps
+        return task.ideal_inner_steps if isinstance(actuator, Ideal) else task.motor_inner_steps
     if isinstance(inner_steps, bool) or not isinstance(inner_steps, numbers.Integral) or inner_steps < 1:
         raise ValueError(f"inner_steps = {inner_steps!r}: must be an integer >= 1")
     return int(inner_steps)

@@ -1,22 +1,25 @@
 """The tasks: the only definition of their observations, rewards, ends and resets."""
 
+from collections.abc import Mapping
 from typing import Any
 
 from codrl_mj.actuators import check_same_family, resolve
-from codrl_mj.tasks import acrobot, cartpole, mountain_car, mountain_car_continuous, pendulum
+from codrl_mj.tasks import acrobot, cartpole, furuta, mountain_car, mountain_car_continuous, pendulum
 from codrl_mj.tasks.base import Task
 from codrl_mj.tasks.registration import TASKS, find_task, reference_of, register
 from codrl_mj.tasks.twin import Twin
 
 OURS = tuple(register(each.TASK) for each in (pendulum, cartpole, acrobot, mountain_car, mountain_car_continuous))
-"""The package's own tasks."""
+"""The tasks that rebuild Gymnasium's, and have the paper's actuators."""
+register(furuta.TASK)
 
 
 def resolve_actuators(given: Any, task: Task) -> tuple[Any, ...]:
     """Turn whatever a user may write for a task's actuator into one for each of its motors.
 
     Args:
-        given: what `codrl_mj.actuators.resolve` takes, for all motors; or a list of these, one for each.
+        given: what `codrl_mj.actuators.resolve` takes, or the name `default`, which is the task's own actuator; for all
+            motors, or a list of these, one for each.
         task: the task, whose own actuators the names vary.
 
     Raises:
@@ -29,16 +32,23 @@ def resolve_actuators(given: Any, task: Task) -> tuple[Any, ...]:
             f"actuator: {len(each)} actuators for the {count} motors of {task.name}: {', '.join(task.motors)}"
         )
     papers = task.paper or (None,) * count
-    actuators = tuple(resolve(one, paper, task.name) for one, paper in zip(each, papers, strict=True))
+    actuators = tuple(resolve(_own(one, task), paper, task.name) for one, paper in zip(each, papers, strict=True))
     check_same_family(actuators)
     return actuators
+
+
+def _own(given: Any, task: Task) -> Any:
+    """What was given, with the name of the task's own actuator in the place of `default`."""
+    if isinstance(given, Mapping) and given.get("name") == "default":
+        return {**given, "name": task.default_actuator}
+    return task.default_actuator if isinstance(given, str) and given == "default" else given
 
 
 def named_actuator(name: str, task: str) -> Any:
     """The actuator called `name` on `task`; with several motors a tuple of them.
 
     Args:
-        name: one of `codrl_mj.actuators.NAMED`, or a family's.
+        name: one of `codrl_mj.actuators.NAMED`, `default`, or a family's.
         task: a task name, as on the command line.
 
     Raises:

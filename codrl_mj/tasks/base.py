@@ -39,7 +39,7 @@ class Task:
     step_duration: float
     """Duration of one environment step [s]."""
     motor_inner_steps: int
-    """Integration steps per environment step when a motor is in the loop; one when the actuator is ideal."""
+    """Integration steps per environment step when a motor is in the loop."""
     max_force: Any
     """Largest desired force [N] or torque [N*m] of any action; where the action is the force, it saturates here. One
     for each motor, or one for all."""
@@ -98,12 +98,17 @@ class Task:
     """Id of the environment that this task rebuilds, with the same spaces, starts, rewards and ends; None if it is none
     of Gymnasium's."""
     twin: Callable[[], Twin] | None = None
-    """Makes that environment, to be driven by any force: the analytic physics, and the oracle of the certificate."""
+    """Makes that environment, or the equations of motion in closed form, to be driven by any force: the analytic
+    physics, and the oracle of the certificate."""
+    ideal_inner_steps: int = 1
+    """Integration steps per environment step when the actuator is ideal: Gymnasium's."""
     speeds: tuple[int, ...] = (1,)
     """Which state entries are the velocities of the joints that the motors drive, in their order."""
     paper: tuple[Actuator, ...] = ()
     """The paper's actuators, one for each motor, of which other named actuators are variations; none where there are
     none."""
+    actuator: str = "ideal"
+    """Name of its actuator where it has none of the paper's, such as a motor of the catalogue."""
     wrapped: tuple[int, ...] = ()
     """State entries that `constrain` wraps to [-pi, pi]: a rounding error at the cut is one, and not a whole turn."""
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
@@ -114,7 +119,12 @@ class Task:
     @property
     def default_actuator(self) -> str:
         """The name of the actuator where none is asked for."""
-        return "paper" if self.paper else "ideal"
+        return "paper" if self.paper else self.actuator
+
+    @property
+    def oracle(self) -> str:
+        """What its `twin` is, in words."""
+        return f"Gymnasium {self.gymnasium_id}" if self.gymnasium_id else "the closed form"
 
     @property
     def max_forces(self) -> np.ndarray:

@@ -85,7 +85,7 @@ class TrainConfig:
         task: str,
         agent: str,
         settings: str = "default",
-        actuator: Any = "paper",
+        actuator: Any = "default",
         env: Mapping[str, Any] | None = None,
         **changes: Any,
     ) -> "TrainConfig":
@@ -152,7 +152,7 @@ class TrainConfig:
             agent = {"name": agent or default_agent(task)}
         if not isinstance(agent, Mapping) or "name" not in agent:
             raise ValueError(f"agent = {agent!r}: must be an agent's name, or a mapping with its name and settings")
-        base = cls.preset(task, agent["name"], settings, env.get("actuator", "paper"))
+        base = cls.preset(task, agent["name"], settings, env.get("actuator", "default"))
         check_names(agent, base.agent.as_mapping(), "key", "agent.")
         agent = agent_from_mapping(base.agent.as_mapping() | dict(agent))
         return dataclasses.replace(base, env=EnvConfig.from_mapping(env, base.env), agent=agent, **given)

@@ -22,7 +22,7 @@ def equations_of(task: Task) -> tuple[Equations, str]:
     """The right-hand side of a task's equations of motion, and whose it is."""
     if task.twin is None:
         return engine_equations(task), "MuJoCo's own accelerations"
-    return gymnasium_equations(task), f"the equations of Gymnasium {task.gymnasium_id}"
+    return gymnasium_equations(task), f"the equations of {task.oracle}"
 
 
 def engine_equations(task: Task) -> Equations:

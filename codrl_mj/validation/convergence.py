@@ -122,7 +122,7 @@ def _bandwidth_check(task: Task, quick: bool) -> Check:
         "largest difference of the state [relative]",
         (),
     )
-    whose = "MuJoCo" if task.twin is None else f"Gymnasium {task.gymnasium_id}"
+    whose = "MuJoCo" if task.twin is None else task.oracle
     oracle = f"{whose} with the desired force itself"
     return order_check("rate in the loop's bandwidth", oracle, families, -1.0, plot, "convergence", task.name)
 

@@ -53,8 +53,7 @@ def _check(
     worst = Worst()
     difference, row, entry = largest(task, ours, oracle)
     worst.see(difference, f"{entry} from {np.array2string(states[row], precision=3)}, force {forces[row]:.3g}")
-    source = f"Gymnasium {task.gymnasium_id}"
-    return Check(name, source, len(states), worst.value, TOLERANCE, worst.where, "dynamics", task.name)
+    return Check(name, task.oracle, len(states), worst.value, TOLERANCE, worst.where, "dynamics", task.name)
 
 
 def one_step(task: Task, integrator: str, samples: int, seed: int = 0) -> Check:
@@ -154,8 +153,7 @@ def accelerations(task: Task, points: int) -> Check:
     row, entry = divmod(int(np.argmax(np.where(np.isnan(gaps), np.inf, gaps))), gaps.shape[1])
     name = task.state_names[task.qvel[entry]].partition(" ")[0]
     worst.see(gaps[row, entry], f"d{name}/dt at {np.array2string(states[row], precision=3)}, force {forces[row]:.3g}")
-    source = f"Gymnasium {task.gymnasium_id}"
-    return Check("accelerations", source, len(states), worst.value, TOLERANCE, worst.where, "dynamics", task.name)
+    return Check("accelerations", task.oracle, len(states), worst.value, TOLERANCE, worst.where, "dynamics", task.name)
 
 
 def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:

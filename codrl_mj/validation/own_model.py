@@ -11,7 +11,7 @@ import numpy as np
 from codrl_mj.actuators import Actuator, ActuatorModel, Ideal, spectral_radius
 from codrl_mj.physics import install_callbacks, motors
 from codrl_mj.physics.mjcf import task_model
-from codrl_mj.tasks import find_task
+from codrl_mj.tasks import find_task, resolve_actuators
 from codrl_mj.validation import execution
 from codrl_mj.validation.compare import STAND_IN, Worst, actuators_of
 from codrl_mj.validation.in_python import beside, entries
@@ -137,10 +137,9 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     """
     task = find_task(task_name)
     if not task.paper:
-        yield Skipped(
-            "the paper's actuators", f"it has none: the {STAND_IN} is in their place, in all groups", "motor", task.name
-        )
-    model = task_model(task, actuators_of(task), task.step_duration / task.motor_inner_steps)
+        yield Skipped("the paper's actuators", f"it has none: the {STAND_IN} is in their place", "motor", task.name)
+    actuators = actuators_of(task) if task.actuator == "ideal" else resolve_actuators("default", task)
+    model = task_model(task, actuators, task.step_duration / task.motor_inner_steps)
     install_callbacks(model)
     yield from _motor(model, task.name, quick)
 

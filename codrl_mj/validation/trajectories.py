@@ -123,7 +123,7 @@ def episodes(task: Task, actuator_name: str, integrator: str, seeds: range, long
         The check of the difference itself, and that of the difference in roundings, with a plot of the first run.
     """
     actuator = starved(task) if actuator_name == STARVED else named_actuator(actuator_name, task.name)
-    oracle = f"Gymnasium {task.gymnasium_id}" + ("" if isinstance(actuator, Ideal) else " and the motor in Python")
+    oracle = task.oracle + ("" if isinstance(actuator, Ideal) else " and the motor in Python")
     steps = min(longest, task.max_episode_steps or UNLIMITED_STEPS)
     horizon = min(steps, (task.trials and task.trials.horizon) or steps)
     runs = [_run(task, actuator, integrator, steps, seed) for seed in seeds]

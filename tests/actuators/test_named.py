@@ -27,8 +27,9 @@ from codrl_mj.actuators import (
     resolve,
 )
 from codrl_mj.fields import real
-from codrl_mj.tasks import TASKS, named_actuator, resolve_actuators
+from codrl_mj.tasks import OURS, TASKS, named_actuator, resolve_actuators
 from tests.actuators.strategies import of_every_family
+from tests.tasks.faces import every_rebuilt
 
 CARTPOLE = TASKS["cartpole"]
 
@@ -53,25 +54,25 @@ PAPER_GAINS = {
 }
 
 
-def test_every_task_has_a_paper_actuator():
-    assert all(len(task.paper) == len(task.motors) for task in TASKS.values())
+def test_every_task_of_the_papers_has_its_actuator():
+    assert all(len(task.paper) == len(task.motors) for task in OURS)
 
 
-@pytest.mark.parametrize("task", TASKS)
+@every_rebuilt
 def test_the_paper_actuator_has_the_papers_motor_and_gains(task):
     kp, ki, kd, kff, arm = PAPER_GAINS[task]
     motor = Motor(resistance=1.0, inductance=0.1, torque_constant=1.0, back_emf_constant=1.0, arm_radius=arm)
     assert named_actuator("paper", task) == Actuator(motor, CurrentLoop(kp, ki, kd, kff, max_voltage=24.0))
 
 
-@pytest.mark.parametrize("task", TASKS)
+@every_rebuilt
 def test_the_weak_actuators_differ_from_the_papers_in_their_gains_only(task):
     motor = TASKS[task].paper[0].motor
     assert named_actuator("weak", task) == Actuator(motor, CurrentLoop(kp=1.0, ki=1.0))
     assert named_actuator("weaker", task) == Actuator(motor, CurrentLoop(kp=0.2, ki=0.2))
 
 
-@pytest.mark.parametrize("task", TASKS)
+@every_rebuilt
 def test_the_open_loop_actuator_feeds_nothing_back_and_holds_the_reference_at_rest(task):
     actuator = named_actuator("open_loop", task)
     loop = actuator.controller
@@ -82,7 +83,7 @@ def test_the_open_loop_actuator_feeds_nothing_back_and_holds_the_reference_at_re
     assert actuator.motor.arm_radius == TASKS[task].paper[0].motor.arm_radius
 
 
-@pytest.mark.parametrize("task", TASKS)
+@every_rebuilt
 @pytest.mark.parametrize("name", NAMED)
 def test_every_named_actuator_is_stable_at_the_step_it_is_used_with(name, task):
     actuator = named_actuator(name, task)

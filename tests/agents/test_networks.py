@@ -126,6 +126,28 @@ def test_entries_without_a_factor_stay_as_they_are():
     assert policy.actor.features_extractor.factors.tolist() == [1, 10, 1, 1]
 
 
+@pytest.mark.parametrize(("command", "largest"), [("force", 0.084), ("voltage", 18.0)])
+def test_unit_actions_are_those_of_a_plain_actor_times_the_largest(command, largest):
+    envs = make_envs("furuta", action=command)
+    plain, units = (
+        PPOConfig(log_std_init=-0.5, unit_actions=given).make_policy(envs.observation_space, envs.action_space)
+        for given in (False, True)
+    )
+    units.load_state_dict(plain.state_dict())
+    seen = torch.as_tensor(observations("furuta"))
+    ours, theirs = units.get_distribution(seen).distribution, plain.get_distribution(seen).distribution
+    torch.testing.assert_close(ours.mean, largest * theirs.mean)
+    torch.testing.assert_close(ours.stddev, torch.full_like(ours.stddev, largest * np.exp(-0.5)))
+
+
+def test_unit_actions_are_refused_where_they_mean_nothing():
+    with pytest.raises(ValueError, match="unit_actions = True: must be False with state_dependent_noise"):
+        PPOConfig(unit_actions=True, state_dependent_noise=True)
+    envs = make_envs("cartpole")
+    with pytest.raises(ValueError, match="unit_actions = True: must be False for discrete actions"):
+        PPOConfig(unit_actions=True).make_policy(envs.observation_space, envs.action_space)
+
+
 def test_activation_is_as_asked():
     envs = make_envs("cartpole")
     policy = PPOConfig(hidden=(5,), activation="relu").make_policy(envs.observation_space, envs.action_space)

@@ -4,8 +4,9 @@ import pytest
 
 from codrl_mj.agents import AGENTS
 from codrl_mj.agents.presets import PRESETS, SETTINGS, find_preset
-from codrl_mj.tasks import TASKS, find_task
+from codrl_mj.tasks import find_task
 from codrl_mj.training import TrainConfig
+from tests.tasks.faces import every_rebuilt
 
 # what the paper prints for its deep agents (Experimental Results)
 PRINTED = {
@@ -48,13 +49,19 @@ PRINTED = {
 }
 
 
-@pytest.mark.parametrize("task", TASKS)
+@every_rebuilt
 @pytest.mark.parametrize("agent", ["ppo", "ddpg", "dqn", "td3", "sac"])
 def test_an_agent_has_default_settings_for_a_task_exactly_if_it_can_act_in_it(agent, task):
     fits = isinstance(find_task(task).action_space, AGENTS[agent].action_spaces)
     assert ((agent, task) in PRESETS) == fits
     if fits:
         assert find_preset(agent, task).agent.name == agent
+
+
+def test_furuta_has_settings_for_ppo_and_says_so():
+    assert find_preset("ppo", "furuta").agent.unit_actions
+    with pytest.raises(ValueError, match="sac on furuta has no such settings; those on furuta are ppo: default"):
+        find_preset("sac", "furuta")
 
 
 def test_settings_have_the_names_that_are_known_and_one_budget():

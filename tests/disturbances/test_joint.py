@@ -10,6 +10,7 @@ from codrl_mj.actuators import IDEAL
 from codrl_mj.disturbances import Joint
 from codrl_mj.physics import MujocoPhysics
 from codrl_mj.tasks import TASKS
+from tests.tasks.faces import every_rebuilt
 
 START = np.array([2.0, 1.0])
 
@@ -93,7 +94,7 @@ def test_the_explicit_integrator_stays_explicit():
     np.testing.assert_array_equal(rubbed.state[[0, 2]], state[[0, 2]] + 0.02 * state[[1, 3]])
 
 
-@pytest.mark.parametrize("task", TASKS)
+@every_rebuilt
 def test_only_the_actuated_joint_is_rubbed(task):
     physics = MujocoPhysics(
         TASKS[task], [IDEAL], 1, TASKS[task].integrators[0], joint=Joint(damping=0.5, friction=0.25, armature=0.125)

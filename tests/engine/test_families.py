@@ -32,6 +32,7 @@ from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, install_callbacks, 
 from codrl_mj.physics.mjcf import drive
 from codrl_mj.tasks import TASKS
 from tests.engine.models import FULL, changed, controls, rotor, rotor_spec, trajectory
+from tests.tasks.faces import every_rebuilt
 
 KEY = 2.0**52 + 12345.0
 
@@ -269,7 +270,7 @@ def test_families_beside_each_other_are_each_as_alone():
         np.testing.assert_allclose(data.act[own : own + model.na], alone.act, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("task", TASKS)
+@every_rebuilt
 def test_both_physics_give_it_the_same_inputs(task):
     """Position, speed and time are what the spring's torque is made of."""
     definition = TASKS[task]

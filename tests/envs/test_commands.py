@@ -19,6 +19,7 @@ from codrl_mj.physics.registry import PHYSICS
 from codrl_mj.tasks import TASKS
 from codrl_mj.tasks.assets import asset_path
 from tests.engine.models import FULL, changed
+from tests.tasks.faces import every_rebuilt
 
 DISCRETE = ("cartpole", "acrobot", "mountain_car")
 CONTINUOUS = ("pendulum", "mountain_car_continuous")
@@ -120,7 +121,7 @@ def winding(motor, dt, substeps, max_voltage, current, voltage, speed):
     return current
 
 
-@every_task
+@every_rebuilt
 @every_physics
 def test_a_voltage_drives_the_winding_and_that_the_task(task, physics):
     """One environment step at a time from the state reached: winding and unmodified Gymnasium, by hand."""
@@ -163,7 +164,7 @@ def test_a_whole_episode_of_pendulum_under_voltages(inner_steps):
         np.testing.assert_allclose(env.unwrapped.state, reference.state, rtol=0, atol=1e-9)
 
 
-@every_task
+@every_rebuilt
 @every_physics
 def test_without_back_emf_the_current_is_that_of_a_locked_winding(task, physics):
     """I = V/R (1 - (1 - R dt/L)^n) after n electrical steps, whatever the load does."""

@@ -18,7 +18,7 @@ from codrl_mj.envs.compiled import compiled_env
 from codrl_mj.physics import SimulationDivergedError
 from codrl_mj.tasks import TASKS, named_actuator
 from tests.matrix import but
-from tests.tasks.faces import actions, desired_force, random_states
+from tests.tasks.faces import actions, desired_force, every_rebuilt, random_states
 
 every_task = pytest.mark.parametrize("task", TASKS)
 NOISY = {"controller": {"current_noise": 0.05, "current_bias": 0.1}, "supply": {"resistance": 0.01}}
@@ -64,7 +64,7 @@ def _plain_step(env, task, state, force):
     return state, env.actuator.motor.torque_constant * data.act[signals_at(Actuator)] / arm
 
 
-@every_task
+@every_rebuilt
 @pytest.mark.parametrize("kind", ["ideal", "motor"])
 def test_a_step_is_the_plain_composition_of_engine_bounds_and_task(task, kind):
     definition = TASKS[task]
@@ -101,7 +101,7 @@ def _episode(step, reset, forces, chosen, generator, low, high, rows, rewards, a
     return len(chosen)
 
 
-@every_task
+@every_rebuilt
 @every_setup
 def test_a_compiled_loop_is_the_loop_over_the_environment_bit_for_bit(task, kind):
     ours, theirs = _env(task, kind), _env(task, kind)
@@ -137,7 +137,7 @@ def test_what_python_has_to_do_is_not_offered_as_compiled():
     assert compiled_env(ActuatedEnv("pendulum", randomize={"motor.inductance": Uniform(0.08, 0.12)})) is None
 
 
-@every_task
+@every_rebuilt
 @every_setup
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
 def test_a_copy_goes_on_by_itself(task, kind, copied):

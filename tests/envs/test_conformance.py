@@ -16,6 +16,7 @@ from codrl_mj.actuators import NAMED
 from codrl_mj.physics.registry import PHYSICS
 from codrl_mj.tasks import TASKS
 from tests.reference import MotorSimulation
+from tests.tasks.faces import every_rebuilt
 
 INFO_KEYS = {"desired_force", "actual_force", "current", "reference_current", "voltage", "saturated"}
 every_task = pytest.mark.parametrize("task", TASKS)
@@ -23,7 +24,7 @@ every_physics = pytest.mark.parametrize("physics", PHYSICS)
 every_actuator = pytest.mark.parametrize("actuator", NAMED)
 
 
-def make(task, actuator="paper", physics="mujoco", **options):
+def make(task, actuator="default", physics="mujoco", **options):
     """The environment as a user makes it, in Gymnasium's wrappers."""
     return gymnasium.make(TASKS[task].env_id, actuator=actuator, physics=physics, **options)
 
@@ -65,7 +66,7 @@ def _inherited(check, task):
     return _complaints(check, gymnasium.make(TASKS[task].gymnasium_id).unwrapped, skip_render_check=True)
 
 
-@every_task
+@every_rebuilt
 @every_physics
 @every_actuator
 @pytest.mark.parametrize("check", [check_env, check_env_sb3], ids=["gymnasium", "stable_baselines3"])
@@ -74,7 +75,7 @@ def test_the_checkers_have_no_complaint(check, task, physics, actuator):
     assert _complaints(check, env, skip_render_check=True) <= _inherited(check, task)
 
 
-@every_task
+@every_rebuilt
 def test_gymnasiums_checker_has_no_complaint_about_rendering(task, monkeypatch):
     monkeypatch.setattr("codrl_mj.envs.single.Window", unittest.mock.Mock())  # pygame may not be there
     env = make(task, render_mode="rgb_array", width=64, height=48)
@@ -82,7 +83,7 @@ def test_gymnasiums_checker_has_no_complaint_about_rendering(task, monkeypatch):
     env.close()
 
 
-@every_task
+@every_rebuilt
 @every_physics
 @every_actuator
 def test_spaces_are_gymnasiums_and_hold_every_observation(task, physics, actuator):
@@ -106,7 +107,7 @@ def test_spaces_are_gymnasiums_and_hold_every_observation(task, physics, actuato
             observation, _ = env.reset()
 
 
-@every_task
+@every_rebuilt
 @every_physics
 def test_the_ideal_actuator_delivers_what_is_desired_and_a_motor_what_its_current_gives(task, physics):
     env = make(task, "ideal", physics)
@@ -116,7 +117,7 @@ def test_the_ideal_actuator_delivers_what_is_desired_and_a_motor_what_its_curren
         assert info["actual_force"] == info["desired_force"]
         assert info["current"] == info["reference_current"] == info["voltage"] == 0.0
         assert not info["saturated"]
-    env = make(task, "paper", physics)
+    env = make(task, "default", physics)
     motor = env.unwrapped.actuator.motor
     env.reset(seed=0)
     for action in sampled_actions(env, 10):
@@ -126,7 +127,7 @@ def test_the_ideal_actuator_delivers_what_is_desired_and_a_motor_what_its_curren
         assert info["reference_current"] == pytest.approx(wanted)
 
 
-@every_task
+@every_rebuilt
 @every_physics
 def test_the_motor_starts_at_rest_in_every_episode(task, physics):
     env = make(task, "weak", physics)
@@ -147,13 +148,13 @@ def test_the_motor_starts_at_rest_in_every_episode(task, physics):
         assert info["current"] == pytest.approx(motor.current, rel=1e-12)
 
 
-@every_task
+@every_rebuilt
 @every_physics
 def test_a_seed_repeats_and_another_differs(task, physics):
     actions = sampled_actions(make(task), 30)
     runs = []
     for seed in (3, 3, 4):
-        env = make(task, "paper", physics)
+        env = make(task, "default", physics)
         observation, _ = env.reset(seed=seed)
         runs.append((observation, rows(env, actions)))
     np.testing.assert_array_equal(runs[0][0], runs[1][0])
@@ -161,7 +162,7 @@ def test_a_seed_repeats_and_another_differs(task, physics):
     assert np.any(runs[0][0] != runs[2][0])
 
 
-@every_task
+@every_rebuilt
 @every_physics
 @pytest.mark.parametrize(
     "duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"]
@@ -179,7 +180,7 @@ def test_a_copy_made_mid_episode_continues_bit_for_bit_motor_included(task, phys
     np.testing.assert_array_equal(env.unwrapped.state, (twin.reset(), twin.unwrapped.state)[1])
 
 
-@every_task
+@every_rebuilt
 @every_physics
 def test_what_is_returned_never_aliases_what_goes_on(task, physics):
     env, control = make(task, "weak", physics), make(task, "weak", physics)
@@ -212,7 +213,7 @@ def test_observations_of_different_steps_are_different_arrays(task):
     np.testing.assert_array_equal(first, kept)
 
 
-@every_task
+@every_rebuilt
 @every_actuator
 def test_both_physics_tell_the_same_story(task, actuator):
     """Over the first steps, before chaos: same observations, rewards, ends, forces and currents."""
@@ -222,7 +223,7 @@ def test_both_physics_tell_the_same_story(task, actuator):
     np.testing.assert_allclose(rows(one, actions), rows(two, actions), rtol=1e-6, atol=1e-6)
 
 
-@every_task
+@every_rebuilt
 def test_mujoco_model_and_data_are_at_hand_and_analytic_physics_says_it_has_none(task):
     env = make(task).unwrapped
     env.reset(seed=0)

@@ -11,6 +11,7 @@ from codrl_mj.envs.distributions import Uniform
 from codrl_mj.physics.analytic import AnalyticPhysics
 from codrl_mj.physics.registry import PHYSICS
 from codrl_mj.tasks import TASKS
+from tests.tasks.faces import every_rebuilt
 
 every_task = pytest.mark.parametrize("task", TASKS)
 NOT_OF_THE_TASK = {"last_u", "np_random", "np_random_seed", "state", "steps_beyond_terminated", "unwrapped"}
@@ -64,7 +65,7 @@ def _run(env, task, seed):
 
 
 @pytest.mark.parametrize("physics", PHYSICS)
-@every_task
+@every_rebuilt
 def test_every_number_that_gymnasiums_environment_has_can_be_read(task, physics):
     ours, theirs = _pair(task, physics=physics)
     ours.reset(seed=0)
@@ -97,7 +98,7 @@ def test_a_written_number_has_the_effect_that_it_has_in_gymnasium(task, values, 
     assert not np.allclose(after, before, rtol=0, atol=1e-3)
 
 
-@every_task
+@every_rebuilt
 def test_a_state_that_is_set_is_the_one_that_the_next_step_starts_from(task):
     ours, theirs = _pair(task)
     state = np.linspace(0.02, 0.05, len(TASKS[task].state_names))

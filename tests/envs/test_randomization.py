@@ -19,7 +19,7 @@ from codrl_mj.engine.families import HEAD
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.tasks import TASKS, named_actuator
 from tests.envs.vectors import MODES, assert_equal_episodes, assert_same, batched, looped, random_actions
-from tests.tasks.faces import actions, gymnasiums, random_states
+from tests.tasks.faces import actions, every_rebuilt, gymnasiums, random_states
 
 every_task = pytest.mark.parametrize("task", TASKS)
 
@@ -114,7 +114,7 @@ def test_a_value_is_the_formula_of_its_draw():
 # -- one environment and many -------------------------------------------------------------------------------
 
 
-@every_task
+@every_rebuilt
 @pytest.mark.parametrize("mode", MODES)
 def test_drawn_episodes_are_those_of_single_environments(task, mode):
     arguments = {"randomize": everything(task), "max_episode_steps": 9}
@@ -154,7 +154,7 @@ def test_each_of_different_actuators_is_varied():
     assert_equal_episodes(batched("pendulum", 3, **arguments), looped("pendulum", 3, **arguments), 20)
 
 
-@every_task
+@every_rebuilt
 def test_seeds_draw_gymnasiums_initial_states_all_the_same(task):
     ours = ActuatedEnv(task, randomize={"controller.kp": LogUniform(0.5, 2.0), **scales(task)})
     gym = gymnasiums(task).unwrapped
@@ -172,7 +172,7 @@ def test_seeds_draw_gymnasiums_initial_states_all_the_same(task):
 # -- in effect ----------------------------------------------------------------------------------------------
 
 
-@every_task
+@every_rebuilt
 @pytest.mark.parametrize("physics", ["mujoco", "analytic"])
 def test_the_drawn_actuator_is_what_acts(task, physics):
     ours = ActuatedEnv(task, physics=physics, randomize=DRIVE)
@@ -261,7 +261,7 @@ def _equal_moments(task, factors):
     return factors
 
 
-@every_task
+@every_rebuilt
 def test_masses_lengths_and_gravity_are_those_of_gymnasium_with_changed_attributes(task):
     generator, worst = np.random.default_rng(5), 0.0
     for _ in range(12):
@@ -508,7 +508,7 @@ def test_a_copy_made_in_mid_episode_goes_on_the_same(task, duplicate):
         assert env.reset()[1] == twin.reset()[1]
 
 
-@every_task
+@every_rebuilt
 def test_a_vector_environment_continues_from_plain_arrays_and_as_a_copy(task):
     arguments = {"randomize": everything(task), "max_episode_steps": 10}
     env = batched(task, 5, **arguments)

@@ -14,6 +14,7 @@ from gymnasium.error import DependencyNotInstalled
 from codrl_mj.envs.window import Window
 from codrl_mj.physics.registry import PHYSICS
 from codrl_mj.tasks import TASKS
+from tests.tasks.faces import every_rebuilt
 
 every_task = pytest.mark.parametrize("task", TASKS)
 every_physics = pytest.mark.parametrize("physics", PHYSICS)
@@ -34,7 +35,7 @@ def make(request):
         env.close()
 
 
-@every_task
+@every_rebuilt
 @every_physics
 def test_an_image_has_its_size_and_something_on_it(make, task, physics):
     env = make(task, physics=physics, width=100, height=60)
@@ -46,7 +47,7 @@ def test_an_image_has_its_size_and_something_on_it(make, task, physics):
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 20
 
 
-@every_task
+@every_rebuilt
 @every_physics
 def test_the_image_follows_the_state(make, task, physics):
     env = make(task, physics=physics)
@@ -61,7 +62,7 @@ def test_the_image_follows_the_state(make, task, physics):
     np.testing.assert_array_equal(env.render(), first)
 
 
-@every_task
+@every_rebuilt
 def test_both_physics_draw_the_same_picture_of_the_same_state(make, task):
     images = []
     for physics in PHYSICS:
@@ -83,7 +84,7 @@ def test_images_are_separate_arrays(make, task):
     np.testing.assert_array_equal(first, kept)
 
 
-@every_task
+@every_rebuilt
 @every_physics
 def test_rendering_changes_nothing_in_the_episode(make, task, physics):
     watched, alone = make(task, physics=physics), make(task, physics=physics)
@@ -211,7 +212,7 @@ def test_without_a_render_mode_there_is_a_warning_and_no_image(make):
     assert "render_mode='rgb_array'" in str(caught[0].message)
 
 
-@every_task
+@every_rebuilt
 def test_the_frame_rate_is_gymnasiums(task):
     ours, theirs = gymnasium.make(TASKS[task].env_id), gymnasium.make(TASKS[task].gymnasium_id)
     assert ours.unwrapped.metadata["render_fps"] == theirs.metadata["render_fps"]

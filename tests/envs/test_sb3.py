@@ -15,6 +15,7 @@ import codrl_mj
 from codrl_mj.envs.sb3 import ActuatedVecEnv
 from codrl_mj.tasks import TASKS
 from tests.envs.vectors import random_actions
+from tests.tasks.faces import every_rebuilt
 
 every_task = pytest.mark.parametrize("task", TASKS)
 
@@ -36,7 +37,7 @@ def sampled(env, steps, seed=0):
     return [batch if hasattr(space, "n") else np.clip(batch, space.low, space.high) for batch in batches]
 
 
-@every_task
+@every_rebuilt
 @pytest.mark.parametrize("physics", ["mujoco", "analytic"])
 @pytest.mark.parametrize("actuator", ["ideal", "weaker"])
 def test_steps_are_those_of_dummy_environments(task, actuator, physics):

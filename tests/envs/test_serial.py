@@ -13,11 +13,12 @@ from codrl_mj.envs import ActuatedEnv, SerialVectorEnv
 from codrl_mj.tasks import TASKS, named_actuator
 from tests.envs.snapshots import everything
 from tests.envs.vectors import assert_equal_episodes, assert_same, batched, looped, random_actions
+from tests.tasks.faces import every_rebuilt
 
 every_task = pytest.mark.parametrize("task", TASKS)
 
 
-@every_task
+@every_rebuilt
 def test_on_mujoco_it_is_the_batched_environment(task):
     arguments = everything(task, "mujoco") | {"max_episode_steps": 11}
     theirs = SerialVectorEnv(4, task, **arguments)
@@ -25,7 +26,7 @@ def test_on_mujoco_it_is_the_batched_environment(task):
     assert ends.sum() > 12
 
 
-@every_task
+@every_rebuilt
 def test_signals_and_draws_are_those_of_the_batched_environment(task):
     arguments = everything(task, "mujoco") | {"max_episode_steps": 7}
     ours, theirs = SerialVectorEnv(3, task, **arguments), batched(task, 3, "SameStep", **arguments).unwrapped
@@ -44,7 +45,7 @@ def test_signals_and_draws_are_those_of_the_batched_environment(task):
         assert_same(ours.randomization, theirs.randomization, f"step {index}")
 
 
-@every_task
+@every_rebuilt
 def test_on_the_analytic_physics_it_is_gymnasiums_loop(task):
     arguments = everything(task, "analytic") | {"max_episode_steps": 11}
     ours, theirs = SerialVectorEnv(3, task, **arguments), looped(task, 3, "SameStep", **arguments)

@@ -14,7 +14,7 @@ from codrl_mj.envs import ActuatedEnv
 from codrl_mj.tasks import TASKS
 from tests.envs.snapshots import PHYSICS, STEPS, everything, run_several, run_single, several, single
 from tests.envs.vectors import assert_same
-from tests.tasks.faces import actions
+from tests.tasks.faces import actions, every_rebuilt
 
 every_task = pytest.mark.parametrize("task", TASKS)
 both_physics = pytest.mark.parametrize("physics", PHYSICS)
@@ -37,7 +37,7 @@ def _assert_same_model(env, other):
 
 
 @both_physics
-@every_task
+@every_rebuilt
 @pytest.mark.parametrize("before", [None, 0, 57], ids=["before the first reset", "at a start", "in an episode"])
 def test_a_fresh_environment_goes_on_as_the_original(task, physics, before):
     env = single(task, physics)
@@ -96,7 +96,7 @@ def test_a_wrong_bit_is_seen(physics):
 
 
 @both_physics
-@every_task
+@every_rebuilt
 def test_the_voltage_that_an_agent_commands_is_restored_too(task, physics):
     discrete = isinstance(TASKS[task].action_space, gymnasium.spaces.Discrete)
     levels = {"levels": (-3.0, 0.0, 3.0)} if discrete else {}
@@ -117,7 +117,7 @@ def test_the_voltage_that_an_agent_commands_is_restored_too(task, physics):
 
 
 @both_physics
-@every_task
+@every_rebuilt
 def test_a_training_s_environments_go_on_as_the_original(task, physics):
     envs = several(task, physics)
     envs.seed(7)

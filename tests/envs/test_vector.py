@@ -16,7 +16,7 @@ from codrl_mj.envs.setup import Setup
 from codrl_mj.tasks import TASKS
 from tests.engine.models import FULL, changed
 from tests.envs.vectors import MODES, assert_equal_episodes, assert_same, batched, looped, random_actions
-from tests.tasks.faces import random_states
+from tests.tasks.faces import every_rebuilt, random_states
 
 every_task = pytest.mark.parametrize("task", TASKS)
 every_mode = pytest.mark.parametrize("mode", MODES)
@@ -33,7 +33,7 @@ DIFFERENT = [
 # -- the same episodes --------------------------------------------------------------------------------------
 
 
-@every_task
+@every_rebuilt
 @every_mode
 @pytest.mark.parametrize("actuator", ["ideal", "paper", "weaker"])
 def test_episodes_are_those_of_single_environments(task, mode, actuator):
@@ -44,7 +44,7 @@ def test_episodes_are_those_of_single_environments(task, mode, actuator):
         assert (ends.sum(axis=1) > 0).all()
 
 
-@every_task
+@every_rebuilt
 def test_episodes_are_equal_over_the_registered_time_limit_and_end_both_ways(task):
     steps = min(TASKS[task].max_episode_steps + 20, 230)
     arguments = {"max_episode_steps": 60} if task == "acrobot" else {}
@@ -97,7 +97,7 @@ def test_actuators_of_the_environments_may_be_written_as_that_of_one(tmp_path):
     assert [one.unwrapped.actuator for one in serial.envs] == each
 
 
-@every_task
+@every_rebuilt
 def test_many_environments_are_as_equal_as_few(task):
     """Compiled array functions take other paths for long arrays than for single numbers."""
     arguments = {"actuator": "weaker", "max_episode_steps": 9}
@@ -208,7 +208,7 @@ def test_without_a_limit_no_episode_is_truncated():
         assert not truncated.any()
 
 
-@every_task
+@every_rebuilt
 @every_mode
 def test_nothing_returned_or_given_aliases_what_goes_on(task, mode):
     arguments = {"actuator": "weaker", "max_episode_steps": 7}
@@ -391,7 +391,7 @@ def test_an_actuator_in_any_form_is_the_same():
     assert single.step(np.array([1.0], np.float32))[4]["current"] == runs[0][0][4]["current"][0]
 
 
-@every_task
+@every_rebuilt
 def test_observation_reward_and_end_of_one_state_are_those_of_a_batch_to_the_last_bit(task):
     setup = Setup.build(EnvConfig(task))
     before, after = (random_states(task, seed, 3000) for seed in (0, 1))

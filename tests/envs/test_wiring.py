@@ -12,7 +12,7 @@ from codrl_mj.physics.registry import PHYSICS
 from codrl_mj.tasks import TASKS
 from tests.engine.models import FULL, changed
 from tests.reference import MotorSimulation
-from tests.tasks.faces import desired_force
+from tests.tasks.faces import desired_force, every_rebuilt
 
 SPEED = {"pendulum": 1, "cartpole": 1, "acrobot": 3, "mountain_car": 1, "mountain_car_continuous": 1}
 STEPS = {"pendulum": 60, "cartpole": 40, "acrobot": 15, "mountain_car": 30, "mountain_car_continuous": 30}
@@ -57,7 +57,7 @@ def _episode(task, physics, actuator):
     return np.array(found), np.array(expected)
 
 
-@pytest.mark.parametrize("task", TASKS)
+@every_rebuilt
 @pytest.mark.parametrize("physics", PHYSICS)
 @pytest.mark.parametrize("feature", OFF)
 def test_a_feature_matters_and_is_what_it_should_be_with_and_without(task, physics, feature):
@@ -74,7 +74,7 @@ def test_a_feature_matters_and_is_what_it_should_be_with_and_without(task, physi
     assert differences[:, :size].max() > 1e-7  # and the motion
 
 
-@pytest.mark.parametrize("task", TASKS)
+@every_rebuilt
 def test_the_pairs_saturate_at_times(task):
     """Guards the pair of the supply, and that of the compensation, which saturation alone leaves incomplete."""
     actuator = changed(FULL, inductance=0.2, max_voltage=SUPPLY[task])

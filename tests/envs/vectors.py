@@ -18,7 +18,7 @@ def batched(task, num_envs, mode="NextStep", **arguments):
 
 def looped(task, num_envs, mode="NextStep", **arguments):
     """Gymnasium's `SyncVectorEnv` of single environments."""
-    actuators = arguments.pop("actuator", "paper")
+    actuators = arguments.pop("actuator", "default")
     if not isinstance(actuators, list):
         options = {"autoreset_mode": AutoresetMode(mode)}
         return gymnasium.make_vec(TASKS[task].env_id, num_envs, "sync", options, actuator=actuators, **arguments)

@@ -7,6 +7,7 @@ from codrl_mj.actuators import Actuator, CurrentLoop, Inputs, Motor, Supply, par
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, trace_names
 from codrl_mj.tasks import TASKS, named_actuator
+from tests.tasks.faces import every_rebuilt
 
 DESIRED, ACTUAL, CURRENT, REFERENCE, VOLTAGE, SATURATED, SPEED = range(7)
 
@@ -27,7 +28,7 @@ def _traces(physics, seed=0):
 
 
 @pytest.mark.parametrize("kind", [MujocoPhysics, AnalyticPhysics])
-@pytest.mark.parametrize("task", TASKS)
+@every_rebuilt
 def test_every_row_follows_from_the_row_before_by_the_loops_own_equations(kind, task):
     physics = _physics(kind, task)
     speed_at_start = 0.05
@@ -52,7 +53,7 @@ def test_every_row_follows_from_the_row_before_by_the_loops_own_equations(kind, 
 
 
 @pytest.mark.parametrize("actuator", ["ideal", "weak"])
-@pytest.mark.parametrize("task", TASKS)
+@every_rebuilt
 def test_the_last_row_is_what_the_engine_says_of_the_steps_end(task, actuator):
     physics = _physics(MujocoPhysics, task, actuator)
     for _ in range(STEPS):
@@ -67,7 +68,7 @@ def test_the_last_row_is_what_the_engine_says_of_the_steps_end(task, actuator):
             np.testing.assert_array_equal(last[CURRENT : SATURATED + 1], physics.data.act[-5:-1])
 
 
-@pytest.mark.parametrize("task", TASKS)
+@every_rebuilt
 def test_both_physics_leave_the_same_trace(task):
     disturbances = Disturbances(command_delay=physics_step(task) * 1.5, command_rate=20.0)
     pair = [_physics(kind, task, disturbances=disturbances) for kind in (MujocoPhysics, AnalyticPhysics)]

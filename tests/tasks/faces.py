@@ -2,10 +2,14 @@
 
 import gymnasium as gym
 import numpy as np
+import pytest
 
 import codrl_mj  # noqa: F401 - registers the environments
-from codrl_mj.tasks import TASKS
+from codrl_mj.tasks import OURS, TASKS
 
+REBUILT = tuple(task.name for task in OURS)
+"""The tasks that Gymnasium and the paper have."""
+every_rebuilt = pytest.mark.parametrize("task", REBUILT)
 NEW = ("pendulum", "acrobot", "mountain_car", "mountain_car_continuous")
 WITH_HILL = ("mountain_car", "mountain_car_continuous")
 

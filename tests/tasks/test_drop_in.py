@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from codrl_mj.tasks import TASKS
-from tests.tasks.faces import NEW, actions, gymnasiums, ours
+from tests.tasks.faces import NEW, actions, every_rebuilt, gymnasiums, ours
 
 SEEDS = range(20)
 
@@ -98,7 +98,7 @@ def test_acrobot_reaches_the_goal_with_gymnasium():
     assert rewards[-1] == [0.0, 0.0]
 
 
-@pytest.mark.parametrize("task", TASKS)
+@every_rebuilt
 def test_spaces_and_limits_are_gymnasiums(task):
     env, reference = ours(task), gymnasiums(task)
     assert env.action_space == reference.action_space

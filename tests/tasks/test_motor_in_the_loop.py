@@ -11,7 +11,7 @@ import pytest
 from codrl_mj.physics import MujocoPhysics, install_callbacks, motors
 from codrl_mj.tasks import TASKS
 from codrl_mj.tasks.assets import asset_path
-from tests.tasks.faces import NEW, actions, ours
+from tests.tasks.faces import NEW, actions, every_rebuilt, ours
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -38,7 +38,7 @@ def test_both_physics_give_the_same_episode(task, tolerance, steps, seed):
             break
 
 
-@pytest.mark.parametrize("task", TASKS)
+@every_rebuilt
 def test_the_motor_is_in_the_loop(task):
     """Inner loops as the paper has them, and a force that follows the desired one but is not it."""
     env = ours(task).unwrapped
@@ -50,7 +50,7 @@ def test_the_motor_is_in_the_loop(task):
     assert 1e-12 < np.abs(errors).max() < 3 * definition.max_force
 
 
-@pytest.mark.parametrize("task", TASKS)
+@every_rebuilt
 def test_the_stored_model_holds_the_papers_actuator(task):
     model = mujoco.MjModel.from_xml_path(str(asset_path(TASKS[task].asset)))
     definition = TASKS[task]

@@ -79,5 +79,22 @@ PRESETS: dict[str, dict[str, Preset]] = {
             about="Ours: the exploration depends on the state and lasts for 256 steps, which drives up the hill.",
         )
     },
+    "furuta": {
+        "default": Preset(
+            PPOConfig(
+                rollout_steps=4096,
+                batch_size=512,
+                epochs=8,
+                gae_lambda=0.95,
+                target_kl=None,
+                log_std_init=-0.5,
+                unit_actions=True,
+                input_scale=(1.0, 1.0, 1.0, 1.0, 0.05, 0.05),
+            ),
+            total_steps=200_000,
+            num_envs=16,
+            about="Ours, for commands of torque, current and voltage alike: actions in units of the largest.",
+        )
+    },
 }
 """Task -> name of the settings -> the settings."""

@@ -1,0 +1,273 @@
+"""Furuta: its mechanics against Lagrange's equations by computer algebra, its motor, and every face of it."""
+
+import functools
+import math
+import warnings
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+import sympy
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+
+from codrl_mj import Drive, Uniform, make_sb3_vec_env, suite
+from codrl_mj.actuators import IDEAL, NAMED
+from codrl_mj.catalogue import motor_entry
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.evaluation import run_episodes, summarize
+from codrl_mj.physics import MujocoPhysics
+from codrl_mj.sizing.scripted import Scripted, StateObserved
+from codrl_mj.tasks import TASKS, resolve_actuators
+from codrl_mj.tasks.furuta import MAX_TORQUE, Twin
+from tests.envs.vectors import MODES, assert_equal_episodes, batched, looped
+
+TASK = TASKS["furuta"]
+ROTOR = 4e-6
+NUMBERS = {  # the manual's; the damping is quanser_robots'
+    "arm_mass": 0.095,
+    "arm_length": 0.085,
+    "rod_mass": 0.024,
+    "rod_length": 0.129,
+    "radius": 0.00475,
+    "hub": 0.6e-6,
+    "c": 5e-6,
+    "d": 1e-6,
+    "gravity": 9.81,
+}
+every_actuator = pytest.mark.parametrize("actuator", ["default", "ideal"])
+
+
+@functools.cache
+def lagrange():
+    """Accelerations of arm and rod, from the positions and the turning of their parts alone.
+
+    The rod is integrated over its length: no theorem of parallel axes, and no moment of inertia but that of its axis.
+    """
+    theta, alpha, w, v, a1, a2, torque, s = sympy.symbols("theta alpha w v a1 a2 torque s")
+    arm_mass, arm, mass, rod, r, hub, c, d, g = symbols = sympy.symbols(list(NUMBERS))
+    angles, speeds, accelerations = sympy.Matrix([theta, alpha]), sympy.Matrix([w, v]), sympy.Matrix([a1, a2])
+    outwards = sympy.Matrix([sympy.cos(theta), sympy.sin(theta), 0])
+    across = sympy.Matrix([-sympy.sin(theta), sympy.cos(theta), 0])
+    up = sympy.Matrix([0, 0, 1])
+    along = sympy.cos(alpha) * up - sympy.sin(alpha) * across  # the rod, from its hinge
+    turning = w * up + v * outwards
+
+    def kinetic(point, density, length):
+        moving = point.jacobian(angles) * speeds
+        return sympy.integrate(sympy.expand(density * moving.dot(moving) / 2), (s, 0, length))
+
+    energy = kinetic(s * outwards, arm_mass / arm, arm) + kinetic(arm * outwards + s * along, mass / rod, rod)
+    energy += hub * w**2 / 2 + mass * r**2 / 2 * turning.dot(along) ** 2 / 2
+    lagrangian = energy - mass * g * rod / 2 * sympy.cos(alpha)
+    momenta = sympy.Matrix([lagrangian.diff(speed) for speed in speeds])
+    rates = momenta.jacobian(angles) * speeds + momenta.jacobian(speeds) * accelerations
+    forces = sympy.Matrix([torque - c * w, -d * v])
+    equations = rates - sympy.Matrix([lagrangian.diff(angle) for angle in angles]) - forces
+    matrix, rest = sympy.linear_eq_to_matrix(list(equations), [a1, a2])
+    return sympy.lambdify([theta, alpha, w, v, torque, *symbols], [matrix, rest], "numpy")
+
+
+def accelerations(state, torque, **changed):
+    matrix, rest = lagrange()(*state, torque, *(NUMBERS | changed).values())
+    return np.linalg.solve(np.array(matrix, float), np.array(rest, float)[:, 0])
+
+
+def states(count, seed=0):
+    return np.random.default_rng(seed).uniform([-3, -7, -30, -40], [3, 7, 30, 40], (count, 4))
+
+
+def off(found, expected):
+    return (np.abs(found - expected) / np.maximum(1.0, np.abs(expected))).max()
+
+
+# -- the mechanics ------------------------------------------------------------------------------------------
+
+
+@every_actuator
+def test_the_engines_accelerations_are_lagranges(actuator):
+    physics = MujocoPhysics(TASK, resolve_actuators(actuator, TASK), 10, "rk4")
+    model, data = physics.model, mujoco.MjData(physics.model)
+    hub = NUMBERS["hub"] + (ROTOR if actuator == "default" else 0.0)
+    generator = np.random.default_rng(1)
+    for state, torque in zip(states(300), generator.uniform(-MAX_TORQUE, MAX_TORQUE, 300), strict=True):
+        data.qpos[:], data.qvel[:] = state[:2], state[2:]
+        data.qfrc_applied[0] = torque
+        mujoco.mj_forward(model, data)
+        assert off(data.qacc, accelerations(state, torque, hub=hub)) < 1e-10
+
+
+def test_the_closed_form_is_lagranges():
+    twin = Twin()
+    for state in states(300, seed=2):
+        assert off(twin.derivative(state, 0.05)[2:], accelerations(state, 0.05)) < 1e-10
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("rod_length", 0.2), ("rod_mass", 0.05), ("arm_length", 0.17), ("arm_mass", 0.2), ("gravity", 1.62)],
+)
+def test_a_number_that_is_set_is_lagranges(name, value):
+    env = gymnasium.make(TASK.env_id, actuator="ideal").unwrapped
+    assert getattr(env, name) == pytest.approx(NUMBERS[name])
+    setattr(env, name, value)
+    for state in states(20, seed=3):
+        env.data.qpos[:], env.data.qvel[:] = state[:2], state[2:]
+        mujoco.mj_forward(env.model, env.data)
+        assert off(env.data.qacc, accelerations(state, 0.0, **{name: value})) < 1e-10
+
+
+def test_energy_is_kept_over_an_episode_without_damping():
+    """As `docs/environments/furuta.md` says: 1e-7 of what lifts the rod, 1 % with one integration step a step."""
+    physics = {count: MujocoPhysics(TASK, [IDEAL], count, "rk4") for count in (10, 1)}
+    lost = {}
+    for count, each in physics.items():
+        each.model.dof_damping[:] = 0.0
+        each.model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
+        each.reset(np.array([0.0, 0.14, 5.0, 0.0]))
+        energies = []
+        for _ in range(TASK.max_episode_steps):
+            each.step(0.0)
+            mujoco.mj_forward(each.model, each.data)
+            energies.append(each.data.energy.sum())
+        lost[count] = np.ptp(energies) / (NUMBERS["rod_mass"] * NUMBERS["gravity"] * NUMBERS["rod_length"])
+    assert lost[10] < 2e-7
+    assert 1e-3 < lost[1] < 2e-2
+
+
+# -- its motor ----------------------------------------------------------------------------------------------
+
+
+def test_its_own_actuator_is_the_motor_of_the_catalogue_at_every_door():
+    motor = Drive.of(motor_entry("quanser-qube-servo-2").numbers)
+    assert (motor.supply.voltage, motor.controller.max_current) == (18.0, 2.0)
+    assert motor.motor.torque_constant * motor.controller.max_current == pytest.approx(MAX_TORQUE)
+    assert EnvConfig("furuta").actuator == motor
+    assert gymnasium.make(TASK.env_id).unwrapped.actuator == motor
+    assert batched("furuta", 2).unwrapped.setup.actuator == motor
+    assert make_sb3_vec_env(TASK.env_id, 2).env.setup.actuator == motor
+    weaker = EnvConfig("furuta", {"name": "default", "supply": {"voltage": 10.0}}).actuator
+    assert (weaker.supply.voltage, weaker.motor) == (10.0, motor.motor)
+    assert EnvConfig("pendulum").actuator == EnvConfig("pendulum", "paper").actuator
+
+
+@pytest.mark.parametrize("name", [name for name in NAMED if name != "ideal"])
+def test_the_papers_actuators_are_refused_by_name(name):
+    with pytest.raises(ValueError, match=f"'{name}': a variation of the paper's actuator, of which furuta has none"):
+        gymnasium.make(TASK.env_id, actuator=name)
+
+
+def test_the_analytic_physics_refuses_the_rotor():
+    with pytest.raises(ValueError, match=r"joint.armature = 4e-06: the equations have no place for it"):
+        gymnasium.make(TASK.env_id, physics="analytic")
+
+
+@pytest.mark.parametrize(("command", "unit"), [("force", 1.0), ("current", 0.042), ("voltage", 0.042 / 8.4)])
+def test_a_command_is_delivered_or_what_its_winding_makes_of_it(command, unit):
+    """The arm is as good as locked, so that the current of a voltage is u/R after a few L/R = 0.14 ms."""
+    env = gymnasium.make(TASK.env_id, action=command, joint={"armature": 1e3})
+    env.reset(seed=0, options={"low": 0.0, "high": 1e-12})
+    action = 0.5 * env.action_space.high
+    info = env.step(action)[4]
+    assert info["actual_force"] == pytest.approx(float(action[0]) * unit, rel=1e-6)
+
+
+def test_a_delayed_command_arrives_late():
+    env = gymnasium.make(TASK.env_id, disturbances={"command_delay": 0.02})
+    env.reset(seed=0)
+    action = np.array([MAX_TORQUE], np.float32)
+    assert [env.step(action)[4]["actual_force"] for _ in range(2)] == pytest.approx([0.0, MAX_TORQUE], abs=1e-6)
+
+
+# -- the task -----------------------------------------------------------------------------------------------
+
+
+def test_reward_goal_and_end():
+    upright, hanging = (0.0, 0.0, 0.0, 0.0), (0.0, math.pi, 0.0, 0.0)
+    options = TASK.options()
+    assert TASK.reward(hanging, 0.0, upright, options) == 1.0
+    assert TASK.reward(upright, 0.0, hanging, options) == 0.0
+    assert TASK.reward(upright, MAX_TORQUE, (2.0, 0.0, 0.0, 0.0), options) == pytest.approx(0.4)
+    assert [bool(TASK.goal((0.0, angle, 0.0, 0.0))) for angle in (0.099, 2 * math.pi - 0.099, 0.101)] == [1, 1, 0]
+    assert [bool(TASK.terminated((angle, 0.0, 0.0, 0.0))) for angle in (2.0, -2.0, 2.001, -2.001)] == [0, 0, 1, 1]
+
+
+def test_it_starts_hanging_within_what_a_reset_asks_for():
+    env = gymnasium.make(TASK.env_id)
+    for options, most in ((None, 0.05), ({"low": -0.5, "high": 0.5}, 0.5)):
+        starts = []
+        for seed in range(20):
+            env.reset(seed=seed, options=options)
+            starts.append(env.unwrapped.state - [0.0, math.pi, 0.0, 0.0])
+        assert 0.8 * most < np.abs(starts).max() <= most
+
+
+@every_actuator
+def test_the_scripted_controller_swings_up_and_balances(actuator):
+    episodes = run_episodes(Scripted(TASK), lambda: StateObserved(EnvConfig("furuta", actuator).make()), 10, seed=0)
+    assert summarize("furuta", episodes).success.mean == 1.0
+
+
+# -- the faces ----------------------------------------------------------------------------------------------
+
+
+@every_actuator
+@pytest.mark.parametrize(
+    ("check", "allowed"),
+    [
+        (check_env, "A Box observation space m.* value is -?infinity"),
+        (check_env_sb3, "symmetric and normalized Box action"),
+    ],
+)
+def test_checkers_say_what_they_say_of_gymnasiums_cart_pole_and_pendulum(check, allowed, actuator):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", f".*{allowed}")
+        check(gymnasium.make(TASK.env_id, actuator=actuator).unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {},
+        {"actuator": "ideal"},
+        {"action": "current", "observe_actuator": True},
+        {"action": "voltage", "disturbances": {"command_delay": 0.004}},
+        {"randomize": {"model.length.rod": Uniform(0.8, 1.2), "model.length.arm": Uniform(0.8, 1.2)}},
+    ],
+    ids=["torque", "ideal", "current", "voltage", "randomised"],
+)
+def test_a_batch_is_single_environments_bit_for_bit(arguments, mode):
+    ends = assert_equal_episodes(batched("furuta", 3, mode, **arguments), looped("furuta", 3, mode, **arguments), 60)
+    assert ends.any()
+
+
+def test_dm_control_has_the_same_episode():
+    single = gymnasium.make(TASK.env_id, disable_env_checker=True)
+    env = suite.load("furuta", task_kwargs={"random": 3})
+    single.reset(seed=0)
+    env.reset()
+    single.unwrapped.physics.reset(np.array([*env.physics.data.qpos, *env.physics.data.qvel]))
+    for share in np.random.default_rng(0).uniform(-0.3, 0.3, 5):
+        action = np.array([share * MAX_TORQUE], np.float32)
+        observation, reward, *_ = single.step(action)
+        step = env.step(action)
+        np.testing.assert_array_equal(np.array(list(step.observation.values())).ravel(), observation)
+        assert step.reward == reward
+
+
+def test_the_picture_follows_the_rod():
+    """Orange, in the middle of the picture: below the arm's end while the rod hangs, above it upright."""
+    env = gymnasium.make(TASK.env_id, render_mode="rgb_array", width=160, height=160)
+    env.reset(seed=0)
+    heights = []
+    for angle in (math.pi, 0.0):
+        env.unwrapped.state = np.array([0.0, angle, 0.0, 0.0])
+        red, _, blue = np.moveaxis(env.render().astype(int), -1, 0)
+        rows, _ = np.nonzero(red - blue > 100)
+        assert len(rows) > 100
+        heights.append(rows.mean())
+    assert heights[1] < 80 < heights[0]
+    assert heights[0] - heights[1] > 30
