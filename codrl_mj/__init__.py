@@ -42,6 +42,7 @@ _PUBLIC = {
     "Choice": "codrl_mj.envs.distributions",
     "make_sb3_vec_env": "codrl_mj.envs.sb3",
     "motorise": "codrl_mj.specs",
+    "motorised": "codrl_mj.foreign.building",
     "motors": "codrl_mj.engine.reading",
     "check": "codrl_mj.engine.reading",
     "clear_motors": "codrl_mj.engine.reading",
