@@ -43,6 +43,7 @@ _PUBLIC = {
     "make_sb3_vec_env": "codrl_mj.envs.sb3",
     "motorise": "codrl_mj.specs",
     "motorised": "codrl_mj.foreign.building",
+    "make": "codrl_mj.foreign.environments",
     "motors": "codrl_mj.engine.reading",
     "check": "codrl_mj.engine.reading",
     "clear_motors": "codrl_mj.engine.reading",
