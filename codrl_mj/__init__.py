@@ -44,6 +44,7 @@ _PUBLIC = {
     "motorise": "codrl_mj.specs",
     "motorised": "codrl_mj.foreign.building",
     "make": "codrl_mj.foreign.environments",
+    "make_dm_control": "codrl_mj.foreign.dm_control",
     "motors": "codrl_mj.engine.reading",
     "check": "codrl_mj.engine.reading",
     "clear_motors": "codrl_mj.engine.reading",
