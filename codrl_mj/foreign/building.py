@@ -55,13 +55,9 @@ class Building:
         wanted = {pattern: actuator for pattern, actuator in self.actuators.items() if matched_by(pattern, names)}
         if not wanted:
             return plain
-        token = _PRESENT.set(None)  # what we build ourselves on the way is left alone
-        try:
-            with warnings.catch_warnings():  # MuJoCo's of the model, which building it without motors has shown
-                warnings.filterwarnings("ignore", category=UserWarning, module=r"codrl_mj\.(specs|foreign\.building)")
-                return motorise(spec(), wanted, self._allow_unstable).compile()
-        finally:
-            _PRESENT.reset(token)
+        with warnings.catch_warnings():  # MuJoCo's of the model, which building it without motors has shown
+            warnings.filterwarnings("ignore", category=UserWarning, module=r"codrl_mj\.(specs|foreign\.building)")
+            return motorise(spec(), wanted, self._allow_unstable).compile()
 
     def check(self) -> None:
         """Refuse patterns that were of no use.

@@ -6,7 +6,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from codrl_mj.actuators import ActuatorModel, Family, field_paths
+from codrl_mj.actuators import ActuatorModel, Family, JointAdditions, field_paths
 from codrl_mj.engine.plugin import PLUGIN_HEAD
 from codrl_mj.envs.distributions import Distribution, parse
 from codrl_mj.envs.randomization import LIMIT
@@ -106,48 +106,54 @@ class Draws:
 class Exchange:
     """Puts other actuators of their families in the place of the motors of a compiled model."""
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, motors: Mapping[int, ActuatorModel]) -> None:
+    def __init__(
+        self, data: mujoco.MjData, motors: Mapping[int, ActuatorModel], places: Mapping[str, list[int]]
+    ) -> None:
         """Remember what the model has.
 
         Args:
-            model: the model.
-            data: a simulation of it, whose constants follow.
+            data: a simulation of the model.
             motors: as `codrl_mj.motors` reads them.
+            places: pattern -> indices of its motors.
         """
-        self._model, self._data, self._nominal = model, data, dict(motors)
+        self._model, self._data, self._nominal, self._places = data.model, data, dict(motors), places
         self._fields = {
-            name: getattr(model, name).copy()
+            name: getattr(data.model, name).copy()
             for name in ("actuator_armature", "actuator_damping", "dof_frictionloss", "tendon_frictionloss")
         }
-        self._constants_follow = False
+        self._added = False
 
-    def put(self, actuators: Mapping[int, ActuatorModel]) -> None:
+    def put(self, actuators: Mapping[str, ActuatorModel]) -> None:
         """Let motors be others; to be followed by a reset, or a restoring of the state.
 
         Args:
-            actuators: index -> actuator, of the family that is there.
+            actuators: pattern -> actuator, of the family that is there.
 
         Raises:
             ValueError: friction is to be put where there is neither joint nor tendon.
         """
-        model, stale = self._model, self._constants_follow
-        self._constants_follow = False
-        for name, values in self._fields.items():
+        model, added = self._model, self._added
+        self._added = False
+        for name, values in self._fields.items() if added else ():
             getattr(model, name)[:] = values
-        for index, actuator in actuators.items():
-            numbers, old, new = actuator.numbers, self._nominal[index].additions, actuator.additions
-            model.actuator_user[index, PLUGIN_HEAD - 1 : PLUGIN_HEAD + len(numbers)] = actuator.arm_radius, *numbers
-            if new == old:
-                continue
-            self._constants_follow = True
-            model.actuator_armature[index] += new.armature - old.armature
-            model.actuator_damping[index] += new.damping - old.damping
-            if new.friction != old.friction:
-                losses, place = self._friction(index)
-                gear = abs(model.actuator_gear[model.actuator_outadr[index], 0])
-                losses[place] += (new.friction - old.friction) * gear
-        if stale or self._constants_follow:
+        for pattern, actuator in actuators.items():
+            numbers, new = (actuator.arm_radius, *actuator.numbers), actuator.additions
+            for index in self._places[pattern]:
+                model.actuator_user[index, PLUGIN_HEAD - 1 : PLUGIN_HEAD - 1 + len(numbers)] = numbers
+                self._add(index, self._nominal[index].additions, new)
+        if added or self._added:
             mujoco.mj_setConst(model, self._data)
+
+    def _add(self, index: int, old: JointAdditions, new: JointAdditions) -> None:
+        """Let a motor add other things to its joint."""
+        if new == old:
+            return
+        model, self._added = self._model, True
+        model.actuator_armature[index] += new.armature - old.armature
+        model.actuator_damping[index] += new.damping - old.damping
+        if new.friction != old.friction:
+            losses, place = self._friction(index)
+            losses[place] += (new.friction - old.friction) * abs(model.actuator_gear[model.actuator_outadr[index], 0])
 
     def _friction(self, index: int) -> tuple[np.ndarray, int]:
         """Where the friction of what an actuator drives is."""

@@ -18,7 +18,7 @@ from gymnasium.wrappers import TimeLimit
 from codrl_mj.actuators import ActuatorModel, Command
 from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.disturbances import OFF, resolve_disturbances
-from codrl_mj.engine.reading import Readout, check_shafts, clear_motors
+from codrl_mj.engine.reading import Readout, bring_to_rest, check_shafts, motors, slots
 from codrl_mj.envs.snapshots import check_snapshot
 from codrl_mj.foreign.building import Building
 from codrl_mj.foreign.commands import Commands, CommandsWay, command_of
@@ -140,8 +140,13 @@ def _with_motors(kind: Any) -> Any:
     class WithMotors(kind):
         remade: Any = None
 
+        @functools.cached_property
+        def _motors(self) -> list[np.ndarray]:
+            return list(slots(self.data, motors(self.model)).values())
+
         def set_state(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
-            clear_motors(self.data)
+            for slot in self._motors:
+                bring_to_rest(slot, self.data.time, slot[1])
             super().set_state(qpos, qvel)
 
         def __reduce__(self) -> Any:
@@ -210,9 +215,10 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         """
         self._model, self._data = self.unwrapped.model, self.unwrapped.data  # type: ignore[attr-defined]
         self._readout = Readout(self._model)
+        self._slots = list(slots(self._data, self._readout.motors).values())
         names = names_of(self._model)
         self._places = {pattern: matched_by(pattern, names) for pattern in self._motorised.actuators}
-        self._exchange = Exchange(self._model, self._data, self._readout.motors)
+        self._exchange = Exchange(self._data, self._readout.motors, self._places)
         self._commands: Commands | None = None
         self._way: CommandsWay | None = None
         self._sensors: Sensors | None = None
@@ -239,12 +245,12 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
             ValueError: they are not stable there.
         """
         changed = {index: one for pattern, one in actuators.items() for index in self._places[pattern]}
+        self._motors = self._readout.motors | changed
         if changed:
-            self._exchange.put(changed)
+            self._exchange.put(actuators)
             for actuator in actuators.values():
                 actuator.check_at(self._model.opt.timestep, self._motorised.allow_unstable)
-            check_shafts(self._model, self._motorised.allow_unstable)
-        self._motors = self._readout.motors | changed
+            check_shafts(self._model, self._motorised.allow_unstable, self._motors)
         if self._observes:
             self._sensors = Sensors(self._data, self._motors)
 
@@ -268,8 +274,8 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         observation, info = self.env.reset(seed=seed, options=options)
         self._begun = True
         if any(motor.random for motor in self._motors.values()):
-            keys = self._generator.random(len(self._motors)) * LARGEST_KEY
-            clear_motors(self._data, keys.tolist())
+            for slot in self._slots:
+                slot[1] = np.floor(self._generator.random() * LARGEST_KEY)
         if self._way is not None:
             self._way.memory[:] = 0.0
         return self._observed(observation, at_start=True), info | self._drawn()
@@ -387,7 +393,7 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         self._bind()
 
 
-_OF_THE_MODEL = ("_model", "_data", "_readout", "_exchange", "_commands", "_way", "_sensors", "_motors")
+_OF_THE_MODEL = ("_model", "_data", "_readout", "_exchange", "_commands", "_way", "_sensors", "_motors", "_slots")
 
 
 def _longer(space: gymnasium.Space, count: int) -> spaces.Box:
