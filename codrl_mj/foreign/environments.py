@@ -52,8 +52,8 @@ def make(
         actuators: what goes where, as for `codrl_mj.motorise`.
         action: `force`: the environment's own actions, whose forces are what is desired (a position servo stays one);
             or what the actuators take besides, such as `current` and `voltage`, with their limits as the action space.
-            The environment still computes its costs from its own controls: those of that current's, or as many
-            amperes' as volts, torque.
+            The environment still computes its costs from its own controls: from the torque that a current makes, or as
+            many amperes as volts.
         observe_actuator: whether the observation ends with what the motors' sensors say, motor by motor.
         randomize: pattern -> field -> distribution (or its text): what is drawn for the motors of a pattern at every
             reset. What was drawn is in the reset's info, `randomization`. The generator is not the environment's: its
@@ -232,8 +232,10 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
             self._commands = Commands(self._model, self.env.action_space, commands)
             self.action_space = self._commands.action_space
         if self._disturbances != OFF:
+            if not hasattr(self.unwrapped, "dt"):
+                raise ValueError("disturbances: the environment has no dt, the duration of its steps [s]; give it one")
             controls = self._model.actuator_ctrladr[list(self._readout.motors)]
-            self._way = CommandsWay(self._model, controls, self._disturbances, self.unwrapped.dt)  # type: ignore[attr-defined]
+            self._way = CommandsWay(self._model, controls, self._disturbances, self.unwrapped.dt)
         self._put({})
         if self._observes:
             self.observation_space = _longer(self.env.observation_space, len(self.sensor_names))
@@ -273,9 +275,9 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
             self._values = self._draws.draw(self._generator, self._put)
         observation, info = self.env.reset(seed=seed, options=options)
         self._begun = True
-        if any(motor.random for motor in self._motors.values()):
-            for slot in self._slots:
-                slot[1] = np.floor(self._generator.random() * LARGEST_KEY)
+        for slot, motor in zip(self._slots, self._motors.values(), strict=True):  # not all environments reset all data
+            key = np.floor(self._generator.random() * LARGEST_KEY) if motor.random else 0.0
+            bring_to_rest(slot, self._data.time, key)
         if self._way is not None:
             self._way.memory[:] = 0.0
         return self._observed(observation, at_start=True), info | self._drawn()

@@ -1,6 +1,7 @@
 """Environments of others, and what their motors are compared with."""
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.mujoco import MujocoEnv
@@ -21,11 +22,11 @@ ARM = """
   </worldbody>
   <actuator>
     <position name="servo" joint="shoulder" kp="20" kv="1" ctrlrange="-1 1"/>
-    <motor name="motor" joint="elbow" gear="5"/>
+    <general name="motor" joint="elbow" gear="5" gainprm="2"/>
   </actuator>
 </mujoco>
 """
-"""A servo, and a plain motor whose control has no range."""
+"""A servo, and a plain motor with a gain, whose control has no range."""
 
 
 class ArmEnv(MujocoEnv):
@@ -43,6 +44,29 @@ class ArmEnv(MujocoEnv):
     def reset_model(self):
         self.set_state(self.init_qpos + self.np_random.uniform(-0.1, 0.1, 2), self.init_qvel)
         return self.state_vector()
+
+
+class BareEnv(gym.Env):
+    """Somebody's environment that is none of Gymnasium's, and resets what it knows of."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (4,), np.float64)
+    action_space = spaces.Box(-1.0, 1.0, (2,), np.float64)
+
+    def __init__(self):
+        """Build the model from text."""
+        self.model = mujoco.MjModel.from_xml_string(ARM)
+        self.data = mujoco.MjData(self.model)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed, options=options)
+        self.data.time, self.data.qpos[:], self.data.qvel[:] = 0.0, 0.3, 0.0
+        mujoco.mj_forward(self.model, self.data)
+        return np.concatenate((self.data.qpos, self.data.qvel)), {}
+
+    def step(self, action):
+        self.data.ctrl[:] = action
+        mujoco.mj_step(self.model, self.data)
+        return np.concatenate((self.data.qpos, self.data.qvel)), 0.0, False, False, {}
 
 
 def actions(env, steps, seed=0):
@@ -70,8 +94,3 @@ def assert_same(found, expected):
         assert ours[1:4] == theirs[1:4]
         for name, value in theirs[4].items():
             np.testing.assert_array_equal(ours[4][name], value, err_msg=name)
-
-
-def plain(env_id, **options):
-    """Gymnasium's own."""
-    return gym.make(env_id, **options)

@@ -18,7 +18,8 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 import codrl_mj
 from codrl_mj.actuators import Actuator, CurrentLoop, Drive, Motor, Servo, TorqueSpeed, VoltageDrive
 from codrl_mj.catalogue import motor_entry
-from tests.foreign.models import ARM, V5, ArmEnv, actions, assert_same, run
+from codrl_mj.engine.reading import slots
+from tests.foreign.models import ARM, V5, ArmEnv, BareEnv, actions, assert_same, run
 from tests.matrix import but
 from tests.motorised.models import full_state
 
@@ -41,6 +42,14 @@ def arm_id(tmp_path):
     gym.register("ForeignArm-v0", functools.partial(ArmEnv, path), max_episode_steps=50)
     yield "ForeignArm-v0"
     gym.registry.pop("ForeignArm-v0")
+
+
+@pytest.fixture
+def bare_id():
+    """The id of an environment that is no `MujocoEnv`."""
+    gym.register("ForeignBare-v0", BareEnv, max_episode_steps=50)
+    yield "ForeignBare-v0"
+    gym.registry.pop("ForeignBare-v0")
 
 
 @every_v5
@@ -158,7 +167,7 @@ def _everything(env_id):
     )
 
 
-@every_v5
+@pytest.mark.parametrize("env_id", but((*KEPT, "Ant-v5"), V5))  # Ant's rewards come from poses that lag a step
 def test_a_snapshot_continues_bit_for_bit_in_a_fresh_environment(env_id):
     env, other = _everything(env_id), _everything(env_id)
     inputs = actions(env, 120)
@@ -203,8 +212,28 @@ def test_resets_bring_motors_to_rest():
     inputs = actions(env, 30)
     first = run(env, inputs, seed=2)
     assert_same(run(env, inputs, seed=2), first)
-    again = run(env, inputs[:2])  # the next episode's noise is another
-    assert not np.array_equal(again[1][4]["current"], first[2][4]["current"])
+
+
+def test_every_motor_has_noise_of_its_own_in_every_episode():
+    env = codrl_mj.make("HalfCheetah-v5", {"b.*": NOISY, "f.*": "lag"}, allow_unstable=True)
+    views, keys = slots(env.unwrapped.data, env.motors), []
+    for seed in (7, None, 7):
+        env.reset(seed=seed)
+        keys.append([view[1] for view in views.values()])
+    assert keys[0] == keys[2]
+    assert len({*keys[0][:3], *keys[1][:3]}) == 6
+    assert keys[0][3:] == [0.0] * 3  # which need none
+
+
+def test_environments_that_do_not_reset_all_data_have_motors_at_rest_too(bare_id):
+    env = codrl_mj.make(bare_id, {".*": "lag"})
+    inputs = actions(env, 10)
+    first = run(env, inputs, seed=0)
+    assert_same(run(env, inputs, seed=0), first)
+    with pytest.raises(ValueError, match="BareEnv: only Gymnasium's MujocoEnv and its descendants"):
+        env.snapshot()
+    with pytest.raises(ValueError, match="has no dt"):
+        codrl_mj.make(bare_id, {".*": "lag"}, disturbances={"command_rate": 1.0})
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
@@ -272,6 +301,18 @@ def test_currents_are_commanded_in_amperes_up_to_the_motors_limits():
         *_, info = env.step(action)
         np.testing.assert_allclose(info["reference_current"], np.clip(action[:3], -5.0, 5.0), rtol=1e-12)
         np.testing.assert_allclose(env.unwrapped.data.actuator_force[3:], action[3:], rtol=1e-7)
+
+
+def test_a_current_is_one_whatever_gain_and_arm_stand_before_it(arm_id):
+    drive = Drive.of(motor_entry("maxon-ec45-flat-50w").numbers).replaced(
+        {"controller.max_current": 5.0, "motor.gear_ratio": 3.0, "motor.arm_radius": 0.5}
+    )
+    env = codrl_mj.make(arm_id, {"motor": drive}, action="current", allow_unstable=True)
+    assert env.action_space.high[1] == 5.0
+    env.reset(seed=0)
+    *_, info = env.step(np.array([0.0, -0.4], np.float32))
+    assert info["reference_current"] == pytest.approx(-0.4, rel=1e-6)
+    assert info["desired_force"] == pytest.approx(-0.4 * drive.motor.torque_constant * 3.0 / 0.5, rel=1e-6)
 
 
 def test_without_a_limit_of_its_own_a_current_goes_as_far_as_the_environments_force():
