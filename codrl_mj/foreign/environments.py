@@ -280,7 +280,7 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
             bring_to_rest(slot, self._data.time, key)
         if self._way is not None:
             self._way.memory[:] = 0.0
-        return self._observed(observation, at_start=True), info | self._drawn()
+        return self._observed(observation), info | self._drawn()
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Advance by one environment step.
@@ -295,11 +295,10 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         observation, reward, terminated, truncated, info = self.env.step(action)
         return self._observed(observation), reward, terminated, truncated, info | readings(self._readout, self._data)
 
-    def _observed(self, observation: Any, at_start: bool = False) -> Any:
+    def _observed(self, observation: Any) -> Any:
         if self._sensors is None:
             return observation
-        seen = self._sensors.seen(at_start)
-        return np.concatenate([observation, seen]).astype(observation.dtype)
+        return np.concatenate([observation, self._sensors.seen()]).astype(observation.dtype)
 
     def _drawn(self) -> dict[str, Any]:
         if self._draws is None or self._values is None:

@@ -57,16 +57,12 @@ class Sensors:
             (type(one), parameters_type(_family(one))(*one.numbers), views[index]) for index, one in observed.items()
         ]
 
-    def seen(self, at_start: bool = False) -> np.ndarray:
-        """What they say now, shape (k,), float64, entries as in `names`.
-
-        Args:
-            at_start: whether there was no step yet in the episode: then all signals are 0.
-        """
+    def seen(self) -> np.ndarray:
+        """What they say now, shape (k,), float64, entries as in `names`."""
         values: list[float] = []
         for family, parameters, slot in self._rows:
             start, count = signals_at(family), len(family.Signals._fields)
-            signals = family.Signals(*([0.0] * count if at_start else slot[start : start + count].tolist()))
+            signals = family.Signals(*slot[start : start + count].tolist())
             inputs = Inputs(0.0, 0.0, 0.0, self._data.time, float(slot[1]))
             values += family.observe(parameters, self._data.model.opt.timestep, signals, inputs)
         return np.array(values)

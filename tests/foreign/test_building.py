@@ -131,9 +131,9 @@ def test_first_use_of_a_drive_builds_nothing_of_ours_with_motors():
     """Layout checks build a model of their own within the building of the first one: in a process that is new."""
     code = (
         "import codrl_mj, mujoco\n"
-        "with codrl_mj.motorised({'motor': 'maxon-ec45-flat-50w'}):\n"
+        "with codrl_mj.motorised({'.*': 'maxon-ec45-flat-50w'}):\n"
         f"    model = mujoco.MjModel.from_xml_string({ARM!r})\n"
         "print(len(codrl_mj.motors(model)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "1\n"
+    assert done.stdout == "2\n"
