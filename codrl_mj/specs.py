@@ -191,6 +191,9 @@ def _drive(spec: mujoco.MjSpec, model: mujoco.MjModel, index: int, actuator: Act
         actuator: what drives it.
     """
     target, name = spec.actuators[index], f"{NAME}.{index}"
+    if actuator.MOTION:  # its own loops take the place of the model's
+        target.gaintype, target.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE
+        target.gainprm[:], target.biasprm[:] = [1.0] + [0.0] * (mujoco.mjNGAIN - 1), 0.0
     target.classname = _default_for(spec, target, name)
     control = model.actuator_ctrladr[index]
     target.inheritrange = 0.0
@@ -202,9 +205,6 @@ def _drive(spec: mujoco.MjSpec, model: mujoco.MjModel, index: int, actuator: Act
     target.plugin.plugin_name, target.plugin.name, target.plugin.active = NAME, name, True
     target.userdata = [*user_head(type(actuator)), actuator.arm_radius, *actuator.numbers]
     added = actuator.additions
-    if actuator.MOTION:  # its own loops take the place of the model's
-        target.gaintype, target.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE
-        target.gainprm[:], target.biasprm[:] = [1.0] + [0.0] * (mujoco.mjNGAIN - 1), 0.0
     target.armature += added.armature
     target.damping[0] += added.damping
     if added.friction:

@@ -24,6 +24,7 @@ from codrl_mj.catalogue import motor_entry, motor_names
 from codrl_mj.motor_design import design, find_drive, torque_limits
 from codrl_mj.runs.files import writing
 from codrl_mj.tasks import TASKS, named_actuator
+from codrl_mj.validation.drives import COLD
 
 FOLDER = Path(__file__).parent.parent / "docs"
 PAGE = "actuators_in_numbers.md"
@@ -129,10 +130,13 @@ def _on_a_slide(task: str) -> bool:
 
 
 def motor_row(name: str) -> dict[str, Any]:
-    """What a motor of the catalogue does at its own gear, at the output, by its nominal voltage or 24 V."""
+    """What a motor of the catalogue does at its own gear, at the output, by its nominal voltage or 24 V, still cold."""
     drive, numbers = find_drive(name), motor_entry(name).numbers
     loop = design(drive)
-    free = dataclasses.replace(drive, controller=dataclasses.replace(drive.controller, max_current=math.inf))
+    cold = dataclasses.replace(drive.motor, **COLD)
+    free = dataclasses.replace(
+        drive, motor=cold, controller=dataclasses.replace(drive.controller, max_current=math.inf)
+    )
     speed, time_constant = _free(free)
     continuous = numbers.continuous_current
     return {

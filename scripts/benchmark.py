@@ -45,7 +45,7 @@ def groups(quick: bool) -> dict[str, Makers]:
     """What is compared with what; the first of a group is what the others are divided by."""
     found: dict[str, Makers] = {}
     for task in TASKS:
-        found[f"engine: {task}"] = [partial(subjects.engine, task, False), partial(subjects.engine, task, True)]
+        found[f"engine: {task}"] = [partial(subjects.engine, task, one) for one in (None, "paper", "drive", "stepped")]
     for count in (1, 6, 17):
         drivers = (None, "ideal", "torque_speed", "lag", "current_loop")
         found[f"motorised: {count} motors"] = [partial(subjects.chain, count, driver) for driver in drivers]

@@ -17,6 +17,7 @@ from codrl_mj.actuators import IDEAL
 from codrl_mj.physics.mjcf import install_callbacks, task_model
 from codrl_mj.physics.offscreen import OffscreenRenderer
 from codrl_mj.tasks import TASKS, named_actuator
+from codrl_mj.validation.drives import Bench, fitted
 
 ACTIONS = 1000
 """Actions drawn beforehand."""
@@ -36,23 +37,35 @@ class Subject:
     """Environment steps (or frames) in one call."""
 
 
-def engine(task: str, with_callbacks: bool) -> Subject:
-    """`mj_step` of the task's model; without our callbacks its motor is dead weight, and a hill is flat."""
+def engine(task: str, actuator: str | None = "paper") -> Subject:
+    """`mj_step` of the task's model with an actuator; None: without our callbacks, a motor dead weight, a hill flat.
+
+    Args:
+        task: the task's name.
+        actuator: `paper`; `drive`, the one that the certificate runs the task with; or `stepped`, the same with its
+            gains given, which is what keeps it from its closed form.
+    """
     definition = TASKS[task]
     timestep = definition.step_duration / definition.motor_inner_steps
-    model = task_model(definition, (named_actuator("paper", task),), timestep)
+    one: Any = named_actuator("paper", task)
+    if actuator in ("drive", "stepped"):
+        one = fitted(task)
+    if actuator == "stepped":
+        bench = Bench(one, timestep)
+        one = one.replaced({"controller.kp": bench.kp, "controller.ki": bench.ki * one.controller.sample_rate})
+    model = task_model(definition, (one,), timestep)
     data = mujoco.MjData(model)
 
     def prepare() -> None:
         callbacks.uninstall()
-        if with_callbacks:
+        if actuator is not None:
             install_callbacks(model)
         mujoco.mj_resetData(model, data)
         data.qpos[:] = 0.3  # in motion in both cases: at rest, a step is cheaper
         data.qvel[:] = 0.1
         data.ctrl[:] = model.actuator_ctrlrange[0, 1] / 2
 
-    name = "mj_step with our callbacks" if with_callbacks else "mj_step, bare"
+    name = "mj_step, bare" if actuator is None else f"mj_step with our callbacks, {actuator}"
     return Subject(name, lambda calls: mujoco.mj_step(model, data, calls), prepare)
 
 

@@ -20,8 +20,8 @@ def _run(script, *arguments, folder):
 @pytest.mark.parametrize(
     ("group", "least", "own"),
     but(
-        [("engine: pendulum", 2, 0)],
-        [("vector: mountain_car_continuous", 3, 2), ("single: pendulum", 3, 2), ("engine: pendulum", 2, 0)],
+        [("engine: pendulum", 4, 0)],
+        [("vector: mountain_car_continuous", 3, 2), ("single: pendulum", 3, 2), ("engine: pendulum", 4, 0)],
     ),
 )
 @pytest.mark.matrix

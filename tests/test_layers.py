@@ -50,7 +50,7 @@ ALLOWED = {
     "sizing": {
         *("actuators", "catalogue", "envs.config", "evaluation", "motor_design", "runs.policies", "tasks", "training"),
     },
-    "validation": {"actuators", "engine", "physics", "runs.files", "tasks", "tasks.assets"},
+    "validation": {"actuators", "catalogue", "engine", "physics", "runs.files", "tasks", "tasks.assets"},
     "study": {
         *("actuators", "disturbances", "envs.config", "evaluation", "evaluation.measures", "fields", "films"),
         *("runs.files", "runs.policies", "tasks", "training"),

@@ -16,10 +16,13 @@ from codrl_mj.actuators.model import (
     family_name,
     family_number,
     field_paths,
+    field_values,
+    options_of,
     parameter_paths,
     parameters_type,
     reference,
     trusting,
+    unchecked,
 )
 from codrl_mj.actuators.named import (
     BUILT_IN,
@@ -71,6 +74,8 @@ __all__ = [
     "family_name",
     "family_number",
     "field_paths",
+    "field_values",
+    "options_of",
     "find_family",
     "mapping_of",
     "parameter_paths",
@@ -80,4 +85,5 @@ __all__ = [
     "spectral_radii",
     "spectral_radius",
     "trusting",
+    "unchecked",
 ]

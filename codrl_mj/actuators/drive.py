@@ -19,7 +19,7 @@ from codrl_mj.actuators.current_loop import Supply
 from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.model import ActuatorModel, Command, Inputs, JointAdditions, UnstableError, parameters_type
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH, SampledLoop
-from codrl_mj.actuators.shaft import Means, Shaft, Winding
+from codrl_mj.actuators.shaft import Heat, Means, Shaft, Winding
 from codrl_mj.fields import part
 
 
@@ -32,16 +32,18 @@ class State(NamedTuple):
     """The controller's integral [V]."""
     pending: float
     """Voltage [V] that a delayed loop applies in the next sample."""
-    rise: float
-    """How much warmer [K] the winding is than its surroundings."""
+    winding_rise: float
+    """How much warmer [K] the winding is than the housing."""
+    housing_rise: float
+    """How much warmer [K] the housing is than the surroundings."""
     acceleration: float
     """What the torque delivered in the last step did to the rotor's speed [rad/s^2]."""
     speed: float
     """Speed [rad/s] of the rotor at its beginning."""
     others: float
     """Acceleration [rad/s^2] of the rotor by all but the motor, as it was taken to be."""
-    started: float
-    """1 once there was a step."""
+    due: float
+    """When [s] the next step is to begin; 0 before the first."""
 
 
 class Signals(NamedTuple):
@@ -59,30 +61,49 @@ class Signals(NamedTuple):
     """1 where the voltage, or the current asked for, was at its limit in some sample."""
 
 
-def limited(parameters: Any, timestep: float, rise: float, resistance: float, asked: float) -> float:
+def limited(parameters: Any, timestep: float, heat: Heat, resistance: float, asked: float) -> float:
     """The current [A] that the loop is given: what is asked for, within `max_current` and what the winding bears."""
     most = parameters.max_current
-    if parameters.thermal_resistance > 0.0 and parameters.max_temperature < math.inf:
-        most = min(most, shaft.thermal_limit(parameters, timestep, rise, resistance))
+    if parameters.max_temperature < math.inf and shaft.is_warming(parameters):
+        most = min(most, shaft.thermal_limit(parameters, timestep, heat, resistance))
     return min(max(asked, -most), most)
 
 
-def begin(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[Winding, Shaft]:
-    """Winding and shaft at the beginning of a step."""
+def begin(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[Winding, Heat, Shaft]:
+    """Winding, temperatures and shaft at the beginning of a step."""
     inertia, others = shaft.inertia_of(parameters, inputs.inertia), 0.0
-    if state.started > 0.0 and inertia < math.inf:
+    if state.due > 0.0 and abs(inputs.time - state.due) < 0.5 * timestep and inertia < math.inf:
         others = shaft.others_after(timestep, inputs.speed - state.speed, state.acceleration, state.others)
     moving = Shaft(inertia, others, inputs.speed)
-    return Winding(state.current, state.integral, state.pending), moving
+    winding = Winding(state.current, state.integral, state.pending)
+    return winding, Heat(state.winding_rise, state.housing_rise), moving
 
 
-def end(parameters: Any, timestep: float, rise: float, winding: Winding, moving: Shaft, means: Means) -> State:
-    """The state after a step, from the shaft at its beginning."""
-    if parameters.thermal_resistance > 0.0:
-        resistance = shaft.resistance_at(parameters, rise)
-        rise = shaft.rise_after(parameters, timestep, rise, means.current, resistance)
+def end(
+    parameters: Any,
+    timestep: float,
+    time: float,
+    heat: Heat,
+    resistance: float,
+    winding: Winding,
+    moving: Shaft,
+    means: Means,
+) -> State:
+    """The state after a step, from temperatures and shaft at its beginning: its mean current heats."""
+    if shaft.is_warming(parameters):
+        heat = shaft.heated(parameters, timestep, heat, resistance * means.current * means.current)
     own = means.torque / moving.inertia
-    return State(winding.current, winding.integral, winding.pending, rise, own, moving.speed, moving.others, 1.0)
+    return State(
+        winding.current,
+        winding.integral,
+        winding.pending,
+        heat.winding,
+        heat.housing,
+        own,
+        moving.speed,
+        moving.others,
+        time + timestep,
+    )
 
 
 def _advance(
@@ -90,13 +111,13 @@ def _advance(
 ) -> tuple[State, float, Signals]:
     """A step of a drive that a torque is asked of or, where the loop is not `closed`, a voltage: kT for a volt."""
     asked = inputs.desired_torque / parameters.torque_constant
-    resistance = shaft.resistance_at(parameters, state.rise)
-    reference = limited(parameters, timestep, state.rise, resistance, asked) if closed else asked
-    winding, moving = begin(parameters, timestep, state, inputs)
+    winding, heat, moving = begin(parameters, timestep, state, inputs)
+    resistance = shaft.resistance_at(parameters, shaft.temperature_of(parameters, heat))
+    reference = limited(parameters, timestep, heat, resistance, asked) if closed else asked
     samples = max(int(timestep * parameters.sample_rate + 0.5), 1)
     winding, _, means = shaft.turn(parameters, resistance, timestep, samples, winding, moving, closed, reference)
-    after = end(parameters, timestep, state.rise, winding, moving, means)
-    temperature = parameters.ambient_temperature + after.rise
+    after = end(parameters, timestep, inputs.time, heat, resistance, winding, moving, means)
+    temperature = shaft.temperature_of(parameters, Heat(after.winding_rise, after.housing_rise))
     at_limit = 1.0 if means.saturated > 0.0 or reference != asked else 0.0
     shown = reference if closed else means.current
     return after, means.torque, Signals(means.current, shown, means.voltage, temperature, at_limit)
@@ -156,8 +177,8 @@ class Drive(ActuatorModel):
         for name, kind in (("motor", GearMotor), ("controller", SampledLoop), ("supply", Supply)):
             if not isinstance(getattr(self, name), kind) and not (name == "supply" and self.supply is None):
                 raise ValueError(
-                    f"Drive.{name} = {getattr(self, name)!r}: must be a {kind.__name__}; to build a drive from nested "
-                    "mappings use Drive.from_mapping"
+                    f"{type(self).__name__}.{name} = {getattr(self, name)!r}: must be a {kind.__name__}; to build one "
+                    f"from nested mappings use {type(self).__name__}.from_mapping"
                 )
 
     @classmethod
@@ -209,7 +230,7 @@ class Drive(ActuatorModel):
         limit, torque = self.controller.max_current, self.motor.torque_constant
         fixed = dict.fromkeys(("motor.torque_constant", *ARM), "it would change what an action means")
         driven = VoltageDrive(self.motor, self.controller, self.supply)
-        past = [f"controller.{name}" for name in _PAST_THE_LOOP]
+        past = ["motor.max_temperature", *(f"controller.{name}" for name in _PAST_THE_LOOP)]
         return {
             "current": Command("A", self, torque, limit if math.isfinite(limit) else None, fixed),
             "voltage": Command(
@@ -238,20 +259,22 @@ class Drive(ActuatorModel):
                 "have them designed; lower supply.resistance; or pass allow_unstable=True to study it as it is"
             )
 
-    def check_shaft(self, timestep: float, inertia: float) -> None:
+    def check_shaft(self, timestep: float, inertia: float, held: bool = False) -> None:
         """Refuse a speed that the back-EMF of a saturated motor makes unstable; warn where it would be wrong.
 
         Raises:
             UnstableError: with the number and a remedy.
         """
-        held = math.isinf(self.motor.load_inertia)
-        rotor = self.motor.rotor_inertia
-        if self.motor.load_inertia > 0.0 and not held:
-            inertia = rotor + self.motor.load_inertia / self.motor.gear_ratio**2
+        rotor, told = self.motor.rotor_inertia, self.motor.load_inertia
+        held = held or math.isinf(told)
+        if 0.0 < told < math.inf:
+            inertia = rotor + told / self.motor.gear_ratio**2
         braking = self.motor.torque_constant * self.motor.back_emf_constant / self.motor.resistance
         samples = 1.0 if held else max(round(timestep * self.controller.sample_rate), 1)
         share = timestep / samples * braking / inertia
-        remedy = "leave motor.load_inertia 0, so that the speed is followed" if held else "raise controller.sample_rate"
+        remedy = "raise controller.sample_rate"
+        if held:
+            remedy = "shorten the step" if told == 0.0 else "leave motor.load_inertia 0, so that the speed is followed"
         text = (
             f"motor.rotor_inertia = {rotor:g}: the back-EMF of a saturated motor takes {share:.3g} of the rotor's "
             f"speed in {timestep / samples:g} s over which that is held"
@@ -263,6 +286,13 @@ class Drive(ActuatorModel):
             )
         if share > 0.5:
             warnings.warn(f"{text}: above 0.5 it is wrong, above 1 it rings; {remedy}", stacklevel=2)
+        elif share * samples > 3.0:
+            warnings.warn(
+                f"motor.rotor_inertia = {rotor:g}: the back-EMF of a saturated motor takes {share * samples:.3g} of "
+                f"the rotor's speed in a step of {timestep:g} s. That is followed on a free shaft; at a stop, under "
+                "friction or beside other joints the torque comes as many steps late; shorten the step",
+                stacklevel=2,
+            )
 
     @classmethod
     def instability(cls, numbers: np.ndarray, timestep: float) -> np.ndarray:
@@ -272,9 +302,13 @@ class Drive(ActuatorModel):
             numbers: shape (m, p), rows as `numbers` returns them.
             timestep: mechanical step [s].
         """
-        samples = timestep * stability.columns(cls, numbers).sample_rate
-        whole = (abs(samples - np.round(samples)) <= 1e-6 * samples) & (samples >= 0.5)
-        return np.where(whole, _radii(cls, numbers), np.inf)
+        columns = stability.columns(cls, numbers)
+        samples = timestep * columns.sample_rate
+        possible = (abs(samples - np.round(samples)) <= 1e-6 * samples) & (samples >= 0.5)
+        # what `GearMotor` and `SampledLoop` refuse of fields together
+        possible &= columns.max_temperature > columns.ambient_temperature
+        possible &= columns.bandwidth <= columns.sample_rate / (2.0 * math.pi)
+        return np.where(possible, _radii(cls, numbers), np.inf)
 
 
 ARM = ("motor.gear_ratio", "motor.arm_radius")

@@ -4,6 +4,8 @@ import dataclasses
 import math
 from typing import Any
 
+import numpy as np
+
 from codrl_mj.fields import check, real
 
 
@@ -37,17 +39,23 @@ class GearMotor:
     viscous_friction: float = real(0.0, least=0.0, unit="N*m*s/rad")
     """Viscous friction [N*m*s/rad] at the rotor, >= 0: the joint's `damping`."""
     stribeck_friction: float = real(0.0, least=0.0, unit="N*m")
-    """What friction has at standstill [N*m] at the rotor over the Coulomb friction, >= 0; of the speed w it falls as
-    exp(-(w/`stribeck_speed`)^2). Part of what is delivered (`codrl_mj.actuators.shaft.friction`)."""
+    """What friction has at standstill [N*m] at the rotor over the Coulomb friction, >= 0; with the speed w it falls as
+    exp(-|w/`stribeck_speed`|^`stribeck_exponent`). Part of what is delivered (`codrl_mj.actuators.shaft.friction`)."""
     stribeck_speed: float = real(1.0, above=0.0, unit="rad/s")
     """Speed [rad/s] of the rotor at which 1/e of it is left, > 0."""
+    stribeck_exponent: float = real(2.0, above=0.0, most=10.0, unit="")
+    """How abruptly it falls, > 0 and <= 10: 2 is the usual, fits to servos give 1.3 and more."""
     load_inertia: float = real(0.0, least=0.0, unit="kg*m^2", infinite=True)
     """Inertia [kg*m^2] of what the output shaft moves, >= 0, by which its speed changes within a step; 0: what it is in
     the model at each moment; `inf`: the speed is held over a step. Nothing is added to the model by it."""
-    thermal_resistance: float = real(0.0, least=0.0, unit="K/W")
-    """Thermal resistance [K/W] from the winding to the surroundings, >= 0; 0: the winding stays as cold as they are."""
-    thermal_time_constant: float = real(10.0, above=0.0, unit="s")
+    thermal_resistance_winding: float = real(0.0, least=0.0, unit="K/W")
+    """Thermal resistance [K/W] from the winding to the housing, >= 0; 0: the winding is as warm as the housing."""
+    thermal_time_constant_winding: float = real(10.0, above=0.0, unit="s")
     """Time constant [s] of the winding's temperature, > 0."""
+    thermal_resistance_housing: float = real(0.0, least=0.0, unit="K/W")
+    """Thermal resistance [K/W] from the housing to the surroundings, >= 0; 0: it stays as cold as they are."""
+    thermal_time_constant_housing: float = real(100.0, above=0.0, unit="s")
+    """Time constant [s] of the housing's temperature, > 0."""
     ambient_temperature: float = real(25.0, above=-273.15, unit="degC")
     """Temperature [degC] of the surroundings, and of the winding at the start of an episode."""
     max_temperature: float = real(math.inf, above=-273.15, unit="degC", infinite=True)
@@ -64,6 +72,17 @@ class GearMotor:
             raise ValueError(
                 f"GearMotor.max_temperature = {self.max_temperature:g}: must be above ambient_temperature = "
                 f"{self.ambient_temperature:g} degC, or no current at all would be asked for"
+            )
+        if self.max_temperature < math.inf and not self.thermal_resistance_winding + self.thermal_resistance_housing:
+            raise ValueError(
+                f"GearMotor.max_temperature = {self.max_temperature:g}: needs thermal_resistance_winding or "
+                "thermal_resistance_housing, without which nothing warms"
+            )
+        if not 1.0 + self.resistance_coefficient * (self.ambient_temperature - 25.0) > 0.0:
+            raise ValueError(
+                f"GearMotor.ambient_temperature = {self.ambient_temperature:g}: with resistance_coefficient = "
+                f"{self.resistance_coefficient:g} the winding would have no resistance; must be above "
+                f"{25.0 - 1.0 / self.resistance_coefficient:g} degC"
             )
 
     @classmethod
@@ -89,7 +108,16 @@ class GearMotor:
         """A motor of `codrl_mj.catalogue.MotorNumbers`; what they do not know is left at 0, an efficiency at 1."""
         known = {field.name: getattr(numbers, field.name, None) for field in dataclasses.fields(cls)}
         known |= {name: 0.0 for name in _UNKNOWN if known[name] is None}
+        whole = getattr(numbers, "thermal_resistance", None)
+        if known["thermal_resistance_winding"] is None and whole is not None:
+            known["thermal_resistance_winding"] = whole - (known["thermal_resistance_housing"] or 0.0)
+        if known["thermal_resistance_winding"] is None:
+            known["max_temperature"] = None
         return cls(**{name: value for name, value in known.items() if value is not None})
+
+    def stribeck(self, speed: Any) -> Any:
+        """Stribeck friction [N*m] at the rotor at its speed [rad/s], any shape."""
+        return self.stribeck_friction * np.exp(-(np.abs(speed / self.stribeck_speed) ** self.stribeck_exponent))
 
     @property
     def electrical_time_constant(self) -> float:

@@ -13,7 +13,7 @@ import hashlib
 import importlib
 import math
 from collections import namedtuple
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -183,12 +183,14 @@ class ActuatorModel:
             ValueError: it cannot be simulated at all, likewise.
         """
 
-    def check_shaft(self, timestep: float, inertia: float) -> None:
+    def check_shaft(self, timestep: float, inertia: float, held: bool = False) -> None:
         """Refuse what cannot be simulated on a shaft that moves so much; called for families that ask for `INERTIA`.
 
         Args:
             timestep: mechanical step [s].
-            inertia: at the shaft [kg*m^2], or mass [kg], the rotor's own included, in the model's initial position.
+            inertia: at the shaft [kg*m^2], or mass [kg], the rotor's own included, in the model's initial position; its
+                share of it where several drive the same joint.
+            held: whether it will not be told the inertia, or not be alone in changing the speed.
 
         Raises:
             UnstableError: it is unstable there; the reason, with its number, and a remedy.
@@ -321,6 +323,45 @@ def _from_values(cls: type, values: Mapping[str, Any], prefix: str = "") -> Any:
         else:
             made[field.name] = _of_kind(cls, field.name, values[f"{prefix}{field.name}"])
     return cls(**made)
+
+
+def field_values(actuator: ActuatorModel) -> tuple[float, ...]:
+    """The values of all fields, in the order of `field_paths`: words as their numbers, flags as 0 and 1."""
+    return tuple(float(_get(actuator, path)) for path in field_paths(_family(actuator)))
+
+
+def unchecked(cls: Family, values: Iterable[float]) -> Any:
+    """An actuator of numbers as they are, for what follows from them: a tenth of the time of one that is checked.
+
+    Args:
+        cls: the family.
+        values: as `field_values` has them.
+    """
+    return _filled(cls, iter(values))
+
+
+def _filled(cls: Family, values: Iterator[float]) -> Any:
+    made = object.__new__(cls)
+    for name, part in _outline(cls):
+        vars(made)[name] = next(values) if part is None else _filled(part, values)
+    return made
+
+
+@functools.cache
+def _outline(cls: Family) -> tuple[tuple[str, Any], ...]:
+    """The fields of a dataclass, each with its class where it is a part, else with None."""
+    nested = fields.parts(cls)
+    return tuple((field.name, nested.get(field.name)) for field in dataclasses.fields(cls))
+
+
+def options_of(cls: type, path: str) -> tuple[str, ...]:
+    """The words that a field at a dotted path can be; empty if it is a number."""
+    owner: Any = cls
+    for name in path.split("."):
+        field = next(field for field in dataclasses.fields(owner) if field.name == name)
+        owner = fields.parts(owner).get(name)
+    words: tuple[str, ...] = field.metadata.get("options", ())
+    return words
 
 
 def _is_arm(path: str) -> bool:

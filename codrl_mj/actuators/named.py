@@ -9,7 +9,7 @@ from codrl_mj.actuators.current_loop import Actuator, CurrentLoop, VoltageDriven
 from codrl_mj.actuators.drive import Drive, VoltageDrive
 from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.lag import Lag
-from codrl_mj.actuators.model import ActuatorModel, Family, look_up
+from codrl_mj.actuators.model import ActuatorModel, Family, family_name, look_up
 from codrl_mj.actuators.servo import Servo
 from codrl_mj.actuators.torque_speed import TorqueSpeed
 
@@ -158,6 +158,12 @@ def actuator_over(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
         ValueError: a field is unknown or out of bounds, or set over the ideal actuator, which has none.
     """
     given = {name: value for name, value in changes.items() if value not in ({}, None)}
+    family = given.pop("family", family_name(type(base)))
+    if family != family_name(type(base)):
+        raise ValueError(
+            f"family = {family!r}: what it is set over is a {family_name(type(base))!r}; give the fields of a "
+            f"{family!r} without a name"
+        )
     if not given:
         return base
     if isinstance(base, Ideal):

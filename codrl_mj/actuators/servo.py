@@ -11,10 +11,10 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from codrl_mj.actuators import drive, shaft
+from codrl_mj.actuators import drive, shaft, stability
 from codrl_mj.actuators.drive import ARM, Drive
 from codrl_mj.actuators.model import Command, Inputs, UnstableError
-from codrl_mj.actuators.shaft import Means, Shaft
+from codrl_mj.actuators.shaft import Heat, Means, Shaft
 from codrl_mj.fields import check, choice, real
 
 
@@ -53,6 +53,12 @@ class ServoLoop:
     def __post_init__(self) -> None:
         """Validate."""
         check(self)
+        unused = "inertia_feed_forward" if self.controls == "position" else "velocity_feed_forward"
+        if getattr(self, unused) != 0.0:
+            raise ValueError(
+                f"ServoLoop.{unused} = {getattr(self, unused):g}: must be 0 where controls = {self.controls!r}, "
+                "which has no use for it"
+            )
 
 
 class State(NamedTuple):
@@ -61,11 +67,12 @@ class State(NamedTuple):
     current: float
     integral: float
     pending: float
-    rise: float
+    winding_rise: float
+    housing_rise: float
     acceleration: float
     speed: float
     others: float
-    started: float
+    due: float
     velocity_integral: float
     """Torque [N*m] at the rotor."""
     target: float
@@ -135,16 +142,17 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
         state.current,
         state.integral,
         state.pending,
-        state.rise,
+        state.winding_rise,
+        state.housing_rise,
         state.acceleration,
         state.speed,
         state.others,
-        state.started,
+        state.due,
     )
-    winding, moving = drive.begin(parameters, timestep, of_drive, inputs)
-    resistance = shaft.resistance_at(parameters, state.rise)
+    winding, heat, moving = drive.begin(parameters, timestep, of_drive, inputs)
+    resistance = shaft.resistance_at(parameters, shaft.temperature_of(parameters, heat))
     target, constant = inputs.desired_torque, parameters.torque_constant
-    rate = (target - state.target) / timestep if state.started > 0.0 else 0.0
+    rate = (target - state.target) / timestep if state.due > 0.0 else 0.0
     count = max(int(timestep * parameters.servo_rate + 0.5), 1)
     every = max(int(1.0 / (timestep * parameters.servo_rate) + 0.5), 1)
     period = timestep / count
@@ -160,7 +168,7 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
         else:
             after = integral
         given = min(max(asked, -most), most) / constant
-        given = drive.limited(parameters, timestep, state.rise, resistance, given)
+        given = drive.limited(parameters, timestep, heat, resistance, given)
         if given == asked / constant or (after - integral) * asked < 0.0:
             integral = after  # it does not wind up
         else:
@@ -174,19 +182,20 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
         torque += means.torque / count
     waiting -= 1.0
     mean = Means(amperes, volts, torque, saturated)
-    followed = drive.end(parameters, timestep, state.rise, winding, moving, mean)
-    temperature = parameters.ambient_temperature + followed.rise
+    followed = drive.end(parameters, timestep, inputs.time, heat, resistance, winding, moving, mean)
+    temperature = shaft.temperature_of(parameters, Heat(followed.winding_rise, followed.housing_rise))
     error = (target - (inputs.position if parameters.controls == 0.0 else inputs.speed)) / parameters.gear_ratio
     at_limit = 1.0 if saturated > 0.0 else 0.0
     after_step = State(
         followed.current,
         followed.integral,
         followed.pending,
-        followed.rise,
+        followed.winding_rise,
+        followed.housing_rise,
         followed.acceleration,
         followed.speed,
         followed.others,
-        followed.started,
+        followed.due,
         integral,
         target,
         asked,
@@ -230,6 +239,8 @@ class Servo(Drive):
         else:
             free = self.voltage_limit / motor.back_emf_constant if motor.back_emf_constant else math.inf
             limit, unit = min(free * arm, loop.max_velocity * motor.arm_radius), "rad/s"
+            if math.isinf(limit):
+                raise ValueError("loop.max_velocity = inf: must be finite where a motor has no back-EMF")
         return {loop.controls: Command(unit, self, 1.0 / arm, limit, fixed)}
 
     def check(self, timestep: float) -> None:
@@ -239,24 +250,30 @@ class Servo(Drive):
             ValueError: with the numbers and a remedy.
         """
         super().check(timestep)
-        in_step, rate = timestep * self.loop.servo_rate, self.loop.servo_rate
-        samples = self.controller.sample_rate / max(rate, 1.0 / timestep)
-        for name, multiple in (("samples of its loops in a step", max(in_step, 1.0 / in_step)), ("drive's", samples)):
-            if abs(multiple - round(multiple)) > 1e-6 * multiple or multiple < 0.5:
-                raise ValueError(
-                    f"ServoLoop.servo_rate = {rate:g}: with a mechanical step of {timestep:g} s and sample_rate = "
-                    f"{self.controller.sample_rate:g} Hz there are {multiple:g} {name} samples to one: must be a whole "
-                    f"number; try {1.0 / timestep:g} Hz"
-                )
+        if not _fits(self.loop.servo_rate, self.controller.sample_rate, timestep):
+            raise ValueError(
+                f"ServoLoop.servo_rate = {self.loop.servo_rate:g}: must be a multiple of the mechanical step's rate, "
+                f"{1.0 / timestep:g} Hz, or that a multiple of it, and the drive's sample_rate = "
+                f"{self.controller.sample_rate:g} Hz a multiple of both; the step's own rate always fits"
+            )
 
-    def check_shaft(self, timestep: float, inertia: float) -> None:
+    @classmethod
+    def instability(cls, numbers: np.ndarray, timestep: float) -> np.ndarray:
+        """As `Drive.instability`; infinite too where rates do not fit. What it moves is not known here."""
+        columns = stability.columns(cls, numbers)
+        fitting = np.array(
+            [_fits(*each, timestep) for each in zip(columns.servo_rate, columns.sample_rate, strict=True)]
+        )
+        return np.where(fitting, super().instability(numbers, timestep), np.inf)
+
+    def check_shaft(self, timestep: float, inertia: float, held: bool = False) -> None:
         """Refuse outer loops that are unstable on what they move, besides what `Drive.check_shaft` refuses.
 
         Raises:
             UnstableError: with the number and a remedy.
         """
-        super().check_shaft(timestep, inertia)
-        radius = _outer_radius(self, timestep, inertia)
+        super().check_shaft(timestep, inertia, held)
+        radius = _outer_radius(self, timestep, inertia, held or math.isinf(self.motor.load_inertia))
         if not radius < 1.0:
             loop, at_joint = self.loop, inertia * self.motor.gear_ratio**2
             raise UnstableError(
@@ -267,11 +284,17 @@ class Servo(Drive):
             )
 
 
-def _outer_radius(servo: Servo, timestep: float, inertia: float) -> float:
+def _fits(servo_rate: float, sample_rate: float, timestep: float) -> bool:
+    """Whether the rates [Hz] of servo, drive and mechanical step are multiples of each other."""
+    in_step = timestep * servo_rate
+    multiples = max(in_step, 1.0 / in_step), sample_rate / max(servo_rate, 1.0 / timestep)
+    return all(abs(one - round(one)) <= 1e-6 * one and one >= 0.5 for one in multiples)
+
+
+def _outer_radius(servo: Servo, timestep: float, inertia: float, held: bool) -> float:
     """Spectral radius of the outer loops on a free inertia, over one of their samples, at the rotor."""
     loop = servo.loop
-    held = math.isinf(servo.motor.load_inertia)  # what they see then is the speed at the beginning of the step
-    period = max(1.0 / loop.servo_rate, timestep if held else 0.0)
+    period = max(1.0 / loop.servo_rate, timestep if held else 0.0)  # held, they see the speed as the step began
     gain = loop.velocity_gain / servo.motor.gear_ratio**2
     reacts = gain * np.array([-loop.position_gain if loop.controls == "position" else 0.0, -1.0])  # to angle and speed
     adds = loop.velocity_integral_gain * period

@@ -25,6 +25,15 @@ class Winding(NamedTuple):
     """Voltage [V] that a delayed loop applies in the next sample."""
 
 
+class Heat(NamedTuple):
+    """How warm the motor is."""
+
+    winding: float
+    """How much warmer [K] the winding is than the housing."""
+    housing: float
+    """How much warmer [K] the housing is than the surroundings."""
+
+
 class Shaft(NamedTuple):
     """The rotor at a moment, and what moves it besides the motor."""
 
@@ -49,31 +58,58 @@ class Means(NamedTuple):
     """How many samples were at the voltage's limit."""
 
 
-def resistance_at(parameters: Any, rise: float) -> float:
-    """Resistance [ohm] of the winding when it is so much [K] warmer than its surroundings."""
-    warmer = parameters.ambient_temperature + rise - RATED_TEMPERATURE
-    return parameters.resistance * (1.0 + parameters.resistance_coefficient * warmer)
+def temperature_of(parameters: Any, heat: Heat) -> float:
+    """Of the winding [degC]."""
+    return parameters.ambient_temperature + heat.winding + heat.housing
 
 
-def kept_rise(parameters: Any, duration: float) -> float:
-    """Share of the winding's temperature rise that is left after some time [s] without a current."""
-    return math.exp(-duration / parameters.thermal_time_constant)
+def resistance_at(parameters: Any, temperature: float) -> float:
+    """Resistance [ohm] of the winding at a temperature [degC]."""
+    return parameters.resistance * (1.0 + parameters.resistance_coefficient * (temperature - RATED_TEMPERATURE))
 
 
-def rise_after(parameters: Any, duration: float, rise: float, current: float, resistance: float) -> float:
-    """The winding's temperature rise [K] after some time [s] at a mean current [A]: exact for what heats evenly."""
-    kept = kept_rise(parameters, duration)
-    return rise * kept + parameters.thermal_resistance * resistance * current * current * (1.0 - kept)
+def warmer(resistance: float, constant: float, duration: float, rise: float, watts: float) -> float:
+    """Temperature rise [K] over a thermal resistance [K/W] after some time [s] of a held loss [W].
+
+    Args:
+        resistance: of the body to what surrounds it [K/W].
+        constant: its time constant [s].
+        duration: [s].
+        rise: at the beginning [K].
+        watts: lost in it [W].
+    """
+    kept = math.exp(-duration / constant)
+    return rise * kept + resistance * watts * (1.0 - kept)
 
 
-def thermal_limit(parameters: Any, duration: float, rise: float, resistance: float) -> float:
+def heated(parameters: Any, duration: float, heat: Heat, watts: float) -> Heat:
+    """The motor's temperatures after some time [s] of a held loss [W] in the winding: two bodies in a row."""
+    return Heat(
+        warmer(
+            parameters.thermal_resistance_winding,
+            parameters.thermal_time_constant_winding,
+            duration,
+            heat.winding,
+            watts,
+        ),
+        warmer(
+            parameters.thermal_resistance_housing,
+            parameters.thermal_time_constant_housing,
+            duration,
+            heat.housing,
+            watts,
+        ),
+    )
+
+
+def thermal_limit(parameters: Any, duration: float, heat: Heat, resistance: float) -> float:
     """The current [A] that takes the winding to `max_temperature` within some time [s], and no further.
 
-    While the winding is cold that is more than it can bear for long; at the limit it is the continuous current.
+    While the motor is cold that is more than it can bear for long; at the limit it falls to the continuous current.
     """
-    kept = kept_rise(parameters, duration)
-    room = parameters.max_temperature - parameters.ambient_temperature - rise * kept
-    return math.sqrt(max(room, 0.0) / (parameters.thermal_resistance * resistance * (1.0 - kept)))
+    cooled, by_a_watt = heated(parameters, duration, heat, 0.0), heated(parameters, duration, Heat(0.0, 0.0), 1.0)
+    room = parameters.max_temperature - parameters.ambient_temperature - cooled.winding - cooled.housing
+    return math.sqrt(max(room, 0.0) / (resistance * (by_a_watt.winding + by_a_watt.housing)))
 
 
 def inertia_of(parameters: Any, inertia: float) -> float:
@@ -121,9 +157,14 @@ def friction(parameters: Any, duration: float, torque: float, shaft: Shaft) -> f
     efficiency = parameters.gear_efficiency
     level = abs(torque) * (1.0 - efficiency if torque * free > 0.0 else 1.0 / efficiency - 1.0)
     if parameters.stribeck_friction > 0.0:
-        ratio = shaft.speed / parameters.stribeck_speed
-        level += parameters.stribeck_friction * math.exp(-ratio * ratio)
+        ratio = abs(shaft.speed) / parameters.stribeck_speed
+        level += parameters.stribeck_friction * math.exp(-(ratio**parameters.stribeck_exponent))
     return math.copysign(min(level, most), free) if free != 0.0 else 0.0
+
+
+def is_warming(parameters: Any) -> bool:
+    """Whether the motor's temperature changes at all."""
+    return parameters.thermal_resistance_winding + parameters.thermal_resistance_housing > 0.0
 
 
 def run_over(
@@ -157,8 +198,8 @@ def run_over(
     compensated = back_emf if parameters.bemf_compensation != 0.0 else 0.0
     designed = parameters.kp == 0.0 and parameters.ki == 0.0
     y = 2.0 * math.pi * (parameters.bandwidth * sample_time if parameters.bandwidth > 0.0 else DEFAULT_BANDWIDTH)
-    as_designed = closed and designed and parameters.anti_windup == 0.0 and resistance == parameters.resistance
-    if as_designed and stiff and parameters.deadband == 0.0:
+    as_designed = closed and designed and parameters.anti_windup == 0.0 and parameters.deadband == 0.0
+    if as_designed and stiff:
         offset = back_emf - compensated
         current, integral, total, saturated = sampled.jump(
             winding.current,
@@ -176,10 +217,8 @@ def run_over(
         kp, ki = parameters.kp, parameters.ki * sample_time
         if not closed:
             kp, ki, compensated, asked = 0.0, 0.0, asked, 0.0
-        elif designed:  # for the winding as its datasheet has it
-            kp, ki = sampled.designed_gains(
-                parameters.resistance, parameters.inductance, sample_time, y * parameters.sample_rate
-            )
+        elif designed:
+            kp, ki = sampled.designed_gains(resistance, parameters.inductance, sample_time, y * parameters.sample_rate)
         current, integral, pending, total, saturated = sampled.run_samples(
             winding.current,
             winding.integral if closed else 0.0,
@@ -233,7 +272,8 @@ def turn(
     Returns:
         The winding and the rotor's speed [rad/s] afterwards, and what there was in between.
     """
-    braking = parameters.torque_constant * parameters.back_emf_constant / resistance
+    viscous = parameters.viscous_friction  # of the joint, which `others` has at the speed of the beginning
+    braking = parameters.torque_constant * parameters.back_emf_constant / resistance + viscous
     pieces = min(max(math.ceil(2.0 * duration * braking / shaft.inertia), 1), samples)
     lossy = parameters.gear_efficiency < 1.0 or parameters.stribeck_friction > 0.0
     amperes, volts, torque, saturated, left, speed = 0.0, 0.0, 0.0, 0, samples, shaft.speed
@@ -246,7 +286,8 @@ def turn(
             now = Shaft(shaft.inertia, shaft.others, speed)
             delivered -= friction(parameters, share * duration, delivered, now)
         amperes, volts, torque = amperes + share * mean, volts + share * voltage, torque + share * delivered
-        speed += share * duration * (delivered / shaft.inertia + shaft.others)
+        changed = delivered - viscous * (speed - shaft.speed)
+        speed += share * duration * (changed / shaft.inertia + shaft.others)
     return winding, speed, Means(amperes, volts, torque, float(saturated))
 
 
@@ -255,10 +296,12 @@ HELPERS = (
     sampled.jump,
     sampled.run_samples,
     sampled.designed_gains,
+    temperature_of,
     resistance_at,
-    kept_rise,
-    rise_after,
+    warmer,
+    heated,
     thermal_limit,
+    is_warming,
     inertia_of,
     others_after,
     friction,

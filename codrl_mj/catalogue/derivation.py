@@ -73,7 +73,7 @@ class MotorNumbers:
     """From winding to housing [K/W]."""
     thermal_resistance_housing: float | None
     """From housing to ambient [K/W]."""
-    thermal_time_constant: float | None
+    thermal_time_constant_winding: float | None
     """Of the winding against the housing [s]."""
     thermal_time_constant_housing: float | None
     """Of the housing against the ambient [s]."""
@@ -91,7 +91,6 @@ _LEAST_EFFICIENCY = 0.2
 OTHER_NAMES = {
     "max_current": "peak_current",
     "voltage": "nominal_voltage",
-    "thermal_time_constant": "thermal_time_constant_winding",
     "max_temperature": "max_winding_temperature",
 }
 """Numbers whose printed field is called otherwise."""

@@ -168,13 +168,17 @@ def bring_to_rest(slot: np.ndarray, time: float, noise_key: float) -> None:
 
 
 def check_shafts(
-    model: mujoco.MjModel, allow_unstable: bool = False, actuators: Mapping[int, ActuatorModel] | None = None
+    model: mujoco.MjModel,
+    allow_unstable: bool = False,
+    held: bool = False,
+    actuators: Mapping[int, ActuatorModel] | None = None,
 ) -> None:
     """Refuse motors that what they move makes unstable (`ActuatorModel.check_shaft`), in the model's initial position.
 
     Args:
         model: any MuJoCo model.
         allow_unstable: whether to let them be.
+        held: whether they will not be told what they move, as on the analytic physics.
         actuators: what `motors` would read, where that is known.
 
     Raises:
@@ -185,11 +189,13 @@ def check_shafts(
         return
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)
-    for index, actuator in asking.items():
+    shafts = [(model.actuator_trntype[index], *model.actuator_trnid[index]) for index in asking]
+    for (index, actuator), shaft in zip(asking.items(), shafts, strict=True):
         arm = 1.0 if model.actuator_plugin[index] < 0 else actuator.arm_radius  # the callback's is in the gear
         inertia = shaft_inertia(model, data, model.actuator_outadr[index], 1.0 / arm)
         try:
-            actuator.check_shaft(model.opt.timestep, inertia)
+            several = shafts.count(shaft)
+            actuator.check_shaft(model.opt.timestep, inertia / several, several > 1 or held)
         except UnstableError as error:
             if not allow_unstable:
                 raise ValueError(f"{model.actuator(index).name or f'actuator {index}'}: {error}") from None

@@ -64,6 +64,12 @@ class Commands:
                     f"action = {name!r}: the ideal actuator has no {name} to command; choose another actuator"
                 )
             raise ValueError(f"action = {name!r}: must be one of {', '.join(['force', *possible[0]])}")
+        wrapped = [task.state_names[at] for at in task.wrapped if actuators[0].MOTION and name == "position"]
+        if wrapped:
+            raise ValueError(
+                f"action = 'position': {task.name} wraps {', '.join(wrapped)}, and a position that jumps by a turn "
+                "cannot be held; use a velocity servo, or another actuator"
+            )
         chosen = [commands[name] for commands in possible]
         scales = np.array([command.torque_per_unit / command.actuator.arm_radius for command in chosen])
         limits = [command.limit for command in chosen]

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import ActuatorModel
-from codrl_mj.envs.randomization import Randomization, nominal_parameters
+from codrl_mj.envs.randomization import Randomization, mounting_of, nominal_fields
 from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
 from codrl_mj.physics.streams import Streams
 from codrl_mj.physics.variation import write_fields
@@ -28,7 +28,8 @@ class Draws:
         self._randomization, self._actuators = randomization, actuators
         self._physics = physics
         count = physics.num_envs
-        self._nominal, self._arms = nominal_parameters(actuators)
+        self._nominal = nominal_fields(actuators)
+        self._mounting = mounting_of(actuators)
         self._values = np.full((count, len(randomization.names)), np.nan)
         self._rejected = np.zeros(count, dtype=np.int64)
 
@@ -48,20 +49,21 @@ class Draws:
         self._values[rows], self._rejected[rows] = self._randomization.draw(
             lambda pending, count: streams.random(rows[pending], count),
             self._nominal[rows],
-            self._arms[rows],
         )
         self._apply(rows)
         return self._randomization.reports(rows, self._values, self._rejected)
 
     def _apply(self, rows: np.ndarray) -> None:
         """Write the values of some environments into their simulations."""
-        values = self._values[rows]
-        if self._randomization.draws_actuator:
-            self._physics.set_parameters(
-                rows, *self._randomization.parameters(self._nominal[rows], self._arms[rows], values)
-            )
-        if self._randomization.variation is not None:
-            self._physics.set_model(rows, self._randomization.model_fields(values))
+        values, randomization = self._values[rows], self._randomization
+        fields = randomization.drawn(self._nominal[rows], values)
+        arms, additions = self._mounting[0][rows], self._mounting[1][rows]
+        if randomization.mounted:
+            arms, additions = randomization.mounting(fields)
+        if randomization.draws_actuator:
+            self._physics.set_parameters(rows, randomization.numbers(fields), arms)
+        if randomization.variation is not None:
+            self._physics.set_model(rows, randomization.model_fields(values, additions))
 
     def present(self) -> dict[str, np.ndarray]:
         """The values in use by name, and the number of rejected sets, each of shape (N,); NaN before a reset."""

@@ -6,11 +6,22 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.actuators import Actuator, ActuatorModel, Family, Ideal, field_paths, parameter_paths
+from codrl_mj.actuators import (
+    Actuator,
+    ActuatorModel,
+    Family,
+    Ideal,
+    field_paths,
+    field_values,
+    options_of,
+    parameter_paths,
+    unchecked,
+)
+from codrl_mj.disturbances import Joint
 from codrl_mj.envs.commands import Commands
 from codrl_mj.envs.distributions import Choice, Distribution
 from codrl_mj.fields import did_you_mean
-from codrl_mj.physics.variation import Variation, variable
+from codrl_mj.physics.variation import Variation, additions_of, variable
 
 LIMIT = 1000
 """Draws of an unstable loop in a row after which a reset gives up."""
@@ -31,7 +42,11 @@ class Randomization:
     allow_unstable: bool
     """Whether unstable loops are kept."""
     variation: Variation | None
-    """What the drawn model fields do; None if there are none."""
+    """What drawn fields do to the model; None if they do nothing."""
+    mounted: tuple[str, ...]
+    """The fields that the actuator's arm and additions to its joint depend on."""
+    in_model: tuple[str, ...]
+    """The fields that the model, besides its actuators, depends on."""
 
     @classmethod
     def build(
@@ -42,6 +57,7 @@ class Randomization:
         commands: Commands,
         timestep: float,
         allow_unstable: bool,
+        joint: Joint,
     ) -> "Randomization":
         """Check the distributions against the fields that they are for.
 
@@ -52,6 +68,7 @@ class Randomization:
             commands: what an action stands for.
             timestep: integration step [s].
             allow_unstable: keep unstable loops.
+            joint: what is added to the actuated joints.
 
         Raises:
             ValueError: an unknown field (the nearest is suggested), one that cannot be drawn here, or impossible
@@ -72,9 +89,23 @@ class Randomization:
             except ValueError as error:
                 raise ValueError(f"randomize[{name!r}] = {distribution}: {error}") from None
         model = [name for name in randomize if name.startswith("model.")]
-        variation = Variation(task, model) if model else None
+        simulated = commands.simulated[0]
+        turned, added = (
+            [name for name in randomize if name not in model and _follows(of, simulated, name)] for of in _MOUNTING
+        )
+        in_model = (*model, *added)
+        variation = Variation(task, model, joint=joint, mounting=bool(added)) if in_model else None
         kinds = {name: _kind(family, name) for name in randomize}
-        return cls(dict(randomize), type(commands.simulated[0]), kinds, timestep, allow_unstable, variation)
+        return cls(
+            dict(randomize),
+            type(simulated),
+            kinds,
+            timestep,
+            allow_unstable,
+            variation,
+            tuple(turned + added),
+            in_model,
+        )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -87,14 +118,13 @@ class Randomization:
         return any(not name.startswith("model.") for name in self.distributions)
 
     def draw(
-        self, random: Callable[[np.ndarray, int], np.ndarray], nominal: np.ndarray, arms: np.ndarray
+        self, random: Callable[[np.ndarray, int], np.ndarray], nominal: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Draw the fields of some environments; whole sets are redrawn until their actuators are stable.
 
         Args:
             random: (positions in `nominal`, count) -> the next `count` numbers in [0, 1) of each of their generators.
-            nominal: numbers of what is simulated, shape (m, n, p).
-            arms: nominal arms [m], shape (m, n).
+            nominal: of what is simulated, as `nominal_fields` has it.
 
         Returns:
             Values (m, k), and how many sets were rejected before, (m,).
@@ -111,7 +141,7 @@ class Randomization:
                 values[pending, column] = distribution.transform(draws[:, column].copy())
             if self.allow_unstable or not self.draws_actuator:
                 return values, rejected
-            drawn, _ = self.parameters(nominal[pending], arms[pending], values[pending])
+            drawn = self.numbers(self.drawn(nominal[pending], values[pending]))
             flat = drawn.reshape(-1, drawn.shape[-1])
             unstable = ~(self.family.instability(flat, self.timestep) < 1.0)
             unstable = unstable.reshape(drawn.shape[:2]).any(axis=1)
@@ -127,37 +157,37 @@ class Randomization:
                     ". Narrow the bounds, shorten the step, or pass allow_unstable=True"
                 )
 
-    def parameters(self, nominal: np.ndarray, arms: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Numbers (m, n, p) and arms (m, n) with the drawn values in place of the nominal ones."""
-        numbers, arms = nominal.copy(), arms.copy()
-        paths = list(parameter_paths(self.family).values())
+    def drawn(self, nominal: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """The fields of actuators, as `nominal_fields` has them, with the drawn values (m, k) in place of theirs."""
+        fields, paths = nominal.copy(), field_paths(self.family)
         for name, column in zip(self.names, values.T, strict=True):
-            if name.rpartition(".")[2] == "arm_radius":
-                arms[:] = column[:, np.newaxis]
-            elif not name.startswith("model."):
-                numbers[:, :, paths.index(name)] = column[:, np.newaxis]
-        return numbers, arms
+            if not name.startswith("model."):
+                fields[:, :, paths.index(name)] = column[:, np.newaxis]
+        return fields
+
+    def numbers(self, fields: np.ndarray) -> np.ndarray:
+        """The numbers, shape (m, n, p), of actuators with the given fields (m, n, f)."""
+        paths = field_paths(self.family)
+        return fields[:, :, [paths.index(path) for path in parameter_paths(self.family).values()]]
+
+    def mounting(self, fields: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The arms [m], shape (m, n), of actuators with the given fields (m, n, f), and their additions, (m, n, 3)."""
+        return mounting_of([[unchecked(self.family, one) for one in each] for each in fields.tolist()])
 
     def nominal_values(self, simulated: Sequence[ActuatorModel]) -> np.ndarray:
         """The values, shape (k,), with which actuator and model are as they are before the first draw."""
-        numbers, arms = nominal_parameters([simulated])
-        paths = list(parameter_paths(self.family).values())
-        values = []
-        for name in self.names:
-            if name.startswith("model."):
-                values.append(0.0 if name.startswith("model.damping.") else 1.0)
-            elif name.rpartition(".")[2] == "arm_radius":
-                values.append(arms[0, 0])
-            else:
-                values.append(numbers[0, 0, paths.index(name)])
-        return np.array(values)
+        fields = dict(zip(field_paths(self.family), field_values(simulated[0]), strict=True))
+        model = {name: float(not name.startswith("model.damping.")) for name in self.names if name.startswith("model.")}
+        return np.array([(fields | model)[name] for name in self.names])
 
-    def model_fields(self, values: np.ndarray, drawn: bool = False) -> dict[str, np.ndarray]:
+    def model_fields(
+        self, values: np.ndarray, additions: np.ndarray | None = None, drawn: bool = False
+    ) -> dict[str, np.ndarray]:
         """The drawn fields of the model; see `Variation.fields`."""
         if self.variation is None:
             return {}
         columns = [self.names.index(name) for name in self.variation.names]
-        return self.variation.fields(values[:, columns], drawn)
+        return self.variation.fields(values[:, columns], additions, drawn)
 
     def actuator(self, nominal: ActuatorModel, values: np.ndarray) -> Any:
         """The nominal actuator with one environment's drawn values, shape (k,)."""
@@ -188,10 +218,28 @@ class Randomization:
         return {"randomization": report, "_randomization": mask}
 
 
-def nominal_parameters(actuators: Sequence[Sequence[ActuatorModel]]) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers (m, n, p) and arms [m] (m, n) of the actuators of m environments."""
-    numbers = np.array([[one.numbers for one in each] for each in actuators])
-    return numbers, np.array([[one.arm_radius for one in each] for each in actuators])
+def nominal_fields(actuators: Sequence[Sequence[ActuatorModel]]) -> np.ndarray:
+    """The fields of the actuators of m environments, shape (m, n, f), columns as in `field_paths`."""
+    return np.array([[field_values(one) for one in each] for each in actuators])
+
+
+def mounting_of(actuators: Sequence[Sequence[ActuatorModel]]) -> tuple[np.ndarray, np.ndarray]:
+    """The arms [m] of the actuators of m environments, shape (m, n), and what they add to their joints, (m, n, 3)."""
+    return np.array([[one.arm_radius for one in each] for each in actuators]), additions_of(actuators)
+
+
+_MOUNTING: tuple[Callable[[ActuatorModel], Any], ...] = (lambda one: one.arm_radius, lambda one: one.additions)
+
+
+def _follows(of: Callable[[ActuatorModel], Any], actuator: ActuatorModel, name: str) -> bool:
+    """Whether something of an actuator depends on a field: at the actuator's values, or where no other field is 0."""
+    family: Family = type(actuator)
+    paths = field_paths(family)
+    for values in (field_values(actuator), (2.0,) * len(paths)):
+        other = [value + (path == name) for path, value in zip(paths, values, strict=True)]
+        if of(unchecked(family, values)) != of(unchecked(family, other)):
+            return True
+    return False
 
 
 def _kind(family: Family, name: str) -> type:
@@ -231,16 +279,15 @@ def _check(name: str, distribution: Distribution, actuator: ActuatorModel, comma
     if name in commands.fixed:
         raise ValueError(f"with action={commands.name!r} {commands.fixed[name]}; draw it with action='force'")
     kind = _kind(type(actuator), name)
-    if kind is not float:
+    words = options_of(type(actuator), name)
+    if words:
+        if not isinstance(distribution, Choice) or any(value not in range(len(words)) for value in distribution.values):
+            numbered = ", ".join(f"{place} for {word}" for place, word in enumerate(words))
+            raise ValueError(f"{name} is a word: draw it from a Choice of {numbered}")
+    elif kind is not float:
         if not isinstance(distribution, Choice) or any(type(value) is not kind for value in distribution.values):
             raise ValueError(f"{name} must be drawn from a Choice of {kind.__name__} values")
     elif any(isinstance(value, bool) for value in distribution.extremes):
         raise ValueError(f"{name} must be a number")
     for value in distribution.extremes:
-        drawn = actuator.replaced({name: value})  # the field's own bounds
-        arm = actuator.arm_radius if name.rpartition(".")[2] != "arm_radius" else drawn.arm_radius
-        if (drawn.additions, drawn.arm_radius) != (actuator.additions, arm):
-            raise ValueError(
-                f"{name} = {value:g}: changes what the actuator adds to its joint, or its gear, and these are built "
-                "into the model; draw other fields, or make environments with different actuators"
-            )
+        actuator.replaced({name: value})  # the field's own bounds

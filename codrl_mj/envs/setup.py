@@ -13,12 +13,13 @@ from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint
 from codrl_mj.engine.reading import check_shafts
 from codrl_mj.envs.commands import Commands
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.randomization import Randomization, nominal_parameters
+from codrl_mj.envs.randomization import Randomization, nominal_fields
 from codrl_mj.envs.views import View
 from codrl_mj.physics import Physics, Signals
 from codrl_mj.physics.base import check_integrator, inner_step_count
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.registry import find_physics
+from codrl_mj.physics.variation import additions_of
 from codrl_mj.tasks import Task, find_task
 
 
@@ -59,19 +60,14 @@ class Setup:
         randomization = None
         if randomize is not None:
             randomization = Randomization.build(
-                randomize, definition.name, actuators[0], commands, timestep, config.allow_unstable
-            )
-        if config.joint.damping and any("model.damping." in name for name in randomize or ()):
-            raise ValueError(
-                f"joint.damping = {config.joint.damping:g}: give either it or a distribution of the joint's "
-                "model.damping, not both"
+                randomize, definition.name, actuators[0], commands, timestep, config.allow_unstable, config.joint
             )
         drawn = randomization is not None and randomization.draws_actuator  # then every draw is checked
         for one in commands.simulated if not drawn else ():
             one.check_at(timestep, config.allow_unstable)
         if any(one.INERTIA for one in commands.simulated):
             model = task_model(definition, commands.simulated, timestep, commands.max_forces, joint=config.joint)
-            check_shafts(model, config.allow_unstable)
+            check_shafts(model, config.allow_unstable, held=config.physics == "analytic")
         return cls(
             task=definition,
             actuators=actuators,
@@ -111,10 +107,10 @@ class Setup:
             joint=self.joint,
         )
         if made.scene is None and self.randomization is not None and self.randomization.variation is not None:
-            names = ", ".join(self.randomization.variation.names)
+            names = ", ".join(self.randomization.in_model)
             raise ValueError(
-                f"physics = {physics!r}: cannot draw {names}: numbers of a MuJoCo model, which it has not; use "
-                "physics='mujoco'"
+                f"physics = {physics!r}: cannot draw {names}: Gymnasium's environments share no names for masses, "
+                "lengths and gravity, and have no damping, friction and rotors; use physics='mujoco'"
             )
         return made
 
@@ -140,7 +136,7 @@ class Setup:
         actuator, info = self.actuator, {}
         if self.randomization is not None:
             values, rejected = self.randomization.draw(
-                lambda rows, count: generator.random((len(rows), count)), *nominal_parameters([self.commands.simulated])
+                lambda rows, count: generator.random((len(rows), count)), nominal_fields([self.commands.simulated])
             )
             actuator = self.vary(physics, values[0])
             info = {"randomization": self.randomization.report(values[0], rejected[0])}
@@ -157,13 +153,16 @@ class Setup:
         Returns:
             The actuator with these values.
         """
-        randomization, actuators = self.randomization, self.actuators
+        randomization, actuators, simulated = self.randomization, self.actuators, self.commands.simulated
         assert randomization is not None
         if randomization.draws_actuator:
-            actuators = tuple(randomization.actuator(one, values) for one in actuators)
-            physics.set_actuators([randomization.actuator(one, values) for one in self.commands.simulated])
+            actuators, simulated = (
+                tuple(randomization.actuator(one, values) for one in nominal) for nominal in (actuators, simulated)
+            )
+            physics.set_actuators(simulated)
         if randomization.variation is not None:
-            physics.set_model(randomization.model_fields(values[np.newaxis], drawn=True))
+            fields = randomization.model_fields(values[np.newaxis], additions_of([simulated]), drawn=True)
+            physics.set_model(fields)
         return alone(actuators)
 
     @functools.cached_property

@@ -252,7 +252,7 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
             self._exchange.put(actuators)
             for actuator in actuators.values():
                 actuator.check_at(self._model.opt.timestep, self._motorised.allow_unstable)
-            check_shafts(self._model, self._motorised.allow_unstable, self._motors)
+            check_shafts(self._model, self._motorised.allow_unstable, actuators=self._motors)
         if self._observes:
             self._sensors = Sensors(self._data, self._motors)
 

@@ -41,7 +41,7 @@ def find_drive(
     loop = {"sample_rate": sample_rate, "bandwidth": bandwidth, "delayed": delayed, "max_current": max_current}
     changes = {"motor": {"gear_ratio": gear_ratio}, "controller": loop, "supply": {"voltage": voltage}}
     base = resolve(name, None, "a motor on its own")
-    if not isinstance(base, Drive):
+    if type(base) is not Drive:
         raise ValueError(
             f"motor = {name!r}: no motor behind a drive, but the actuator family {base.family}; name a motor of the "
             "catalogue (codrl-mj motor list), a TOML file with a datasheet, or an actuator of the family drive"
@@ -133,5 +133,6 @@ def _at_output(motor: GearMotor, current: np.ndarray, speed: np.ndarray) -> np.n
     torque = motor.torque_constant * current
     torque = torque * np.where(torque * speed >= 0.0, motor.gear_efficiency, 1.0 / motor.gear_efficiency)
     friction = motor.coulomb_friction + motor.viscous_friction * motor.gear_ratio * np.abs(speed)
+    friction = friction + motor.stribeck(motor.gear_ratio * speed)
     still = np.sign(torque) * np.maximum(np.abs(torque) - friction, 0.0)
     return motor.gear_ratio * np.where(speed == 0.0, still, torque - friction * np.sign(speed))

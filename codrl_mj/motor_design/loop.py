@@ -88,7 +88,8 @@ def respond(drive: Drive, references: Any, speed: float = 0.0) -> Response:
     parameters, time = parameters_type(Drive)(*drive.numbers), 1.0 / drive.controller.sample_rate
     back_emf = drive.motor.back_emf_constant * speed
     integral = 0.0 if drive.controller.bemf_compensation else back_emf
-    state: Any = drive.State(0.0, integral, back_emf, rise=0.0, acceleration=0.0, speed=speed, others=0.0, started=0.0)
+    kind: Any = drive.State
+    state = kind(*[0.0] * len(kind._fields))._replace(integral=integral, pending=back_emf, speed=speed)
     rows = []
     for reference in references:
         before = state.current

@@ -50,7 +50,10 @@ class Physics(Protocol):
     simulation there, the motor left as it is."""
 
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
-        """Exchange the actuators for others of their family; to be followed by a reset."""
+        """Exchange the actuators for others of their family; to be followed by a reset.
+
+        What they add to their joints is the model's: see `set_model`.
+        """
 
     def set_model(self, fields: Mapping[str, np.ndarray]) -> None:
         """Change fields of the model, as `codrl_mj.physics.variation.Variation.fields` has them; then a reset follows.

@@ -94,9 +94,6 @@ def task_model(
     A diverging simulation is left to diverge, so that it can be reported, instead of being reset by the engine. Where
     the Euler integrator is made `explicit`, joint damping is explicit too.
 
-    Joint friction is a constraint of MuJoCo's: for it the solver, which the models switch off, is switched on, and
-    starts from nothing at each step, so that a step depends on the state alone.
-
     Args:
         task: the task.
         actuators: one for each of the task's motors.
@@ -114,7 +111,7 @@ def task_model(
     for name, actuator, limit in zip(task.motors, actuators, limits.tolist(), strict=True):
         motor = spec.actuator(name)
         drive(motor, actuator, limit)
-        for added in (actuator.additions, JointAdditions(joint.armature, joint.damping, joint.friction)):
+        for added in (JointAdditions(joint.armature, joint.damping, joint.friction), actuator.additions):
             _add(spec, spec.joint(motor.target), added)
     return spec.compile()
 
@@ -125,5 +122,13 @@ def _add(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, added: JointAdditions) -> 
     joint.damping[0] += added.damping
     if added.friction:
         joint.frictionloss += added.friction
-        spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-        spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
+        spec.option.disableflags = flags_with_friction(spec.option.disableflags)
+
+
+def flags_with_friction(flags: int) -> int:
+    """The `disableflags` of a model whose joints have friction, from those of one whose joints have none.
+
+    Friction is a constraint of MuJoCo's: for it the solver, which the models switch off, is switched on, and starts
+    from nothing at each step, so that a step depends on the state alone.
+    """
+    return flags & ~int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)

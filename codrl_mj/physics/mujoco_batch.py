@@ -17,10 +17,10 @@ from codrl_mj.engine.sensors import compiled_observe
 from codrl_mj.physics.base import LARGEST, Signals, SimulationDivergedError
 from codrl_mj.physics.constrain import compiled_batch
 from codrl_mj.physics.disturber import disturber
-from codrl_mj.physics.mjcf import needed_callbacks, task_model
+from codrl_mj.physics.mjcf import flags_with_friction, needed_callbacks, task_model
 from codrl_mj.physics.mujoco_single import wiring
 from codrl_mj.physics.stepping import NOISE_KEY, TORQUE
-from codrl_mj.physics.variation import write_fields
+from codrl_mj.physics.variation import Variation, additions_of, write_fields
 from codrl_mj.tasks import Task
 
 
@@ -77,7 +77,11 @@ class MujocoBatchPhysics:
         self._make_batch()
         self._rest = self._batch.state[0].copy()  # a simulation just reset, motor at rest
         self._arms = np.ones((self.num_envs, len(task.motors)))
-        self.set_actuators(np.arange(self.num_envs), actuators)
+        every, additions = np.arange(self.num_envs), additions_of(actuators)
+        self.set_actuators(every, actuators)
+        if (additions != additions[0]).any():
+            mounting = Variation(task.name, (), joint=joint, mounting=True)
+            self.set_model(every, mounting.fields(np.empty((self.num_envs, 0)), additions))
 
     def _make_batch(self) -> None:
         """Make the engine's batch, and take the views that a step uses."""
@@ -117,7 +121,10 @@ class MujocoBatchPhysics:
         self.restore(rows)
 
     def set_actuators(self, rows: np.ndarray, actuators: Sequence[Sequence[ActuatorModel]]) -> None:
-        """Give some simulations other actuators of the family; to be followed by a reset of them."""
+        """Give some simulations other actuators of the family; to be followed by a reset of them.
+
+        What they add to their joints is the models': see `set_model`.
+        """
         numbers = np.array([[one.numbers for one in each] for each in actuators])
         self.set_parameters(rows, numbers, np.array([[one.arm_radius for one in each] for each in actuators]))
 
@@ -148,6 +155,9 @@ class MujocoBatchPhysics:
         """
         for name, values in fields.items():
             self.field(name)[rows] = values
+        if "dof_frictionloss" in fields:
+            rub, flags = fields["dof_frictionloss"].any(axis=1), self.model.opt.disableflags
+            self.field("opt.disableflags")[rows] = np.where(rub, flags_with_friction(flags), flags)
         self._varied = True
         self._batch.set_const(rows)
 

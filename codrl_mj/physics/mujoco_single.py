@@ -13,7 +13,7 @@ from codrl_mj.engine.families import HEAD
 from codrl_mj.engine.library import addresses
 from codrl_mj.physics.base import check_finite, trace_names
 from codrl_mj.physics.disturber import disturber
-from codrl_mj.physics.mjcf import needed_callbacks, task_model
+from codrl_mj.physics.mjcf import flags_with_friction, needed_callbacks, task_model
 from codrl_mj.physics.stepping import Stepping, Wiring, compiled_stepping
 from codrl_mj.physics.variation import write_fields
 from codrl_mj.tasks import Task
@@ -67,6 +67,7 @@ class MujocoPhysics:
         timestep = task.step_duration / inner_steps
         self.model = task_model(task, tuple(actuators), timestep, max_forces, self._explicit, joint)
         self.data = mujoco.MjData(self.model)
+        self._flags = self.model.opt.disableflags
         self._qpos_order, self._qvel_order = _progression(task.qpos), _progression(task.qvel)
         self._disturber = disturber(disturbances, timestep, self._max_forces, 1)
         self.trace = np.zeros((inner_steps, len(actuators), len(trace_names(self.family))))
@@ -124,7 +125,10 @@ class MujocoPhysics:
         stepping.start(np.asarray(state, dtype=np.float64), float(key), *arguments)
 
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
-        """Exchange the actuators for others of their family; to be followed by a reset."""
+        """Exchange the actuators for others of their family; to be followed by a reset.
+
+        What they add to their joints is the model's: see `set_model`.
+        """
         if issubclass(self.family, Ideal):
             return
         for row, (one, limit) in enumerate(zip(actuators, self._max_forces, strict=True)):
@@ -141,6 +145,9 @@ class MujocoPhysics:
             fields: as `codrl_mj.physics.variation.Variation.fields` returns them, for one simulation.
         """
         write_fields(self.model, fields)
+        if "dof_frictionloss" in fields:
+            rubs = fields["dof_frictionloss"].any()
+            self.model.opt.disableflags = flags_with_friction(self._flags) if rubs else self._flags
         mujoco.mj_setConst(self.model, self.data)
 
     def show(self, state: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""Variations of a task's model: masses, lengths, gravity and damping, of many simulations at once."""
+"""Variations of a task's model, of many simulations at once: masses, lengths, gravity, damping, rotors on joints."""
 
 import functools
 from collections.abc import Mapping, Sequence
@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 import mujoco
 import numpy as np
 
-from codrl_mj.actuators import IDEAL
+from codrl_mj.actuators import IDEAL, ActuatorModel
+from codrl_mj.disturbances import PLAIN, Joint
 from codrl_mj.engine.hill import GRAVITY
 from codrl_mj.fields import did_you_mean
 from codrl_mj.physics.mjcf import hills, task_model
@@ -14,12 +15,19 @@ from codrl_mj.tasks import TASKS
 
 DRAWN = ("geom_pos", "geom_size")
 """Fields that only what is drawn depends on."""
+ADDED = ("dof_armature", "dof_damping", "dof_frictionloss")
+"""What an actuator adds to the degree of freedom of its joint: entries as in `JointAdditions`."""
 
 
 @functools.cache
-def _nominal_model(task: str) -> mujoco.MjModel:
-    """A task's model, read only."""
-    return task_model(TASKS[task], (IDEAL,) * len(TASKS[task].motors), TASKS[task].step_duration)
+def _nominal_model(task: str, joint: Joint = PLAIN) -> mujoco.MjModel:
+    """A task's model with ideal actuators, read only."""
+    return task_model(TASKS[task], (IDEAL,) * len(TASKS[task].motors), TASKS[task].step_duration, joint=joint)
+
+
+def additions_of(actuators: Sequence[Sequence[ActuatorModel]]) -> np.ndarray:
+    """What the actuators of m environments add to their joints, shape (m, n, 3), entries as in `JointAdditions`."""
+    return np.array([[one.additions for one in each] for each in actuators])
 
 
 def variable(task: str) -> tuple[str, ...]:
@@ -53,18 +61,27 @@ class Variation:
     gravity and the force of a hill; `model.damping.JOINT` is the damping [N*s/m or N*m*s/rad] added to a joint.
     """
 
-    def __init__(self, task: str, names: Sequence[str], model: mujoco.MjModel | None = None) -> None:
+    def __init__(
+        self,
+        task: str,
+        names: Sequence[str],
+        model: mujoco.MjModel | None = None,
+        joint: Joint = PLAIN,
+        mounting: bool = False,
+    ) -> None:
         """Find the fields.
 
         Args:
             task: the task's name.
             names: what is varied, of `variable(task)`.
-            model: a model of the task, whose present fields are varied; None is the task's own.
+            model: a model of the task, whose present fields are varied; None is the task's own, with ideal actuators.
+            joint: what that one has on its actuated joints.
+            mounting: whether what actuators add to their joints is varied too.
 
         Raises:
             ValueError: an unknown name; the nearest known one is suggested.
         """
-        model = _nominal_model(task) if model is None else model
+        model = _nominal_model(task, joint) if model is None else model
         known = variable(task)
         self.names = tuple(names)
         self._nominal: dict[str, np.ndarray] = {}
@@ -73,18 +90,23 @@ class Variation:
                 raise ValueError(f"unknown {name!r}: {did_you_mean(name, known)}{task} has {', '.join(known)}")
             for field in _FIELDS[name.split(".")[1]]:
                 self._nominal[field] = field_of(model, field).copy()
+        self._nominal |= {field: field_of(model, field).copy() for field in ADDED if mounting}
         self._bodies = {model.body(body).name: body for body in range(model.nbody)}
         self._dofs = {model.joint(joint).name: int(model.jnt_dofadr[joint]) for joint in range(model.njnt)}
         self._parents = model.body_parentid.copy()
         self._geom_bodies = model.geom_bodyid.copy()
         self._geoms_along = _along(model)
         self._hills = hills(model)
+        self._driven = [model.jnt_dofadr[model.actuator(name).trnid[0]] for name in TASKS[task].motors]
 
-    def fields(self, values: np.ndarray, drawn: bool = False) -> dict[str, np.ndarray]:
+    def fields(
+        self, values: np.ndarray, additions: np.ndarray | None = None, drawn: bool = False
+    ) -> dict[str, np.ndarray]:
         """The varied fields of the model.
 
         Args:
             values: shape (m, k), one column for each of `names`.
+            additions: of the actuators to their joints, as `additions_of` has them; None where there are none.
             drawn: include those that only what is drawn depends on.
 
         Returns:
@@ -109,6 +131,10 @@ class Variation:
                 fields["opt.gravity"] *= column[:, np.newaxis]
                 for joint in self._hills:
                     fields["jnt_user"][:, joint, GRAVITY] *= column
+        for entry, field in enumerate(ADDED):
+            if field in fields and additions is not None:
+                for motor, dof in enumerate(self._driven):
+                    fields[field][:, dof] += additions[:, motor, entry]
         return fields
 
     def _stretch(self, fields: dict[str, np.ndarray], body: int, factor: np.ndarray) -> None:
@@ -162,4 +188,4 @@ def write_fields(model: mujoco.MjModel, fields: Mapping[str, np.ndarray], row: i
         row: the row.
     """
     for name, values in fields.items():
-        field_of(model, name)[:] = values[row]
+        setattr(model.opt if name.startswith("opt.") else model, name.removeprefix("opt."), values[row])

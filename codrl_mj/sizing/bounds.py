@@ -114,7 +114,7 @@ def _limits(
     needed, limit = float(asked.voltage.max()), drive.voltage_limit
     ratio, least = _at_most_power(drive, demand)
     remedy = f"raise the supply to {needed:.4g} V" + (
-        f", or take a gear nearer to {ratio:.3g}" if least < limit else ""
+        f", or take a gear nearer to {ratio:.3g}" if least < limit and math.isfinite(ratio) else ""
     )
     bounds = [_bound("voltage", "|R i + L di/dt + N kE omega|, largest", needed, limit, "V", (SURELY, unmet), remedy)]
     largest, most = float(np.abs(asked.current).max()), drive.controller.max_current
@@ -134,6 +134,7 @@ def _necessary(drive: Drive, demand: Demand, unmet: str) -> list[Bound]:
     largest = float(np.abs(demand.torque[power >= 0.0]).max(initial=0.0))
     current = min(limit / motor.resistance, most)
     still = motor.torque_constant * motor.gear_efficiency * current / drive.arm_radius - drive.additions.friction
+    still -= motor.stribeck_friction / drive.arm_radius
     needed = float(power.max(initial=0.0)) / motor.gear_efficiency
     _, least = _at_most_power(drive, demand)
     return [

@@ -41,14 +41,16 @@ def operation(demand: Demand, drive: Drive) -> Operation:
         tau_rotor = (tau + N^2 (J alpha + b omega) + N tau_c sign(omega)) / (N eta),   i = tau_rotor / kT,
         V >= |R i + N kE omega| + R_supply |i|, and with L di/dt while i comes from its value in the step before.
 
-    A change of the torque is to be made within a step of the demand; so is that from one episode to the next. Where
-    the motor brakes, eta is 1: the gear helps then, but not at standstill. Energies are of the mean speed in a step,
-    all else of that at its start.
+    with Stribeck friction in tau_c. A change of the torque is to be made within a step of the demand; so is that from
+    one episode to the next. Where the motor brakes or holds, eta is 1: the gear helps then. Energies
+    are of the mean speed in a step, all else of that at its start.
     """
     motor, added, arm = drive.motor, drive.additions, drive.arm_radius
-    own = added.armature * demand.acceleration + added.damping * demand.speed + added.friction * np.sign(demand.speed)
+    sticking = motor.stribeck(demand.speed / arm) / arm
+    own = added.armature * demand.acceleration + added.damping * demand.speed
+    own = own + (added.friction + sticking) * np.sign(demand.speed)
     joint = demand.torque + own
-    torque = arm * joint / np.where(joint * demand.speed >= 0.0, motor.gear_efficiency, 1.0)
+    torque = arm * joint / np.where(joint * demand.speed > 0.0, motor.gear_efficiency, 1.0)
     speed, current = demand.speed / arm, torque / motor.torque_constant
     terminal = motor.resistance * current + motor.back_emf_constant * speed
     changing = terminal + motor.inductance * np.diff(current, prepend=current[:1]) / demand.duration

@@ -108,7 +108,7 @@ _LOOP = dataclasses.replace(EVERY_FEATURE.actuator.controller, max_voltage=1.5, 
 EXAMPLES: tuple[ActuatorModel, ...] = (
     Actuator(EVERY_FEATURE.actuator.motor, _LOOP, Supply(voltage=1.6, resistance=0.5)),
     Lag(time_constant=0.03, delay=0.013),
-    TorqueSpeed(stall_torque=1.0, no_load_speed=2.0, max_torque=0.8),
+    TorqueSpeed(stall_torque=0.2, no_load_speed=1.0, max_torque=0.2),
     Drive(GearMotor(gear_ratio=3.0), SampledLoop(sample_rate=10e3, max_current=4.0), Supply(6.0)),
 )
 """Actuators in which every parameter counts and limits are reached, of those families whose defaults do not show it."""

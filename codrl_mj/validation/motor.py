@@ -2,12 +2,13 @@
 
 `motor_analogue` has the closed form, `motor_sampled` scipy and python-control, `motor_native` MuJoCo's own `<dcmotor>`,
 `motor_gem` gym-electric-motor, `motor_constants` a datasheet's numbers. Torques are read where the engine applies them.
-`in_python` has what can be asked of any family of actuators.
+`in_python` has what can be asked of any family of actuators, `drives` what bench motors are compared with.
 """
 
 from collections.abc import Iterator
 
 from codrl_mj.actuators import Motor
+from codrl_mj.validation.drives import drive_checks
 from codrl_mj.validation.in_python import compiled_checks
 from codrl_mj.validation.motor_analogue import analogue_checks
 from codrl_mj.validation.motor_constants import constants_checks, voltage_limit_check
@@ -31,6 +32,7 @@ def checks(task_name: str | None = None, quick: bool = False) -> Iterator[Check]
     loops = standard_loops()
     yield from checks_of(loops if task_name is None else {task_name: loops[task_name]}, quick)
     yield from compiled_checks(quick)
+    yield from drive_checks(quick)
     yield from native_checks(MOTORS, quick)
     if available():
         yield gem_check(Motor(), quick)

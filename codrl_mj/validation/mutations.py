@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 
 from codrl_mj import engine
-from codrl_mj.actuators import ActuatorModel, current_loop
+from codrl_mj.actuators import ActuatorModel, current_loop, drive
 from codrl_mj.engine import control
 from codrl_mj.engine.families import SLOT, replaced
 from codrl_mj.engine.hill import GRAVITY
@@ -147,22 +147,22 @@ def wrong_callback(*edits: Edit) -> Iterator[None]:
 
 
 @functools.cache
-def _wrong_families(edits: tuple[Edit, ...]) -> tuple[type[ActuatorModel], ...]:
-    """The families of the current loop's module, made from its edited source."""
-    wrong = vars(edited(current_loop, edits)).values()
+def _wrong_families(module: types.ModuleType, edits: tuple[Edit, ...]) -> tuple[type[ActuatorModel], ...]:
+    """The families of a module, made from its edited source."""
+    wrong = vars(edited(module, edits)).values()
     return tuple(
         kind
         for kind in wrong
-        if isinstance(kind, type) and kind.__module__ == current_loop.__name__ and issubclass(kind, ActuatorModel)
+        if isinstance(kind, type) and kind.__module__ == module.__name__ and issubclass(kind, ActuatorModel)
     )
 
 
 @contextlib.contextmanager
-def wrong_loop(*edits: Edit) -> Iterator[None]:
+def wrong_loop(*edits: Edit, module: types.ModuleType = current_loop) -> Iterator[None]:
     """The callback runs a loop that was compiled from edited source; in Python it stays what it is."""
     with contextlib.ExitStack() as stack:
-        for family in _wrong_families(edits):
-            stack.enter_context(replaced(getattr(current_loop, family.__name__), family))
+        for family in _wrong_families(module, edits):
+            stack.enter_context(replaced(getattr(module, family.__name__), family))
         yield
 
 
@@ -170,7 +170,7 @@ def wrong_loop(*edits: Edit) -> Iterator[None]:
 def wrong_loop_everywhere(*edits: Edit) -> Iterator[None]:
     """The callback and the plain-Python loop share the fault: comparing the two cannot show it."""
     with wrong_loop(*edits), contextlib.ExitStack() as stack:
-        for family in _wrong_families(edits):
+        for family in _wrong_families(current_loop, edits):
             right = getattr(current_loop, family.__name__)
             stack.enter_context(_method(right, "advance", vars(family)["advance"]))
         yield
@@ -180,6 +180,7 @@ _BACK_EMF: Edit = ("voltage - back_emf -", "voltage + back_emf -")
 _GAINS: Edit = ("parameters.kp * error + parameters.ki * integral", "parameters.ki * error + parameters.kp * integral")
 _RESISTANCE: Edit = ("- parameters.resistance * current", "- 1.01 * parameters.resistance * current")
 _VOLTAGE_LIMIT: Edit = ("voltage = min(max(voltage, -", "voltage = 0.99 * min(max(voltage / 0.99, -")
+_MORE_CURRENT: Edit = ("asked = inputs.desired_torque /", "asked = 1.01 * inputs.desired_torque /")
 _COMMIT = "                commit_slot(number, slot, time)\n"
 _LATE_FORCE: tuple[Edit, ...] = (
     (
@@ -191,7 +192,7 @@ _LATE_FORCE: tuple[Edit, ...] = (
 )
 _EVERY_PASS: Edit = ("if time != f64(slot)[0]:", "if True:")
 _EVERY_STAGE: Edit = ("if i64(data + pbase_at)[0] != 0:", "if False:")
-_ADVANCED = "                time,\n            )\n"
+_ADVANCED = "if asks_inertia(number) else math.inf,\n            )\n"
 _CANDIDATE = SLOT + len(current_loop.State._fields)
 _SHARED_CURRENT: tuple[Edit, ...] = (
     (_COMMIT, f"{_COMMIT}                f64(slot)[{SLOT}] = f64(HIDDEN)[0]\n"),
@@ -285,6 +286,7 @@ MUTATIONS: tuple[Mutation, ...] = (
     Mutation("the sign of the back-EMF, everywhere", lambda: wrong_loop_everywhere(_BACK_EMF), ("motor", "energy")),
     _in_loop("kp and ki swapped", _GAINS, _LOOP, _UNEQUAL_GAINS),
     Mutation("kp and ki swapped, everywhere", lambda: wrong_loop_everywhere(_GAINS), ("motor", "convergence")),
+    Mutation("a drive that asks for 1 % more current", lambda: wrong_loop(_MORE_CURRENT, module=drive), _LOOP),
     Mutation("a force one step late", lambda: wrong_callback(*_LATE_FORCE), (*_LOOP, "convergence", "energy")),
     Mutation("a stale command", _stale_command, (*_PHYSICS, "convergence")),
     Mutation("bounds that are not kept", _no_bounds, _PHYSICS, _BOUNDED),

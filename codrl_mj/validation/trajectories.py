@@ -16,6 +16,7 @@ from codrl_mj.actuators import Actuator, ActuatorModel, Ideal
 from codrl_mj.physics import SimulationDivergedError
 from codrl_mj.tasks import Task, find_task, named_actuator
 from codrl_mj.validation.compare import NO_TWIN, SEVERAL_MOTORS, Worst, both, differences, last_signals
+from codrl_mj.validation.drives import FITTED, runs
 from codrl_mj.validation.growth import ROUNDING, Growth, lyapunov_exponent
 from codrl_mj.validation.outcome import Check, Curve, Plot, Skipped
 
@@ -157,3 +158,7 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
             shorter = 100 if task.motor_inner_steps > 1 else 200
             seeds, longest = (range(1), shorter) if quick else (range(2), 999)
             yield from episodes(task, actuator, integrator, seeds, longest)
+    if task.name in FITTED:
+        yield from runs(task, TOLERANCE, quick)
+    else:
+        yield Skipped("a run with a motor that one can buy", "none was chosen for it", "trajectories", task.name)

@@ -12,7 +12,7 @@ import codrl_mj
 from codrl_mj.actuators import Drive, GearMotor, Inputs, SampledLoop, Supply, parameters_type
 from codrl_mj.actuators.shaft import Shaft, friction
 
-HOT = GearMotor(thermal_resistance=20.0, thermal_time_constant=3.0, ambient_temperature=20.0)
+HOT = GearMotor(thermal_resistance_winding=20.0, thermal_time_constant_winding=3.0, ambient_temperature=20.0)
 
 
 def advanced(one, timestep, torques, speed=0.0, inertia=math.inf):
@@ -53,6 +53,17 @@ def test_a_winding_warms_and_its_resistance_with_it():
     np.testing.assert_allclose([one.temperature for one in found], 20.0 + exact, atol=0.15)
     volts = hot * (1.0 + 0.00393 * (exact - 5.0)) * amperes
     np.testing.assert_allclose([one.voltage for one in found[100:]], volts[100:], rtol=2e-3)
+
+
+def test_winding_and_housing_warm_one_after_the_other():
+    """Of a resistance that does not grow: the sum of two first-order responses."""
+    motor = dataclasses.replace(
+        HOT, thermal_resistance_housing=30.0, thermal_time_constant_housing=40.0, resistance_coefficient=0.0
+    )
+    found, _ = advanced(Drive(motor, supply=Supply(48.0)), 0.02, [0.042 * 0.5] * 3000)
+    times, watts = 0.02 * np.arange(1, 3001), 0.25 * 8.4
+    expected = 20.0 + watts * (20.0 * -np.expm1(-times / 3.0) + 30.0 * -np.expm1(-times / 40.0))
+    np.testing.assert_allclose([one.temperature for one in found], expected, atol=0.02)
 
 
 def test_current_and_temperature_are_those_of_mujoco_s_own_motor():
@@ -104,7 +115,22 @@ def test_a_drive_keeps_the_winding_s_limit_and_then_gives_the_continuous_current
 
 def test_what_is_colder_than_its_surroundings_may_not_be_the_limit():
     with pytest.raises(ValueError, match=r"max_temperature = 20: must be above ambient_temperature = 25 degC"):
-        GearMotor(max_temperature=20.0)
+        GearMotor(max_temperature=20.0, thermal_resistance_winding=1.0)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"max_temperature": 80.0}, r"max_temperature = 80: needs thermal_resistance_winding or"),
+        (
+            {"ambient_temperature": -260.0},
+            r"= -260: .* no resistance; must be above -229\.453 degC",
+        ),
+    ],
+)
+def test_a_limit_without_heat_and_a_winding_without_resistance_are_refused(fields, message):
+    with pytest.raises(ValueError, match=message):
+        GearMotor(**fields)
 
 
 def test_a_bridge_loses_its_dead_band():
@@ -187,3 +213,59 @@ def test_friction_only_takes_energy():
         speeds.append(data.qvel.item())
     assert (np.diff(speeds) <= 1e-12).all()
     assert abs(speeds[-1]) < 1e-6
+
+
+MASS, LENGTH, ABOUT = 0.5, 0.15, 0.035  # a pendulum: [kg], [m] to its centre, [kg*m^2] about its hinge
+
+
+def servo_model(timestep, duration, start, friction_of, motor):
+    """A pendulum's angles [rad] as Duclusaud et al. (2024) simulate servos: what stops it, within what friction can."""
+    angle, speed, found = start, 0.0, []
+    for step in range(round(duration / timestep)):
+        pull = motor(step * timestep) - MASS * 9.81 * LENGTH * math.sin(angle)
+        stops = ABOUT * speed / timestep + pull
+        speed += timestep / ABOUT * (pull - math.copysign(min(abs(stops), friction_of(abs(speed))), stops))
+        angle += timestep * speed
+        found.append(angle)
+    return np.array(found)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 50.0])
+@pytest.mark.parametrize(
+    ("start", "motor", "far"),
+    [(-1.5, lambda _: 0.0, 0.1), (0.0, lambda time: 0.6 * math.sin(4.4 * time), 0.5)],
+    ids=["released", "driven"],
+)
+def test_coulomb_viscous_and_stribeck_friction_are_those_of_a_servo_model(ratio, start, motor, far):
+    """Numbers near those that were fitted to a Dynamixel MX-64; MuJoCo has the first two."""
+    coulomb, stribeck, at, exponent, viscous = 0.06, 0.05, 1.5, 1.3, 0.015
+    expected = servo_model(
+        0.001, 3.0, start, lambda w: coulomb + stribeck * math.exp(-((w / at) ** exponent)) + viscous * w, motor
+    )
+    one = GearMotor(
+        rotor_inertia=0.0,
+        gear_ratio=ratio,
+        coulomb_friction=coulomb / ratio,
+        viscous_friction=viscous / ratio**2,
+        stribeck_friction=stribeck / ratio,
+        stribeck_speed=at * ratio,
+        stribeck_exponent=exponent,
+    )
+    found = {}
+    for name, changed in (("with", one), ("without", dataclasses.replace(one, stribeck_friction=0.0))):
+        spec = mujoco.MjSpec()
+        spec.option.timestep, body = 0.001, spec.worldbody.add_body()
+        body.explicitinertial, body.mass, body.ipos = True, MASS, [0.0, 0.0, -LENGTH]
+        body.inertia = [ABOUT - MASS * LENGTH**2] * 3
+        body.add_joint(name="shaft", axis=[0.0, -1.0, 0.0])
+        spec.add_actuator(target="shaft", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
+        model = codrl_mj.motorise(spec, {"shaft": Drive(changed, supply=Supply(1e4))}).compile()
+        data, rows = mujoco.MjData(model), []
+        data.qpos[:] = start
+        for _ in expected:
+            data.ctrl[:] = motor(data.time)
+            mujoco.mj_step(model, data)
+            rows.append(data.qpos[0])
+        found[name] = np.abs(np.array(rows) - expected).max()
+    assert found["with"] < 0.015 * np.ptp(expected)
+    assert found["without"] > far

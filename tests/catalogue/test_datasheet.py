@@ -214,7 +214,7 @@ def test_thermal_numbers_are_read_with_their_offsets_and_of_either_print():
     )
     assert kelvin.max_temperature == pytest.approx(125.0)
     assert from_datasheet(**CIM, max_winding_temperature="257 degF").max_temperature == pytest.approx(125.0)
-    assert (kelvin.thermal_resistance, kelvin.thermal_time_constant) == pytest.approx((5.0, 30.0))
+    assert (kelvin.thermal_resistance, kelvin.thermal_time_constant_winding) == pytest.approx((5.0, 30.0))
     assert kelvin.thermal_resistance_winding is from_datasheet(**CIM).thermal_resistance is None
     parts = {"thermal_resistance_winding": "3 K/W", "thermal_resistance_housing": "2 K/W"}
     with pytest.raises(ValueError, match=r"thermal_resistance = 9 K/W, but .* = 3 K/W \+ 2 K/W = 5 K/W"):

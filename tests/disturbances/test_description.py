@@ -101,12 +101,6 @@ def test_what_cannot_be_simulated_is_refused_with_a_reason(case):
         gymnasium.make("codrl_mj/Pendulum-v0", **arguments)
 
 
-def test_damping_given_twice_is_refused():
-    randomize = {"model.damping.hinge": codrl_mj.Uniform(0.0, 0.1)}
-    with pytest.raises(ValueError, match=r"joint\.damping = 0\.1: give either"):
-        gymnasium.make("codrl_mj/Pendulum-v0", randomize=randomize, joint={"damping": 0.1})
-
-
 def test_a_configuration_survives_json():
     config = EnvConfig("pendulum", disturbances=Disturbances(**MOST), joint=Joint(**RUBBED))
     assert EnvConfig.from_mapping(json.loads(json.dumps(config.as_mapping()))) == config

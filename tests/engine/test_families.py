@@ -125,7 +125,11 @@ ALL = [
     Drive(GearMotor(torque_constant=0.5), SampledLoop(10e3, anti_windup="clamping", delayed=True), Supply(2.0, 0.5)),
     Drive(
         GearMotor(
-            torque_constant=0.5, gear_ratio=2.0, gear_efficiency=0.8, stribeck_friction=0.01, thermal_resistance=50.0
+            torque_constant=0.5,
+            gear_ratio=2.0,
+            gear_efficiency=0.8,
+            stribeck_friction=0.01,
+            thermal_resistance_winding=50.0,
         ),
         SampledLoop(10e3, deadband=0.1, max_current=0.3),
         Supply(2.0),

@@ -129,7 +129,9 @@ def test_a_motor_of_the_catalogue_saturates_where_its_datasheet_says():
     asked for, for longer than the winding takes, that is delivered; but where a contact changes the speed meanwhile.
     """
     entry = motor_entry("maxon-ec45-flat-50w").numbers
-    cold = Drive.of(entry).replaced({"motor.thermal_resistance": 0.0})
+    warming = ("thermal_resistance_winding", "thermal_resistance_housing")
+    fields = dict.fromkeys((f"motor.{name}" for name in warming), 0.0) | {"motor.max_temperature": math.inf}
+    cold = Drive.of(entry).replaced(fields)
     env = codrl_mj.make("HalfCheetah-v5", {".*": cold}, frame_skip=1, reset_noise_scale=0.5)
     env.reset(seed=0)
     kt, ke, resistance, slack = entry.torque_constant, entry.back_emf_constant, entry.resistance, 0.05

@@ -87,7 +87,7 @@ ACTUATORS = {
         Supply(3.0),
     ),
     "servo": Servo(
-        GearMotor(rotor_inertia=0.0, gear_ratio=5.0, thermal_resistance=30.0, max_temperature=30.0),
+        GearMotor(rotor_inertia=0.0, gear_ratio=5.0, thermal_resistance_housing=30.0, max_temperature=30.0),
         SampledLoop(10e3),
         Supply(3.0),
         ServoLoop(position_gain=2.0, velocity_gain=0.5, velocity_integral_gain=0.1),

@@ -12,7 +12,7 @@ import pytest
 from scipy import integrate, signal
 
 from codrl_mj.actuators import FAMILIES, Actuator, CurrentLoop, Motor
-from codrl_mj.validation import in_python, motor, motor_gem, motor_native, rotors
+from codrl_mj.validation import drives, in_python, motor, motor_gem, motor_native, rotors
 from codrl_mj.validation.motor_analogue import closed_form
 from codrl_mj.validation.motor_loops import EVERY_FEATURE, Loop, standard_loops
 from codrl_mj.validation.motor_sampled import closed_loop, sampled_system
@@ -36,14 +36,15 @@ COMPILED = {
     f"compiled advance: {kind}"
     for kind in ("Actuator", "VoltageDriven", "Drive", "VoltageDrive", "Servo", "Lag", "TorqueSpeed")
 }
-EVERY = LOOP | {VOLTAGE, LINE, NO_LOAD, RK4, GEM} | NATIVE | COMPILED
+DRIVES = {"drives, exact winding", "drives, closed form"}
+EVERY = LOOP | {VOLTAGE, LINE, NO_LOAD, RK4, GEM} | NATIVE | COMPILED | DRIVES
 
 
 def outcomes():
     """All checks with a few loops and motors only, by name."""
     checks = [*motor.checks_of({"every feature": EVERY_FEATURE}, quick=True)]
     checks += [*in_python.compiled_checks(quick=True), *motor_native.native_checks(SMALL, quick=True)]
-    checks.append(motor_gem.gem_check(Motor(), quick=True))
+    checks += [motor_gem.gem_check(Motor(), quick=True), *drives.drive_checks(quick=True)]
     return {check.name: check for check in checks}
 
 
@@ -111,7 +112,7 @@ def test_every_check_passes_and_can_be_looked_at(installed):
             assert "[" in plot.x_label
             assert "[" in plot.y_label
             assert all(len(curve.x) == len(curve.y) > 2 for curve in plot.curves)
-    assert {check.name for check in checks if not check.plots} == {LIMIT, VOLTAGE, NO_LOAD} | COMPILED
+    assert {check.name for check in checks if not check.plots} == {LIMIT, VOLTAGE, NO_LOAD} | COMPILED | DRIVES
 
 
 @pytest.mark.parametrize("mutation", MUTATIONS)
@@ -225,4 +226,4 @@ def test_the_native_motor_is_wrong_under_rk4_and_ours_is_not():
 def test_without_gym_electric_motor_its_check_is_left_out(monkeypatch):
     monkeypatch.setattr(motor, "checks_of", lambda *_: iter(()))
     monkeypatch.setattr(motor, "available", lambda: False)
-    assert {check.name for check in motor.checks(quick=True)} == NATIVE | {RK4} | COMPILED
+    assert {check.name for check in motor.checks(quick=True)} == NATIVE | {RK4} | COMPILED | DRIVES
