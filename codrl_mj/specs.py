@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NoReturn
 
 import mujoco
 import numpy as np
@@ -52,7 +52,7 @@ def motorise(spec: mujoco.MjSpec, actuators: Mapping[str, Any], allow_unstable: 
     new, model = spec.copy(), spec.copy().compile()
     # MuJoCo 3.17 copies default classes without their numbers, and forgets those that are added then; this numbers them
     new.delete(new.add_default(NAME, new.default))
-    chosen = _chosen(new, actuators)
+    chosen = _chosen(new, model, actuators)
     for index, (pattern, actuator) in sorted(chosen.items()):
         reason = _refusal(model, new.actuators[index], index, actuator)
         if reason:
@@ -74,27 +74,69 @@ def _call(target: mujoco.MjsActuator, index: int) -> str:
     return f"actuator {target.name or index}" + (f" of {target.target}" if target.target else "")
 
 
-def _chosen(spec: mujoco.MjSpec, actuators: Mapping[str, Any]) -> dict[int, tuple[str, ActuatorModel]]:
-    """Index -> (pattern, actuator)."""
-    found: dict[int, tuple[str, ActuatorModel]] = {}
-    names = [[name for name in (target.name, target.target) if name] for target in spec.actuators]
+def resolve_patterns(actuators: Mapping[str, Any], whose: str) -> dict[str, ActuatorModel]:
+    """Pattern -> actuator, of whatever a user may write for either.
+
+    Args:
+        actuators: as for `motorise`.
+        whose: whose they are, for messages.
+
+    Raises:
+        ValueError: it is no mapping, a pattern is no regular expression, or an actuator is none.
+    """
     if not isinstance(actuators, Mapping):
         raise ValueError(f"actuators = {actuators!r}: must be a mapping of patterns, such as {{'.*': 'lag'}}")
-    for pattern, given in actuators.items():
+    for pattern in actuators:
         try:
             re.compile(pattern)
         except (re.error, TypeError) as error:
             raise ValueError(
                 f"{pattern!r}: must be a regular expression ({error}); '.*' is any name, 'leg.*' a leg's"
             ) from None
-        actuator = resolve(given, None, f"the model {spec.modelname!r}")
-        matched = [index for index, own in enumerate(names) if any(re.fullmatch(pattern, name) for name in own)]
+    return {pattern: resolve(given, None, whose) for pattern, given in actuators.items()}
+
+
+def names_of(model: mujoco.MjModel) -> list[list[str]]:
+    """What patterns can match of each actuator of a compiled model: its name, and that of what it drives."""
+    kinds = {mujoco.mjtTrn.mjTRN_TENDON: model.tendon, mujoco.mjtTrn.mjTRN_BODY: model.body}
+    kinds |= dict.fromkeys(_JOINT, model.joint)
+    kinds |= dict.fromkeys((mujoco.mjtTrn.mjTRN_SITE, mujoco.mjtTrn.mjTRN_SLIDERCRANK), model.site)
+    names = []
+    for index in range(model.nactuator):
+        driven = kinds.get(mujoco.mjtTrn(model.actuator_trntype[index]))
+        target = "" if driven is None else driven(model.actuator_trnid[index, 0]).name
+        names.append([name for name in (model.actuator(index).name, target) if name])
+    return names
+
+
+def matched_by(pattern: str, names: list[list[str]]) -> list[int]:
+    """Indices of the actuators that a pattern matches, by their `names_of`."""
+    return [index for index, own in enumerate(names) if any(re.fullmatch(pattern, name) for name in own)]
+
+
+def refuse_unmatched(pattern: str, names: list[list[str]]) -> NoReturn:
+    """Say that a pattern matches none of the actuators with these `names_of`.
+
+    Raises:
+        ValueError: always.
+    """
+    known = list(dict.fromkeys(name for own in names for name in own))
+    raise ValueError(
+        f"{pattern!r}: no actuator has such a name, nor drives anything that has; "
+        f"{did_you_mean(pattern, known)}there are {', '.join(known) or 'none'}"
+    )
+
+
+def _chosen(
+    spec: mujoco.MjSpec, model: mujoco.MjModel, actuators: Mapping[str, Any]
+) -> dict[int, tuple[str, ActuatorModel]]:
+    """Index -> (pattern, actuator)."""
+    found: dict[int, tuple[str, ActuatorModel]] = {}
+    names = names_of(model)
+    for pattern, actuator in resolve_patterns(actuators, f"the model {spec.modelname!r}").items():
+        matched = matched_by(pattern, names)
         if not matched:
-            known = list(dict.fromkeys(name for own in names for name in own))
-            raise ValueError(
-                f"{pattern!r}: no actuator has such a name, nor drives anything that has; "
-                f"{did_you_mean(pattern, known)}there are {', '.join(known) or 'none'}"
-            )
+            refuse_unmatched(pattern, names)
         joints: dict[str, int] = {}
         for index in matched:
             target = spec.actuators[index]

@@ -28,6 +28,9 @@ ALLOWED = {
     "envs": {
         *("actuators", "disturbances", "engine", "envs.config", "envs.distributions", "fields", "physics", "tasks"),
     },
+    "foreign": {
+        *("actuators", "disturbances", "engine", "envs", "envs.distributions", "fields", "physics", "specs"),
+    },
     "suite": {"actuators", "envs", "envs.config", "physics", "tasks"},
     "agents": {"actuators", "envs", "envs.config", "fields", "physics"},
     "runs.files": set(),
@@ -84,6 +87,7 @@ FOREIGN = {
     "engine": {"mujoco", "numba", "llvmlite", "numpy"},
     "specs": {"mujoco", "numpy"},
     "physics": {"mujoco", "numba", "numpy", "gymnasium"},
+    "foreign": {"dm_control", "dm_env", "gymnasium", "mujoco", "numpy"},
     "envs.distributions": {"numpy"},
     "envs.config": {"gymnasium", "numpy"},
     "envs": {"gymnasium", "numpy", "numba", "mujoco", "stable_baselines3", "pygame"},

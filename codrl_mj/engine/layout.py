@@ -135,7 +135,7 @@ def check_layout(model_fields: tuple[str, ...], data_fields: tuple[str, ...]) ->
     Raises:
         LayoutError: a field is elsewhere.
     """
-    model = mujoco.MjModel.from_xml_string(_PROBE)
+    model = mujoco.MjSpec.from_string(_PROBE).compile()  # within `motorised`, which this is no model for
     data = mujoco.MjData(model)
     data.time = 4.56
     mujoco.mj_fwdPosition(model, data)  # uses the stack: `maxuse_stack` is no longer zero

@@ -158,22 +158,33 @@ def clear_motors(data: mujoco.MjData, noise_keys: Sequence[int] | None = None) -
                 f"noise_keys[{index}] = {key!r}: must be a whole number from 0 to 2**53 - 1, which a float64 holds"
             )
     for slot, key in zip(found, keys, strict=True):
-        slot[:] = 0.0
-        slot[:2] = data.time, key
+        bring_to_rest(slot, data.time, key)
 
 
-def check_shafts(model: mujoco.MjModel, allow_unstable: bool = False, held: bool = False) -> None:
+def bring_to_rest(slot: np.ndarray, time: float, noise_key: float) -> None:
+    """Clear a motor's state, as `slots` has it, at a time [s]."""
+    slot[:] = 0.0
+    slot[:2] = time, noise_key
+
+
+def check_shafts(
+    model: mujoco.MjModel,
+    allow_unstable: bool = False,
+    held: bool = False,
+    actuators: Mapping[int, ActuatorModel] | None = None,
+) -> None:
     """Refuse motors that what they move makes unstable (`ActuatorModel.check_shaft`), in the model's initial position.
 
     Args:
         model: any MuJoCo model.
         allow_unstable: whether to let them be.
         held: whether they will not be told what they move, as on the analytic physics.
+        actuators: what `motors` would read, where that is known.
 
     Raises:
         ValueError: see `motors`; or a motor is refused: the message has its name, the number and a remedy.
     """
-    asking = {index: one for index, one in motors(model).items() if one.INERTIA}
+    asking = {index: one for index, one in (actuators or motors(model)).items() if one.INERTIA}
     if not asking:
         return
     data = mujoco.MjData(model)

@@ -1,0 +1,147 @@
+"""Motors for every model that others' code builds from XML: `motorised`."""
+
+import contextlib
+import contextvars
+import threading
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import mujoco
+
+from codrl_mj.actuators import ActuatorModel
+from codrl_mj.specs import matched_by, motorise, names_of, refuse_unmatched, resolve_patterns
+
+
+class Building:
+    """The actuators for models yet to be built, and what was met of these."""
+
+    def __init__(self, actuators: Mapping[str, Any], allow_unstable: bool = False) -> None:
+        """Check what needs no model.
+
+        Args:
+            actuators: as for `codrl_mj.motorise`, but that a pattern may match nothing in some of the models.
+            allow_unstable: likewise.
+
+        Raises:
+            ValueError: a pattern is no regular expression, or an actuator is none.
+        """
+        self.actuators: dict[str, ActuatorModel] = resolve_patterns(actuators, "another's environment")
+        self._allow_unstable = allow_unstable
+        self._met: list[list[list[str]]] = []
+
+    @contextlib.contextmanager
+    def motorising(self) -> Iterator[None]:
+        """Give motors to every model that this thread builds from XML in a `with` block."""
+        token = _PRESENT.set(self)
+        try:
+            with _HOOK:
+                yield
+        finally:
+            _PRESENT.reset(token)
+
+    def motorised(self, plain: mujoco.MjModel, spec: Callable[[], mujoco.MjSpec]) -> mujoco.MjModel:
+        """A model with the motors that are for it; it itself if none are.
+
+        Args:
+            plain: the model.
+            spec: reads its spec.
+
+        Raises:
+            ValueError: see `codrl_mj.motorise`.
+        """
+        names = names_of(plain)
+        self._met.append(names)
+        wanted = {pattern: actuator for pattern, actuator in self.actuators.items() if matched_by(pattern, names)}
+        if not wanted:
+            return plain
+        with warnings.catch_warnings():  # MuJoCo's of the model, which building it without motors has shown
+            warnings.filterwarnings("ignore", category=UserWarning, module=r"codrl_mj\.(specs|foreign\.building)")
+            return motorise(spec(), wanted, self._allow_unstable).compile()
+
+    def check(self) -> None:
+        """Refuse patterns that were of no use.
+
+        Raises:
+            ValueError: no model was built, or a pattern matched nothing in any of them.
+        """
+        if not self._met:
+            raise ValueError(
+                f"actuators = {list(self.actuators)}: no model was built inside by MjModel.from_xml_path or "
+                "from_xml_string in this thread; build the environment inside, or put motors into its MjSpec with "
+                "codrl_mj.motorise"
+            )
+        for pattern in self.actuators:
+            if not any(matched_by(pattern, names) for names in self._met):
+                refuse_unmatched(pattern, [own for names in self._met for own in names])
+
+
+@contextlib.contextmanager
+def motorised(actuators: Mapping[str, Any], allow_unstable: bool = False) -> Iterator[None]:
+    """Put motors into any environment that is built inside: Gymnasium's, dm_control's, anybody's.
+
+    Models that this thread builds by `mujoco.MjModel.from_xml_path` or `from_xml_string` in the block go through
+    `codrl_mj.motorise`. Of nested blocks the innermost counts. What builds its model again later, as composer
+    environments of dm_control do at every reset, has to do so inside too (`codrl_mj.make_dm_control` sees to that).
+
+        >>> with codrl_mj.motorised({".*": "maxon-ec45-flat-50w"}):
+        ...     env = gym.make("HalfCheetah-v5")
+
+    Args:
+        actuators: as for `codrl_mj.motorise`; a pattern has to match something in one of the models at least.
+        allow_unstable: likewise.
+
+    Raises:
+        ValueError: see `codrl_mj.motorise`; or, at the end, no model was built inside, or a pattern matched nothing.
+    """
+    building = Building(actuators, allow_unstable)
+    with building.motorising():
+        yield
+    building.check()
+
+
+_PRESENT: contextvars.ContextVar[Building | None] = contextvars.ContextVar("present", default=None)
+"""What the models of this thread are built with."""
+
+
+class _Hook:
+    """Stands in for MuJoCo's two ways to build a model from XML while any thread is in a block of `motorising`."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._users = 0
+        self._plain: dict[str, Any] = {}
+
+    def __enter__(self) -> None:
+        with self._lock:
+            self._users += 1
+            if self._users == 1:
+                for name, spec in (("from_xml_path", _spec_of_path), ("from_xml_string", _spec_of_string)):
+                    self._plain[name] = vars(mujoco.MjModel)[name]
+                    setattr(mujoco.MjModel, name, staticmethod(_loader(getattr(mujoco.MjModel, name), spec)))
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._users -= 1
+            if self._users == 0:
+                for name, plain in self._plain.items():
+                    setattr(mujoco.MjModel, name, plain)
+
+
+_HOOK = _Hook()
+
+
+def _loader(plain: Callable[..., mujoco.MjModel], spec: Callable[..., mujoco.MjSpec]) -> Callable[..., mujoco.MjModel]:
+    def load(*arguments: Any, **options: Any) -> mujoco.MjModel:
+        model, building = plain(*arguments, **options), _PRESENT.get()
+        return model if building is None else building.motorised(model, lambda: spec(*arguments, **options))
+
+    return load
+
+
+def _spec_of_path(filename: str, assets: Any = None, vfs: Any = None) -> mujoco.MjSpec:
+    return mujoco.MjSpec.from_file(filename, include=assets, assets=assets, vfs=vfs)
+
+
+def _spec_of_string(xml: str, assets: Any = None, vfs: Any = None) -> mujoco.MjSpec:
+    return mujoco.MjSpec.from_string(xml, include=assets, assets=assets, vfs=vfs)

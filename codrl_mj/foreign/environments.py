@@ -1,0 +1,411 @@
+"""Gymnasium's environments with motors: `make`."""
+
+import copy
+import dataclasses
+import functools
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.mujoco import MujocoEnv
+from gymnasium.envs.registration import load_env_creator
+from gymnasium.utils import RecordConstructorArgs, seeding
+from gymnasium.wrappers import TimeLimit
+
+from codrl_mj.actuators import ActuatorModel, Command
+from codrl_mj.actuators.noise import LARGEST_KEY
+from codrl_mj.disturbances import OFF, resolve_disturbances
+from codrl_mj.engine.reading import Readout, bring_to_rest, check_shafts, motors, slots
+from codrl_mj.envs.snapshots import check_snapshot
+from codrl_mj.foreign.building import Building
+from codrl_mj.foreign.commands import Commands, CommandsWay, command_of
+from codrl_mj.foreign.draws import Draws, Exchange
+from codrl_mj.foreign.readings import Sensors, readings
+from codrl_mj.foreign.state import set_state_of, state_of
+from codrl_mj.physics.streams import set_words, words_of
+from codrl_mj.specs import matched_by, names_of, resolve_patterns
+
+
+def make(
+    env_id: str,
+    actuators: Mapping[str, Any],
+    *,
+    action: str = "force",
+    observe_actuator: bool = False,
+    randomize: Mapping[str, Mapping[str, Any]] | None = None,
+    disturbances: Any = None,
+    allow_unstable: bool = False,
+    **options: Any,
+) -> "MotorisedEnv":
+    """An environment of Gymnasium's, or of anybody's who registers with it, with motors behind its actuators.
+
+        >>> env = codrl_mj.make("HalfCheetah-v5", actuators={".*": "maxon-ec45-flat-50w"})
+
+    With `"ideal"` actuators it is bit for bit the environment that `gymnasium.make` makes. Processes are given
+    functions that call this, such as `functools.partial(codrl_mj.make, "HalfCheetah-v5", {".*": "lag"})`.
+
+    Args:
+        env_id: the id.
+        actuators: what goes where, as for `codrl_mj.motorise`.
+        action: `force`: the environment's own actions, whose forces are what is desired (a position servo stays one);
+            or what the actuators take besides, such as `current` and `voltage`, with their limits as the action space.
+            The environment still computes its costs from its own controls: from the torque that a current makes, or as
+            many amperes as volts.
+        observe_actuator: whether the observation ends with what the motors' sensors say, motor by motor.
+        randomize: pattern -> field -> distribution (or its text): what is drawn for the motors of a pattern at every
+            reset. What was drawn is in the reset's info, `randomization`. The generator is not the environment's: its
+            initial states are the same as without.
+        disturbances: delay, quantum and rate of the commands, once an environment step: see `codrl_mj.Disturbances`.
+            Of a plain motor in its force [N or N*m] before the gear, of others in what their control stands for.
+        allow_unstable: as for `codrl_mj.motorise`.
+        **options: of `gymnasium.make` and the environment, such as `render_mode` and `max_episode_steps`.
+
+    Raises:
+        gymnasium.error.UnregisteredEnv: there is no such environment.
+        ValueError: see `codrl_mj.motorise`; a model is not built from XML; or an argument does not go with the
+            actuators or the environment.
+    """
+    entry = gymnasium.spec(env_id)
+    resolved = resolve_patterns(actuators, f"the environment {env_id}")
+    spec = copy.copy(entry)
+    spec.entry_point = Motorised(entry.entry_point, resolved, action, allow_unstable)
+    return MotorisedEnv(gymnasium.make(spec, **options), observe_actuator, randomize, disturbances)
+
+
+@dataclasses.dataclass(frozen=True)
+class Motorised:
+    """What makes an environment with motors, in place of the entry point that makes it without."""
+
+    entry_point: Any
+    """Makes it without."""
+    actuators: Mapping[str, ActuatorModel]
+    """Pattern -> actuator."""
+    action: str
+    """What actions stand for."""
+    allow_unstable: bool
+    """As for `codrl_mj.motorise`."""
+
+    @functools.cached_property
+    def commands(self) -> dict[str, Command | None]:
+        """Pattern -> what an action means to its motors; None where it is the environment's own.
+
+        Raises:
+            ValueError: an actuator takes no such command.
+        """
+        return {pattern: command_of(one, self.action, pattern) for pattern, one in self.actuators.items()}
+
+    @property
+    def simulated(self) -> dict[str, ActuatorModel]:
+        """Pattern -> what is simulated: the actuator, or what a command leaves of it."""
+        return {
+            pattern: self.actuators[pattern] if command is None else command.actuator
+            for pattern, command in self.commands.items()
+        }
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """The environment's, which `gymnasium.make` asks for."""
+        return self._creator.metadata  # an AttributeError where a plain function makes the environment
+
+    @property
+    def _creator(self) -> Any:
+        return load_env_creator(self.entry_point) if isinstance(self.entry_point, str) else self.entry_point
+
+    def __call__(self, **options: Any) -> gymnasium.Env:
+        """Make it.
+
+        Raises:
+            ValueError: see `codrl_mj.motorised`.
+        """
+        creator, building = self._creator, Building(self.simulated, self.allow_unstable)
+        ours = isinstance(creator, type) and issubclass(creator, MujocoEnv)
+        with building.motorising():
+            env = _with_motors(creator)(**options) if ours else creator(**options)
+        building.check()
+        if ours:
+            env.remade = functools.partial(self, **options)
+        return env
+
+
+@functools.cache
+def _with_motors(kind: Any) -> Any:
+    """A subclass of an environment's class that brings motors to rest where the state is set, and keeps them if copied.
+
+    Gymnasium's environments copy and pickle themselves by being made again.
+    """
+
+    class WithMotors(kind):
+        remade: Any = None
+
+        @functools.cached_property
+        def _motors(self) -> list[np.ndarray]:
+            return list(slots(self.data, motors(self.model)).values())
+
+        def set_state(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
+            for slot in self._motors:
+                bring_to_rest(slot, self.data.time, slot[1])
+            super().set_state(qpos, qvel)
+
+        def __reduce__(self) -> Any:
+            return self.remade, ()
+
+    for name in ("__name__", "__qualname__", "__module__", "__doc__"):
+        setattr(WithMotors, name, getattr(kind, name))
+    return WithMotors
+
+
+class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
+    """What `make` adds to an environment that was built with motors.
+
+    Every step's `info` has `desired_force` and `actual_force` [N or N*m], at the motors' side of the model's gears, the
+    signals of the actuators' families and `saturated`, at the end of the step; of several motors arrays (n_motors,) in
+    the model's order.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        observe_actuator: bool = False,
+        randomize: Mapping[str, Mapping[str, Any]] | None = None,
+        disturbances: Any = None,
+    ) -> None:
+        """Wrap an environment that `Motorised` made.
+
+        Args:
+            env: the environment.
+            observe_actuator: as for `make`, and so are the others.
+            randomize: see there.
+            disturbances: see there.
+
+        Raises:
+            ValueError: see `make`.
+        """
+        RecordConstructorArgs.__init__(
+            self, observe_actuator=observe_actuator, randomize=randomize, disturbances=disturbances
+        )
+        super().__init__(env)
+        base, name = env.unwrapped, env.spec.id if env.spec else ""
+        if not isinstance(getattr(base, "model", None), mujoco.MjModel) or not hasattr(base, "data"):
+            raise ValueError(
+                f"{name}: has no MuJoCo model and data as attributes: build it inside codrl_mj.motorised, and read the "
+                "motors with codrl_mj.signals"
+            )
+        assert base.spec is not None
+        self._motorised: Motorised = base.spec.entry_point  # type: ignore[assignment]
+        self._disturbances = resolve_disturbances(disturbances)
+        self._observes = observe_actuator
+        self._draws: Draws | None = None
+        if randomize is not None:
+            commands = self._motorised.commands
+            fixed = {pattern: command.fixed for pattern, command in commands.items() if command is not None}
+            self._draws = Draws(randomize, self._motorised.simulated, fixed)
+        self._values: np.ndarray | None = None
+        self._generator = np.random.default_rng()
+        self._begun = False
+        self._bind()
+
+    def _bind(self) -> None:
+        """Find the motors of the environment's model.
+
+        Raises:
+            ValueError: see `make`.
+        """
+        self._model, self._data = self.unwrapped.model, self.unwrapped.data  # type: ignore[attr-defined]
+        self._readout = Readout(self._model)
+        self._slots = list(slots(self._data, self._readout.motors).values())
+        names = names_of(self._model)
+        self._places = {pattern: matched_by(pattern, names) for pattern in self._motorised.actuators}
+        self._exchange = Exchange(self._data, self._readout.motors, self._places)
+        self._commands: Commands | None = None
+        self._way: CommandsWay | None = None
+        self._sensors: Sensors | None = None
+        commands = {
+            index: command
+            for pattern, command in self._motorised.commands.items()
+            for index in self._places[pattern]
+            if command is not None
+        }
+        if commands:
+            self._commands = Commands(self._model, self.env.action_space, commands)
+            self.action_space = self._commands.action_space
+        if self._disturbances != OFF:
+            if not hasattr(self.unwrapped, "dt"):
+                raise ValueError("disturbances: the environment has no dt, the duration of its steps [s]; give it one")
+            controls = self._model.actuator_ctrladr[list(self._readout.motors)]
+            self._way = CommandsWay(self._model, controls, self._disturbances, self.unwrapped.dt)
+        self._put({})
+        if self._observes:
+            self.observation_space = _longer(self.env.observation_space, len(self.sensor_names))
+
+    def _put(self, actuators: Mapping[str, ActuatorModel]) -> None:
+        """Give the model the actuators of some patterns.
+
+        Raises:
+            ValueError: they are not stable there.
+        """
+        changed = {index: one for pattern, one in actuators.items() for index in self._places[pattern]}
+        self._motors = self._readout.motors | changed
+        if changed:
+            self._exchange.put(actuators)
+            for actuator in actuators.values():
+                actuator.check_at(self._model.opt.timestep, self._motorised.allow_unstable)
+            check_shafts(self._model, self._motorised.allow_unstable, actuators=self._motors)
+        if self._observes:
+            self._sensors = Sensors(self._data, self._motors)
+
+    @property
+    def motors(self) -> dict[int, ActuatorModel]:
+        """The motors of the present episode, by the index of the actuator in the model."""
+        return dict(self._motors)
+
+    @property
+    def sensor_names(self) -> tuple[str, ...]:
+        """Names of what `observe_actuator` appends to the observation."""
+        return () if self._sensors is None else self._sensors.names
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start an episode, the motors at rest; a seed starts the generator of their draws too."""
+        if seed is not None:
+            own = np.random.SeedSequence(seed, spawn_key=(1,))  # independent of the environment's
+            self._generator = np.random.Generator(np.random.PCG64(own))
+        if self._draws is not None:
+            self._values = self._draws.draw(self._generator, self._put)
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._begun = True
+        for slot, motor in zip(self._slots, self._motors.values(), strict=True):  # not all environments reset all data
+            key = np.floor(self._generator.random() * LARGEST_KEY) if motor.random else 0.0
+            bring_to_rest(slot, self._data.time, key)
+        if self._way is not None:
+            self._way.memory[:] = 0.0
+        return self._observed(observation), info | self._drawn()
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Advance by one environment step.
+
+        Raises:
+            ValueError: the action has not the shape of the action space.
+        """
+        if self._commands is not None:
+            action = self._commands.controls(action)
+        if self._way is not None:
+            action = self._way.controls(action)
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self._observed(observation), reward, terminated, truncated, info | readings(self._readout, self._data)
+
+    def _observed(self, observation: Any) -> Any:
+        if self._sensors is None:
+            return observation
+        return np.concatenate([observation, self._sensors.seen()]).astype(observation.dtype)
+
+    def _drawn(self) -> dict[str, Any]:
+        if self._draws is None or self._values is None:
+            return {}
+        return {"randomization": self._draws.report(self._values)}
+
+    @property
+    def randomization(self) -> dict[str, Any]:
+        """What the present episode was drawn with, as in the reset's info; empty if nothing was drawn."""
+        return self._drawn().get("randomization", {})
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Everything that the future depends on, as plain arrays: simulation, motors, generators, draws, time limit.
+
+        That is MuJoCo's state and what was computed from it, which observations and rewards read; not what an
+        environment keeps in attributes of its own, nor what wrappers count besides `TimeLimit`.
+
+        Raises:
+            ValueError: the environment is no `MujocoEnv` of Gymnasium's.
+        """
+        env = self.unwrapped
+        if not isinstance(env, MujocoEnv):
+            raise ValueError(
+                f"{type(env).__name__}: only Gymnasium's MujocoEnv and its descendants have snapshots, of others it is "
+                "not known where their state is"
+            )
+        elapsed = [-1 if limit._elapsed_steps is None else limit._elapsed_steps for limit in self._limits()]
+        found = {
+            "environment": np.frombuffer(self._motorised_id.encode(), dtype=np.uint8).copy(),
+            **state_of(self._data),
+            "generator": words_of(env.np_random),
+            "motors_generator": words_of(self._generator),
+            "elapsed_steps": np.array(elapsed, dtype=np.int64),
+        }
+        if self._way is not None:
+            found["disturbances"] = self._way.memory.copy()
+        if self._draws is not None:
+            found["drawn"] = np.full(self._draws.size, np.nan) if self._values is None else self._values.copy()
+        return found
+
+    def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
+        """Continue from what `snapshot` returned, bit for bit, in an environment made with the same arguments.
+
+        Raises:
+            ValueError: the snapshot is of another environment, or of arguments that need other entries or shapes;
+                nothing was changed.
+        """
+        expected = self.snapshot()
+        check_snapshot(snapshot, expected)
+        if not np.array_equal(snapshot["environment"], expected["environment"]):
+            raise ValueError(
+                f"snapshot['environment'] is of {bytes(snapshot['environment'])!r}: must be of {self._motorised_id!r}"
+            )
+        if not self._begun:  # which Gymnasium's wrappers insist on
+            self.env.reset()
+            self._begun = True
+        if self._draws is not None:
+            values = snapshot["drawn"].copy()
+            self._values = None if np.isnan(values).any() else values
+            nominal = self._motorised.simulated
+            self._put(nominal if self._values is None else self._draws.actuators(values))
+        set_state_of(self._data, snapshot["state"], snapshot["computed"])
+        if self._way is not None:
+            self._way.memory[:] = snapshot["disturbances"]
+        generator, _ = seeding.np_random(0)
+        set_words(generator, snapshot["generator"])
+        self.unwrapped.np_random = generator
+        self._generator, _ = seeding.np_random(0)
+        set_words(self._generator, snapshot["motors_generator"])
+        for limit, steps in zip(self._limits(), snapshot["elapsed_steps"].tolist(), strict=True):
+            limit._elapsed_steps = None if steps < 0 else steps
+
+    @property
+    def _motorised_id(self) -> str:
+        return "" if self.env.spec is None else self.env.spec.id
+
+    def _limits(self) -> list[TimeLimit]:
+        """The time limits inside this wrapper."""
+        limits, env = [], self.env
+        while isinstance(env, gymnasium.Wrapper):
+            if isinstance(env, TimeLimit):
+                limits.append(env)
+            env = env.env
+        return limits
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but what belongs to the model, which a copied environment makes again."""
+        return {name: value for name, value in self.__dict__.items() if name not in _OF_THE_MODEL}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore, in this or another process; as with all of Gymnasium's, the copy has to be reset."""
+        self.__dict__.update(state, _begun=False)
+        self._bind()
+
+
+_OF_THE_MODEL = ("_model", "_data", "_readout", "_exchange", "_commands", "_way", "_sensors", "_motors", "_slots")
+
+
+def _longer(space: gymnasium.Space, count: int) -> spaces.Box:
+    """An observation space with some unbounded entries more.
+
+    Raises:
+        ValueError: it is no vector.
+    """
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        raise ValueError(f"observe_actuator=True: observations are {space}, and only to vectors can be appended")
+    low, high = (
+        np.append(bound, np.full(count, value)) for bound, value in ((space.low, -np.inf), (space.high, np.inf))
+    )
+    return spaces.Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype.type)

@@ -1,0 +1,1 @@
+"""Motors in environments of others."""

@@ -1,0 +1,139 @@
+"""`motorised`: models that others' code builds get motors, and nothing else is changed."""
+
+import subprocess
+import sys
+import threading
+
+import gymnasium as gym
+import mujoco
+import pytest
+
+import codrl_mj
+from codrl_mj.actuators import Lag
+from tests.foreign.models import ARM
+
+LOADERS = ("from_xml_path", "from_xml_string")
+PLAIN = {name: vars(mujoco.MjModel)[name] for name in LOADERS}
+BALL = "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
+ARM_FROM_FILE = "<mujoco><include file='arm.xml'/></mujoco>"
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_left():
+    yield
+    assert {name: vars(mujoco.MjModel)[name] for name in LOADERS} == PLAIN
+
+
+def _families(model):
+    return {model.actuator(index).name: type(motor) for index, motor in codrl_mj.motors(model).items()}
+
+
+def test_models_from_files_and_text_get_motors_inside_and_none_outside(tmp_path):
+    path = tmp_path / "arm.xml"
+    path.write_text(ARM)
+    with codrl_mj.motorised({"servo": "lag"}):
+        models = [mujoco.MjModel.from_xml_path(str(path)), mujoco.MjModel.from_xml_string(xml=ARM)]
+    assert [_families(model) for model in models] == [{"servo": Lag}] * 2
+    assert not codrl_mj.motors(mujoco.MjModel.from_xml_string(ARM))
+
+
+def test_assets_are_found():
+    with codrl_mj.motorised({".*": "lag"}):
+        model = mujoco.MjModel.from_xml_string(ARM_FROM_FILE, {"arm.xml": ARM.encode()})
+    assert _families(model) == {"servo": Lag, "motor": Lag}
+
+
+def test_names_of_joints_match_too():
+    with codrl_mj.motorised({"elbow": "lag"}):
+        assert _families(mujoco.MjModel.from_xml_string(ARM)) == {"motor": Lag}
+
+
+def test_an_environment_that_is_built_inside_has_motors():
+    with codrl_mj.motorised({"b.*": "lag"}):
+        env = gym.make("HalfCheetah-v5")
+    assert list(codrl_mj.motors(env.unwrapped.model)) == [0, 1, 2]
+
+
+def test_a_model_without_a_match_is_left_alone_where_another_has_one():
+    with codrl_mj.motorised({"servo": "lag"}):
+        ball, arm = mujoco.MjModel.from_xml_string(BALL), mujoco.MjModel.from_xml_string(ARM)
+    assert _families(arm) == {"servo": Lag}
+    assert ball.nplugin == 0
+
+
+def test_of_nested_blocks_the_innermost_counts():
+    with codrl_mj.motorised({"servo": "lag"}):
+        with codrl_mj.motorised({"motor": "lag"}):
+            inner = mujoco.MjModel.from_xml_string(ARM)
+        outer = mujoco.MjModel.from_xml_string(ARM)
+    assert (*_families(inner), *_families(outer)) == ("motor", "servo")
+
+
+def test_an_exception_passes_and_everything_is_restored():
+    with pytest.raises(ZeroDivisionError), codrl_mj.motorised({"servo": "lag"}):
+        raise ZeroDivisionError
+    assert not codrl_mj.motors(mujoco.MjModel.from_xml_string(ARM))
+
+
+def test_threads_have_motors_of_their_own():
+    """Each enters before and leaves after another builds: whoever restores too early or too late shows."""
+    barrier, found = threading.Barrier(3), {}
+
+    def build(name):
+        with codrl_mj.motorised({name: "lag"}):
+            barrier.wait()
+            found[name] = _families(mujoco.MjModel.from_xml_string(ARM))
+            if name == "motor":
+                barrier.wait()
+        if name == "servo":
+            barrier.wait()
+
+    def build_plain():
+        barrier.wait()
+        found["plain"] = _families(mujoco.MjModel.from_xml_string(ARM))
+        barrier.wait()
+
+    threads = [threading.Thread(target=build, args=(name,)) for name in ("servo", "motor")]
+    threads.append(threading.Thread(target=build_plain))
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert found == {"servo": {"servo": Lag}, "motor": {"motor": Lag}, "plain": {}}
+
+
+@pytest.mark.parametrize(
+    ("actuators", "text"),
+    [
+        ({"wheel": "lag"}, r"'wheel': no actuator has such a name.*there are servo, shoulder, motor, elbow"),
+        ({"serv": "lag"}, "did you mean 'servo'"),
+        ({".*": "lag", "servo": "lag"}, "both '.*' and 'servo' match it"),
+        ({".*": "lagg"}, "did you mean 'lag'"),
+        ({"*": "lag"}, "must be a regular expression"),
+        ("lag", "must be a mapping of patterns"),
+        ({".*": {"family": "lag", "delay": 1.0}}, "must be <= 0.08 s"),
+    ],
+)
+def test_what_is_wrong_is_said(actuators, text):
+    with pytest.raises(ValueError, match=text), codrl_mj.motorised(actuators):
+        mujoco.MjModel.from_xml_string(ARM)
+
+
+def test_a_block_in_which_nothing_is_built_is_an_error():
+    with (
+        pytest.raises(ValueError, match=r"no model was built inside.*codrl_mj.motorise"),
+        codrl_mj.motorised({".*": "lag"}),
+    ):
+        mujoco.MjSpec.from_string(ARM).compile()
+
+
+def test_first_use_of_a_drive_builds_nothing_of_ours_with_motors():
+    """Layout checks build a model of their own within the building of the first one: in a process that is new."""
+    code = (
+        "import codrl_mj, mujoco\n"
+        "with codrl_mj.motorised({'.*': 'maxon-ec45-flat-50w'}):\n"
+        f"    model = mujoco.MjModel.from_xml_string({ARM!r})\n"
+        "print(len(codrl_mj.motors(model)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "2\n"

@@ -1,0 +1,121 @@
+"""`make_dm_control`: dm_control's environments with motors."""
+
+import numpy as np
+import pytest
+from dm_control import composer, manipulation, suite
+from dm_control.locomotion.examples import basic_cmu_2019, basic_rodent_2020
+
+import codrl_mj
+from codrl_mj.actuators import Actuator, CurrentLoop, Lag, Motor, TorqueSpeed
+from tests.matrix import but
+
+IDEAL = {".*": "ideal"}
+DOMAINS = sorted({domain: f"{domain}/{task}" for domain, task in reversed(suite.ALL_TASKS)}.values())
+"""A task of each domain of the suite."""
+
+
+def _inputs(env, steps):
+    spec = env.action_spec()
+    low = np.where(np.isfinite(spec.minimum), spec.minimum, -1.0)
+    high = np.where(np.isfinite(spec.maximum), spec.maximum, 1.0)
+    return np.random.default_rng(0).uniform(low, high, (steps, *spec.shape))
+
+
+def _assert_same(ours, plain, steps):
+    for index, action in enumerate([None, *_inputs(plain, steps)]):
+        found, expected = (env.reset() if action is None else env.step(action) for env in (ours, plain))
+        assert found[:3] == expected[:3], index
+        assert found.observation.keys() == expected.observation.keys()
+        for name, value in expected.observation.items():
+            np.testing.assert_array_equal(found.observation[name], value, err_msg=f"{name}, step {index}")
+    return expected
+
+
+def test_there_are_enough_domains():
+    assert len(DOMAINS) >= 15
+
+
+@pytest.mark.parametrize("name", but(("cheetah/run", "cartpole/balance"), DOMAINS))
+def test_ideal_motors_change_no_bit_of_whole_episodes(name):
+    """1000 steps are the suite's longest episodes; shorter ones start again."""
+    ours = codrl_mj.make_dm_control(name, IDEAL, task_kwargs={"random": 1})
+    plain = suite.load(*name.split("/"), task_kwargs={"random": 1})
+    assert len(codrl_mj.motors(ours.mujoco[0])) == plain.physics.model.nactuator > 0
+    for specification in ("action_spec", "observation_spec", "reward_spec", "discount_spec"):
+        assert getattr(ours, specification)() == getattr(plain, specification)()
+    _assert_same(ours, plain, 1001)
+
+
+def _reach():
+    return manipulation.load("reach_duplo_features", seed=1)
+
+
+def _rodent():
+    return basic_rodent_2020.rodent_run_gaps(random_state=np.random.RandomState(1))
+
+
+def _humanoid():
+    return basic_cmu_2019.cmu_humanoid_run_walls(random_state=np.random.RandomState(1))
+
+
+@pytest.mark.parametrize("build", but((_reach,), (_reach, _rodent, _humanoid)))
+def test_environments_that_build_their_model_at_every_reset_have_motors_in_each(build):
+    ours, plain = codrl_mj.make_dm_control(build, IDEAL), build()
+    assert isinstance(plain, composer.Environment)
+    models = []
+    for _ in range(2):
+        _assert_same(ours, plain, 10)
+        models.append(ours.mujoco[0])
+        assert len(codrl_mj.motors(models[-1])) == models[-1].nactuator
+        assert len(ours.signals()["actual_force"]) == models[-1].nactuator
+    assert models[0] is not models[1]
+
+
+def test_signals_are_those_of_the_forces_that_moved_it_last():
+    """dm_control's order, `mj_step2` before `mj_step1`: the speed after a step is that of the next first force."""
+    line = TorqueSpeed(stall_torque=1.5, no_load_speed=5.0, max_torque=1.0)
+    env = codrl_mj.make_dm_control("cartpole/swingup", {"slide": line}, task_kwargs={"random": 0})
+    env.reset()
+    gear, saturated = env.mujoco[0].actuator_gear[0, 0], []
+    for action in np.repeat(_inputs(env, 30), 5, axis=0):
+        speed = gear * env.physics.data.qvel[0]
+        env.step(action)
+        upper, lower = (np.clip(1.5 * (sign - speed / 5.0), -1.0, 1.0) for sign in (1.0, -1.0))
+        signals = env.signals()
+        assert signals["desired_force"] == action[0]
+        assert signals["actual_force"] == pytest.approx(np.clip(action[0], lower, upper), rel=1e-12, abs=1e-13)
+        assert signals["saturated"] is bool(signals["actual_force"] != action[0])
+        saturated.append(signals["saturated"])
+    assert 10 < sum(saturated) < 140
+
+
+def test_noise_differs_between_episodes_and_repeats_with_its_seed():
+    noisy = Actuator(
+        Motor(resistance=1.0, inductance=0.05, torque_constant=0.8, back_emf_constant=0.01),
+        CurrentLoop(kp=0.5, ki=2.0, max_voltage=4.0, current_noise=0.1),
+    )
+    runs = []
+    for seed in (1, 1, 2):
+        env = codrl_mj.make_dm_control("pendulum/swingup", {".*": noisy}, noise_seed=seed, task_kwargs={"random": 0})
+        runs.append([])
+        for _ in range(2):
+            env.reset()
+            env.step(np.array([0.3]))
+            runs[-1].append(env.signals()["current"])
+    assert runs[0] == runs[1]
+    assert len({*runs[0], *runs[2]}) == 4
+
+
+def test_motors_can_be_given_to_dm_control_in_a_block():
+    with codrl_mj.motorised({"b.*": "lag"}):
+        env = suite.load("cheetah", "run")
+    assert set(map(type, codrl_mj.motors(env.physics.model.ptr).values())) == {Lag}
+
+
+def test_what_is_wrong_is_said():
+    with pytest.raises(ValueError, match=r"environment = 'cheetah/rn': did you mean 'cheetah/run'\?"):
+        codrl_mj.make_dm_control("cheetah/rn", IDEAL)
+    with pytest.raises(ValueError, match=r"'knee': no actuator has such a name.*bthigh"):
+        codrl_mj.make_dm_control("cheetah/run", {"knee": "lag"})
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = codrl_mj.make_dm_control("cheetah/run", IDEAL).nothing
