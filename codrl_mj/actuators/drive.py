@@ -298,6 +298,8 @@ class Drive(ActuatorModel):
     def instability(cls, numbers: np.ndarray, timestep: float) -> np.ndarray:
         """The spectral radius of the loop over a sample; infinite where a step holds no whole number of samples.
 
+        And where two fields are together what their class refuses.
+
         Args:
             numbers: shape (m, p), rows as `numbers` returns them.
             timestep: mechanical step [s].

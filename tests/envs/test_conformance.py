@@ -46,7 +46,7 @@ def rows(env, actions):
 
 
 def test_every_task_is_registered_with_the_limits_of_the_environment_it_rebuilds():
-    for task in TASKS.values():
+    for task in (task for task in TASKS.values() if task.gymnasium_id):
         ours, theirs = gymnasium.spec(task.env_id), gymnasium.spec(task.gymnasium_id)
         assert ours.max_episode_steps == theirs.max_episode_steps
         assert ours.reward_threshold == theirs.reward_threshold
