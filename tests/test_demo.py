@@ -64,7 +64,7 @@ def test_it_leaves_two_runs_and_a_film(demonstrated):
 def test_it_prints_the_validation_and_all_four_results_and_where_to_look(demonstrated):
     out, text = demonstrated
     assert "FAILED" not in text
-    assert text.count("passed") == 23
+    assert text.count("passed") == 25
     for trained in ("ideal", "weaker"):
         for deployed in ("ideal", "weaker"):
             assert f"trained on {trained}, run on {deployed}" in text

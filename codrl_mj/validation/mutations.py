@@ -180,7 +180,10 @@ _BACK_EMF: Edit = ("voltage - back_emf -", "voltage + back_emf -")
 _GAINS: Edit = ("parameters.kp * error + parameters.ki * integral", "parameters.ki * error + parameters.kp * integral")
 _RESISTANCE: Edit = ("- parameters.resistance * current", "- 1.01 * parameters.resistance * current")
 _VOLTAGE_LIMIT: Edit = ("voltage = min(max(voltage, -", "voltage = 0.99 * min(max(voltage / 0.99, -")
-_MORE_CURRENT: Edit = ("asked = inputs.desired_torque /", "asked = 1.01 * inputs.desired_torque /")
+_WARM_WINDING: Edit = (
+    "shaft.turn(parameters, resistance, timestep",
+    "shaft.turn(parameters, 1.01 * resistance, timestep",
+)
 _COMMIT = "                commit_slot(number, slot, time)\n"
 _LATE_FORCE: tuple[Edit, ...] = (
     (
@@ -286,7 +289,7 @@ MUTATIONS: tuple[Mutation, ...] = (
     Mutation("the sign of the back-EMF, everywhere", lambda: wrong_loop_everywhere(_BACK_EMF), ("motor", "energy")),
     _in_loop("kp and ki swapped", _GAINS, _LOOP, _UNEQUAL_GAINS),
     Mutation("kp and ki swapped, everywhere", lambda: wrong_loop_everywhere(_GAINS), ("motor", "convergence")),
-    Mutation("a drive that asks for 1 % more current", lambda: wrong_loop(_MORE_CURRENT, module=drive), _LOOP),
+    Mutation("a drive's winding off by 1 %, its gains with it", lambda: wrong_loop(_WARM_WINDING, module=drive), _LOOP),
     Mutation("a force one step late", lambda: wrong_callback(*_LATE_FORCE), (*_LOOP, "convergence", "energy")),
     Mutation("a stale command", _stale_command, (*_PHYSICS, "convergence")),
     Mutation("bounds that are not kept", _no_bounds, _PHYSICS, _BOUNDED),

@@ -11,8 +11,7 @@ import pytest
 from codrl_mj import Choice, Uniform
 from codrl_mj.actuators import Actuator, Drive, GearMotor, JointAdditions, Supply, field_paths, field_values, unchecked
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.tasks import TASKS
-from codrl_mj.validation.drives import Bench, Mechanics, fitted
+from codrl_mj.validation.drives import FITTED, Bench, Mechanics, fitted
 from tests.envs.vectors import assert_equal_episodes, assert_same, batched, looped
 from tests.matrix import but
 from tests.tasks.faces import actions
@@ -193,7 +192,7 @@ def test_different_drives_bring_each_their_own_rotor_and_friction(randomize):
         assert [on_joint(model) for model in env.unwrapped.physics.models()] == [one.additions for one in drives]
 
 
-@pytest.mark.parametrize("task", but(["pendulum"], TASKS))
+@pytest.mark.parametrize("task", but(["pendulum"], FITTED))
 @pytest.mark.parametrize("drawn", but([False], [False, True]))
 def test_the_drive_of_a_task_is_the_same_in_a_batch_as_alone(task, drawn):
     one = fitted(task)
