@@ -86,12 +86,13 @@ def test_current_and_temperature_are_those_of_mujoco_s_own_motor():
         )
         theirs = spec.compile()
         data, other, unequal = mujoco.MjData(ours), mujoco.MjData(theirs), []
+        readout = codrl_mj.Readout(ours)
         for step in range(round(4.0 / timestep)):
             volts = 12.0 if int(step * timestep / 0.5) % 2 == 0 else -4.0
             data.ctrl[:], other.ctrl[:] = HOT.torque_constant * volts, volts
             mujoco.mj_step(ours, data)
             mujoco.mj_step(theirs, other)
-            read = codrl_mj.signals(ours, data)
+            read = readout(data)
             unequal.append(abs(read["temperature"].item() - 20.0 - other.act[0]))
         assert other.act[0] > 10.0
         assert read["current"].item() == pytest.approx(other.act[1], rel=1e-3)

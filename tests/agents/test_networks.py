@@ -126,6 +126,7 @@ def test_entries_without_a_factor_stay_as_they_are():
     assert policy.actor.features_extractor.factors.tolist() == [1, 10, 1, 1]
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize(("command", "largest"), [("force", 0.084), ("voltage", 18.0)])
 def test_unit_actions_are_those_of_a_plain_actor_times_the_largest(command, largest):
     envs = make_envs("furuta", action=command)

@@ -56,6 +56,7 @@ def _table(model):
 # -- the updates ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.matrix
 def test_it_finds_the_values_of_a_chain():
     """Greedily the way out takes 3, 2, 1 steps; the other action was given up where it seemed no better."""
     model = SARSA(TileCodingPolicy, Chain(), step_size=0.5, epsilon=0.0, policy_kwargs=TABLE, seed=0).learn(2000)

@@ -109,6 +109,7 @@ def test_a_configuration_survives_json():
     assert not {"disturbances", "joint"} & {*EnvConfig("pendulum").as_arguments()}
 
 
+@pytest.mark.matrix
 def test_the_command_line_takes_them_and_refuses_in_one_line(capsys, tmp_path):
     line = ["render", "pendulum", "--env.max-episode-steps", "3", "--width", "200", "--height", "120"]
     trajectories = []

@@ -127,6 +127,7 @@ def test_a_block_in_which_nothing_is_built_is_an_error():
         mujoco.MjSpec.from_string(ARM).compile()
 
 
+@pytest.mark.matrix
 def test_first_use_of_a_drive_builds_nothing_of_ours_with_motors():
     """Layout checks build a model of their own within the building of the first one: in a process that is new."""
     code = (

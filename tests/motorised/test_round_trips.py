@@ -144,6 +144,7 @@ def _python(code, folder):
     )
 
 
+@pytest.mark.matrix
 def test_another_process_has_the_same_motors_and_imports_no_code_because_a_model_says_so(tmp_path):
     inputs = 0.1 * (np.arange(50) % 7)[:, np.newaxis] * np.ones(2)
     ours = codrl_mj.motorise(arm(), {"one": LOOP, "two": "torque_speed"})
