@@ -69,8 +69,8 @@ def limited(parameters: Any, timestep: float, heat: Heat, resistance: float, ask
     return min(max(asked, -most), most)
 
 
-def begin(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[Winding, Heat, Shaft]:
-    """Winding, temperatures and shaft at the beginning of a step."""
+def begin(parameters: Any, timestep: float, state: Any, inputs: Inputs) -> tuple[Winding, Heat, Shaft]:
+    """Winding, temperatures and shaft at the beginning of a step, from a state that has the entries of `State`."""
     inertia, others = shaft.inertia_of(parameters, inputs.inertia), 0.0
     if state.due > 0.0 and abs(inputs.time - state.due) < 0.5 * timestep and inertia < math.inf:
         others = shaft.others_after(timestep, inputs.speed - state.speed, state.acceleration, state.others)

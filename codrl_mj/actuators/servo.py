@@ -138,18 +138,7 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
         state: as the step before left it.
         inputs: in place of the desired torque, position [rad] or speed [rad/s] of the rotor; and as for a drive.
     """
-    of_drive = drive.State(
-        state.current,
-        state.integral,
-        state.pending,
-        state.winding_rise,
-        state.housing_rise,
-        state.acceleration,
-        state.speed,
-        state.others,
-        state.due,
-    )
-    winding, heat, moving = drive.begin(parameters, timestep, of_drive, inputs)
+    winding, heat, moving = drive.begin(parameters, timestep, state, inputs)
     resistance = shaft.resistance_at(parameters, shaft.temperature_of(parameters, heat))
     target, constant = inputs.desired_torque, parameters.torque_constant
     rate = (target - state.target) / timestep if state.due > 0.0 else 0.0
