@@ -29,7 +29,8 @@ ALLOWED = {
         *("actuators", "disturbances", "engine", "envs.config", "envs.distributions", "fields", "physics", "tasks"),
     },
     "foreign": {
-        *("actuators", "disturbances", "engine", "envs", "envs.distributions", "fields", "physics", "specs"),
+        *("actuators", "disturbances", "engine", "envs", "envs.config", "envs.distributions", "fields", "physics"),
+        *("specs", "tasks"),
     },
     "suite": {"actuators", "envs", "envs.config", "physics", "tasks"},
     "agents": {"actuators", "envs", "envs.config", "fields", "physics"},
@@ -45,10 +46,11 @@ ALLOWED = {
     "films": {"actuators", "envs", "envs.config", "evaluation", "physics", "runs.files"},
     "training": {
         *("actuators", "agents", "disturbances", "envs", "envs.config", "evaluation", "runs.files", "runs.layout"),
-        *("runs.policies", "tasks", "tasks.assets", "fields"),
+        *("runs.policies", "tasks", "tasks.assets", "fields", "foreign"),
     },
     "sizing": {
-        *("actuators", "catalogue", "envs.config", "evaluation", "motor_design", "runs.policies", "tasks", "training"),
+        *("actuators", "catalogue", "engine", "envs.config", "evaluation", "fields", "foreign", "motor_design"),
+        *("runs.policies", "tasks", "training"),
     },
     "validation": {"actuators", "catalogue", "engine", "physics", "runs.files", "tasks", "tasks.assets"},
     "study": {
@@ -60,12 +62,14 @@ ALLOWED = {
     "cli": {
         *("actuators", "agents", "disturbances", "envs.config", "evaluation", "evaluation.measures", "fields", "films"),
         *(
+            "foreign",
             "motor_design",
             "runs.files",
             "runs.layout",
             "runs.policies",
             "runs.summaries",
             "sizing",
+            "specs",
             "study",
             "tasks",
             "training",

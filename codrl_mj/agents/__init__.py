@@ -55,19 +55,20 @@ def agent_from_mapping(mapping: Mapping[str, Any]) -> AgentConfig:
     return find_agent(str(settings.pop("name", None))).from_mapping(settings)
 
 
-def check_fits(agent: str, task: Any) -> None:
-    """Raise if an agent cannot act in a task's action space.
+def check_fits(agent: str, env: Any) -> None:
+    """Raise if an agent cannot act in an environment's action space.
 
     Args:
         agent: the agent's name.
-        task: a `codrl_mj.tasks.Task`, whose module is too heavy for those that only want settings.
+        env: the environment's configuration, whose module is too heavy for those that only want settings.
 
     Raises:
         ValueError: it cannot; the message names the agents that can.
     """
-    if not isinstance(task.action_space, find_agent(agent).action_spaces):
-        kind = type(task.action_space).__name__
-        fitting = [name for name, config in AGENTS.items() if isinstance(task.action_space, config.action_spaces)]
+    space = env.action_space
+    if not isinstance(space, find_agent(agent).action_spaces):
+        fitting = [name for name, config in AGENTS.items() if isinstance(space, config.action_spaces)]
         raise ValueError(
-            f"agent = {agent!r}: cannot act in the {kind} actions of {task.name}; agents that can: {', '.join(fitting)}"
+            f"agent = {agent!r}: cannot act in the {type(space).__name__} actions of {env.task}; agents that can: "
+            f"{', '.join(fitting) or 'none'}"
         )

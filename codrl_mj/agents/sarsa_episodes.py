@@ -74,7 +74,8 @@ class CompiledEpisodes:
         start = self.env.env.snapshot()
         if start["elapsed"][0] != 0:
             return None
-        self._physics.reset(np.zeros(len(self.env.env.task.state_names)))  # sees to the callbacks
+        vector: Any = self.env.env
+        self._physics.reset(np.zeros(len(vector.task.state_names)))  # sees to the callbacks
         self._physics.restore(start["physics"][0])
         self._physics.memory[:] = start.get("disturbances", np.zeros((1, 0)))[0]
         observation = start["observations"][0].copy()
@@ -92,7 +93,7 @@ class CompiledEpisodes:
         )
         if not fine:
             self._physics.check_finite()
-        setup = self.env.env.setup
+        setup = vector.setup
         columns = dict(zip(trace_names(setup.family), self._record[:length].T.copy(), strict=True))
         columns["saturated"] = columns.get("saturated", np.zeros(length)) != 0.0
         signals = setup.signals({name: columns[name] for name in signal_names(setup.family)})

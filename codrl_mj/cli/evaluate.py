@@ -14,6 +14,8 @@ from codrl_mj.cli.subject import Source
 class Evaluate:
     """Measure a trained policy on any actuator: return, success, torque tracking, voltage, energy, heat.
 
+    Of several motors there is a second table, with what each of them did.
+
     Example: codrl-mj evaluate runs/cartpole-ppo-ideal-0 --actuator weaker --episodes 100
     """
 
@@ -38,7 +40,7 @@ class Evaluate:
         from codrl_mj.evaluation import evaluate
 
         subject = self.source.load(self.policy)
-        env = environment(self, subject.env.task, self.actuator_name, subject.env.actuator)
+        env = environment(self, subject.env.task, self.actuator_name, subject.env)
         subject.check_interface(env)
         with progress_bar("{task.completed}/{task.total} episodes") as bar:
             row = bar.add_task("evaluating", total=self.episodes)

@@ -7,10 +7,11 @@ import dataclasses
 import functools
 import inspect
 import itertools
+import json
 import re
 import textwrap
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,13 +20,14 @@ import tyro
 from codrl_mj.actuators import FAMILIES, NAMED, Actuator, Ideal, actuator_over
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import parts
+from codrl_mj.foreign.config import EVERY, ForeignConfig, is_gymnasium_id
 from codrl_mj.runs.layout import CONFIG
-from codrl_mj.tasks import TASKS, find_task, named_actuator, resolve_actuators
+from codrl_mj.tasks import TASKS, find_task, resolve_actuators
 
 
 def is_task(word: str) -> bool:
-    """Whether a word is a task's name, or `module:NAME`, as one of somebody's own is named."""
-    return word in TASKS or re.fullmatch(r"[\w.]+:[\w.]+", word) is not None
+    """Whether a word is a task's name, `module:NAME`, as one of somebody's own is named, or an id of Gymnasium's."""
+    return word in TASKS or is_gymnasium_id(word) or re.fullmatch(r"[\w.]+:[\w.]+", word) is not None
 
 
 @functools.cache
@@ -92,12 +94,21 @@ ActuatorName = Annotated[
     ),
 ]
 
+Actuators = Annotated[
+    tuple[str, ...],
+    tyro.conf.arg(
+        metavar="PATTERN=NAME",
+        help="What single motors go through, over --actuator: names as there, for the motors whose names, or whose "
+        "joints', the regular expression matches from beginning to end. Or a YAML file of patterns and actuators, such "
+        "as codrl-mj motor choose writes.",
+    ),
+]
 AS_TRAINED, AS_CONFIGURED = "as-trained", "as-configured"
 """Instead of a name: the actuator that the policy was trained on; that of the configuration file or run."""
 
 
-def environment_fields(defaults: EnvConfig, name: str | None, task: str) -> list[Any]:
-    """Flags for an environment: single fields over its actuator, all else but its task, and the options of all tasks.
+def environment_fields(defaults: EnvConfig | ForeignConfig, name: str | None, task: str) -> list[Any]:
+    """Flags for an environment: single fields over its actuators, all else but its task, and the options of all tasks.
 
     Args:
         defaults: the environment whose values are the defaults.
@@ -108,43 +119,151 @@ def environment_fields(defaults: EnvConfig, name: str | None, task: str) -> list
     Returns:
         Fields for `dataclasses.make_dataclass`; `environment` reads them.
     """
-    options = defaults.as_mapping()["options"]
-    of_tasks = [
-        (option, Annotated[hint | None, tyro.conf.arg(help=text)], options.get(option))
-        for option, (hint, text) in _task_options().items()
-    ]
-    env = flags(EnvConfig, defaults, ("task", "actuator", "options"), of_tasks)
-    family: Any = type(defaults.actuators[0])
+    if isinstance(defaults, ForeignConfig):
+        env, family = _foreign_flags(defaults), type(defaults.actuator[0])
+    else:
+        options = defaults.as_mapping()["options"]
+        of_tasks = [
+            (option, Annotated[hint | None, tyro.conf.arg(help=text)], options.get(option))
+            for option, (hint, text) in _task_options().items()
+        ]
+        env = flags(EnvConfig, defaults, ("task", "actuator", "options"), of_tasks)
+        family = type(defaults.actuators[0])
     if name not in (None, AS_TRAINED, AS_CONFIGURED):
         with contextlib.suppress(ValueError, OSError):  # the verb says so better
-            family = type(resolve_actuators(name, find_task(task))[0])
+            family = type(_named(str(name), task)[0])
     over = flags(Actuator if issubclass(family, Ideal) else family)
     return [
+        ("actuators", Actuators, ()),
         ("actuator_fields", Annotated[over, tyro.conf.arg(name="actuator", help="Single fields over it.")], over()),
         ("env", Annotated[env, tyro.conf.arg(help="The environment.")], env()),
     ]
 
 
-def environment(verb: Any, task: str, name: str, known: Any = None) -> EnvConfig:
+def _foreign_flags(defaults: ForeignConfig) -> Any:
+    """Flags for an environment of somebody else's."""
+    docs = field_docs(ForeignConfig)
+    draws = defaults.randomize or {}
+    written = tuple(f"{pattern}:{name}={text}" for pattern, own in draws.items() for name, text in own.items())
+    options = tuple(f"{name}={json.dumps(value)}" for name, value in defaults.options.items())
+    about = "Keyword arguments of the environment, such as frame_skip=2: their values as JSON, or else as text."
+    adding = [
+        ("randomize", Annotated[tuple[str, ...] | None, tyro.conf.arg(help=docs["randomize"])], written or None),
+        ("options", Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE", help=about)], options),
+    ]
+    return flags(ForeignConfig, defaults, ("task", "actuators", "randomize", "options"), adding)
+
+
+def _named(name: str, task: str) -> tuple[Any, ...]:
+    """The actuators that a name stands for in a task, or in an environment of somebody else's."""
+    if is_gymnasium_id(task):
+        return ForeignConfig(task, {EVERY: name}).actuator
+    return resolve_actuators(name, find_task(task))
+
+
+def default_actuator(task: str) -> str:
+    """The name of what a task goes through unless told otherwise; in an environment of somebody else's nothing."""
+    return "ideal" if is_gymnasium_id(task) else find_task(task).default_actuator
+
+
+def through(actuators: Sequence[str], name: str) -> str:
+    """What to call what `--actuators`, or else `--actuator`, says."""
+    return "-".join(dict.fromkeys(Path(each.rpartition("=")[2]).stem for each in actuators)) or name
+
+
+def environment(verb: Any, task: str, name: str, known: Any = None) -> EnvConfig | ForeignConfig:
     """The environment that a verb's flags describe.
 
     Args:
         verb: has the fields of `environment_fields`.
-        task: the task's name.
+        task: the task's name, or the id of an environment of somebody else's.
         name: a named actuator, or `AS_TRAINED` or `AS_CONFIGURED`.
-        known: what these stand for.
+        known: the environment whose actuators these stand for.
 
     Raises:
         ValueError: unknown name, value out of bounds, or fields set over the ideal actuator, which has none.
     """
+    if is_gymnasium_id(task):
+        return _foreign_environment(verb, task, name, known)
     given: dict[str, Any] = dict(vars(verb.env))
     nested: dict[str, Any] = {name: vars(given.pop(name)) for name in ("disturbances", "joint")}
     options = {name: value for name in _task_options() if (value := given.pop(name, None)) is not None}
-    base = known if name in (AS_TRAINED, AS_CONFIGURED) else named_actuator(name, task)
-    changed = [
-        actuator_over(one, _given(verb.actuator_fields)) for one in (base if isinstance(base, tuple) else [base])
-    ]
+    from codrl_mj.specs import matched_by, refuse_unmatched
+
+    actuators = list(known.actuators if name in (AS_TRAINED, AS_CONFIGURED) else _named(name, task))
+    definition = find_task(task)
+    for pattern, other in _patterns(verb.actuators).items():
+        matched = matched_by(pattern, [[motor] for motor in definition.motors])
+        if not matched:
+            refuse_unmatched(pattern, [[motor] for motor in definition.motors])
+        for index in matched:
+            actuators[index] = resolve_actuators(other, definition)[index]
+    changed = [actuator_over(one, _given(verb.actuator_fields)) for one in actuators]
     return EnvConfig(task, changed, options=options, **given, **nested)
+
+
+def _foreign_environment(verb: Any, task: str, name: str, known: Any) -> ForeignConfig:
+    """`environment` of somebody else's."""
+    given: dict[str, Any] = dict(vars(verb.env))
+    options = {key: _value(text) for key, text in _pairs(given.pop("options"), "--env.options", str.partition).items()}
+    disturbances = vars(given.pop("disturbances"))
+    actuators = _patterns(verb.actuators)
+    if actuators and name not in (AS_TRAINED, AS_CONFIGURED, "ideal"):
+        raise ValueError(
+            f"--actuator {name}: is for all motors, and --actuators for single ones: leave one of them out"
+        )
+    if not actuators and name in (AS_TRAINED, AS_CONFIGURED) and known is not None:
+        actuators = known.actuators
+    elif not actuators:
+        actuators = dict.fromkeys([EVERY] if known is None else known.actuators, name)
+    made = ForeignConfig(task, actuators).actuators
+    over = _given(verb.actuator_fields)
+    changed = {pattern: actuator_over(one, over) for pattern, one in made.items()}
+    return ForeignConfig(task, changed, options=options, disturbances=disturbances, **given)
+
+
+def _patterns(items: Sequence[str]) -> dict[str, Any]:
+    """Pattern -> what is behind these actuators, of PATTERN=NAME and of files."""
+    found: dict[str, Any] = {}
+    for item in items:
+        if "=" not in item and Path(item).suffix in (".yaml", ".yml", ".json"):
+            import yaml
+
+            content = yaml.safe_load(Path(item).read_text())
+            if not isinstance(content, Mapping):
+                raise ValueError(f"--actuators {item}: the file must have a mapping of patterns to actuators")
+            found |= content
+        else:
+            found |= _pairs([item], "--actuators")
+    return found
+
+
+def _pairs(items: Sequence[str], flag: str, split: Callable[[str, str], Any] = str.rpartition) -> dict[str, str]:
+    """Name -> value of NAME=VALUE.
+
+    Args:
+        items: these.
+        flag: whose they are.
+        split: at which '=': at the last, where names may be regular expressions, or at the first.
+
+    Raises:
+        ValueError: there is no '='.
+    """
+    pairs = {}
+    for item in items:
+        name, equals, value = split(item, "=")
+        if not equals or not name:
+            raise ValueError(f"{flag} {item}: must be NAME=VALUE")
+        pairs[name] = value
+    return pairs
+
+
+def _value(text: str) -> Any:
+    """What a text is as JSON, or else the text itself."""
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
 
 
 def scan(arguments: Sequence[str], *names: str) -> argparse.Namespace:
@@ -180,14 +299,18 @@ def with_environment(verb: Any, arguments: Sequence[str]) -> Any:
     from codrl_mj.training.folder import load_config
 
     chosen = scan(arguments, "actuator")
-    known = EnvConfig("cartpole", Actuator())
+    task = chosen.task or "cartpole"
+    known: Any = EnvConfig("cartpole", Actuator())
     with contextlib.suppress(ValueError):  # the verb says so better
-        find_task(chosen.task or "cartpole")  # its options are flags
+        if is_gymnasium_id(task):
+            known = ForeignConfig(task)
+        else:
+            find_task(task)  # its options are flags
     for run in map(Path, arguments):
         if (run / CONFIG).is_file():
             with contextlib.suppress(ValueError, OSError):  # the verb says so better
                 known = load_config(run, chosen.trust).evaluation_env
-    fields = environment_fields(known, chosen.actuator, chosen.task or "cartpole")
+    fields = environment_fields(known, chosen.actuator, known.task if isinstance(known, ForeignConfig) else task)
     made = dataclasses.make_dataclass(verb.__name__, fields, bases=(verb,), frozen=True)
     made.__doc__ = verb.__doc__
     return made

@@ -1,7 +1,9 @@
 """`codrl-mj motor feasible` and `codrl-mj motor choose`."""
 
 import dataclasses
-from collections.abc import Sequence
+import itertools
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,9 +13,14 @@ Asked = Annotated[
     tyro.conf.Positional[str],
     tyro.conf.arg(
         metavar="TASK|RUN",
-        help="A task, which a scripted controller drives; a run folder, trained on the ideal actuator; or an .npz file "
-        "with the arrays time [s], torque [N*m] and speed [rad/s] of a joint.",
+        help="A task, which a scripted controller drives; a run folder, trained on the ideal actuator, of a task or of "
+        "somebody else's environment; or an .npz file with the arrays time [s], torque [N*m] and speed [rad/s] of a "
+        "joint.",
     ),
+]
+OfMotor = Annotated[
+    str | None,
+    tyro.conf.arg(metavar="NAME", help="Of a run with several motors, the one that is asked about, by its name."),
 ]
 Trust = Annotated[
     bool, tyro.conf.arg(help="Import the modules of a run folder's task or agent if these are somebody's own.")
@@ -36,6 +43,7 @@ class Feasible:
     """Turns of the rotor for a turn of the joint, or radians for a metre; the motor's own unless given."""
     voltage: float | None = None
     """Voltage of the supply [V]."""
+    motor: OfMotor = None
     out: Path | None = None
     """Folder for torque_speed.png: what was asked for over what the motor can do."""
     trust: Trust = False
@@ -46,7 +54,7 @@ class Feasible:
         from codrl_mj.sizing import SURELY_NOT, catalogued, demand_of, feasibility
 
         drive, continuous, unknown = catalogued(self.name, self.gear_ratio, self.voltage)
-        demand = demand_of(self.asked, trust=self.trust)
+        demand = demand_of(self.asked, trust=self.trust, motor=self.motor)
         found = feasibility(drive, demand, continuous)
         table = _table(f"{self.name}, gear {1.0 / drive.arm_radius:.4g}, {drive.voltage_limit:g} V: {demand.source}")
         for header in ("bound", "of", "needs", "has", "unit", "", "says"):
@@ -76,9 +84,11 @@ class Choose:
     """Rank the catalogue's motors for a task, the smallest that does it first, and say what is wrong with the others.
 
     Each is taken at its best gear. It does the task if voltage, largest current and heat hold with the margin, its heat
-    is known, and the rotor leaves half to the load; smallest means by the most mechanical power at its supply.
+    is known, and the rotor leaves half to the load; smallest means by the most mechanical power at its supply. A run
+    with several motors gets one for each of them, and with --out the file actuators.yaml, which train, evaluate and
+    render take as --actuators FILE.
 
-    Example: codrl-mj motor choose pendulum --top 5 --out chosen
+    Example: codrl-mj motor choose pendulum --top 5 --out chosen, or codrl-mj motor choose runs/Hopper_v5-sac-ideal-0
     """
 
     asked: Asked
@@ -88,6 +98,7 @@ class Choose:
     """Share of voltage, largest and continuous current that has to be left."""
     voltage: float | None = None
     """Voltage of the supply [V]; each motor's own unless given."""
+    motor: OfMotor = None
     out: Path | None = None
     """Folder for NAME.png of those shown: what was asked for over what the motor can do."""
     trust: Trust = False
@@ -95,13 +106,18 @@ class Choose:
     def run(self) -> int:
         """Print the ranking."""
         from codrl_mj.cli.terminal import console
-        from codrl_mj.sizing import choose, demand_of
+        from codrl_mj.sizing import choose, demand_of, demands_of
 
         if self.top < 1:
             raise ValueError(f"--top {self.top}: must be >= 1")
-        demand = demand_of(self.asked, trust=self.trust)
+        if self.motor is None and len(demands := demands_of(self.asked, trust=self.trust)) > 1:
+            return self._for_each(demands)
+        demand = demand_of(self.asked, trust=self.trust, motor=self.motor)
         choices = choose(demand, voltage=self.voltage, least_margin=self.margin)
         shown, console_ = choices[: self.top], console()
+        if demand.model_gear != 1.0:
+            text = f"gears are at the joint; the model's actuator has one of {demand.model_gear:g}, which the motor's "
+            console_.print(f"{text}arm_radius {demand.model_gear:g} undoes", markup=False, highlight=False)
         console_.print(_ranking(shown, f"smallest that does it with {self.margin:.0%} left first: {demand.source}"))
         for choice in shown:
             if choice.unknown:
@@ -116,16 +132,50 @@ class Choose:
             _draw(choice.drive, demand, choice.name, self.out / f"{Path(choice.name).stem}.png")
         return 0
 
+    def _for_each(self, demands: Mapping[str, Any]) -> int:
+        """Choose for each of several motors, and say how to go on."""
+        from codrl_mj.actuators import mapping_of
+        from codrl_mj.cli.terminal import console
+        from codrl_mj.sizing import choose
 
-def _ranking(choices: Sequence[Any], title: str) -> Any:
+        best = {}
+        for name, demand in demands.items():
+            ranked = choose(demand, voltage=self.voltage, least_margin=self.margin)
+            best[name] = ranked[0]
+            if self.out is not None:
+                _draw(ranked[0].drive, demand, ranked[0].name, self.out / f"{name}.png")
+        console().print(_ranking(best.values(), f"smallest with {self.margin:.0%} left: {self.asked}", list(best)))
+        for name, choice in best.items():
+            if choice.lacks:
+                text = f"{name}: none does it; {choice.name} comes nearest at gear {choice.ratio:.4g}: {choice.lacks}"
+                console().print(text, markup=False, highlight=False)
+        if self.out is not None:
+            import yaml
+
+            from codrl_mj.runs.files import writing
+
+            content = {
+                re.escape(name): mapping_of(choice.behind(demands[name].model_gear)) for name, choice in best.items()
+            }
+            with writing(self.out / "actuators.yaml") as temporary:
+                temporary.write_text(yaml.safe_dump(content, sort_keys=False))
+            print(f"wrote {self.out / 'actuators.yaml'}")
+        return 0
+
+
+def _ranking(choices: Iterable[Any], title: str, driven: Sequence[str] = ()) -> Any:
+    """A row for each choice; of several motors, each with what it drives."""
     table = _table(title)
+    if driven:
+        table.add_column("drives", overflow="fold")
     columns = ("motor", "gear", "supply\n[V]", "power\n[W]", "does\nit", "margin", "rotor's\nshare", "peak\n[A]")
     for header in (*columns, "rms\n[A]", "drawn\n[J]", "heat\n[J]"):
         table.add_column(header, justify="left" if header in ("motor", "does\nit") else "right", no_wrap=True)
-    for choice in choices:
+    for choice, name in itertools.zip_longest(choices, driven):
         asked = choice.feasibility.operation
         numbers = abs(asked.current).max(), asked.rms_current, asked.energy_drawn, asked.copper_loss
         table.add_row(
+            *((name,) if driven else ()),
             *(choice.name, f"{choice.ratio:.4g}", f"{choice.drive.voltage_limit:g}", f"{choice.power:,.0f}"),
             "[red]no" if choice.lacks else "[green]yes",
             *(f"{choice.feasibility.margin:.0%}", f"{asked.own_share:.0%}", *(f"{number:.3g}" for number in numbers)),

@@ -6,9 +6,11 @@ from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, environment, is_task
+from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, default_actuator, environment, is_task, through
 from codrl_mj.cli.subject import Source
-from codrl_mj.tasks import find_task
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.fields import did_you_mean
+from codrl_mj.foreign.config import environment_from
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,30 +40,44 @@ class Render:
     height: int = 480
     """Height of the scene [px], even."""
     camera: str = "fixed"
-    """A camera of the model: fixed or close."""
+    """A camera of the model: fixed or close; other models have others, and fixed is their environment's own."""
     pretty: bool = False
     """Shadows, reflections and multisampling: slower."""
+    motor: str | None = None
+    """Of several motors that whose torque and voltage the strip shows, by its name; the first unless given."""
 
     def run(self: Any) -> int:
         """Run the episode and film it."""
         from codrl_mj.cli.terminal import progress_bar
         from codrl_mj.evaluation import RandomPolicy, run_episodes, save_episode
-        from codrl_mj.films.film import Panel, film
+        from codrl_mj.films.film import Filmed, Panel, film
         from codrl_mj.runs.policies import Policy
 
         if is_task(self.subject):
-            task, name = self.subject, self.actuator_name
-            name = find_task(task).default_actuator if name == AS_TRAINED else name
-            env = environment(self, task, name)
+            known = environment_from({"task": self.subject})
+            env = environment(self, known.task, self.actuator_name, known)
             policy: Policy = RandomPolicy(env.make().action_space, self.seed)
         else:
-            loaded, name = self.source.load(Path(self.subject)), self.actuator_name
-            task, policy = loaded.env.task, loaded.policy
-            env = environment(self, task, name, loaded.env.actuator)
+            loaded = self.source.load(Path(self.subject))
+            policy, env = loaded.policy, environment(self, loaded.env.task, self.actuator_name, loaded.env)
             loaded.check_interface(env)
-        (episode,) = run_episodes(policy, env.make, 1, self.seed)
-        title = f"{Path(self.subject).name} on {name}: return {episode.total:.0f}"
-        panel = Panel(title, task, env.actuator, episode)
+        filmed: list[Filmed] = []
+
+        def make() -> Any:
+            if isinstance(env, EnvConfig):
+                return env.make()
+            view = env.view(self.width, self.height, None if self.camera == "fixed" else self.camera)
+            filmed.append(Filmed(env.make(**view), self.pretty))
+            return filmed[-1]
+
+        (episode,) = run_episodes(policy, make, 1, self.seed)
+        title = f"{Path(self.subject).name} on {self._name()}: return {episode.total:.0f}"
+        if episode.motors:
+            title += f"; {episode.motors[self._motor(episode)]}"
+        panel = Panel(title, env.task, episode.actuator, episode, self._motor(episode))
+        for one in filmed:
+            rate = one.metadata.get("render_fps", 1.0 / float(episode.time[0]))
+            panel = dataclasses.replace(panel, frames=one.frames, rate=rate)
         with progress_bar("{task.completed}/{task.total} frames") as bar:
             row = bar.add_task("filming", total=None)
             film(
@@ -78,3 +94,19 @@ class Render:
             save_episode(episode, self.trajectory)
             print(f"wrote {self.trajectory}")
         return 0
+
+    def _name(self: Any) -> str:
+        """Of what the episode runs on."""
+        if self.actuator_name == AS_TRAINED and is_task(self.subject):
+            return through(self.actuators, default_actuator(self.subject))
+        return through(self.actuators, self.actuator_name)
+
+    def _motor(self, episode: Any) -> int:
+        """Which of the motors the strip shows."""
+        if self.motor is None:
+            return 0
+        names = episode.motors
+        if self.motor not in names:
+            there = ", ".join(names) or "one, which needs no name"
+            raise ValueError(f"--motor {self.motor}: {did_you_mean(self.motor, names)}there are {there}")
+        return int(names.index(self.motor))

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.tasks import find_task
+from codrl_mj.foreign.config import ForeignConfig, environment_from
 
 
 @dataclasses.dataclass(frozen=True)
@@ -16,12 +16,12 @@ class Subject:
 
     policy: Any
     """What chooses the actions."""
-    env: EnvConfig
+    env: EnvConfig | ForeignConfig
     """The environment it was trained in, as far as that is known."""
     run: Path | None = None
     """The run folder that says so; None if there is none."""
 
-    def check_interface(self, env: EnvConfig) -> None:
+    def check_interface(self, env: EnvConfig | ForeignConfig) -> None:
         """Refuse an environment in which the policy would command or observe something else than in its training.
 
         Raises:
@@ -93,4 +93,4 @@ class Source:
             raise ValueError(f"{path} does not say which algorithm made it: name it with --agent, such as --agent ppo")
         else:
             policy = load_sb3_zip(path, self.agent or "", self.trust)
-        return Subject(policy, EnvConfig(self.task, find_task(self.task).default_actuator))
+        return Subject(policy, environment_from({"task": self.task}))

@@ -29,7 +29,9 @@ def evaluation_tables(evaluations: Mapping[str, Evaluation], details: bool = Tru
     """
     names = list(evaluations) if details else []
     chunks = [names[begin : begin + _COLUMNS] for begin in range(0, len(names), _COLUMNS)]
-    return [_compact(evaluations), *(_details({name: evaluations[name] for name in chunk}) for chunk in chunks)]
+    of_motors = [_motors(name, evaluations[name]) for name in names if evaluations[name].motors]
+    whole = [_details({name: evaluations[name] for name in chunk}) for chunk in chunks]
+    return [_compact(evaluations), *of_motors, *whole]
 
 
 _TELLING: dict[str, tuple[str, Callable[[Any], str]]] = {
@@ -61,6 +63,33 @@ def _compact(evaluations: Mapping[str, Evaluation]) -> Table:
         values = {name: getattr(evaluation, name) for name in shown}
         texts = [_NOTHING if value is None else shown[name](value) for name, value in values.items()]
         table.add_row(*map(escape, (title, *texts)))
+    return table
+
+
+_OF_MOTORS = {
+    # measure: its column's header
+    "tracking_rms": "torque\nerror [N·m]",
+    "tracking_percent": "of desired\n[%]",
+    "saturated_percent": "saturated\n[%]",
+    "rms_current": "current,\nrms [A]",
+    "peak_current": "peak\n[A]",
+    "peak_speed": "speed,\npeak [rad/s]",
+    "peak_temperature": "hottest\n[°C]",
+    "copper_loss": "heat\n[J]",
+    "energy_drawn": "drawn\n[J]",
+    "mechanical_work": "work\n[J]",
+}
+
+
+def _motors(title: str, evaluation: Evaluation) -> Table:
+    """A row for each of several motors; measures that none of them has are left out."""
+    shown = [name for name in _OF_MOTORS if any(one.get(name) is not None for one in evaluation.motors.values())]
+    table = _table(f"motors of {title}: energies of an episode")
+    table.add_column("motor", overflow="fold")
+    for name in shown:
+        table.add_column(_OF_MOTORS[name], justify="right", no_wrap=True)
+    for motor, measures in evaluation.motors.items():
+        table.add_row(*map(escape, (motor, *(_text(measures[name]) for name in shown))))
     return table
 
 

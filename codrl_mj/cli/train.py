@@ -13,13 +13,16 @@ from codrl_mj.agents.presets import SETTINGS
 from codrl_mj.cli.fields import (
     AS_CONFIGURED,
     ActuatorName,
+    default_actuator,
     environment,
     environment_fields,
     flags,
     scan,
+    through,
 )
+from codrl_mj.foreign.config import environment_from
 from codrl_mj.runs.layout import finished
-from codrl_mj.tasks import TASKS, find_task
+from codrl_mj.tasks import TASKS
 from codrl_mj.training.config import TrainConfig, default_agent, read_config
 from codrl_mj.training.folder import load_config
 
@@ -72,7 +75,7 @@ def train_verb(arguments: list[str]) -> Any:
             ],
             chosen.settings if chosen.settings in SETTINGS else "default",
         ),
-        ("actuator_name", ActuatorName, AS_CONFIGURED if configured else find_task(base.task).default_actuator),
+        ("actuator_name", ActuatorName, AS_CONFIGURED if configured else default_actuator(base.task)),
         *((field.name, field.type, field.default) for field in dataclasses.fields(rest)),
         ("agent", Annotated[agent_flags, tyro.conf.arg(help="The agent's settings.")], agent_flags()),
         *environment_fields(base.env, chosen.actuator, base.task),
@@ -91,7 +94,8 @@ class Train:
     policy (safetensors and JSON), an evaluation and the learning curve. Ctrl-C writes a checkpoint and stops.
 
     Example: codrl-mj train cartpole --actuator weaker --env.center-radius 0.1 --out runs/through-weaker, and after an
-    interruption codrl-mj train --resume runs/through-weaker
+    interruption codrl-mj train --resume runs/through-weaker. Environments of others go by their Gymnasium ids:
+    codrl-mj train HalfCheetah-v5 --actuators 'b.*=maxon-ec45-flat-50w' 'f.*=lag'
     """
 
     config: Path | None = None
@@ -117,13 +121,13 @@ class Train:
         from codrl_mj.cli.terminal import training_bars
         from codrl_mj.training import train
 
-        if find_task(self.task) is not find_task(self.base.task) and self.resume is None:
+        if _task(self.task) != _task(self.base.task) and self.resume is None:
             raise ValueError(f"name the task before the flags, as in codrl-mj train {self.task} --seed 1")
         if self.resume is not None and self.out not in (None, self.resume):
             raise ValueError(f"--out {self.out}: a run continues in its own folder, {self.resume}: leave --out out")
         config = dataclasses.replace(
             self.base,
-            env=environment(self, self.task, self.actuator_name, self.base.actuator),
+            env=environment(self, self.base.task, self.actuator_name, self.base.env),
             agent=type(self.base.agent)(**vars(self.agent)),
             **{
                 field.name: getattr(self, field.name)
@@ -134,7 +138,7 @@ class Train:
         if self.resume is not None and finished(self.resume) and config == load_config(self.resume, self.trust):
             print(f"{self.resume} is finished already; next: codrl-mj evaluate {self.resume}")
             return 0
-        parts = config.task, config.agent.name, self.actuator_name, str(config.seed)
+        parts = config.task, config.agent.name, through(self.actuators, self.actuator_name), str(config.seed)
         name = "-".join(re.sub(r"[^\w.]+", "_", part) for part in parts)
         out = self.resume or self.out or Path("runs") / name
         with training_bars({f"{config.agent.name.upper()} on {config.task}": (config, out)}):
@@ -166,4 +170,9 @@ def _base(chosen: argparse.Namespace) -> TrainConfig:
     task = chosen.task or "cartpole"
     agent = chosen.agent if chosen.agent in AGENTS or ":" in str(chosen.agent) else default_agent(task)
     settings = chosen.settings if chosen.settings in SETTINGS else "default"
-    return TrainConfig.preset(task, agent, settings, find_task(task).default_actuator)
+    return TrainConfig.preset(task, agent, settings, default_actuator(task))
+
+
+def _task(name: str) -> str:
+    """A task's one name, whichever of its names is given."""
+    return environment_from({"task": name}).task

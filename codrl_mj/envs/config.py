@@ -127,11 +127,26 @@ class EnvConfig:
         return self.max_episode_steps or find_task(self.task).max_episode_steps
 
     @property
+    def action_space(self) -> "gymnasium.spaces.Space[Any]":
+        """The task's actions; commands have others of the same kind."""
+        return find_task(self.task).action_space
+
+    @property
+    def as_posed(self) -> "EnvConfig":
+        """The environment without changes of time limit and reward."""
+        return dataclasses.replace(self, max_episode_steps=None, options=None)
+
+    @property
+    def modules(self) -> set[str]:
+        """Names of the modules that decide on what it does."""
+        return {type(self.actuators[0]).__module__, find_task(self.task).reward.__module__}
+
+    @property
     def interface(self) -> dict[str, Any]:
         """The fields that say what a policy commands and observes: it can do nothing else once it is trained."""
         return {name: getattr(self, name) for name in ("action", "levels", "observe_actuator")}
 
-    def seen_as(self, trained: "EnvConfig") -> "EnvConfig":
+    def seen_as(self, trained: Any) -> "EnvConfig":
         """This environment with the actions and observations of another: those that a policy was trained with."""
         return dataclasses.replace(self, **trained.interface)
 

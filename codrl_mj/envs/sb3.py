@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.serial import SerialVectorEnv
 from codrl_mj.envs.snapshots import check_snapshot
+from codrl_mj.envs.stepped import SteppedVectorEnv
 from codrl_mj.envs.vector import ActuatedVectorEnv
 from codrl_mj.physics import Signals
 from codrl_mj.tasks import TASKS, find_task
@@ -24,7 +25,7 @@ class ActuatedVecEnv(VecEnv):
     step is in `signals`, as arrays.
     """
 
-    def __init__(self, env: ActuatedVectorEnv | SerialVectorEnv) -> None:
+    def __init__(self, env: ActuatedVectorEnv | SteppedVectorEnv) -> None:
         """Wrap a vector environment in `SAME_STEP` mode."""
         self.env = env
         self._actions: np.ndarray | None = None
@@ -46,6 +47,11 @@ class ActuatedVecEnv(VecEnv):
     def signals(self) -> Signals | None:
         """The actuators' signals of the last step, each an array of shape (N,); None before the first."""
         return self.env.signals
+
+    @property
+    def arm_radii(self) -> np.ndarray:
+        """Of the motors of an environment [m], or 1 where a joint is driven directly; shape (motors,)."""
+        return self.env.arm_radii
 
     @property
     def randomization(self) -> dict[str, np.ndarray]:
@@ -115,18 +121,24 @@ class ActuatedVecEnv(VecEnv):
         """
         return self.env.snapshot() | self._records()
 
-    def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
+    def restore(self, snapshot: Mapping[str, np.ndarray]) -> np.ndarray | None:
         """Continue from what `snapshot` returned, bit for bit, in environments made with the same arguments.
+
+        Returns:
+            None; or the first observations (N, k), where the environments could only start an episode anew.
 
         Raises:
             ValueError: the snapshot is of another number of environments, another task or other arguments.
         """
         own = self._records()
         check_snapshot(snapshot, self.env.snapshot() | own)
-        self.env.restore({name: values for name, values in snapshot.items() if name not in own})
+        begun = self.env.restore({name: values for name, values in snapshot.items() if name not in own})
         self._returns[:], self._lengths[:] = snapshot["returns"], snapshot["lengths"]
         self._seeds = [None if seed < 0 else seed for seed in snapshot["seeds"].tolist()]
         self._actions = None
+        if begun is not None:
+            self._returns[:], self._lengths[:] = 0.0, 0
+        return begun
 
     def _records(self) -> dict[str, np.ndarray]:
         seeds = np.array([-1 if seed is None else seed for seed in self._seeds], dtype=np.int64)
@@ -160,7 +172,7 @@ class ActuatedVecEnv(VecEnv):
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise ValueError(f"set_attr({attr_name!r}): the environments share it; it can only be set for all of them")
         owners: list[Any] = [self.env]
-        if isinstance(self.env, SerialVectorEnv) and not hasattr(self.env, attr_name):
+        if isinstance(self.env, SteppedVectorEnv) and not hasattr(self.env, attr_name):
             owners = [one.unwrapped for one in self.env.envs]
         for owner in owners:
             setattr(owner, attr_name, value)

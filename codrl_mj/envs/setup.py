@@ -81,6 +81,11 @@ class Setup:
         )
 
     @property
+    def arm_radii(self) -> np.ndarray:
+        """Of the motors, shape (motors,)."""
+        return np.array([one.arm_radius for one in self.actuators])
+
+    @property
     def actuator(self) -> Any:
         """The actuator; with several motors a tuple of them."""
         return alone(self.actuators)

@@ -11,11 +11,12 @@ from codrl_mj.actuators import IDEAL
 from codrl_mj.envs.attributes import GymnasiumAttributes, checked_states, read, written
 from codrl_mj.envs.compiled import arguments, compiled_kernels
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.envs.recording import PhysicsRecorder
 from codrl_mj.envs.setup import Setup
 from codrl_mj.envs.snapshots import check_snapshot
 from codrl_mj.envs.views import signals_of
 from codrl_mj.envs.window import Window
-from codrl_mj.physics import MujocoPhysics
+from codrl_mj.physics import MujocoPhysics, signal_names
 from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
 from codrl_mj.physics.streams import set_words, words_of
 from codrl_mj.tasks import Task
@@ -119,6 +120,16 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     @state.setter
     def state(self, state: Any) -> None:
         self.physics.state = checked_states(state, self.physics.state.shape)
+
+    @property
+    def recorder(self) -> PhysicsRecorder:
+        """Reads the environment between its steps."""
+        return PhysicsRecorder(self)
+
+    @property
+    def signal_names(self) -> tuple[str, ...]:
+        """Of the actuators' signals in `info`."""
+        return signal_names(self.setup.family)
 
     def _engine(self) -> tuple[Any, Any]:
         if self.physics.scene is None:

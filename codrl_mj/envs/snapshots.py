@@ -1,8 +1,20 @@
-"""Whether a snapshot fits the environment that is to continue from it."""
+"""What snapshots of environments have in common: whether one fits, and the time limits that they have to remember."""
 
 from collections.abc import Mapping
+from typing import Any
 
+import gymnasium
 import numpy as np
+
+
+def time_limits(env: "gymnasium.Env[Any, Any]") -> list[Any]:
+    """The time limits among an environment's wrappers, from the outermost; it may be one itself."""
+    limits = []
+    while isinstance(env, gymnasium.Wrapper):
+        if "_elapsed_steps" in vars(env):  # TimeLimit, or what rl-zoo3 puts in its place
+            limits.append(env)
+        env = env.env
+    return limits
 
 
 def check_snapshot(snapshot: Mapping[str, np.ndarray], expected: Mapping[str, np.ndarray]) -> None:

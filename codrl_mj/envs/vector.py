@@ -133,6 +133,11 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         self._offer_attributes(self.task)
 
     @property
+    def arm_radii(self) -> Array:
+        """Of the motors of an environment, shape (motors,)."""
+        return self.setup.arm_radii
+
+    @property
     def task(self) -> Task:
         """The task."""
         return self.setup.task

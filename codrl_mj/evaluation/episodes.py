@@ -14,8 +14,8 @@ import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.actuators import IDEAL, Actuator, actuator_from_mapping, mapping_of, trusting
-from codrl_mj.envs.single import ActuatedEnv
-from codrl_mj.physics import signal_names, trace_names
+from codrl_mj.envs.recording import PhysicsRecorder, Recorder
+from codrl_mj.physics import signal_names
 from codrl_mj.runs.files import writing
 from codrl_mj.runs.policies import Policy
 from codrl_mj.tasks import find_task
@@ -48,6 +48,13 @@ class Episode:
     """What it ran on: the one that was drawn for it, if actuators were; with several motors a tuple of them."""
     command: str = "force"
     """What the agent commanded: `force`, `current` or `voltage`."""
+    motors: tuple[str, ...] = ()
+    """Names of several motors."""
+    first_speeds: np.ndarray | None = None
+    """In environments of others: velocities at the motors' side of the model's gears before the first step [m/s or
+    rad/s], shape (motors,)."""
+    succeeded: bool | None = None
+    """What an environment of others said of it in the end (`is_success` or `success` in its info), if anything."""
 
     @property
     def total(self) -> float:
@@ -114,6 +121,12 @@ def save_episode(episode: Episode, path: Path) -> None:
     arrays: dict[str, Any] = {field: getattr(episode, field) for field in (*_ARRAYS, "terminated", "command")}
     for field in ("trace", "signals"):
         arrays |= {f"{field}/{name}": values for name, values in getattr(episode, field).items()}
+    if episode.first_speeds is not None:
+        arrays["first_speeds"] = episode.first_speeds
+    if episode.motors:
+        arrays["motors"] = episode.motors
+    if episode.succeeded is not None:
+        arrays["succeeded"] = episode.succeeded
     several = isinstance(episode.actuator, tuple)
     described = [mapping_of(one) for one in episode.actuator] if several else mapping_of(episode.actuator)
     with writing(path) as temporary:
@@ -150,6 +163,9 @@ def load_episode(path: Path, trust: bool = False) -> Episode:
             terminated=bool(arrays["terminated"]),
             actuator=tuple(actuators) if several else actuators[0],
             command=str(arrays["command"]),
+            motors=tuple(arrays["motors"].tolist()) if "motors" in arrays else (),
+            first_speeds=arrays.get("first_speeds"),
+            succeeded=bool(arrays["succeeded"]) if "succeeded" in arrays else None,
         )
     except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path} is not the trajectory of an episode: {error}") from None
@@ -165,9 +181,10 @@ class _Recording:
     def __init__(self, env: gymnasium.Env[Any, Any], seed: int) -> None:
         """Reset the environment."""
         self.env = env
-        self._core: ActuatedEnv = env.unwrapped  # type: ignore[assignment]
+        self._recorder: Recorder = env.get_wrapper_attr("recorder")
         self.observations = [env.reset(seed=seed)[0]]
-        self._states = [self._core.physics.state]
+        self._states = [self._recorder.state()]
+        self._first_speeds = self._recorder.speeds()
         self._actions: list[Any] = []
         self._rewards: list[float] = []
         self._traces: list[np.ndarray] = []
@@ -178,34 +195,37 @@ class _Recording:
         """Take a step, and say whether the episode has ended."""
         observation, reward, self._terminated, truncated, info = self.env.step(action)
         self.observations.append(observation)
-        self._states.append(self._core.physics.state)
+        self._states.append(self._recorder.state())
         self._actions.append(action)
         self._rewards.append(float(reward))
-        self._traces.append(self._core.physics.trace.copy())
+        self._traces.append(self._recorder.trace())
         self._signals.append(info)
         return self._terminated or truncated
 
     def episode(self) -> Episode:
         """What has happened."""
+        recorder, of_others = self._recorder, not isinstance(self._recorder, PhysicsRecorder)
+        said = self._signals[-1].get("is_success", self._signals[-1].get("success"))
         return Episode(
-            time=self._core.task.step_duration * np.arange(1, len(self._rewards) + 1),
+            time=recorder.step_duration * np.arange(1, len(self._rewards) + 1),
             state=np.array(self._states),
             observation=np.array(self.observations),
             action=np.array(self._actions),
             reward=np.array(self._rewards),
             trace=self._trace(),
-            signals={
-                name: np.array([info[name] for info in self._signals]) for name in signal_names(self._core.setup.family)
-            },
+            signals={name: np.array([info[name] for info in self._signals]) for name in recorder.signal_names},
             terminated=self._terminated,
-            actuator=self._core.actuator,
-            command=self._core.setup.commands.name,
+            actuator=recorder.actuator,
+            command=recorder.command,
+            motors=recorder.motors if len(recorder.motors) > 1 else (),
+            first_speeds=self._first_speeds if of_others else None,
+            succeeded=bool(said) if of_others and said is not None else None,
         )
 
     def _trace(self) -> dict[str, np.ndarray]:
         whole = np.concatenate(self._traces)
         columns = whole[:, 0].T if whole.shape[1] == 1 else np.moveaxis(whole, 2, 0)
-        return dict(zip(trace_names(self._core.setup.family), columns.copy(), strict=True))
+        return dict(zip(self._recorder.trace_names, columns.copy(), strict=True))
 
 
 @contextlib.contextmanager

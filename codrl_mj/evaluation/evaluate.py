@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, Ideal
-from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.evaluation.measures import (
     Interval,
@@ -53,9 +52,10 @@ class Evaluation:
     """Mean return of the episodes without the best and the worst quarter."""
     length: Interval = _measure("length", "steps")
     """Environment steps per episode."""
-    success: Interval = _measure("success", "share")
-    """Share of episodes that succeed, as the task defines it; Wilson's interval."""
-    failure: Interval = _measure("failure", "share")
+    success: Interval | None = _measure("success", "share")
+    """Share of episodes that succeed, as the task defines it, or as an environment of others says in its `info`; None
+    where it says nothing. Wilson's interval."""
+    failure: Interval | None = _measure("failure", "share")
     """Share of episodes that do not."""
     time_to_goal: Quartiles | None = _measure("time to goal, median", "s")
     """Time from which the goal was held until the end, in successful episodes; None if there are none, or if the goal
@@ -79,6 +79,8 @@ class Evaluation:
     """Root mean square of the current, which heats the winding."""
     peak_speed: float | None = _measure("speed, peak", "rad/s")
     """Largest absolute speed of the motor's shaft."""
+    peak_temperature: float | None = _measure("winding, hottest", "degC")
+    """Highest temperature of the winding; None where the motor has none."""
     energy_drawn: Interval | None = _measure("energy drawn", "J")
     """Electrical energy drawn from the supply in an episode."""
     energy_returned: Interval | None = _measure("energy returned", "J")
@@ -93,6 +95,8 @@ class Evaluation:
     """Return of each episode, in the order of their seeds."""
     episode_times_to_goal: tuple[float | None, ...] = ()
     """Time to the goal of each episode [s]; None where it did not succeed, 0 where the goal is to last."""
+    motors: Mapping[str, Mapping[str, float | None]] = dataclasses.field(default_factory=dict)
+    """Of several motors, what each of them did: name -> measure -> value, of energies the mean of an episode."""
     conditions: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """What it was measured under: environment, seed and so on, as JSON-serialisable values."""
 
@@ -121,7 +125,7 @@ MEASURES: dict[str, dataclasses.Field[Any]] = {
 
 def evaluate(
     policy: Policy,
-    env: EnvConfig,
+    env: Any,
     episodes: int = 100,
     seed: int = 0,
     deterministic: bool = True,
@@ -131,7 +135,8 @@ def evaluate(
 
     Args:
         policy: chooses actions.
-        env: task, actuator and all else; what it randomises is drawn for every episode.
+        env: an `EnvConfig` or a `ForeignConfig`: task, actuator and all else; what it randomises is drawn for every
+            episode.
         episodes: their number, >= 1.
         seed: of the first episode, the others counting up from it; and of the actions that are sampled.
         deterministic: whether the policy takes its most likely action or samples.
@@ -150,20 +155,22 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
     """Reduce episodes to an `Evaluation`.
 
     Args:
-        task: the task's name.
+        task: the task's name, or the id of an environment of others.
         episodes: at least one, all of them with the same integration step.
 
     Raises:
         ValueError: unknown task.
     """
-    definition = find_task(task)
+    definition = find_task(task) if episodes[0].first_speeds is None else None
     returns = np.array([episode.total for episode in episodes])
     goals = [_time_to_goal(definition, episode) for episode in episodes]
     reached = np.array([time for time in goals if time is not None])
-    success = wilson_rate(len(reached), len(episodes))
+    success = None
+    if definition is not None or episodes[0].succeeded is not None:
+        success = wilson_rate(len(reached), len(episodes))
     driven = [_driven(definition, episode) for episode in episodes]
     return Evaluation(
-        task=definition.name,
+        task=task if definition is None else definition.name,
         episodes=len(episodes),
         terminated=sum(episode.terminated for episode in episodes),
         returns=bootstrap_mean(returns),
@@ -171,14 +178,26 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
         returns_interquartile_mean=interquartile_mean(returns),
         length=_mean_of(episodes, lambda episode: len(episode.reward)),
         success=success,
-        failure=Interval(1 - success.mean, 1 - success.high, 1 - success.low),
-        time_to_goal=quartiles(reached) if definition.goal is not None and len(reached) else None,
+        failure=None if success is None else Interval(1 - success.mean, 1 - success.high, 1 - success.low),
+        time_to_goal=quartiles(reached) if definition is not None and definition.goal and len(reached) else None,
         mechanical_work=bootstrap_mean(np.array([sum(one.work for one in each) for each in driven])),
         episode_returns=tuple(returns.tolist()),
-        episode_times_to_goal=tuple(goals),
+        episode_times_to_goal=() if success is None else tuple(goals),
+        motors={
+            name: _of_motor(episodes, [[each[number]] for each in driven])
+            for number, name in enumerate(episodes[0].motors)
+        },
         **_tracking(episodes, driven),
         **_electrical(episodes, driven),
     )
+
+
+def _of_motor(episodes: Sequence[Episode], driven: Sequence[Sequence["_Driven"]]) -> dict[str, float | None]:
+    """What one of several motors did: measures by their names, of energies the mean."""
+    measures = _tracking(episodes, driven) | _electrical(episodes, driven)
+    work = float(np.mean([one.work for each in driven for one in each]))
+    means = {name: value.mean if isinstance(value, Interval) else value for name, value in measures.items()}
+    return means | {"mechanical_work": work}
 
 
 def _mean_of(episodes: Sequence[Episode], value: Callable[[Episode], float]) -> Interval:
@@ -186,8 +205,10 @@ def _mean_of(episodes: Sequence[Episode], value: Callable[[Episode], float]) -> 
     return bootstrap_mean(np.array([value(episode) for episode in episodes], dtype=float))
 
 
-def _time_to_goal(task: Task, episode: Episode) -> float | None:
+def _time_to_goal(task: Task | None, episode: Episode) -> float | None:
     """Time from which an episode that succeeded was at the goal [s]; None if it did not succeed."""
+    if task is None:
+        return 0.0 if episode.succeeded else None
     if task.goal is None:
         return None if episode.terminated else 0.0
     since = holds_since(task.goal(episode.state.T)) * task.step_duration
@@ -219,28 +240,37 @@ class _Driven:
         return mechanical_work(self.force, self.speed, self.timestep)
 
     @property
+    def wound(self) -> bool:
+        """Whether it has a winding whose current and voltage are known."""
+        return {"current", "voltage"} <= self.signals.keys() and self.actuator.winding is not None
+
+    @property
     def current(self) -> np.ndarray:
         """Before the first step, which begins with none, and after each [A]."""
         return np.append(0.0, self.signals["current"])
 
 
-def _driven(task: Task, episode: Episode) -> list[_Driven]:
+def _driven(task: Task | None, episode: Episode) -> list[_Driven]:
     """What each motor did."""
     several = isinstance(episode.actuator, tuple)
+    first = episode.first_speeds if task is None else episode.state[0, list(task.speeds)]
+    assert first is not None
     made = []
     for number, actuator in enumerate(episode.actuator if several else (episode.actuator,)):
         own = {name: values[:, number] if several else values for name, values in episode.trace.items()}
         asked = episode.signals["desired_force"][:, number] if several else episode.signals["desired_force"]
         arm, force, speed = actuator.arm_radius, own.pop("actual_force"), own.pop("speed")
+        known: Any = actuator
+        shown = {name: own[name] for name in known.Signals._fields if name in own}  # others are of other families
         made.append(
             _Driven(
                 actuator,
                 episode.timestep,
                 arm * np.repeat(asked, episode.inner_steps),
                 arm * force,
-                np.append(episode.state[0, task.speeds[number]], speed),
+                np.append(first[number], speed),
                 force,
-                own,
+                shown,
             )
         )
     return made
@@ -277,17 +307,23 @@ def _electrical(episodes: Sequence[Episode], driven: Sequence[Sequence[_Driven]]
     """What was asked of the actuators: of any but the ideal one, and of windings, as far as the family shows it."""
     names = ("saturated_percent", "peak_voltage", "peak_current", "rms_current", "peak_speed", "energy_drawn")
     found: dict[str, Any] = dict.fromkeys((*names, "energy_returned", "copper_loss", "magnetic_energy"))
-    every = [one for each in driven for one in each]
-    if isinstance(every[0].actuator, Ideal):
+    found["peak_temperature"] = None
+    every = [one for each in driven for one in each if not isinstance(one.actuator, Ideal)]
+    if not every:
         return found
     found["peak_speed"] = max(float(np.abs(one.speed).max()) / one.actuator.arm_radius for one in every)
-    if "saturated" in every[0].signals:
-        found["saturated_percent"] = float(100 * np.concatenate([one.signals["saturated"] for one in every]).mean())
-    if not {"current", "voltage"} <= every[0].signals.keys() or every[0].actuator.winding is None:
+    if limited := [one.signals["saturated"] for one in every if "saturated" in one.signals]:
+        found["saturated_percent"] = float(100 * np.concatenate(limited).mean())
+    warmed = [one.signals["temperature"] for one in every if "temperature" in one.signals]
+    if warmed and any(np.ptp(values) > 0.0 for values in warmed):  # constant where nothing is known of it
+        found["peak_temperature"] = float(np.concatenate(warmed).max())
+    wound = [[one for one in each if one.wound] for each in driven]
+    every = [one for each in wound for one in each]
+    if not every:
         return found
-    energies = [[_energies(one) for one in each] for each in driven]
+    energies = [[_energies(one) for one in each] for each in wound]
     drawn, returned, copper, magnetic, squares = np.array([np.sum(each, axis=0) for each in energies]).T
-    duration = math.fsum(episode.time[-1] for episode in episodes) * len(driven[0])
+    duration = math.fsum(episode.time[-1] for episode in episodes) * len(wound[0])
     return found | {
         "peak_voltage": float(np.abs(np.concatenate([one.signals["voltage"] for one in every])).max()),
         "peak_current": float(np.abs(np.concatenate([one.signals["current"] for one in every])).max()),

@@ -1,6 +1,7 @@
 """Films of episodes: the scene, and under it a strip of desired and actual torque and the voltage.
 
-Episodes are recorded first and drawn afterwards from their states, so that drawing never disturbs a simulation.
+Episodes of tasks are recorded first and drawn afterwards from their states, so that drawing never disturbs a
+simulation; an environment of somebody else's draws itself while it runs.
 """
 
 import contextlib
@@ -10,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 
 from codrl_mj.envs.single import ActuatedEnv
@@ -40,6 +42,11 @@ class Panel:
     """The episode."""
     motor: int = 0
     """Which of several motors the strip shows."""
+    frames: Sequence[np.ndarray] | None = None
+    """Of an environment of somebody else's: the scene before the first step and after each, each (height, width, 3),
+    uint8, as `Filmed` keeps them; None: the task's own."""
+    rate: float = 0.0
+    """Of these: images a second."""
 
 
 def film(
@@ -133,9 +140,12 @@ class _DrawnPanel:
 
     def __init__(self, panel: Panel, width: int, height: int, camera: str, pretty: bool, end: float) -> None:
         self._panel = panel
-        self._env = ActuatedEnv(panel.task, "ideal")
-        self.rate = self._env.metadata["render_fps"]
-        self._renderer = OffscreenRenderer(self._env.model, width, height, camera, pretty)
+        self._scene: Any
+        if panel.frames is None:
+            self._scene = _TaskScene(panel, width, height, camera, pretty)
+        else:
+            self._scene = _FilmedScene(panel.frames, panel.rate, width, height)
+        self.rate = self._scene.rate
         self._title = draw_text(panel.title, width, _TITLE_HEIGHT)
         self._window = min(end, _WINDOW_STEPS * float(panel.episode.time[0]))
         self._scale = pixels_per_second(width, self._window)
@@ -148,8 +158,7 @@ class _DrawnPanel:
     def frame(self, instant: int) -> np.ndarray:
         """The panel after `instant` steps, shape (height, width, 3), uint8."""
         episode, now = self._panel.episode, min(instant, self._last)
-        self._env.physics.show(episode.state[now])  # type: ignore[attr-defined]
-        scene = self._renderer.render(self._env.data).copy()
+        scene = self._scene.image(now)
         if now == self._last:
             scene[-_TITLE_HEIGHT:] = self._over
             if episode.terminated:
@@ -167,4 +176,70 @@ class _DrawnPanel:
 
     def close(self) -> None:
         """Free the OpenGL context."""
+        self._scene.close()
+
+
+class _TaskScene:
+    """A task's scene, drawn from the episode's states."""
+
+    def __init__(self, panel: Panel, width: int, height: int, camera: str, pretty: bool) -> None:
+        self._env, self._states = ActuatedEnv(panel.task, "ideal"), panel.episode.state
+        self.rate = self._env.metadata["render_fps"]
+        self._renderer = OffscreenRenderer(self._env.model, width, height, camera, pretty)
+
+    def image(self, instant: int) -> np.ndarray:
+        self._env.physics.show(self._states[instant])  # type: ignore[attr-defined]
+        return self._renderer.render(self._env.data).copy()
+
+    def close(self) -> None:
         self._renderer.close()
+
+
+class _FilmedScene:
+    """Images that were taken while the episode ran, brought to size."""
+
+    def __init__(self, frames: Sequence[np.ndarray], rate: float, width: int, height: int) -> None:
+        self._frames, self._size, self.rate = frames, (width, height), rate
+
+    def image(self, instant: int) -> np.ndarray:
+        from PIL import Image
+
+        frame = Image.fromarray(self._frames[instant])
+        return np.array(frame if frame.size == self._size else frame.resize(self._size))
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Keeps an image of every instant of an episode: `frames`."""
+
+    def __init__(self, env: "gymnasium.Env[Any, Any]", pretty: bool = False) -> None:
+        """Film an environment.
+
+        Args:
+            env: with `render_mode="rgb_array"`.
+            pretty: shadows and multisampling, where its model has them; on a CPU they cost ten times the rest.
+
+        Raises:
+            ValueError: it draws no images.
+        """
+        if env.render_mode != "rgb_array":
+            raise ValueError(f"render_mode = {env.render_mode!r}: must be 'rgb_array' for a film")
+        super().__init__(env)
+        if not pretty and hasattr(env.unwrapped, "model"):
+            quality = env.unwrapped.model.vis.quality
+            quality.shadowsize = quality.offsamples = 0
+        self.frames: list[np.ndarray] = []
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        """Start an episode, and its film."""
+        result = self.env.reset(**options)
+        self.frames = [self.env.render()]  # type: ignore[list-item]
+        return result
+
+    def step(self, action: Any) -> Any:
+        """Advance by one environment step."""
+        result = self.env.step(action)
+        self.frames.append(self.env.render())  # type: ignore[arg-type]
+        return result

@@ -1,5 +1,6 @@
 """Gymnasium's environments with motors: `make`."""
 
+import contextlib
 import copy
 import dataclasses
 import functools
@@ -13,17 +14,17 @@ from gymnasium import spaces
 from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.envs.registration import load_env_creator
 from gymnasium.utils import RecordConstructorArgs, seeding
-from gymnasium.wrappers import TimeLimit
 
 from codrl_mj.actuators import ActuatorModel, Command
 from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.disturbances import OFF, resolve_disturbances
 from codrl_mj.engine.reading import Readout, bring_to_rest, check_shafts, motors, slots
-from codrl_mj.envs.snapshots import check_snapshot
+from codrl_mj.envs.snapshots import check_snapshot, time_limits
 from codrl_mj.foreign.building import Building
 from codrl_mj.foreign.commands import Commands, CommandsWay, command_of
 from codrl_mj.foreign.draws import Draws, Exchange
 from codrl_mj.foreign.readings import Sensors, readings
+from codrl_mj.foreign.recording import MotorsRecorder
 from codrl_mj.foreign.state import set_state_of, state_of
 from codrl_mj.physics.streams import set_words, words_of
 from codrl_mj.specs import matched_by, names_of, resolve_patterns
@@ -214,6 +215,7 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
             ValueError: see `make`.
         """
         self._model, self._data = self.unwrapped.model, self.unwrapped.data  # type: ignore[attr-defined]
+        self._recorder: MotorsRecorder | None = None
         self._readout = Readout(self._model)
         self._slots = list(slots(self._data, self._readout.motors).values())
         names = names_of(self._model)
@@ -262,6 +264,18 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         return dict(self._motors)
 
     @property
+    def signal_names(self) -> tuple[str, ...]:
+        """Of the motors' signals in `info`."""
+        return tuple(readings(self._readout, self._data))
+
+    @property
+    def recorder(self) -> MotorsRecorder:
+        """Reads the environment between its steps; from now on every integration step is looked at."""
+        if self._recorder is None:
+            self._recorder = MotorsRecorder(self._data, self._readout, self._motorised.action, lambda: self._motors)
+        return self._recorder
+
+    @property
     def sensor_names(self) -> tuple[str, ...]:
         """Names of what `observe_actuator` appends to the observation."""
         return () if self._sensors is None else self._sensors.names
@@ -292,7 +306,8 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
             action = self._commands.controls(action)
         if self._way is not None:
             action = self._way.controls(action)
-        observation, reward, terminated, truncated, info = self.env.step(action)
+        with contextlib.nullcontext() if self._recorder is None else self._recorder.watching():
+            observation, reward, terminated, truncated, info = self.env.step(action)
         return self._observed(observation), reward, terminated, truncated, info | readings(self._readout, self._data)
 
     def _observed(self, observation: Any) -> Any:
@@ -314,22 +329,15 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         """Everything that the future depends on, as plain arrays: simulation, motors, generators, draws, time limit.
 
         That is MuJoCo's state and what was computed from it, which observations and rewards read; not what an
-        environment keeps in attributes of its own, nor what wrappers count besides `TimeLimit`.
-
-        Raises:
-            ValueError: the environment is no `MujocoEnv` of Gymnasium's.
+        environment keeps in attributes of its own, nor what wrappers count besides `TimeLimit`. Of environments that
+        are no `MujocoEnv` of Gymnasium's nobody knows where their state is: the snapshot has the generators, and
+        `restore` starts an episode.
         """
-        env = self.unwrapped
-        if not isinstance(env, MujocoEnv):
-            raise ValueError(
-                f"{type(env).__name__}: only Gymnasium's MujocoEnv and its descendants have snapshots, of others it is "
-                "not known where their state is"
-            )
-        elapsed = [-1 if limit._elapsed_steps is None else limit._elapsed_steps for limit in self._limits()]
+        elapsed = [-1 if limit._elapsed_steps is None else limit._elapsed_steps for limit in time_limits(self.env)]
         found = {
             "environment": np.frombuffer(self._motorised_id.encode(), dtype=np.uint8).copy(),
-            **state_of(self._data),
-            "generator": words_of(env.np_random),
+            **(state_of(self._data) if self._whole else {}),
+            "generator": words_of(self.unwrapped.np_random),
             "motors_generator": words_of(self._generator),
             "elapsed_steps": np.array(elapsed, dtype=np.int64),
         }
@@ -339,8 +347,11 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
             found["drawn"] = np.full(self._draws.size, np.nan) if self._values is None else self._values.copy()
         return found
 
-    def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
+    def restore(self, snapshot: Mapping[str, np.ndarray]) -> Any:
         """Continue from what `snapshot` returned, bit for bit, in an environment made with the same arguments.
+
+        Returns:
+            None; or the first observation of the episode that was started, where the state is not in the snapshot.
 
         Raises:
             ValueError: the snapshot is of another environment, or of arguments that need other entries or shapes;
@@ -360,29 +371,28 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
             self._values = None if np.isnan(values).any() else values
             nominal = self._motorised.simulated
             self._put(nominal if self._values is None else self._draws.actuators(values))
-        set_state_of(self._data, snapshot["state"], snapshot["computed"])
-        if self._way is not None:
-            self._way.memory[:] = snapshot["disturbances"]
         generator, _ = seeding.np_random(0)
         set_words(generator, snapshot["generator"])
         self.unwrapped.np_random = generator
         self._generator, _ = seeding.np_random(0)
         set_words(self._generator, snapshot["motors_generator"])
-        for limit, steps in zip(self._limits(), snapshot["elapsed_steps"].tolist(), strict=True):
+        if not self._whole:
+            return self.reset()[0]
+        set_state_of(self._data, snapshot["state"], snapshot["computed"])
+        if self._way is not None:
+            self._way.memory[:] = snapshot["disturbances"]
+        for limit, steps in zip(time_limits(self.env), snapshot["elapsed_steps"].tolist(), strict=True):
             limit._elapsed_steps = None if steps < 0 else steps
+        return None
 
     @property
     def _motorised_id(self) -> str:
         return "" if self.env.spec is None else self.env.spec.id
 
-    def _limits(self) -> list[TimeLimit]:
-        """The time limits inside this wrapper."""
-        limits, env = [], self.env
-        while isinstance(env, gymnasium.Wrapper):
-            if isinstance(env, TimeLimit):
-                limits.append(env)
-            env = env.env
-        return limits
+    @property
+    def _whole(self) -> bool:
+        """Whether all of the environment's state is known."""
+        return isinstance(self.unwrapped, MujocoEnv)
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but what belongs to the model, which a copied environment makes again."""
@@ -394,7 +404,9 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         self._bind()
 
 
-_OF_THE_MODEL = ("_model", "_data", "_readout", "_exchange", "_commands", "_way", "_sensors", "_motors", "_slots")
+_OF_THE_MODEL = (
+    *("_model", "_data", "_readout", "_exchange", "_commands", "_way", "_sensors", "_motors", "_slots", "_recorder"),
+)
 
 
 def _longer(space: gymnasium.Space, count: int) -> spaces.Box:

@@ -131,7 +131,7 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
         problem="; ".join(problems) or None,
         task=task,
         agent=str(agent["name"]) if isinstance(agent, Mapping) and "name" in agent else None,
-        actuator=_actuator_name(env["actuator"], task) if "actuator" in env else None,
+        actuator=_actuator_of(env, task),
         seed=_whole(config.get("seed")),
         steps=_whole(steps),
         total_steps=_whole(config.get("total_steps")),
@@ -210,6 +210,13 @@ def _first(one: Mapping[str, Any] | None, other: Mapping[str, Any] | None, name:
     """The first of two sources' numbers of that name; None if neither has one."""
     numbers = [_number((source or {}).get(name)) for source in (one, other)]
     return next((number for number in numbers if number is not None), None)
+
+
+def _actuator_of(env: Mapping[str, Any], task: Any) -> str | None:
+    """The name of an environment's actuator; in environments of others those of all patterns."""
+    if isinstance(patterns := env.get("actuators"), Mapping):
+        return ", ".join(dict.fromkeys(_actuator_name(one, task) for one in patterns.values()))
+    return _actuator_name(env["actuator"], task) if "actuator" in env else None
 
 
 def _actuator_name(actuator: Any, task: Any) -> str:

@@ -2,13 +2,14 @@
 
 from codrl_mj.sizing.bounds import SURELY, SURELY_NOT, TRY_IT, Bound, Feasibility, feasibility
 from codrl_mj.sizing.choice import Catalogued, Choice, catalogued, choose
-from codrl_mj.sizing.demand import Demand, demand_of, recorded
+from codrl_mj.sizing.demand import Demand, demand_of, demands_of, recorded
 from codrl_mj.sizing.operation import Operation, best_ratio, operation
 from codrl_mj.sizing.swing import Swing, least_gain, least_pumped, least_voltage
 
 __all__ = [
     "Demand",
     "demand_of",
+    "demands_of",
     "recorded",
     "Bound",
     "Feasibility",

@@ -57,6 +57,11 @@ class Choice(NamedTuple):
     lacks: str
     """Why it is not to be taken; empty where it is."""
 
+    def behind(self, gear: float) -> Drive:
+        """The drive for an actuator of a model with a gear of its own, which the arm undoes: `Demand.model_gear`."""
+        motor = self.drive.motor
+        return dataclasses.replace(self.drive, motor=dataclasses.replace(motor, arm_radius=gear * motor.arm_radius))
+
     @property
     def power(self) -> float:
         """The most mechanical power [W] that the motor makes at its supply: its size, whatever its winding and gear."""

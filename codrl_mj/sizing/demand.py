@@ -7,9 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.actuators import Ideal
+from codrl_mj.actuators import IDEAL
+from codrl_mj.engine.reading import motors
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import Episode, run_episodes
+from codrl_mj.fields import did_you_mean
+from codrl_mj.foreign.config import ForeignConfig
 from codrl_mj.sizing.scripted import Scripted, StateObserved
 from codrl_mj.sizing.swing import Swing
 from codrl_mj.tasks import Task, find_task
@@ -44,24 +47,54 @@ class Demand:
     """Whether the joint is a slide."""
     swing: Swing | None = None
     """The pendulum, where the task is to swing one up."""
+    model_gear: float = 1.0
+    """Of the model's actuator, of somebody else's: what turns its force into the joint's torque; the motor's gear, and
+    what is asked of it, are at the joint."""
 
 
-def demand_of(what: str | Path, episodes: int = EPISODES, seed: int = 0, trust: bool = False) -> Demand:
-    """What a task, a trained run or a recording asks of an actuator.
+def demand_of(
+    what: str | Path, episodes: int = EPISODES, seed: int = 0, trust: bool = False, motor: str | None = None
+) -> Demand:
+    """What a task, a trained run or a recording asks of an actuator: `demands_of`, of one motor.
+
+    Args:
+        what: as for `demands_of`, and so are the others.
+        episodes: see there.
+        seed: see there.
+        trust: see there.
+        motor: which of several motors, by its name.
+
+    Raises:
+        ValueError: see there; or there are several motors and none of them is named, or another.
+    """
+    found = demands_of(what, episodes, seed, trust)
+    if motor is None and len(found) > 1:
+        raise ValueError(f"motor = None: {what} has {len(found)} motors: must be one of {', '.join(found)}")
+    if motor is None:
+        return next(iter(found.values()))
+    if motor not in found:
+        names = ", ".join(name for name in found if name) or "none that has a name: leave it out"
+        raise ValueError(f"motor = {motor!r}: {did_you_mean(motor, found)}there are {names}")
+    return found[motor]
+
+
+def demands_of(what: str | Path, episodes: int = EPISODES, seed: int = 0, trust: bool = False) -> dict[str, Demand]:
+    """What a task, a trained run or a recording asks of its motors, by their names; of a single one the name is empty.
 
     Args:
         what: a task's name, which a scripted controller drives; the folder of a run that was trained on the ideal
-            actuator; or an `.npz` file with the arrays `time` [s], `torque` [N*m] and `speed` [rad/s] at the joint.
+            actuator, of a task or of an environment of somebody else's; or an `.npz` file with the arrays `time` [s],
+            `torque` [N*m] and `speed` [rad/s] at the joint.
         episodes: runs to take it from.
         seed: of the first of them.
         trust: whether to import the modules of a run folder's task or agent if they are somebody's own.
 
     Raises:
-        ValueError: it is none of these; the run was trained on another actuator; the task has several motors.
+        ValueError: it is none of these; the run was trained on another actuator; there is no scripted controller.
     """
     path = Path(what)
     if path.suffix == ".npz":
-        return _read(path)
+        return {"": _read(path)}
     if path.is_dir():
         return _of_run(path, episodes, seed, trust)
     task = find_task(str(what))
@@ -108,18 +141,20 @@ def _read(path: Path) -> Demand:
         raise ValueError(f"{path}: no recording of the arrays time, torque and speed: {error}") from None
 
 
-def _of_run(path: Path, episodes: int, seed: int, trust: bool) -> Demand:
+def _of_run(path: Path, episodes: int, seed: int, trust: bool) -> dict[str, Demand]:
     from codrl_mj.runs.policies import load_policy
     from codrl_mj.training.folder import load_config
 
     env = load_config(path, trust).env
-    _alone(find_task(env.task))
-    if not isinstance(env.actuator, Ideal):
+    through = env.actuator if isinstance(env.actuator, tuple) else (env.actuator,)
+    others = [one.family for one in through if one != IDEAL]
+    if others:
         raise ValueError(
-            f"{path}: was trained on {env.actuator.family}: must be ideal, whose torques are the task's and not a "
-            "motor's; train it with --actuator ideal, or name the task instead"
+            f"{path}: was trained on {others[0]}: must be ideal, whose torques are the task's and not a motor's; train "
+            "it with --actuator ideal, or name the task instead"
         )
-    env = _resolved(env)
+    if isinstance(env, EnvConfig):
+        env = _resolved(env)
     ran = run_episodes(load_policy(path, trust), env.make, episodes, seed)
     return _gathered(f"the policy {path.name} of {env.task}", env, ran)
 
@@ -127,8 +162,8 @@ def _of_run(path: Path, episodes: int, seed: int, trust: bool) -> Demand:
 def _alone(task: Task) -> None:
     if len(task.motors) > 1:
         raise ValueError(
-            f"task {task.name!r} has {len(task.motors)} motors: must have one; record time, torque and speed of each "
-            "joint, and give them as .npz files"
+            f"task {task.name!r} has {len(task.motors)} motors: there is no scripted controller; train it with "
+            "--actuator ideal and name the run, or give time, torque and speed of each joint as .npz files"
         )
 
 
@@ -139,34 +174,59 @@ def _resolved(env: EnvConfig) -> EnvConfig:
     return dataclasses.replace(env, physics="mujoco")
 
 
-def _gathered(source: str, env: EnvConfig, ran: list[Episode]) -> Demand:
-    task = find_task(env.task)
-    before = [np.append(one.state[0, task.speeds[0]], one.trace["speed"]) for one in ran]
-    reached = sum(_reaches(task, one) for one in ran)
+def _gathered(source: str, env: EnvConfig | ForeignConfig, ran: list[Episode]) -> dict[str, Demand]:
+    """The demands on all motors, from episodes of one environment."""
+    import mujoco
+
+    task, swing = find_task(env.task) if isinstance(env, EnvConfig) else None, None
+    ends = [_reaches(task, one) for one in ran]
+    if None not in ends:
+        source = f"{source}, {sum(map(bool, ends))} of {len(ran)} episodes at the goal"
     made = env.make()
     core: Any = made.unwrapped
-    swing = None
-    if task.name == "pendulum":
+    if isinstance(env, EnvConfig) and env.task == "pendulum":
+        assert task is not None
         length = core.l
         inertia, gravity = core.m * length**2 / 3.0 + env.joint.armature, core.m * core.g * length / 2.0
         swing = Swing(inertia, gravity, float(task.max_forces[0]), env.joint.damping, env.joint.friction)
-    model, _ = core.physics.scene
-    import mujoco
-
-    joint = model.actuator(task.motors[0]).trnid[0]
+    model = core.model
+    outputs = list(motors(model)) if task is None else [model.actuator(name).id for name in task.motors]
     made.close()
-    return Demand(
-        source=f"{source}, {reached} of {len(ran)} episodes at the goal",
-        duration=np.full(sum(len(one) - 1 for one in before), ran[0].timestep),
-        torque=np.concatenate([one.trace["actual_force"] for one in ran]),
-        speed=np.concatenate([one[:-1] for one in before]),
-        acceleration=np.concatenate([np.diff(one) / ran[0].timestep for one in before]),
-        episodes=len(ran),
-        linear=bool(model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE),
-        swing=swing,
-    )
+    found = {}
+    for number, index in enumerate(outputs):
+        name = ran[0].motors[number] if len(outputs) > 1 else ""
+        before = [_speeds(task, one, number) for one in ran]
+        kind, driven = mujoco.mjtTrn(model.actuator_trntype[index]), model.actuator_trnid[index, 0]
+        on_joint = kind in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+        sliding = on_joint and model.jnt_type[driven] == mujoco.mjtJoint.mjJNT_SLIDE
+        gear = 1.0 if task is not None else abs(float(model.actuator_gear[model.actuator_outadr[index], 0])) or 1.0
+        found[name] = Demand(
+            source=f"{source}: {name}" if name else source,
+            duration=np.full(sum(len(one) - 1 for one in before), ran[0].timestep),
+            torque=gear * np.concatenate([_of_motor(one.trace["actual_force"], number) for one in ran]),
+            speed=np.concatenate([one[:-1] for one in before]) / gear,
+            acceleration=np.concatenate([np.diff(one) / ran[0].timestep for one in before]) / gear,
+            episodes=len(ran),
+            linear=bool(sliding),
+            swing=swing,
+            model_gear=gear,
+        )
+    return found
 
 
-def _reaches(task: Task, episode: Episode) -> bool:
-    """Whether an episode ends at the goal; where that is to last, at the time limit."""
+def _of_motor(values: np.ndarray, number: int) -> np.ndarray:
+    return values[:, number] if values.ndim > 1 else values
+
+
+def _speeds(task: Task | None, episode: Episode, number: int) -> np.ndarray:
+    """Of one motor's joint, before the first step and after each, shape (T*n+1,)."""
+    first = episode.first_speeds if task is None else episode.state[0, list(task.speeds)]
+    assert first is not None
+    return np.append(first[number], _of_motor(episode.trace["speed"], number))
+
+
+def _reaches(task: Task | None, episode: Episode) -> bool | None:
+    """Whether an episode ends at the goal; where that is to last, at the time limit. None where nobody knows."""
+    if task is None:
+        return episode.succeeded
     return not episode.terminated if task.goal is None else bool(np.asarray(task.goal(episode.state[-1])))

@@ -6,12 +6,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from gymnasium import spaces
+
 from codrl_mj.actuators import trusting
 from codrl_mj.agents import AgentConfig, agent_from_mapping, check_fits
 from codrl_mj.agents.ppo import PPOConfig
-from codrl_mj.agents.presets import find_preset
+from codrl_mj.agents.presets import ELSEWHERE, find_preset
 from codrl_mj.envs.config import EnvConfig, upgraded
 from codrl_mj.fields import check_names
+from codrl_mj.foreign.config import ForeignConfig, environment_from, is_gymnasium_id
 from codrl_mj.tasks import find_task
 
 EVALUATION_SEED = 1_000_000
@@ -26,7 +29,7 @@ class TrainConfig:
         ValueError: a field is out of bounds, or the agent cannot act in the task; the message says what would do.
     """
 
-    env: EnvConfig
+    env: EnvConfig | ForeignConfig
     """What to train in: task, actuator and all else."""
     agent: AgentConfig = PPOConfig()
     """The agent's settings."""
@@ -47,10 +50,12 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Validate."""
-        for name, kind in (("agent", AgentConfig), ("env", EnvConfig)):
+        kinds: dict[str, tuple[type, ...]] = {"agent": (AgentConfig,), "env": (EnvConfig, ForeignConfig)}
+        for name, kind in kinds.items():
             if not isinstance(getattr(self, name), kind):
-                raise ValueError(f"TrainConfig.{name} = {getattr(self, name)!r}: must be a {kind.__name__}")
-        check_fits(self.agent.known_as(), find_task(self.task))
+                known = " or ".join(f"a {one.__name__}" for one in kind)
+                raise ValueError(f"TrainConfig.{name} = {getattr(self, name)!r}: must be {known}")
+        check_fits(self.agent.known_as(), self.env)
         for name in ("num_envs", "checkpoint_interval", "evaluation_interval", "evaluation_episodes"):
             self._check_integer(name, 1)
         self._check_integer("seed", 0, 2**32 - 1)
@@ -76,7 +81,7 @@ class TrainConfig:
 
     @property
     def actuator(self) -> Any:
-        """What is trained through; with several motors a tuple."""
+        """What is trained through; with several motors, or patterns of them, a tuple."""
         return self.env.actuator
 
     @classmethod
@@ -102,17 +107,20 @@ class TrainConfig:
         Raises:
             ValueError: there are no such settings, or a field is out of bounds.
         """
-        check_fits(agent, find_task(task))
-        preset = find_preset(agent, task, settings)
+        posed = environment_from({"task": task})
+        check_fits(agent, posed)
+        preset = find_preset(agent, ELSEWHERE if isinstance(posed, ForeignConfig) else posed.task, settings)
         names = {field.name for field in dataclasses.fields(cls)} - {"env"}
         chosen = {name: value for name, value in vars(preset).items() if name in names}
-        fields = {**preset.env, **(env or {}), "task": task, "actuator": actuator}
-        return cls(EnvConfig.from_mapping(fields), **(chosen | changes))
+        fields = {**preset.env, **(env or {}), "task": task}
+        if "actuators" not in fields:
+            fields["actuator"] = actuator
+        return cls(environment_from(fields), **(chosen | changes))
 
     @property
-    def evaluation_env(self) -> EnvConfig:
+    def evaluation_env(self) -> EnvConfig | ForeignConfig:
         """What policies are evaluated in: the environment without changes of time limit and reward."""
-        return dataclasses.replace(self.env, max_episode_steps=None, options=None)
+        return self.env.as_posed
 
     def as_mapping(self) -> dict[str, Any]:
         """The configuration as JSON-serialisable values; `from_mapping` reads it."""
@@ -142,7 +150,7 @@ class TrainConfig:
             raise ValueError(f"not a training configuration: it has no {', '.join(missing)}")
         env, settings, agent = given.pop("env"), given.pop("settings", "default"), given.pop("agent", None)
         if whole:
-            return cls(EnvConfig.from_mapping(env), agent_from_mapping(agent), **given)
+            return cls(environment_from(env), agent_from_mapping(agent), **given)
         if not isinstance(env, Mapping):
             raise ValueError(f"env = {env!r}: must be a mapping of the environment's arguments")
         if "task" not in env:
@@ -155,7 +163,7 @@ class TrainConfig:
         base = cls.preset(task, agent["name"], settings, env.get("actuator", "default"))
         check_names(agent, base.agent.as_mapping(), "key", "agent.")
         agent = agent_from_mapping(base.agent.as_mapping() | dict(agent))
-        return dataclasses.replace(base, env=EnvConfig.from_mapping(env, base.env), agent=agent, **given)
+        return dataclasses.replace(base, env=environment_from(env, base.env), agent=agent, **given)
 
     def differences(self, other: "TrainConfig") -> list[str]:
         """What differs from another configuration, a line a field."""
@@ -169,8 +177,14 @@ class TrainConfig:
 
 
 def default_agent(task: str) -> str:
-    """The agent that is trained on a task unless another is named; of the five tasks the paper's."""
-    return str(find_task(task).agent)
+    """The agent that is trained on a task unless another is named; of the five tasks the paper's.
+
+    In environments of others, SAC for continuous actions and PPO for others.
+    """
+    if not is_gymnasium_id(task):
+        return str(find_task(task).agent)
+    continuous = isinstance(environment_from({"task": task}).action_space, spaces.Box)
+    return "sac" if continuous else "ppo"
 
 
 def read_config(path: Path, trust: bool = False, **overriding: Any) -> TrainConfig:

@@ -15,7 +15,6 @@ from typing import Any
 from codrl_mj.actuators import trusting
 from codrl_mj.runs.files import leftovers, read_json, sealed, write_json
 from codrl_mj.runs.layout import CONFIG, EVALUATION, POLICY_FILES, PROGRESS, RESULT
-from codrl_mj.tasks import find_task
 from codrl_mj.training.config import TrainConfig
 
 EPISODES, CURVE = "episodes.csv", "learning_curve.png"
@@ -112,8 +111,7 @@ def provenance(config: TrainConfig) -> dict[str, Any]:
 
     The code is ours, and the files of task, agent and family of actuators where these are somebody's own.
     """
-    family, reward = type(config.env.actuators[0]), find_task(config.task).reward
-    modules = {one.__module__ for one in (family, reward, type(config.agent))}
+    modules = {*config.env.modules, type(config.agent).__module__}
     versions = {package: importlib.metadata.version(package) for package in _PACKAGES}
     return {"versions": {"python": platform.python_version(), **versions}, "code": _code_digest(*sorted(modules))}
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from codrl_mj.foreign.config import ForeignConfig
 from codrl_mj.runs.files import sealed, write_json
 from codrl_mj.runs.layout import finished
 from codrl_mj.training import folder
@@ -111,6 +112,8 @@ def train(
 
 def _make_envs(config: TrainConfig) -> Any:
     """The environments as one Stable-Baselines3 `VecEnv`."""
+    if isinstance(config.env, ForeignConfig):
+        return config.env.make_sb3(config.num_envs)
     from codrl_mj.envs.sb3 import make_sb3_vec_env
 
     return make_sb3_vec_env(config.env, config.num_envs)

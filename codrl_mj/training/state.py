@@ -105,9 +105,11 @@ def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
         for name in tensors:
             with torch.no_grad():
                 _member(model, name).copy_(_tensor(arrays[f"tensor.{name}"]))
-        envs.restore(_below(arrays, "env."))
-        model._last_obs = arrays["last_obs"].copy()
+        begun = envs.restore(_below(arrays, "env."))
+        model._last_obs = arrays["last_obs"].copy() if begun is None else begun
         model._last_episode_starts = arrays["last_episode_starts"].copy()
+        if begun is not None:  # environments whose state nobody can set
+            model._last_episode_starts[:] = True
         if (buffer := getattr(model, "replay_buffer", None)) is not None:
             buffer.pos, buffer.full = facts["buffer"]["pos"], facts["buffer"]["full"]
             for name in _BUFFER:

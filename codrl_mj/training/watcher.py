@@ -52,7 +52,6 @@ class Watcher(BaseCallback):
         super().__init__()
         self._config, self._out, self._stop, self._on_progress = config, out, stop, on_progress
         self._tensorboard = tensorboard
-        self._arms = np.array([one.arm_radius for one in config.env.actuators])
         self._marks = {"report": 0, "evaluation": 0, "checkpoint": 0}
         self._squares, self._samples = 0.0, 0  # of the torque error since the last report
         self._best = {"return": -math.inf, "steps": 0}
@@ -106,8 +105,9 @@ class Watcher(BaseCallback):
         # of every step since the last call, where an agent's compiled loop takes several
         signals = self.locals.get("signals", self.training_env.signals)  # type: ignore[attr-defined]
         if signals is not None:
-            errors = np.subtract(signals["desired_force"], signals["actual_force"]).reshape(-1, len(self._arms))
-            errors = (errors * self._arms).ravel()
+            arms = self.training_env.arm_radii  # type: ignore[attr-defined]
+            errors = np.subtract(signals["desired_force"], signals["actual_force"]).reshape(-1, len(arms))
+            errors = (errors * arms).ravel()
             self._squares += float(np.dot(errors, errors))
             self._samples += errors.size
         for info in self.locals["infos"]:

@@ -19,7 +19,7 @@ from codrl_mj.agents import (
     find_agent,
 )
 from codrl_mj.agents.presets import PRESETS
-from codrl_mj.tasks import find_task
+from codrl_mj.envs.config import EnvConfig
 from tests.agents.small import make_model
 
 BUFFERED = (DDPGConfig, DQNConfig, TD3Config, SACConfig)
@@ -172,12 +172,12 @@ def test_an_unknown_setting_or_agent_is_named():
 )
 def test_an_agent_that_cannot_act_in_a_task_is_refused_with_those_that_can(agent, task, kind):
     with pytest.raises(ValueError, match=rf"agent = '{agent}': cannot act in the {kind} actions of {task}") as refusal:
-        check_fits(agent, find_task(task))
+        check_fits(agent, EnvConfig(task))
     named = str(refusal.value).rpartition(": ")[2].split(", ")
     assert "ppo" in named
     assert agent not in named
     for name in set(AGENTS) & set(named):
-        check_fits(name, find_task(task))
+        check_fits(name, EnvConfig(task))
 
 
 def test_settings_that_do_not_go_with_the_environments_are_refused():

@@ -5,9 +5,9 @@ One module an agent. What the numbers gave, in training and in test, is in docs/
 
 from codrl_mj.agents import find_agent
 from codrl_mj.agents.presets import ddpg, dqn, ppo, sac, sarsa, td3
-from codrl_mj.agents.presets.preset import Preset
+from codrl_mj.agents.presets.preset import ELSEWHERE, Preset
 
-__all__ = ["PRESETS", "SETTINGS", "Preset", "find_preset"]
+__all__ = ["ELSEWHERE", "PRESETS", "SETTINGS", "Preset", "find_preset"]
 
 SETTINGS = ("default", "paper", "repaired")
 """Names that settings can have: ours, the paper's as printed, and the paper's with what makes it fail changed."""
@@ -23,12 +23,17 @@ PRESETS: dict[tuple[str, str], dict[str, Preset]] = {
 def find_preset(agent: str, task: str, settings: str = "default") -> Preset:
     """The settings of that name for an agent on a task; the agent's own defaults where somebody brought one of them.
 
+    Args:
+        agent: its name.
+        task: the task's name, or `ELSEWHERE`.
+        settings: one of `SETTINGS`.
+
     Raises:
         ValueError: there are none; the message names those that exist.
     """
     named = PRESETS.get((agent, task), {})
-    ours = ":" not in agent and any(of == task for _, of in PRESETS)
-    if settings == "default" and not ours:
+    ours = ":" not in agent and task != ELSEWHERE and any(of == task for _, of in PRESETS)
+    if settings == "default" and not named and not ours:
         return Preset(find_agent(agent)(), total_steps=200_000, num_envs=8)
     if settings not in named:
         there = "; ".join(f"{other}: {', '.join(names)}" for (other, of), names in PRESETS.items() if of == task)

@@ -1,7 +1,7 @@
 """Settings for PPO."""
 
 from codrl_mj.agents.ppo import PPOConfig
-from codrl_mj.agents.presets.preset import Preset
+from codrl_mj.agents.presets.preset import ELSEWHERE, Preset
 
 PRESETS: dict[str, dict[str, Preset]] = {
     "cartpole": {
@@ -94,6 +94,13 @@ PRESETS: dict[str, dict[str, Preset]] = {
             total_steps=200_000,
             num_envs=16,
             about="Ours, for commands of torque, current and voltage alike: actions in units of the largest.",
+        )
+    },
+    ELSEWHERE: {
+        "default": Preset(
+            PPOConfig(learning_rate=3e-4, batch_size=64, gae_lambda=0.95, target_kl=None),
+            total_steps=300_000,
+            about="As Schulman et al. (2017) have it for MuJoCo's robots.",
         )
     },
 }

@@ -6,6 +6,9 @@ from typing import Any
 
 from codrl_mj.agents.base import AgentConfig
 
+ELSEWHERE = "another's environment"
+"""Instead of a task: any environment that is none of ours."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Preset:

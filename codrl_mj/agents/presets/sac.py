@@ -1,6 +1,6 @@
 """Settings for SAC."""
 
-from codrl_mj.agents.presets.preset import Preset
+from codrl_mj.agents.presets.preset import ELSEWHERE, Preset
 from codrl_mj.agents.sac import SACConfig
 
 PRESETS: dict[str, dict[str, Preset]] = {
@@ -32,6 +32,15 @@ PRESETS: dict[str, dict[str, Preset]] = {
             ),
             total_steps=8000,
             about="The exploration of Stable-Baselines3 Zoo, by the state and for 32 steps each, drives up the hill.",
+        )
+    },
+    ELSEWHERE: {
+        "default": Preset(
+            SACConfig(
+                learning_rate=3e-4, hidden=(256, 256), batch_size=256, buffer_size=1_000_000, learning_starts=5000
+            ),
+            total_steps=100_000,
+            about="As Haarnoja et al. (2018) have it for MuJoCo's robots.",
         )
     },
 }

@@ -1,0 +1,94 @@
+"""What a motorised environment shows of its episodes, integration step by integration step."""
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from codrl_mj.actuators import ActuatorModel
+from codrl_mj.engine.reading import Readout
+
+
+class MotorsRecorder:
+    """The `codrl_mj.envs.recording.Recorder` of a motorised environment.
+
+    It sees each integration step of environments that call `mujoco.mj_step`; of others the end of their steps.
+    """
+
+    def __init__(
+        self, data: mujoco.MjData, readout: Readout, command: str, motors: Callable[[], Mapping[int, ActuatorModel]]
+    ) -> None:
+        """Look at a simulation.
+
+        Args:
+            data: the simulation.
+            readout: of its model.
+            command: what the agent commands.
+            motors: the motors of the present episode, by the index of the actuator.
+        """
+        model = data.model
+        self._data, self._readout, self._motors = data, readout, motors
+        self._rows: list[np.ndarray] = []
+        self.command, self.motors = command, tuple(motor_names(model, readout.motors))
+        self._outputs = model.actuator_outadr[list(readout.motors)]
+        self._moments = np.empty((model.nout, model.nv))
+        names = list(readout(data))
+        self.trace_names = (*names, "speed")
+        self.signal_names = (*(name for name in names if name != "saturated"), "saturated")
+        self.step_duration = float(model.opt.timestep)
+
+    @property
+    def actuator(self) -> Any:
+        """See `Recorder`."""
+        found = tuple(self._motors().values())
+        return found[0] if len(found) == 1 else found
+
+    def state(self) -> np.ndarray:
+        """Positions and velocities, `qpos` and `qvel`."""
+        return np.concatenate([self._data.qpos, self._data.qvel])
+
+    def speeds(self) -> np.ndarray:
+        """See `Recorder`; the engine's own are those at the beginning of a step."""
+        data = self._data
+        mujoco.mju_sparse2dense(
+            self._moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
+        )
+        return self._moments[self._outputs] @ data.qvel
+
+    @contextlib.contextmanager
+    def watching(self) -> Iterator[None]:
+        """Record what the environment does in the block: one step of it."""
+        self._rows, plain, began = [], mujoco.mj_step, self._data.time
+
+        def each(model: mujoco.MjModel, data: mujoco.MjData, nstep: int = 1) -> None:
+            if data is not self._data:
+                plain(model, data, nstep)
+                return
+            for _ in range(nstep):
+                plain(model, data)
+                self._row()
+
+        mujoco.mj_step = each  # type: ignore[assignment]
+        try:
+            yield
+        finally:
+            mujoco.mj_step = plain
+        if self._rows:
+            self.step_duration = len(self._rows) * float(self._data.model.opt.timestep)
+        else:
+            self.step_duration = float(self._data.time - began)
+            self._row()
+
+    def _row(self) -> None:
+        self._rows.append(np.column_stack([*self._readout(self._data).values(), self.speeds()]))
+
+    def trace(self) -> np.ndarray:
+        """See `Recorder`."""
+        return np.array(self._rows)
+
+
+def motor_names(model: mujoco.MjModel, motors: Mapping[int, Any]) -> list[str]:
+    """What the motors of a model are called: as their actuators; by their indices where these have no names."""
+    return [model.actuator(index).name or str(index) for index in motors]
