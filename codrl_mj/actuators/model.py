@@ -443,21 +443,34 @@ def trusting(trust: bool) -> Iterator[None]:
         _TRUSTED.reset(token)
 
 
-def load_object(text: str) -> Any:
-    """What stands at `module:NAME`.
+def load_module(text: str) -> Any:
+    """The module of `module:NAME`.
 
     Raises:
-        ValueError: there is no such module, or nothing of that name in it; or it may not be imported (`trusting`).
+        ValueError: there is no such module; or it may not be imported (`trusting`).
     """
-    module, _, name = text.partition(":")
+    module = text.partition(":")[0]
     if not _TRUSTED.get():
         raise ValueError(
             f"{text!r}: needs the module {module}, and importing it executes whatever its author put there. Pass "
             "--trust (in Python: trust=True) if that author is you, or somebody whose programs you would run"
         )
     try:
-        return functools.reduce(getattr, name.split("."), importlib.import_module(module))
-    except (ImportError, AttributeError, TypeError, ValueError) as error:
+        return importlib.import_module(module)
+    except (ImportError, TypeError, ValueError) as error:
+        raise ValueError(f"{text!r}: {error}; must be module:NAME, of a module that Python finds") from None
+
+
+def load_object(text: str) -> Any:
+    """What stands at `module:NAME`.
+
+    Raises:
+        ValueError: as for `load_module`, or there is nothing of that name in it.
+    """
+    module = load_module(text)
+    try:
+        return functools.reduce(getattr, text.partition(":")[2].split("."), module)
+    except AttributeError as error:
         raise ValueError(f"{text!r}: {error}; must be module:NAME, of a module that Python finds") from None
 
 

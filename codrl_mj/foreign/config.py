@@ -11,6 +11,7 @@ import gymnasium
 from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel, mapping_of
+from codrl_mj.actuators.model import load_module
 from codrl_mj.disturbances import OFF, Disturbances, resolve_disturbances
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.distributions import Distribution, parse
@@ -63,6 +64,8 @@ class ForeignConfig:
 
         if not is_gymnasium_id(self.task):
             raise ValueError(f"task = {self.task!r}: must be the id of an environment, such as HalfCheetah-v5")
+        if ":" in self.task:
+            load_module(self.task)
         if not self.actuators:
             raise ValueError(f"actuators = {self.actuators!r}: must name what drives what, such as {{'.*': 'lag'}}")
         self._set("actuators", resolve_patterns(self.actuators, f"the environment {self.task}"))
@@ -96,7 +99,7 @@ class ForeignConfig:
             ValueError: there is no such environment; Gymnasium's message suggests one.
         """
         try:
-            return gymnasium.spec(self.task)
+            return gymnasium.spec(self.task.rpartition(":")[2])
         except (gymnasium.error.Error, ModuleNotFoundError) as error:
             raise ValueError(
                 f"task = {self.task!r}: {error}; environments of packages that Gymnasium does not load by itself are "
@@ -171,7 +174,7 @@ class ForeignConfig:
         if self.max_episode_steps is not None:
             limit = {"max_episode_steps": self.max_episode_steps}
         return make(
-            self.spec.id if ":" not in self.task else self.task,
+            self.spec.id,
             self.actuators,
             **{name: getattr(self, name) for name in names},
             disturbances=None if self.disturbances == OFF else self.disturbances,
@@ -241,7 +244,7 @@ def environment_from(mapping: Any, base: Any = None) -> "EnvConfig | ForeignConf
 
 @functools.cache
 def _action_space(task: str, options: str) -> spaces.Space[Any]:
-    env = gymnasium.make(task, disable_env_checker=True, **json.loads(options))
+    env = gymnasium.make(task.rpartition(":")[2], disable_env_checker=True, **json.loads(options))
     space = env.action_space
     env.close()
     return space

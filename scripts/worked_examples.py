@@ -1,0 +1,150 @@
+"""Environments of others through motors that `choose` finds, and through smaller ones: what is lost, what comes back.
+
+An agent learns each environment on ideal actuators; the motors are chosen for what the first seed's policy asks of
+them; the others are the strongest of the catalogue that lack something. Agents then learn through both, and every
+policy is tested on all three. Trainings that were interrupted go on. Writes docs/worked_examples.csv and the page's
+tables; `--steps 0.01` tries it.
+"""
+
+import argparse
+import csv
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "examples"))  # where servo_arm is
+
+from codrl_mj.actuators import mapping_of  # noqa: E402
+from codrl_mj.evaluation import evaluate  # noqa: E402
+from codrl_mj.runs.files import writing  # noqa: E402
+from codrl_mj.runs.policies import load_policy  # noqa: E402
+from codrl_mj.sizing import Choice, choose, demands_of  # noqa: E402
+from codrl_mj.training import TrainConfig, train  # noqa: E402
+
+SAC: dict[str, Any] = {"hidden": [64, 64], "batch_size": 128, "learning_starts": 2000, "learning_rate": 1e-3}
+EXAMPLES: dict[str, tuple[str, int]] = {
+    # name -> id, environment steps of a training
+    "double pendulum": ("InvertedDoublePendulum-v5", 15_000),
+    "cheetah": ("HalfCheetah-v5", 40_000),
+    "servo arm": ("servo_arm:ServoArm-v0", 15_000),
+}
+THROUGH = ("ideal", "chosen", "smaller")
+EPISODES, TEST_SEED = 20, 2_000_000
+COLUMNS = ("environment", "trained through", "seed", "tested on", "return", "saturated %", "heat J", "success")
+
+
+def main() -> None:
+    """Train, choose, train, test, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "worked_examples", help="folder for the runs")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs", help="folder for worked_examples.csv")
+    parser.add_argument("--seeds", type=int, default=3, help="trainings of each kind")
+    parser.add_argument("--steps", type=float, default=1.0, help="share of the environment steps")
+    parser.add_argument("--only", nargs="*", choices=EXAMPLES, default=list(EXAMPLES), help="environments")
+    options = parser.parse_args()
+    for name in options.only:
+        _example(name, options)
+    rows = [row for path in sorted(options.runs.glob("*/tests.json")) for row in json.loads(path.read_text())]
+    order = list(EXAMPLES)
+    rows.sort(key=lambda row: order.index(row["environment"]))
+    with writing(options.out / "worked_examples.csv") as temporary, temporary.open("w", newline="") as file:
+        table = csv.DictWriter(file, COLUMNS)
+        table.writeheader()
+        table.writerows(rows)
+    print(_table(rows))
+
+
+def _example(name: str, options: Any) -> None:
+    """All of one environment; a test that is written is not made again."""
+    folder, (env_id, steps) = options.runs / name.replace(" ", "_"), EXAMPLES[name]
+    if (folder / "tests.json").exists():
+        return
+    budget = max(300, int(options.steps * steps))
+
+    def run(through: str, seed: int, actuators: Any) -> Path:
+        agent = {**SAC, "learning_starts": min(SAC["learning_starts"], budget // 3), "name": "sac"}
+        config = TrainConfig.from_mapping(
+            {
+                "env": {"task": env_id, "actuators": actuators},
+                "agent": agent,
+                "seed": seed,
+                "total_steps": budget,
+                "checkpoint_interval": 5000,
+                "evaluation_interval": budget,
+                "evaluation_episodes": 5,
+            }
+        )
+        return train(config, folder / f"{through}-{seed}", resume=True, tensorboard=False)
+
+    ideal = {".*": "ideal"}
+    runs = {("ideal", seed): run("ideal", seed, ideal) for seed in range(options.seeds)}
+    motors = {"ideal": ideal, **_motors(folder, runs["ideal", 0])}
+    for through in THROUGH[1:]:
+        runs |= {(through, seed): run(through, seed, motors[through]) for seed in range(options.seeds)}
+    rows = []
+    for (through, seed), path in runs.items():
+        config = TrainConfig.from_mapping(json.loads((path / "config.json").read_text())["train"], whole=True)
+        for tested in THROUGH:
+            env = dataclasses.replace(config.env, actuators=motors[tested])
+            found = evaluate(load_policy(path), env, EPISODES, TEST_SEED)
+            success = "" if found.success is None else found.success.mean
+            heat = "" if found.copper_loss is None else round(found.copper_loss.mean, 2)
+            saturated = "" if found.saturated_percent is None else round(found.saturated_percent, 2)
+            values = name, through, seed, tested, round(found.returns.mean, 3), saturated, heat, success
+            rows.append(dict(zip(COLUMNS, values, strict=True)))
+            print(*values, flush=True)
+    with writing(folder / "tests.json") as temporary:
+        temporary.write_text(json.dumps(rows, indent=1))
+
+
+def _motors(folder: Path, ideal: Path) -> dict[str, Any]:
+    """`chosen` and `smaller`: pattern -> mapping, also as YAML files that `--actuators` takes; made once."""
+    files = {name: folder / f"{name}.yaml" for name in THROUGH[1:]}
+    if not all(path.exists() for path in files.values()):
+        found: dict[str, dict[str, Any]] = {name: {} for name in files}
+        for motor, demand in demands_of(ideal, episodes=5, trust=True).items():
+            pattern = motor or ".*"
+            ranked = choose(demand)
+            smaller = _smaller(ranked)
+            for name, choice in (("chosen", ranked[0]), ("smaller", smaller)):
+                found[name][pattern] = mapping_of(choice.behind(demand.model_gear))
+                verdict = choice.lacks or "does it"
+                print(f"{pattern} {name}: {choice.name}, gear {choice.ratio:.4g}, {choice.power:.0f} W: {verdict}")
+        for name, path in files.items():
+            with writing(path) as temporary:
+                temporary.write_text(yaml.safe_dump(found[name], sort_keys=False))
+    return {name: yaml.safe_load(path.read_text()) for name, path in files.items()}
+
+
+def _smaller(ranked: list[Choice]) -> Choice:
+    """The strongest motor of less power than the first that lacks a third of the voltage or the current for it."""
+    weaker = [one for one in ranked[1:] if one.power < ranked[0].power and one.feasibility.margin < -1 / 3]
+    return max(weaker, key=lambda one: one.power) if weaker else ranked[-1]
+
+
+def _table(rows: list[dict[str, Any]]) -> str:
+    """Mean return over seeds [lowest, highest], a row for each training, a column for each test; Markdown."""
+    lines = [
+        "| environment | trained through | on ideal | on the chosen | on the smaller |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for name in dict.fromkeys(row["environment"] for row in rows):
+        for through in THROUGH:
+            cells = []
+            for tested in THROUGH:
+                own = (name, through, tested)
+                each = [row for row in rows if (row["environment"], row["trained through"], row["tested on"]) == own]
+                returns = [float(row["return"]) for row in each]
+                cells.append(f"{np.mean(returns):.1f} [{min(returns):.1f}, {max(returns):.1f}]" if returns else "–")
+            lines.append(f"| {name} | {through} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
