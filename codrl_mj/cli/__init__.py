@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
+import gymnasium
 import tyro
 
 from codrl_mj.cli.evaluate import Evaluate
@@ -62,7 +63,7 @@ def _run(arguments: list[str]) -> int:
             args=arguments,
         )
         return verb.run()
-    except (ValueError, OSError, RuntimeError, ArithmeticError) as error:
+    except (ValueError, OSError, RuntimeError, ArithmeticError, gymnasium.error.Error) as error:
         print(f"codrl-mj: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except ModuleNotFoundError as error:

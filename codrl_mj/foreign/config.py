@@ -109,7 +109,7 @@ class ForeignConfig:
     @property
     def action_space(self) -> spaces.Space[Any]:
         """The environment's own actions; commands have others of the same kind."""
-        return _action_space(self.task, json.dumps(self.options))
+        return _action_space(self.spec.id, json.dumps(self.options))
 
     @property
     def time_limit(self) -> int | None:
@@ -244,7 +244,7 @@ def environment_from(mapping: Any, base: Any = None) -> "EnvConfig | ForeignConf
 
 @functools.cache
 def _action_space(task: str, options: str) -> spaces.Space[Any]:
-    env = gymnasium.make(task.rpartition(":")[2], disable_env_checker=True, **json.loads(options))
+    env = gymnasium.make(task, disable_env_checker=True, **json.loads(options))
     space = env.action_space
     env.close()
     return space

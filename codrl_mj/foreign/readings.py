@@ -9,6 +9,7 @@ import numpy as np
 from codrl_mj.actuators import ActuatorModel, Family, Inputs, parameters_type
 from codrl_mj.engine.families import signals_at
 from codrl_mj.engine.reading import Readout, slots
+from codrl_mj.foreign.recording import motor_names
 
 
 def readings(readout: Readout, data: mujoco.MjData) -> dict[str, Any]:
@@ -50,7 +51,9 @@ class Sensors:
                 "motor of the catalogue"
             )
         self.names = tuple(
-            f"{model.actuator(index).name or index}.{name}" for index, one in observed.items() for name in one.OBSERVED
+            f"{own}.{name}"
+            for own, one in zip(motor_names(model, observed), observed.values(), strict=True)
+            for name in one.OBSERVED
         )
         views = slots(data, observed)
         self._rows: list[tuple[Any, Any, np.ndarray]] = [

@@ -1,7 +1,7 @@
 """What a motorised environment shows of its episodes, integration step by integration step."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import mujoco
@@ -9,6 +9,7 @@ import numpy as np
 
 from codrl_mj.actuators import ActuatorModel
 from codrl_mj.engine.reading import Readout
+from codrl_mj.specs import names_of
 
 
 class MotorsRecorder:
@@ -89,6 +90,12 @@ class MotorsRecorder:
         return np.array(self._rows)
 
 
-def motor_names(model: mujoco.MjModel, motors: Mapping[int, Any]) -> list[str]:
-    """What the motors of a model are called: as their actuators; by their indices where these have no names."""
-    return [model.actuator(index).name or str(index) for index in motors]
+def motor_names(model: mujoco.MjModel, motors: Iterable[int]) -> list[str]:
+    """What motors are called: as their actuators, or else as what these drive; by their indices where that says less.
+
+    Args:
+        model: the model.
+        motors: indices of actuators.
+    """
+    every = [own[0] if own else "" for own in names_of(model)]
+    return [every[index] if every.count(every[index]) == 1 and every[index] else str(index) for index in motors]

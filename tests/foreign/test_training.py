@@ -1,0 +1,284 @@
+"""Environments of others on the command line and in run folders: described, trained, continued, measured, filmed."""
+
+import dataclasses
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import imageio
+import numpy as np
+import pytest
+import yaml
+
+import codrl_mj
+from codrl_mj.actuators import IDEAL, Drive, Lag
+from codrl_mj.agents import SACConfig
+from codrl_mj.catalogue import motor_entry
+from codrl_mj.cli import main
+from codrl_mj.evaluation import RandomPolicy, evaluate, load_episode, run_episodes, save_episode
+from codrl_mj.foreign.config import ForeignConfig
+from codrl_mj.runs.summaries import read_run
+from codrl_mj.sizing import demand_of, demands_of
+from codrl_mj.training import TrainConfig, load_config, train
+from codrl_mj.training.config import read_config
+from tests.foreign.models import BareEnv
+from tests.matrix import but
+from tests.training.interruptions import TERMINATE, crash, differing, interrupt, outcome, resume
+from tests.training.test_kill import in_a_process, kill_test, status_of, wait_for
+
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # deprecated attributes in other people's models
+MAXON = {".*": "maxon-ec45-flat-50w"}
+QUICK = "--agent.hidden 8 --agent.batch-size 16 --agent.learning-starts 40 --evaluation-episodes 1 --no-tensorboard"
+EVERYTHING = {
+    "observe_actuator": True,
+    "disturbances": {"command_delay": 0.12},
+    "randomize": {".*": {"motor.resistance": "uniform(0.9, 1.1)"}},
+}
+SMALL = SACConfig(learning_starts=40, batch_size=16, buffer_size=150, hidden=(8,))
+
+
+def config(env, num_envs=1):
+    often = {"checkpoint_interval": 60, "evaluation_interval": 120, "evaluation_episodes": 1}
+    return TrainConfig(env, SMALL, seed=3, num_envs=num_envs, total_steps=240, **often)
+
+
+CASES = {
+    "cheetah": config(ForeignConfig("HalfCheetah-v5", MAXON, max_episode_steps=25, **EVERYTHING), 2),
+    "reacher by currents": config(ForeignConfig("Reacher-v5", {"joint.*": "maxon-re65"}, action="current")),
+}
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def reacher(tmp_path_factory):
+    """A tiny run of two motors on ideal actuators."""
+    out = tmp_path_factory.mktemp("trained") / "reacher"
+    assert main(["train", "Reacher-v5", "--total-steps", "150", *QUICK.split(), "--out", str(out)]) == 0
+    return out
+
+
+# -- descriptions ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_configuration_survives_json(name):
+    whole = json.loads(json.dumps(CASES[name].as_mapping()))
+    assert TrainConfig.from_mapping(whole, whole=True) == CASES[name]
+
+
+def test_a_file_says_what_is_behind_what(tmp_path):
+    text = "env: {task: HalfCheetah-v5, actuators: {b.*: maxon-ec45-flat-50w, f.*: lag}, options: {frame_skip: 2}}\n"
+    (tmp_path / "train.yaml").write_text(text + "agent: {name: sac, gamma: 0.98}\n")
+    found = read_config(tmp_path / "train.yaml")
+    assert found.env.actuators == {"b.*": Drive.of(motor_entry("maxon-ec45-flat-50w").numbers), "f.*": Lag()}
+    assert found.env.make().unwrapped.frame_skip == 2
+    assert (found.agent.gamma, found.agent.hidden, found.num_envs) == (0.98, (256, 256), 1)  # the others as always
+
+
+def test_ids_of_ours_are_their_tasks():
+    assert TrainConfig.from_mapping({"task": "codrl_mj/Pendulum-v0"}).env.task == "pendulum"
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"task": "HalfCheeta-v5"}, "HalfCheeta.*doesn't exist"),
+        ({"task": "HalfCheetah-v5", "actuators": {}}, "actuators = {}: must name"),
+        ({"task": "HalfCheetah-v5", "actuators": {"(": "lag"}}, "must be a regular expression"),
+        ({"task": "HalfCheetah-v5", "actuators": {".*": "maxon-ec45-flat"}}, "did you mean 'maxon-ec45-flat-50w'"),
+        ({"task": "HalfCheetah-v5", "actuator": "paper"}, "of which the environment HalfCheetah-v5 has none"),
+        ({"task": "HalfCheetah-v5", "max_episode_steps": 0}, "must be an integer >= 1"),
+        ({"task": "HalfCheetah-v5", "randomize": ["motor.resistance"]}, r"must be \[PATTERN:\]FIELD=DISTRIBUTION"),
+        ({"task": "HalfCheetah-v5", "options": {"frame_skip": {1, 2}}}, "that JSON can hold"),
+        ({"task": "HalfCheetah-v5", "levels": [1.0]}, "unknown key env.levels"),
+    ],
+)
+def test_bad_descriptions_are_refused(fields, message):
+    with pytest.raises(ValueError, match=message):
+        TrainConfig.from_mapping({"env": fields})
+
+
+def test_a_module_of_somebodys_is_not_imported_from_a_run_folder_unasked(tmp_path):
+    (tmp_path / "config.json").write_text(json.dumps({"train": CASES["cheetah"].as_mapping()}))
+    text = (tmp_path / "config.json").read_text().replace("HalfCheetah-v5", "tests.foreign.nobody:Robot-v0")
+    (tmp_path / "config.json").write_text(text)
+    with pytest.raises(ValueError, match="Pass --trust"):
+        load_config(tmp_path)
+
+
+# -- training -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", but(["reacher by currents"], CASES))
+def test_an_interrupted_training_comes_to_the_same_result(tmp_path, name):
+    interrupt(CASES[name], tmp_path / "run", 70, TERMINATE)
+    interrupt(CASES[name], tmp_path / "run", 70, crash)
+    ours, theirs = (outcome(resume(CASES[name], tmp_path / run)) for run in ("run", "uninterrupted"))
+    assert differing(theirs, ours) == []
+
+
+@pytest.mark.matrix
+def test_a_killed_training_of_the_cheetah_comes_to_the_same_result():
+    line = "HalfCheetah-v5 --actuators .*=maxon-ec45-flat-50w --total-steps 1200 --checkpoint-interval 200 "
+    arguments = ["train", *line.split(), *QUICK.split(), "--env.max-episode-steps", "100"]
+    assert main([*arguments, "--out", "uninterrupted"]) == 0
+    child = in_a_process([*arguments, "--out", "run"])
+    wait_for(lambda: kill_test.saved_steps(Path("run")) >= 400)
+    time.sleep(0.05)  # [s]
+    os.kill(child, signal.SIGKILL)
+    assert status_of(child) == -9
+    assert main(["train", "--resume", "run"]) == 0
+    assert differing(outcome(Path("uninterrupted")), outcome(Path("run"))) == []
+
+
+def test_where_nobody_can_set_the_state_a_continued_training_starts_an_episode():
+    gym.register("ForeignBare-v0", BareEnv, max_episode_steps=50)
+    try:
+        tiny = config(ForeignConfig("ForeignBare-v0", {".*": "lag"}))
+        interrupt(tiny, Path("run"), 70, crash)  # in the second episode
+        resume(tiny, Path("run"))
+    finally:
+        gym.registry.pop("ForeignBare-v0")
+    lengths = np.loadtxt("run/episodes.csv", delimiter=",", skiprows=1)[:, 3]
+    assert read_run(Path("run")).steps == 240
+    assert set(lengths) == {50.0}  # none was cut
+
+
+def test_dictionaries_of_observations_are_refused():
+    gym.register("ForeignDict-v0", lambda: _WithDictionaries(), max_episode_steps=50)
+    try:
+        with pytest.raises(ValueError, match=r"must be a vector.*FlattenObservation"):
+            train(config(ForeignConfig("ForeignDict-v0", {".*": "lag"})), Path("run"))
+    finally:
+        gym.registry.pop("ForeignDict-v0")
+
+
+class _WithDictionaries(BareEnv):
+    observation_space = gym.spaces.Dict({"all": BareEnv.observation_space})
+
+    def reset(self, **options):
+        observation, info = super().reset(**options)
+        return {"all": observation}, info
+
+
+# -- measuring ------------------------------------------------------------------------------------------------
+
+
+def test_every_integration_step_is_looked_at_and_nothing_changes_by_it():
+    """The trace, against the sums of a loop over `mj_step` of one's own."""
+    import mujoco
+
+    known = ForeignConfig("HalfCheetah-v5", MAXON, max_episode_steps=10)
+    policy = RandomPolicy(known.make().action_space, 1)
+    (episode,) = run_episodes(policy, known.make, 1, seed=4)
+    env = known.make()
+    env.reset(seed=4)
+    model, data = env.unwrapped.model, env.unwrapped.data
+    work = np.zeros(6)
+    for action, inside in zip(episode.action, episode.trace["actual_force"].reshape(10, 5, 6), strict=True):
+        data.ctrl[:] = action
+        for force in inside:
+            before = model.actuator_gear[:, 0] * data.qvel[3:]
+            mujoco.mj_step(model, data)
+            np.testing.assert_array_equal(force, data.actuator_force)
+            work += force * (before + model.actuator_gear[:, 0] * data.qvel[3:]) / 2 * model.opt.timestep
+    np.testing.assert_array_equal(episode.state[-1], np.concatenate([data.qpos, data.qvel]))
+    found = codrl_mj.evaluation.summarize(known.task, [episode]).motors
+    assert list(found) == ["bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot"]
+    np.testing.assert_allclose([one["mechanical_work"] for one in found.values()], work, rtol=1e-12)
+
+
+def test_motors_of_several_families_are_measured_by_what_they_have():
+    mixed = ForeignConfig("Reacher-v5", {"joint0": "lag", "joint1": "maxon-re65"})
+    found = evaluate(RandomPolicy(mixed.make().action_space, 0), mixed, 2)
+    lag, maxon = found.motors.values()
+    assert lag["rms_current"] is None
+    assert maxon["rms_current"] == pytest.approx(found.rms_current)
+    assert maxon["copper_loss"] == pytest.approx(found.copper_loss.mean)
+    assert found.success is None  # Reacher says nothing of it
+
+
+def test_an_episode_survives_its_file(tmp_path):
+    known = ForeignConfig("Reacher-v5", {".*": "lag"})
+    (episode,) = run_episodes(RandomPolicy(known.make().action_space, 0), known.make, 1)
+    save_episode(episode, tmp_path / "episode.npz")
+    other = load_episode(tmp_path / "episode.npz")
+    for field in dataclasses.fields(episode):
+        np.testing.assert_equal(getattr(other, field.name), getattr(episode, field.name))
+
+
+# -- the command line -----------------------------------------------------------------------------------------
+
+
+def test_a_run_is_evaluated_on_other_motors(reacher, capsys):
+    assert load_config(reacher).env.actuators == {".*": IDEAL}
+    line = f"evaluate {reacher} --actuators joint0=maxon-re65 joint1=lag --episodes 2 --out result.json"
+    assert main(line.split()) == 0
+    shown = capsys.readouterr().out
+    assert "motors of reacher" in shown
+    assert "joint1" in shown
+    result = json.loads(Path("result.json").read_text())
+    assert result["conditions"]["env"]["actuators"]["joint1"] == Lag().as_mapping()
+    assert main(["runs", str(reacher.parent)]) == 0
+    listed = capsys.readouterr().out
+    assert "Reacher-v5" in listed
+    assert "ideal" in listed
+
+
+def test_motors_are_chosen_for_what_a_policy_asked_and_do_it(reacher, capsys):
+    assert main(["motor", "choose", str(reacher), "--out", "chosen"]) == 0
+    assert "joint1" in capsys.readouterr().out
+    chosen = yaml.safe_load(Path("chosen/actuators.yaml").read_text())
+    assert list(chosen) == ["joint0", "joint1"]
+    assert Path("chosen/joint1.png").stat().st_size > 1000
+    line = f"evaluate {reacher} --actuators chosen/actuators.yaml --episodes 2 --out result.json"
+    assert main(line.split()) == 0
+    result = json.loads(Path("result.json").read_text())
+    assert result["saturated_percent"] == 0.0
+    assert all(motor["tracking_percent"] < 5.0 for motor in result["motors"].values())
+    with pytest.raises(ValueError, match="must be one of joint0, joint1"):
+        demand_of(reacher)
+    asked = demands_of(reacher, episodes=2)["joint0"]
+    assert asked.model_gear == 200.0  # Reacher's: forces are up to 200 times 1
+    assert 1.0 < np.abs(asked.torque).max() <= 200.0
+
+
+def test_an_episode_is_filmed_with_the_strip_of_a_motor(reacher, capsys):
+    line = f"render {reacher} --motor joint1 --out film.gif --width 160 --height 120 --trajectory episode.npz"
+    assert main(line.split()) == 0
+    frames = imageio.mimread("film.gif")
+    assert len(frames) == 26  # 50 steps of 20 ms, at half the rate, and the end
+    assert len(load_episode(Path("episode.npz")).reward) == 50
+    assert np.ptp(frames[0][60:120].astype(int)) > 50  # the scene
+    capsys.readouterr()
+    assert main(["render", str(reacher), "--motor", "joint", "--out", "other.gif"]) == 2
+    assert "did you mean 'joint1'" in capsys.readouterr().err.replace("joint0", "joint1")
+    assert not Path("other.gif").exists()
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("train HalfCheetah-v5 --actuators thigh=lag", "'thigh': no actuator has such a name"),
+        ("train HalfCheetah-v5 --actuator lag --actuators bthigh=lag", "leave one of them out"),
+        ("train HalfCheetah-v5 --actuators bthigh", "must be NAME=VALUE"),
+        ("train Cheetah-v5", "Cheetah.* doesn't exist"),
+        ("train HalfCheetah-v5 --agent dqn", "cannot act in the Box actions of HalfCheetah-v5"),
+        ("train CartPole-v1", "CartPole-v1: no model was built|no model was built inside"),
+    ],
+)
+def test_what_cannot_be_costs_one_line(capfd, line, message):
+    import re
+
+    assert main([*line.split(), "--out", "run"]) == 2
+    said = [one for one in capfd.readouterr().err.splitlines() if one.startswith("codrl-mj: error")]
+    assert len(said) == 1
+    assert re.search(message, said[0])
+    assert not Path("run").exists()
