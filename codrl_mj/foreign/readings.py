@@ -22,10 +22,10 @@ def readings(readout: Readout, data: mujoco.MjData) -> dict[str, Any]:
         `desired_force`, `actual_force`, the families' signals and `saturated` (bool), each a number where there is one
         motor, else an array (n_motors,); units as `Readout` has them.
     """
-    signals = readout(data)
-    saturated = signals.pop("saturated", np.zeros(len(readout.motors)))
-    signals["saturated"] = (saturated != 0.0) & ~np.isnan(saturated)
-    return {name: values.item() for name, values in signals.items()} if len(readout.motors) == 1 else signals
+    table, count = readout.table(data), len(readout.motors)
+    found: dict[str, Any] = dict(zip(readout.names, table[:, 0].tolist() if count == 1 else table, strict=True))
+    found["saturated"] = abs(found.get("saturated", 0.0 if count == 1 else np.zeros(count))) > 0.0  # which NaN is not
+    return found
 
 
 class Sensors:
