@@ -22,9 +22,12 @@ def readings(readout: Readout, data: mujoco.MjData) -> dict[str, Any]:
         `desired_force`, `actual_force`, the families' signals and `saturated` (bool), each a number where there is one
         motor, else an array (n_motors,); units as `Readout` has them.
     """
-    table, count = readout.table(data), len(readout.motors)
-    found: dict[str, Any] = dict(zip(readout.names, table[:, 0].tolist() if count == 1 else table, strict=True))
-    found["saturated"] = abs(found.get("saturated", 0.0 if count == 1 else np.zeros(count))) > 0.0  # which NaN is not
+    table, alone = readout.table(data), len(readout.motors) == 1
+    found: dict[str, Any] = dict(zip(readout.names, table[:, 0].tolist() if alone else table, strict=True))
+    if "saturated" in found:
+        found["saturated"] = found["saturated"] > 0.0  # which NaN is not
+    else:
+        found["saturated"] = False if alone else np.zeros(table.shape[1], dtype=bool)
     return found
 
 
