@@ -30,6 +30,7 @@ from codrl_mj.tasks import OURS
 
 Makers = list[Callable[[], Subject]]
 NUM_ENVS = 1024
+BOUGHT = "maxon-ec45-flat-50w"
 ENVPOOL = {  # of its dm_control swing-ups Pendulum's alone: a thousand of the others take minutes to make
     "pendulum": ("Pendulum-v1", "PendulumSwingup-v1"),
     "cartpole": ("CartPole-v1",),
@@ -50,6 +51,10 @@ def groups(quick: bool) -> dict[str, Makers]:
     for count in (1, 6, 17):
         drivers = (None, "ideal", "torque_speed", "lag", "current_loop")
         found[f"motorised: {count} motors"] = [partial(subjects.chain, count, driver) for driver in drivers]
+    for env_id in ("HalfCheetah-v5", "Humanoid-v5"):
+        given = (None, "ideal", "lag", "torque_speed", "current_loop", BOUGHT)
+        found[f"foreign: {env_id}"] = [partial(subjects.foreign, env_id, driver) for driver in given]
+        found[f"foreign: {env_id}"].append(partial(subjects.without_motors, env_id, BOUGHT))
     for task, definition in TASKS.items():
         assert definition.gymnasium_id is not None
         members: Makers = [partial(subjects.theirs, definition.gymnasium_id)]

@@ -118,6 +118,26 @@ def theirs(env_id: str) -> Subject:
     return single(f"Gymnasium {env_id}", gymnasium.make(env_id, disable_env_checker=True))
 
 
+def foreign(env_id: str, actuator: str | None) -> Subject:
+    """An environment of Gymnasium's with motors behind its actuators; None: as it is."""
+    given: Any = {"current_loop": codrl_mj.Actuator(controller=codrl_mj.CurrentLoop(ki=1.0, max_voltage=24.0))}
+    if actuator is None:
+        return theirs(env_id)
+    actuators = {".*": given.get(actuator, actuator)}
+    return single(actuator, codrl_mj.make(env_id, actuators, allow_unstable=True, disable_env_checker=True))
+
+
+def without_motors(env_id: str, actuator: str) -> Subject:
+    """It with all that an actuator adds to its joints, inertia and friction: what the engine alone takes with those."""
+    env = gymnasium.make(env_id, disable_env_checker=True)
+    plain: Any = env.unwrapped
+    model = codrl_mj.make(env_id, {".*": actuator}, allow_unstable=True).unwrapped.model  # type: ignore[attr-defined]
+    for field in ("actuator_armature", "actuator_damping", "dof_frictionloss", "tendon_frictionloss"):
+        getattr(plain.model, field)[:] = getattr(model, field)
+    mujoco.mj_setConst(plain.model, plain.data)
+    return single(f"inertia and friction of {actuator}, no motors", env)
+
+
 def dm_control(domain: str, task: str) -> Subject:
     """A task of dm_control's suite."""
     from dm_control import suite

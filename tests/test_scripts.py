@@ -34,3 +34,14 @@ def test_the_cross_validation():
     printed = run("cross_validate.py", "mountain_car", "--quick").splitlines()
     assert len(printed) > 20
     assert all(line.startswith("passed") for line in printed)
+
+
+def test_the_table_of_furuta(tmp_path):
+    lines = run("furuta_table.py", "--seeds", 1, "--episodes", 1, "--total-steps", 512, "--out", tmp_path).splitlines()
+    assert len({line.count("|") for line in lines}) == 1
+    assert len(lines) == 2 + 12
+    for policy in ("ideal", "18V", "6V", "18V_6ms"):
+        assert read_run(tmp_path / f"{policy}-0").state == "finished"
+    for line in lines[2:]:
+        for cell in line.split("|")[2:-1]:
+            assert 0.0 <= float(cell.split()[0]) <= 250.0

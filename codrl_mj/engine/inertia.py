@@ -9,10 +9,12 @@ import numba
 import numpy as np
 
 from codrl_mj.engine.layout import check_layout, offset
-from codrl_mj.engine.memory import array, f64, i32, i64, internal
+from codrl_mj.engine.memory import array, f64, i32, i64, internal, on_stack
 
 INERTIA_MODEL_FIELDS = ("nv", "M_rownnz", "M_rowadr", "M_colind")
 INERTIA_DATA_FIELDS = ("qLD", "qLDiagInv", "moment_rownnz", "moment_rowadr", "moment_colind", "actuator_moment")
+MOST_ON_STACK = 1024
+"""Degrees of freedom up to which the work is done on the stack, which is quicker."""
 
 
 @functools.cache
@@ -28,12 +30,16 @@ def inertia() -> Any:
         offset("mjData", field) for field in INERTIA_DATA_FIELDS
     )
 
-    @internal
-    def seen_from(model: int, data: int, output: int, gear: float) -> float:
-        turned = np.zeros(i64(model + nv_at)[0])  # L^-T*m
+    @internal(inline="always")
+    def eliminated(model: int, data: int, output: int, gear: float, turned: Any) -> float:
+        """`turned` becomes L^-T*m; there it has room for a number for each degree of freedom."""
         start, last = i32(array(data, moment_adr_at))[output], 0
-        for entry in range(start, start + i32(array(data, moment_nnz_at))[output]):
+        entries = range(start, start + i32(array(data, moment_nnz_at))[output])
+        for entry in entries:
             last = max(last, i32(array(data, moment_col_at))[entry])
+        for row in range(last + 1):
+            turned[row] = 0.0
+        for entry in entries:
             turned[i32(array(data, moment_col_at))[entry]] = gear * f64(array(data, moment_at))[entry]
         total = 0.0
         for row in range(last, -1, -1):
@@ -44,6 +50,13 @@ def inertia() -> Any:
             for entry in range(start, start + i32(array(model, rownnz_at))[row] - 1):  # its ancestors; then itself
                 turned[i32(array(model, colind_at))[entry]] -= f64(array(data, qld_at))[entry] * turned[row]
         return 1.0 / total if total > 0.0 else math.inf
+
+    @internal
+    def seen_from(model: int, data: int, output: int, gear: float) -> float:
+        count = i64(model + nv_at)[0]
+        if count > MOST_ON_STACK:
+            return eliminated(model, data, output, gear, np.empty(count))
+        return eliminated(model, data, output, gear, on_stack(count))
 
     return seen_from
 

@@ -71,6 +71,16 @@ def array(typing_context: Any, struct: Any, at: Any) -> Any:  # noqa: ARG001 - n
 
 
 @intrinsic
+def on_stack(typing_context: Any, count: Any) -> Any:  # noqa: ARG001 - numba fixes the arguments
+    """Typed pointer to so many float64 of no value, which end with the function that calls this."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
+        return builder.alloca(context.get_value_type(types.float64), size=arguments[0])
+
+    return types.CPointer(types.float64)(types.int64), codegen
+
+
+@intrinsic
 def read(typing_context: Any, address: Any, kind: Any) -> Any:  # noqa: ARG001 - numba fixes the arguments
     """The named tuple of class `kind` whose entries are the float64 numbers from an address on."""
     made = types.BaseTuple.from_types((types.float64,) * len(kind.instance_class._fields), kind.instance_class)

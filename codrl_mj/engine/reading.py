@@ -2,7 +2,6 @@
 
 import numbers
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -216,28 +215,48 @@ class Readout:
         self.motors = motors(model)
         indices = np.array(list(self.motors), dtype=int)
         families: list[Family] = [type(actuator) for actuator in self.motors.values()]
-        self._tracks = np.array([family.tracks for family in families], dtype=bool)
-        self._out = model.actuator_outadr[indices]
-        self._control = model.actuator_ctrladr[indices]
-        instances = model.actuator_plugin[indices]
-        self._behind_plugin = instances >= 0
+        out, instances = model.actuator_outadr[indices], model.actuator_plugin[indices]
+        behind_plugin, tracks = instances >= 0, np.array([family.tracks for family in families], dtype=bool)
+        # places in activations, then plugins' states, then forces, then a NaN
+        in_plugin = model.plugin_stateadr[instances] if model.nplugin else 0
+        starts = np.where(behind_plugin, model.na + in_plugin, model.actuator_actadr[indices])
+        actual = model.na + model.npluginstate + out
+        nothing = model.na + model.npluginstate + model.nout
+        last = np.array([slot_size(family) for family in families], dtype=int)
+        places = {"desired_force": np.where(behind_plugin & tracks, starts + last, actual), "actual_force": actual}
+        for motor, (start, family) in enumerate(zip(starts, families, strict=True)):
+            for place, name in enumerate(family.Signals._fields, start + signals_at(family)):
+                places.setdefault(name, np.full(len(families), nothing))[motor] = place
+        self.names = tuple(places)
+        """Of the signals, in order."""
+        self._places = np.stack(list(places.values()))
         # a motor at the callback's door has its arm in the gear, and forces at the shaft
-        self._gear = np.where(self._behind_plugin, 1.0, model.actuator_gear[self._out, 0])
+        self._called = np.flatnonzero(~behind_plugin)
+        self._gear = np.where(behind_plugin, 1.0, model.actuator_gear[out, 0])
+        self._asked = np.flatnonzero(~behind_plugin & tracks)
+        self._control = model.actuator_ctrladr[indices[self._asked]]
         limited = model.actuator_ctrllimited[self._control].astype(bool)
         low, high = model.actuator_ctrlrange[self._control].T
         self._low, self._high = np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
-        nothing = model.na + model.npluginstate
-        in_plugin = model.plugin_stateadr[instances] if model.nplugin else nothing
-        starts = np.where(self._behind_plugin, model.na + in_plugin, model.actuator_actadr[indices])
-        self._places: dict[str, np.ndarray] = {}
-        for motor, (start, family) in enumerate(zip(starts, families, strict=True)):
-            for place, name in enumerate(family.Signals._fields, start + signals_at(family)):
-                self._places.setdefault(name, np.full(len(families), nothing))[motor] = place
-        last = np.array([slot_size(family) for family in families], dtype=int)
-        self._desired = np.where(self._behind_plugin, starts + last, nothing)
+
+    def table(self, data: mujoco.MjData) -> np.ndarray:
+        """The signals after the last step or `mj_forward`, shape (k, n_motors), rows as in `names`.
+
+        Args:
+            data: a simulation of the model.
+        """
+        numbers = np.concatenate((data.act, data.plugin_state, data.actuator_force, _NAN))
+        table: np.ndarray = numbers[self._places]
+        if self._called.size:
+            table[:2] *= self._gear
+            controls = data.ctrl[self._control]
+            if not data.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
+                controls = np.clip(controls, self._low, self._high)
+            table[0, self._asked] = controls * self._gear[self._asked]
+        return table
 
     def __call__(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
-        """The signals after the last step or `mj_forward`.
+        """`table` by name.
 
         Args:
             data: a simulation of the model.
@@ -247,15 +266,10 @@ class Readout:
             the arm (and before the gear that the model of a plugin has), and every signal of the families, NaN where a
             motor's family has none of that name.
         """
-        states = np.concatenate((data.act, data.plugin_state, [np.nan]))
-        controls = data.ctrl[self._control]
-        if not data.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
-            controls = np.clip(controls, self._low, self._high)
-        commanded = controls * self._gear
-        desired = np.where(self._behind_plugin, states[self._desired], commanded)
-        actual = data.actuator_force[self._out] * self._gear
-        forces: dict[str, Any] = {"desired_force": np.where(self._tracks, desired, actual), "actual_force": actual}
-        return forces | {name: states[places] for name, places in self._places.items()}
+        return dict(zip(self.names, self.table(data), strict=True))
+
+
+_NAN = np.array([np.nan])
 
 
 def signals(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, np.ndarray]:

@@ -1,12 +1,13 @@
 """From an agent's action to the controls of somebody else's environment."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel, Command
+from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.physics.disturber import Disturber
 
@@ -82,45 +83,79 @@ class Commands:
 
 
 class CommandsWay:
-    """Disturbances of the motors' controls, once an environment step, which has the place of the integration step."""
+    """Disturbances of the motors, once an environment step, which has the place of the integration step."""
 
     def __init__(
-        self, model: mujoco.MjModel, controls: np.ndarray, disturbances: Disturbances, step_duration: float
+        self,
+        data: mujoco.MjData,
+        motors: Sequence[int],
+        actions: spaces.Space,
+        disturbances: Disturbances,
+        step_duration: float,
     ) -> None:
         """Take the units: of a plain motor its force [N or N*m] before the gear, of others the control's own.
 
         Args:
-            model: the environment's.
-            controls: indices of the motors' controls, shape (n,).
-            disturbances: what happens to them.
+            data: the environment's simulation.
+            motors: indices of the motors' actuators, n of them.
+            actions: the environment's own action space.
+            disturbances: what happens to their commands, and to their joints.
             step_duration: environment step [s].
 
         Raises:
-            ValueError: there are load pulses.
+            ValueError: actions are not the model's controls; or there are load pulses, and a motor drives no joint.
         """
-        if disturbances.pulse_force:
+        model, indices = data.model, list(motors)
+        if not isinstance(actions, spaces.Box) or actions.shape != (model.nu,):
             raise ValueError(
-                f"disturbances.pulse_force = {disturbances.pulse_force:g}: loads on the joints of another's "
-                "environment are not known here; give only command_delay, command_quantum and command_rate"
+                f"disturbances: the environment's actions are {actions}, not the {model.nu} controls of its model, "
+                "which are what can be disturbed"
             )
-        self._controls = controls
+        self._data, self._pulses = data, disturbances.random
+        self._controls = controls = model.actuator_ctrladr[indices]
         limited = model.actuator_ctrllimited[controls].astype(bool)
         largest = np.where(limited, np.abs(model.actuator_ctrlrange[controls]).max(axis=1), np.inf)
-        indices = [int(np.flatnonzero(model.actuator_ctrladr == control)[0]) for control in controls]
         self._gains = np.array([plain_gain(model, index) or 1.0 for index in indices])
         self._disturber = Disturber(disturbances, step_duration, largest * np.abs(self._gains), 1)
+        self._dofs = [_dof(model, index) for index in indices] if self._pulses else []
 
     @property
     def memory(self) -> np.ndarray:
-        """The commands on their way, a live array."""
+        """The commands on their way and the pulses to come, a live array."""
         return self._disturber.memory
 
+    def begin(self, generator: np.random.Generator) -> None:
+        """Forget everything at the start of an episode; pulses have random numbers of their own in each."""
+        key = np.floor(generator.random() * LARGEST_KEY) if self._pulses else 0.0
+        self._disturber.reset(np.zeros(1, dtype=int), key)
+        self._data.qfrc_applied[self._dofs] = 0.0
+
     def controls(self, action: np.ndarray) -> np.ndarray:
-        """What arrives of an action in this step, float64."""
+        """What arrives of an action in this step, float64; the loads of the step go to the joints."""
         arrived = np.array(action, dtype=np.float64)
         wanted = arrived[self._controls] * self._gains
         arrived[self._controls] = self._disturber.commands(wanted[np.newaxis])[0] / self._gains
+        if self._pulses:
+            self._data.qfrc_applied[self._dofs] = 0.0
+            np.add.at(self._data.qfrc_applied, self._dofs, self._disturber.loads()[0])
         return arrived
+
+
+_JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+
+
+def _dof(model: mujoco.MjModel, index: int) -> int:
+    """The degree of freedom that a motor drives.
+
+    Raises:
+        ValueError: it drives no joint.
+    """
+    if mujoco.mjtTrn(model.actuator_trntype[index]) not in _JOINT:
+        raise ValueError(
+            f"disturbances.pulse_force: {model.actuator(index).name or f'actuator {index}'} drives no joint on which a "
+            "load could act; give only command_delay, command_quantum and command_rate"
+        )
+    return int(model.jnt_dofadr[model.actuator_trnid[index, 0]])
 
 
 def plain_gain(model: mujoco.MjModel, index: int) -> float | None:

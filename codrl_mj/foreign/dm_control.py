@@ -7,12 +7,17 @@ import dm_env
 import mujoco
 import numpy as np
 from dm_control import suite
+from dm_env import specs
+from gymnasium import spaces
 
-from codrl_mj.actuators.noise import LARGEST_KEY
-from codrl_mj.engine.reading import Readout, clear_motors
+from codrl_mj.actuators import ActuatorModel
+from codrl_mj.disturbances import resolve_disturbances
 from codrl_mj.fields import did_you_mean
 from codrl_mj.foreign.building import Building
+from codrl_mj.foreign.commands import command_of
 from codrl_mj.foreign.readings import readings
+from codrl_mj.foreign.simulated import Simulated
+from codrl_mj.specs import resolve_patterns
 
 
 class MotorisedEnvironment(dm_env.Environment):
@@ -22,47 +27,103 @@ class MotorisedEnvironment(dm_env.Environment):
     that moved it last.
     """
 
-    def __init__(self, build: Callable[[], dm_env.Environment], building: Building, noise_seed: int | None) -> None:
+    def __init__(
+        self,
+        build: Callable[[], dm_env.Environment],
+        actuators: Mapping[str, ActuatorModel],
+        action: str = "force",
+        randomize: Mapping[str, Any] | None = None,
+        disturbances: Any = None,
+        allow_unstable: bool = False,
+        noise_seed: int | None = None,
+    ) -> None:
         """Build it.
 
         Args:
             build: makes the environment.
-            building: the motors.
-            noise_seed: of the noise of their sensors.
+            actuators: pattern -> actuator.
+            action: as for `make_dm_control`, and so are the others.
+            randomize: see there.
+            disturbances: see there.
+            allow_unstable: see there.
+            noise_seed: see there.
 
         Raises:
-            ValueError: see `codrl_mj.motorised`.
+            ValueError: see `make_dm_control`.
         """
-        self._building = building
-        with building.motorising():
+        self._meanings = {pattern: command_of(one, action, pattern) for pattern, one in actuators.items()}
+        self._actuators = {
+            pattern: actuators[pattern] if command is None else command.actuator
+            for pattern, command in self._meanings.items()
+        }
+        self._building = Building(self._actuators, allow_unstable)
+        self._randomize, self._disturbances = randomize, resolve_disturbances(disturbances)
+        self._allow_unstable = allow_unstable
+        with self._building.motorising():
             self._environment = build()
-        building.check()
+        self._building.check()
+        if randomize is not None and _builds_at_resets(self._environment):
+            raise ValueError(
+                f"randomize: {type(self._environment).__name__} builds its model anew at every reset; let its own "
+                "variations change it"
+            )
         self._generator = np.random.default_rng(noise_seed)
-        self._read: tuple[Any, Readout] | None = None
+        self._ended = True
+        self._bound: tuple[mujoco.MjModel, Simulated] | None = None
+        _ = self._simulated  # what is wrong is said here
 
     def reset(self) -> dm_env.TimeStep:
         """Start an episode, the motors at rest; composer environments build their model anew."""
+        if self._randomize is not None:
+            self._simulated.draw(self._generator)
         with self._building.motorising():
-            return self._begun(self._environment.reset())
+            timestep = self._environment.reset()
+        self._ended = False
+        self._simulated.begin(self._generator)
+        return timestep
 
     def step(self, action: Any) -> dm_env.TimeStep:
-        """Advance by one environment step; an episode that has ended starts anew."""
-        with self._building.motorising():
-            return self._begun(self._environment.step(action))
+        """Advance by one environment step; an episode that has ended starts anew.
 
-    def _begun(self, timestep: dm_env.TimeStep) -> dm_env.TimeStep:
-        """Give noisy sensors their keys where an episode begins."""
-        if timestep.first() and any(motor.random for motor in self._readout.motors.values()):
-            keys = self._generator.integers(LARGEST_KEY, size=len(self._readout.motors))
-            clear_motors(self.mujoco[1], keys.tolist())
+        Raises:
+            ValueError: the action has not the shape of the action specification.
+        """
+        if self._ended:
+            return self.reset()
+        with self._building.motorising():
+            timestep = self._environment.step(self._simulated.controls(action))
+        self._ended = timestep.last()
         return timestep
 
     @property
-    def _readout(self) -> Readout:
-        model, _ = self.mujoco
-        if self._read is None or self._read[0] is not model:
-            self._read = model, Readout(model)
-        return self._read[1]
+    def _simulated(self) -> Simulated:
+        """The motors in the present model."""
+        model, data = self.mujoco
+        if self._bound is None or self._bound[0] is not model:
+            spec = self._environment.action_spec()
+            low, high = (np.broadcast_to(bound, spec.shape) for bound in (spec.minimum, spec.maximum))
+            simulated = Simulated(
+                data,
+                self._actuators,
+                self._meanings,
+                spaces.Box(low, high, dtype=np.float64),
+                randomize=self._randomize,
+                disturbances=self._disturbances,
+                step_duration=self._environment.control_timestep(),
+                allow_unstable=self._allow_unstable,
+            )
+            self._bound = model, simulated
+        return self._bound[1]
+
+    @property
+    def motors(self) -> dict[int, ActuatorModel]:
+        """The motors of the present episode, by the index of the actuator in the model."""
+        return dict(self._simulated.motors)
+
+    @property
+    def randomization(self) -> dict[str, Any]:
+        """What the present episode was drawn with; empty if nothing was drawn."""
+        return self._simulated.report
 
     def signals(self) -> dict[str, Any]:
         """The motors' signals after the last step, as in `info` of `codrl_mj.make`.
@@ -70,7 +131,7 @@ class MotorisedEnvironment(dm_env.Environment):
         `desired_force` and `actual_force` [N or N*m], the signals of the families and `saturated`; of several motors
         arrays (n_motors,) in the model's order.
         """
-        return readings(self._readout, self.mujoco[1])
+        return readings(self._simulated.readout, self.mujoco[1])
 
     @property
     def mujoco(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -83,8 +144,12 @@ class MotorisedEnvironment(dm_env.Environment):
         return self._environment.observation_spec()
 
     def action_spec(self) -> Any:
-        """The environment's."""
-        return self._environment.action_spec()
+        """The environment's, with the limits of the motors' commands where these are what an action stands for."""
+        spec = self._environment.action_spec()
+        if not any(self._meanings.values()):
+            return spec
+        space: Any = self._simulated.action_space
+        return specs.BoundedArray(spec.shape, spec.dtype, space.low, space.high, spec.name)
 
     def reward_spec(self) -> Any:
         """The environment's."""
@@ -105,10 +170,18 @@ class MotorisedEnvironment(dm_env.Environment):
         return getattr(self._environment, name)
 
 
+def _builds_at_resets(environment: dm_env.Environment) -> bool:
+    """Whether an environment is one of `dm_control.composer`, which need not have been imported."""
+    return any(kind.__module__.startswith("dm_control.composer") for kind in type(environment).__mro__)
+
+
 def make_dm_control(
     environment: str | Callable[..., dm_env.Environment],
     actuators: Mapping[str, Any],
     *,
+    action: str = "force",
+    randomize: Mapping[str, Any] | None = None,
+    disturbances: Any = None,
     allow_unstable: bool = False,
     noise_seed: int | None = None,
     **options: Any,
@@ -122,16 +195,22 @@ def make_dm_control(
     Args:
         environment: `DOMAIN/TASK` of the suite, or a function that makes an environment.
         actuators: what goes where, as for `codrl_mj.motorise`.
-        allow_unstable: likewise.
-        noise_seed: of the noise of the motors' sensors.
+        action: as for `codrl_mj.make`, and so are the next three.
+        randomize: see there; what was drawn is in `randomization`. Not for environments that build their model anew at
+            every reset.
+        disturbances: see there; actions have to be the model's controls.
+        allow_unstable: see there.
+        noise_seed: of the noise of the motors' sensors, of draws and of load pulses.
         **options: of `dm_control.suite.load`, or of the function.
 
     Raises:
-        ValueError: see `codrl_mj.motorise`; an unknown environment; or its model is not built from XML.
+        ValueError: see `codrl_mj.motorise`; an unknown environment; its model is not built from XML; or an argument
+            does not go with the actuators or the environment.
     """
-    building = Building(actuators, allow_unstable)
+    resolved = resolve_patterns(actuators, "an environment of dm_control")
+    arguments = (resolved, action, randomize, disturbances, allow_unstable, noise_seed)
     if not isinstance(environment, str):
-        return MotorisedEnvironment(lambda: environment(**options), building, noise_seed)
+        return MotorisedEnvironment(lambda: environment(**options), *arguments)
     domain, _, task = environment.partition("/")
     if (domain, task) not in suite.ALL_TASKS:
         known = ["/".join(each) for each in suite.ALL_TASKS]
@@ -139,4 +218,4 @@ def make_dm_control(
             f"environment = {environment!r}: {did_you_mean(environment, known)}must be DOMAIN/TASK of "
             "dm_control.suite.ALL_TASKS, or a function"
         )
-    return MotorisedEnvironment(lambda: suite.load(domain, task, **options), building, noise_seed)
+    return MotorisedEnvironment(lambda: suite.load(domain, task, **options), *arguments)

@@ -1,4 +1,4 @@
-"""Motors of somebody else's model, drawn anew for every episode."""
+"""Motors of somebody else's model, and the model itself, drawn anew for every episode."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -11,38 +11,46 @@ from codrl_mj.engine.plugin import PLUGIN_HEAD
 from codrl_mj.envs.distributions import Distribution, parse
 from codrl_mj.envs.randomization import LIMIT
 from codrl_mj.fields import check_names
+from codrl_mj.foreign.model_fields import PREFIX, ModelFields
 
 _JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 
 
 class Draws:
-    """Distributions of the fields of motors, by their patterns; the motors of one pattern get the same values."""
+    """Distributions of the fields of motors, by their patterns, and of the model's.
+
+    The motors of one pattern get the same values.
+    """
 
     def __init__(
         self,
-        randomize: Mapping[str, Mapping[str, Distribution | str]],
+        randomize: Mapping[str, Any],
         nominal: Mapping[str, ActuatorModel],
         fixed: Mapping[str, Mapping[str, str]],
+        data: mujoco.MjData,
     ) -> None:
         """Check the distributions against the fields that they are for.
 
         Args:
-            randomize: pattern -> field -> distribution, or its text.
+            randomize: pattern -> field -> distribution, or its text; and field of the model -> distribution.
             nominal: pattern -> what is simulated.
             fixed: pattern -> field that cannot be drawn -> why.
+            data: a simulation of the model.
 
         Raises:
             ValueError: a pattern or a field is unknown, or a distribution is none or beyond the field's bounds.
         """
-        if not isinstance(randomize, Mapping) or not all(isinstance(each, Mapping) for each in randomize.values()):
+        own = dict(randomize) if isinstance(randomize, Mapping) else {}
+        of_model = {name: own.pop(name) for name in list(own) if str(name).startswith(PREFIX)}
+        if not isinstance(randomize, Mapping) or not all(isinstance(each, Mapping) for each in own.values()):
             raise ValueError(
                 f"randomize = {randomize!r}: must be a mapping of the actuators' patterns to mappings of fields to "
                 f"distributions, such as {{{next(iter(nominal))!r}: {{'motor.resistance': 'uniform(0.4, 0.6)'}}}}"
             )
-        check_names(randomize, nominal, "pattern", "randomize: ")
-        self._nominal = {pattern: nominal[pattern] for pattern in randomize}
+        check_names(own, nominal, "pattern", "randomize: ")
+        self._nominal = {pattern: nominal[pattern] for pattern in own}
         self._distributions: dict[str, dict[str, Distribution]] = {}
-        for pattern, given in randomize.items():
+        for pattern, given in own.items():
             actuator, family = nominal[pattern], _family(nominal[pattern])
             check_names(given, field_paths(family), "field", f"randomize[{pattern!r}]: ")
             self._distributions[pattern] = {}
@@ -56,18 +64,25 @@ class Draws:
                 except ValueError as error:
                     raise ValueError(f"randomize[{pattern!r}][{name!r}] = {text}: {error}") from None
                 self._distributions[pattern][name] = distribution
+        self._of_model: dict[str, Distribution] = {}
+        for name, text in of_model.items():
+            try:
+                self._of_model[name] = text if isinstance(text, Distribution) else parse(text)
+            except ValueError as error:
+                raise ValueError(f"randomize[{name!r}] = {text}: {error}") from None
+        self._fields = ModelFields(data, self._of_model) if of_model else None
 
     @property
     def size(self) -> int:
         """How many numbers `draw` returns."""
-        return sum(map(len, self._distributions.values())) + 1
+        return sum(map(len, self._distributions.values())) + len(self._of_model) + 1
 
-    def draw(self, generator: np.random.Generator, put: Callable[[Mapping[str, ActuatorModel]], None]) -> np.ndarray:
+    def draw(self, generator: np.random.Generator, put: Callable[[np.ndarray], None]) -> np.ndarray:
         """Draw until what is drawn can be simulated.
 
         Args:
             generator: draws.
-            put: puts actuators into the model, by their patterns; raises a ValueError where they are not stable there.
+            put: puts values into the model; raises a ValueError where its motors are not stable then.
 
         Returns:
             The values, and how many sets were rejected before: shape (k + 1,).
@@ -75,12 +90,12 @@ class Draws:
         Raises:
             ValueError: `LIMIT` sets in a row were rejected.
         """
-        each = [one for own in self._distributions.values() for one in own.values()]
+        each = [one for own in self._distributions.values() for one in own.values()] + [*self._of_model.values()]
         reason = ""
         for rejected in range(LIMIT):
             values = np.array([*(one.transform(generator.random(1))[0] for one in each), rejected])
             try:
-                put(self.actuators(values))
+                put(values)
             except ValueError as error:
                 reason = str(error)
             else:
@@ -94,12 +109,19 @@ class Draws:
         """Pattern -> the actuator of a draw."""
         return {pattern: one.replaced(self.report(values)[pattern]) for pattern, one in self._nominal.items()}
 
+    def put_fields(self, values: np.ndarray | None) -> None:
+        """Give the model the fields of a draw, or its own; to be followed by a reset, or a restoring of the state."""
+        if self._fields is not None:
+            drawn = {} if values is None else self.report(values)
+            self._fields.put({name: drawn[name] for name in self._of_model if name in drawn})
+
     def report(self, values: np.ndarray) -> dict[str, Any]:
         """What `info` says of a draw: pattern -> field -> value, and `rejected`."""
         left = iter(values.tolist())
         named: dict[str, Any] = {
             pattern: {name: next(left) for name in own} for pattern, own in self._distributions.items()
         }
+        named |= {name: next(left) for name in self._of_model}
         return named | {"rejected": int(next(left))}
 
 

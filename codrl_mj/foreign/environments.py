@@ -16,18 +16,17 @@ from gymnasium.envs.registration import load_env_creator
 from gymnasium.utils import RecordConstructorArgs, seeding
 
 from codrl_mj.actuators import ActuatorModel, Command
-from codrl_mj.actuators.noise import LARGEST_KEY
-from codrl_mj.disturbances import OFF, resolve_disturbances
-from codrl_mj.engine.reading import Readout, bring_to_rest, check_shafts, motors, slots
+from codrl_mj.disturbances import resolve_disturbances
+from codrl_mj.engine.reading import bring_to_rest, motors, slots
 from codrl_mj.envs.snapshots import check_snapshot, time_limits
 from codrl_mj.foreign.building import Building
-from codrl_mj.foreign.commands import Commands, CommandsWay, command_of
-from codrl_mj.foreign.draws import Draws, Exchange
+from codrl_mj.foreign.commands import command_of
 from codrl_mj.foreign.readings import Sensors, readings
 from codrl_mj.foreign.recording import MotorsRecorder
+from codrl_mj.foreign.simulated import Simulated
 from codrl_mj.foreign.state import set_state_of, state_of
 from codrl_mj.physics.streams import set_words, words_of
-from codrl_mj.specs import matched_by, names_of, resolve_patterns
+from codrl_mj.specs import resolve_patterns
 
 
 def make(
@@ -197,13 +196,8 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         assert base.spec is not None
         self._motorised: Motorised = base.spec.entry_point  # type: ignore[assignment]
         self._disturbances = resolve_disturbances(disturbances)
+        self._randomize = randomize
         self._observes = observe_actuator
-        self._draws: Draws | None = None
-        if randomize is not None:
-            commands = self._motorised.commands
-            fixed = {pattern: command.fixed for pattern, command in commands.items() if command is not None}
-            self._draws = Draws(randomize, self._motorised.simulated, fixed)
-        self._values: np.ndarray | None = None
         self._generator = np.random.default_rng()
         self._begun = False
         self._bind()
@@ -214,65 +208,47 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         Raises:
             ValueError: see `make`.
         """
-        self._model, self._data = self.unwrapped.model, self.unwrapped.data  # type: ignore[attr-defined]
+        base: Any = self.unwrapped
         self._recorder: MotorsRecorder | None = None
-        self._readout = Readout(self._model)
-        self._slots = list(slots(self._data, self._readout.motors).values())
-        names = names_of(self._model)
-        self._places = {pattern: matched_by(pattern, names) for pattern in self._motorised.actuators}
-        self._exchange = Exchange(self._data, self._readout.motors, self._places)
-        self._commands: Commands | None = None
-        self._way: CommandsWay | None = None
+        self._data, motorised = base.data, self._motorised
+        self._simulated = Simulated(
+            base.data,
+            motorised.simulated,
+            motorised.commands,
+            self.env.action_space,
+            randomize=self._randomize,
+            disturbances=self._disturbances,
+            step_duration=getattr(base, "dt", None),
+            allow_unstable=motorised.allow_unstable,
+        )
+        if self._simulated.action_space is not self.env.action_space:
+            self.action_space = self._simulated.action_space
         self._sensors: Sensors | None = None
-        commands = {
-            index: command
-            for pattern, command in self._motorised.commands.items()
-            for index in self._places[pattern]
-            if command is not None
-        }
-        if commands:
-            self._commands = Commands(self._model, self.env.action_space, commands)
-            self.action_space = self._commands.action_space
-        if self._disturbances != OFF:
-            if not hasattr(self.unwrapped, "dt"):
-                raise ValueError("disturbances: the environment has no dt, the duration of its steps [s]; give it one")
-            controls = self._model.actuator_ctrladr[list(self._readout.motors)]
-            self._way = CommandsWay(self._model, controls, self._disturbances, self.unwrapped.dt)
-        self._put({})
+        self._look()
         if self._observes:
             self.observation_space = _longer(self.env.observation_space, len(self.sensor_names))
 
-    def _put(self, actuators: Mapping[str, ActuatorModel]) -> None:
-        """Give the model the actuators of some patterns.
-
-        Raises:
-            ValueError: they are not stable there.
-        """
-        changed = {index: one for pattern, one in actuators.items() for index in self._places[pattern]}
-        self._motors = self._readout.motors | changed
-        if changed:
-            self._exchange.put(actuators)
-            for actuator in actuators.values():
-                actuator.check_at(self._model.opt.timestep, self._motorised.allow_unstable)
-            check_shafts(self._model, self._motorised.allow_unstable, actuators=self._motors)
+    def _look(self) -> None:
+        """Have the sensors of the present motors."""
         if self._observes:
-            self._sensors = Sensors(self._data, self._motors)
+            self._sensors = Sensors(self._data, self._simulated.motors)
 
     @property
     def motors(self) -> dict[int, ActuatorModel]:
         """The motors of the present episode, by the index of the actuator in the model."""
-        return dict(self._motors)
+        return dict(self._simulated.motors)
 
     @property
     def signal_names(self) -> tuple[str, ...]:
         """Of the motors' signals in `info`."""
-        return tuple(readings(self._readout, self._data))
+        return tuple(readings(self._simulated.readout, self._data))
 
     @property
     def recorder(self) -> MotorsRecorder:
         """Reads the environment between its steps; from now on every integration step is looked at."""
         if self._recorder is None:
-            self._recorder = MotorsRecorder(self._data, self._readout, self._motorised.action, lambda: self._motors)
+            readout, command = self._simulated.readout, self._motorised.action
+            self._recorder = MotorsRecorder(self._data, readout, command, lambda: self.motors)
         return self._recorder
 
     @property
@@ -285,15 +261,11 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         if seed is not None:
             own = np.random.SeedSequence(seed, spawn_key=(1,))  # independent of the environment's
             self._generator = np.random.Generator(np.random.PCG64(own))
-        if self._draws is not None:
-            self._values = self._draws.draw(self._generator, self._put)
+        self._simulated.draw(self._generator)
+        self._look()
         observation, info = self.env.reset(seed=seed, options=options)
         self._begun = True
-        for slot, motor in zip(self._slots, self._motors.values(), strict=True):  # not all environments reset all data
-            key = np.floor(self._generator.random() * LARGEST_KEY) if motor.random else 0.0
-            bring_to_rest(slot, self._data.time, key)
-        if self._way is not None:
-            self._way.memory[:] = 0.0
+        self._simulated.begin(self._generator)
         return self._observed(observation), info | self._drawn()
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -302,13 +274,10 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         Raises:
             ValueError: the action has not the shape of the action space.
         """
-        if self._commands is not None:
-            action = self._commands.controls(action)
-        if self._way is not None:
-            action = self._way.controls(action)
         with contextlib.nullcontext() if self._recorder is None else self._recorder.watching():
-            observation, reward, terminated, truncated, info = self.env.step(action)
-        return self._observed(observation), reward, terminated, truncated, info | readings(self._readout, self._data)
+            observation, reward, terminated, truncated, info = self.env.step(self._simulated.controls(action))
+        seen = readings(self._simulated.readout, self._data)
+        return self._observed(observation), reward, terminated, truncated, info | seen
 
     def _observed(self, observation: Any) -> Any:
         if self._sensors is None:
@@ -316,14 +285,12 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         return np.concatenate([observation, self._sensors.seen()]).astype(observation.dtype)
 
     def _drawn(self) -> dict[str, Any]:
-        if self._draws is None or self._values is None:
-            return {}
-        return {"randomization": self._draws.report(self._values)}
+        return {"randomization": self.randomization} if self.randomization else {}
 
     @property
     def randomization(self) -> dict[str, Any]:
         """What the present episode was drawn with, as in the reset's info; empty if nothing was drawn."""
-        return self._drawn().get("randomization", {})
+        return self._simulated.report
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Everything that the future depends on, as plain arrays: simulation, motors, generators, draws, time limit.
@@ -341,11 +308,7 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
             "motors_generator": words_of(self._generator),
             "elapsed_steps": np.array(elapsed, dtype=np.int64),
         }
-        if self._way is not None:
-            found["disturbances"] = self._way.memory.copy()
-        if self._draws is not None:
-            found["drawn"] = np.full(self._draws.size, np.nan) if self._values is None else self._values.copy()
-        return found
+        return found | {name: array.copy() for name, array in self._simulated.memory.items()}
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> Any:
         """Continue from what `snapshot` returned, bit for bit, in an environment made with the same arguments.
@@ -366,11 +329,9 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         if not self._begun:  # which Gymnasium's wrappers insist on
             self.env.reset()
             self._begun = True
-        if self._draws is not None:
-            values = snapshot["drawn"].copy()
-            self._values = None if np.isnan(values).any() else values
-            nominal = self._motorised.simulated
-            self._put(nominal if self._values is None else self._draws.actuators(values))
+        if "drawn" in expected:
+            self._simulated.restore(snapshot["drawn"].copy())
+            self._look()
         generator, _ = seeding.np_random(0)
         set_words(generator, snapshot["generator"])
         self.unwrapped.np_random = generator
@@ -379,8 +340,8 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         if not self._whole:
             return self.reset()[0]
         set_state_of(self._data, snapshot["state"], snapshot["computed"])
-        if self._way is not None:
-            self._way.memory[:] = snapshot["disturbances"]
+        if "disturbances" in expected:
+            self._simulated.memory["disturbances"][:] = snapshot["disturbances"]
         for limit, steps in zip(time_limits(self.env), snapshot["elapsed_steps"].tolist(), strict=True):
             limit._elapsed_steps = None if steps < 0 else steps
         return None
@@ -404,9 +365,7 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         self._bind()
 
 
-_OF_THE_MODEL = (
-    *("_model", "_data", "_readout", "_exchange", "_commands", "_way", "_sensors", "_motors", "_slots", "_recorder"),
-)
+_OF_THE_MODEL = ("_data", "_simulated", "_sensors", "_recorder")
 
 
 def _longer(space: gymnasium.Space, count: int) -> spaces.Box:

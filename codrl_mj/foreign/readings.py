@@ -23,10 +23,13 @@ def readings(readout: Readout, data: mujoco.MjData) -> dict[str, Any]:
         `desired_force`, `actual_force`, the families' signals and `saturated` (bool), each a number where there is one
         motor, else an array (n_motors,); units as `Readout` has them.
     """
-    signals = readout(data)
-    saturated = signals.pop("saturated", np.zeros(len(readout.motors)))
-    signals["saturated"] = (saturated != 0.0) & ~np.isnan(saturated)
-    return {name: values.item() for name, values in signals.items()} if len(readout.motors) == 1 else signals
+    table, alone = readout.table(data), len(readout.motors) == 1
+    found: dict[str, Any] = dict(zip(readout.names, table[:, 0].tolist() if alone else table, strict=True))
+    if "saturated" in found:
+        found["saturated"] = found["saturated"] > 0.0  # which NaN is not
+    else:
+        found["saturated"] = False if alone else np.zeros(table.shape[1], dtype=bool)
+    return found
 
 
 class Sensors:

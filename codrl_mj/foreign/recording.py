@@ -35,7 +35,7 @@ class MotorsRecorder:
         self.command, self.motors = command, tuple(motor_names(model, readout.motors))
         self._outputs = model.actuator_outadr[list(readout.motors)]
         self._moments = np.empty((model.nout, model.nv))
-        names = list(readout(data))
+        names = readout.names
         self.trace_names = (*names, "speed")
         self.signal_names = (*(name for name in names if name != "saturated"), "saturated")
         self.step_duration = float(model.opt.timestep)
@@ -83,7 +83,7 @@ class MotorsRecorder:
             self._row()
 
     def _row(self) -> None:
-        self._rows.append(np.column_stack([*self._readout(self._data).values(), self.speeds()]))
+        self._rows.append(np.column_stack([*self._readout.table(self._data), self.speeds()]))
 
     def trace(self) -> np.ndarray:
         """See `Recorder`."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -11,6 +11,11 @@ from codrl_mj.actuators import Actuator
 from codrl_mj.tasks.attributes import Attribute
 from codrl_mj.tasks.trials import Trials
 from codrl_mj.tasks.twin import Twin
+
+
+class NoOptions(NamedTuple):
+    """The options of a task that has none."""
+
 
 Options = Any
 """A task's options: a `NamedTuple` of floats and flags whose fields have defaults."""
@@ -43,27 +48,12 @@ class Task:
     max_force: Any
     """Largest desired force [N] or torque [N*m] of any action; where the action is the force, it saturates here. One
     for each motor, or one for all."""
-    forces: tuple[Any, ...] | None
-    """Desired forces [N] or torques [N*m] of the discrete actions, in order, each a number, or with several motors a
-    tuple; None where the action is the force."""
-    render_fps: int
-    """Frames per second of a video with one frame a step, Gymnasium's; rarely real time."""
     integrators: tuple[str, ...]
     """Names of the integrators that can be chosen; the first is Gymnasium's."""
     state_names: tuple[str, ...]
     """Names of the state's entries, with units."""
-    qpos: tuple[int, ...]
-    """Which state entries are MuJoCo's `qpos`, in order; an arithmetic progression, as is `qvel`."""
-    qvel: tuple[int, ...]
-    """Which state entries are MuJoCo's `qvel`, in order."""
-    action_space: spaces.Space[Any]
-    """The action space, Gymnasium's."""
     observation_names: tuple[str, ...]
     """Names of the observation's entries."""
-    observation_space: spaces.Box
-    """The observation space, Gymnasium's."""
-    options: type[Any]
-    """The task's options: a `NamedTuple` class whose fields all have defaults."""
     initial_bounds: Callable[[dict[str, Any] | None], tuple[np.ndarray, np.ndarray]]
     """(reset options) -> lower and upper bounds, shape (k,) each, of the k numbers that Gymnasium draws at a reset."""
     initial_state: Callable[[Entries], tuple[Any, ...]]
@@ -85,6 +75,22 @@ class Task:
     goal_hold: float = 0.0
     """How long an episode that succeeds has been at the goal when it ends [s]."""
 
+    forces: tuple[Any, ...] | None = None
+    """Desired forces [N] or torques [N*m] of the discrete actions, in order, each a number, or with several motors a
+    tuple; None where the action is the force."""
+    options: type[Any] = NoOptions
+    """The task's options: a `NamedTuple` class whose fields all have defaults."""
+    qpos: tuple[int, ...] = ()
+    """Which state entries are MuJoCo's `qpos`, in order; an arithmetic progression, as is `qvel`. The state's first
+    half unless told otherwise."""
+    qvel: tuple[int, ...] = ()
+    """Which state entries are MuJoCo's `qvel`, in order; the second half unless told otherwise."""
+    action_space: spaces.Space[Any] = None  # type: ignore[assignment]
+    """The action space, Gymnasium's; unless told otherwise up to `max_force`, or which of `forces`."""
+    observation_space: spaces.Box = None  # type: ignore[assignment]
+    """The observation space, Gymnasium's; without bounds unless told otherwise."""
+    render_fps: int = 0
+    """Frames per second of a video with one frame a step: real time unless told otherwise, as Gymnasium does."""
     motors: tuple[str, ...] = ("motor",)
     """Names of the MJCF model's actuators that the task drives, in the order of actions and forces. With several of
     them, forces and signals are arrays (n,) wherever they are numbers otherwise."""
@@ -115,6 +121,21 @@ class Task:
     """Numbers that environments of the task have as attributes, by their names, and where they live."""
     trials: Trials | None = None
     """What the certificate tries the task in; without it, the checks that need states of the task's are left out."""
+
+    def __post_init__(self) -> None:
+        """Fill in what follows from the rest."""
+        half, size = len(self.state_names) // 2, (len(self.observation_names),)
+        limits = self.max_forces.astype(np.float32)
+        derived = {
+            "qpos": tuple(range(half)),
+            "qvel": tuple(range(half, 2 * half)),
+            "action_space": spaces.Box(-limits, limits) if self.forces is None else spaces.Discrete(len(self.forces)),
+            "observation_space": spaces.Box(-np.inf, np.inf, size, np.float32),
+            "render_fps": max(round(1.0 / self.step_duration), 1),
+        }
+        for name, value in derived.items():
+            if not getattr(self, name):
+                object.__setattr__(self, name, value)
 
     @property
     def default_actuator(self) -> str:

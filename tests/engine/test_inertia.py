@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from codrl_mj.engine.inertia import shaft_inertia
+from codrl_mj.engine.inertia import MOST_ON_STACK, shaft_inertia
 
 MODELS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 
@@ -28,6 +28,20 @@ def test_it_is_one_over_the_moment_through_the_inverse_inertia_matrix(name):
         expected = 1.0 / np.einsum("ij,ij->i", moments, solved)
         found = [shaft_inertia(model, data, output, 3.0) for output in range(model.nu)]
         np.testing.assert_allclose(found, expected / 9.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("count", [3, MOST_ON_STACK + 1])
+def test_a_slide_of_many_that_are_not_connected_has_its_bodys_mass(count):
+    spec = mujoco.MjSpec()
+    for index in range(count):
+        body = spec.worldbody.add_body(mass=0.5 + index, inertia=[1.0, 1.0, 1.0], explicitinertial=True)
+        joint = body.add_joint(name=str(index), type=mujoco.mjtJoint.mjJNT_SLIDE)
+        spec.add_actuator(target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_fwdPosition(model, data)
+    for index in (0, 1, count - 1):
+        assert shaft_inertia(model, data, index, 2.0) == pytest.approx((0.5 + index) / 4.0, rel=1e-15)
 
 
 def test_what_moves_nothing_has_no_end_of_inertia():

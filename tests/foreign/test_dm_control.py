@@ -6,7 +6,8 @@ from dm_control import composer, manipulation, suite
 from dm_control.locomotion.examples import basic_cmu_2019, basic_rodent_2020
 
 import codrl_mj
-from codrl_mj.actuators import Actuator, CurrentLoop, Lag, Motor, TorqueSpeed
+from codrl_mj.actuators import Actuator, CurrentLoop, Drive, Lag, Motor, TorqueSpeed
+from codrl_mj.catalogue import motor_entry
 from tests.matrix import but
 
 IDEAL = {".*": "ideal"}
@@ -110,6 +111,54 @@ def test_motors_can_be_given_to_dm_control_in_a_block():
     with codrl_mj.motorised({"b.*": "lag"}):
         env = suite.load("cheetah", "run")
     assert set(map(type, codrl_mj.motors(env.physics.model.ptr).values())) == {Lag}
+
+
+MAXON = {".*": "maxon-ec45-flat-50w"}
+
+
+def test_currents_are_commanded_in_amperes():
+    motor = Drive.of(motor_entry("maxon-ec45-flat-50w").numbers).replaced({"controller.max_current": 5.0})
+    env = codrl_mj.make_dm_control("cheetah/run", {".*": motor}, action="current", task_kwargs={"random": 0})
+    spec = env.action_spec()
+    np.testing.assert_array_equal((spec.minimum, spec.maximum), ([-5.0] * 6, [5.0] * 6))
+    env.reset()
+    action = np.array([0.3, -0.2, 0.1, 5.0, 9.0, 0.0])
+    env.step(action)
+    np.testing.assert_allclose(env.signals()["reference_current"], np.clip(action, -5.0, 5.0), rtol=1e-12)
+    with pytest.raises(ValueError, match=r"action has shape \(1,\): must be \(6,\)"):
+        env.step(np.zeros(1))
+
+
+def test_motors_and_model_are_drawn_at_every_reset_and_initial_states_are_not_touched():
+    draws = {".*": {"motor.resistance": "uniform(0.6, 1.2)"}, "model.mass.torso": "uniform(0.5, 2.0)"}
+    arguments = {"task_kwargs": {"random": 3}}
+    env = codrl_mj.make_dm_control("cheetah/run", MAXON, randomize=draws, noise_seed=1, **arguments)
+    again = codrl_mj.make_dm_control("cheetah/run", MAXON, randomize=draws, noise_seed=1, **arguments)
+    plain = codrl_mj.make_dm_control("cheetah/run", MAXON, **arguments)
+    mass, factors = plain.mujoco[0].body("torso").mass[0], []
+    for _ in range(3):
+        (one, two), other = (each.reset() for each in (env, again)), plain.reset()
+        np.testing.assert_array_equal(one.observation["position"], two.observation["position"])
+        assert env.randomization == again.randomization
+        factors.append(env.randomization["model.mass.torso"])
+        assert env.mujoco[0].body("torso").mass[0] == mass * factors[-1]
+        resistance = env.randomization[".*"]["motor.resistance"]
+        assert {motor.motor.resistance for motor in env.motors.values()} == {resistance}
+        assert one.observation["position"].shape == other.observation["position"].shape
+    assert len(set(factors)) == 3
+    with pytest.raises(ValueError, match="randomize: Environment builds its model anew at every reset"):
+        codrl_mj.make_dm_control(_reach, IDEAL, randomize={"model.gravity": "uniform(0.9, 1.1)"})
+
+
+def test_commands_are_delayed_by_whole_environment_steps():
+    env = codrl_mj.make_dm_control("cheetah/run", IDEAL, disturbances={"command_delay": 0.02})
+    inputs = _inputs(env, 10)
+    for _ in range(2):  # a reset forgets what is on its way
+        env.reset()
+        for index, action in enumerate(inputs):
+            env.step(action)
+            expected = inputs[index - 2] if index >= 2 else np.zeros(6)  # two steps of 0.01 s
+            np.testing.assert_allclose(env.signals()["desired_force"], expected, rtol=0, atol=1e-15)
 
 
 def test_what_is_wrong_is_said():

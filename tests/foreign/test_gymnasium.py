@@ -155,15 +155,19 @@ def test_a_motor_of_the_catalogue_saturates_where_its_datasheet_says():
     assert (kept >= 0.98 * possible).all()
 
 
+PULSES = {"pulse_force": 0.5, "pulse_duration": 0.03, "pulse_interval": 0.1}
+
+
 def _everything(env_id):
     """An environment with all that a snapshot has to remember: noise, draws, delays, a limit of time."""
     draws = {".*": {"motor.resistance": "uniform(0.5, 1.5)", "motor.back_emf_constant": codrl_mj.Uniform(0.0, 0.02)}}
+    draws["model.gravity"] = "uniform(0.8, 1.2)"
     return codrl_mj.make(
         env_id,
         {".*": NOISY},
         observe_actuator=True,
         randomize=draws,
-        disturbances={"command_delay": 0.07, "command_rate": 20.0},
+        disturbances={"command_delay": 0.07, "command_rate": 20.0} | PULSES,
         allow_unstable=True,
         max_episode_steps=40,
     )
@@ -385,6 +389,57 @@ def test_a_drawn_motor_is_the_motor_that_it_would_be_from_the_first():
         np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=0.0, err_msg=field)
 
 
+def _of_the_model(mass, gravity, damping):
+    return {"model.mass.pole": mass, "model.gravity": gravity, "model.damping.hinge": damping}
+
+
+def test_a_model_that_is_drawn_as_it_is_is_as_before():
+    draws = _of_the_model("choice(1.0)", "choice(1.0)", "choice(0.0)")
+    plain, ours = gym.make("InvertedPendulum-v5"), codrl_mj.make("InvertedPendulum-v5", IDEAL, randomize=draws)
+    inputs = actions(plain, 100)
+    assert_same(run(ours, inputs, seed=0), run(plain, inputs, seed=0))
+
+
+def test_a_drawn_model_is_the_model_that_it_would_be_from_the_first():
+    """Built anew by MuJoCo's compiler, which computes all that follows from masses."""
+    draws = _of_the_model("uniform(0.5, 2.0)", "uniform(0.5, 2.0)", "uniform(0.0, 0.3)")
+    env = codrl_mj.make("InvertedPendulum-v5", IDEAL, randomize=draws)
+    plain = gym.make("InvertedPendulum-v5").unwrapped
+    for seed in (1, 2):
+        drawn = env.reset(seed=seed)[1]["randomization"]
+        spec = mujoco.MjSpec.from_file(plain.fullpath)
+        (geom,) = spec.body("pole").geoms
+        geom.mass = drawn["model.mass.pole"] * plain.model.body("pole").mass[0]
+        spec.option.gravity = drawn["model.gravity"] * plain.model.opt.gravity
+        spec.joint("hinge").damping[0] += drawn["model.damping.hinge"]
+        expected, found = spec.compile(), env.unwrapped.model
+        np.testing.assert_allclose(found.opt.gravity, expected.opt.gravity, rtol=1e-12)
+        for field in ("body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_M0", "dof_damping"):
+            ours, theirs = getattr(found, field), getattr(expected, field)
+            np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-15, err_msg=field)
+    assert env.reset(seed=1)[1]["randomization"]["model.gravity"] != drawn["model.gravity"]
+
+
+def test_load_pulses_act_on_the_motors_joints():
+    """One that lasts for good begins at once: the environment without motors under the same load, bit for bit."""
+    pulses = {"pulse_force": 2.0, "pulse_duration": 1e6, "pulse_interval": 1e-9}
+    env, plain = codrl_mj.make("HalfCheetah-v5", IDEAL, disturbances=pulses), gym.make("HalfCheetah-v5")
+    dofs = plain.unwrapped.model.jnt_dofadr[plain.unwrapped.model.actuator_trnid[:, 0]]
+    inputs, signs = actions(plain, 5), []
+    for seed in (0, 1, 0):
+        np.testing.assert_array_equal(env.reset(seed=seed)[0], plain.reset(seed=seed)[0])
+        for index, action in enumerate(inputs):
+            row = env.step(action)
+            load = env.unwrapped.data.qfrc_applied.copy()
+            if index:
+                np.testing.assert_allclose(np.abs(load[dofs]), 2.0, rtol=1e-12)
+            assert np.count_nonzero(load) == len(dofs)
+            plain.unwrapped.data.qfrc_applied[:] = load
+            np.testing.assert_array_equal(row[0], plain.step(action)[0])
+        signs.append(tuple(np.sign(load[dofs])))
+    assert signs[0] == signs[2] != signs[1]
+
+
 def test_unstable_draws_are_drawn_again():
     loop = dict.fromkeys(("kp",), "uniform(0.1, 20.0)")
     draws = {".*": {f"controller.{name}": text for name, text in loop.items()}}
@@ -466,7 +521,9 @@ def test_stable_baselines3s_processes_too(context):
         ({"randomize": {"time_constant": "uniform(0, 1)"}}, "must be a mapping of the actuators' patterns"),
         ({"randomize": {".*": {"time_constnt": "uniform(0, 1)"}}}, "did you mean .*time_constant"),
         ({"randomize": {".*": {"time_constant": "uniform(-1, 1)"}}}, r"'\.\*'\]\['time_constant'\].*must be.*>= 0"),
-        ({"disturbances": {"pulse_force": 1, "pulse_duration": 1, "pulse_interval": 1}}, "pulse_force = 1: loads"),
+        ({"randomize": {"model.mass.trso": "uniform(0.5, 2)"}}, "did you mean randomize: model.mass.torso"),
+        ({"randomize": {"model.mass.torso": "uniform(0, 2)"}}, r"mass.torso'\] = uniform\(0.*: 0 must be .* > 0"),
+        ({"randomize": {"model.gravity": "uniform(0)"}}, r"randomize\['model.gravity'\] = uniform\(0\)"),
         ({"disturbances": {"comand_delay": 1}}, "did you mean disturbances.command_delay"),
     ],
 )

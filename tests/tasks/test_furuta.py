@@ -95,13 +95,13 @@ def test_the_engines_accelerations_are_lagranges(actuator):
         data.qpos[:], data.qvel[:] = state[:2], state[2:]
         data.qfrc_applied[0] = torque
         mujoco.mj_forward(model, data)
-        assert off(data.qacc, accelerations(state, torque, hub=hub)) < 1e-10
+        assert off(data.qacc, accelerations(state, torque, hub=hub)) < 1e-11
 
 
 def test_the_closed_form_is_lagranges():
     twin = Twin()
     for state in states(300, seed=2):
-        assert off(twin.derivative(state, 0.05)[2:], accelerations(state, 0.05)) < 1e-10
+        assert off(twin.derivative(state, 0.05)[2:], accelerations(state, 0.05)) < 1e-11
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,132 @@
+"""Robots of other people's in environments: motors that do nothing, strong ones, others' beside ours, two at once."""
+
+import functools
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.envs.mujoco import MujocoEnv
+
+import codrl_mj
+from codrl_mj.actuators import Drive, GearMotor, SampledLoop, Supply
+from tests.foreign.models import actions, assert_same, run
+from tests.matrix import but
+from tests.motorised.models import MENAGERIE
+
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # deprecated attributes in other people's models
+IDEAL = {".*": "ideal"}
+
+
+class Robot(MujocoEnv):
+    """Any model as an environment: its own controls, its state, an end after a second."""
+
+    def __init__(self, path, **options):
+        """Build the model from the file."""
+        super().__init__(str(path), 5, None, **options)
+        size = self.data.qpos.size + self.data.qvel.size
+        self.observation_space = spaces.Box(-np.inf, np.inf, (size,), np.float64)
+
+    def step(self, action):
+        self.do_simulation(action, self.frame_skip)
+        return self.state_vector(), 0.0, False, self.data.time > 1.0, {}
+
+    def reset_model(self):
+        self.set_state(self.init_qpos, self.np_random.uniform(-0.1, 0.1, self.model.nv))
+        return self.state_vector()
+
+
+@pytest.fixture
+def robot():
+    """Registers a model's file, and returns the id."""
+
+    def registered(path):
+        gym.register("ForeignRobot-v0", functools.partial(Robot, path))
+        return "ForeignRobot-v0"
+
+    yield registered
+    gym.registry.pop("ForeignRobot-v0", None)
+
+
+@pytest.mark.parametrize("path", but(MENAGERIE[5:6], MENAGERIE), ids=lambda path: path.parent.name)
+def test_ideal_motors_change_no_bit_of_robots_that_one_can_buy(path, robot):
+    env_id = robot(path)
+    plain, ours = gym.make(env_id), codrl_mj.make(env_id, IDEAL)
+    assert len(ours.motors) == plain.unwrapped.model.nactuator > 0
+    inputs = actions(plain, 250)
+    assert_same(run(ours, inputs, seed=3), run(plain, inputs, seed=3))
+
+
+BESIDE = """
+<mujoco>
+  <extension>
+    <plugin plugin="mujoco.pid"><instance name="pid"><config key="kp" value="9"/></instance></plugin>
+  </extension>
+  <worldbody>
+    <body><joint name="a" axis="0 1 0"/><geom type="capsule" size=".05 .2" mass="1"/>
+      <body pos="0 0 .5"><joint name="b" axis="0 1 0" range="-90 90"/><geom size=".1" mass=".7"/>
+        <body pos="0 0 .3"><joint name="c" axis="0 1 0"/><geom size=".1" mass=".3"/></body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="ours" joint="a" ctrlrange="-1 1"/>
+    <muscle name="muscle" joint="b" ctrlrange="0 1"/>
+    <plugin name="pid" joint="c" plugin="mujoco.pid" instance="pid" actdim="0" ctrlrange="-1 1"/>
+  </actuator>
+</mujoco>
+"""
+NONE = "<mujoco><worldbody><body><joint name='a'/><geom size='1'/></body></worldbody></mujoco>"
+
+
+def test_motors_of_ours_stand_beside_a_muscle_and_a_plugin_of_others(robot, tmp_path):
+    path = tmp_path / "beside.xml"
+    path.write_text(BESIDE)
+    env_id = robot(path)
+    plain, ours = gym.make(env_id), codrl_mj.make(env_id, {"ours": "ideal"})
+    inputs = actions(plain, 200)
+    assert_same(run(ours, inputs, seed=0), run(plain, inputs, seed=0))
+    assert list(ours.motors) == [0]
+    with pytest.raises(ValueError, match=r"muscle of b: cannot be motorised: .*mjDYN_MUSCLE"):
+        codrl_mj.make(env_id, {"muscle": "ideal"})
+
+
+def test_two_environments_with_different_motors_do_not_know_of_each_other():
+    makers = [functools.partial(codrl_mj.make, "HalfCheetah-v5", {".*": name}) for name in ("lag", "torque_speed")]
+    inputs = actions(makers[0](), 40)
+    alone = [run(make(), inputs, seed=1) for make in makers]
+    envs = [make() for make in makers]
+    for env in envs:
+        env.reset(seed=1)
+    together = [[env.step(action) for env in envs] for action in inputs]
+    for each, expected in zip(zip(*together, strict=True), alone, strict=True):
+        assert_same(list(each), expected[1:])
+    assert not np.array_equal(alone[0][-1][0], alone[1][-1][0])
+
+
+@pytest.mark.parametrize(("env_id", "steps"), [("InvertedPendulum-v5", 30), ("Reacher-v5", 50)])
+def test_the_faster_a_strong_motors_loop_the_closer_it_is_to_ideal(env_id, steps):
+    """What is lost is what the loop takes to answer, a share of a sample: ten times the rate, a tenth of it."""
+    plain = gym.make(env_id)
+    inputs = 0.05 * actions(plain, steps)
+    expected = [row[0] for row in run(plain, inputs, seed=0)]
+    distances = []
+    for rate in (20e3, 200e3):
+        motor = GearMotor(resistance=0.1, inductance=1e-4, torque_constant=1.0, back_emf_constant=1.0, rotor_inertia=0)
+        fast = Drive(motor, SampledLoop(sample_rate=rate), Supply(voltage=1e5))
+        found = [row[0] for row in run(codrl_mj.make(env_id, {".*": fast}, allow_unstable=True), inputs, seed=0)]
+        distances.append(np.abs(np.array(found) - expected).max())
+    assert distances[0] < 1e-2
+    assert distances[0] / distances[1] == pytest.approx(10.0, rel=0.1)
+
+
+def test_what_is_wrong_is_said(robot, tmp_path):
+    path = tmp_path / "none.xml"
+    path.write_text(NONE)
+    with pytest.raises(ValueError, match="no actuator has such a name, nor drives anything that has; there are none"):
+        codrl_mj.make(robot(path), IDEAL)
+    with pytest.raises(gym.error.NameNotFound, match="Did you mean: `HalfCheetah`"):
+        codrl_mj.make("HalfChetah-v5", IDEAL)
+    stiff = codrl_mj.Actuator(codrl_mj.Motor(inductance=1e-3), codrl_mj.CurrentLoop(kp=1.0))
+    with pytest.raises(ValueError, match=r"'\.\*': actuator: .* unstable at a step of 0.01 s.*allow_unstable"):
+        codrl_mj.make("HalfCheetah-v5", {".*": stiff})

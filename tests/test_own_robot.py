@@ -1,0 +1,92 @@
+"""What docs/own_robot.md tells a reader to type works as it stands, and the robot is what it says it is."""
+
+import math
+import re
+import shlex
+import shutil
+import sys
+from pathlib import Path
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+
+from codrl_mj.cli import main
+
+ROOT = Path(__file__).parent.parent
+FOLDER = ROOT / "examples" / "own_robot"
+PAGE = (ROOT / "docs" / "own_robot.md").read_text()
+BLOCKS = re.findall(r"```(xml|python|console)\n(.*?)```", PAGE, re.DOTALL)
+FILES, COMMANDS = BLOCKS[:2], re.findall(r"^\$ python -m codrl_mj (.*)$", PAGE, re.MULTILINE)
+SHORT = {"100000": "512", "50": "1"}
+"""Numbers of the page's commands -> those of the tests, whose machine has other things to do."""
+
+
+@pytest.fixture(autouse=True)
+def copied(tmp_path, monkeypatch):
+    """The two files in a folder of their own, as `python` sees them there, imported anew."""
+    shutil.copytree(FOLDER, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "ball_and_beam", raising=False)
+    yield
+    sys.modules.pop("ball_and_beam", None)
+
+
+def test_the_page_has_the_files_whole():
+    assert [
+        ("xml", (FOLDER / "ball_and_beam.xml").read_text()),
+        ("python", (FOLDER / "ball_and_beam.py").read_text()),
+    ] == FILES
+
+
+def test_the_python_examples_run(capsys):
+    namespace = {}
+    for _, block in [block for block in BLOCKS[2:] if block[0] == "python"]:
+        exec(compile(block, "own_robot.md", "exec"), namespace)  # one after the other, as a reader would
+    of_one, of_thousands, drawn = capsys.readouterr().out.splitlines()
+    desired, actual, _, voltage = map(float, of_one.split())
+    assert 0.0 < abs(actual) < abs(desired)  # what the gear passes on
+    assert abs(voltage) <= 6.0
+    assert of_thousands == "(4096, 4) (4096,)"
+    assert "model.mass.ball" in drawn
+    namespace["envs"].close()
+
+
+def run(command):
+    line = [SHORT.get(word, word) for word in shlex.split(command)]
+    assert main(line) == 0
+
+
+def test_the_training_runs():
+    run(COMMANDS[0])
+    assert Path("runs/ball/policy.safetensors").is_file()
+
+
+@pytest.mark.matrix
+def test_all_commands_run_one_after_the_other():
+    for command in COMMANDS:
+        run(command)
+    assert [command.split()[0] for command in COMMANDS] == ["train", "evaluate", "evaluate", "render", "validate"]
+    assert Path("ball.gif").stat().st_size > 1000
+
+
+def test_the_ball_rolls_as_a_ball_does():
+    """Down a beam that is held it accelerates by 5/7 g sin(angle): Galilei's, of a solid ball."""
+    model = mujoco.MjModel.from_xml_path("ball_and_beam.xml")
+    data = mujoco.MjData(model)
+    data.qpos[:] = 0.3, 0.1
+    mujoco.mj_forward(model, data)
+    force = np.zeros(2)
+    mujoco.mj_mulM(model, data, force, np.array([0.0, 1.0]))  # of the ball's unit acceleration, the beam's being 0
+    assert -data.qfrc_bias[1] / force[1] == pytest.approx(5 / 7 * 9.81 * math.sin(0.3), rel=1e-12)
+
+
+def test_what_a_task_does_not_say_follows():
+    import ball_and_beam
+
+    task = ball_and_beam.TASK
+    assert (task.qpos, task.qvel, task.render_fps, task.options()) == ((0, 1), (2, 3), 50, ())
+    assert task.action_space == gymnasium.spaces.Box(np.float32(-0.4), np.float32(0.4), (1,))
+    assert task.observation_space == gymnasium.spaces.Box(-np.inf, np.inf, (4,))
