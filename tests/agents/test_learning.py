@@ -75,7 +75,7 @@ def mean_return(policy, task, episodes=20):
     return np.mean(list(returns.values()))
 
 
-@pytest.mark.parametrize("agent", but(["dqn"], LEARNERS))
+@pytest.mark.parametrize("agent", but([], LEARNERS))
 def test_an_agent_learns(agent):
     config, task, num_envs, steps, least = LEARNERS[agent]
     model = make_model(config, task, seed=2, num_envs=num_envs)
