@@ -109,6 +109,15 @@ def _state_columns(
     return columns
 
 
+def settled(model: Model, values: np.ndarray, segments: Sequence[Segment]) -> list[np.ndarray]:
+    """What the model makes of each segment, shape (m,), from the state from which it fits best."""
+    simulate, made = model.at(values), []
+    for segment in segments:
+        scale = robust_scale(_residuals(simulate, segment, segment.state))
+        made.append(simulate(segment, _settle(simulate, segment, segment.state, model.steps, scale)[0]))
+    return made
+
+
 class _Problem:
     """The outer problem, as scipy takes it; remembers the states of the point that it last took a Jacobian at."""
 

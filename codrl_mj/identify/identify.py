@@ -1,5 +1,6 @@
 """From logs to a motor: which parts can be fitted, what is found, and how far it may be trusted."""
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -17,8 +18,12 @@ from codrl_mj.identify.stages import Fitted, Shaft, Stage, Winding, fitted, move
 
 WIDEST = 0.3
 """An interval of more than this share of the value to either side is too wide; of the whole friction, for friction."""
+WIDEST_OF = {"resistance": 0.05, "back_emf_constant": 0.05, "inductance": 0.2}
+"""For what a current sensor tells."""
+NARROWEST = 0.002
+"""No interval is narrower than this share of the value to either side: nobody's sensors are better calibrated."""
 BIASED = 0.5
-"""The self-test fails where it is off by more than this share of `WIDEST`."""
+"""The self-test fails where it is off by more than this share of the widest interval."""
 STEPS_OF_A_STAGE = 8 + 3
 UNEXPLAINED = 8.0
 """Residuals of more standard deviations of the sensor in the mean are no noise,"""
@@ -68,27 +73,31 @@ def identify(
 
         return one
 
-    winding, estimates, warnings = None, [], []
-    if _electrical(logs):
-        winding = fitted(Winding(given), _electrical(logs), step("winding"))
-        estimates += _judged(winding, given, seed, step("winding"))
+    winding = fitted(Winding(given), _electrical(logs), step("winding")) if _electrical(logs) else None
     shaft, driven_by = None, _driven_by(logs)
     if driven_by is not None:
-        constant, passed_on = _constant(given, estimates, driven_by)
-        stage = Shaft(rig, "coulomb", driven_by, {**given, **passed_on}, tuple(estimated))
-        moving = [log for log in logs if moves(log) and log.has(driven_by)]
+        moving = [log for log in logs if moves(log)]
+        stage = Shaft(rig, "coulomb", driven_by, {**given, **_constant(given, winding, driven_by)}, tuple(estimated))
         stage = chosen_friction(stage, moving, friction)
-        friction = stage.friction
         shaft = fitted(stage, moving, step("shaft"))
-        estimates += _with_constant(_judged(shaft, stage.known, seed, step("shaft")), constant, stage)
-        warnings += _warnings(shaft)
+    estimates, warnings = [], []
     if winding is not None:
+        if shaft is not None and driven_by == "current":
+            winding = winding.refitted(Winding(given, shaft))
+        estimates += _judged(winding, seed, step("winding"))
         warnings += _warnings(winding)
+    if shaft is not None:
+        constant = _constant(given, winding, shaft.stage.driven_by)
+        shaft = shaft.refitted(dataclasses.replace(shaft.stage, known={**shaft.stage.known, **constant}))
+        found = _judged(shaft, seed, step("shaft"))
+        own = next((one for one in estimates if one.name == "back_emf_constant"), None) if constant else None
+        estimates += _with_constant(found, own, shaft.stage)
+        warnings += _warnings(shaft)
     estimates = _completed(estimates, given)
     return Identified(
         tuple(log.name for log in logs),
         rig,
-        friction,
+        friction if shaft is None else shaft.stage.friction,
         driven_by,
         {name: part.delay for name, part in (("winding", winding), ("shaft", shaft)) if part is not None},
         tuple(estimates),
@@ -139,16 +148,14 @@ def _driven_by(logs: Sequence[Log]) -> str | None:
     return next((name for name in ("torque", "current", "voltage") if moving and all(m.has(name) for m in moving)), None)
 
 
-def _constant(
-    given: Mapping[str, float], estimates: Sequence[Estimate], driven_by: str
-) -> tuple[Estimate | None, dict[str, float]]:
+def _constant(given: Mapping[str, float], winding: Fitted | None, driven_by: str) -> dict[str, float]:
     """The back-EMF constant where it stands for the torque constant, which it is in SI units but for losses."""
     if driven_by != "current" or "torque_constant" in given:
-        return None, {}
-    found = next((one for one in estimates if one.name == "back_emf_constant"), None)
-    if found is None and "back_emf_constant" in given:
-        return None, {"torque_constant": given["back_emf_constant"]}
-    return found, ({} if found is None else {"torque_constant": found.value})
+        return {}
+    if "back_emf_constant" in given:
+        return {"torque_constant": given["back_emf_constant"]}
+    found = {} if winding is None else winding.model.all_values(winding.fit.values)
+    return {"torque_constant": found["back_emf_constant"]} if found.get("back_emf_constant", 0.0) > 0.0 else {}
 
 
 def _with_constant(found: list[Estimate], constant: Estimate | None, stage: Shaft) -> list[Estimate]:
@@ -171,7 +178,7 @@ def _with_constant(found: list[Estimate], constant: Estimate | None, stage: Shaf
     return made
 
 
-def _judged(part: Fitted, given: Mapping[str, float], seed: int, on_step: Callable[[], None]) -> list[Estimate]:
+def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estimate]:
     """Every free parameter of a stage with its interval and status."""
     fit, model = part.fit, part.model
     weights = _weights(part)
@@ -189,7 +196,9 @@ def _judged(part: Fitted, given: Mapping[str, float], seed: int, on_step: Callab
     directions = honesty.unknown_directions(fit, part.segments, scales)
     made = []
     for place, name in enumerate(fit.names):
-        value, half = float(fit.values[place]), float(spread.total[place])
+        value = float(fit.values[place])
+        half = math.hypot(float(spread.total[place]), NARROWEST * value)
+        widest = WIDEST_OF.get(name, WIDEST) if isinstance(part.stage, Winding) else WIDEST
         least, most = PARAMETERS[name].least, PARAMETERS[name].most
         causes = {field: float(getattr(spread, field)[place]) for field in vars(spread)}
         share = half / scales[place]
@@ -203,10 +212,10 @@ def _judged(part: Fitted, given: Mapping[str, float], seed: int, on_step: Callab
             status, why = "unidentifiable", "the logs are as likely whatever it is"
         elif at_bound and not (nothing or name == "gear_efficiency"):
             status, why = "refused", f"it ended at its bound, {value:g} {PARAMETERS[name].unit}".strip()
-        elif not causes["self_test"] <= BIASED * WIDEST * scales[place]:
+        elif not causes["self_test"] <= BIASED * widest * scales[place]:
             status = "refused"
             why = f"the self-test finds {tested[place]:.4g} where the fit that it simulates has {value:.4g}"
-        elif not share <= WIDEST:
+        elif not share <= widest:
             status = "refused"
             worst = max(causes, key=lambda cause: causes[cause]).replace("_", " ")
             whole = "all friction" if name in FRICTION else "it"
@@ -285,7 +294,6 @@ def _warnings(part: Fitted) -> list[str]:
         rest = np.concatenate([part.fit.residuals[i] * part.segments[i].deviation for i in own])
         swing = np.concatenate([part.segments[i].measured - part.segments[i].measured.mean() for i in own])
         share = float(np.std(rest) / max(np.std(swing), 1e-12))
-        print("SHARE", log.name, sizes.mean() / 0.8, share, np.sqrt((sizes**2).mean()))
         if sizes.mean() / 0.8 > UNEXPLAINED and share > UNLIKE:
             found.append(
                 f"log {log.name}: residuals are {sizes.mean() / 0.8:.1f} standard deviations of the sensor in the mean, "

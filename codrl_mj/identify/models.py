@@ -179,22 +179,50 @@ def shaft_model(
         wanted.insert(0, "resistance")
     free = tuple(name for name in dict.fromkeys(wanted) if name not in known)
     given = {**DEFAULTS, **known}
-    factors, drive, speed = _shaft_regression(segments, rig, driven_by, output, given)
+    firsts = []
+    for window in (0.02, 0.004):
+        factors, drive, speed = _shaft_regression(segments, rig, output, window)
+        firsts.append(_shaft_start(factors, drive, speed, driven_by, given, known))
+    start, floors = firsts[0]
+    scales = np.array(
+        [floors[name] if name in FRICTION else max(abs(start[name]), floors.get(name, 1e-9)) for name in free]
+    )
+    starts = [_inside(np.array([one[name] for name in free]), free, scales) for one, _ in firsts]
+    changes = np.random.default_rng(0).uniform(-0.7, 0.7, (2, len(free)))
+    starts += [starts[0] * np.exp(change) for change in changes]
+    fixed = {name: float(value) for name, value in given.items()}
+    fixed |= {name: 0.0 for name in ("coulomb_friction", "viscous_friction") if name not in known}
+    return ShaftModel(free, fixed, scales, driven_by, output), starts
+
+
+def _inside(start: np.ndarray, free: Sequence[str], scales: np.ndarray) -> np.ndarray:
+    """A start whose parameters are as positive as they must be."""
+    positive = np.array([PARAMETERS[name].least >= 0.0 for name in free])
+    return np.where(positive & ~(start > 0.02 * scales), 0.3 * scales, start)
+
+
+def _shaft_start(
+    factors: Mapping[str, float],
+    drive: float,
+    speed: float,
+    driven_by: str,
+    given: Mapping[str, float],
+    known: Mapping[str, float],
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Every parameter of a shaft by the factors that its input was regressed by, and sizes that matter of some."""
     ratio = given["gear_ratio"]
-    # of the output, for one of the input, where that is not known
+    # torque at the output for one of the input, where that is not known
     gain, braking, resistance = given["torque_gain"], 0.0, given.get("resistance", 1.0)
     if driven_by != "torque":
-        gain = given.get("torque_constant", _gain_of(factors, given, known, driven_by) / ratio) * ratio
+        gain = given.get("torque_constant", _gain_of(factors, given, known) / ratio) * ratio
     start = dict(given)
     if driven_by == "voltage":
         if "torque_constant" in known or "resistance" in known:
-            per_volt = gain / resistance if "torque_constant" in known else gain
-            per_volt = _gain_of(factors, given, known, driven_by, per_volt)
+            per_volt = _gain_of(factors, given, known, gain / resistance if "torque_constant" in known else gain)
             resistance = resistance if "resistance" in known else gain / max(per_volt, 1e-9)
         else:  # as if all of what brakes were the back-EMF
             per_volt = gain
-            constant = max(factors["viscous"], 0.0) + 1e-6  # of the output, for a volt: n*kE
-            resistance = constant / max(per_volt, 1e-9)
+            resistance = (max(factors["viscous"], 0.0) + 1e-6) / max(per_volt, 1e-9)
         start["torque_constant"] = given.get("torque_constant", per_volt * resistance / ratio)
         start["resistance"] = resistance
         braking = per_volt * ratio * given.get("back_emf_constant", start["torque_constant"])
@@ -213,7 +241,7 @@ def shaft_model(
         "stribeck_speed": 0.1 * speed * ratio,
     }
     floors = {
-        "inertia": 0.01 * torque,
+        "inertia": 0.003 * torque / max(speed, 1e-9),
         "mgl": 0.1 * torque,
         "constant_torque": 0.1 * torque,
         "coulomb_friction": 0.1 * torque / ratio,
@@ -221,26 +249,11 @@ def shaft_model(
         "stribeck_friction": 0.1 * torque / ratio,
         "gear_efficiency": 0.1,
     }
-    scales = np.array(
-        [floors[name] if name in FRICTION else max(abs(start[name]), floors.get(name, 1e-9)) for name in free]
-    )
-    first = np.array([start[name] for name in free])
-    for place, name in enumerate(free):
-        if PARAMETERS[name].least >= 0.0 and not first[place] > 0.02 * scales[place]:
-            first[place] = 0.3 * scales[place]
-    changes = np.random.default_rng(0).uniform(-0.7, 0.7, (3, len(free)))
-    starts = [first, *(first * np.exp(change) for change in changes)]
-    fixed = {name: float(value) for name, value in given.items()}
-    fixed |= {name: 0.0 for name in ("coulomb_friction", "viscous_friction") if name not in known}
-    return ShaftModel(free, fixed, scales, driven_by, output), starts
+    return start, floors
 
 
 def _gain_of(
-    factors: Mapping[str, float],
-    given: Mapping[str, float],
-    known: Mapping[str, float],
-    driven_by: str,  # noqa: ARG001
-    otherwise: float = 1.0,
+    factors: Mapping[str, float], given: Mapping[str, float], known: Mapping[str, float], otherwise: float = 1.0
 ) -> float:
     """Torque at the output for one of the input, by whatever torque or inertia is known."""
     for name in ("mgl", "constant_torque", "inertia"):
@@ -250,9 +263,12 @@ def _gain_of(
 
 
 def _shaft_regression(
-    segments: Sequence[Segment], rig: str, driven_by: str, output: str, given: Mapping[str, float]  # noqa: ARG001
+    segments: Sequence[Segment], rig: str, output: str, window: float
 ) -> tuple[dict[str, float], float, float]:
-    """Factors of the input's integral in those of what it works against, its size, and that of the speed."""
+    """Factors of the input's integral in those of what it works against, its size, and that of the speed.
+
+    Speeds are positions smoothed over `window` [s].
+    """
     from codrl_mj.identify.differentiation import speeds
 
     rows, inputs, turning = [], [], []
@@ -261,12 +277,12 @@ def _shaft_regression(
         position = segment.measured if output == "position" else np.zeros(len(times))
         speed = segment.measured
         if output == "position":
-            speed = speeds(times, position, times, max(0.02, 5.0 * step))
+            speed = speeds(times, position, times, max(window, 5.0 * step))
         columns = np.sin(position), np.ones(len(times)), np.sign(speed) * (np.abs(speed) > 0.0), speed, segment.inputs
         sums = [
             np.concatenate([[0.0], np.cumsum(0.5 * (one[1:] + one[:-1]) * np.diff(times))]) for one in columns
         ]
-        edges = np.unique(np.searchsorted(times, np.arange(times[0], times[-1] + 1e-9, 0.05)))
+        edges = np.unique(np.searchsorted(times, np.arange(times[0], times[-1] + 1e-9, 2.5 * window)))
         rows.append(np.stack([np.diff(speed[edges]), *(np.diff(one[edges]) for one in sums)], axis=1))
         inputs.append(segment.inputs)
         turning.append(speed)

@@ -14,6 +14,8 @@ SEGMENT = 0.5
 """Time [s] that a shaft is simulated for at once: longer ones meet friction that no model has, and several minima."""
 BLOCK = 1.0
 """Shortest stretch [s] of a log that is resampled as a whole: residuals within it belong together."""
+SHAFT_STEP = 5e-4
+"""Rows that are nearer [s] are taken together for a shaft, which is slower: the inputs' mean, every so many positions."""
 STILL = 3.0
 """A shaft that moves by less than so many steps of its encoder is locked."""
 
@@ -97,28 +99,41 @@ def mean_speeds(log: Log, rows: slice) -> np.ndarray:
     return 0.5 * (velocity + np.append(velocity[1:], velocity[-1]))
 
 
-def winding_segments(logs: Sequence[Log], delay: int = 0) -> list[Segment]:
-    """Segments of a block each, in which voltage and speed drive the current."""
+def turning(log: Log) -> np.ndarray:
+    """Mean speed [rad/s] from each row to the next, shape (n,), by the positions around it."""
+    found = np.zeros(len(log.time))
+    for stretch in usable(log):
+        found[stretch] = mean_speeds(log, stretch)
+    return found
+
+
+def winding_segments(logs: Sequence[Log], turned: Sequence[np.ndarray], delay: int = 0) -> list[Segment]:
+    """Segments of a block each, in which voltage and speed drive the current.
+
+    Args:
+        logs: each with voltage and current.
+        turned: mean speed [rad/s] from each row to the next of each log, shape (n,).
+        delay: rows by which the voltage is late.
+    """
     made: list[Segment] = []
-    for place, log in enumerate(logs):
+    for place, (log, speed) in enumerate(zip(logs, turned, strict=True)):
         volts = delayed(log, "voltage", delay)
         deviation = sensor_deviation(log, "current")
-        turning = np.zeros(len(log.time))
-        for stretch in usable(log):
-            turning[stretch] = mean_speeds(log, stretch)
         for rows in cut(log, BLOCK):
             current = log.signals["current"][rows]
             still = np.zeros(len(current))
             made.append(
                 Segment(
-                    place, len(made), rows, log.time[rows], volts[rows], still, turning[rows], current, deviation,
+                    place, len(made), rows, log.time[rows], volts[rows], still, speed[rows], current, deviation,
                     current[:1],
                 )
             )  # fmt: skip
     return made
 
 
-def shaft_segments(logs: Sequence[Log], driven_by: str, delay: int = 0, longest: float = SEGMENT) -> list[Segment]:
+def shaft_segments(
+    logs: Sequence[Log], driven_by: str, delay: int = 0, longest: float = SEGMENT, shortest: float = SHAFT_STEP
+) -> list[Segment]:
     """Segments in which a torque, a current or a voltage drives the shaft.
 
     Args:
@@ -126,23 +141,32 @@ def shaft_segments(logs: Sequence[Log], driven_by: str, delay: int = 0, longest:
         driven_by: the input. A voltage holds from row to row; what a sensor samples is joined by straight lines.
         delay: rows by which the input is late.
         longest: [s].
+        shortest: step of time [s] below which rows are taken together.
     """
     made: list[Segment] = []
     block = -1
     for place, log in enumerate(logs):
         given, output = delayed(log, driven_by, delay), output_of(log)
         measured, deviation = log.signals[output], sensor_deviation(log, output)
+        together = max(int(shortest / log.step * (1.0 + 1e-6)), 1)
         began = -math.inf
         for rows in cut(log, longest):
-            times, values = log.time[rows], measured[rows]
+            times, drive = log.time[rows], given[rows]
             if times[0] - began >= BLOCK - 1e-3:
                 block, began = block + 1, times[0]
             slopes = np.zeros(len(times))
             if driven_by != "voltage":
-                slopes[:-1] = np.diff(given[rows]) / np.diff(times)
+                slopes[:-1] = np.diff(drive) / np.diff(times)
+            if together > 1:
+                means = drive[:-1] + 0.5 * slopes[:-1] * np.diff(times)
+                edges = np.arange(0, len(times), together)
+                totals = np.diff(np.concatenate([[0.0], np.cumsum(means * np.diff(times))])[edges])
+                drive = np.append(totals / np.diff(times[edges]), drive[-1])
+                rows = slice(rows.start, rows.start + int(edges[-1]) + 1, together)  # noqa: PLW2901
+                times, slopes = times[edges], np.zeros(len(edges))
             made.append(
                 Segment(
-                    place, block, rows, times, given[rows], slopes, slopes, values, deviation,
+                    place, block, rows, times, drive, slopes, slopes, measured[rows], deviation,
                     initial_state(log, rows),
                 )
             )  # fmt: skip

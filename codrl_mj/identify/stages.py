@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.identify.estimate import Fit, estimate
+from codrl_mj.identify.differentiation import speeds
+from codrl_mj.identify.estimate import Fit, estimate, settled
 from codrl_mj.identify.log import Log
 from codrl_mj.identify.models import ShaftModel, shaft_model, winding_model
 from codrl_mj.identify.segments import (
@@ -15,6 +16,7 @@ from codrl_mj.identify.segments import (
     is_locked,
     output_of,
     shaft_segments,
+    turning,
     usable,
     winding_segments,
 )
@@ -30,11 +32,30 @@ class Winding:
     """Voltage and speed drive the current."""
 
     known: Mapping[str, float]
+    shaft: "Fitted | None" = None
+    """The shaft under the current, where it is known: what an encoder does not see of the speed between its rows."""
 
     def build(self, logs: Sequence[Log], delay: int) -> tuple[list[Segment], Any, list[np.ndarray]]:
         """Segments, model, starts."""
-        segments = winding_segments(logs, delay)
+        segments = winding_segments(logs, [self._turning(log) for log in logs], delay)
         return segments, *winding_model(segments, self.known)
+
+    def _turning(self, log: Log) -> np.ndarray:
+        """Mean speeds till the next row: of positions, smoothed; or what the shaft does, and what it leaves, smoothed.
+
+        A smoothed speed lags behind a light rotor, and the back-EMF that it misses would be taken for inductance.
+        """
+        found = turning(log)
+        if self.shaft is None or not moves(log) or not log.has("position", "current"):
+            return found
+        part = self.shaft
+        segments = shaft_segments([log], "current", part.delay, shortest=0.0)
+        for segment, positions in zip(segments, settled(part.model, part.fit.values, segments), strict=True):
+            left = log.signals["position"][segment.rows] - positions
+            middles = 0.5 * (segment.times[1:] + segment.times[:-1])
+            rest = speeds(segment.times, left, middles)
+            found[segment.rows][:-1] = np.diff(positions) / np.diff(segment.times) + rest
+        return found
 
     def pretended(self, logs: Sequence[Log], segments: Sequence[Segment], fit: Fit, model: Any, sign: float) -> list[Log]:
         """The logs as the fit would have made them: the speeds as they were taken to be, positions rounded anew."""
@@ -72,7 +93,8 @@ Stage = Winding | Shaft
 class Fitted:
     """A stage with its logs, and what came of it."""
 
-    stage: Stage
+    stage: Any
+    """A `Winding` or a `Shaft`."""
     logs: tuple[Log, ...]
     delay: int
     segments: tuple[Segment, ...]
@@ -85,6 +107,12 @@ class Fitted:
         """The parameters that other logs give, from where these ended."""
         segments, _, _ = self.stage.build(logs, self.delay if delay is None else delay)
         return estimate(self.model, segments, [self.fit.values], most=20)[0].values
+
+    def refitted(self, stage: Stage) -> "Fitted":
+        """Of the same logs with another stage, from where this ended."""
+        segments, model, _ = stage.build(self.logs, self.delay)
+        fit, _ = estimate(model, segments, [self.fit.values])
+        return dataclasses.replace(self, stage=stage, segments=tuple(segments), model=model, fit=fit)
 
     def half_rate(self) -> np.ndarray:
         """The parameters at half the rate, an input being late by half as many rows, rounded."""
@@ -158,11 +186,11 @@ def _turned(log: Log, segments: Sequence[Segment], place: int) -> Log:
     """A log whose positions are the integral of its segments' speeds, rounded as its sensor rounds."""
     if not log.has("position") or is_locked(log):
         return log
-    turning = np.zeros(len(log.time))
+    speed = np.zeros(len(log.time))
     for segment in segments:
         if segment.log == place:
-            turning[segment.rows] = segment.speeds
-    turns = np.concatenate([[0.0], np.cumsum(turning[:-1] * np.diff(log.time))])
+            speed[segment.rows] = segment.speeds
+    turns = np.concatenate([[0.0], np.cumsum(speed[:-1] * np.diff(log.time))])
     moved = _rounded(log, "position", log.signals["position"][0] + turns)
     return dataclasses.replace(log, signals={**log.signals, "position": moved})
 
