@@ -14,6 +14,7 @@ from codrl_mj.identify.log import Log
 from codrl_mj.identify.parameters import DEFAULTS, FRICTION, OF_RIG, PARAMETERS
 from codrl_mj.identify.prediction import Prediction, predict
 from codrl_mj.identify.result import Estimate, Identified
+from codrl_mj.identify.segments import SEGMENT
 from codrl_mj.identify.stages import Fitted, Shaft, Stage, Winding, fitted, moves
 
 WIDEST = 0.3
@@ -38,6 +39,7 @@ def identify(
     friction: str = "coulomb",
     held_out: Sequence[Log] = (),
     estimated: Sequence[str] = (),
+    segment: float = SEGMENT,
     base: Mapping[str, Any] | None = None,
     on_progress: Callable[[str, int, int], None] = lambda *_: None,
     seed: int = 0,
@@ -53,6 +55,8 @@ def identify(
             it was not fitted to, by more than those differ.
         held_out: logs that are only foretold.
         estimated: parameters to fit that are otherwise taken as known, such as `torque_gain`.
+        segment: time [s] that the shaft is simulated for at once, >= 0.05: short where it tips over by itself, a second
+            or two where it only sticks and slides.
         base: the mapping of a drive that gives what the logs do not tell.
         on_progress: called with what is being done, steps done and steps in all.
         seed: of the resampling.
@@ -61,6 +65,8 @@ def identify(
         ValueError: unknown names, values out of bounds, or logs that tell nothing; the message says what is missing.
     """
     given = _checked(logs, rig, known or {}, friction, estimated)
+    if not segment >= 0.05:
+        raise ValueError(f"segment = {segment!r}: must be >= 0.05 s; {SEGMENT:g} is the default")
     rig = rig or ("pendulum" if "mgl" in given else "free")
     stages = 2 - (not _electrical(logs)) - (not any(moves(log) for log in logs))
     done, total = 0, STEPS_OF_A_STAGE * max(stages, 1)
@@ -77,7 +83,7 @@ def identify(
     shaft, driven_by = None, _driven_by(logs)
     if driven_by is not None:
         moving = [log for log in logs if moves(log)]
-        stage = Shaft(rig, "coulomb", driven_by, {**given, **_constant(given, winding, driven_by)}, tuple(estimated))
+        stage = Shaft(rig, "coulomb", driven_by, {**given, **_constant(given, winding, driven_by)}, tuple(estimated), segment)
         stage = chosen_friction(stage, moving, friction)
         shaft = fitted(stage, moving, step("shaft"))
     estimates, warnings = [], []
@@ -192,7 +198,9 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
     on_step()
     halved = part.half_rate()
     on_step()
-    spread = honesty.Spread(resampled, logs, np.abs(tested - fit.values), np.abs(halved - fit.values))
+    sampled = isinstance(part.stage, Winding) and not all(log.mean_voltage for log in part.logs)
+    rate = (2.0 if sampled else 1.0) * np.abs(halved - fit.values)  # what a loop does between rows goes with their root
+    spread = honesty.Spread(resampled, logs, np.abs(tested - fit.values), rate)
     directions = honesty.unknown_directions(fit, part.segments, scales)
     made = []
     for place, name in enumerate(fit.names):

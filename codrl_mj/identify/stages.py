@@ -11,6 +11,7 @@ from codrl_mj.identify.estimate import Fit, estimate, settled
 from codrl_mj.identify.log import Log
 from codrl_mj.identify.models import ShaftModel, shaft_model, winding_model
 from codrl_mj.identify.segments import (
+    SEGMENT,
     Segment,
     halved,
     is_locked,
@@ -49,7 +50,7 @@ class Winding:
         if self.shaft is None or not moves(log) or not log.has("position", "current"):
             return found
         part = self.shaft
-        segments = shaft_segments([log], "current", part.delay, shortest=0.0)
+        segments = shaft_segments([log], "current", part.delay, part.stage.segment, 0.0)
         for segment, positions in zip(segments, settled(part.model, part.fit.values, segments), strict=True):
             left = log.signals["position"][segment.rows] - positions
             middles = 0.5 * (segment.times[1:] + segment.times[:-1])
@@ -72,10 +73,12 @@ class Shaft:
     driven_by: str
     known: Mapping[str, float]
     estimated: tuple[str, ...] = ()
+    segment: float = SEGMENT
+    """Time [s] that is simulated at once."""
 
     def build(self, logs: Sequence[Log], delay: int) -> tuple[list[Segment], ShaftModel, list[np.ndarray]]:
         """Segments, model, starts."""
-        segments, output = shaft_segments(logs, self.driven_by, delay), output_of(logs[0])
+        segments, output = shaft_segments(logs, self.driven_by, delay, self.segment), output_of(logs[0])
         model, starts = shaft_model(
             segments, self.rig, self.friction, self.driven_by, output, self.known, self.estimated
         )
