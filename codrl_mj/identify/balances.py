@@ -5,6 +5,7 @@ the derivatives go over to phi. Source: Shinbrot, *On the Analysis of Linear and
 of modulating functions. Good for signs, orders of magnitude and starts; noise in what is regressed on biases it.
 """
 
+import functools
 import math
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -15,6 +16,8 @@ from codrl_mj.identify.log import Log, usable
 
 _ROWS = 12
 """Rows of a window, at least."""
+_POWER = 5
+"""Of s - s^2 in phi: so high that the trapezoidal rule is good for phi'' too."""
 
 
 class Balance(NamedTuple):
@@ -31,7 +34,7 @@ class Balance(NamedTuple):
 
 
 class Windows:
-    """A log cut into overlapping windows, in each of which signals are weighted by phi = 64 (s - s^2)^3, s in [0, 1].
+    """A log cut into overlapping windows, in each of which signals are weighted by phi ~ (s - s^2)^5, s in [0, 1].
 
     Args:
         log: the log.
@@ -39,9 +42,10 @@ class Windows:
     """
 
     def __init__(self, log: Log, duration: float = 0.0) -> None:
+        """Cut it."""
         count = max(math.ceil(duration / log.step), _ROWS)
         starts = [
-            np.arange(part.start, part.stop - count, max(count // 2, 1)) for part in usable(log)
+            np.arange(part.start, part.stop - count, max(count // 4, 1)) for part in usable(log)
         ]  # of the whole windows of every stretch
         self.rows = np.concatenate(starts)[:, None] + np.arange(count + 1)
         self._log = log
@@ -62,6 +66,8 @@ class Windows:
             order: 0, 1 or 2.
         """
         values = (self._log.signals[signal] if isinstance(signal, str) else signal)[self.rows]
+        if order > 0:  # what is constant counts for nothing, and would only be rounded
+            values = values - values.mean(axis=1, keepdims=True)
         weighted = values * _phi(self._phase, order) * (-1.0 / self.length) ** order
         return np.sum(0.5 * self._steps * (weighted[:, 1:] + weighted[:, :-1]), axis=1) / self.length[:, 0]
 
@@ -82,12 +88,14 @@ class Windows:
 
 def _phi(phase: np.ndarray, order: int) -> np.ndarray:
     """Phi's derivative of some order by the phase; -1: its integral."""
-    if order == -1:
-        return 64.0 * (phase**4 / 4.0 - 0.6 * phase**5 + phase**6 / 2.0 - phase**7 / 7.0)
-    inner, slope = phase - phase**2, 1.0 - 2.0 * phase
-    if order == 0:
-        return 64.0 * inner**3
-    return 192.0 * inner**2 * slope if order == 1 else 384.0 * inner * (slope**2 - inner)
+    return _polynomials()[order](phase)
+
+
+@functools.cache
+def _polynomials() -> dict[int, np.polynomial.Polynomial]:
+    phi = np.polynomial.Polynomial([0.0, 1.0, -1.0]) ** _POWER
+    phi = phi / phi.integ()(1.0)
+    return {-1: phi.integ(), 0: phi, 1: phi.deriv(), 2: phi.deriv(2)}
 
 
 def regress(target: np.ndarray, terms: Mapping[str, np.ndarray]) -> Balance | None:
@@ -112,7 +120,7 @@ def regress(target: np.ndarray, terms: Mapping[str, np.ndarray]) -> Balance | No
     if rank < len(terms):
         return None
     error = math.sqrt(float(np.mean((weights * residual) ** 2)))
-    # windows overlap by half, so that they count for half
+    # phi is about half as wide as its window, and so overlaps by half with the next one: they count for half
     covariance = 2.0 * error**2 * np.linalg.inv((matrix * weights[:, None]).T @ (matrix * weights[:, None]))
     certain = solution / np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     return Balance(
@@ -123,34 +131,50 @@ def regress(target: np.ndarray, terms: Mapping[str, np.ndarray]) -> Balance | No
     )
 
 
-def _speed(log: Log, windows: Windows, order: int = 0) -> np.ndarray | None:
+def speed_terms(log: Log, windows: Windows, order: int = 0) -> np.ndarray | None:
+    """The weighted mean of the speed, or of its derivative; by the position if there is one. None without a motion."""
     if log.has("position"):
         return windows.mean("position", order + 1)
     return windows.mean("velocity", order) if log.has("velocity") else None
 
 
-def voltage_balance(log: Log, lag: float = 0.0, duration: float = 0.0, sag: bool = False) -> Balance | None:
-    """u = R*i + L*di/dt + kE*omega: `resistance` [ohm], `inductance` [H], `back_emf_constant` [V*s/rad] at the output.
+def voltage_terms(log: Log, windows: Windows, sag: bool = False) -> dict[str, np.ndarray]:
+    """The terms of `voltage_balance`."""
+    terms = {"resistance": windows.mean("current"), "inductance": windows.mean("current", 1)}
+    speed = speed_terms(log, windows)
+    if speed is not None:
+        terms["back_emf_constant"] = speed
+    if sag:
+        voltage = log.signals["voltage"]
+        share = voltage / max(float(np.abs(voltage).max()), 1e-300)
+        terms["supply_resistance"] = windows.mean(share**2 * log.signals["current"])
+    return terms
+
+
+def voltage_balance(log: Log, duration: float = 0.0, sag: bool = False) -> Balance | None:
+    """Fits `resistance`*i + `inductance`*di/dt + `back_emf_constant`*omega, of the output, to the voltage; all SI.
 
     Args:
         log: with voltage and current; without a motion the shaft counts as locked.
-        lag: how much later than its stamps the voltage is in force [s].
         duration: of a window [s].
         sag: whether to regress on (u/max u)^2*i too, which a supply takes whose resistance is `supply_resistance`.
     """
     windows = Windows(log, duration)
-    terms = {"resistance": windows.mean("current"), "inductance": windows.mean("current", 1)}
-    speed = _speed(log, windows)
-    if speed is not None and np.ptp(speed) > 0.0:
-        terms["back_emf_constant"] = speed
-    if sag:
-        voltage = log.signals["voltage"]
-        terms["supply_resistance"] = windows.mean((voltage / np.abs(voltage).max()) ** 2 * log.signals["current"])
-    return regress(windows.mean_held("voltage", lag), terms)
+    return regress(windows.mean_held("voltage"), voltage_terms(log, windows, sag)) if len(windows) else None
 
 
-def torque_balance(log: Log, effort: str, duration: float = 0.15) -> Balance | None:
-    """effort = inertia*alpha + gravity*sin(q) + viscous*omega + coulomb*sign(omega) + constant, in the effort's unit.
+def torque_terms(log: Log, windows: Windows) -> dict[str, np.ndarray] | None:
+    """The terms of `torque_balance`; None without a motion."""
+    speed, acceleration = speed_terms(log, windows), speed_terms(log, windows, 1)
+    if speed is None or acceleration is None:
+        return None
+    one = windows.mean(np.ones(len(log.time)))
+    terms = {"inertia": acceleration, "viscous": speed, "coulomb": np.sign(speed) * one, "constant": one}
+    return terms | ({"gravity": windows.mean(np.sin(log.signals["position"]))} if log.has("position") else {})
+
+
+def torque_balance(log: Log, effort: str = "torque", duration: float = 0.3) -> Balance | None:
+    """Fits `inertia`*alpha + `gravity`*sin(q) + `viscous`*omega + `coulomb`*sign(omega) + `constant` to the effort.
 
     Args:
         log: with the effort and a position or a velocity; gravity only with a position.
@@ -158,17 +182,7 @@ def torque_balance(log: Log, effort: str, duration: float = 0.15) -> Balance | N
         duration: of a window [s].
     """
     windows = Windows(log, duration)
-    if not len(windows):
+    terms = torque_terms(log, windows) if len(windows) else None
+    if terms is None:
         return None
-    speed, acceleration = _speed(log, windows), _speed(log, windows, 1)
-    if speed is None or acceleration is None or not np.ptp(speed) > 0.0:
-        return None
-    terms = {
-        "inertia": acceleration,
-        "viscous": speed,
-        "coulomb": np.sign(speed) * windows.mean(np.ones(len(log.time))),
-        "constant": windows.mean(np.ones(len(log.time))),
-    }
-    if log.has("position"):
-        terms["gravity"] = windows.mean(np.sin(log.signals["position"]))
     return regress(windows.mean_held(effort) if effort == "voltage" else windows.mean(effort), terms)
