@@ -39,15 +39,17 @@ class Windows:
     Args:
         log: the log.
         duration: of a window [s]; at least a dozen rows.
+        most: of the windows, evenly spread, that are looked at.
     """
 
-    def __init__(self, log: Log, duration: float = 0.0) -> None:
+    def __init__(self, log: Log, duration: float = 0.0, most: int = 20_000) -> None:
         """Cut it."""
         count = max(math.ceil(duration / log.step), _ROWS)
         starts = [
             np.arange(part.start, part.stop - count, max(count // 4, 1)) for part in usable(log)
         ]  # of the whole windows of every stretch
-        self.rows = np.concatenate(starts)[:, None] + np.arange(count + 1)
+        every = np.concatenate(starts)
+        self.rows = every[:: math.ceil(len(every) / most) or 1, None] + np.arange(count + 1)
         self._log = log
         time = log.time[self.rows] if self.rows.size else np.zeros(self.rows.shape)
         self.begin, self.length = time[:, :1], time[:, -1:] - time[:, :1]

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.identify.balances import Balance, torque_balance, voltage_balance
+from codrl_mj.identify.balances import Balance, Windows, torque_balance, voltage_balance
 from codrl_mj.identify.lags import current_lag, motion_lag, velocity_lag
 from codrl_mj.identify.log import Finding, Log, find_resolution
 
@@ -42,18 +42,32 @@ def contradictions(log: Log, motor: Any = None) -> list[Finding]:
         motor: what its datasheet says, a `GearMotor`; None: nothing is known.
     """
     found: list[Finding] = [*_degrees(log)]
-    moves = log.has("position") or log.has("velocity")
-    if log.has("position", "velocity"):
+    moves = _moves(log)
+    if log.has("position", "velocity") and moves:
         found += _velocity(log)
     electrical = voltage_balance(log) if log.has("voltage", "current") else None
     if log.has("voltage", "current"):
-        found += [*_electrical(electrical), *_delay(log), *_sag(log)]
+        found += [*_electrical(electrical), *_delay(log), *_sag(log, electrical)]
+    if not moves and (log.has("position") or log.has("velocity")):
+        text = "the shaft stands still, as if it were locked"
+        found.append(Finding("info", "excitation", None, text, "leave position and velocity out if it is"))
     effort = next((name for name in ("torque", "current", "voltage") if log.has(name)), None)
     if moves and effort is not None:
         found += [*_mechanical(log, effort), *_motion(log)]
     if electrical is not None:
         found += [*_two_constants(log, electrical), *_datasheet(electrical, motor)]
     return found
+
+
+def _moves(log: Log) -> bool:
+    """Whether the shaft moves by more than noise and quantisation."""
+    if log.has("position"):
+        return float(np.ptp(log.signals["position"])) > max(10.0 * log.resolution.get("position", 0.0), 1e-4)
+    windows = Windows(log, 0.05, 1000) if log.has("velocity") else ()
+    if not len(windows):
+        return False
+    smooth = windows.mean("velocity")
+    return float(np.std(smooth)) > 0.3 * float(np.std(log.signals["velocity"]))
 
 
 def _degrees(log: Log) -> Iterator[Finding]:
@@ -132,17 +146,17 @@ def _delay(log: Log) -> Iterator[Finding]:
         yield Finding("warning" if log.mean_voltage else "info", "voltage", None, text, remedy)
 
 
-def _sag(log: Log) -> Iterator[Finding]:
+def _sag(log: Log, balance: Balance | None) -> Iterator[Finding]:
     """A supply that gives way, where the share of its voltage changes; at one share it looks as the winding does."""
-    balance = voltage_balance(log, sag=True)
     share = np.abs(log.signals["voltage"])
-    if balance is None or float(np.std(share)) < 0.1 * float(share.max()):
+    with_sag = voltage_balance(log, sag=True) if float(np.std(share)) > 0.1 * float(share.max()) else None
+    if balance is None or with_sag is None or with_sag.residual > 0.9 * balance.residual:
         return
-    resistance, supply = balance.values["resistance"], balance.values["supply_resistance"]
-    if balance.certainty["supply_resistance"] < -_CERTAIN or supply < 0.03 * abs(resistance):
-        return
-    if balance.certainty["supply_resistance"] > _CERTAIN:
-        text = f"the voltage sags by about {supply:.2g} ohm under current, beside a winding of {resistance:.2g} ohm"
+    supply = with_sag.values["supply_resistance"]
+    if with_sag.certainty["supply_resistance"] > _CERTAIN and supply > 0.03 * with_sag.values["resistance"] > 0.0:
+        text = (
+            f"the voltage sags as behind {supply:.2g} ohm, beside a winding of {with_sag.values['resistance']:.2g} ohm"
+        )
         remedy = "log the voltage of the supply, and write voltage=duty*bus:V"
         yield Finding("warning", "sag", None, text, remedy)
 
@@ -162,7 +176,7 @@ def _mechanical(log: Log, effort: str) -> Iterator[Finding]:
         text = f"gravity pushes away from position 0 (m*g*l would be {values['gravity']:.3g}): 0 is at the top"
         remedy = "write position=column-3.14159:rad, so that it hangs at 0; or the sign of the position is wrong"
         yield Finding("warning", "sign", None, text, remedy)
-    if effort == "torque" and balance.unexplained > 0.2:
+    if effort == "torque" and balance.unexplained > 0.25:
         text = f"the motion leaves {balance.unexplained:.0%} of the torque unexplained (mean over 0.3 s)"
         lag = motion_lag(log)
         if lag is not None and abs(lag.lag) > log.step and lag.improvement < 0.9:
@@ -174,10 +188,7 @@ def _mechanical(log: Log, effort: str) -> Iterator[Finding]:
 def _motion(log: Log) -> Iterator[Finding]:
     """Whether it moves to and fro."""
     speed = log.signals["velocity"] if log.has("velocity") else np.diff(log.signals["position"])
-    size = float(np.abs(speed).max())
-    if size == 0.0:
-        yield Finding("info", "excitation", None, "the shaft stands still", "leave the motion out if it is locked")
-    elif min(float(speed.max()), float(-speed.min())) < 0.05 * size:
+    if min(float(speed.max()), float(-speed.min())) < 0.05 * float(np.abs(speed).max()):
         text = "the shaft turns one way only: friction cannot be told from a constant load"
         yield Finding("info", "excitation", None, text, "add a log that reverses")
 

@@ -11,6 +11,8 @@ from codrl_mj.identify.log import Log
 
 _ROWS = 20_000
 """More are not looked at."""
+_WINDOWS = 800
+"""More tell no more."""
 
 
 class Lag(NamedTuple):
@@ -34,7 +36,7 @@ def velocity_lag(log: Log, longest: float = 0.1) -> Lag | None:
         longest: lag that is looked for [s]; at least 4 rows are.
     """
     log = _beginning(log)
-    windows = Windows(log, max(0.05, 4.0 * log.step))
+    windows = Windows(log, max(0.05, 4.0 * log.step), _WINDOWS)
     if not len(windows):
         return None
     rate = windows.mean("position", 1)
@@ -61,7 +63,7 @@ def current_lag(log: Log, longest: float = 20.0) -> Lag | None:
         longest: lag that is looked for, in rows.
     """
     log = _beginning(log)
-    windows = Windows(log)
+    windows = Windows(log, most=_WINDOWS)
     if not len(windows) or not np.any(log.signals["voltage"]):
         return None
     terms = voltage_terms(log, windows)
@@ -82,7 +84,7 @@ def motion_lag(log: Log, effort: str = "torque", longest: float = 0.06) -> Lag |
         longest: lag that is looked for [s].
     """
     log = _beginning(log)
-    windows = Windows(log, 0.3)
+    windows = Windows(log, 0.3, _WINDOWS)
     terms = torque_terms(log, windows) if len(windows) else None
     if terms is None:
         return None
@@ -91,7 +93,7 @@ def motion_lag(log: Log, effort: str = "torque", longest: float = 0.06) -> Lag |
         balance = regress(windows.mean_held(effort, lag), terms)
         return (np.inf, 1.0) if balance is None else (balance.residual, balance.unexplained)
 
-    return _compared(compare, max(log.step, longest / 20.0), longest, longest)
+    return _compared(compare, log.step, longest, longest)
 
 
 def _compared(compare: Callable[[float], tuple[float, float]], step: float, ahead: float, behind: float) -> Lag | None:
@@ -104,11 +106,17 @@ def _compared(compare: Callable[[float], tuple[float, float]], step: float, ahea
 
 
 def _least(residual: Callable[[float], float], step: float, ahead: float, behind: float) -> float:
-    """The lag of the least residual: by whole steps from -ahead to behind, then by quarters beside the best."""
-    rows = np.arange(-max(round(ahead / step), 4), max(round(behind / step), 4) + 1)
-    coarse = min((residual(step * row), abs(row), row) for row in rows)[2]
-    fine = coarse + 0.25 * np.arange(-3, 4)
-    return float(step * min((residual(step * row), abs(row), row) for row in fine)[2])
+    """The lag of the least residual, to a quarter of a step: by long steps, then by shorter ones beside the best."""
+    shift = step
+    while ahead + behind > 40.0 * shift:
+        shift *= 2.0
+    places = shift * np.arange(-max(round(ahead / shift), 4), max(round(behind / shift), 4) + 1)
+    while True:
+        best = min((residual(place), abs(place), place) for place in places)[2]
+        if shift <= 0.3 * step:
+            return float(best)
+        shift /= 2.0
+        places = best + shift * np.arange(-2, 3)
 
 
 def _beginning(log: Log) -> Log:
