@@ -150,7 +150,7 @@ def _sag(log: Log, balance: Balance | None) -> Iterator[Finding]:
     """A supply that gives way, where the share of its voltage changes; at one share it looks as the winding does."""
     share = np.abs(log.signals["voltage"])
     with_sag = voltage_balance(log, sag=True) if float(np.std(share)) > 0.1 * float(share.max()) else None
-    if balance is None or with_sag is None or with_sag.residual > 0.9 * balance.residual:
+    if balance is None or with_sag is None or with_sag.residual > 0.96 * balance.residual:
         return
     supply = with_sag.values["supply_resistance"]
     if with_sag.certainty["supply_resistance"] > _CERTAIN and supply > 0.03 * with_sag.values["resistance"] > 0.0:
@@ -176,7 +176,8 @@ def _mechanical(log: Log, effort: str) -> Iterator[Finding]:
         text = f"gravity pushes away from position 0 (m*g*l would be {values['gravity']:.3g}): 0 is at the top"
         remedy = "write position=column-3.14159:rad, so that it hangs at 0; or the sign of the position is wrong"
         yield Finding("warning", "sign", None, text, remedy)
-    if effort == "torque" and balance.unexplained > 0.25:
+    large = 0.08 * float(np.std(log.signals[effort]))  # else it is what fast changes leave of rounding
+    if effort == "torque" and balance.unexplained > 0.25 and balance.residual > large:
         text = f"the motion leaves {balance.unexplained:.0%} of the torque unexplained (mean over 0.3 s)"
         lag = motion_lag(log)
         if lag is not None and abs(lag.lag) > log.step and lag.improvement < 0.9:

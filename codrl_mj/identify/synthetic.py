@@ -42,6 +42,10 @@ class Load:
         check(self)
 
 
+FREE = Load()
+"""Nothing but the rotor."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Sensor:
     """How a signal is read: value -> gain * value(time - delay) + bias + noise, then rounded.
@@ -109,7 +113,7 @@ class Course(NamedTuple):
     """Of the supply [V]."""
 
 
-def run(drive: Drive, excitation: Excitation, load: Load = Load(), position: float = 0.0) -> Course:
+def run(drive: Drive, excitation: Excitation, load: Load = FREE, position: float = 0.0) -> Course:
     """What a drive does under a voltage, from standstill.
 
     A bridge makes the voltage u of a share d = u/V of the supply, which sags by its resistance times d*i.
@@ -123,32 +127,81 @@ def run(drive: Drive, excitation: Excitation, load: Load = Load(), position: flo
     Raises:
         ValueError: the motor moves nothing that has an inertia.
     """
+    commanded = excitation.voltage(sample_times(drive, excitation.duration))
+    return play(drive, commanded, dataclasses.replace(load, locked=load.locked or excitation.locked), position)
+
+
+def sample_times(drive: Drive, duration: float) -> np.ndarray:
+    """The times [s] of the drive's samples from 0 to a duration, shape (n + 1,)."""
     period = 1.0 / drive.controller.sample_rate
-    time = period * np.arange(math.ceil(excitation.duration / period - 1e-9) + 1)
-    limit = drive.voltage_limit
-    commanded = np.clip(excitation.voltage(time), -limit, limit)
-    motor, locked = drive.motor, load.locked or excitation.locked
+    return period * np.arange(math.ceil(duration / period - 1e-9) + 1)
+
+
+def play(drive: Drive, commanded: np.ndarray, load: Load = FREE, position: float = 0.0) -> Course:
+    """`run` under any voltages.
+
+    Args:
+        drive: see `run`.
+        commanded: voltage [V] in each of the drive's samples, shape (n + 1,).
+        load: what it moves.
+        position: of the output at the beginning [rad].
+
+    Raises:
+        ValueError: see `run`.
+    """
+    period, limit = 1.0 / drive.controller.sample_rate, drive.voltage_limit
+    time, commanded = period * np.arange(len(commanded)), np.clip(commanded, -limit, limit)
+    motor = drive.motor
+    sag = 0.0 if drive.supply is None else drive.supply.resistance
+    shares = np.sign(commanded) * np.maximum(np.abs(commanded) - drive.controller.deadband, 0.0) / limit
+    states = _compiled()[0](
+        parameters_type(type(drive))(*drive.numbers),
+        period,
+        shares,
+        float(limit),
+        float(sag),
+        _moved(drive, load),
+        load.locked,
+        float(position * motor.gear_ratio),
+    )
+    voltage, current, speed, angle, bus = states.T
+    return Course(time, voltage, commanded, current, speed / motor.gear_ratio, angle / motor.gear_ratio, bus)
+
+
+def turn(drive: Drive, torque: np.ndarray, load: Load = FREE, position: float = 0.0) -> np.ndarray:
+    """Position of the output [rad] under a torque of the motor, at the drive's samples, shape (n,).
+
+    Args:
+        drive: whose shaft, gear and friction.
+        torque: at the rotor [N*m] in each sample, shape (n,).
+        load: what it moves.
+        position: at the beginning [rad].
+
+    Raises:
+        ValueError: see `run`.
+    """
+    motor, period = drive.motor, 1.0 / drive.controller.sample_rate
+    angle = float(position * motor.gear_ratio)
+    angles = _compiled()[1](parameters_type(type(drive))(*drive.numbers), period, torque, _moved(drive, load), angle)
+    return angles / motor.gear_ratio
+
+
+def _moved(drive: Drive, load: Load) -> tuple[float, float, float]:
+    """Inertia at the rotor [kg*m^2], gravity and constant torque at the output [N*m]."""
+    motor = drive.motor
     inertia = motor.rotor_inertia + load.inertia / motor.gear_ratio**2
-    if not inertia > 0.0 and not locked:
+    if not inertia > 0.0 and not load.locked:
         raise ValueError(
             f"motor.rotor_inertia = {motor.rotor_inertia:g} and load.inertia = {load.inertia:g}: one must be > 0; "
             "give the load its inertia, or lock the shaft"
         )
-    sag = 0.0 if drive.supply is None else drive.supply.resistance
-    shares = np.sign(commanded) * np.maximum(np.abs(commanded) - drive.controller.deadband, 0.0) / limit
-    parameters = parameters_type(type(drive))(*drive.numbers)
-    moved = float(inertia), float(load.gravity), float(load.torque)
-    angle = float(position * motor.gear_ratio)
-    states = _compiled()(parameters, period, shares, float(limit), float(sag), moved, locked, angle)
-    voltage, current, speed, angle, bus = states.T
-    ratio = motor.gear_ratio
-    return Course(time, voltage, commanded, current, speed / ratio, angle / ratio, bus)
+    return inertia, load.gravity, load.torque
 
 
 def simulate(
     drive: Drive,
     excitation: Excitation,
-    load: Load = Load(),
+    load: Load = FREE,
     sensors: Mapping[str, Sensor] | None = None,
     sampler: Sampler = Sampler(),
     seed: int = 0,
@@ -231,13 +284,13 @@ def write_log(path: Path, log: Log) -> str:
 
 
 @functools.cache
-def _compiled() -> Callable[..., Any]:
+def _compiled() -> tuple[Callable[..., Any], Callable[..., Any]]:
     import numba
     from numba.extending import register_jitable
 
     for helper in (shaft.friction, _step_shaft):
         register_jitable(helper)
-    return numba.njit(_course)
+    return numba.njit(_course), numba.njit(_angles)
 
 
 def _step_shaft(
@@ -286,3 +339,12 @@ def _course(
         if not locked:
             speed, angle = _step_shaft(parameters, 0.5 * period, torque_constant * current, moved, speed, angle)
     return states
+
+
+def _angles(parameters: Any, period: float, torques: Any, moved: Any, angle: float) -> Any:
+    """Angle of the rotor [rad] at each sample, shape (n,)."""
+    angles, speed = np.empty(len(torques)), 0.0
+    for row in range(len(torques)):
+        angles[row] = angle
+        speed, angle = _step_shaft(parameters, period, torques[row], moved, speed, angle)
+    return angles
