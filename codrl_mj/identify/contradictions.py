@@ -63,19 +63,18 @@ def _moves(log: Log) -> bool:
     """Whether the shaft moves by more than noise and quantisation."""
     if log.has("position"):
         return float(np.ptp(log.signals["position"])) > max(10.0 * log.resolution.get("position", 0.0), 1e-4)
-    windows = Windows(log, 0.05, 1000) if log.has("velocity") else ()
-    if not len(windows):
+    windows = Windows(log, 0.05, 1000)
+    if not log.has("velocity") or not len(windows):
         return False
-    smooth = windows.mean("velocity")
-    return float(np.std(smooth)) > 0.3 * float(np.std(log.signals["velocity"]))
+    return float(np.std(windows.mean("velocity"))) > 0.3 * float(np.std(log.signals["velocity"]))
 
 
 def _degrees(log: Log) -> Iterator[Finding]:
     """An encoder that divides 360 and not 2 pi."""
     step = log.resolution.get("position", 0.0) or find_resolution(log.signals.get("position", np.zeros(2)))
-    if step > 0.0 and (turns := 360.0 / step) > 8.0:
+    if step > 0.0 and 8.0 < (turns := 360.0 / step) < 1e5:
         of_radians = 2.0 * math.pi / step
-        if abs(turns - round(turns)) < 1e-4 * turns**0.5 and abs(of_radians - round(of_radians)) > 1e-3:
+        if abs(turns - round(turns)) < 1e-6 * turns and abs(of_radians - round(of_radians)) > 1e-3:
             text = f"the position's steps of {step:.4g} are 1/{round(turns)} of 360, not of 2 pi: is it in degrees?"
             yield Finding("warning", "unit", None, text, "write position=column:deg")
 

@@ -100,6 +100,7 @@ def plan(
     sensing: Sensing | None = None,
     duration: float = 4.0,
     max_current: float = math.inf,
+    continuous_current: float = math.inf,
 ) -> Plan:
     """Compare excitations and sample rates for a motor whose parameters are about known.
 
@@ -109,6 +110,7 @@ def plan(
         sensing: what is measured.
         duration: of a log [s].
         max_current: that the bench allows [A]; the drive's own counts too.
+        continuous_current: that the motor bears [A]; its root mean square stays below.
 
     Raises:
         ValueError: the motor has no inertia to turn; or a value is out of bounds.
@@ -116,11 +118,13 @@ def plan(
     if not duration >= 4.0 * _SEGMENT:
         raise ValueError(f"duration = {duration!r}: must be at least {4.0 * _SEGMENT:g} s; log for longer")
     limit = min(max_current, drive.controller.max_current)
-    if not limit > 0.0:
-        raise ValueError(f"max_current = {max_current!r}: must be above 0 A")
+    for name, value in (("max_current", max_current), ("continuous_current", continuous_current)):
+        if not value > 0.0:
+            raise ValueError(f"{name} = {value!r}: must be above 0 A; leave it out if there is no limit")
     options = []
     for kind in KINDS:
-        options += _options(drive, _sized(drive, kind, load, duration, limit), load, sensing or Sensing())
+        sized = _sized(drive, kind, load, duration, (limit, continuous_current))
+        options += _options(drive, sized, load, sensing or Sensing())
     reached = [option for option in options if option.worst <= 1.0 / MARGIN]
     best = min(reached, key=lambda one: (one.rate, one.worst)) if reached else min(options, key=lambda one: one.worst)
     names = {name: GOALS[name] for name in GOALS if _value(drive, load, name) > 0.0}
@@ -136,8 +140,8 @@ def write_excitation(path: Path, option: Option) -> None:
         np.savetxt(temporary, table, fmt="%.7g", delimiter=",", header="time,voltage", comments="")
 
 
-def _sized(drive: Drive, kind: str, load: Load, duration: float, limit: float) -> Excitation:
-    """An excitation as large as voltage and current allow; a response is nearly in proportion to it."""
+def _sized(drive: Drive, kind: str, load: Load, duration: float, limits: tuple[float, float]) -> Excitation:
+    """An excitation as large as voltage, peak and mean current allow; a response is nearly in proportion to it."""
     motor = drive.motor
     constant = motor.inductance / motor.resistance
     largest = Excitation(
@@ -148,11 +152,12 @@ def _sized(drive: Drive, kind: str, load: Load, duration: float, limit: float) -
         highest=min(200.0, 0.5 / constant),
         clock=4.0 * constant,
     )
-    for _ in range(3):
-        peak = float(np.abs(run(drive, largest, load).current).max())
-        if peak <= limit:
+    for _ in range(4):
+        current = run(drive, largest, load).current
+        excess = max(float(np.abs(current).max()) / limits[0], float(np.sqrt(np.mean(current**2))) / limits[1])
+        if excess <= 1.0:
             break
-        largest = dataclasses.replace(largest, amplitude=0.98 * largest.amplitude * limit / peak)
+        largest = dataclasses.replace(largest, amplitude=0.96 * largest.amplitude / excess)
     return largest
 
 
@@ -170,7 +175,9 @@ def _options(drive: Drive, excitation: Excitation, load: Load, sensing: Sensing)
         course, told = play(drive, voltage, load), _told(drive, voltage, rate, sensing)
         errors = _electrical(drive, course, told, rate, sensing)
         if not load.locked:
-            errors |= _mechanical(drive, course, load, rate, sensing)
+            constant = errors.get("back_emf_constant", 0.0)  # which the torque is known by
+            by_position = _mechanical(drive, course, load, rate, sensing)
+            errors |= {name: math.hypot(error, constant) for name, error in by_position.items()}
         rms = float(np.sqrt(np.mean(course.current**2)))
         options.append(Option(clocked, rate, float(np.abs(course.current).max()), rms, errors))
     return options

@@ -155,7 +155,7 @@ def play(drive: Drive, commanded: np.ndarray, load: Load = FREE, position: float
     sag = 0.0 if drive.supply is None else drive.supply.resistance
     shares = np.sign(commanded) * np.maximum(np.abs(commanded) - drive.controller.deadband, 0.0) / limit
     states = _compiled()[0](
-        parameters_type(type(drive))(*drive.numbers),
+        _parameters(drive),
         period,
         shares,
         float(limit),
@@ -182,8 +182,13 @@ def turn(drive: Drive, torque: np.ndarray, load: Load = FREE, position: float = 
     """
     motor, period = drive.motor, 1.0 / drive.controller.sample_rate
     angle = float(position * motor.gear_ratio)
-    angles = _compiled()[1](parameters_type(type(drive))(*drive.numbers), period, torque, _moved(drive, load), angle)
+    angles = _compiled()[1](_parameters(drive), period, torque, _moved(drive, load), angle)
     return angles / motor.gear_ratio
+
+
+def _parameters(drive: Drive) -> Any:
+    family: Any = type(drive)
+    return parameters_type(family)(*drive.numbers)
 
 
 def _moved(drive: Drive, load: Load) -> tuple[float, float, float]:
