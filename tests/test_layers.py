@@ -57,9 +57,11 @@ ALLOWED = {
     },
     "rl_zoo3": set(),
     "motor_design": {"actuators", "catalogue", "fields", "runs.files"},
+    "identify": {"actuators", "catalogue", "fields", "runs.files"},
     "cli": {
         *("actuators", "agents", "disturbances", "envs.config", "evaluation", "evaluation.measures", "fields", "films"),
         *(
+            "identify",
             "motor_design",
             "runs.files",
             "runs.layout",
@@ -83,6 +85,7 @@ FOREIGN = {
     "tasks.assets": set(),
     "catalogue": {"pint"},
     "motor_design": {"control", "matplotlib", "numpy", "scipy"},
+    "identify": {"numba", "numpy", "scipy"},
     "plugin": {"mujoco"},
     "engine": {"mujoco", "numba", "llvmlite", "numpy"},
     "specs": {"mujoco", "numpy"},

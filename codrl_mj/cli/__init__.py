@@ -10,6 +10,7 @@ import tyro
 
 from codrl_mj.cli.evaluate import Evaluate
 from codrl_mj.cli.fields import with_environment
+from codrl_mj.cli.identify_tools import IdentifyTools
 from codrl_mj.cli.motor import Motor
 from codrl_mj.cli.render import Render
 from codrl_mj.cli.reproduce import Reproduce
@@ -25,6 +26,7 @@ VERBS: dict[str, Any] = {
     "runs": Runs,
     "render": Render,
     "motor": Motor,
+    "identify": IdentifyTools,
     "validate": Validate,
     "study": Study,
     "reproduce": Reproduce,

@@ -1,7 +1,7 @@
 """A bench log in SI units: what the fit reads and the checks look at."""
 
 import dataclasses
-import math
+import itertools
 from collections.abc import Mapping
 
 import numpy as np
@@ -20,6 +20,7 @@ SIGNALS = {
 """What a log may hold -> its SI unit; None: any."""
 LONGEST_STEP = 5.0
 """A longer step, in median steps, is a gap, across which nothing is simulated."""
+_MOST_LEVELS = 1_000_000  # of a converter: what has more is as good as continuous
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +122,7 @@ def usable(log: Log, longest: float = LONGEST_STEP) -> list[slice]:
         raise ValueError(f"longest = {longest!r}: must be a number of steps > 1, such as {LONGEST_STEP:g}")
     gaps = np.flatnonzero(np.diff(log.time) > longest * log.step) + 1
     edges = [0, *map(int, gaps), len(log.time)]
-    return [slice(start, end) for start, end in zip(edges, edges[1:], strict=False) if end - start >= 2]
+    return [slice(start, end) for start, end in itertools.pairwise(edges) if end - start >= 2]
 
 
 def find_resolution(values: np.ndarray) -> float:
@@ -136,11 +137,11 @@ def find_resolution(values: np.ndarray) -> float:
     steps = steps[steps > 1e-9 * spread]
     if steps.size < 2:  # what has one or two values says nothing
         return 0.0
-    step = float(steps.min())
-    step = float(steps[steps < 1.5 * step].mean())  # rounding of the file itself
-    counts = np.round((levels - levels[0]) / step)
-    if counts[-1] < 1.0 or not math.isfinite(counts[-1]):
-        return 0.0
-    step = spread / float(counts[-1])
-    off = np.abs((levels - levels[0]) / step - np.round((levels - levels[0]) / step))
-    return step if float(off.max()) < 0.1 and counts[-1] < 1e6 else 0.0
+    least = float(steps.min())
+    least = float(steps[steps < 1.2 * least].mean())  # rounding of the file itself
+    for parts in (1, 2, 3):  # neighbouring levels need not occur
+        count = round(parts * spread / least)
+        grid = (levels - levels[0]) * (count / spread)
+        if count < _MOST_LEVELS and float(np.abs(grid - np.round(grid)).max()) < 0.1:
+            return spread / count
+    return 0.0
