@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.actuators import FAMILIES, NAMED, Actuator, Ideal, actuator_over
+from codrl_mj.actuators import FAMILIES, NAMED, Actuator, Ideal, actuator_over, identified_ranges
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import parts
 from codrl_mj.runs.layout import CONFIG
@@ -140,11 +140,30 @@ def environment(verb: Any, task: str, name: str, known: Any = None) -> EnvConfig
     given: dict[str, Any] = dict(vars(verb.env))
     nested: dict[str, Any] = {name: vars(given.pop(name)) for name in ("disturbances", "joint")}
     options = {name: value for name in _task_options() if (value := given.pop(name, None)) is not None}
+    given["randomize"] = _ranges(given["randomize"], name)
     base = known if name in (AS_TRAINED, AS_CONFIGURED) else named_actuator(name, task)
     changed = [
         actuator_over(one, _given(verb.actuator_fields)) for one in (base if isinstance(base, tuple) else [base])
     ]
     return EnvConfig(task, changed, options=options, **given, **nested)
+
+
+def _ranges(randomize: Any, actuator: str) -> Any:
+    """What `--env.randomize` says, `identified` replaced by the intervals that the actuator's file has.
+
+    Raises:
+        ValueError: the actuator is no file that has any.
+    """
+    if randomize is None or "identified" not in randomize:
+        return randomize
+    if Path(actuator).suffix not in (".yaml", ".yml", ".json"):
+        raise ValueError(
+            f"--env.randomize identified: draws within the intervals of a file; --actuator is {actuator!r}, must be one "
+            "that `codrl-mj identify` wrote"
+        )
+    others = [one for one in randomize if one != "identified"]
+    named = {one.partition("=")[0].strip() for one in others}
+    return (*others, *(f"{name}={text}" for name, text in identified_ranges(actuator).items() if name not in named))
 
 
 def scan(arguments: Sequence[str], *names: str) -> argparse.Namespace:

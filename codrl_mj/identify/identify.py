@@ -15,7 +15,7 @@ from codrl_mj.identify.parameters import DEFAULTS, FRICTION, OF_RIG, PARAMETERS
 from codrl_mj.identify.prediction import Prediction, predict
 from codrl_mj.identify.result import Estimate, Identified
 from codrl_mj.identify.segments import SEGMENT
-from codrl_mj.identify.stages import Fitted, Shaft, Stage, Winding, fitted, moves
+from codrl_mj.identify.stages import Fitted, Shaft, Winding, fitted, moves
 
 WIDEST = 0.3
 """An interval of more than this share of the value to either side is too wide; of the whole friction, for friction."""
@@ -328,5 +328,3 @@ def _predictions(shaft: Fitted | None, logs: Sequence[Log]) -> tuple[Prediction,
         predict(shaft.model, shaft.fit.values, log, shaft.delay) for log in logs if log.has(shaft.model.driven_by)
     )
 
-
-__all__ = ["Stage", "identify"]

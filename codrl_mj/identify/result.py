@@ -2,10 +2,12 @@
 
 import dataclasses
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Literal
 
 from codrl_mj.identify.parameters import PARAMETERS
 from codrl_mj.identify.prediction import Prediction
+from codrl_mj.runs.files import write_json, writing
 
 Status = Literal["identified", "given", "ratio", "unidentifiable", "refused"]
 USABLE = ("identified", "given")
@@ -118,3 +120,17 @@ class Identified:
             return {"identified": section | {"problem": problem}}
         intervals = {name: list(ends) for name, ends in self.intervals().items()}
         return {**self.actuator().as_mapping(), "identified": section | {"intervals": intervals}}
+
+    def write(self, folder: Path) -> list[Path]:
+        """Write actuator.yaml and result.json into a folder, whole or not at all.
+
+        Returns:
+            Their paths.
+        """
+        import yaml
+
+        actuator, result = folder / "actuator.yaml", folder / "result.json"
+        with writing(actuator) as temporary:
+            temporary.write_text(yaml.safe_dump(self.as_file(), sort_keys=False))
+        write_json(result, self.as_mapping())
+        return [actuator, result]
