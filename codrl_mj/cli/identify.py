@@ -163,7 +163,9 @@ def print_identified(found: Any) -> None:
         for kind, several in (("fitted", found.fitted), ("held out", found.held_out)):
             for one in several:
                 closed = "" if one.closed_loop is None else f"{one.closed_loop:.3g}"
-                table.add_row(escape(one.log), kind, f"{one.output} {units[one.output]}", f"{one.open_loop:.3g}", closed)
+                table.add_row(
+                    escape(one.log), kind, f"{one.output} {units[one.output]}", f"{one.open_loop:.3g}", closed
+                )
         console().print(table)
     for part, rows in found.delays.items():
         if rows:

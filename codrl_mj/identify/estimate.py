@@ -27,15 +27,25 @@ Simulate = Callable[[Segment, np.ndarray], np.ndarray]
 class Model(Protocol):
     """What is fitted."""
 
-    names: tuple[str, ...]
-    """Free parameters."""
-    lower: np.ndarray
-    upper: np.ndarray
-    """Their bounds, shape (p,)."""
-    scales: np.ndarray
-    """What a change of each is measured by, > 0, shape (p,)."""
-    steps: np.ndarray
-    """Steps of finite differences of the state, shape (s,)."""
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Free parameters."""
+
+    @property
+    def lower(self) -> np.ndarray:
+        """Their least values, shape (p,)."""
+
+    @property
+    def upper(self) -> np.ndarray:
+        """Their largest values, shape (p,)."""
+
+    @property
+    def scales(self) -> np.ndarray:
+        """What a change of each is measured by, > 0, shape (p,)."""
+
+    @property
+    def steps(self) -> np.ndarray:
+        """Steps of finite differences of the state, shape (s,)."""
 
     def at(self, values: np.ndarray) -> Simulate:
         """(segment, state at its beginning) -> what the sensor would have seen, shape (m,), for parameters (p,)."""

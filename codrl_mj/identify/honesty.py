@@ -6,7 +6,7 @@ simulated and fitted again, and by what is found at half the rate.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -16,12 +16,10 @@ from codrl_mj.identify.segments import Segment
 LEAST_LOGS = 5
 """From so many logs on whole logs are resampled; below, blocks of them."""
 DRAWS = 500
-UNKNOWN = 0.5
-"""A direction in which the parameters may go by so much of themselves is not identified."""
 FLAT = 1e-7
-"""Nor is one in which the squared residuals change by less than this share of what the best one changes them by."""
-PART = 0.1
-"""Share of such a direction from which a parameter belongs to it."""
+"""Directions in which the squared residuals change by less than this share of the most do not count as known."""
+SLACK = 1e-3
+"""Share of the cost that a fit may be better by luck: dry friction has many minima."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -87,25 +85,22 @@ def between_logs(fit: Fit, segments: Sequence[Segment], scales: np.ndarray) -> n
     return np.asarray(2.0 * pulls.std(axis=0, ddof=1) / np.sqrt(count))
 
 
-def unknown_directions(fit: Fit, segments: Sequence[Segment], scales: np.ndarray) -> list[Mapping[str, float]]:
-    """Directions in which the parameters may go and nothing changes: parameter -> part of its scale, the largest 1.
+def weakest_direction(fit: Fit, segments: Sequence[Segment], scales: np.ndarray) -> np.ndarray:
+    """The direction in which the parameters change the residuals least, in their scales: a unit vector, shape (p,)."""
+    _, matrices = _sums(fit, [segment.block for segment in segments])
+    return np.asarray(np.linalg.eigh(matrices.sum(axis=0) * np.outer(scales, scales))[1][:, 0])
 
-    Of the eigenvectors of the Gauss-Newton matrix in the parameters' scales: those that noise of the residuals' size
-    moves by more than `UNKNOWN`, or that are flat. Residuals within a block belong together, which the ratio of both
-    estimates of the covariance, by blocks and by rows, makes up for.
+
+def noticed(fit: Fit, segments: Sequence[Segment]) -> float:
+    """By how much the robust cost must rise to be more than chance, at 95 %.
+
+    Residuals of a block belong together: the ratio of both estimates of the covariance along the direction that is
+    known best, by blocks and by rows, makes up for that.
     """
     gradients, matrices = _sums(fit, [segment.block for segment in segments])
-    matrix = matrices.sum(axis=0) * np.outer(scales, scales)
-    pulls = gradients * scales
-    strengths, vectors = np.linalg.eigh(matrix)
-    strongest = vectors[:, -1]
+    root = np.sqrt(np.diag(matrices.sum(axis=0)))
+    strengths, vectors = np.linalg.eigh(matrices.sum(axis=0) / np.outer(root, root))
+    pulls = gradients / root @ vectors[:, -1]
     noise = float(np.mean(np.concatenate([fit.weights(i) * r**2 for i, r in enumerate(fit.residuals)])))
-    together = max(float(np.sum((pulls @ strongest) ** 2)) / max(strengths[-1] * noise, 1e-30), 1.0)
-    found = []
-    for strength, vector in zip(strengths, vectors.T, strict=True):
-        flat = strength < FLAT * strengths[-1]
-        if flat or np.sqrt(noise * together / strength) > UNKNOWN:
-            largest = vector[np.argmax(np.abs(vector))]
-            shares = vector / largest
-            found.append({name: float(s) for name, s in zip(fit.names, shares, strict=True) if abs(s) > PART})
-    return found
+    together = max(float(pulls @ pulls) / max(strengths[-1] * noise, 1e-30), 1.0)
+    return 3.84 * noise * together + SLACK * fit.cost

@@ -13,8 +13,8 @@ from codrl_mj.identify.friction import chosen_friction
 from codrl_mj.identify.log import Log
 from codrl_mj.identify.parameters import DEFAULTS, FRICTION, OF_RIG, PARAMETERS
 from codrl_mj.identify.prediction import Prediction, predict
-from codrl_mj.identify.result import Estimate, Identified
-from codrl_mj.identify.segments import SEGMENT
+from codrl_mj.identify.result import Estimate, Identified, Status
+from codrl_mj.identify.segments import BLOCK, SEGMENT
 from codrl_mj.identify.stages import Fitted, Shaft, Winding, fitted, moves
 
 WIDEST = 0.3
@@ -25,7 +25,7 @@ NARROWEST = 0.002
 """No interval is narrower than this share of the value to either side: nobody's sensors are better calibrated."""
 BIASED = 0.5
 """The self-test fails where it is off by more than this share of the widest interval."""
-STEPS_OF_A_STAGE = 8 + 3
+STEPS_OF_A_STAGE = 8 + 4
 UNEXPLAINED = 8.0
 """Residuals of more standard deviations of the sensor in the mean are no noise,"""
 UNLIKE = 0.02
@@ -83,7 +83,9 @@ def identify(
     shaft, driven_by = None, _driven_by(logs)
     if driven_by is not None:
         moving = [log for log in logs if moves(log)]
-        stage = Shaft(rig, "coulomb", driven_by, {**given, **_constant(given, winding, driven_by)}, tuple(estimated), segment)
+        stage = Shaft(
+            rig, "coulomb", driven_by, {**given, **_constant(given, winding, driven_by)}, tuple(estimated), segment
+        )
         stage = chosen_friction(stage, moving, friction)
         shaft = fitted(stage, moving, step("shaft"))
     estimates, warnings = [], []
@@ -151,7 +153,9 @@ def _electrical(logs: Sequence[Log]) -> list[Log]:
 def _driven_by(logs: Sequence[Log]) -> str | None:
     """What drives the shaft: the nearest to it that all logs that move have."""
     moving = [log for log in logs if moves(log)]
-    return next((name for name in ("torque", "current", "voltage") if moving and all(m.has(name) for m in moving)), None)
+    return next(
+        (name for name in ("torque", "current", "voltage") if moving and all(m.has(name) for m in moving)), None
+    )
 
 
 def _constant(given: Mapping[str, float], winding: Fitted | None, driven_by: str) -> dict[str, float]:
@@ -201,7 +205,8 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
     sampled = isinstance(part.stage, Winding) and not all(log.mean_voltage for log in part.logs)
     rate = (2.0 if sampled else 1.0) * np.abs(halved - fit.values)  # what a loop does between rows goes with their root
     spread = honesty.Spread(resampled, logs, np.abs(tested - fit.values), rate)
-    directions = honesty.unknown_directions(fit, part.segments, scales)
+    directions = part.unknown_directions(scales)
+    on_step()
     made = []
     for place, name in enumerate(fit.names):
         value = float(fit.values[place])
@@ -213,13 +218,16 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
         own = [direction for direction in directions if name in direction]
         nothing = name in FRICTION and least <= value <= least + 1e-6 * model.scales[place]
         at_bound = min(value - least, most - value) <= 1e-6 * model.scales[place]
-        status, why = "identified", ""
+        status: Status = "identified"
+        why = ""
         if own and (len(own[0]) > 1):
             status, why = "ratio", _text(own[0])
         elif own:
             status, why = "unidentifiable", "the logs are as likely whatever it is"
         elif at_bound and not (nothing or name == "gear_efficiency"):
             status, why = "refused", f"it ended at its bound, {value:g} {PARAMETERS[name].unit}".strip()
+        elif math.isinf(causes["resampling"]):
+            status, why = "refused", f"there are no two stretches of {BLOCK:g} s to resample: give a longer log"
         elif not causes["self_test"] <= BIASED * widest * scales[place]:
             status = "refused"
             why = f"the self-test finds {tested[place]:.4g} where the fit that it simulates has {value:.4g}"
@@ -228,9 +236,7 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
             worst = max(causes, key=lambda cause: causes[cause]).replace("_", " ")
             whole = "all friction" if name in FRICTION else "it"
             why = f"its interval is {100.0 * share:.3g} % of {whole} to either side, above all by {worst}"
-        made.append(
-            Estimate(name, value, max(value - half, least), min(value + half, most), status, why, causes)
-        )
+        made.append(Estimate(name, value, max(value - half, least), min(value + half, most), status, why, causes))
     return made
 
 
@@ -264,7 +270,7 @@ def _speeds(model: Any, segment: Any) -> np.ndarray:
 
 def _text(direction: Mapping[str, float]) -> str:
     moves = ", ".join(f"{name} by {100.0 * share:+.0f} %" for name, share in direction.items())
-    return f"changed together nothing is seen of it: {moves} (of friction: % of all of it)"
+    return f"changed together nothing is seen of it: {moves} (of friction: of all of it)"
 
 
 def _completed(estimates: list[Estimate], given: Mapping[str, float]) -> list[Estimate]:
@@ -289,7 +295,9 @@ def _rotor_inertia(whole: Estimate, load: float, ratio: float) -> Estimate:
     status, why = whole.status, whole.why
     if status == "identified" and not high - value <= WIDEST * value:
         status = "refused"
-        why = f"of an inertia of {whole.value:.4g} kg*m^2 in all, {load:.4g} is said to be the load's: too little is left"
+        why = (
+            f"of an inertia of {whole.value:.4g} kg*m^2 in all, {load:.4g} is said to be the load's: too little is left"
+        )
     return Estimate("rotor_inertia", max(value, 0.0), max(low, 0.0), max(high, 0.0), status, why)
 
 
@@ -327,4 +335,3 @@ def _predictions(shaft: Fitted | None, logs: Sequence[Log]) -> tuple[Prediction,
     return tuple(
         predict(shaft.model, shaft.fit.values, log, shaft.delay) for log in logs if log.has(shaft.model.driven_by)
     )
-

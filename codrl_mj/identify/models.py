@@ -47,9 +47,7 @@ class WindingModel(_Model):
         constant = number["back_emf_constant"] * number["gear_ratio"]
 
         def currents(segment: Segment, state: np.ndarray) -> np.ndarray:
-            return simulate(
-                segment.times, segment.inputs, segment.speeds, state[0], resistance, inductance, constant
-            )
+            return simulate(segment.times, segment.inputs, segment.speeds, state[0], resistance, inductance, constant)
 
         return currents
 
@@ -110,9 +108,7 @@ def winding_model(segments: Sequence[Segment], known: Mapping[str, float]) -> tu
         known: values of parameters that are not to be fitted.
     """
     moving = any(np.any(segment.speeds) for segment in segments)
-    free = tuple(
-        name for name in ELECTRICAL if name not in known and (moving or name != "back_emf_constant")
-    )
+    free = tuple(name for name in ELECTRICAL if name not in known and (moving or name != "back_emf_constant"))
     given = {**DEFAULTS, "back_emf_constant": 0.0, **known}
     starts = []
     for count in (2, 8, 32):
@@ -279,9 +275,7 @@ def _shaft_regression(
         if output == "position":
             speed = speeds(times, position, times, max(window, 5.0 * step))
         columns = np.sin(position), np.ones(len(times)), np.sign(speed) * (np.abs(speed) > 0.0), speed, segment.inputs
-        sums = [
-            np.concatenate([[0.0], np.cumsum(0.5 * (one[1:] + one[:-1]) * np.diff(times))]) for one in columns
-        ]
+        sums = [np.concatenate([[0.0], np.cumsum(0.5 * (one[1:] + one[:-1]) * np.diff(times))]) for one in columns]
         edges = np.unique(np.searchsorted(times, np.arange(times[0], times[-1] + 1e-9, 2.5 * window)))
         rows.append(np.stack([np.diff(speed[edges]), *(np.diff(one[edges]) for one in sums)], axis=1))
         inputs.append(segment.inputs)

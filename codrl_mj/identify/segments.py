@@ -48,8 +48,10 @@ class Segment(NamedTuple):
 def delayed(log: Log, name: str, rows: int) -> np.ndarray:
     """A signal as it was some rows before (or, negative, after), the ends repeated."""
     values = log.signals[name]
-    return np.concatenate([np.full(rows, values[0]), values[:-rows]]) if rows > 0 else (
-        np.concatenate([values[-rows:], np.full(-rows, values[-1])]) if rows < 0 else values
+    return (
+        np.concatenate([np.full(rows, values[0]), values[:-rows]])
+        if rows > 0
+        else (np.concatenate([values[-rows:], np.full(-rows, values[-1])]) if rows < 0 else values)
     )
 
 
@@ -162,7 +164,7 @@ def shaft_segments(
                 edges = np.arange(0, len(times), together)
                 totals = np.diff(np.concatenate([[0.0], np.cumsum(means * np.diff(times))])[edges])
                 drive = np.append(totals / np.diff(times[edges]), drive[-1])
-                rows = slice(rows.start, rows.start + int(edges[-1]) + 1, together)  # noqa: PLW2901
+                rows = slice(rows.start, rows.start + int(edges[-1]) + 1, together)
                 times, slopes = times[edges], np.zeros(len(edges))
             made.append(
                 Segment(

@@ -1,8 +1,8 @@
 """A motor's winding and shaft, stepped by the time stamps of a log; compiled at the first use.
 
-Friction is that of `GearMotor`: what `codrl_mj.actuators.shaft.friction` takes from the motor's torque, and then Coulomb
-friction, which stops the shaft and holds it, as MuJoCo's constraint does. So fitted numbers mean there what they mean
-here.
+Friction is that of `GearMotor`: what `codrl_mj.actuators.shaft.friction` takes from the motor's torque, and then
+Coulomb friction, which stops the shaft and holds it, as MuJoCo's constraint does. So fitted numbers mean there what
+they mean here.
 """
 
 import functools
@@ -85,7 +85,7 @@ def _turned() -> Any:
     def turned(
         duration: float, given: float, slope: float, position: float, speed: float, moved: Any
     ) -> tuple[float, float]:
-        pieces = int(math.ceil(duration / LONGEST_SUBSTEP - 1e-6))
+        pieces = math.ceil(duration / LONGEST_SUBSTEP - 1e-6)
         step = duration / pieces
         damped = 0.5 * step * (moved.viscous + moved.braking) / moved.inertia
         for piece in range(pieces):

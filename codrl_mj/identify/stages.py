@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from codrl_mj.identify import honesty
 from codrl_mj.identify.differentiation import speeds
 from codrl_mj.identify.estimate import Fit, estimate, settled
 from codrl_mj.identify.log import Log
@@ -24,6 +25,10 @@ from codrl_mj.identify.segments import (
 
 DELAYS = (-1, 1, 2, 3)
 """Rows that the input is tried to be late by, besides 0."""
+UNKNOWN = 0.5
+"""A direction in which the parameters may go by so much of themselves, unnoticed, is not identified."""
+PART = 0.1
+"""Share of such a direction from which a parameter belongs to it."""
 BETTER = 0.8
 """A delay is believed where it takes the robust cost to less than this share."""
 
@@ -58,7 +63,9 @@ class Winding:
             found[segment.rows][:-1] = np.diff(positions) / np.diff(segment.times) + rest
         return found
 
-    def pretended(self, logs: Sequence[Log], segments: Sequence[Segment], fit: Fit, model: Any, sign: float) -> list[Log]:
+    def pretended(
+        self, logs: Sequence[Log], segments: Sequence[Segment], fit: Fit, model: Any, sign: float
+    ) -> list[Log]:
         """The logs as the fit would have made them: the speeds as they were taken to be, positions rounded anew."""
         made = _replaced(logs, segments, fit, model, "current", sign)
         return [_turned(log, segments, place) for place, log in enumerate(made)]
@@ -84,7 +91,9 @@ class Shaft:
         )
         return segments, model, starts
 
-    def pretended(self, logs: Sequence[Log], segments: Sequence[Segment], fit: Fit, model: Any, sign: float) -> list[Log]:
+    def pretended(
+        self, logs: Sequence[Log], segments: Sequence[Segment], fit: Fit, model: Any, sign: float
+    ) -> list[Log]:
         """The logs as the fit would have made them, segment by segment."""
         return _replaced(logs, segments, fit, model, output_of(logs[0]), sign)
 
@@ -116,6 +125,51 @@ class Fitted:
         segments, model, _ = stage.build(self.logs, self.delay)
         fit, _ = estimate(model, segments, [self.fit.values])
         return dataclasses.replace(self, stage=stage, segments=tuple(segments), model=model, fit=fit)
+
+    def unknown_directions(self, scales: np.ndarray) -> list[dict[str, float]]:
+        """Directions in which the parameters may go, and nobody would notice: parameter -> share, the largest 1.
+
+        In the direction that the derivatives say is the weakest, the parameter that has most of it is moved by half its
+        scale, and all others are fitted anew: if the logs are then explained as well, what the others did is the
+        direction. (Derivatives alone do not tell: dry friction makes them rough, and what is flat looks known.)
+
+        Args:
+            scales: what a change of each is measured by, shape (p,).
+        """
+        found: list[dict[str, float]] = []
+        here = self
+        while len(here.fit.names) > 1 or not found:
+            fit, names = here.fit, here.fit.names
+            own = np.array([scales[self.fit.names.index(name)] for name in names])
+            direction = honesty.weakest_direction(fit, here.segments, own)
+            place = int(np.argmax(np.abs(direction)))
+            step = UNKNOWN * own[place] * np.sign(direction[place])
+            if not here.model.lower[place] <= fit.values[place] + step <= here.model.upper[place]:
+                step = -step
+            moved = np.clip(fit.values + step / own[place] / direction[place] * direction * own, 0.2 * fit.values, None)
+            other = here.holding(place, float(fit.values[place] + step), moved)
+            if _cost(other.fit, fit.scale) > fit.cost + honesty.noticed(fit, here.segments):
+                break
+            changes = np.insert((other.fit.values - np.delete(fit.values, place)) / np.delete(own, place), place, step / own[place])
+            shares = changes / step * own[place]
+            found.append({name: float(s) for name, s in zip(names, shares, strict=True) if abs(s) > PART})
+            here = other
+            if len(names) == 1:
+                break
+        return found
+
+    def holding(self, place: int, value: float, start: np.ndarray) -> "Fitted":
+        """With one of the parameters, by its place, held at a value, and the others fitted from a start, shape (p,)."""
+        model = dataclasses.replace(
+            self.model,
+            names=tuple(np.delete(self.fit.names, place).tolist()),
+            known={**self.model.known, self.fit.names[place]: value},
+            scales=np.delete(self.model.scales, place),
+        )
+        if not model.names:
+            return dataclasses.replace(self, model=model, fit=estimate(model, self.segments, [np.zeros(0)])[0])
+        fit, _ = estimate(model, self.segments, [np.delete(start, place)], most=20)
+        return dataclasses.replace(self, model=model, fit=fit)
 
     def half_rate(self) -> np.ndarray:
         """The parameters at half the rate, an input being late by half as many rows, rounded."""
