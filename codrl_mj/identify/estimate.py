@@ -119,13 +119,17 @@ def _state_columns(
     return columns
 
 
+def settled_state(model: Model, values: np.ndarray, segment: Segment) -> np.ndarray:
+    """The state from which a segment fits best, by the parameters (p,)."""
+    simulate = model.at(values)
+    scale = robust_scale(_residuals(simulate, segment, segment.state))
+    return _settle(simulate, segment, segment.state, model.steps, scale)[0]
+
+
 def settled(model: Model, values: np.ndarray, segments: Sequence[Segment]) -> list[np.ndarray]:
     """What the model makes of each segment, shape (m,), from the state from which it fits best."""
-    simulate, made = model.at(values), []
-    for segment in segments:
-        scale = robust_scale(_residuals(simulate, segment, segment.state))
-        made.append(simulate(segment, _settle(simulate, segment, segment.state, model.steps, scale)[0]))
-    return made
+    simulate = model.at(values)
+    return [simulate(segment, settled_state(model, values, segment)) for segment in segments]
 
 
 class _Problem:
@@ -167,13 +171,9 @@ class _Problem:
         moves = np.diag(inward * DIFFERENCE * model.scales)
         here, moved = model.at(values), [model.at(values + move) for move in moves]
         for segment, state, found in zip(self.segments, states, residuals, strict=True):
-            columns = np.stack(
-                [
-                    (_residuals(simulate, segment, state) - found) / move.sum()
-                    for simulate, move in zip(moved, moves, strict=True)
-                ],
-                axis=1,
-            )
+            columns = np.empty((len(found), len(values)))
+            for place, (simulate, move) in enumerate(zip(moved, moves, strict=True)):
+                columns[:, place] = (_residuals(simulate, segment, state) - found) / move.sum()
             own = _state_columns(here, segment, state, model.steps, found)
             root = ((1.0 + (found / self.scale) ** 2) ** -0.25)[:, None]
             shares = np.linalg.lstsq(root * own, root * columns, rcond=1e-9)[0]
@@ -188,6 +188,8 @@ def _minimise(problem: _Problem, start: np.ndarray, most: int) -> np.ndarray:
     from scipy.optimize import least_squares
 
     model = problem.model
+    if not model.names:
+        return start
     inside = np.clip(start, model.lower + 1e-9 * model.scales, model.upper - 1e-9 * model.scales)
     found = least_squares(
         problem.residuals,

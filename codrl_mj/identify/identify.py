@@ -184,13 +184,16 @@ def _with_constant(found: list[Estimate], constant: Estimate | None, stage: Shaf
         status, why = one.status, one.why
         if status == "identified" and constant.status not in ("identified", "given"):
             status, why = "refused", f"the torque constant that it is in proportion to is {constant.status}"
-        made.append(Estimate(one.name, one.value, low, high, status, why, {**one.causes, "torque_constant": own}))
+        ends = max(low, PARAMETERS[one.name].least), min(high, PARAMETERS[one.name].most)
+        made.append(Estimate(one.name, one.value, *ends, status, why, {**one.causes, "torque_constant": own}))
     return made
 
 
 def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estimate]:
     """Every free parameter of a stage with its interval and status."""
     fit, model = part.fit, part.model
+    if not fit.names:
+        return []
     weights = _weights(part)
     # what a change is measured by: the value itself or, of friction, what would be all of it
     scales = np.array([weights.get(name, abs(value)) for name, value in zip(fit.names, fit.values, strict=True)])

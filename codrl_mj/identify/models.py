@@ -193,7 +193,7 @@ def shaft_model(
 
 def _inside(start: np.ndarray, free: Sequence[str], scales: np.ndarray) -> np.ndarray:
     """A start whose parameters are as positive as they must be."""
-    positive = np.array([PARAMETERS[name].least >= 0.0 for name in free])
+    positive = np.array([PARAMETERS[name].least >= 0.0 for name in free], bool)
     return np.where(positive & ~(start > 0.02 * scales), 0.3 * scales, start)
 
 

@@ -6,12 +6,15 @@ import math
 import numpy as np
 
 from codrl_mj.identify import simulation
+from codrl_mj.identify.estimate import settled_state
 from codrl_mj.identify.log import Log, usable
 from codrl_mj.identify.models import ShaftModel
 from codrl_mj.identify.segments import initial_state, shaft_segments
 
 HORIZON = 0.5
-"""Time [s] that is foretold at once."""
+"""Time [s] that is foretold at once,"""
+KNOWN = 0.03
+"""from where and how fast the shaft was in its first so many [s], five rows at least."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,7 +25,7 @@ class Prediction:
     output: str
     """`position` [rad] or `velocity` [rad/s]."""
     open_loop: float
-    """Over `HORIZON`, under the logged input, each time from where the shaft was."""
+    """Over `HORIZON`, under the logged input, each time from the state that its first `KNOWN` tell."""
     closed_loop: float | None
     """Over the whole log, under the law by which the servo makes a voltage of its error; None where there is none."""
 
@@ -36,9 +39,12 @@ def predict(model: ShaftModel, values: np.ndarray, log: Log, delay: int = 0) -> 
         log: with what drives the shaft.
         delay: rows by which the input is late.
     """
-    segments = shaft_segments([log], model.driven_by, delay, HORIZON)
-    simulate = model.at(values)
-    errors = np.concatenate([np.abs(simulate(one, one.state) - one.measured) for one in segments])
+    simulate, errors = model.at(values), []
+    for segment in shaft_segments([log], model.driven_by, delay, HORIZON):
+        known = max(int(np.searchsorted(segment.times, segment.times[0] + KNOWN)), 5)
+        state = settled_state(model, values, segment.first(known))
+        errors.append(np.abs(simulate(segment, state) - segment.measured)[known:])
+    errors = np.concatenate(errors)
     return Prediction(log.name, model.output, float(errors.mean()), closed_loop_error(model, values, log))
 
 

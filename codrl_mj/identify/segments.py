@@ -44,6 +44,11 @@ class Segment(NamedTuple):
     state: np.ndarray
     """A guess of the state at the first row."""
 
+    def first(self, count: int) -> "Segment":
+        """Its first rows."""
+        several = ("times", "inputs", "slopes", "speeds", "measured")
+        return self._replace(**{name: getattr(self, name)[:count] for name in several})
+
 
 def delayed(log: Log, name: str, rows: int) -> np.ndarray:
     """A signal as it was some rows before (or, negative, after), the ends repeated."""

@@ -166,8 +166,6 @@ class Fitted:
             known={**self.model.known, self.fit.names[place]: value},
             scales=np.delete(self.model.scales, place),
         )
-        if not model.names:
-            return dataclasses.replace(self, model=model, fit=estimate(model, self.segments, [np.zeros(0)])[0])
         fit, _ = estimate(model, self.segments, [np.delete(start, place)], most=20)
         return dataclasses.replace(self, model=model, fit=fit)
 
