@@ -23,6 +23,8 @@ WIDEST_OF = {"resistance": 0.05, "back_emf_constant": 0.05, "inductance": 0.2}
 """For what a current sensor tells."""
 NARROWEST = 0.002
 """No interval is narrower than this share of the value to either side: nobody's sensors are better calibrated."""
+NARROWEST_OF = {"inductance": 0.02}
+"""What comes of a fifth of a row's time: neither stamps nor a held back-EMF are better."""
 BIASED = 0.5
 """The self-test fails where it is off by more than this share of the widest interval."""
 STEPS_OF_A_STAGE = 8 + 4
@@ -213,7 +215,7 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
     made = []
     for place, name in enumerate(fit.names):
         value = float(fit.values[place])
-        half = math.hypot(float(spread.total[place]), NARROWEST * value)
+        half = math.hypot(float(spread.total[place]), NARROWEST_OF.get(name, NARROWEST) * value)
         widest = WIDEST_OF.get(name, WIDEST) if isinstance(part.stage, Winding) else WIDEST
         least, most = PARAMETERS[name].least, PARAMETERS[name].most
         causes = {field: float(getattr(spread, field)[place]) for field in vars(spread)}

@@ -196,6 +196,9 @@ def fitted(stage: Stage, logs: Sequence[Log], on_step: Callable[[], None] = lamb
         starts: how many at most.
     """
     segments, model, several = stage.build(logs, 0)
+    if not model.names:
+        fit, tried = estimate(model, segments, several[:1], on_step)
+        return Fitted(stage, tuple(logs), 0, tuple(segments), model, fit, tried)
     fit, tried = estimate(model, segments, several[:starts], on_step)
     cost, costs = _cost(fit, fit.scale), {}
     for late in DELAYS:

@@ -82,7 +82,7 @@ SWUNG = {"inertia": 0.19, "mgl": 3.6, "coulomb_friction": 0.15}
 
 @pytest.fixture(scope="module")
 def swings():
-    return [bench.mujoco_pendulum(0), bench.mujoco_pendulum(1)]
+    return [bench.mujoco_pendulum(0, 6.0), bench.mujoco_pendulum(1, 3.0)]
 
 
 def test_mujocos_pendulum_is_identified(swings):
@@ -99,15 +99,18 @@ def test_without_a_known_mass_a_torques_gain_is_not_told_apart(swings):
     found = identify(swings[:1], "pendulum", estimated=["torque_gain"])
     assert found["torque_gain"].status == found["inertia"].status == found["mgl"].status == "ratio"
     assert "inertia by" in found["torque_gain"].why
-    # and with one it is found
-    gain = 1.25
-    log = swings[0]
+
+
+@pytest.mark.matrix
+def test_with_a_known_mass_a_torques_gain_is_found(swings):
+    gain, log = 1.25, swings[0]
     wrong = dataclasses.replace(log, signals={**log.signals, "torque": log.signals["torque"] / gain})
     told = identify([wrong], "pendulum", {"mgl": 3.6}, estimated=["torque_gain"])
     assert told["torque_gain"].status == "identified"
     assert told["torque_gain"].value == pytest.approx(gain, rel=0.02)
 
 
+@pytest.mark.matrix
 def test_a_voltage_alone_tells_the_constants_only_together(swings):
     """With V = torque and no back-EMF the voltage of a motor with kT = kE = k has k/R = 1 and nothing of k itself."""
     log = swings[0]
