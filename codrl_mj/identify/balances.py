@@ -38,12 +38,13 @@ class Windows:
 
     Args:
         log: the log.
-        duration: of a window [s]; at least a dozen rows.
+        duration: of a window [s]; at least a dozen rows, at most a tenth of the log.
         most: of the windows, evenly spread, that are looked at.
     """
 
     def __init__(self, log: Log, duration: float = 0.0, most: int = 20_000) -> None:
         """Cut it."""
+        duration = min(duration, float(log.time[-1] - log.time[0]) / 10.0)
         count = max(math.ceil(duration / log.step), _ROWS)
         starts = [
             np.arange(part.start, part.stop - count, max(count // 4, 1)) for part in usable(log)

@@ -18,7 +18,6 @@ FACTORS = {
     "hundredths are confused with units, as N*cm with N*m or percent with shares": 100.0,
     "kgf*cm and N*m are confused": 10.197,
     "degrees and turns, or rpm and deg/s, are confused": 360.0,
-    "rpm and deg/s are confused": 6.0,
     "rpm and turn/s are confused": 60.0,
 }
 """What a factor between two numbers that should be equal tells."""
