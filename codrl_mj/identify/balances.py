@@ -56,6 +56,7 @@ class Windows:
         self.begin, self.length = time[:, :1], time[:, -1:] - time[:, :1]
         self._phase = (time - self.begin) / np.where(self.length > 0.0, self.length, 1.0)
         self._steps = np.diff(time, axis=1)
+        self._weights: dict[int, np.ndarray] = {}
 
     def __len__(self) -> int:
         """How many windows there are."""
@@ -71,7 +72,9 @@ class Windows:
         values = (self._log.signals[signal] if isinstance(signal, str) else signal)[self.rows]
         if order > 0:  # what is constant counts for nothing, and would only be rounded
             values = values - values.mean(axis=1, keepdims=True)
-        weighted = values * _phi(self._phase, order) * (-1.0 / self.length) ** order
+        if order not in self._weights:
+            self._weights[order] = _phi(self._phase, order) * (-1.0 / self.length) ** order
+        weighted = values * self._weights[order]
         return np.sum(0.5 * self._steps * (weighted[:, 1:] + weighted[:, :-1]), axis=1) / self.length[:, 0]
 
     def mean_held(self, signal: str, lag: float = 0.0) -> np.ndarray:

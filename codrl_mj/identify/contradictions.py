@@ -161,13 +161,15 @@ def _sag(log: Log, balance: Balance | None) -> Iterator[Finding]:
 
 def _mechanical(log: Log, effort: str) -> Iterator[Finding]:
     """Signs of inertia and gravity; whether the motion follows from the torque."""
-    balance = torque_balance(log, effort)
+    quick = torque_balance(log, effort, 0.03)  # where it shakes, shorter windows show more of the inertia
+    balance = torque_balance(log, effort) or quick
     if balance is None:
         return
     values, certain = balance.values, balance.certainty
-    heavy, hangs = certain.get("inertia", 0.0), certain.get("gravity", 0.0)
+    both = [one.certainty.get("inertia", 0.0) for one in (balance, quick) if one is not None]
+    heavy, hangs = max(both, key=abs), certain.get("gravity", 0.0)
     if heavy < -_CERTAIN or (hangs < -_CERTAIN and heavy < -3.0):
-        text = f"the {effort} accelerates the wrong way: the inertia would be {values['inertia']:.3g} of its unit"
+        text = f"the {effort} accelerates the wrong way: the inertia would be negative, by {-heavy:.0f} standard errors"
         remedy = f"give the {effort}, or position and velocity, a minus"
         yield Finding("error", "sign", None, text, remedy)
     elif hangs < -_CERTAIN and abs(values["gravity"]) > 2.0 * balance.residual:

@@ -11,7 +11,7 @@ from codrl_mj.identify.log import Log
 
 _ROWS = 20_000
 """More are not looked at."""
-_WINDOWS = 800
+_WINDOWS = 400
 """More tell no more."""
 
 

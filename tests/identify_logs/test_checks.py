@@ -28,7 +28,7 @@ def drive_of(motor, sag=0.0):
 
 def excitation_of(motor, kind):
     clock = 4.0 * MOTORS[motor].electrical_time_constant
-    return Excitation(kind, 6.0, 2.0, frequency=2.0 if kind == "square" else 1.0, highest=150.0, clock=clock)
+    return Excitation(kind, 6.0, 1.0, frequency=2.0 if kind == "square" else 1.0, highest=150.0, clock=clock)
 
 
 @functools.cache
@@ -176,7 +176,7 @@ def test_gaps_dropped_rows_and_jitter():
     missing = int(log.row_numbers[-1] - len(log.time))
     assert dropped.message.startswith(f"{missing} rows missing")
     assert found(log, "jitter")
-    keep = np.r_[0:1000, 3000:10001]
+    keep = np.r_[0:1000, 3000:5001]
     gap = dataclasses.replace(
         logged(), time=logged().time[keep], signals={k: v[keep] for k, v in logged().signals.items()}, rows=keep + 1
     )
@@ -188,7 +188,7 @@ def test_gaps_dropped_rows_and_jitter():
 def test_outliers_are_found_where_they_are(kind):
     clean = logged(kind=kind)
     spoiled = clean.signals["current"].copy()
-    rows = np.arange(333, 10_000, 500)
+    rows = np.arange(333, 5_000, 250)
     spoiled[rows] += 5.0 * np.std(spoiled) * np.where(rows % 2, 1.0, -1.0)
     (one,) = found(replaced(clean, current=spoiled), "outliers")
     listed = [int(word) for word in one.message.partition("(")[2].rstrip(")").split(",")]
@@ -218,7 +218,7 @@ def test_coarse_sensors_are_found():
 def test_a_supply_that_sags_unseen_is_found_where_the_duty_varies(motor):
     (one,) = found(logged(motor, "chirp", sag=0.25), "sag")
     # at half of the duty: d^2*R/4
-    assert float(one.message.split()[5]) == pytest.approx(0.0625 * MOTORS[motor].resistance, rel=0.2)
+    assert float(one.message.split()[5]) == pytest.approx(0.0625 * MOTORS[motor].resistance, rel=0.3)
     assert found(logged(motor, "chirp"), "sag") == []
 
 
@@ -244,7 +244,7 @@ def test_gravity_tells_a_zero_at_the_top():
 def test_a_torque_that_does_not_move_it_is_found():
     log = without(logged("geared", "square"), "voltage", "current")
     assert found(log, "torque") == []
-    other = np.random.default_rng(0).standard_normal(20)[np.arange(len(log.time)) // 501]
+    other = np.random.default_rng(0).standard_normal(20)[np.arange(len(log.time)) // 251]
     assert found(replaced(log, torque=log.signals["torque"] + 0.3 * other), "torque")
 
 
