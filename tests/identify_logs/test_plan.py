@@ -47,13 +47,12 @@ def test_what_a_slow_sine_and_a_held_shaft_do_not_show(planned):
     assert prbs["inductance"] < 0.3 * square["inductance"]
 
 
-def test_rows_that_know_nothing_between_them_cost_most_of_a_slow_inductance():
+def test_voltages_that_change_between_rows_cost_most_of_the_inductance():
     errors = {
-        how: of(plan(DRIVE, LOAD, Sensing(voltage=how), duration=1.0), "chirp", 2000.0).errors["inductance"]
+        how: of(plan(DRIVE, LOAD, Sensing(voltage=how), duration=1.0), "locked_prbs", 5000.0).errors["inductance"]
         for how in ("together", "mean", "instantaneous")
     }
-    assert errors["together"] < errors["mean"] < errors["instantaneous"]
-    assert errors["instantaneous"] > 3.0 * errors["together"]
+    assert 10.0 * errors["together"] < errors["mean"] < errors["instantaneous"]
 
 
 def test_errors_expected_are_those_of_fits(planned):
