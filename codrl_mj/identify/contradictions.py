@@ -187,7 +187,7 @@ def _mechanical(log: Log, effort: str) -> Iterator[Finding]:
 
 
 def _motion(log: Log) -> Iterator[Finding]:
-    """Whether it moves to and fro."""
+    """Whether it moves back and forth."""
     speed = log.signals["velocity"] if log.has("velocity") else np.diff(log.signals["position"])
     if min(float(speed.max()), float(-speed.min())) < 0.05 * float(np.abs(speed).max()):
         text = "the shaft turns one way only: friction cannot be told from a constant load"
