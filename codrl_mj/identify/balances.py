@@ -38,12 +38,13 @@ class Windows:
 
     Args:
         log: the log.
-        duration: of a window [s]; at least a dozen rows.
+        duration: of a window [s]; at least a dozen rows, at most a tenth of the log.
         most: of the windows, evenly spread, that are looked at.
     """
 
     def __init__(self, log: Log, duration: float = 0.0, most: int = 20_000) -> None:
         """Cut it."""
+        duration = min(duration, float(log.time[-1] - log.time[0]) / 10.0)
         count = max(math.ceil(duration / log.step), _ROWS)
         starts = [
             np.arange(part.start, part.stop - count, max(count // 4, 1)) for part in usable(log)
@@ -55,6 +56,7 @@ class Windows:
         self.begin, self.length = time[:, :1], time[:, -1:] - time[:, :1]
         self._phase = (time - self.begin) / np.where(self.length > 0.0, self.length, 1.0)
         self._steps = np.diff(time, axis=1)
+        self._weights: dict[int, np.ndarray] = {}
 
     def __len__(self) -> int:
         """How many windows there are."""
@@ -70,7 +72,9 @@ class Windows:
         values = (self._log.signals[signal] if isinstance(signal, str) else signal)[self.rows]
         if order > 0:  # what is constant counts for nothing, and would only be rounded
             values = values - values.mean(axis=1, keepdims=True)
-        weighted = values * _phi(self._phase, order) * (-1.0 / self.length) ** order
+        if order not in self._weights:
+            self._weights[order] = _phi(self._phase, order) * (-1.0 / self.length) ** order
+        weighted = values * self._weights[order]
         return np.sum(0.5 * self._steps * (weighted[:, 1:] + weighted[:, :-1]), axis=1) / self.length[:, 0]
 
     def mean_held(self, signal: str, lag: float = 0.0) -> np.ndarray:

@@ -24,7 +24,7 @@ def check(log: Log, motor: Any = None) -> list[Finding]:
         findings += _resolution(log, signal)
         if signal in _SAW:
             findings += [*_saturation(log, signal), *_outliers(log, signal)]
-    findings += contradictions(log, motor)
+    findings += [*_wrapped(log), *_beyond_supply(log), *contradictions(log, motor)]
     order = ("error", "warning", "info")
     return sorted(findings, key=lambda one: order.index(one.severity))
 
@@ -119,3 +119,26 @@ def _outliers(log: Log, signal: str) -> list[Finding]:
     remedy = "nothing up to 1 % of the rows, which a robust fit bears; else find out where they come from"
     severity = "info" if share <= 0.01 else "warning"
     return [Finding(severity, "outliers", int(log.row_numbers[wild[0]]), text, remedy)]
+
+
+def _wrapped(log: Log) -> list[Finding]:
+    """A position that jumps by a turn."""
+    steps = np.diff(log.signals["position"]) if log.has("position") else np.zeros(0)
+    jumps = np.flatnonzero(np.abs(np.abs(steps) - 2.0 * np.pi) < 0.1 * 2.0 * np.pi)
+    if not jumps.size or np.mean(np.abs(steps) > np.pi / 2.0) > 0.2:
+        return []
+    text = f"the position jumps by a turn, {jumps.size} times, first here"
+    remedy = "write position=unwrap(column, 2*pi):rad, or unwrap(column, 360):deg"
+    return [Finding("error", "wrapped", int(log.row_numbers[jumps[0] + 1]), text, remedy)]
+
+
+def _beyond_supply(log: Log) -> list[Finding]:
+    """More voltage than the supply has."""
+    if not log.has("voltage", "bus"):
+        return []
+    excess = np.abs(log.signals["voltage"]) / np.maximum(np.abs(log.signals["bus"]), 1e-9)
+    row = int(np.argmax(excess))
+    if excess[row] < 1.1:
+        return []
+    text = f"the voltage is up to {excess[row]:.3g} times that of the supply"
+    return [Finding("error", "unit", int(log.row_numbers[row]), text, "correct the scale of the duty, or of the bus")]

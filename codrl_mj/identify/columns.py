@@ -116,7 +116,7 @@ class Column:
         needed = FUNCTIONS[name][0]
         if len(call.args) != needed or call.keywords:
             raise ValueError(f"columns: {self.text}: {name} takes {needed} arguments, not {len(call.args)}")
-        if needed == 2 and not isinstance(call.args[1], ast.Constant | ast.BinOp):
+        if needed == 2 and {name for _, name in _names(call.args[1])} - {"pi"}:
             raise ValueError(f"columns: {self.text}: the second argument of {name} must be a number, such as 16")
 
     def _quantity(self, value: Any) -> Any:

@@ -18,7 +18,6 @@ FACTORS = {
     "hundredths are confused with units, as N*cm with N*m or percent with shares": 100.0,
     "kgf*cm and N*m are confused": 10.197,
     "degrees and turns, or rpm and deg/s, are confused": 360.0,
-    "rpm and deg/s are confused": 6.0,
     "rpm and turn/s are confused": 60.0,
 }
 """What a factor between two numbers that should be equal tells."""
@@ -162,13 +161,15 @@ def _sag(log: Log, balance: Balance | None) -> Iterator[Finding]:
 
 def _mechanical(log: Log, effort: str) -> Iterator[Finding]:
     """Signs of inertia and gravity; whether the motion follows from the torque."""
-    balance = torque_balance(log, effort)
+    quick = torque_balance(log, effort, 0.03)  # where it shakes, shorter windows show more of the inertia
+    balance = torque_balance(log, effort) or quick
     if balance is None:
         return
     values, certain = balance.values, balance.certainty
-    heavy, hangs = certain.get("inertia", 0.0), certain.get("gravity", 0.0)
+    both = [one.certainty.get("inertia", 0.0) for one in (balance, quick) if one is not None]
+    heavy, hangs = max(both, key=abs), certain.get("gravity", 0.0)
     if heavy < -_CERTAIN or (hangs < -_CERTAIN and heavy < -3.0):
-        text = f"the {effort} accelerates the wrong way: the inertia would be {values['inertia']:.3g} of its unit"
+        text = f"the {effort} accelerates the wrong way: the inertia would be negative, by {-heavy:.0f} standard errors"
         remedy = f"give the {effort}, or position and velocity, a minus"
         yield Finding("error", "sign", None, text, remedy)
     elif hangs < -_CERTAIN and abs(values["gravity"]) > 2.0 * balance.residual:
@@ -186,7 +187,7 @@ def _mechanical(log: Log, effort: str) -> Iterator[Finding]:
 
 
 def _motion(log: Log) -> Iterator[Finding]:
-    """Whether it moves to and fro."""
+    """Whether it moves back and forth."""
     speed = log.signals["velocity"] if log.has("velocity") else np.diff(log.signals["position"])
     if min(float(speed.max()), float(-speed.min())) < 0.05 * float(np.abs(speed).max()):
         text = "the shaft turns one way only: friction cannot be told from a constant load"

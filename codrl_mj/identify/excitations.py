@@ -69,7 +69,7 @@ def chirp(excitation: Excitation, time: np.ndarray) -> np.ndarray:
 
 
 def prbs(excitation: Excitation, time: np.ndarray) -> np.ndarray:
-    """Half of a PRBS, and half of a slow sine that turns the shaft to and fro."""
+    """Half of a PRBS, and half of a slow sine that turns the shaft back and forth."""
     return 0.5 * _bits(excitation, time) + 0.5 * slow_sine(excitation, time)
 
 
@@ -79,7 +79,7 @@ def locked_prbs(excitation: Excitation, time: np.ndarray) -> np.ndarray:
 
 
 KINDS: dict[str, tuple[Callable[[Excitation, np.ndarray], np.ndarray], str]] = {
-    "slow_sine": (slow_sine, "turns slowly to and fro"),
+    "slow_sine": (slow_sine, "turns slowly back and forth"),
     "square": (square, "reverses at once"),
     "chirp": (chirp, "a sine that becomes faster"),
     "prbs": (prbs, "random steps on slow turning"),

@@ -11,7 +11,7 @@ from codrl_mj.identify.log import Log
 
 _ROWS = 20_000
 """More are not looked at."""
-_WINDOWS = 800
+_WINDOWS = 400
 """More tell no more."""
 
 
@@ -70,7 +70,10 @@ def current_lag(log: Log, longest: float = 20.0) -> Lag | None:
 
     def compare(lag: float) -> tuple[float, float]:
         balance = regress(windows.mean_held("voltage", lag), terms)
-        return (np.inf, 1.0) if balance is None else (balance.residual, balance.unexplained)
+        # of a nearly sinusoidal current a delay looks like more inductance, and too long a one like less than none
+        if balance is None or (lag > 0.0 and balance.certainty.get("inductance", 0.0) < -3.0):
+            return np.inf, 1.0
+        return balance.residual, balance.unexplained
 
     return _compared(compare, log.step, 3.0 * log.step, longest * log.step)
 

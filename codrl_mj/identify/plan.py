@@ -18,7 +18,7 @@ import numpy as np
 from codrl_mj.actuators import Drive
 from codrl_mj.fields import check, check_names, real
 from codrl_mj.identify.excitations import KINDS, Excitation
-from codrl_mj.identify.synthetic import FREE, Course, Load, play, run, sample_times, turn
+from codrl_mj.identify.synthetic import FREE, Course, Load, play, sample_times, turn
 from codrl_mj.runs.files import writing
 
 GOALS = {
@@ -123,8 +123,7 @@ def plan(
             raise ValueError(f"{name} = {value!r}: must be above 0 A; leave it out if there is no limit")
     options = []
     for kind in KINDS:
-        sized = _sized(drive, kind, load, duration, (limit, continuous_current))
-        options += _options(drive, sized, load, sensing or Sensing())
+        options += _options(drive, kind, duration, load, sensing or Sensing(), (limit, continuous_current))
     reached = [option for option in options if option.worst <= 1.0 / MARGIN]
     best = min(reached, key=lambda one: (one.rate, one.worst)) if reached else min(options, key=lambda one: one.worst)
     names = {name: GOALS[name] for name in GOALS if _value(drive, load, name) > 0.0}
@@ -140,46 +139,41 @@ def write_excitation(path: Path, option: Option) -> None:
         np.savetxt(temporary, table, fmt="%.7g", delimiter=",", header="time,voltage", comments="")
 
 
-def _sized(drive: Drive, kind: str, load: Load, duration: float, limits: tuple[float, float]) -> Excitation:
-    """An excitation as large as voltage, peak and mean current allow; a response is nearly in proportion to it."""
-    motor = drive.motor
-    constant = motor.inductance / motor.resistance
-    largest = Excitation(
-        kind,
-        drive.voltage_limit,
-        duration,
-        frequency=2.0 if kind == "square" else 0.5,
-        highest=min(200.0, 0.5 / constant),
-        clock=4.0 * constant,
-    )
-    for _ in range(4):
-        current = run(drive, largest, load).current
-        excess = max(float(np.abs(current).max()) / limits[0], float(np.sqrt(np.mean(current**2))) / limits[1])
-        if excess <= 1.0:
-            break
-        largest = dataclasses.replace(largest, amplitude=0.96 * largest.amplitude / excess)
-    return largest
-
-
-def _options(drive: Drive, excitation: Excitation, load: Load, sensing: Sensing) -> list[Option]:
-    load = dataclasses.replace(load, locked=load.locked or excitation.locked)
+def _options(
+    drive: Drive, kind: str, duration: float, load: Load, sensing: Sensing, limits: tuple[float, float]
+) -> list[Option]:
+    """An excitation at every rate, as large as the supply, the largest and the continuous current allow."""
+    constant, together = drive.motor.electrical_time_constant, sensing.voltage == "together"
     options = []
     for rate in RATES:
         if rate > drive.controller.sample_rate:
             continue
-        clocked, time = excitation, sample_times(drive, excitation.duration)
-        if sensing.voltage == "together":
-            clocked = dataclasses.replace(excitation, clock=max(round(excitation.clock * rate), 1) / rate)
-            time = np.floor(time * rate + 1e-6) / rate
-        voltage = clocked.voltage(time)
-        course, told = play(drive, voltage, load), _told(drive, voltage, rate, sensing)
+        excitation = Excitation(
+            kind,
+            drive.voltage_limit,
+            duration,
+            frequency=2.0 if kind == "square" else 0.5,
+            highest=min(200.0, 0.5 / constant),
+            clock=max(round(4.0 * constant * rate), 1) / rate if together else 4.0 * constant,
+        )
+        held = dataclasses.replace(load, locked=load.locked or excitation.locked)
+        time = sample_times(drive, duration)
+        shape = excitation.voltage(np.floor(time * rate + 1e-6) / rate if together else time) / excitation.amplitude
+        amplitude = excitation.amplitude
+        for _ in range(8):  # the response is nearly in proportion to the voltage
+            course = play(drive, amplitude * shape, held)
+            peak, rms = float(np.abs(course.current).max()), float(np.sqrt(np.mean(course.current**2)))
+            excess = max(peak / limits[0], rms / limits[1])
+            if excess <= 1.0:
+                break
+            amplitude *= 0.98 / excess
+        told = _told(drive, amplitude * shape, rate, sensing)
         errors = _electrical(drive, course, told, rate, sensing)
-        if not load.locked:
-            constant = errors.get("back_emf_constant", 0.0)  # which the torque is known by
-            by_position = _mechanical(drive, course, load, rate, sensing)
-            errors |= {name: math.hypot(error, constant) for name, error in by_position.items()}
-        rms = float(np.sqrt(np.mean(course.current**2)))
-        options.append(Option(clocked, rate, float(np.abs(course.current).max()), rms, errors))
+        if not held.locked:
+            constant_error = errors.get("back_emf_constant", 0.0)  # which the torque is known by
+            by_position = _mechanical(drive, course, held, rate, sensing)
+            errors |= {name: math.hypot(error, constant_error) for name, error in by_position.items()}
+        options.append(Option(dataclasses.replace(excitation, amplitude=amplitude), rate, peak, rms, errors))
     return options
 
 

@@ -48,12 +48,14 @@ def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
         signals = {
             signal: np.broadcast_to(np.asarray(one.value(values), float), (count,)) for signal, one in mapping.items()
         }
-        return _log(name, signals, mapping, table)
+        return _log(name, signals, mapping, table, _unsigned(values, mapping))
     except (ValueError, UnicodeDecodeError, gzip.BadGzipFile, EOFError) as error:
         raise ValueError(f"log {path}: {error}") from None
 
 
-def _log(name: str, signals: dict[str, np.ndarray], mapping: Mapping[str, Column], table: _Table) -> Log:
+def _log(
+    name: str, signals: dict[str, np.ndarray], mapping: Mapping[str, Column], table: _Table, first: list[Finding]
+) -> Log:
     time, only = signals.pop("time"), signals.pop("only", None)
     wanted = np.ones(len(time), bool) if only is None else only != 0.0
     finite = np.isfinite(time) & np.all([np.isfinite(values) for values in signals.values()], axis=0)
@@ -61,6 +63,7 @@ def _log(name: str, signals: dict[str, np.ndarray], mapping: Mapping[str, Column
     latest = np.maximum.accumulate(time[rows]) if rows.size else time[rows]
     forward = np.concatenate([[True], time[rows][1:] > latest[:-1]]) if rows.size else np.zeros(0, bool)
     findings = [
+        *first,
         *_left_out(np.flatnonzero(wanted & ~finite), "missing", "have no number in some column, and are left out"),
         *_left_out(rows[~forward], "stamps", "have a time that is not after the rows before, and are left out"),
         *(
@@ -91,6 +94,24 @@ def _log(name: str, signals: dict[str, np.ndarray], mapping: Mapping[str, Column
         numbers,
         tuple(findings),
     )
+
+
+def _unsigned(values: Mapping[str, Any], mapping: Mapping[str, Column]) -> list[Finding]:
+    """Columns that look like registers with a sign that is read without it: the highest and lowest quarter are used."""
+    found = []
+    for name in sorted(
+        {name for one in mapping.values() for name in one.names if "twos_complement" not in one.formula}
+    ):
+        column = np.asarray(values[name] if values[name] is not None else 0.0, float)
+        for bits in (8, 16, 32):
+            whole = 2.0**bits
+            high, low = column >= 0.75 * whole, column < 0.25 * whole
+            within = np.all((column >= 0.0) & (column < whole) & (column == np.round(column)))
+            if within and high.any() and low.any() and np.all(high | low):
+                row = int(np.flatnonzero(high)[0]) + 1
+                text = f"{name} is below {whole / 4:.0f} or above {3 * whole / 4:.0f}: has it {bits} bits and a sign?"
+                found.append(Finding("error", "register", row, text, f"write twos_complement({name}, {bits})"))
+    return found
 
 
 def _file_rows(count: int, ragged: list[int]) -> np.ndarray:
