@@ -85,7 +85,7 @@ FOREIGN = {
     "tasks.assets": set(),
     "catalogue": {"pint"},
     "motor_design": {"control", "matplotlib", "numpy", "scipy"},
-    "identify": {"numba", "numpy", "scipy"},
+    "identify": {"numba", "numpy", "scipy", "yaml"},
     "plugin": {"mujoco"},
     "engine": {"mujoco", "numba", "llvmlite", "numpy"},
     "specs": {"mujoco", "numpy"},

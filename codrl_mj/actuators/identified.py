@@ -1,4 +1,4 @@
-"""Files of actuators that were identified: beside the fields, the intervals of those that were, or why none can be used.
+"""Files of actuators that were identified: beside the fields, their intervals, or why none can be used.
 
 Their entry `identified` has `intervals`, dotted paths of fields with [low, high], or `problem`.
 """

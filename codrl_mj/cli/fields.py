@@ -158,8 +158,8 @@ def _ranges(randomize: Any, actuator: str) -> Any:
         return randomize
     if Path(actuator).suffix not in (".yaml", ".yml", ".json"):
         raise ValueError(
-            f"--env.randomize identified: draws within the intervals of a file; --actuator is {actuator!r}, must be one "
-            "that `codrl-mj identify` wrote"
+            f"--env.randomize identified: draws within the intervals of a file; --actuator is {actuator!r}, must be "
+            "one that `codrl-mj identify` wrote"
         )
     others = [one for one in randomize if one != "identified"]
     named = {one.partition("=")[0].strip() for one in others}

@@ -28,11 +28,11 @@ class Identify:
     ]
     columns: Columns
     rig: Literal["pendulum", "free", "load"] | None = None
-    """What the output moves: a pendulum that hangs at position 0, nothing but inertia, or inertia and a held load. A log
-    in which nothing moves is of a locked rotor. A pendulum where mgl is known."""
+    """What the output moves: a pendulum that hangs at position 0, nothing but inertia, or inertia and a held load. A
+    log in which nothing moves is of a locked rotor. A pendulum where mgl is known."""
     known: tuple[str, ...] = ()
-    """What is not to be fitted, as NAME=VALUE in SI units: mgl, inertia, load_inertia and constant_torque at the output,
-    the others (resistance, inductance, torque_constant, back_emf_constant, gear_ratio, rotor_inertia,
+    """What is not to be fitted, as NAME=VALUE in SI units: mgl, inertia, load_inertia and constant_torque at the
+    output, the others (resistance, inductance, torque_constant, back_emf_constant, gear_ratio, rotor_inertia,
     coulomb_friction, viscous_friction, gear_efficiency, stribeck_friction, stribeck_speed) as a drive has them."""
     estimate: tuple[str, ...] = ()
     """What to fit that is otherwise taken as known, such as torque_gain."""

@@ -1,7 +1,7 @@
 """Which friction a motor has: what foretells logs that it was not fitted to."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -14,19 +14,20 @@ TRIED = ("load", "stribeck", "both")
 LEAST_LOGS = 3
 
 
-def foretold(stage: Shaft, logs: Sequence[Log]) -> np.ndarray:
-    """Mean absolute error on each log of the fit to all others, shape (n,)."""
-    errors = []
+def foretold(stage: Shaft, logs: Sequence[Log], on_step: Callable[[], None]) -> np.ndarray:
+    """Mean absolute error on each log of the fit to all others, from that to all, shape (n,)."""
+    segments, model, starts = stage.build(logs, 0)
+    whole, errors = estimate(model, segments, starts[:2])[0].values, []
     for place, log in enumerate(logs):
         others = [other for index, other in enumerate(logs) if index != place]
-        segments, model, starts = stage.build(others, 0)
-        best, _ = estimate(model, segments, starts[:1])
+        best, _ = estimate(model, stage.build(others, 0)[0], [whole], most=12)
         found = predict(model, best.values, log)
         errors.append(found.open_loop if found.closed_loop is None else found.closed_loop)
+        on_step()
     return np.array(errors)
 
 
-def chosen_friction(stage: Shaft, logs: Sequence[Log], wanted: str) -> Shaft:
+def chosen_friction(stage: Shaft, logs: Sequence[Log], wanted: str, on_step: Callable[[], None]) -> Shaft:
     """The stage with the friction that is wanted or, for `auto`, with what leaving out one log at a time speaks for.
 
     More than viscous and Coulomb friction is kept where the errors on the logs left out fall by more, in the mean, than
@@ -36,10 +37,10 @@ def chosen_friction(stage: Shaft, logs: Sequence[Log], wanted: str) -> Shaft:
         return dataclasses.replace(stage, friction=wanted)
     if len(logs) < LEAST_LOGS:
         return stage
-    best, least = stage, foretold(stage, logs)
+    best, least = stage, foretold(stage, logs, on_step)
     for friction in TRIED:
         tried = dataclasses.replace(stage, friction=friction)
-        errors = foretold(tried, logs)
+        errors = foretold(tried, logs, on_step)
         gained = least - errors
         if gained.mean() > 2.0 * gained.std(ddof=1) / np.sqrt(len(gained)):
             best, least = tried, errors

@@ -33,9 +33,9 @@ class Spread:
 
     @property
     def total(self) -> np.ndarray:
-        """The larger of the first two, and the others, as what is independent adds up."""
+        """The larger of the first two, and what the rate does, as what is independent adds up, and the bias over that."""
         wide = np.maximum(self.resampling, self.logs)
-        return np.asarray(np.sqrt(wide**2 + self.self_test**2 + self.half_rate**2))
+        return np.asarray(np.sqrt(wide**2 + self.half_rate**2) + self.self_test)
 
 
 def _sums(fit: Fit, groups: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:

@@ -71,7 +71,8 @@ def identify(
         raise ValueError(f"segment = {segment!r}: must be >= 0.05 s; {SEGMENT:g} is the default")
     rig = rig or ("pendulum" if "mgl" in given else "free")
     stages = 2 - (not _electrical(logs)) - (not any(moves(log) for log in logs))
-    done, total = 0, STEPS_OF_A_STAGE * max(stages, 1)
+    folds = 4 * sum(moves(log) for log in logs) if friction == "auto" else 0
+    done, total = 0, STEPS_OF_A_STAGE * max(stages, 1) + folds
 
     def step(what: str) -> Callable[[], None]:
         def one() -> None:
@@ -88,7 +89,7 @@ def identify(
         stage = Shaft(
             rig, "coulomb", driven_by, {**given, **_constant(given, winding, driven_by)}, tuple(estimated), segment
         )
-        stage = chosen_friction(stage, moving, friction)
+        stage = chosen_friction(stage, moving, friction, step("friction"))
         shaft = fitted(stage, moving, step("shaft"))
     estimates, warnings = [], []
     if winding is not None:
@@ -171,7 +172,7 @@ def _constant(given: Mapping[str, float], winding: Fitted | None, driven_by: str
 
 
 def _with_constant(found: list[Estimate], constant: Estimate | None, stage: Shaft) -> list[Estimate]:
-    """Estimates of a shaft under a current whose torque constant was itself found: as wide, and no better, than that."""
+    """Estimates of a shaft under a current whose torque constant was itself found: they are no better than that."""
     if constant is None:
         return found
     made = [
@@ -308,7 +309,7 @@ def _rotor_inertia(whole: Estimate, load: float, ratio: float) -> Estimate:
 
 def _warnings(part: Fitted) -> list[str]:
     """What is wrong with logs, or with the model of them."""
-    found = []
+    unlike = {}
     for place, log in enumerate(part.logs):
         own = [index for index, segment in enumerate(part.segments) if segment.log == place]
         sizes = np.concatenate([np.abs(part.fit.residuals[index]) for index in own])
@@ -316,10 +317,21 @@ def _warnings(part: Fitted) -> list[str]:
         swing = np.concatenate([part.segments[i].measured - part.segments[i].measured.mean() for i in own])
         share = float(np.std(rest) / max(np.std(swing), 1e-12))
         if sizes.mean() / 0.8 > UNEXPLAINED and share > UNLIKE:
-            found.append(
-                f"log {log.name}: residuals are {sizes.mean() / 0.8:.1f} standard deviations of the sensor in the mean, "
-                f"{100.0 * share:.2g} % of what moves: the model does not explain it. Leave it out, or find out what else moved"
+            unlike[log.name] = (
+                f"{sizes.mean() / 0.8:.1f} standard deviations of the sensor, {100.0 * share:.2g} % of what moves"
             )
+    found = []
+    if 1 < len(unlike) == len(part.logs):
+        found.append(
+            "the model does not explain any of the logs within what their sensors see: of the first, residuals are "
+            f"{next(iter(unlike.values()))}. Fit more friction, or find out what else moved"
+        )
+    else:
+        found += [
+            f"log {name}: residuals are {text} in the mean: the model does not explain it. Leave it out, find out what "
+            "else moved, or fit more friction"
+            for name, text in unlike.items()
+        ]
     values = np.array([one.values for one in part.tried])
     best = min(_cost_of(one) for one in part.tried)
     near = np.array([_cost_of(one) < 1.1 * best for one in part.tried])

@@ -57,7 +57,7 @@ class ShaftModel(_Model):
     """Inertia, gravity, load and friction under a torque, a current or a voltage."""
 
     driven_by: str
-    """`torque`, `current`, or `voltage`: then the winding is taken to be settled, and kE to be kT unless it is known."""
+    """`torque`, `current`, or `voltage`: then the winding is taken to be settled, and kE to be kT unless known."""
     output: str
     """`position` or `velocity`."""
 

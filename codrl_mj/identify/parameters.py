@@ -1,4 +1,4 @@
-"""What can be identified: names, units and bounds. Those of a motor are called as `GearMotor`'s fields, at its rotor."""
+"""What can be identified: names, units, bounds. Those of a motor are called as `GearMotor`'s fields, at its rotor."""
 
 from typing import Literal, NamedTuple
 

@@ -39,12 +39,12 @@ def predict(model: ShaftModel, values: np.ndarray, log: Log, delay: int = 0) -> 
         log: with what drives the shaft.
         delay: rows by which the input is late.
     """
-    simulate, errors = model.at(values), []
+    simulate, found = model.at(values), []
     for segment in shaft_segments([log], model.driven_by, delay, HORIZON):
         known = max(int(np.searchsorted(segment.times, segment.times[0] + KNOWN)), 5)
         state = settled_state(model, values, segment.first(known))
-        errors.append(np.abs(simulate(segment, state) - segment.measured)[known:])
-    errors = np.concatenate(errors)
+        found.append(np.abs(simulate(segment, state) - segment.measured)[known:])
+    errors = np.concatenate(found)
     return Prediction(log.name, model.output, float(errors.mean()), closed_loop_error(model, values, log))
 
 

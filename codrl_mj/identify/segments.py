@@ -1,6 +1,7 @@
 """Logs cut into segments, each simulated from an initial state of its own."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -15,7 +16,7 @@ SEGMENT = 0.5
 BLOCK = 1.0
 """Shortest stretch [s] of a log that is resampled as a whole: residuals within it belong together."""
 SHAFT_STEP = 5e-4
-"""Rows that are nearer [s] are taken together for a shaft, which is slower: the inputs' mean, every so many positions."""
+"""Rows that are nearer [s] are taken together for a shaft, which is slower: their mean input, their first position."""
 STILL = 3.0
 """A shaft that moves by less than so many steps of its encoder is locked."""
 
@@ -90,7 +91,7 @@ def cut(log: Log, longest: float) -> list[slice]:
         count = max(round((end - begin) / longest), 1)
         edges = np.searchsorted(log.time[stretch], np.linspace(begin, end, count + 1)[:-1]) + stretch.start
         edges = [*map(int, np.unique(edges)), stretch.stop]
-        found += [slice(a, b) for a, b in zip(edges, edges[1:], strict=False) if b - a >= 4]
+        found += [slice(a, b) for a, b in itertools.pairwise(edges) if b - a >= 4]
     return found
 
 

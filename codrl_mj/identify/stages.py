@@ -150,7 +150,9 @@ class Fitted:
             other = here.holding(place, float(fit.values[place] + step), moved)
             if _cost(other.fit, fit.scale) > fit.cost + honesty.noticed(fit, here.segments):
                 break
-            changes = np.insert((other.fit.values - np.delete(fit.values, place)) / np.delete(own, place), place, step / own[place])
+            changes = np.insert(
+                (other.fit.values - np.delete(fit.values, place)) / np.delete(own, place), place, step / own[place]
+            )
             shares = changes / step * own[place]
             found.append({name: float(s) for name, s in zip(names, shares, strict=True) if abs(s) > PART})
             here = other

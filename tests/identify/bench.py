@@ -58,7 +58,9 @@ def motor_log(kind="prbs", rate=5000, duration=2.0, noise=0.01, step=0.0, seed=0
     if step:
         position = np.round(position / step) * step
     told = volts.reshape(-1, every).mean(axis=1) if mean else volts[::every]
-    return Log(kind, time[::every], {"voltage": told, "current": current, "position": position}, {"position": step}, mean)
+    return Log(
+        kind, time[::every], {"voltage": told, "current": current, "position": position}, {"position": step}, mean
+    )
 
 
 def mujoco_pendulum(seed=0, duration=8.0, coulomb=0.15, viscous=0.01, step=3e-3, every=10, effort="torque"):

@@ -114,7 +114,9 @@ def test_with_a_known_mass_a_torques_gain_is_found(swings):
 def test_a_voltage_alone_tells_the_constants_only_together(swings):
     """With V = torque and no back-EMF the voltage of a motor with kT = kE = k has k/R = 1 and nothing of k itself."""
     log = swings[0]
-    driven = Log(log.name, log.time, {"position": log.signals["position"], "voltage": log.signals["torque"]}, log.resolution)
+    driven = Log(
+        log.name, log.time, {"position": log.signals["position"], "voltage": log.signals["torque"]}, log.resolution
+    )
     found = identify([driven], "pendulum", {"mgl": 3.6})
     assert found["torque_constant"].status in ("ratio", "refused")
     assert found["resistance"].status in ("ratio", "refused")
@@ -127,7 +129,7 @@ def test_bad_input_says_what_to_do(swings):
         identify([log])
     with pytest.raises(ValueError, match=r"mgl = -1.0: must be from 0"):
         identify([log], known={"mgl": -1.0})
-    with pytest.raises(ValueError, match="did you mean known.inertia"):
+    with pytest.raises(ValueError, match=r"did you mean known\.inertia"):
         identify([log], "pendulum", {"inertja": 1.0})
     with pytest.raises(ValueError, match="tell nothing"):
         identify([Log("empty", log.time, {"position": log.signals["position"]})], "free")

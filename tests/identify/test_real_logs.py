@@ -39,7 +39,11 @@ def test_the_pendulum_is_identified_and_foretells_what_it_was_not_fitted_to():
 @pytest.mark.matrix
 def test_a_servo_without_a_current_sensor_tells_ratios_and_friction_that_depends_on_the_load():
     folder = bench.EXAMPLES / "bam_xl330"
-    logs = [read_log(folder / f"kp{kp}_{name}.json.gz", bench.SERVO) for kp in (100, 800) for name in ("sin_sin", "up_and_down")]
+    logs = [
+        read_log(folder / f"kp{kp}_{name}.json.gz", bench.SERVO)
+        for kp in (100, 800)
+        for name in ("sin_sin", "up_and_down")
+    ]
     held_out = [read_log(folder / f"kp200_{name}.json.gz", bench.SERVO) for name in ("sin_sin", "up_and_down")]
     known = {"mgl": 0.49 * 9.81 * 0.1}
     plain, loaded = (identify(logs, "pendulum", known, kind, held_out) for kind in ("coulomb", "load"))
@@ -47,4 +51,6 @@ def test_a_servo_without_a_current_sensor_tells_ratios_and_friction_that_depends
     assert errors[1] < 0.7 * errors[0]
     assert errors[1] < 0.06
     assert plain["resistance"].status in ("ratio", "refused")
-    assert loaded["inertia"].low < 0.49 * 0.1**2 + 0.0018 < loaded["inertia"].high or loaded["inertia"].status == "refused"
+    assert (
+        loaded["inertia"].low < 0.49 * 0.1**2 + 0.0018 < loaded["inertia"].high or loaded["inertia"].status == "refused"
+    )

@@ -39,7 +39,9 @@ def test_the_file_is_the_actuator_and_randomize_draws_within_the_intervals(tmp_p
     assert isinstance(drive, Drive)
     assert (drive.motor.resistance, drive.motor.inductance, drive.motor.coulomb_friction) == (1.2, 1e-3, 1e-3)
     ranges = identified_ranges(written[0])
-    assert set(ranges) == {f"motor.{n}" for n in ("resistance", "back_emf_constant", "torque_constant", "coulomb_friction")}
+    assert set(ranges) == {
+        f"motor.{n}" for n in ("resistance", "back_emf_constant", "torque_constant", "coulomb_friction")
+    }
     assert ranges["motor.resistance"] == "loguniform(1.1, 1.3)"
     assert ranges["motor.coulomb_friction"] == "uniform(0.0, 0.002)"
     assert json.loads(written[1].read_text())["estimates"][0]["high"] == 1.3

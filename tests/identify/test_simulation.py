@@ -10,7 +10,9 @@ STILL = Moved(0.2, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 2.0, 0.0, 1.0, 0.0)
 
 
 def simulate(moved, times, inputs, position=0.0, speed=0.0):
-    return moving()(times, np.broadcast_to(inputs, times.shape).astype(float), np.zeros(len(times)), position, speed, moved)
+    return moving()(
+        times, np.broadcast_to(inputs, times.shape).astype(float), np.zeros(len(times)), position, speed, moved
+    )
 
 
 def test_the_winding_is_exact_over_uneven_steps():
