@@ -33,7 +33,7 @@ class Spread:
 
     @property
     def total(self) -> np.ndarray:
-        """The larger of the first two, and what the rate does, as what is independent adds up, and the bias over that."""
+        """The larger of the first two, and what the rate does, as what is independent adds up; over that the bias."""
         wide = np.maximum(self.resampling, self.logs)
         return np.asarray(np.sqrt(wide**2 + self.half_rate**2) + self.self_test)
 
