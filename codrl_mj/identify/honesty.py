@@ -26,6 +26,7 @@ SLACK = 1e-3
 class Spread:
     """Half-widths of 95 % intervals by cause, each of shape (p,)."""
 
+    curvature: np.ndarray
     resampling: np.ndarray
     logs: np.ndarray
     self_test: np.ndarray
@@ -33,8 +34,8 @@ class Spread:
 
     @property
     def total(self) -> np.ndarray:
-        """The larger of the first two, and what the rate does, as what is independent adds up; over that the bias."""
-        wide = np.maximum(self.resampling, self.logs)
+        """The largest of the first three, and what the rate does, as what is independent adds up; and then the bias."""
+        wide = np.maximum(np.maximum(self.curvature, self.resampling), self.logs)
         return np.asarray(np.sqrt(wide**2 + self.half_rate**2) + self.self_test)
 
 
@@ -73,6 +74,13 @@ def resampling(fit: Fit, segments: Sequence[Segment], scales: np.ndarray, seed: 
     low, high = np.percentile(moved, [2.5, 97.5], axis=0)
     few = t.ppf(0.975, count - 1) / t.ppf(0.975, 1e6) * np.sqrt(count / (count - 1.0))
     return np.asarray(np.maximum(-low, high) * few)
+
+
+def curvature(fit: Fit, segments: Sequence[Segment], scales: np.ndarray) -> np.ndarray:
+    """Half-widths, shape (p,), were the model exact and each residual by itself: never less, however few the blocks."""
+    _, matrices = _sums(fit, [segment.block for segment in segments])
+    noise = float(np.mean(np.concatenate([fit.weights(i) * r**2 for i, r in enumerate(fit.residuals)])))
+    return np.asarray(1.96 * np.sqrt(noise * np.diag(_inverse(matrices.sum(axis=0), scales))))
 
 
 def between_logs(fit: Fit, segments: Sequence[Segment], scales: np.ndarray) -> np.ndarray:

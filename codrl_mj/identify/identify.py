@@ -19,7 +19,7 @@ from codrl_mj.identify.stages import Fitted, Shaft, Winding, fitted, moves
 
 WIDEST = 0.3
 """An interval of more than this share of the value to either side is too wide; of the whole friction, for friction."""
-WIDEST_OF = {"resistance": 0.05, "back_emf_constant": 0.05, "inductance": 0.2}
+WIDEST_OF = {"resistance": 0.05, "back_emf_constant": 0.05, "inductance": 0.15}
 """For what a current sensor tells."""
 NARROWEST = 0.002
 """No interval is narrower than this share of the value to either side: nobody's sensors are better calibrated."""
@@ -208,9 +208,10 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
     on_step()
     halved = part.half_rate()
     on_step()
-    sampled = isinstance(part.stage, Winding) and not all(log.mean_voltage for log in part.logs)
-    rate = (2.0 if sampled else 1.0) * np.abs(halved - fit.values)  # what a loop does between rows goes with their root
-    spread = honesty.Spread(resampled, logs, np.abs(tested - fit.values), rate)
+    # an error that goes with a row's time is half as large at the rate of the logs, one with its root more than that
+    rate = (2.0 if isinstance(part.stage, Winding) else 1.0) * np.abs(halved - fit.values)
+    curved = honesty.curvature(fit, part.segments, scales)
+    spread = honesty.Spread(curved, resampled, logs, np.abs(tested - fit.values), rate)
     directions = part.unknown_directions(scales)
     on_step()
     made = []
