@@ -106,8 +106,9 @@ def noticed(fit: Fit, segments: Sequence[Segment]) -> float:
     known best, by blocks and by rows, makes up for that.
     """
     gradients, matrices = _sums(fit, [segment.block for segment in segments])
-    root = np.sqrt(np.diag(matrices.sum(axis=0)))
-    strengths, vectors = np.linalg.eigh(matrices.sum(axis=0) / np.outer(root, root))
+    whole = matrices.sum(axis=0)
+    root = np.sqrt(np.maximum(np.diag(whole), 1e-300))
+    strengths, vectors = np.linalg.eigh(whole / root / root[:, None])
     pulls = gradients / root @ vectors[:, -1]
     noise = float(np.mean(np.concatenate([fit.weights(i) * r**2 for i, r in enumerate(fit.residuals)])))
     together = max(float(pulls @ pulls) / max(strengths[-1] * noise, 1e-30), 1.0)

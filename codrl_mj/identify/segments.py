@@ -17,6 +17,8 @@ BLOCK = 1.0
 """Shortest stretch [s] of a log that is resampled as a whole: residuals within it belong together."""
 SHAFT_STEP = 5e-4
 """Rows that are nearer [s] are taken together for a shaft, which is slower: their mean input, their first position."""
+SPIKE = 5.0
+"""A row is a spike where it sticks out by more than so many times what nine of ten rows do at most."""
 STILL = 3.0
 """A shaft that moves by less than so many steps of its encoder is locked."""
 
@@ -59,6 +61,19 @@ def delayed(log: Log, name: str, rows: int) -> np.ndarray:
         if rows > 0
         else (np.concatenate([values[-rows:], np.full(-rows, values[-1])]) if rows < 0 else values)
     )
+
+
+def without_spikes(values: np.ndarray) -> np.ndarray:
+    """A sampled signal, rows that stick out of both their neighbours by far more than is usual in place of the nearer.
+
+    Residuals of an output bear outliers, by the robust loss; what drives a simulation has to be free of them.
+    """
+    middle = np.median(np.stack([values[:-2], values[1:-1], values[2:]]), axis=0)
+    off = np.abs(values[1:-1] - middle)
+    usual = max(float(np.percentile(off, 90.0)), 1e-3 * float(np.std(values)))
+    found = values.copy()
+    found[1:-1][off > SPIKE * usual] = middle[off > SPIKE * usual]
+    return found
 
 
 def sensor_deviation(log: Log, name: str) -> float:
@@ -155,6 +170,8 @@ def shaft_segments(
     block = -1
     for place, log in enumerate(logs):
         given, output = delayed(log, driven_by, delay), output_of(log)
+        if driven_by != "voltage":
+            given = without_spikes(given)
         measured, deviation = log.signals[output], sensor_deviation(log, output)
         together = max(int(shortest / log.step * (1.0 + 1e-6)), 1)
         began = -math.inf
