@@ -17,7 +17,7 @@ BLOCK = 1.0
 """Shortest stretch [s] of a log that is resampled as a whole: residuals within it belong together."""
 SHAFT_STEP = 5e-4
 """Rows that are nearer [s] are taken together for a shaft, which is slower: their mean input, their first position."""
-SPIKE = 5.0
+SPIKE = 50.0
 """A row is a spike where it sticks out by more than so many times what nine of ten rows do at most."""
 STILL = 3.0
 """A shaft that moves by less than so many steps of its encoder is locked."""
