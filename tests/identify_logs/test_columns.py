@@ -69,7 +69,7 @@ def test_mappings_are_as_good_as_text():
         ("time=t:s,current=a:blub", "blub"),
         ("time=t:s,velocity=a:Hz", "rad/s"),
         ("time=t:s,velocity=a:1/s", "turns or radians"),
-        ("time=t:s,currrent=a:A", "did you mean current"),
+        ("time=t:s,currant=a:A", "did you mean current"),
         ("time=t:s,current=a:A,current=b:A", "twice"),
         ("time=t:s,current=a:A:V", "two colons"),
         ("time=t:s,current", "signal=formula:unit"),

@@ -71,7 +71,7 @@ def test_a_plan_is_printed_and_its_excitation_written(capsys, tmp_path):
         ("simulate quanser-qube-servo-2 --out log.txt", "must end in .csv"),
         ("simulate quanser-qube-servo-2 --out log.csv --sensor current:nois=1", "did you mean noise"),
         ("simulate quanser-qube-servo-2 --out log.csv --sensor current:noise=a", "SIGNAL:FIELD=NUMBER"),
-        ("simulate quanser-qube-servo-2 --out log.csv --sensor currrent:noise=1", "did you mean current"),
+        ("simulate quanser-qube-servo-2 --out log.csv --sensor currant:noise=1", "did you mean current"),
         ("simulate quanser-qube-servo-2 --out log.csv --rate 0", "rate"),
     ],
 )

@@ -140,7 +140,7 @@ def test_what_is_written_is_read_again(tmp_path, name, mean):
 def test_a_log_holds_what_it_says():
     time = np.arange(5.0)
     with pytest.raises(ValueError, match="unknown signal"):
-        Log("x", time, {"currrent": time})
+        Log("x", time, {"currant": time})
     with pytest.raises(ValueError, match="shape"):
         Log("x", time, {"current": time[1:]})
     with pytest.raises(ValueError, match="finite"):

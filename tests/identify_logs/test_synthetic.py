@@ -98,7 +98,7 @@ def test_sensors_show_what_they_are_told():
         plain.signals["torque"]
     )
     with pytest.raises(ValueError, match="did you mean current"):
-        simulate(DRIVE, excitation, LOAD, {"currrent": Sensor()})
+        simulate(DRIVE, excitation, LOAD, {"currant": Sensor()})
 
 
 def test_samplers_jitter_drop_and_average():
