@@ -137,3 +137,27 @@ def test_bad_input_says_what_to_do(swings):
         identify([], "free")
     with pytest.raises(ValueError, match=r"segment = 0.0: must be >= 0.05"):
         identify([log], "pendulum", segment=0.0)
+
+
+@pytest.mark.matrix
+def test_intervals_hold_what_is_true_in_nineteen_of_twenty_draws():
+    truth = {"resistance": bench.RESISTANCE, "inductance": bench.INDUCTANCE}
+    held = dict.fromkeys(truth, 0)
+    for seed in range(20):
+        found = identify([bench.motor_log("locked", 2000, 2.5, seed=seed)], seed=seed)
+        assert {found[name].status for name in truth} == {"identified"}
+        for name, inside in within(found, **truth).items():
+            held[name] += inside
+    assert min(held.values()) >= 19
+
+
+@pytest.mark.matrix
+def test_friction_is_found_within_five_percent_whatever_it_is():
+    random = np.random.default_rng(2)
+    for seed in range(3):
+        coulomb, viscous = random.uniform(0.05, 0.3), random.uniform(0.01, 0.05)
+        logs = [bench.mujoco_pendulum(2 * seed + place, 6.0, coulomb, viscous) for place in (0, 1)]
+        found = identify(logs, "pendulum")
+        truth = {"coulomb_friction": coulomb, "viscous_friction": viscous}
+        assert all(within(found, **truth).values())
+        assert max(map(abs, errors(found, **truth).values())) < 0.05
