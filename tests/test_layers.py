@@ -59,10 +59,12 @@ ALLOWED = {
     },
     "rl_zoo3": set(),
     "motor_design": {"actuators", "catalogue", "fields", "runs.files"},
+    "identify": {"actuators", "catalogue", "fields", "runs.files"},
     "cli": {
         *("actuators", "agents", "disturbances", "envs.config", "evaluation", "evaluation.measures", "fields", "films"),
         *(
             "foreign",
+            "identify",
             "motor_design",
             "runs.files",
             "runs.layout",
@@ -87,6 +89,7 @@ FOREIGN = {
     "tasks.assets": set(),
     "catalogue": {"pint"},
     "motor_design": {"control", "matplotlib", "numpy", "scipy"},
+    "identify": {"numba", "numpy", "scipy", "yaml"},
     "plugin": {"mujoco"},
     "engine": {"mujoco", "numba", "llvmlite", "numpy"},
     "specs": {"mujoco", "numpy"},

@@ -4,6 +4,7 @@ from codrl_mj.actuators.current_loop import Actuator, CurrentLoop, Motor, Supply
 from codrl_mj.actuators.drive import Drive, VoltageDrive
 from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.ideal import IDEAL, Ideal
+from codrl_mj.actuators.identified import identified_ranges
 from codrl_mj.actuators.lag import Lag
 from codrl_mj.actuators.model import (
     ActuatorModel,
@@ -77,6 +78,7 @@ __all__ = [
     "field_values",
     "options_of",
     "find_family",
+    "identified_ranges",
     "mapping_of",
     "parameter_paths",
     "parameters_type",

@@ -8,6 +8,7 @@ from typing import Any
 from codrl_mj.actuators.current_loop import Actuator, CurrentLoop, VoltageDriven
 from codrl_mj.actuators.drive import Drive, VoltageDrive
 from codrl_mj.actuators.ideal import IDEAL, Ideal
+from codrl_mj.actuators.identified import usable_fields
 from codrl_mj.actuators.lag import Lag
 from codrl_mj.actuators.model import ActuatorModel, Family, family_name, look_up
 from codrl_mj.actuators.servo import Servo
@@ -142,7 +143,7 @@ def actuator_from_file(path: Path, paper: Actuator | None, whose: str) -> Any:
             raise ValueError(f"{fields!r}: must be a mapping of an actuator's fields")
         if Path(str(fields.get("name"))).suffix in _FILES:
             raise ValueError(f"name = {fields['name']!r}: must be an actuator's name, and no file")
-        return resolve(fields, paper, whose)
+        return resolve(usable_fields(fields), paper, whose)
     except (yaml.YAMLError, UnicodeDecodeError, ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
 

@@ -71,11 +71,10 @@ def read(name: str, printed: Any, kind: Kind) -> Reading:
 
 
 def _si(name: str, printed: str, number: float, unit: str, kind: Kind, remedy: str) -> float:
-    for spelling, plain in _SPELLINGS:
-        unit = re.sub(spelling, plain, unit)
+    unit = respelled(unit)
     if not unit and kind.unit:
         raise ValueError(f"datasheet.{name} = {printed!r}: has no unit; {remedy}")
-    registry = _registry()
+    registry = unit_registry()
     try:
         quantity = registry.Quantity(number, unit)
     except (
@@ -87,16 +86,28 @@ def _si(name: str, printed: str, number: float, unit: str, kind: Kind, remedy: s
             f"datasheet.{name} = {printed!r}: {unit!r} is no unit of this quantity, which is in "
             f"{kind.unit or 'no unit'}; {remedy}"
         )
-    units = {unit for unit, _ in quantity.unit_items()}
-    if any(unit.endswith("hertz") for unit in units) or (kind.unit.startswith("rad") and not units & _ANGLES):
+    if leaves_angle_open(quantity, kind.unit):
         raise ValueError(
             f"datasheet.{name} = {printed!r}: turns or radians? Hz and 1/s leave it open; write rpm, turn/s or rad/s"
         )
     return float(quantity.to(kind.unit).magnitude)
 
 
+def respelled(unit: str) -> str:
+    """A unit as datasheets spell it, as pint does."""
+    for spelling, plain in _SPELLINGS:
+        unit = re.sub(spelling, plain, unit)
+    return unit
+
+
+def leaves_angle_open(quantity: Any, unit: str) -> bool:
+    """Whether a pint quantity leaves open if turns or radians are meant, where the SI unit is one of an angle."""
+    units = {name for name, _ in quantity.unit_items()}
+    return any(name.endswith("hertz") for name in units) or (unit.startswith("rad") and not units & _ANGLES)
+
+
 @functools.cache
-def _registry() -> Any:
+def unit_registry() -> Any:
     """Pint's units; half a second, so not before they are needed."""
     import pint
 

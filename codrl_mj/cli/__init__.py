@@ -11,6 +11,7 @@ import tyro
 
 from codrl_mj.cli.evaluate import Evaluate
 from codrl_mj.cli.fields import with_environment
+from codrl_mj.cli.identify import Identify, identify_verb
 from codrl_mj.cli.motor import Motor
 from codrl_mj.cli.render import Render
 from codrl_mj.cli.reproduce import Reproduce
@@ -26,6 +27,7 @@ VERBS: dict[str, Any] = {
     "runs": Runs,
     "render": Render,
     "motor": Motor,
+    "identify": Identify,
     "validate": Validate,
     "study": Study,
     "reproduce": Reproduce,
@@ -33,6 +35,7 @@ VERBS: dict[str, Any] = {
 """The verbs by name."""
 _MADE: dict[str, Callable[[list[str]], Any]] = {
     "train": train_verb,
+    "identify": identify_verb,
     "evaluate": functools.partial(with_environment, Evaluate),
     "render": functools.partial(with_environment, Render),
 }

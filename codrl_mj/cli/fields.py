@@ -17,7 +17,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.actuators import FAMILIES, NAMED, Actuator, Ideal, actuator_over
+from codrl_mj.actuators import FAMILIES, NAMED, Actuator, Ideal, actuator_over, identified_ranges
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import parts
 from codrl_mj.foreign.config import EVERY, ForeignConfig, is_gymnasium_id
@@ -188,6 +188,7 @@ def environment(verb: Any, task: str, name: str, known: Any = None) -> EnvConfig
     given: dict[str, Any] = dict(vars(verb.env))
     nested: dict[str, Any] = {name: vars(given.pop(name)) for name in ("disturbances", "joint")}
     options = {name: value for name in _task_options() if (value := given.pop(name, None)) is not None}
+    given["randomize"] = _ranges(given["randomize"], name)
     from codrl_mj.specs import matched_by, refuse_unmatched
 
     actuators = list(known.actuators if name in (AS_TRAINED, AS_CONFIGURED) else _named(name, task))
@@ -216,6 +217,11 @@ def _foreign_environment(verb: Any, task: str, name: str, known: Any) -> Foreign
         actuators = known.actuators
     elif not actuators:
         actuators = dict.fromkeys([EVERY] if known is None else known.actuators, name)
+    if "identified" in (given["randomize"] or ()) and verb.actuators:
+        every = [(pattern, _ranges(("identified",), str(one))) for pattern, one in actuators.items()]
+        drawn = [f"{pattern}:{text}" for pattern, texts in every for text in texts]
+        given["randomize"] = (*(one for one in given["randomize"] if one != "identified"), *drawn)
+    given["randomize"] = _ranges(given["randomize"], name)
     made = ForeignConfig(task, actuators).actuators
     over = _given(verb.actuator_fields)
     changed = {pattern: actuator_over(one, over) for pattern, one in made.items()}
@@ -264,6 +270,24 @@ def _value(text: str) -> Any:
         return json.loads(text)
     except ValueError:
         return text
+
+
+def _ranges(randomize: Any, actuator: str) -> Any:
+    """What `--env.randomize` says, `identified` replaced by the intervals that the actuator's file has.
+
+    Raises:
+        ValueError: the actuator is no file that has any.
+    """
+    if randomize is None or "identified" not in randomize:
+        return randomize
+    if Path(actuator).suffix not in (".yaml", ".yml", ".json"):
+        raise ValueError(
+            f"--env.randomize identified: draws within the intervals of a file; --actuator is {actuator!r}, must be "
+            "one that `codrl-mj identify` wrote"
+        )
+    others = [one for one in randomize if one != "identified"]
+    named = {one.partition("=")[0].strip() for one in others}
+    return (*others, *(f"{name}={text}" for name, text in identified_ranges(actuator).items() if name not in named))
 
 
 def scan(arguments: Sequence[str], *names: str) -> argparse.Namespace:

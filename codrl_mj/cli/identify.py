@@ -1,0 +1,177 @@
+"""`codrl-mj identify`: a motor from its bench logs, and what is done before."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from codrl_mj.cli.identify_tools import TOOLS, Columns, IdentifyTools
+from codrl_mj.cli.motor import AsJson
+
+
+@dataclasses.dataclass(frozen=True)
+class Identify:
+    """Identify a motor from its bench logs: every number with an interval, and whether it can be relied on.
+
+    Voltage and current tell the winding; torque, current or voltage, and a position or velocity, tell inertia, load and
+    friction. The folder gets actuator.yaml, which --actuator takes, and result.json; --env.randomize identified then
+    draws within the intervals. What was not identified is refused until it is given with --known. Before that: codrl-mj
+    identify check, plan and simulate. docs/identify.md has more.
+
+    Example: codrl-mj identify swing1.csv swing2.csv --columns time=t:s,voltage=duty*vbus:V,current=i:A,position=q:rad
+    --rig pendulum --known mgl=2.81 --friction auto --holdout swing3.csv --out motor
+    """
+
+    logs: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="LOG", help="CSV, JSON (or .gz), Parquet.")
+    ]
+    columns: Columns
+    rig: Literal["pendulum", "free", "load"] | None = None
+    """What the output moves: a pendulum that hangs at position 0, nothing but inertia, or inertia and a held load. A
+    log in which nothing moves is of a locked rotor. A pendulum where mgl is known."""
+    known: tuple[str, ...] = ()
+    """What is not to be fitted, as NAME=VALUE in SI units: mgl, inertia, load_inertia and constant_torque at the
+    output, the others (resistance, inductance, torque_constant, back_emf_constant, gear_ratio, rotor_inertia,
+    coulomb_friction, viscous_friction, gear_efficiency, stribeck_friction, stribeck_speed) as a drive has them."""
+    estimate: tuple[str, ...] = ()
+    """What to fit that is otherwise taken as known, such as torque_gain."""
+    friction: Literal["auto", "coulomb", "stribeck", "load", "both"] = "coulomb"
+    """Viscous and Coulomb friction, or more; auto keeps more where it foretells logs that it was not fitted to."""
+    segment: float = 0.5
+    """Time [s] that the shaft is simulated for at once: short where it tips over by itself, a second or two where it
+    only sticks and slides."""
+    motor: str | None = None
+    """Motor of the catalogue, or a file, that gives what the logs do not tell."""
+    holdout: tuple[Path, ...] = ()
+    """Logs that are only foretold."""
+    out: Path | None = None
+    """Folder for actuator.yaml and result.json."""
+    ignore_errors: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Fit logs that the checks find errors in."""
+    as_json: AsJson = False
+
+    def run(self) -> int:
+        """Check the logs, fit, print a table, write the files."""
+        from codrl_mj.cli.terminal import console, progress_bar
+        from codrl_mj.identify import identify
+        from codrl_mj.identify.reading import read_log
+
+        logs, held_out = ([read_log(path, self.columns) for path in paths] for paths in (self.logs, self.holdout))
+        base = self._base()
+        self._check([*logs, *held_out], base)
+        with progress_bar("{task.completed}/{task.total}") as bar:
+            row = bar.add_task("identifying", total=None)
+            found = identify(
+                logs,
+                self.rig,
+                _numbers(self.known),
+                self.friction,
+                held_out,
+                self.estimate,
+                self.segment,
+                base and base.as_mapping(),
+                lambda what, done, total: bar.update(row, description=f"fitting: {what}", completed=done, total=total),
+            )
+        if self.as_json:
+            console().print_json(data=found.as_mapping())
+        else:
+            print_identified(found)
+        if self.out is not None:
+            for path in found.write(self.out):
+                if not self.as_json:
+                    print(f"wrote {path}")
+        return 0
+
+    def _base(self) -> Any:
+        from codrl_mj.motor_design import find_drive
+
+        return None if self.motor is None else find_drive(self.motor)
+
+    def _check(self, logs: list[Any], base: Any) -> None:
+        """Print what is wrong with the logs.
+
+        Raises:
+            ValueError: one has errors.
+        """
+        from codrl_mj.cli.identify_tools import findings_table
+        from codrl_mj.cli.terminal import console
+        from codrl_mj.identify.checks import check
+
+        found = {log.name: check(log, base and base.motor) for log in logs}
+        wrong = [name for name, findings in found.items() if any(one.severity == "error" for one in findings)]
+        for name, findings in found.items():
+            worth = [one for one in findings if one.severity != "info"]
+            if worth and not self.as_json:
+                console().print(findings_table(name, worth))
+        if wrong and not self.ignore_errors:
+            raise ValueError(
+                f"logs {', '.join(wrong)} have errors, with which a fit would be wrong: see codrl-mj identify check; "
+                "correct the columns, leave the logs out, or pass --ignore-errors"
+            )
+
+
+def identify_verb(arguments: list[str]) -> Any:
+    """The verb's dataclass for a command line: the fit, or what is done before.
+
+    Args:
+        arguments: what follows `identify`.
+    """
+    return IdentifyTools if arguments[:1] and arguments[0] in TOOLS else Identify
+
+
+def _numbers(texts: tuple[str, ...]) -> dict[str, float]:
+    """NAME=VALUE, each.
+
+    Raises:
+        ValueError: one is not that, or a name stands twice.
+    """
+    found: dict[str, float] = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        if name in found:
+            raise ValueError(f"known {name}: given twice; give it one value")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            raise ValueError(f"known {text!r}: must be NAME=NUMBER in SI units, such as mgl=2.81") from None
+    return found
+
+
+def print_identified(found: Any) -> None:
+    """Print parameters and errors of the simulation, and what is to be known of them."""
+    from rich import box
+    from rich.markup import escape
+    from rich.table import Table
+
+    from codrl_mj.cli.terminal import console
+
+    look: Any = {"title_justify": "left", "box": box.SIMPLE_HEAD, "pad_edge": False, "padding": (0, 1, 0, 0)}
+    table = Table(title=escape(f"Identified from {', '.join(found.logs)}"), **look)
+    for name in ("parameter", "value", "95 % interval", "unit", "status", "why"):
+        table.add_column(name, justify="right" if name in ("value", "95 % interval") else "left", overflow="fold")
+    for one in found.estimates:
+        interval = "" if one.status == "given" else f"{one.low:.4g} to {one.high:.4g}"
+        texts = one.name, f"{one.value:.4g}", interval, one.unit, one.status, one.why
+        table.add_row(*map(escape, texts), style="" if one.status in ("identified", "given") else "yellow")
+    console().print(table)
+    if found.fitted or found.held_out:
+        units = {"position": "rad", "velocity": "rad/s"}
+        table = Table(title="Errors of the simulation, mean absolute", **look)
+        for name in ("log", "", "of", "open loop, 0.5 s", "closed loop"):
+            table.add_column(name, justify="right" if "loop" in name else "left")
+        for kind, several in (("fitted", found.fitted), ("held out", found.held_out)):
+            for one in several:
+                closed = "" if one.closed_loop is None else f"{one.closed_loop:.3g}"
+                table.add_row(
+                    escape(one.log), kind, f"{one.output} {units[one.output]}", f"{one.open_loop:.3g}", closed
+                )
+        console().print(table)
+    for part, rows in found.delays.items():
+        if rows:
+            print(f"{part}: the input is late by {rows} row{'s' if abs(rows) > 1 else ''}, which is allowed for")
+    for text in found.warnings:
+        console().print(f"warning: {text}", markup=False, highlight=False, style="yellow")
+    problem = found.problem()
+    if problem:
+        console().print(f"not to be used as an actuator: {problem}", markup=False, highlight=False, style="yellow")

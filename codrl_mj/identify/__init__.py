@@ -1,0 +1,10 @@
+"""Motors from their bench logs."""
+
+from codrl_mj.identify.identify import identify
+from codrl_mj.identify.log import Finding, Log
+from codrl_mj.identify.parameters import PARAMETERS
+from codrl_mj.identify.prediction import Prediction
+from codrl_mj.identify.reading import read_log
+from codrl_mj.identify.result import Estimate, Identified
+
+__all__ = ["PARAMETERS", "Estimate", "Finding", "Identified", "Log", "Prediction", "identify", "read_log"]

@@ -1,0 +1,194 @@
+"""Voltage and torque balances of a log by linear regression, without differentiating anything.
+
+Both balances are multiplied by functions phi that vanish with their slope at both ends of a window, and integrated:
+the derivatives go over to phi. Source: Shinbrot, *On the Analysis of Linear and Nonlinear Systems* (1957), the method
+of modulating functions. Good for signs, orders of magnitude and starts; noise in what is regressed on biases it.
+"""
+
+import functools
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from codrl_mj.identify.log import Log, usable
+
+_ROWS = 12
+"""Rows of a window, at least."""
+_POWER = 5
+"""Of s - s^2 in phi: so high that the trapezoidal rule is good for phi'' too."""
+
+
+class Balance(NamedTuple):
+    """A regression over the windows of a log."""
+
+    values: Mapping[str, float]
+    """Term -> its coefficient."""
+    certainty: Mapping[str, float]
+    """Term -> its coefficient over its standard error."""
+    unexplained: float
+    """Root mean square of the residual over that of what was to be explained."""
+    residual: float
+    """Root mean square of the residual, in the unit of what was to be explained."""
+
+
+class Windows:
+    """A log cut into overlapping windows, in each of which signals are weighted by phi ~ (s - s^2)^5, s in [0, 1].
+
+    Args:
+        log: the log.
+        duration: of a window [s]; at least a dozen rows, at most a tenth of the log.
+        most: of the windows, evenly spread, that are looked at.
+    """
+
+    def __init__(self, log: Log, duration: float = 0.0, most: int = 20_000) -> None:
+        """Cut it."""
+        duration = min(duration, float(log.time[-1] - log.time[0]) / 10.0)
+        count = max(math.ceil(duration / log.step), _ROWS)
+        starts = [
+            np.arange(part.start, part.stop - count, max(count // 4, 1)) for part in usable(log)
+        ]  # of the whole windows of every stretch
+        every = np.concatenate(starts)
+        self.rows = every[:: math.ceil(len(every) / most) or 1, None] + np.arange(count + 1)
+        self._log = log
+        time = log.time[self.rows] if self.rows.size else np.zeros(self.rows.shape)
+        self.begin, self.length = time[:, :1], time[:, -1:] - time[:, :1]
+        self._phase = (time - self.begin) / np.where(self.length > 0.0, self.length, 1.0)
+        self._steps = np.diff(time, axis=1)
+        self._weights: dict[int, np.ndarray] = {}
+
+    def __len__(self) -> int:
+        """How many windows there are."""
+        return len(self.rows)
+
+    def mean(self, signal: str | np.ndarray, order: int = 0) -> np.ndarray:
+        """The weighted mean of a signal's derivative of some order, shape (windows,).
+
+        Args:
+            signal: its name, or values of shape (n,).
+            order: 0, 1 or 2.
+        """
+        values = (self._log.signals[signal] if isinstance(signal, str) else signal)[self.rows]
+        if order > 0:  # what is constant counts for nothing, and would only be rounded
+            values = values - values.mean(axis=1, keepdims=True)
+        if order not in self._weights:
+            self._weights[order] = _phi(self._phase, order) * (-1.0 / self.length) ** order
+        weighted = values * self._weights[order]
+        return np.sum(0.5 * self._steps * (weighted[:, 1:] + weighted[:, :-1]), axis=1) / self.length[:, 0]
+
+    def mean_held(self, signal: str, lag: float = 0.0) -> np.ndarray:
+        """The weighted mean of a signal that is held from a row to the next, shape (windows,).
+
+        Args:
+            signal: its name.
+            lag: how much later than its stamps it is in force [s].
+        """
+        values, time = self._log.signals[signal], self._log.time
+        reach = 0 if lag == 0.0 else math.ceil(abs(lag) / self._log.step) + 1
+        rows = np.arange(-reach, self.rows.shape[1] - 1 + reach) + self.rows[:, :1]
+        rows = np.clip(rows, 0, len(time) - 2)
+        edges = [np.clip((time[rows + k] + lag - self.begin) / self.length, 0.0, 1.0) for k in (0, 1)]
+        return np.sum(values[rows] * (_phi(edges[1], -1) - _phi(edges[0], -1)), axis=1)
+
+
+def _phi(phase: np.ndarray, order: int) -> np.ndarray:
+    """Phi's derivative of some order by the phase; -1: its integral."""
+    return _polynomials()[order](phase)
+
+
+@functools.cache
+def _polynomials() -> dict[int, np.polynomial.Polynomial]:
+    phi = np.polynomial.Polynomial([0.0, 1.0, -1.0]) ** _POWER
+    phi = phi / phi.integ()(1.0)
+    return {-1: phi.integ(), 0: phi, 1: phi.deriv(), 2: phi.deriv(2)}
+
+
+def regress(target: np.ndarray, terms: Mapping[str, np.ndarray]) -> Balance | None:
+    """Least squares that outliers do not move; None where there are too few windows, or terms say the same.
+
+    Args:
+        target: shape (windows,).
+        terms: each of that shape; those that are 0 throughout are left out.
+    """
+    terms = {name: values for name, values in terms.items() if np.any(values)}
+    if len(target) < 3 * len(terms) or not terms or not np.any(target):
+        return None
+    matrix = np.column_stack(list(terms.values()))
+    scales = np.sqrt(np.mean(matrix**2, axis=0))
+    matrix = matrix / scales
+    weights = np.ones(len(target))
+    for _ in range(8):  # Huber's weights, reweighted
+        solution, _, rank, _ = np.linalg.lstsq(matrix * weights[:, None], target * weights, rcond=1e-9)
+        residual = target - matrix @ solution
+        scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-12 * float(np.abs(target).max())
+        weights = np.sqrt(np.minimum(1.0, 2.0 * scale / np.maximum(np.abs(residual), 1e-300)))
+    if rank < len(terms):
+        return None
+    error = math.sqrt(float(np.mean((weights * residual) ** 2)))
+    # phi is about half as wide as its window, and so overlaps by half with the next one: they count for half
+    covariance = 2.0 * error**2 * np.linalg.inv((matrix * weights[:, None]).T @ (matrix * weights[:, None]))
+    certain = solution / np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    return Balance(
+        dict(zip(terms, map(float, solution / scales), strict=True)),
+        dict(zip(terms, map(float, certain), strict=True)),
+        error / math.sqrt(float(np.mean((weights * target) ** 2))),
+        error,
+    )
+
+
+def speed_terms(log: Log, windows: Windows, order: int = 0) -> np.ndarray | None:
+    """The weighted mean of the speed, or of its derivative; by the position if there is one. None without a motion."""
+    if log.has("position"):
+        return windows.mean("position", order + 1)
+    return windows.mean("velocity", order) if log.has("velocity") else None
+
+
+def voltage_terms(log: Log, windows: Windows, sag: bool = False) -> dict[str, np.ndarray]:
+    """The terms of `voltage_balance`."""
+    terms = {"resistance": windows.mean("current"), "inductance": windows.mean("current", 1)}
+    speed = speed_terms(log, windows)
+    if speed is not None:
+        terms["back_emf_constant"] = speed
+    if sag:
+        voltage = log.signals["voltage"]
+        share = voltage / max(float(np.abs(voltage).max()), 1e-300)
+        terms["supply_resistance"] = windows.mean(share**2 * log.signals["current"])
+    return terms
+
+
+def voltage_balance(log: Log, duration: float = 0.0, sag: bool = False) -> Balance | None:
+    """Fits `resistance`*i + `inductance`*di/dt + `back_emf_constant`*omega, of the output, to the voltage; all SI.
+
+    Args:
+        log: with voltage and current; without a motion the shaft counts as locked.
+        duration: of a window [s].
+        sag: whether to regress on (u/max u)^2*i too, which a supply takes whose resistance is `supply_resistance`.
+    """
+    windows = Windows(log, duration)
+    return regress(windows.mean_held("voltage"), voltage_terms(log, windows, sag)) if len(windows) else None
+
+
+def torque_terms(log: Log, windows: Windows) -> dict[str, np.ndarray] | None:
+    """The terms of `torque_balance`; None without a motion."""
+    speed, acceleration = speed_terms(log, windows), speed_terms(log, windows, 1)
+    if speed is None or acceleration is None:
+        return None
+    one = windows.mean(np.ones(len(log.time)))
+    terms = {"inertia": acceleration, "viscous": speed, "coulomb": np.sign(speed) * one, "constant": one}
+    return terms | ({"gravity": windows.mean(np.sin(log.signals["position"]))} if log.has("position") else {})
+
+
+def torque_balance(log: Log, effort: str = "torque", duration: float = 0.3) -> Balance | None:
+    """Fits `inertia`*alpha + `gravity`*sin(q) + `viscous`*omega + `coulomb`*sign(omega) + `constant` to the effort.
+
+    Args:
+        log: with the effort and a position or a velocity; gravity only with a position.
+        effort: `torque`, `current` or `voltage`.
+        duration: of a window [s].
+    """
+    windows = Windows(log, duration)
+    terms = torque_terms(log, windows) if len(windows) else None
+    if terms is None:
+        return None
+    return regress(windows.mean_held(effort) if effort == "voltage" else windows.mean(effort), terms)

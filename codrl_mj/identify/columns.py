@@ -1,0 +1,221 @@
+"""Which columns of a file are which signals: `time=t:s,voltage=duty*vbus:V,current=-i:mA`. Nothing is guessed."""
+
+import ast
+import dataclasses
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from codrl_mj.fields import check_names
+from codrl_mj.identify.log import SIGNALS
+
+_KINDS: dict[str, str | None] = {"time": "s", **SIGNALS, "only": ""}
+_EXAMPLE = "time=t:s,voltage=duty*vbus:V,current=i:A,position=q:rad"
+
+
+def twos_complement(values: Any, bits: Any) -> Any:
+    """Whole numbers that a register shows without their sign, with it: 65535 of 16 bits is -1."""
+    whole = 2.0 ** float(bits)
+    return (np.asarray(values) + whole / 2.0) % whole - whole / 2.0
+
+
+def _unwrap(values: Any, period: Any) -> Any:
+    return np.unwrap(values, period=float(period))
+
+
+FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
+    "twos_complement": (2, twos_complement),
+    "unwrap": (2, _unwrap),
+    "abs": (1, np.abs),
+    "sign": (1, np.sign),
+    "sqrt": (1, np.sqrt),
+}
+"""What a formula may call -> number of arguments, function. The second is a number: of bits, the period."""
+_OPERATORS: dict[type, Callable[[Any, Any], Any]] = {
+    ast.Add: np.add,
+    ast.Sub: np.subtract,
+    ast.Mult: np.multiply,
+    ast.Div: np.divide,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Column:
+    """A signal as a formula of a file's columns."""
+
+    signal: str
+    """`time`, one of `SIGNALS`, or `only`: rows where it is 0 are left out."""
+    formula: str
+    """Columns (one with spaces in quotes), numbers, `pi`, + - * / and `FUNCTIONS`."""
+    unit: str | None
+    """Of the formula's value; None: SI, which only a formula of more than a name may leave out."""
+    mean: bool = False
+    """Of a voltage: whether it is the mean from its row to the next, not what holds from its row on."""
+
+    def __post_init__(self) -> None:
+        """Validate, without a file."""
+        check_names([self.signal], _KINDS, "signal")
+        tree = self._tree()
+        for node in ast.walk(tree):
+            if not isinstance(node, _ALLOWED) or (isinstance(node, ast.BinOp) and type(node.op) not in _OPERATORS):
+                raise ValueError(
+                    f"columns: {self.text}: {type(node).__name__} is not allowed; write names, numbers, + - * / and "
+                    f"{', '.join(FUNCTIONS)}"
+                )
+        for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
+            self._check_call(call)
+        kind = _KINDS[self.signal]
+        if self.unit is not None:
+            self._quantity(1.0)
+        elif kind and isinstance(tree.body, ast.Name | ast.Constant):
+            raise ValueError(
+                f"columns: {self.text}: has no unit, must have one that is of {kind}; write "
+                f"{self.signal}={self.formula}:{kind} if it is in {kind}"
+            )
+
+    @property
+    def text(self) -> str:
+        """As it is written, for messages."""
+        return f"{self.signal}={self.formula}" + (f":{self.unit}" if self.unit is not None else "")
+
+    @property
+    def names(self) -> set[str]:
+        """The columns and constants that it reads."""
+        tree = self._tree()
+        calls = {id(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call)}
+        return {name for node, name in _names(tree) if id(node) not in calls and name != "pi"}
+
+    def value(self, table: Mapping[str, Any]) -> Any:
+        """The signal in SI.
+
+        Args:
+            table: column -> its values, or the constant, by name.
+
+        Raises:
+            ValueError: it has no such column, and the nearest is suggested.
+        """
+        check_names(self.names, table, "column")
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return self._quantity(_evaluate(self._tree().body, {"pi": math.pi, **table}))
+
+    def _tree(self) -> ast.Expression:
+        try:
+            return ast.parse(self.formula.strip(), mode="eval")
+        except SyntaxError as error:
+            raise ValueError(
+                f"columns: {self.signal}={self.formula}: no formula ({error.msg}); write a column's name, in quotes if "
+                f"it has spaces, as in {_EXAMPLE}"
+            ) from None
+
+    def _check_call(self, call: ast.Call) -> None:
+        name = call.func.id if isinstance(call.func, ast.Name) else "?"
+        check_names([name], FUNCTIONS, "function")
+        needed = FUNCTIONS[name][0]
+        if len(call.args) != needed or call.keywords:
+            raise ValueError(f"columns: {self.text}: {name} takes {needed} arguments, not {len(call.args)}")
+        if needed == 2 and {name for _, name in _names(call.args[1])} - {"pi"}:
+            raise ValueError(f"columns: {self.text}: the second argument of {name} must be a number, such as 16")
+
+    def _quantity(self, value: Any) -> Any:
+        """A value in SI."""
+        kind, unit = _KINDS[self.signal], self.unit
+        if unit is None or (not kind and unit in ("", "1")):
+            return value
+        from codrl_mj.catalogue.units import leaves_angle_open, respelled, unit_registry
+
+        registry = unit_registry()
+        try:
+            quantity = registry.Quantity(value, respelled(unit))
+        except Exception as error:  # pint raises what its parser stumbles over
+            raise ValueError(f"columns: {self.text}: the unit {unit!r} is not known; write {kind or '1'}") from error
+        if kind is None:
+            return quantity.to_base_units().magnitude
+        if not quantity.check(registry.Quantity(1.0, kind).dimensionality):
+            raise ValueError(f"columns: {self.text}: {unit!r} is no unit of {self.signal}, must be of {kind or '1'}")
+        if leaves_angle_open(registry.Quantity(1.0, respelled(unit)), kind):
+            raise ValueError(f"columns: {self.text}: turns or radians? Write rad, deg, turn, rad/s or rpm")
+        return quantity.to(kind or "dimensionless").magnitude
+
+
+_ALLOWED = (
+    *(ast.Expression, ast.BinOp, ast.UnaryOp, ast.USub, ast.UAdd, ast.Call, ast.Name, ast.Load, ast.Constant),
+    *_OPERATORS,
+)
+
+
+def _names(tree: ast.AST) -> Iterator[tuple[ast.AST, str]]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name):
+            yield node, node.id
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node, node.value
+
+
+def _evaluate(node: ast.AST, table: Mapping[str, Any]) -> Any:
+    match node:
+        case ast.Constant(value=str(name)) | ast.Name(id=name):
+            return table[name]
+        case ast.Constant(value=number):
+            return number
+        case ast.UnaryOp(op=operator, operand=inner):
+            value = _evaluate(inner, table)
+            return -value if isinstance(operator, ast.USub) else value
+        case ast.BinOp(left=left, op=operator, right=right):
+            return _OPERATORS[type(operator)](_evaluate(left, table), _evaluate(right, table))
+        case ast.Call(func=ast.Name(id=name), args=arguments):
+            return FUNCTIONS[name][1](*(_evaluate(one, table) for one in arguments))
+    raise AssertionError(ast.dump(node))
+
+
+def parse_columns(given: str | Mapping[str, str]) -> dict[str, Column]:
+    """Signal -> what it is made of.
+
+    Args:
+        given: `signal=formula:unit` separated by commas, or a mapping of signals to `formula:unit`. The voltage is what
+            holds from its row to the next, or `mean(formula)`: the mean in between. `only=formula` leaves out the rows
+            where it is 0.
+
+    Raises:
+        ValueError: unknown signal, unit or function; no unit; no time; nothing but time; a signal twice.
+    """
+    if isinstance(given, str):
+        pairs = [_split(entry, "=") for entry in _split(given, ",") if entry.strip()]
+    else:
+        pairs = [[name, text] for name, text in given.items()]
+    found: dict[str, Column] = {}
+    for pair in pairs:
+        if len(pair) != 2:
+            raise ValueError(f"columns: {'='.join(pair)!r}: must be signal=formula:unit, as in {_EXAMPLE}")
+        name, (formula, *unit) = pair[0].strip(), _split(pair[1], ":")
+        if len(unit) > 1:
+            raise ValueError(f"columns: {pair[1]!r}: has two colons; write formula:unit")
+        if name in found:
+            raise ValueError(f"columns: {name} is given twice, must be given once; leave one out")
+        formula = formula.strip()
+        mean = re.fullmatch(r"mean\((.*)\)", formula) if name == "voltage" else None
+        found[name] = Column(name, mean[1] if mean else formula, unit[0].strip() if unit else None, mean is not None)
+    if "time" not in found:
+        raise ValueError(f"columns: there is no time; write for instance {_EXAMPLE}")
+    if not found.keys() - {"time", "only"}:
+        raise ValueError(f"columns: nothing but time is given; add signals ({', '.join(SIGNALS)}), as in {_EXAMPLE}")
+    return found
+
+
+def _split(text: str, separator: str) -> list[str]:
+    """Split, but not within quotes or brackets."""
+    pieces, depth, quote = [""], 0, ""
+    for letter in text:
+        if quote:
+            quote = "" if letter == quote else quote
+        elif letter in "'\"":
+            quote = letter
+        elif letter in "()":
+            depth += 1 if letter == "(" else -1
+        if letter == separator and depth == 0 and not quote:
+            pieces.append("")
+        else:
+            pieces[-1] += letter
+    return pieces

@@ -1,0 +1,228 @@
+"""Signals of a log that contradict each other: lags, signs, units, and what they do not show at all."""
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from codrl_mj.identify.balances import Balance, Windows, torque_balance, voltage_balance
+from codrl_mj.identify.lags import current_lag, motion_lag, velocity_lag
+from codrl_mj.identify.log import Finding, Log, find_resolution
+
+FACTORS = {
+    "degrees and radians are confused": 180.0 / math.pi,
+    "rpm and rad/s are confused": 30.0 / math.pi,
+    "turns and radians are confused": 2.0 * math.pi,
+    "thousandths are confused with units, as mA with A or ms with s": 1000.0,
+    "hundredths are confused with units, as N*cm with N*m or percent with shares": 100.0,
+    "kgf*cm and N*m are confused": 10.197,
+    "degrees and turns, or rpm and deg/s, are confused": 360.0,
+    "rpm and turn/s are confused": 60.0,
+}
+"""What a factor between two numbers that should be equal tells."""
+_CERTAIN = 10.0  # coefficient over its standard error
+
+
+def name_of_factor(ratio: float) -> str:
+    """What confusion a ratio, or its inverse, looks like; else that it may be a gear."""
+    size = abs(math.log(abs(ratio)))
+    for name, factor in FACTORS.items():
+        if abs(size - math.log(factor)) < 0.04:
+            return name
+    return "a wrong scale, or two sides of a gear"
+
+
+def contradictions(log: Log, motor: Any = None) -> list[Finding]:
+    """What contradicts what.
+
+    Args:
+        log: the log.
+        motor: what its datasheet says, a `GearMotor`; None: nothing is known.
+    """
+    found: list[Finding] = [*_degrees(log)]
+    moves = _moves(log)
+    if log.has("position", "velocity") and moves:
+        found += _velocity(log)
+    electrical = voltage_balance(log) if log.has("voltage", "current") else None
+    if log.has("voltage", "current"):
+        found += [*_electrical(electrical), *_delay(log), *_sag(log, electrical)]
+    if not moves and (log.has("position") or log.has("velocity")):
+        text = "the shaft stands still, as if it were locked"
+        found.append(Finding("info", "excitation", None, text, "leave position and velocity out if it is"))
+    effort = next((name for name in ("torque", "current", "voltage") if log.has(name)), None)
+    if moves and effort is not None:
+        found += [*_mechanical(log, effort), *_motion(log)]
+    if electrical is not None:
+        found += [*_two_constants(log, electrical), *_datasheet(electrical, motor)]
+    return found
+
+
+def _moves(log: Log) -> bool:
+    """Whether the shaft moves by more than noise and quantisation."""
+    if log.has("position"):
+        return float(np.ptp(log.signals["position"])) > max(10.0 * log.resolution.get("position", 0.0), 1e-4)
+    windows = Windows(log, 0.05, 1000)
+    if not log.has("velocity") or not len(windows):
+        return False
+    return float(np.std(windows.mean("velocity"))) > 0.3 * float(np.std(log.signals["velocity"]))
+
+
+def _degrees(log: Log) -> Iterator[Finding]:
+    """An encoder that divides 360 and not 2 pi."""
+    step = log.resolution.get("position", 0.0) or find_resolution(log.signals.get("position", np.zeros(2)))
+    if step > 0.0 and 8.0 < (turns := 360.0 / step) < 1e5:
+        of_radians = 2.0 * math.pi / step
+        if abs(turns - round(turns)) < 1e-6 * turns and abs(of_radians - round(of_radians)) > 1e-3:
+            text = f"the position's steps of {step:.4g} are 1/{round(turns)} of 360, not of 2 pi: is it in degrees?"
+            yield Finding("warning", "unit", None, text, "write position=column:deg")
+
+
+def _velocity(log: Log) -> Iterator[Finding]:
+    """The velocity against the differentiated position."""
+    found = velocity_lag(log)
+    if found is None:
+        return
+    if found.unexplained > 0.5:
+        text = f"velocity and differentiated position have nothing in common ({found.unexplained:.0%} is left over)"
+        yield Finding("error", "velocity", None, text, "check both columns; leave the velocity out")
+        return
+    if found.gain < 0.0:
+        text = "the velocity falls where the position grows"
+        yield Finding("error", "sign", None, text, "give one of them a minus: velocity=-column:unit")
+    if abs(math.log(abs(found.gain))) > 0.1:
+        text = f"the velocity is {abs(found.gain):.4g} times what the position says: {name_of_factor(found.gain)}"
+        yield Finding("error", "unit", None, text, "correct the unit of velocity, position or time")
+    rows = abs(found.lag) / log.step
+    if (rows > 0.75 and found.improvement < 0.7) or (rows > 2.0 and found.improvement < 0.85):
+        late = "after" if found.lag > 0.0 else "before"
+        text = f"the velocity comes {1e3 * abs(found.lag):.3g} ms {late} the differentiated position ({rows:.2g} rows)"
+        remedy = "leave the velocity out, so that the position alone is fitted, or fit its delay"
+        yield Finding("warning", "lag", None, text, remedy)
+
+
+def _electrical(balance: Balance | None) -> Iterator[Finding]:
+    """Signs and certainty of R, L and kE."""
+    if balance is None:
+        text = "voltage or current do not change, or there are too few rows in a row"
+        yield Finding("error", "excitation", None, text, "log while the voltage changes; see codrl-mj identify plan")
+        return
+    values, certain = balance.values, balance.certainty
+    if certain["resistance"] < -_CERTAIN:
+        text = f"the resistance would be {values['resistance']:.3g} ohm: the current flows against the voltage"
+        yield Finding("error", "sign", None, text, "give one of them a minus: current=-column:A")
+    elif certain.get("back_emf_constant", 0.0) < -_CERTAIN:
+        text = f"the back-EMF constant would be {values['back_emf_constant']:.3g} V*s/rad: the motor turns against it"
+        remedy = "give position and velocity a minus, or voltage and current"
+        yield Finding("error", "sign", None, text, remedy)
+    for name, what in (("inductance", "quickly: a PRBS"), ("back_emf_constant", "speed: a slow sine")):
+        if name in values and abs(certain[name]) < _CERTAIN:
+            text = f"the {name.replace('_', ' ')} hardly shows: it is {abs(certain[name]):.2g} standard errors"
+            yield Finding("info", "excitation", None, text, f"add a log that changes {what}, or give it by --known")
+    if balance.unexplained > 0.3:
+        text = f"R*i + L*di/dt + kE*speed leaves {balance.unexplained:.0%} of the voltage unexplained"
+        remedy = "check that the voltage is that of the terminals, and that rows are as frequent as it changes"
+        yield Finding("warning", "voltage", None, text, remedy)
+
+
+def _delay(log: Log) -> Iterator[Finding]:
+    """The current against the voltage."""
+    found = current_lag(log)
+    if found is None or found.unexplained > 0.3:
+        return
+    rows = found.lag / log.step
+    if abs(rows) >= 0.7 and found.improvement < 0.55:
+        late = "after" if rows > 0.0 else "before"
+        text = f"the current comes {abs(rows):.2g} rows ({1e6 * abs(found.lag):.3g} us) {late} the voltage"
+        yield Finding("warning", "lag", None, text, "fit with a scan over delays, or shift a column of the log")
+    elif -0.8 < rows < -0.2 and found.improvement < 0.8:
+        declared = "declared as the mean to the next row" if log.mean_voltage else "held to the next row"
+        text = f"the voltage fits better about half a row earlier than {declared}: it seems to be read at the row"
+        remedy = "log the mean of the voltage, or rows as frequent as it changes"
+        if log.mean_voltage:
+            remedy = "write voltage=column:V without mean(); or log the mean"
+        yield Finding("warning" if log.mean_voltage else "info", "voltage", None, text, remedy)
+
+
+def _sag(log: Log, balance: Balance | None) -> Iterator[Finding]:
+    """A supply that gives way, where the share of its voltage changes; at one share it looks as the winding does."""
+    share = np.abs(log.signals["voltage"])
+    with_sag = voltage_balance(log, sag=True) if float(np.std(share)) > 0.1 * float(share.max()) else None
+    if balance is None or with_sag is None or with_sag.residual > 0.96 * balance.residual:
+        return
+    supply = with_sag.values["supply_resistance"]
+    if with_sag.certainty["supply_resistance"] > _CERTAIN and supply > 0.03 * with_sag.values["resistance"] > 0.0:
+        text = (
+            f"the voltage sags as behind {supply:.2g} ohm, beside a winding of {with_sag.values['resistance']:.2g} ohm"
+        )
+        remedy = "log the voltage of the supply, and write voltage=duty*bus:V"
+        yield Finding("warning", "sag", None, text, remedy)
+
+
+def _mechanical(log: Log, effort: str) -> Iterator[Finding]:
+    """Signs of inertia and gravity; whether the motion follows from the torque."""
+    quick = torque_balance(log, effort, 0.03)  # where it shakes, shorter windows show more of the inertia
+    balance = torque_balance(log, effort) or quick
+    if balance is None:
+        return
+    values, certain = balance.values, balance.certainty
+    both = [one.certainty.get("inertia", 0.0) for one in (balance, quick) if one is not None]
+    heavy, hangs = max(both, key=abs), certain.get("gravity", 0.0)
+    if heavy < -_CERTAIN or (hangs < -_CERTAIN and heavy < -3.0):
+        text = f"the {effort} accelerates the wrong way: the inertia would be negative, by {-heavy:.0f} standard errors"
+        remedy = f"give the {effort}, or position and velocity, a minus"
+        yield Finding("error", "sign", None, text, remedy)
+    elif hangs < -_CERTAIN and abs(values["gravity"]) > 2.0 * balance.residual:
+        text = f"gravity pushes away from position 0 (m*g*l would be {values['gravity']:.3g}): 0 is at the top"
+        remedy = "write position=column-3.14159:rad, so that it hangs at 0; or the sign of the position is wrong"
+        yield Finding("warning", "sign", None, text, remedy)
+    large = 0.08 * float(np.std(log.signals[effort]))  # else it is what fast changes leave of rounding
+    if effort == "torque" and balance.unexplained > 0.25 and balance.residual > large:
+        text = f"the motion leaves {balance.unexplained:.0%} of the torque unexplained (mean over 0.3 s)"
+        lag = motion_lag(log)
+        if lag is not None and abs(lag.lag) > log.step and lag.improvement < 0.9:
+            text += f"; {lag.unexplained:.0%} if the motion came {1e3 * lag.lag:.3g} ms later"
+        remedy = "something else moves it, or the columns are not of one time: trust this log less than others"
+        yield Finding("warning", "torque", None, text, remedy)
+
+
+def _motion(log: Log) -> Iterator[Finding]:
+    """Whether it moves back and forth."""
+    speed = log.signals["velocity"] if log.has("velocity") else np.diff(log.signals["position"])
+    if min(float(speed.max()), float(-speed.min())) < 0.05 * float(np.abs(speed).max()):
+        text = "the shaft turns one way only: friction cannot be told from a constant load"
+        yield Finding("info", "excitation", None, text, "add a log that reverses")
+
+
+def _two_constants(log: Log, electrical: Balance) -> Iterator[Finding]:
+    """The torque constant against the back-EMF constant, which in SI are equal but for losses and star or delta."""
+    back_emf = electrical.values.get("back_emf_constant", 0.0)
+    if not log.has("torque", "current") or electrical.certainty.get("back_emf_constant", 0.0) < _CERTAIN:
+        return
+    current, torque = log.signals["current"], log.signals["torque"]
+    constant = float(current @ torque / max(current @ current, 1e-300))
+    if constant <= 0.0:
+        text = "torque and current are of opposite signs"
+        yield Finding("error", "sign", None, text, "give one of them a minus: torque=-column:N*m")
+    elif abs(math.log(constant / back_emf)) > math.log(2.0):
+        text = (
+            f"torque/current is {constant:.3g} N*m/A and the back-EMF constant {back_emf:.3g} V*s/rad, must be about "
+            f"equal: {name_of_factor(constant / back_emf)}"
+        )
+        yield Finding("error", "unit", None, text, "correct the unit of torque, current, voltage or motion")
+
+
+def _datasheet(balance: Balance, motor: Any) -> Iterator[Finding]:
+    """Resistance and back-EMF constant against what is printed."""
+    if motor is None:
+        return
+    printed: Mapping[str, float] = {
+        "resistance": motor.resistance,
+        "back_emf_constant": motor.back_emf_constant * motor.gear_ratio,
+    }
+    for name, value in printed.items():
+        found = balance.values.get(name, 0.0)
+        if balance.certainty.get(name, 0.0) > _CERTAIN and value > 0.0 and abs(math.log(found / value)) > math.log(2.0):
+            text = f"the {name.replace('_', ' ')} would be {found:.3g}, the datasheet says {value:.3g}: "
+            remedy = "correct the units of voltage, current and motion, or name the right motor"
+            yield Finding("error", "unit", None, text + name_of_factor(found / value), remedy)

@@ -1,0 +1,279 @@
+"""Output error: parameters of all segments at once, the initial states of each eliminated, a robust loss.
+
+The states are solved for within each evaluation, and their share of the Jacobian is projected out (Kaufman 1975, *A
+variable projection method for solving separable nonlinear least squares problems*), so that the outer problem has a
+handful of unknowns however many segments there are.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
+from typing import Protocol
+
+import numpy as np
+
+from codrl_mj.identify.segments import Segment
+
+DIFFERENCE = 1e-4
+"""Step of finite differences, in the parameters' scales: dry friction makes smaller ones rough."""
+TOLERANCE = 1e-6
+FAR = 1e30
+SCREENING = 12
+"""Evaluations from each start; the two that get farthest go on."""
+
+
+Simulate = Callable[[Segment, np.ndarray], np.ndarray]
+
+
+class Model(Protocol):
+    """What is fitted."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Free parameters."""
+
+    @property
+    def lower(self) -> np.ndarray:
+        """Their least values, shape (p,)."""
+
+    @property
+    def upper(self) -> np.ndarray:
+        """Their largest values, shape (p,)."""
+
+    @property
+    def scales(self) -> np.ndarray:
+        """What a change of each is measured by, > 0, shape (p,)."""
+
+    @property
+    def steps(self) -> np.ndarray:
+        """Steps of finite differences of the state, shape (s,)."""
+
+    def at(self, values: np.ndarray) -> Simulate:
+        """(segment, state at its beginning) -> what the sensor would have seen, shape (m,), for parameters (p,)."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Fit:
+    """Parameters that fit, and what is needed to judge them."""
+
+    names: tuple[str, ...]
+    values: np.ndarray
+    """Shape (p,)."""
+    cost: float
+    """Robust cost, in squares of the sensors' standard deviations."""
+    scale: float
+    """Residuals beyond this, in standard deviations of the sensor, count less."""
+    residuals: tuple[np.ndarray, ...]
+    """Of each segment, in standard deviations of the sensor, shape (m,)."""
+    jacobians: tuple[np.ndarray, ...]
+    """Of each segment, what its states cannot do taken out, shape (m, p)."""
+    states: tuple[np.ndarray, ...]
+    """At the beginning of each segment."""
+
+    def weights(self, segment: int) -> np.ndarray:
+        """What each of a segment's residuals counts: 1 where it is small, shape (m,)."""
+        return 1.0 / np.sqrt(1.0 + (self.residuals[segment] / self.scale) ** 2)
+
+
+def robust_cost(residuals: np.ndarray, scale: float) -> float:
+    """Soft-L1 loss, the sum of squares where residuals are small."""
+    return float(2.0 * scale * scale * np.sum(np.sqrt(1.0 + (residuals / scale) ** 2) - 1.0))
+
+
+def _residuals(simulate: Simulate, segment: Segment, state: np.ndarray) -> np.ndarray:
+    found = (simulate(segment, state) - segment.measured) / segment.deviation
+    return found if found @ found < FAR else np.clip(np.nan_to_num(found, nan=1e9), -1e9, 1e9)
+
+
+def _settle(
+    simulate: Simulate, segment: Segment, state: np.ndarray, steps: np.ndarray, scale: float, most: int = 4
+) -> tuple[np.ndarray, np.ndarray]:
+    """The state from which a segment fits best, and its residuals."""
+    residuals = _residuals(simulate, segment, state)
+    cost = robust_cost(residuals, scale)
+    for _ in range(most):
+        root = (1.0 + (residuals / scale) ** 2) ** -0.25
+        columns = _state_columns(simulate, segment, state, steps, residuals)
+        step = np.linalg.lstsq(root[:, None] * columns, -root * residuals, rcond=1e-9)[0]
+        for share in (1.0, 0.25):
+            tried = _residuals(simulate, segment, state + share * step)
+            lower = robust_cost(tried, scale)
+            if lower < cost:
+                break
+        else:
+            break
+        state, residuals, gained, cost = state + share * step, tried, cost - lower, lower
+        if gained < 1e-6 * cost:
+            break
+    return state, residuals
+
+
+def _state_columns(
+    simulate: Simulate, segment: Segment, state: np.ndarray, steps: np.ndarray, residuals: np.ndarray
+) -> np.ndarray:
+    columns = np.empty((len(residuals), len(steps)))
+    for place, step in enumerate(steps):
+        moved = state.copy()
+        moved[place] += step
+        columns[:, place] = (_residuals(simulate, segment, moved) - residuals) / step
+    return columns
+
+
+def settled_state(model: Model, values: np.ndarray, segment: Segment) -> np.ndarray:
+    """The state from which a segment fits best, by the parameters (p,)."""
+    simulate = model.at(values)
+    scale = robust_scale(_residuals(simulate, segment, segment.state))
+    return _settle(simulate, segment, segment.state, model.steps, scale)[0]
+
+
+def settled(model: Model, values: np.ndarray, segments: Sequence[Segment]) -> list[np.ndarray]:
+    """What the model makes of each segment, shape (m,), from the state from which it fits best."""
+    simulate = model.at(values)
+    return [simulate(segment, settled_state(model, values, segment)) for segment in segments]
+
+
+class _Problem:
+    """The outer problem, as scipy takes it; remembers the states of the point that it last took a Jacobian at."""
+
+    def __init__(self, model: Model, segments: Sequence[Segment], scale: float) -> None:
+        self.model, self.segments, self.scale = model, segments, scale
+        self.known = [segment.state for segment in segments]
+        self.at: tuple[bytes, list[np.ndarray], list[np.ndarray]] | None = None
+
+    def solve(self, values: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        if self.at is None or self.at[0] != values.tobytes():
+            simulate, steps = self.model.at(values), self.model.steps
+            pairs = [
+                _settle(simulate, segment, state, steps, self.scale)
+                for segment, state in zip(self.segments, self.known, strict=True)
+            ]
+            self.at = values.tobytes(), [state for state, _ in pairs], [residuals for _, residuals in pairs]
+        return self.at[1], self.at[2]
+
+    def reconsider(self, values: np.ndarray) -> None:
+        """Begin each segment from where it fits best: what is known, or its own guess."""
+        simulate, steps = self.model.at(values), self.model.steps
+        for place, segment in enumerate(self.segments):
+            pairs = [
+                _settle(simulate, segment, state, steps, self.scale) for state in (self.known[place], segment.state)
+            ]
+            self.known[place] = min(pairs, key=lambda pair: robust_cost(pair[1], self.scale))[0]
+        self.at = None
+
+    def residuals(self, values: np.ndarray) -> np.ndarray:
+        return np.concatenate(self.solve(values)[1])
+
+    def jacobians(self, values: np.ndarray) -> list[np.ndarray]:
+        states, residuals = self.solve(values)
+        self.known = states
+        model, made = self.model, []
+        inward = np.where(values + DIFFERENCE * model.scales > model.upper, -1.0, 1.0)
+        moves = np.diag(inward * DIFFERENCE * model.scales)
+        here, moved = model.at(values), [model.at(values + move) for move in moves]
+        for segment, state, found in zip(self.segments, states, residuals, strict=True):
+            columns = np.empty((len(found), len(values)))
+            for place, (simulate, move) in enumerate(zip(moved, moves, strict=True)):
+                columns[:, place] = (_residuals(simulate, segment, state) - found) / move.sum()
+            own = _state_columns(here, segment, state, model.steps, found)
+            root = ((1.0 + (found / self.scale) ** 2) ** -0.25)[:, None]
+            shares = np.linalg.lstsq(root * own, root * columns, rcond=1e-9)[0]
+            made.append(columns - own @ shares)
+        return made
+
+    def jacobian(self, values: np.ndarray) -> np.ndarray:
+        return np.concatenate(self.jacobians(values))
+
+
+def _minimise(problem: _Problem, start: np.ndarray, most: int) -> np.ndarray:
+    from scipy.optimize import least_squares
+
+    model = problem.model
+    if not model.names:
+        return start
+    inside = np.clip(start, model.lower + 1e-9 * model.scales, model.upper - 1e-9 * model.scales)
+    found = least_squares(
+        problem.residuals,
+        inside,
+        problem.jacobian,
+        bounds=(model.lower, model.upper),
+        x_scale=model.scales,
+        loss="soft_l1",
+        f_scale=problem.scale,
+        max_nfev=most,
+        xtol=TOLERANCE,
+        ftol=TOLERANCE,
+        gtol=1e-10,
+    )
+    return np.asarray(found.x)
+
+
+def robust_scale(residuals: np.ndarray) -> float:
+    """One and a half standard deviations of what is no outlier, and at least those of the sensor."""
+    return 1.5 * max(1.4826 * float(np.median(np.abs(residuals))), 1.0)
+
+
+def estimate(
+    model: Model,
+    segments: Sequence[Segment],
+    starts: Iterable[np.ndarray],
+    on_start: Callable[[], None] = lambda: None,
+    most: int = 40,
+) -> tuple[Fit, tuple[Fit, ...]]:
+    """Fit a model to segments.
+
+    Args:
+        model: the model.
+        segments: at least one.
+        starts: of the parameters, each (p,).
+        on_start: called after each start.
+        most: evaluations for each start.
+
+    Returns:
+        The best fit, and what each start led to.
+    """
+    found = []
+    for start in starts:
+        found.append(_refined(model, segments, start, [segment.state for segment in segments], min(SCREENING, most)))
+        on_start()
+    scale = min(one.scale for one in found)
+    found.sort(key=lambda one: robust_cost(np.concatenate(one.residuals), scale))
+    polished = [_refined(model, segments, one.values, one.states, most, one.scale) for one in found[:2]]
+    best = min(polished, key=lambda one: robust_cost(np.concatenate(one.residuals), scale))
+    return best, tuple(found)
+
+
+def _refined(
+    model: Model,
+    segments: Sequence[Segment],
+    start: np.ndarray,
+    states: Sequence[np.ndarray],
+    most: int,
+    scale: float | None = None,
+) -> Fit:
+    """A fit from a start; the states begin from what is known of them, or from the segments' own where that is better.
+
+    Dry friction gives a segment several minima: the one that it was in under other parameters need not be the best.
+    """
+    values = np.clip(start, model.lower, model.upper)
+    problem = _Problem(model, segments, scale or 1.0)
+    problem.known = list(states)
+    if scale is None:
+        simulate = model.at(values)
+        raw = [_residuals(simulate, one, state) for one, state in zip(segments, states, strict=True)]
+        problem.scale = robust_scale(np.concatenate(raw))
+    else:
+        problem.reconsider(values)
+    values = _minimise(problem, values, most)
+    return _fit_at(model, segments, values, problem.known, robust_scale(problem.residuals(values)))
+
+
+def _fit_at(
+    model: Model, segments: Sequence[Segment], values: np.ndarray, states: Sequence[np.ndarray], scale: float
+) -> Fit:
+    problem = _Problem(model, segments, scale)
+    problem.known = list(states)
+    problem.reconsider(values)
+    jacobians = problem.jacobians(values)
+    settled, residuals = problem.solve(values)
+    cost = robust_cost(np.concatenate(residuals), scale)
+    return Fit(model.names, values, cost, scale, tuple(residuals), tuple(jacobians), tuple(settled))

@@ -1,0 +1,115 @@
+"""How far a fit may be trusted: resampling, other data of the same kind, and directions that no data tell.
+
+Intervals from the curvature at the optimum are a lie where the model is not exact, and it never is. So whole stretches
+of the logs are resampled, and the interval is widened by what differs between logs, by what is found when the fit is
+simulated and fitted again, and by what is found at half the rate.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from codrl_mj.identify.estimate import Fit
+from codrl_mj.identify.segments import Segment
+
+LEAST_LOGS = 5
+"""From so many logs on whole logs are resampled; below, blocks of them."""
+DRAWS = 500
+FLAT = 1e-7
+"""Directions in which the squared residuals change by less than this share of the most do not count as known."""
+SLACK = 1e-3
+"""Share of the cost that a fit may be better by luck: dry friction has many minima."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Spread:
+    """Half-widths of 95 % intervals by cause, each of shape (p,)."""
+
+    curvature: np.ndarray
+    resampling: np.ndarray
+    logs: np.ndarray
+    self_test: np.ndarray
+    half_rate: np.ndarray
+
+    @property
+    def total(self) -> np.ndarray:
+        """The largest of the first three, and what the rate does, as what is independent adds up; and then the bias."""
+        wide = np.maximum(np.maximum(self.curvature, self.resampling), self.logs)
+        return np.asarray(np.sqrt(wide**2 + self.half_rate**2) + self.self_test)
+
+
+def _sums(fit: Fit, groups: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Gradient (c, p) and Gauss-Newton matrix (c, p, p) of each group of segments."""
+    count, size = len(set(groups)), len(fit.values)
+    gradients, matrices = np.zeros((count, size)), np.zeros((count, size, size))
+    place = {group: index for index, group in enumerate(dict.fromkeys(groups))}
+    for index, group in enumerate(groups):
+        weighted = fit.jacobians[index] * fit.weights(index)[:, None]
+        gradients[place[group]] += weighted.T @ fit.residuals[index]
+        matrices[place[group]] += weighted.T @ fit.jacobians[index]
+    return gradients, matrices
+
+
+def _inverse(matrix: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    scaled = matrix * np.outer(scales, scales)
+    return np.asarray(np.linalg.pinv(scaled, rcond=FLAT, hermitian=True) * np.outer(scales, scales))
+
+
+def resampling(fit: Fit, segments: Sequence[Segment], scales: np.ndarray, seed: int) -> np.ndarray:
+    """Half-widths, shape (p,), by refits of stretches drawn with replacement, each a Gauss-Newton step from the fit.
+
+    Few stretches tell little of how they differ: percentiles are stretched to Student's.
+    """
+    from scipy.stats import t
+
+    logs = {segment.log for segment in segments}
+    groups = [segment.log if len(logs) >= LEAST_LOGS else segment.block for segment in segments]
+    gradients, matrices = _sums(fit, groups)
+    count = len(gradients)
+    if count < 2:
+        return np.full(len(fit.values), np.inf)
+    drawn = np.random.default_rng(seed).multinomial(count, np.full(count, 1.0 / count), DRAWS)
+    moved = [-_inverse(np.tensordot(times, matrices, 1), scales) @ (times @ gradients) for times in drawn]
+    low, high = np.percentile(moved, [2.5, 97.5], axis=0)
+    few = t.ppf(0.975, count - 1) / t.ppf(0.975, 1e6) * np.sqrt(count / (count - 1.0))
+    return np.asarray(np.maximum(-low, high) * few)
+
+
+def curvature(fit: Fit, segments: Sequence[Segment], scales: np.ndarray) -> np.ndarray:
+    """Half-widths, shape (p,), were the model exact and each residual by itself: never less, however few the blocks."""
+    _, matrices = _sums(fit, [segment.block for segment in segments])
+    noise = float(np.mean(np.concatenate([fit.weights(i) * r**2 for i, r in enumerate(fit.residuals)])))
+    return np.asarray(1.96 * np.sqrt(noise * np.diag(_inverse(matrices.sum(axis=0), scales))))
+
+
+def between_logs(fit: Fit, segments: Sequence[Segment], scales: np.ndarray) -> np.ndarray:
+    """Half-widths, shape (p,), by how the logs pull: two standard deviations of their mean; 0 for a single log."""
+    gradients, matrices = _sums(fit, [segment.log for segment in segments])
+    count = len(gradients)
+    if count < 2:
+        return np.zeros(len(fit.values))
+    pulls = count * gradients @ _inverse(matrices.sum(axis=0), scales)
+    return np.asarray(2.0 * pulls.std(axis=0, ddof=1) / np.sqrt(count))
+
+
+def weakest_direction(fit: Fit, segments: Sequence[Segment], scales: np.ndarray) -> np.ndarray:
+    """The direction in which the parameters change the residuals least, in their scales: a unit vector, shape (p,)."""
+    _, matrices = _sums(fit, [segment.block for segment in segments])
+    return np.asarray(np.linalg.eigh(matrices.sum(axis=0) * np.outer(scales, scales))[1][:, 0])
+
+
+def noticed(fit: Fit, segments: Sequence[Segment]) -> float:
+    """By how much the robust cost must rise to be more than chance, at 95 %.
+
+    Residuals of a block belong together: the ratio of both estimates of the covariance along the direction that is
+    known best, by blocks and by rows, makes up for that.
+    """
+    gradients, matrices = _sums(fit, [segment.block for segment in segments])
+    whole = matrices.sum(axis=0)
+    root = np.sqrt(np.maximum(np.diag(whole), 1e-300))
+    strengths, vectors = np.linalg.eigh(whole / root / root[:, None])
+    pulls = gradients / root @ vectors[:, -1]
+    noise = float(np.mean(np.concatenate([fit.weights(i) * r**2 for i, r in enumerate(fit.residuals)])))
+    together = max(float(pulls @ pulls) / max(strengths[-1] * noise, 1e-30), 1.0)
+    return 3.84 * noise * together + SLACK * fit.cost

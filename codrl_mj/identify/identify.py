@@ -1,0 +1,355 @@
+"""From logs to a motor: which parts can be fitted, what is found, and how far it may be trusted."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from codrl_mj.fields import check_names
+from codrl_mj.identify import honesty
+from codrl_mj.identify.friction import chosen_friction
+from codrl_mj.identify.log import Log
+from codrl_mj.identify.parameters import DEFAULTS, FRICTION, OF_RIG, PARAMETERS
+from codrl_mj.identify.prediction import Prediction, predict
+from codrl_mj.identify.result import Estimate, Identified, Status
+from codrl_mj.identify.segments import BLOCK, SEGMENT
+from codrl_mj.identify.stages import Fitted, Shaft, Winding, fitted, moves
+
+WIDEST = 0.3
+"""An interval of more than this share of the value to either side is too wide; of the whole friction, for friction."""
+WIDEST_OF = {"resistance": 0.05, "back_emf_constant": 0.05, "inductance": 0.15}
+"""For what a current sensor tells."""
+NARROWEST = 0.002
+"""No interval is narrower than this share of the value to either side: nobody's sensors are better calibrated."""
+NARROWEST_OF = {"inductance": 0.02}
+"""What comes of a fifth of a row's time: neither stamps nor a held back-EMF are better."""
+BIASED = 0.5
+"""The self-test fails where it is off by more than this share of the widest interval."""
+STEPS_OF_A_STAGE = 8 + 4
+UNEXPLAINED = 8.0
+"""Residuals of more standard deviations of the sensor in the mean are no noise,"""
+UNLIKE = 0.02
+"""and more than this share of what moves within a segment is not explained: the log is bad, or the model is."""
+
+
+def identify(
+    logs: Sequence[Log],
+    rig: str | None = None,
+    known: Mapping[str, float] | None = None,
+    friction: str = "coulomb",
+    held_out: Sequence[Log] = (),
+    estimated: Sequence[str] = (),
+    segment: float = SEGMENT,
+    base: Mapping[str, Any] | None = None,
+    on_progress: Callable[[str, int, int], None] = lambda *_: None,
+    seed: int = 0,
+) -> Identified:
+    """Identify a motor.
+
+    Args:
+        logs: to fit, at least one. Voltage and current tell the winding; torque or current, or else voltage, and
+            position or velocity tell the shaft.
+        rig: what the output moves: `pendulum`, `free` or `load`; None: a pendulum where `mgl` is known.
+        known: parameters that are not to be fitted, by names of `PARAMETERS`.
+        friction: `coulomb` (viscous and Coulomb), `stribeck`, `load`, `both`, or `auto`: whichever foretells logs that
+            it was not fitted to, by more than those differ.
+        held_out: logs that are only foretold.
+        estimated: parameters to fit that are otherwise taken as known, such as `torque_gain`.
+        segment: time [s] that the shaft is simulated for at once, >= 0.05: short where it tips over by itself, a second
+            or two where it only sticks and slides.
+        base: the mapping of a drive that gives what the logs do not tell.
+        on_progress: called with what is being done, steps done and steps in all.
+        seed: of the resampling.
+
+    Raises:
+        ValueError: unknown names, values out of bounds, or logs that tell nothing; the message says what is missing.
+    """
+    given = _checked(logs, rig, known or {}, friction, estimated)
+    if not segment >= 0.05:
+        raise ValueError(f"segment = {segment!r}: must be >= 0.05 s; {SEGMENT:g} is the default")
+    rig = rig or ("pendulum" if "mgl" in given else "free")
+    stages = 2 - (not _electrical(logs)) - (not any(moves(log) for log in logs))
+    folds = 4 * sum(moves(log) for log in logs) if friction == "auto" else 0
+    done, total = 0, STEPS_OF_A_STAGE * max(stages, 1) + folds
+
+    def step(what: str) -> Callable[[], None]:
+        def one() -> None:
+            nonlocal done
+            done += 1
+            on_progress(what, min(done, total), total)
+
+        return one
+
+    winding = fitted(Winding(given), _electrical(logs), step("winding")) if _electrical(logs) else None
+    shaft, driven_by = None, _driven_by(logs)
+    if driven_by is not None:
+        moving = [log for log in logs if moves(log)]
+        stage = Shaft(
+            rig, "coulomb", driven_by, {**given, **_constant(given, winding, driven_by)}, tuple(estimated), segment
+        )
+        stage = chosen_friction(stage, moving, friction, step("friction"))
+        shaft = fitted(stage, moving, step("shaft"))
+    estimates, warnings = [], []
+    if winding is not None:
+        if shaft is not None and driven_by == "current":
+            winding = winding.refitted(Winding(given, shaft))
+        estimates += _judged(winding, seed, step("winding"))
+        warnings += _warnings(winding)
+    if shaft is not None:
+        constant = _constant(given, winding, shaft.stage.driven_by)
+        shaft = shaft.refitted(dataclasses.replace(shaft.stage, known={**shaft.stage.known, **constant}))
+        found = _judged(shaft, seed, step("shaft"))
+        own = next((one for one in estimates if one.name == "back_emf_constant"), None) if constant else None
+        estimates += _with_constant(found, own, shaft.stage)
+        warnings += _warnings(shaft)
+    estimates = _completed(estimates, given)
+    return Identified(
+        tuple(log.name for log in logs),
+        rig,
+        friction if shaft is None else shaft.stage.friction,
+        driven_by,
+        {name: part.delay for name, part in (("winding", winding), ("shaft", shaft)) if part is not None},
+        tuple(estimates),
+        _predictions(shaft, [log for log in logs if moves(log)]),
+        _predictions(shaft, [log for log in held_out if moves(log)]),
+        tuple(warnings),
+        base,
+    )
+
+
+def _checked(
+    logs: Sequence[Log], rig: str | None, known: Mapping[str, float], friction: str, estimated: Sequence[str]
+) -> dict[str, float]:
+    if not logs:
+        raise ValueError("logs: none was given; give one or more")
+    check_names(known, PARAMETERS, "parameter", "known.")
+    check_names(estimated, PARAMETERS, "parameter", "estimated.")
+    if rig is not None:
+        check_names([rig], OF_RIG, "rig")
+    check_names([friction], ("auto", "coulomb", "stribeck", "load", "both"), "friction")
+    for name, value in known.items():
+        parameter = PARAMETERS[name]
+        if not (math.isfinite(value) and parameter.least <= value <= parameter.most):
+            raise ValueError(
+                f"known {name} = {value!r}: must be from {parameter.least:g} to {parameter.most:g} "
+                f"{parameter.unit}; give {parameter.what}".strip()
+            )
+    if not _electrical(logs) and _driven_by(logs) is None:
+        have = "; ".join(f"{log.name}: {', '.join(log.signals) or 'nothing'}" for log in logs)
+        raise ValueError(
+            f"logs tell nothing ({have}): give voltage and current for the winding, or torque, current or voltage with "
+            "a position or velocity that moves for the shaft"
+        )
+    if rig is None and "mgl" not in known and _driven_by(logs) is not None:
+        raise ValueError(
+            "rig = None: what the output moves decides what is fitted, and must be said: pendulum, free or load"
+        )
+    return dict(known)
+
+
+def _electrical(logs: Sequence[Log]) -> list[Log]:
+    return [log for log in logs if log.has("voltage", "current")]
+
+
+def _driven_by(logs: Sequence[Log]) -> str | None:
+    """What drives the shaft: the nearest to it that all logs that move have."""
+    moving = [log for log in logs if moves(log)]
+    return next(
+        (name for name in ("torque", "current", "voltage") if moving and all(m.has(name) for m in moving)), None
+    )
+
+
+def _constant(given: Mapping[str, float], winding: Fitted | None, driven_by: str) -> dict[str, float]:
+    """The back-EMF constant where it stands for the torque constant, which it is in SI units but for losses."""
+    if driven_by != "current" or "torque_constant" in given:
+        return {}
+    if "back_emf_constant" in given:
+        return {"torque_constant": given["back_emf_constant"]}
+    found = {} if winding is None else winding.model.all_values(winding.fit.values)
+    return {"torque_constant": found["back_emf_constant"]} if found.get("back_emf_constant", 0.0) > 0.0 else {}
+
+
+def _with_constant(found: list[Estimate], constant: Estimate | None, stage: Shaft) -> list[Estimate]:
+    """Estimates of a shaft under a current whose torque constant was itself found: they are no better than that."""
+    if constant is None:
+        return found
+    made = [
+        Estimate("torque_constant", constant.value, constant.low, constant.high, constant.status,
+                 f"taken as the back-EMF constant{': ' + constant.why if constant.why else ''}", constant.causes)
+    ]  # fmt: skip
+    relative = max(constant.high - constant.value, constant.value - constant.low) / max(constant.value, 1e-12)
+    anchored = "mgl" in stage.known or "inertia" in stage.known
+    for one in found:
+        own = one.value * relative if one.name not in ("gear_efficiency", "stribeck_speed") and not anchored else 0.0
+        low, high = one.value - math.hypot(one.value - one.low, own), one.value + math.hypot(one.high - one.value, own)
+        status, why = one.status, one.why
+        if status == "identified" and constant.status not in ("identified", "given"):
+            status, why = "refused", f"the torque constant that it is in proportion to is {constant.status}"
+        ends = max(low, PARAMETERS[one.name].least), min(high, PARAMETERS[one.name].most)
+        made.append(Estimate(one.name, one.value, *ends, status, why, {**one.causes, "torque_constant": own}))
+    return made
+
+
+def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estimate]:
+    """Every free parameter of a stage with its interval and status."""
+    fit, model = part.fit, part.model
+    if not fit.names:
+        return []
+    weights = _weights(part)
+    # what a change is measured by: the value itself or, of friction, what would be all of it
+    scales = np.array([weights.get(name, abs(value)) for name, value in zip(fit.names, fit.values, strict=True)])
+    scales = np.maximum(scales, 1e-6 * model.scales)
+    resampled = honesty.resampling(fit, part.segments, scales, seed)
+    logs = honesty.between_logs(fit, part.segments, scales)
+    on_step()
+    tested = part.self_test()
+    on_step()
+    halved = part.half_rate()
+    on_step()
+    # an error that goes with a row's time is half as large at the rate of the logs, one with its root more than that
+    rate = (2.0 if isinstance(part.stage, Winding) else 1.0) * np.abs(halved - fit.values)
+    curved = honesty.curvature(fit, part.segments, scales)
+    spread = honesty.Spread(curved, resampled, logs, np.abs(tested - fit.values), rate)
+    directions = part.unknown_directions(scales)
+    on_step()
+    made = []
+    for place, name in enumerate(fit.names):
+        value = float(fit.values[place])
+        half = math.hypot(float(spread.total[place]), NARROWEST_OF.get(name, NARROWEST) * value)
+        widest = WIDEST_OF.get(name, WIDEST) if isinstance(part.stage, Winding) else WIDEST
+        least, most = PARAMETERS[name].least, PARAMETERS[name].most
+        causes = {field: float(getattr(spread, field)[place]) for field in vars(spread)}
+        share = half / scales[place]
+        own = [direction for direction in directions if name in direction]
+        nothing = name in FRICTION and least <= value <= least + 1e-6 * model.scales[place]
+        at_bound = min(value - least, most - value) <= 1e-6 * model.scales[place]
+        status: Status = "identified"
+        why = ""
+        if own and (len(own[0]) > 1):
+            status, why = "ratio", _text(own[0])
+        elif own:
+            status, why = "unidentifiable", "the logs are as likely whatever it is"
+        elif at_bound and not (nothing or name == "gear_efficiency"):
+            status, why = "refused", f"it ended at its bound, {value:g} {PARAMETERS[name].unit}".strip()
+        elif math.isinf(causes["resampling"]):
+            status, why = "refused", f"there are no two stretches of {BLOCK:g} s to resample: give a longer log"
+        elif not causes["self_test"] <= BIASED * widest * scales[place]:
+            status = "refused"
+            why = f"the self-test finds {tested[place]:.4g} where the fit that it simulates has {value:.4g}"
+        elif not share <= widest:
+            status = "refused"
+            worst = max(causes, key=lambda cause: causes[cause]).replace("_", " ")
+            whole = "all friction" if name in FRICTION else "it"
+            why = f"its interval is {100.0 * share:.3g} % of {whole} to either side, above all by {worst}"
+        made.append(Estimate(name, value, max(value - half, least), min(value + half, most), status, why, causes))
+    return made
+
+
+def _weights(part: Fitted) -> dict[str, float]:
+    """Of each kind of friction, how much of it would be all friction that there is."""
+    if isinstance(part.stage, Winding):
+        return {}
+    model, number = part.model, part.model.all_values(part.fit.values)
+    moved = model.moved(part.fit.values)
+    speeds = np.concatenate([_speeds(model, one) for one in part.segments])
+    speed = max(float(np.sqrt(np.mean(speeds**2))), 1e-9) * number["gear_ratio"]
+    inputs = np.concatenate([one.inputs for one in part.segments])
+    torque = float(np.sqrt(np.mean(inputs**2))) * moved.gain / number["gear_ratio"]
+    lost = (1.0 - number["gear_efficiency"]) * torque
+    whole = number["coulomb_friction"] + number["viscous_friction"] * speed + lost + 1e-2 * torque
+    return {
+        "coulomb_friction": whole,
+        "viscous_friction": whole / speed,
+        "stribeck_friction": whole,
+        "gear_efficiency": min(whole / torque, 1.0),
+    }
+
+
+def _speeds(model: Any, segment: Any) -> np.ndarray:
+    if model.output == "velocity":
+        return np.asarray(segment.measured)
+    return np.diff(segment.measured[:: max(len(segment.times) // 20, 1)]) / np.diff(
+        segment.times[:: max(len(segment.times) // 20, 1)]
+    )
+
+
+def _text(direction: Mapping[str, float]) -> str:
+    moves = ", ".join(f"{name} by {100.0 * share:+.0f} %" for name, share in direction.items())
+    return f"changed together nothing is seen of it: {moves} (of friction: of all of it)"
+
+
+def _completed(estimates: list[Estimate], given: Mapping[str, float]) -> list[Estimate]:
+    """With what was given, and what follows of both."""
+    named = {one.name: one for one in estimates}
+    for name, value in given.items():
+        named[name] = Estimate(name, value, value, value, "given")
+    if "back_emf_constant" not in named and "torque_constant" in named:
+        one = named["torque_constant"]
+        why = f"taken as the torque constant{': ' + one.why if one.why else ''}"
+        named["back_emf_constant"] = Estimate(
+            "back_emf_constant", one.value, one.low, one.high, one.status, why, one.causes
+        )
+    ratio = given.get("gear_ratio", DEFAULTS["gear_ratio"])
+    if "inertia" in named and "load_inertia" in given and "rotor_inertia" not in given:
+        named["rotor_inertia"] = _rotor_inertia(named["inertia"], given["load_inertia"], ratio)
+    return [named[name] for name in PARAMETERS if name in named]
+
+
+def _rotor_inertia(whole: Estimate, load: float, ratio: float) -> Estimate:
+    value, low, high = ((one - load) / ratio**2 for one in (whole.value, whole.low, whole.high))
+    status, why = whole.status, whole.why
+    if status == "identified" and not high - value <= WIDEST * value:
+        status = "refused"
+        why = (
+            f"of an inertia of {whole.value:.4g} kg*m^2 in all, {load:.4g} is said to be the load's: too little is left"
+        )
+    return Estimate("rotor_inertia", max(value, 0.0), max(low, 0.0), max(high, 0.0), status, why)
+
+
+def _warnings(part: Fitted) -> list[str]:
+    """What is wrong with logs, or with the model of them."""
+    unlike = {}
+    for place, log in enumerate(part.logs):
+        own = [index for index, segment in enumerate(part.segments) if segment.log == place]
+        sizes = np.concatenate([np.abs(part.fit.residuals[index]) for index in own])
+        rest = np.concatenate([part.fit.residuals[i] * part.segments[i].deviation for i in own])
+        swing = np.concatenate([part.segments[i].measured - part.segments[i].measured.mean() for i in own])
+        share = float(np.std(rest) / max(np.std(swing), 1e-12))
+        if sizes.mean() / 0.8 > UNEXPLAINED and share > UNLIKE:
+            unlike[log.name] = (
+                f"{sizes.mean() / 0.8:.1f} standard deviations of the sensor, {100.0 * share:.2g} % of what moves"
+            )
+    found = []
+    if 1 < len(unlike) == len(part.logs):
+        found.append(
+            "the model does not explain any of the logs within what their sensors see: of the first, residuals are "
+            f"{next(iter(unlike.values()))}. Fit more friction, or find out what else moved"
+        )
+    else:
+        found += [
+            f"log {name}: residuals are {text} in the mean: the model does not explain it. Leave it out, find out what "
+            "else moved, or fit more friction"
+            for name, text in unlike.items()
+        ]
+    values = np.array([one.values for one in part.tried])
+    best = min(_cost_of(one) for one in part.tried)
+    near = np.array([_cost_of(one) < 1.1 * best for one in part.tried])
+    apart = np.ptp(values[near], axis=0) / np.maximum(np.abs(part.fit.values), part.model.scales)
+    if np.any(apart > 0.2):
+        names = ", ".join(name for name, one in zip(part.fit.names, apart, strict=True) if one > 0.2)
+        found.append(f"several minima: starts ended within 10 % of the best cost, but apart in {names}")
+    return found
+
+
+def _cost_of(fit: Any) -> float:
+    return float(np.mean(np.abs(np.concatenate(fit.residuals))))
+
+
+def _predictions(shaft: Fitted | None, logs: Sequence[Log]) -> tuple[Prediction, ...]:
+    if shaft is None:
+        return ()
+    return tuple(
+        predict(shaft.model, shaft.fit.values, log, shaft.delay) for log in logs if log.has(shaft.model.driven_by)
+    )

@@ -1,0 +1,126 @@
+"""How late one signal of a log is against another."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from codrl_mj.identify.balances import Windows, regress, torque_terms, voltage_terms
+from codrl_mj.identify.log import Log
+
+_ROWS = 20_000
+"""More are not looked at."""
+_WINDOWS = 400
+"""More tell no more."""
+
+
+class Lag(NamedTuple):
+    """The shift of time by which two signals agree best."""
+
+    lag: float
+    """[s]"""
+    improvement: float
+    """Residual at that shift over the one without."""
+    gain: float = 1.0
+    """Factor between the two."""
+    unexplained: float = 0.0
+    """Residual at that shift over what was to be explained, root mean squares."""
+
+
+def velocity_lag(log: Log, longest: float = 0.1) -> Lag | None:
+    """How late the velocity is against the differentiated position; the gain is the velocity's over the position's.
+
+    Args:
+        log: with position and velocity.
+        longest: lag that is looked for [s]; at least 4 rows are.
+    """
+    log = _beginning(log)
+    windows = Windows(log, max(0.05, 4.0 * log.step), _WINDOWS)
+    if not len(windows):
+        return None
+    rate = windows.mean("position", 1)
+    velocity, time = log.signals["velocity"], log.time
+    if not np.any(rate) or not np.any(velocity):
+        return None
+
+    def compare(lag: float) -> tuple[float, float]:
+        seen = windows.mean(np.interp(time + lag, time, velocity))
+        gain = float(seen @ rate / (rate @ rate))
+        return float(np.sqrt(np.mean((seen - gain * rate) ** 2))), gain
+
+    lag = _least(lambda lag: compare(lag)[0], log.step, longest, longest)
+    (best, gain), (now, _) = compare(lag), compare(0.0)
+    scale = abs(gain) * float(np.sqrt(np.mean(rate**2)))
+    return Lag(lag, best / max(now, 1e-300), gain, best / max(scale, 1e-300))
+
+
+def current_lag(log: Log, longest: float = 20.0) -> Lag | None:
+    """How late the current is against the voltage, by the voltage balance.
+
+    Args:
+        log: with voltage and current.
+        longest: lag that is looked for, in rows.
+    """
+    log = _beginning(log)
+    windows = Windows(log, most=_WINDOWS)
+    if not len(windows) or not np.any(log.signals["voltage"]):
+        return None
+    terms = voltage_terms(log, windows)
+
+    def compare(lag: float) -> tuple[float, float]:
+        balance = regress(windows.mean_held("voltage", lag), terms)
+        # of a nearly sinusoidal current a delay looks like more inductance, and too long a one like less than none
+        if balance is None or (lag > 0.0 and balance.certainty.get("inductance", 0.0) < -3.0):
+            return np.inf, 1.0
+        return balance.residual, balance.unexplained
+
+    return _compared(compare, log.step, 3.0 * log.step, longest * log.step)
+
+
+def motion_lag(log: Log, effort: str = "torque", longest: float = 0.06) -> Lag | None:
+    """How late the motion is against what causes it, by the torque balance.
+
+    Args:
+        log: with the effort and a position or a velocity.
+        effort: `torque`, `current` or `voltage`.
+        longest: lag that is looked for [s].
+    """
+    log = _beginning(log)
+    windows = Windows(log, 0.3, _WINDOWS)
+    terms = torque_terms(log, windows) if len(windows) else None
+    if terms is None:
+        return None
+
+    def compare(lag: float) -> tuple[float, float]:
+        balance = regress(windows.mean_held(effort, lag), terms)
+        return (np.inf, 1.0) if balance is None else (balance.residual, balance.unexplained)
+
+    return _compared(compare, log.step, longest, longest)
+
+
+def _compared(compare: Callable[[float], tuple[float, float]], step: float, ahead: float, behind: float) -> Lag | None:
+    now = compare(0.0)[0]
+    if not np.isfinite(now):
+        return None
+    lag = _least(lambda lag: compare(lag)[0], step, ahead, behind)
+    best, unexplained = compare(lag)
+    return Lag(lag, best / max(now, 1e-300), 1.0, unexplained)
+
+
+def _least(residual: Callable[[float], float], step: float, ahead: float, behind: float) -> float:
+    """The lag of the least residual, to a quarter of a step: by long steps, then by shorter ones beside the best."""
+    shift = step
+    while ahead + behind > 40.0 * shift:
+        shift *= 2.0
+    places = shift * np.arange(-max(round(ahead / shift), 4), max(round(behind / shift), 4) + 1)
+    while True:
+        best = min((residual(place), abs(place), place) for place in places)[2]
+        if shift <= 0.3 * step:
+            return float(best)
+        shift /= 2.0
+        places = best + shift * np.arange(-2, 3)
+
+
+def _beginning(log: Log) -> Log:
+    return dataclasses.replace(log.part(slice(0, _ROWS)), findings=())

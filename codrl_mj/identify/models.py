@@ -1,0 +1,289 @@
+"""A winding and a shaft as models that the estimator fits, with the starts that regression gives."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from codrl_mj.identify import simulation
+from codrl_mj.identify.estimate import Simulate
+from codrl_mj.identify.parameters import DEFAULTS, ELECTRICAL, FRICTION, OF_FRICTION, OF_RIG, PARAMETERS
+from codrl_mj.identify.segments import Segment
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Model:
+    names: tuple[str, ...]
+    """Free parameters."""
+    known: Mapping[str, float]
+    """Values of the others."""
+    scales: np.ndarray
+    """What a change of each is measured by, shape (p,)."""
+
+    @property
+    def lower(self) -> np.ndarray:
+        """Least values, shape (p,)."""
+        return np.array([PARAMETERS[name].least for name in self.names])
+
+    @property
+    def upper(self) -> np.ndarray:
+        """Largest values, shape (p,)."""
+        return np.array([PARAMETERS[name].most for name in self.names])
+
+    def all_values(self, values: np.ndarray) -> dict[str, float]:
+        """Free and known parameters by name."""
+        return {**DEFAULTS, **self.known, **dict(zip(self.names, map(float, values), strict=True))}
+
+
+class WindingModel(_Model):
+    """L di/dt = u - R i - kE n w, exactly over each interval of a held voltage; the speed is its mean there."""
+
+    steps = np.array([1e-3])
+
+    def at(self, values: np.ndarray) -> Simulate:
+        """Of currents [A]."""
+        number, simulate = self.all_values(values), simulation.winding()
+        resistance, inductance = number["resistance"], number["inductance"]
+        constant = number["back_emf_constant"] * number["gear_ratio"]
+
+        def currents(segment: Segment, state: np.ndarray) -> np.ndarray:
+            return simulate(segment.times, segment.inputs, segment.speeds, state[0], resistance, inductance, constant)
+
+        return currents
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ShaftModel(_Model):
+    """Inertia, gravity, load and friction under a torque, a current or a voltage."""
+
+    driven_by: str
+    """`torque`, `current`, or `voltage`: then the winding is taken to be settled, and kE to be kT unless known."""
+    output: str
+    """`position` or `velocity`."""
+
+    steps = np.array([1e-4, 1e-3])
+
+    def moved(self, values: np.ndarray) -> simulation.Moved:
+        """What a simulation takes."""
+        number = self.all_values(values)
+        ratio = number["gear_ratio"]
+        gain, braking = number["torque_gain"], 0.0
+        if self.driven_by != "torque":
+            gain = number["torque_constant"] * ratio
+        if self.driven_by == "voltage":
+            gain /= number["resistance"]
+            braking = gain * ratio * number.get("back_emf_constant", number["torque_constant"])
+        return simulation.Moved(
+            number["inertia"],
+            number["mgl"],
+            number["constant_torque"],
+            number["coulomb_friction"] * ratio,
+            number["viscous_friction"] * ratio**2,
+            number["gear_efficiency"],
+            number["stribeck_friction"] * ratio,
+            number["stribeck_speed"] / ratio,
+            2.0,
+            0.0,
+            gain,
+            braking,
+        )
+
+    def at(self, values: np.ndarray) -> Simulate:
+        """Of positions [rad] or speeds [rad/s]."""
+        moved, simulate, output = self.moved(values), simulation.moving(), int(self.output == "velocity")
+
+        def motion(segment: Segment, state: np.ndarray) -> np.ndarray:
+            return simulate(segment.times, segment.inputs, segment.slopes, state[0], state[1], moved)[output]
+
+        return motion
+
+
+def winding_model(segments: Sequence[Segment], known: Mapping[str, float]) -> tuple[WindingModel, list[np.ndarray]]:
+    """A winding, and starts: regressions of the voltage's integral over windows of several lengths.
+
+    The integral over a window is R times that of the current, L times its change and kE times the turn.
+
+    Args:
+        segments: of `winding_segments`.
+        known: values of parameters that are not to be fitted.
+    """
+    moving = any(np.any(segment.speeds) for segment in segments)
+    free = tuple(name for name in ELECTRICAL if name not in known and (moving or name != "back_emf_constant"))
+    given = {**DEFAULTS, "back_emf_constant": 0.0, **known}
+    starts = []
+    for count in (2, 8, 32):
+        rows = np.concatenate([_winding_rows(one, count, given["gear_ratio"]) for one in segments])
+        starts.append(_regressed(rows[:, :3], rows[:, 3], ELECTRICAL, free, given))
+    magnitudes = np.abs(np.median(starts, axis=0))
+    volts = np.concatenate([one.inputs for one in segments])
+    amperes = np.concatenate([one.measured for one in segments])
+    fallback = {"resistance": np.std(volts) / max(np.std(amperes), 1e-9) + 1e-6, "inductance": 1e-4}
+    floor = np.array([fallback.get(name, 1e-3) for name in free])
+    scales = np.maximum(magnitudes, 0.03 * floor)
+    starts = [np.where(one > 0.02 * scales, one, scales) for one in starts]
+    return WindingModel(free, {name: float(value) for name, value in given.items()}, scales), starts
+
+
+def _winding_rows(segment: Segment, count: int, ratio: float) -> np.ndarray:
+    """Integral and change of the current, turn of the rotor, and integral of the voltage, of windows of some rows."""
+    steps, current = np.diff(segment.times), segment.measured
+    edges = np.arange(0, len(current), min(count, len(current) - 1))
+    parts = 0.5 * (current[1:] + current[:-1]) * steps, segment.speeds[:-1] * ratio * steps, segment.inputs[:-1] * steps
+    charge, turn, flux = (np.diff(np.concatenate([[0.0], np.cumsum(one)])[edges]) for one in parts)
+    return np.stack([charge, np.diff(current[edges]), turn, flux], axis=1)
+
+
+def _regressed(
+    columns: np.ndarray,
+    target: np.ndarray,
+    names: Sequence[str],
+    free: Sequence[str],
+    given: Mapping[str, float],
+) -> np.ndarray:
+    """Least squares for the free ones of the columns' factors, the others being given."""
+    rest = target - sum(columns[:, place] * given[name] for place, name in enumerate(names) if name not in free)
+    matrix = columns[:, [names.index(name) for name in free]]
+    norms = np.maximum(np.linalg.norm(matrix, axis=0), 1e-30)
+    found = np.linalg.lstsq(matrix / norms, rest, rcond=1e-6)[0]
+    return np.asarray(found / norms)
+
+
+def shaft_model(
+    segments: Sequence[Segment],
+    rig: str,
+    friction: str,
+    driven_by: str,
+    output: str,
+    known: Mapping[str, float],
+    estimated: Sequence[str] = (),
+) -> tuple[ShaftModel, list[np.ndarray]]:
+    """A shaft, and starts: a regression of the input's integral, and changes of it.
+
+    Args:
+        segments: of `shaft_segments`.
+        rig: what is moved.
+        friction: which friction there is.
+        driven_by: the input.
+        output: `position` or `velocity`.
+        known: values of parameters that are not to be fitted.
+        estimated: parameters to fit that are otherwise taken as known.
+    """
+    wanted = [*OF_RIG[rig], *OF_FRICTION[friction], *estimated]
+    if driven_by != "torque":
+        wanted.insert(0, "torque_constant")
+    if driven_by == "voltage":
+        wanted.insert(0, "resistance")
+    free = tuple(name for name in dict.fromkeys(wanted) if name not in known)
+    given = {**DEFAULTS, **known}
+    firsts = []
+    for window in (0.02, 0.004):
+        factors, drive, speed = _shaft_regression(segments, rig, output, window)
+        firsts.append(_shaft_start(factors, drive, speed, driven_by, given, known))
+    start, floors = firsts[0]
+    scales = np.array(
+        [floors[name] if name in FRICTION else max(abs(start[name]), floors.get(name, 1e-9)) for name in free]
+    )
+    starts = [_inside(np.array([one[name] for name in free]), free, scales) for one, _ in firsts]
+    changes = np.random.default_rng(0).uniform(-0.7, 0.7, (2, len(free)))
+    starts += [starts[0] * np.exp(change) for change in changes]
+    fixed = {name: float(value) for name, value in given.items()}
+    fixed |= {name: 0.0 for name in ("coulomb_friction", "viscous_friction") if name not in known}
+    return ShaftModel(free, fixed, scales, driven_by, output), starts
+
+
+def _inside(start: np.ndarray, free: Sequence[str], scales: np.ndarray) -> np.ndarray:
+    """A start whose parameters are as positive as they must be."""
+    positive = np.array([PARAMETERS[name].least >= 0.0 for name in free], bool)
+    return np.where(positive & ~(start > 0.02 * scales), 0.3 * scales, start)
+
+
+def _shaft_start(
+    factors: Mapping[str, float],
+    drive: float,
+    speed: float,
+    driven_by: str,
+    given: Mapping[str, float],
+    known: Mapping[str, float],
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Every parameter of a shaft by the factors that its input was regressed by, and sizes that matter of some."""
+    ratio = given["gear_ratio"]
+    # torque at the output for one of the input, where that is not known
+    gain, braking, resistance = given["torque_gain"], 0.0, given.get("resistance", 1.0)
+    if driven_by != "torque":
+        gain = given.get("torque_constant", _gain_of(factors, given, known) / ratio) * ratio
+    start = dict(given)
+    if driven_by == "voltage":
+        if "torque_constant" in known or "resistance" in known:
+            per_volt = _gain_of(factors, given, known, gain / resistance if "torque_constant" in known else gain)
+            resistance = resistance if "resistance" in known else gain / max(per_volt, 1e-9)
+        else:  # as if all of what brakes were the back-EMF
+            per_volt = gain
+            resistance = (max(factors["viscous"], 0.0) + 1e-6) / max(per_volt, 1e-9)
+        start["torque_constant"] = given.get("torque_constant", per_volt * resistance / ratio)
+        start["resistance"] = resistance
+        braking = per_volt * ratio * given.get("back_emf_constant", start["torque_constant"])
+        gain = per_volt
+    else:
+        start["torque_constant"] = gain / ratio
+    torque = max(drive * gain, 1e-9)
+    start |= {
+        "inertia": factors["inertia"] * gain,
+        "mgl": factors["mgl"] * gain,
+        "constant_torque": factors["constant_torque"] * gain,
+        "coulomb_friction": factors["coulomb"] * gain / ratio,
+        "viscous_friction": (factors["viscous"] * gain - braking) / ratio**2,
+        "gear_efficiency": 0.9,
+        "stribeck_friction": 0.05 * torque / ratio,
+        "stribeck_speed": 0.1 * speed * ratio,
+    }
+    floors = {
+        "inertia": 0.003 * torque / max(speed, 1e-9),
+        "mgl": 0.1 * torque,
+        "constant_torque": 0.1 * torque,
+        "coulomb_friction": 0.1 * torque / ratio,
+        "viscous_friction": 0.1 * torque / max(speed, 1e-9) / ratio**2,
+        "stribeck_friction": 0.1 * torque / ratio,
+        "gear_efficiency": 0.1,
+    }
+    return start, floors
+
+
+def _gain_of(
+    factors: Mapping[str, float], given: Mapping[str, float], known: Mapping[str, float], otherwise: float = 1.0
+) -> float:
+    """Torque at the output for one of the input, by whatever torque or inertia is known."""
+    for name in ("mgl", "constant_torque", "inertia"):
+        if name in known and given[name] != 0.0 and factors[name] > 0.0:
+            return given[name] / factors[name]
+    return otherwise
+
+
+def _shaft_regression(
+    segments: Sequence[Segment], rig: str, output: str, window: float
+) -> tuple[dict[str, float], float, float]:
+    """Factors of the input's integral in those of what it works against, its size, and that of the speed.
+
+    Speeds are positions smoothed over `window` [s].
+    """
+    from codrl_mj.identify.differentiation import speeds
+
+    rows, inputs, turning = [], [], []
+    for segment in segments:
+        times, step = segment.times, float(np.median(np.diff(segment.times)))
+        position = segment.measured if output == "position" else np.zeros(len(times))
+        speed = segment.measured
+        if output == "position":
+            speed = speeds(times, position, times, max(window, 5.0 * step))
+        columns = np.sin(position), np.ones(len(times)), np.sign(speed) * (np.abs(speed) > 0.0), speed, segment.inputs
+        sums = [np.concatenate([[0.0], np.cumsum(0.5 * (one[1:] + one[:-1]) * np.diff(times))]) for one in columns]
+        edges = np.unique(np.searchsorted(times, np.arange(times[0], times[-1] + 1e-9, 2.5 * window)))
+        rows.append(np.stack([np.diff(speed[edges]), *(np.diff(one[edges]) for one in sums)], axis=1))
+        inputs.append(segment.inputs)
+        turning.append(speed)
+    table = np.concatenate(rows)
+    names = ["inertia", "mgl", "constant_torque", "coulomb", "viscous"]
+    free = [name for name in names if name not in ("mgl", "constant_torque") or name in OF_RIG[rig]]
+    found = _regressed(table[:, :5], table[:, 5], names, free, dict.fromkeys(names, 0.0))
+    factors = dict.fromkeys(names, 0.0) | dict(zip(free, map(float, found), strict=True))
+    size = float(np.sqrt(np.mean(np.concatenate(inputs) ** 2)))
+    return factors, size, float(np.sqrt(np.mean(np.concatenate(turning) ** 2)))

@@ -1,0 +1,62 @@
+"""What can be identified: names, units, bounds. Those of a motor are called as `GearMotor`'s fields, at its rotor."""
+
+from typing import Literal, NamedTuple
+
+Rig = Literal["pendulum", "free", "load"]
+"""What the output moves: a pendulum that hangs at position 0, nothing but inertia, or inertia and a held load."""
+Friction = Literal["coulomb", "stribeck", "load", "both"]
+"""Viscous and Coulomb friction, and Stribeck friction, what depends on the load, or both of these over it."""
+
+
+class Parameter(NamedTuple):
+    """A number that a log may tell."""
+
+    unit: str
+    least: float
+    most: float
+    what: str
+
+
+PARAMETERS = {
+    "resistance": Parameter("ohm", 1e-4, 1e5, "terminal resistance"),
+    "inductance": Parameter("H", 1e-8, 1e2, "terminal inductance"),
+    "back_emf_constant": Parameter("V*s/rad", 1e-6, 1e3, "back-EMF constant at the rotor"),
+    "torque_constant": Parameter("N*m/A", 1e-6, 1e3, "torque constant at the rotor"),
+    "torque_gain": Parameter("", 1e-2, 1e2, "true torque for one of the torque that was logged"),
+    "inertia": Parameter("kg*m^2", 1e-9, 1e4, "inertia of all that moves, at the output"),
+    "mgl": Parameter("N*m", 0.0, 1e4, "largest torque of gravity, at the output"),
+    "constant_torque": Parameter("N*m", -1e4, 1e4, "held load against positive speeds, at the output"),
+    "coulomb_friction": Parameter("N*m", 0.0, 1e3, "Coulomb friction at the rotor"),
+    "viscous_friction": Parameter("N*m*s/rad", 0.0, 1e3, "viscous friction at the rotor"),
+    "gear_efficiency": Parameter("", 0.3, 1.0, "share of the torque that the gear passes on"),
+    "stribeck_friction": Parameter("N*m", 0.0, 1e3, "what standstill adds to Coulomb friction, at the rotor"),
+    "stribeck_speed": Parameter("rad/s", 1e-3, 1e4, "rotor speed at which 1/e of that is left"),
+    "rotor_inertia": Parameter("kg*m^2", 0.0, 1e3, "inertia of the rotor"),
+    "load_inertia": Parameter("kg*m^2", 0.0, 1e4, "inertia of what the output moves besides the motor"),
+    "gear_ratio": Parameter("", 1e-3, 1e5, "turns of the rotor for one of the output"),
+}
+"""Everything that can be identified or given as known."""
+ELECTRICAL = ("resistance", "inductance", "back_emf_constant")
+FRICTION = ("coulomb_friction", "viscous_friction", "stribeck_friction", "gear_efficiency")
+"""What may well be nothing at all (an efficiency: 1): judged by how much of the torque it takes."""
+OF_FRICTION: dict[str, tuple[str, ...]] = {
+    "coulomb": ("coulomb_friction", "viscous_friction"),
+    "stribeck": ("coulomb_friction", "viscous_friction", "stribeck_friction", "stribeck_speed"),
+    "load": ("coulomb_friction", "viscous_friction", "gear_efficiency"),
+    "both": ("coulomb_friction", "viscous_friction", "stribeck_friction", "stribeck_speed", "gear_efficiency"),
+}
+OF_RIG: dict[str, tuple[str, ...]] = {
+    "pendulum": ("inertia", "mgl"),
+    "free": ("inertia",),
+    "load": ("inertia", "constant_torque"),
+}
+DEFAULTS = {
+    "torque_gain": 1.0,
+    "gear_ratio": 1.0,
+    "mgl": 0.0,
+    "constant_torque": 0.0,
+    "gear_efficiency": 1.0,
+    "stribeck_friction": 0.0,
+    "stribeck_speed": 1.0,
+}
+"""What is taken for parameters that are neither fitted nor known."""

@@ -1,0 +1,77 @@
+"""How well a shaft's model foretells a log: from where it was, without looking again."""
+
+import dataclasses
+import math
+
+import numpy as np
+
+from codrl_mj.identify import simulation
+from codrl_mj.identify.estimate import settled_state
+from codrl_mj.identify.log import Log, usable
+from codrl_mj.identify.models import ShaftModel
+from codrl_mj.identify.segments import initial_state, shaft_segments
+
+HORIZON = 0.5
+"""Time [s] that is foretold at once,"""
+KNOWN = 0.03
+"""from where and how fast the shaft was in its first so many [s], five rows at least."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Prediction:
+    """Mean absolute errors on a log, in the unit of what is foretold."""
+
+    log: str
+    output: str
+    """`position` [rad] or `velocity` [rad/s]."""
+    open_loop: float
+    """Over `HORIZON`, under the logged input, each time from the state that its first `KNOWN` tell."""
+    closed_loop: float | None
+    """Over the whole log, under the law by which the servo makes a voltage of its error; None where there is none."""
+
+
+def predict(model: ShaftModel, values: np.ndarray, log: Log, delay: int = 0) -> Prediction:
+    """Errors of a model's simulations of a log.
+
+    Args:
+        model: the shaft's.
+        values: its parameters, shape (p,).
+        log: with what drives the shaft.
+        delay: rows by which the input is late.
+    """
+    simulate, found = model.at(values), []
+    for segment in shaft_segments([log], model.driven_by, delay, HORIZON):
+        known = max(int(np.searchsorted(segment.times, segment.times[0] + KNOWN)), 5)
+        state = settled_state(model, values, segment.first(known))
+        found.append(np.abs(simulate(segment, state) - segment.measured)[known:])
+    errors = np.concatenate(found)
+    return Prediction(log.name, model.output, float(errors.mean()), closed_loop_error(model, values, log))
+
+
+def closed_loop_error(model: ShaftModel, values: np.ndarray, log: Log) -> float | None:
+    """Mean absolute error [rad] of a whole log under its own command, by a proportional law found in the log.
+
+    The law is the straight line through the origin from the command's error to the input, where the input is not at
+    its limit: `bus`, or the largest that the log has. None where the log has no command that explains its input.
+    """
+    if model.output != "position" or not log.has("command", model.driven_by):
+        return None
+    wanted, given = log.signals["command"], log.signals[model.driven_by]
+    error = wanted - log.signals["position"]
+    limits = log.signals["bus"] if log.has("bus") else np.full(len(error), np.abs(given).max())
+    free = np.abs(given) < 0.98 * limits
+    if not np.any(error[free]):
+        return None
+    law = float(given[free] @ error[free] / (error[free] @ error[free]))
+    lawful = np.clip(law * error, -limits, limits)
+    if not np.mean((given - lawful) ** 2) < 0.25 * np.mean(given**2):
+        return None
+    moved, found = model.moved(values), []
+    for stretch in usable(log):
+        position, speed = initial_state(log, stretch)
+        simulated = simulation.served()(
+            log.time[stretch], wanted[stretch], limits[stretch], law, position, speed, moved
+        )
+        found.append(np.abs(simulated - log.signals["position"][stretch]))
+    total = float(np.concatenate(found).mean())
+    return total if math.isfinite(total) else None

@@ -1,0 +1,201 @@
+"""Logs from files: CSV (also .gz), JSON and, where pyarrow is installed, Parquet."""
+
+import csv
+import gzip
+import importlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from codrl_mj.identify.columns import Column, parse_columns
+from codrl_mj.identify.log import SIGNALS, Finding, Log, find_resolution
+
+_WORDS = {"": np.nan, "nan": np.nan, "none": np.nan, "null": np.nan, "true": 1.0, "false": 0.0}
+_MOST_UNUSABLE = 0.2  # share of rows that may be left out as unreadable or out of order
+
+
+class _Table(NamedTuple):
+    columns: Mapping[str, Any]  # texts or numbers, each of the same length
+    constants: Mapping[str, float]
+    ragged: list[int]  # rows that are incomplete, from 1
+
+
+def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
+    """A log from a file; what could not be read of it is among the log's findings.
+
+    Rows with missing values, and those whose time does not increase, are left out. Time starts at 0.
+
+    Args:
+        path: .csv, .csv.gz, .json, .json.gz or .parquet. CSV has a line of names, and a comma, semicolon or tab between
+            values. JSON is a list of rows, or an object with one such list, such as `entries`, and numbers beside it,
+            which formulas can use, or an object of columns.
+        columns: see `codrl_mj.identify.columns.parse_columns`.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is none of these, lacks a column, has text where a number is needed, or too few rows are left.
+    """
+    path, mapping = Path(path), parse_columns(columns)
+    name = path.name.removesuffix(".gz").rpartition(".")[0]
+    if not path.is_file():
+        raise FileNotFoundError(f"no log at {path}")
+    try:
+        table = _read(path)
+        values, count = _numbers(table, mapping)
+        signals = {
+            signal: np.broadcast_to(np.asarray(one.value(values), float), (count,)) for signal, one in mapping.items()
+        }
+        return _log(name, signals, mapping, table, _unsigned(values, mapping))
+    except (ValueError, UnicodeDecodeError, gzip.BadGzipFile, EOFError) as error:
+        raise ValueError(f"log {path}: {error}") from None
+
+
+def _log(
+    name: str, signals: dict[str, np.ndarray], mapping: Mapping[str, Column], table: _Table, first: list[Finding]
+) -> Log:
+    time, only = signals.pop("time"), signals.pop("only", None)
+    wanted = np.ones(len(time), bool) if only is None else only != 0.0
+    finite = np.isfinite(time) & np.all([np.isfinite(values) for values in signals.values()], axis=0)
+    rows = np.flatnonzero(wanted & finite)
+    latest = np.maximum.accumulate(time[rows]) if rows.size else time[rows]
+    forward = np.concatenate([[True], time[rows][1:] > latest[:-1]]) if rows.size else np.zeros(0, bool)
+    findings = [
+        *first,
+        *_left_out(np.flatnonzero(wanted & ~finite), "missing", "have no number in some column, and are left out"),
+        *_left_out(rows[~forward], "stamps", "have a time that is not after the rows before, and are left out"),
+        *(
+            Finding("info", "units", None, f"{one.text}: no unit is given, taken as {SIGNALS[one.signal]}", "")
+            for one in mapping.values()
+            if one.unit is None and SIGNALS.get(one.signal)
+        ),
+    ]
+    if table.ragged:
+        findings += _left_out(np.array(table.ragged) - 1, "missing", "are incomplete, and are left out")
+    unusable = int((wanted & ~finite).sum() + (~forward).sum())
+    rows = rows[forward]
+    if rows.size < 2 or unusable > _MOST_UNUSABLE * max(int(wanted.sum()), 1):
+        raise ValueError(
+            f"{unusable} of {int(wanted.sum())} rows cannot be used, must be at most {_MOST_UNUSABLE:.0%} and leave 2: "
+            + ("; ".join(one.message for one in findings if one.severity != "info") or "it is empty")
+            + "; check the columns"
+        )
+    kept = {signal: np.ascontiguousarray(values[rows]) for signal, values in signals.items()}
+    numbers = _file_rows(len(time), table.ragged)[rows]
+    return Log(
+        name,
+        time[rows] - time[rows[0]],
+        kept,
+        {signal: find_resolution(values) for signal, values in kept.items()},
+        "voltage" in mapping and mapping["voltage"].mean,
+        table.constants,
+        numbers,
+        tuple(findings),
+    )
+
+
+def _unsigned(values: Mapping[str, Any], mapping: Mapping[str, Column]) -> list[Finding]:
+    """Columns that look like registers with a sign that is read without it: the highest and lowest quarter are used."""
+    found = []
+    for name in sorted(
+        {name for one in mapping.values() for name in one.names if "twos_complement" not in one.formula}
+    ):
+        column = np.asarray(values[name] if values[name] is not None else 0.0, float)
+        for bits in (8, 16, 32):
+            whole = 2.0**bits
+            high, low = column >= 0.75 * whole, column < 0.25 * whole
+            within = np.all((column >= 0.0) & (column < whole) & (column == np.round(column)))
+            if within and high.any() and low.any() and np.all(high | low):
+                row = int(np.flatnonzero(high)[0]) + 1
+                text = f"{name} is below {whole / 4:.0f} or above {3 * whole / 4:.0f}: has it {bits} bits and a sign?"
+                found.append(Finding("error", "register", row, text, f"write twos_complement({name}, {bits})"))
+    return found
+
+
+def _file_rows(count: int, ragged: list[int]) -> np.ndarray:
+    return np.setdiff1d(np.arange(1, count + len(ragged) + 1), ragged)
+
+
+def _left_out(rows: np.ndarray, check: str, what: str) -> list[Finding]:
+    if not rows.size:
+        return []
+    text = f"{rows.size} row{'s' if rows.size > 1 else ''}, the first one {rows[0] + 1}, {what}"
+    severity = "error" if check == "stamps" else "warning"
+    remedy = "find out why the logger wrote them; sort the file, or cut it, if its clock was set back"
+    return [Finding(severity, check, int(rows[0]) + 1, text, remedy if check == "stamps" else "")]
+
+
+def _read(path: Path) -> _Table:
+    kind = Path(path.name.removesuffix(".gz")).suffix.lower()
+    if kind == ".parquet":
+        return _parquet(path)
+    if kind not in (".csv", ".txt", ".tsv", ".json"):
+        raise ValueError(f"unknown kind of file {kind!r}, must be .csv, .json (or either with .gz) or .parquet")
+    with gzip.open(path, "rt", newline="") if path.suffix == ".gz" else path.open(newline="") as file:
+        return _json(json.load(file)) if kind == ".json" else _csv(file)
+
+
+def _csv(file: Any) -> _Table:
+    header = file.readline().lstrip("\ufeff#")
+    separator = max(",;\t", key=header.count)
+    names = [name.strip().strip('"') for name in header.strip().split(separator)]
+    if len(set(names)) < len(names) or not any(names):
+        raise ValueError(f"the first line must name the columns, each once; it is {header.strip()!r}")
+    rows = [row for row in csv.reader(file, delimiter=separator) if row]
+    ragged = [number for number, row in enumerate(rows, 1) if len(row) != len(names)]
+    whole = [row for row in rows if len(row) == len(names)]
+    columns = dict(zip(names, zip(*whole, strict=True), strict=True)) if whole else dict.fromkeys(names, ())
+    return _Table(columns, {}, ragged)
+
+
+def _json(content: Any) -> _Table:
+    if isinstance(content, dict):
+        constants = {name: float(one) for name, one in content.items() if isinstance(one, int | float)}
+        lists = {name: one for name, one in content.items() if isinstance(one, list) and one}
+        tables = [one for one in lists.values() if isinstance(one[0], dict)]
+        if len(tables) == 1:
+            return _Table(_by_column(tables[0]), constants, [])
+        if not tables and lists and len({len(one) for one in lists.values()}) == 1:
+            return _Table(lists, constants, [])
+    elif isinstance(content, list) and content and all(isinstance(row, dict) for row in content):
+        return _Table(_by_column(content), {}, [])
+    raise ValueError(
+        "JSON must be a list of rows, an object with one such list and numbers beside it, or an object of columns of "
+        "the same length"
+    )
+
+
+def _by_column(rows: list[dict[str, Any]]) -> dict[str, list[Any]]:
+    names = dict.fromkeys(name for row in rows for name in row)
+    return {name: [row.get(name) for row in rows] for name in names}
+
+
+def _parquet(path: Path) -> _Table:
+    try:
+        parquet = importlib.import_module("pyarrow.parquet")
+    except ModuleNotFoundError:
+        raise ValueError("reading Parquet needs pyarrow: pip install pyarrow, or save the log as .csv") from None
+    return _Table(parquet.read_table(path).to_pydict(), {}, [])
+
+
+def _numbers(table: _Table, mapping: Mapping[str, Column]) -> tuple[dict[str, Any], int]:
+    """The columns that are needed, as numbers, with the constants, and the number of rows."""
+    needed = set().union(*(one.names for one in mapping.values()))
+    count = len(next(iter(table.columns.values()), ()))
+    values: dict[str, Any] = {**dict.fromkeys(table.columns), **table.constants}
+    for name in needed & table.columns.keys():
+        values[name] = np.array([_number(name, row, one) for row, one in enumerate(table.columns[name], 1)])
+    return values, count
+
+
+def _number(name: str, row: int, one: Any) -> float:
+    if isinstance(one, int | float):
+        return float(one)
+    text = "" if one is None else str(one).strip()
+    try:
+        return _WORDS[text.lower()] if text.lower() in _WORDS else float(text)
+    except ValueError:
+        remedy = "write a decimal point" if "," in text else "leave such rows out, or map another column"
+        raise ValueError(f"{name} in row {row} is {text!r}, must be a number; {remedy}") from None

@@ -1,0 +1,230 @@
+"""Logs cut into segments, each simulated from an initial state of its own."""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from codrl_mj.identify.differentiation import speeds
+from codrl_mj.identify.log import Log, usable
+
+SEGMENT = 0.5
+"""Time [s] that a shaft is simulated for at once: longer ones meet friction that no model has, and several minima."""
+BLOCK = 1.0
+"""Shortest stretch [s] of a log that is resampled as a whole: residuals within it belong together."""
+SHAFT_STEP = 5e-4
+"""Rows that are nearer [s] are taken together for a shaft, which is slower: their mean input, their first position."""
+SPIKE = 50.0
+"""A row is a spike where it sticks out by more than so many times what nine of ten rows do at most."""
+STILL = 3.0
+"""A shaft that moves by less than so many steps of its encoder is locked."""
+
+
+class Segment(NamedTuple):
+    """Rows that are simulated at once."""
+
+    log: int
+    """Place of its log among those fitted."""
+    block: int
+    """Number of the stretch that it is resampled with, unique over all logs."""
+    rows: slice
+    """Of its log."""
+    times: np.ndarray
+    """[s], shape (m,)."""
+    inputs: np.ndarray
+    """What drives it, at the times, shape (m,)."""
+    slopes: np.ndarray
+    """How that changes till the next row [1/s], shape (m,)."""
+    speeds: np.ndarray
+    """Mean speed [rad/s] till the next row, shape (m,): of a winding."""
+    measured: np.ndarray
+    """What a simulation is compared with, shape (m,)."""
+    deviation: float
+    """Standard deviation of the sensor, in the unit of `measured`."""
+    state: np.ndarray
+    """A guess of the state at the first row."""
+
+    def first(self, count: int) -> "Segment":
+        """Its first rows."""
+        several = ("times", "inputs", "slopes", "speeds", "measured")
+        return self._replace(**{name: getattr(self, name)[:count] for name in several})
+
+
+def delayed(log: Log, name: str, rows: int) -> np.ndarray:
+    """A signal as it was some rows before (or, negative, after), the ends repeated."""
+    values = log.signals[name]
+    return (
+        np.concatenate([np.full(rows, values[0]), values[:-rows]])
+        if rows > 0
+        else (np.concatenate([values[-rows:], np.full(-rows, values[-1])]) if rows < 0 else values)
+    )
+
+
+def without_spikes(values: np.ndarray) -> np.ndarray:
+    """A sampled signal, rows that stick out of both their neighbours by far more than is usual in place of the nearer.
+
+    Residuals of an output bear outliers, by the robust loss; what drives a simulation has to be free of them.
+    """
+    middle = np.median(np.stack([values[:-2], values[1:-1], values[2:]]), axis=0)
+    off = np.abs(values[1:-1] - middle)
+    usual = max(float(np.percentile(off, 90.0)), 1e-3 * float(np.std(values)))
+    found = values.copy()
+    found[1:-1][off > SPIKE * usual] = middle[off > SPIKE * usual]
+    return found
+
+
+def sensor_deviation(log: Log, name: str) -> float:
+    """Standard deviation of a signal's sensor: of its quantisation, or of what no smooth motion does within 4 rows.
+
+    Where the latter is within a step of the quantisation it is that of the quantisation.
+    """
+    values = log.signals[name]
+    step = log.resolution.get(name, 0.0)
+    if len(values) < 8:
+        return max(step / math.sqrt(12.0), 1e-9)
+    ripple = np.diff(values, n=3) / math.sqrt(20.0)  # 1, 3, 3, 1
+    noise = 1.4826 * float(np.median(np.abs(ripple)))
+    return max(noise if noise > step else step / math.sqrt(12.0), 1e-6 * float(np.ptp(values)), 1e-12)
+
+
+def is_locked(log: Log) -> bool:
+    """Whether the shaft stands still throughout."""
+    if log.has("position"):
+        swing = float(np.ptp(log.signals["position"]))
+        return swing <= STILL * max(log.resolution.get("position", 0.0), 1e-6)
+    return bool(log.has("velocity") and not np.any(log.signals["velocity"]))
+
+
+def cut(log: Log, longest: float) -> list[slice]:
+    """Rows of segments of a length [s], where there are no gaps; the last of a stretch is up to half longer."""
+    found = []
+    for stretch in usable(log):
+        begin, end = log.time[stretch.start], log.time[stretch.stop - 1]
+        count = max(round((end - begin) / longest), 1)
+        edges = np.searchsorted(log.time[stretch], np.linspace(begin, end, count + 1)[:-1]) + stretch.start
+        edges = [*map(int, np.unique(edges)), stretch.stop]
+        found += [slice(a, b) for a, b in itertools.pairwise(edges) if b - a >= 4]
+    return found
+
+
+def mean_speeds(log: Log, rows: slice) -> np.ndarray:
+    """Mean speed [rad/s] from each row to the next, shape (m,), of a log with position or velocity, else 0."""
+    times = log.time[rows]
+    if is_locked(log) or not (log.has("position") or log.has("velocity")):
+        return np.zeros(len(times))
+    if log.has("position"):
+        middles = times + 0.5 * np.diff(times, append=2.0 * times[-1] - times[-2])
+        return speeds(times, log.signals["position"][rows], middles)
+    velocity = log.signals["velocity"][rows]
+    return 0.5 * (velocity + np.append(velocity[1:], velocity[-1]))
+
+
+def turning(log: Log) -> np.ndarray:
+    """Mean speed [rad/s] from each row to the next, shape (n,), by the positions around it."""
+    found = np.zeros(len(log.time))
+    for stretch in usable(log):
+        found[stretch] = mean_speeds(log, stretch)
+    return found
+
+
+def winding_segments(logs: Sequence[Log], turned: Sequence[np.ndarray], delay: int = 0) -> list[Segment]:
+    """Segments of a block each, in which voltage and speed drive the current.
+
+    Args:
+        logs: each with voltage and current.
+        turned: mean speed [rad/s] from each row to the next of each log, shape (n,).
+        delay: rows by which the voltage is late.
+    """
+    made: list[Segment] = []
+    for place, (log, speed) in enumerate(zip(logs, turned, strict=True)):
+        volts = delayed(log, "voltage", delay)
+        deviation = sensor_deviation(log, "current")
+        for rows in cut(log, BLOCK):
+            current = log.signals["current"][rows]
+            still = np.zeros(len(current))
+            made.append(
+                Segment(
+                    place, len(made), rows, log.time[rows], volts[rows], still, speed[rows], current, deviation,
+                    current[:1],
+                )
+            )  # fmt: skip
+    return made
+
+
+def shaft_segments(
+    logs: Sequence[Log], driven_by: str, delay: int = 0, longest: float = SEGMENT, shortest: float = SHAFT_STEP
+) -> list[Segment]:
+    """Segments in which a torque, a current or a voltage drives the shaft.
+
+    Args:
+        logs: each with `driven_by` and a position, or a velocity.
+        driven_by: the input. A voltage holds from row to row; what a sensor samples is joined by straight lines.
+        delay: rows by which the input is late.
+        longest: [s].
+        shortest: step of time [s] below which rows are taken together.
+    """
+    made: list[Segment] = []
+    block = -1
+    for place, log in enumerate(logs):
+        given, output = delayed(log, driven_by, delay), output_of(log)
+        if driven_by != "voltage":
+            given = without_spikes(given)
+        measured, deviation = log.signals[output], sensor_deviation(log, output)
+        together = max(int(shortest / log.step * (1.0 + 1e-6)), 1)
+        began = -math.inf
+        for rows in cut(log, longest):
+            times, drive = log.time[rows], given[rows]
+            if times[0] - began >= BLOCK - 1e-3:
+                block, began = block + 1, times[0]
+            slopes = np.zeros(len(times))
+            if driven_by != "voltage":
+                slopes[:-1] = np.diff(drive) / np.diff(times)
+            if together > 1:
+                means = drive[:-1] + 0.5 * slopes[:-1] * np.diff(times)
+                edges = np.arange(0, len(times), together)
+                totals = np.diff(np.concatenate([[0.0], np.cumsum(means * np.diff(times))])[edges])
+                drive = np.append(totals / np.diff(times[edges]), drive[-1])
+                rows = slice(rows.start, rows.start + int(edges[-1]) + 1, together)
+                times, slopes = times[edges], np.zeros(len(edges))
+            made.append(
+                Segment(
+                    place, block, rows, times, drive, slopes, slopes, measured[rows], deviation,
+                    initial_state(log, rows),
+                )
+            )  # fmt: skip
+    return made
+
+
+def output_of(log: Log) -> str:
+    """What a simulation of a shaft is compared with: its position or, without one, its velocity."""
+    return "position" if log.has("position") else "velocity"
+
+
+def initial_state(log: Log, rows: slice, window: float = 0.03) -> np.ndarray:
+    """Position and speed at the first row, from the rows around it: a parabola within half a window, or five rows."""
+    time = log.time[rows.start]
+    if not log.has("position"):
+        return np.array([0.0, log.signals["velocity"][rows.start]])
+    stretch = next(one for one in usable(log) if one.start <= rows.start < one.stop)
+    first = max(min(int(np.searchsorted(log.time, time - 0.5 * window)), rows.start - 2), stretch.start)
+    last = min(max(int(np.searchsorted(log.time, time + 0.5 * window)), rows.start + 3), stretch.stop)
+    near = slice(first, last)
+    degree = min(2, last - first - 1)
+    fitted = np.polynomial.polynomial.polyfit(log.time[near] - time, log.signals["position"][near], degree)
+    return np.array([fitted[0], fitted[1]])
+
+
+def halved(log: Log) -> Log:
+    """Every second row of a log; a mean voltage becomes that of both."""
+    count = len(log.time) - (len(log.time) + 1) % 2  # to begin and end with a row that is kept
+    kept = log.part(slice(0, count, 2))
+    if not (log.mean_voltage and log.has("voltage")):
+        return kept
+    steps, volts = np.diff(log.time[:count]), log.signals["voltage"][:count]
+    energy = volts[:-1] * steps
+    mean = (energy[::2] + energy[1::2]) / (steps[::2] + steps[1::2])
+    signals = {**kept.signals, "voltage": np.append(mean, volts[-1])}
+    return dataclasses.replace(kept, signals=signals)

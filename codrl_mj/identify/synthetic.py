@@ -1,0 +1,355 @@
+"""Logs that are computed: a drive of ours under a voltage, through sensors and a sampler, with faults to order.
+
+The winding is exact between the drive's samples, at the speed in their middle; the shaft moves half a sample before and
+half a sample after it (Strang's splitting, of second order), under the friction that `codrl_mj.actuators` has.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from codrl_mj.actuators import Drive, parameters_type, shaft
+from codrl_mj.fields import check, check_names, real
+from codrl_mj.identify.excitations import Excitation
+from codrl_mj.identify.log import SIGNALS, Log, find_resolution
+from codrl_mj.runs.files import writing
+
+
+@dataclasses.dataclass(frozen=True)
+class Load:
+    """What the output shaft moves.
+
+    Raises:
+        ValueError: a field is out of bounds.
+    """
+
+    inertia: float = real(0.0, least=0.0, unit="kg*m^2")
+    """[kg*m^2], >= 0, besides the rotor's."""
+    gravity: float = real(0.0, least=0.0, unit="N*m")
+    """m*g*l [N*m] of a pendulum, >= 0, that hangs at position 0."""
+    torque: float = real(0.0, unit="N*m")
+    """Constant torque [N*m] against the motor, as of a lifted weight."""
+    locked: bool = False
+    """Whether the shaft is held."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        check(self)
+
+
+FREE = Load()
+"""Nothing but the rotor."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sensor:
+    """How a signal is read: value -> gain * value(time - delay) + bias + noise, then rounded.
+
+    Raises:
+        ValueError: a field is out of bounds.
+    """
+
+    noise: float = real(0.0, least=0.0, unit="")
+    """Standard deviation of white noise, >= 0, in the signal's unit."""
+    resolution: float = real(0.0, least=0.0, unit="")
+    """Step of the rounding, >= 0, in the signal's unit; 0: none."""
+    delay: float = real(0.0, least=0.0, unit="s")
+    """How old [s] the values are, >= 0."""
+    gain: float = real(1.0, unit="")
+    """What the sensor shows of one; -1 is a wrong sign."""
+    bias: float = real(0.0, unit="")
+    """What it shows of nothing, in the signal's unit."""
+    outliers: float = real(0.0, least=0.0, most=1.0)
+    """Share of values, in [0, 1], that are off by 3 to 10 of the signal's standard deviations."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        check(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class Sampler:
+    """When rows are written.
+
+    Raises:
+        ValueError: a field is out of bounds.
+    """
+
+    rate: float = real(5000.0, above=0.0, unit="Hz")
+    """Rows a second [Hz], > 0."""
+    jitter: float = real(0.0, least=0.0, most=0.3)
+    """Standard deviation of the times as a share of the period, in [0, 0.3]; the stamps are right."""
+    dropped: float = real(0.0, least=0.0, most=0.9)
+    """Share of rows that are lost, in [0, 0.9]."""
+    mean_voltage: bool = False
+    """Whether the voltage is the mean from a row to the next, and not what it is at the row."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        check(self)
+
+
+class Course(NamedTuple):
+    """What happens, at the drive's every sample; each of shape (n + 1,)."""
+
+    time: np.ndarray
+    """[s]"""
+    voltage: np.ndarray
+    """At the terminals from each time on [V]."""
+    commanded: np.ndarray
+    """What was asked for [V]."""
+    current: np.ndarray
+    """[A]"""
+    speed: np.ndarray
+    """Of the output [rad/s]."""
+    position: np.ndarray
+    """Of the output [rad]."""
+    bus: np.ndarray
+    """Of the supply [V]."""
+
+
+def run(drive: Drive, excitation: Excitation, load: Load = FREE, position: float = 0.0) -> Course:
+    """What a drive does under a voltage, from standstill.
+
+    A bridge makes the voltage u of a share d = u/V of the supply, which sags by its resistance times d*i.
+
+    Args:
+        drive: whose motor, supply, sample rate and dead band count; its loop is left out.
+        excitation: the voltage; held over a sample, limited to the supply's.
+        load: what it moves; held if the excitation wants that.
+        position: of the output at the beginning [rad].
+
+    Raises:
+        ValueError: the motor moves nothing that has an inertia.
+    """
+    commanded = excitation.voltage(sample_times(drive, excitation.duration))
+    return play(drive, commanded, dataclasses.replace(load, locked=load.locked or excitation.locked), position)
+
+
+def sample_times(drive: Drive, duration: float) -> np.ndarray:
+    """The times [s] of the drive's samples from 0 to a duration, shape (n + 1,)."""
+    period = 1.0 / drive.controller.sample_rate
+    return period * np.arange(math.ceil(duration / period - 1e-9) + 1)
+
+
+def play(drive: Drive, commanded: np.ndarray, load: Load = FREE, position: float = 0.0) -> Course:
+    """`run` under any voltages.
+
+    Args:
+        drive: see `run`.
+        commanded: voltage [V] in each of the drive's samples, shape (n + 1,).
+        load: what it moves.
+        position: of the output at the beginning [rad].
+
+    Raises:
+        ValueError: see `run`.
+    """
+    period, limit = 1.0 / drive.controller.sample_rate, drive.voltage_limit
+    time, commanded = period * np.arange(len(commanded)), np.clip(commanded, -limit, limit)
+    motor = drive.motor
+    sag = 0.0 if drive.supply is None else drive.supply.resistance
+    shares = np.sign(commanded) * np.maximum(np.abs(commanded) - drive.controller.deadband, 0.0) / limit
+    states = _compiled()[0](
+        _parameters(drive),
+        period,
+        shares,
+        float(limit),
+        float(sag),
+        _moved(drive, load),
+        load.locked,
+        float(position * motor.gear_ratio),
+    )
+    voltage, current, speed, angle, bus = states.T
+    return Course(time, voltage, commanded, current, speed / motor.gear_ratio, angle / motor.gear_ratio, bus)
+
+
+def turn(drive: Drive, torque: np.ndarray, load: Load = FREE, position: float = 0.0) -> np.ndarray:
+    """Position of the output [rad] under a torque of the motor, at the drive's samples, shape (n,).
+
+    Args:
+        drive: whose shaft, gear and friction.
+        torque: at the rotor [N*m] in each sample, shape (n,).
+        load: what it moves.
+        position: at the beginning [rad].
+
+    Raises:
+        ValueError: see `run`.
+    """
+    motor, period = drive.motor, 1.0 / drive.controller.sample_rate
+    angle = float(position * motor.gear_ratio)
+    angles = _compiled()[1](_parameters(drive), period, torque, _moved(drive, load), angle)
+    return angles / motor.gear_ratio
+
+
+def _parameters(drive: Drive) -> Any:
+    family: Any = type(drive)
+    return parameters_type(family)(*drive.numbers)
+
+
+def _moved(drive: Drive, load: Load) -> tuple[float, float, float]:
+    """Inertia at the rotor [kg*m^2], gravity and constant torque at the output [N*m]."""
+    motor = drive.motor
+    inertia = motor.rotor_inertia + load.inertia / motor.gear_ratio**2
+    if not inertia > 0.0 and not load.locked:
+        raise ValueError(
+            f"motor.rotor_inertia = {motor.rotor_inertia:g} and load.inertia = {load.inertia:g}: one must be > 0; "
+            "give the load its inertia, or lock the shaft"
+        )
+    return inertia, load.gravity, load.torque
+
+
+def simulate(
+    drive: Drive,
+    excitation: Excitation,
+    load: Load = FREE,
+    sensors: Mapping[str, Sensor] | None = None,
+    sampler: Sampler = Sampler(),
+    seed: int = 0,
+    position: float = 0.0,
+    name: str = "synthetic",
+) -> Log:
+    """A log of a drive of ours, with everything in it that can be logged.
+
+    Args:
+        drive: see `run`.
+        excitation: the voltage.
+        load: what the output moves.
+        sensors: by signal; those that are not named show what is. The voltage is the one asked for, without the
+            supply's sag, and the torque n*kT*i.
+        sampler: when rows are written.
+        seed: of noise, jitter, outliers and lost rows.
+        position: of the output at the beginning [rad].
+        name: of the log.
+
+    Raises:
+        ValueError: a signal is unknown; or see `run`.
+    """
+    sensors = dict(sensors or {})
+    signals = ("voltage", "current", "position", "velocity", "torque", "bus", "duty")
+    check_names(sensors, signals, "signal")
+    course, random = run(drive, excitation, load, position), np.random.default_rng(seed)
+    period = 1.0 / sampler.rate
+    time = period * np.arange(math.floor(course.time[-1] / period + 1e-9) + 1)
+    time[1:-1] += period * sampler.jitter * np.clip(random.standard_normal(max(len(time) - 2, 0)), -3.0, 3.0)
+    time = np.maximum.accumulate(time + 1e-9 * period * np.arange(len(time)))  # rows never swap
+    torque = drive.motor.gear_ratio * drive.motor.torque_constant * course.current
+    smooth = (course.current, course.position, course.speed, torque, course.bus)
+    found = {}
+    for signal, values in zip(("current", "position", "velocity", "torque", "bus"), smooth, strict=True):
+        late = time - sensors.get(signal, Sensor()).delay
+        found[signal] = _seen(np.interp(late, course.time, values), sensors.get(signal), random)
+    for signal, scale in (("voltage", 1.0), ("duty", 1.0 / drive.voltage_limit)):
+        late = time - sensors.get(signal, Sensor()).delay
+        held = _mean(course, late) if sampler.mean_voltage else course.commanded[_sample(course, late)]
+        found[signal] = _seen(scale * held, sensors.get(signal), random)
+    kept = random.random(len(time)) >= sampler.dropped
+    kept[[0, -1]] = True
+    found = {signal: values[kept] for signal, values in found.items()}
+    resolution = {signal: find_resolution(values) for signal, values in found.items()}
+    return Log(name, time[kept], found, resolution, sampler.mean_voltage, rows=np.flatnonzero(kept) + 1)
+
+
+def _sample(course: Course, time: np.ndarray) -> np.ndarray:
+    """Which of the drive's samples a time is in."""
+    period = course.time[1] - course.time[0]
+    return np.clip(np.floor(time / period + 1e-6).astype(int), 0, len(course.time) - 1)
+
+
+def _mean(course: Course, time: np.ndarray) -> np.ndarray:
+    """The mean voltage asked for from each row to the next; in the last row what holds."""
+    flux = np.concatenate([[0.0], np.cumsum(np.diff(course.time) * course.commanded[:-1])])
+    means = np.diff(np.interp(time, course.time, flux)) / np.diff(time)
+    return np.append(means, course.commanded[_sample(course, time[-1:])])
+
+
+def _seen(values: np.ndarray, sensor: Sensor | None, random: np.random.Generator) -> np.ndarray:
+    if sensor is None:
+        return values
+    seen = sensor.gain * values + sensor.bias + sensor.noise * random.standard_normal(len(values))
+    wrong = random.random(len(values)) < sensor.outliers
+    off = random.uniform(3.0, 10.0, len(values)) * random.choice([-1.0, 1.0], len(values))
+    seen = seen + np.where(wrong, off * float(np.std(seen)), 0.0)
+    return seen if sensor.resolution == 0.0 else sensor.resolution * np.round(seen / sensor.resolution)
+
+
+def write_log(path: Path, log: Log) -> str:
+    """Write a log as CSV (.csv or .csv.gz), whole or not at all; returns the columns that `read_log` reads it by."""
+    names = ["time", *log.signals]
+    table = np.column_stack([log.time, *log.signals.values()])
+    with writing(path) as temporary:
+        np.savetxt(temporary, table, fmt="%.9g", delimiter=",", header=",".join(names), comments="")
+    kinds = {"time": "s", **SIGNALS}
+    texts = {name: f"mean({name})" if log.mean_voltage and name == "voltage" else name for name in names}
+    return ",".join(f"{name}={text}:{kinds[name] or '1'}" for name, text in texts.items())
+
+
+@functools.cache
+def _compiled() -> tuple[Callable[..., Any], Callable[..., Any]]:
+    import numba
+    from numba.extending import register_jitable
+
+    for helper in (shaft.friction, _step_shaft):
+        register_jitable(helper)
+    return numba.njit(_course), numba.njit(_angles)
+
+
+def _step_shaft(
+    parameters: Any,
+    duration: float,
+    torque: float,
+    moved: Any,
+    speed: float,
+    angle: float,
+) -> tuple[float, float]:
+    """Speed and angle of the rotor after a short time; dry friction at most stops it.
+
+    Args:
+        parameters: the drive's.
+        duration: [s].
+        torque: of the motor, at the rotor [N*m].
+        moved: inertia at the rotor [kg*m^2], gravity and constant torque at the output [N*m].
+        speed: of the rotor [rad/s].
+        angle: of the rotor [rad].
+    """
+    inertia, gravity, against = moved
+    ratio = parameters.gear_ratio
+    others = -(gravity * math.sin(angle / ratio) + against) / (ratio * inertia)
+    torque -= shaft.friction(parameters, duration, torque, shaft.Shaft(inertia, others, speed))
+    free = speed + duration * (torque / inertia + others)
+    slowed = max(abs(free) - duration * parameters.coulomb_friction / inertia, 0.0)
+    after = math.copysign(slowed, free) / (1.0 + duration * parameters.viscous_friction / inertia)
+    return after, angle + 0.5 * duration * (speed + after)
+
+
+def _course(
+    parameters: Any, period: float, shares: Any, limit: float, sag: float, moved: Any, locked: bool, angle: float
+) -> Any:
+    """Voltage, current, speed and angle of the rotor, and bus voltage, at each sample, shape (n, 5)."""
+    states = np.empty((len(shares), 5))
+    current, speed, torque_constant = 0.0, 0.0, parameters.torque_constant
+    decay = math.exp(-parameters.resistance * period / parameters.inductance)
+    for row in range(len(shares)):
+        bus = limit - sag * shares[row] * current
+        voltage = shares[row] * bus
+        states[row] = voltage, current, speed, angle, bus
+        if not locked:
+            speed, angle = _step_shaft(parameters, 0.5 * period, torque_constant * current, moved, speed, angle)
+        reached = (voltage - parameters.back_emf_constant * speed) / parameters.resistance
+        current = reached + (current - reached) * decay
+        if not locked:
+            speed, angle = _step_shaft(parameters, 0.5 * period, torque_constant * current, moved, speed, angle)
+    return states
+
+
+def _angles(parameters: Any, period: float, torques: Any, moved: Any, angle: float) -> Any:
+    """Angle of the rotor [rad] at each sample, shape (n,)."""
+    angles, speed = np.empty(len(torques)), 0.0
+    for row in range(len(torques)):
+        angles[row] = angle
+        speed, angle = _step_shaft(parameters, period, torques[row], moved, speed, angle)
+    return angles

@@ -1,0 +1,1 @@
+"""Motors from their bench logs."""

@@ -1,0 +1,97 @@
+"""Logs of known motors, made by others: scipy's matrix exponential, and MuJoCo."""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from scipy.linalg import expm
+
+from codrl_mj.identify import Log, read_log
+
+EXAMPLES = Path(__file__).parents[2] / "examples" / "bench_logs"
+PENDULUM = "time=time:s,position=position:rad,torque=torque:N*m"
+SERVO = (
+    "time=timestamp:s,position=position:rad,voltage=twos_complement(load,16)/885*input_volts:V,bus=input_volts:V,"
+    "command=goal_position:rad,only=torque_enable"
+)
+RESISTANCE, CONSTANT, INDUCTANCE = 1.2, 0.05, 0.6e-3
+INERTIA, VISCOUS = 2e-5, 1e-4
+LOOP = 20000.0
+
+
+def pendulum_log(name):
+    return read_log(EXAMPLES / "dfki_pendulum" / f"{name}.csv.gz", PENDULUM)
+
+
+def prbs(time, random, clock=2e-3):
+    bits = random.choice([-1.0, 1.0], int(time[-1] / clock) + 1)
+    return bits[(time / clock + 1e-9).astype(int)]
+
+
+def motor_log(kind="prbs", rate=5000, duration=2.0, noise=0.01, step=0.0, seed=0, mean=True):
+    """A free or locked DC motor with viscous friction under a voltage that changes at 20 kHz; exact: x' = A x + B u.
+
+    Args:
+        kind: `prbs` with a slow sine, `sine`, or `locked`, a PRBS on a held shaft.
+        rate: of the rows [Hz].
+        duration: [s].
+        noise: of the current, as a share of its largest value.
+        step: of the encoder [rad]; 0: none.
+        seed: of the PRBS and the noise.
+        mean: whether rows have the mean voltage, or that of their time.
+    """
+    random = np.random.default_rng(seed)
+    time = np.arange(round(duration * LOOP)) / LOOP
+    slow, fast = 3.0 * np.sin(np.pi * time), 3.0 * prbs(time, random)
+    volts = {"prbs": slow + fast, "sine": 2.0 * slow, "locked": fast}[kind]
+    system = np.zeros((4, 4))
+    system[0] = [-RESISTANCE / INDUCTANCE, -CONSTANT / INDUCTANCE, 0.0, 1.0 / INDUCTANCE]
+    if kind != "locked":
+        system[1, :2], system[2, 1] = [CONSTANT / INERTIA, -VISCOUS / INERTIA], 1.0
+    exact = expm(system / LOOP)
+    states = np.zeros((len(time), 3))
+    for row in range(len(time) - 1):
+        states[row + 1] = exact[:3, :3] @ states[row] + exact[:3, 3] * volts[row]
+    every = round(LOOP / rate)
+    current, position = states[::every, 0], states[::every, 2]
+    current = current + noise * np.abs(states[:, 0]).max() * random.standard_normal(len(current))
+    if step:
+        position = np.round(position / step) * step
+    told = volts.reshape(-1, every).mean(axis=1) if mean else volts[::every]
+    return Log(
+        kind, time[::every], {"voltage": told, "current": current, "position": position}, {"position": step}, mean
+    )
+
+
+def mujoco_pendulum(seed=0, duration=8.0, coulomb=0.15, viscous=0.01, step=3e-3, every=10, effort="torque"):
+    """A pendulum of 0.19 kg*m^2 and 3.6 N*m with friction, pushed about by smooth torques; MuJoCo's, at 0.2 ms.
+
+    Args:
+        seed: of the torques.
+        duration: [s].
+        coulomb: [N*m].
+        viscous: [N*m*s/rad].
+        step: of the encoder [rad].
+        every: steps for a row.
+        effort: what the torque is called, a `current` if it is that of a motor with 1 N*m/A.
+    """
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option timestep="2e-4" integrator="implicitfast"/><worldbody><body>
+        <joint name="hinge" axis="0 1 0" damping="{viscous}" frictionloss="{coulomb}" solreffriction="0.0005 1"/>
+        <inertial mass="1" pos="0 0 {-3.6 / 9.81}" diaginertia="0.06 {0.19 - (3.6 / 9.81) ** 2} 0.06"/>
+        </body></worldbody><actuator><motor joint="hinge"/></actuator></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    random = np.random.default_rng(seed)
+    phases, rates = random.uniform(0.0, 2.0 * np.pi, 4), np.array([0.25, 0.6, 0.95, 1.4]) * random.uniform(0.9, 1.1, 4)
+    count = round(duration / 2e-4)
+    time = np.arange(count) * 2e-4
+    torque = np.sum(0.9 * np.sin(2.0 * np.pi * np.outer(time, rates) + phases), axis=1)
+    position = np.empty(count)
+    for row in range(count):
+        position[row] = data.qpos[0]
+        data.ctrl[0] = torque[row]
+        mujoco.mj_step(model, data)
+    rows = slice(None, None, every)
+    seen = np.round(position[rows] / step) * step
+    return Log(f"swing{seed}", time[rows], {"position": seen, effort: torque[rows]}, {"position": step})

@@ -1,0 +1,110 @@
+"""What comes out: an actuator's file, refusals, draws within intervals, the command line."""
+
+import json
+
+import numpy as np
+import pytest
+import tyro
+import yaml
+
+from codrl_mj.actuators import Drive, identified_ranges, resolve
+from codrl_mj.cli import main
+from codrl_mj.cli.fields import environment
+from codrl_mj.cli.train import train_verb
+from codrl_mj.identify.result import Estimate, Identified
+from tests.identify import bench
+
+GIVEN = {"inductance": 1e-3, "rotor_inertia": 2e-5}
+
+
+def identified(*estimates, base=None):
+    return Identified(("a", "b"), "free", "coulomb", "current", {}, estimates, (), (), (), base)
+
+
+def motor(**changes):
+    numbers = {
+        "resistance": Estimate("resistance", 1.2, 1.1, 1.3, "identified"),
+        "back_emf_constant": Estimate("back_emf_constant", 0.05, 0.049, 0.051, "identified"),
+        "torque_constant": Estimate("torque_constant", 0.05, 0.049, 0.051, "identified"),
+        "coulomb_friction": Estimate("coulomb_friction", 1e-3, 0.0, 2e-3, "identified"),
+        "inertia": Estimate("inertia", 3e-4, 2e-4, 4e-4, "identified"),
+    }
+    numbers |= {name: Estimate(name, value, value, value, "given") for name, value in GIVEN.items()}
+    return identified(*{**numbers, **changes}.values())
+
+
+def test_the_file_is_the_actuator_and_randomize_draws_within_the_intervals(tmp_path):
+    written = motor().write(tmp_path)
+    drive = resolve(str(written[0]), None, "a test")
+    assert isinstance(drive, Drive)
+    assert (drive.motor.resistance, drive.motor.inductance, drive.motor.coulomb_friction) == (1.2, 1e-3, 1e-3)
+    ranges = identified_ranges(written[0])
+    assert set(ranges) == {
+        f"motor.{n}" for n in ("resistance", "back_emf_constant", "torque_constant", "coulomb_friction")
+    }
+    assert ranges["motor.resistance"] == "loguniform(1.1, 1.3)"
+    assert ranges["motor.coulomb_friction"] == "uniform(0.0, 0.002)"
+    assert json.loads(written[1].read_text())["estimates"][0]["high"] == 1.3
+
+
+@pytest.mark.parametrize("status", ["ratio", "unidentifiable", "refused"])
+def test_a_number_that_was_not_identified_is_refused_until_it_is_given(tmp_path, status):
+    found = motor(resistance=Estimate("resistance", 1.2, 0.1, 9.0, status, "its interval is wide"))
+    with pytest.raises(ValueError, match=f"resistance is {status}: its interval is wide. Give it with --known"):
+        found.actuator()
+    file, _ = found.write(tmp_path)
+    with pytest.raises(ValueError, match=rf"actuator.yaml: identified from a, b: resistance is {status}"):
+        resolve(str(file), None, "a test")
+    with pytest.raises(ValueError, match="resistance is"):
+        identified_ranges(file)
+    assert motor(resistance=Estimate("resistance", 1.2, 1.2, 1.2, "given")).actuator().motor.resistance == 1.2
+
+
+def test_what_the_logs_do_not_tell_is_asked_for_or_taken_from_a_motor():
+    friction = Estimate("coulomb_friction", 1e-3, 5e-4, 2e-3, "identified")
+    with pytest.raises(ValueError, match="resistance: these logs say nothing of it"):
+        identified(friction).actuator()
+    whole = identified(friction, base=Drive().as_mapping()).actuator()
+    assert whole == Drive().replaced({"motor.coulomb_friction": 1e-3})
+
+
+def test_only_files_of_identified_actuators_have_ranges(tmp_path):
+    file = tmp_path / "drive.yaml"
+    file.write_text(yaml.safe_dump(Drive().as_mapping()))
+    with pytest.raises(ValueError, match="has no intervals"):
+        identified_ranges(file)
+    with pytest.raises(FileNotFoundError):
+        identified_ranges(tmp_path / "none.yaml")
+
+
+def write_csv(path, log):
+    table = np.column_stack([log.time, *log.signals.values()])
+    np.savetxt(path, table, delimiter=",", header=",".join(["t", *log.signals]), comments="")
+    return str(path)
+
+
+def test_the_command_line_identifies_and_draws_within_the_intervals(tmp_path, capsys):
+    log = write_csv(tmp_path / "bench.csv", bench.motor_log("locked", duration=4.0))
+    columns = "time=t:s,voltage=mean(voltage):V,current=current:A,position=position:rad"
+    out = tmp_path / "motor"
+    known = ["--known", "torque_constant=0.05", "back_emf_constant=0.05", "rotor_inertia=2e-5"]
+    given = ["identify", log, "--columns", columns, *known, "--out", str(out)]
+    assert main(given) == 0
+    shown = capsys.readouterr().out
+    assert "resistance" in shown
+    assert "identified" in shown
+    actuator = str(out / "actuator.yaml")
+    fields = yaml.safe_load((out / "actuator.yaml").read_text())
+    low, high = fields["identified"]["intervals"]["motor.resistance"]
+    assert low < bench.RESISTANCE < high
+    words = ["pendulum", "--actuator", actuator, "--env.randomize", "identified", "motor.inductance=uniform(1e-4,1e-3)"]
+    verb = tyro.cli(train_verb(words), args=words)
+    config = environment(verb, "pendulum", verb.actuator_name)
+    assert config.randomize[0] == "motor.inductance=uniform(0.0001, 0.001)"
+    assert f"motor.resistance=loguniform({low!r}, {high!r})" in config.randomize
+    words[2] = "weak"
+    verb = tyro.cli(train_verb(words), args=words)
+    with pytest.raises(ValueError, match="identified: draws within the intervals of a file"):
+        environment(verb, "pendulum", verb.actuator_name)
+    assert main(["identify", log, "--columns", columns, "--known", "mgl"]) == 2
+    assert "must be NAME=NUMBER" in capsys.readouterr().err

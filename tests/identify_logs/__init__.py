@@ -1,0 +1,1 @@
+"""Reading, checking, planning and simulating bench logs."""

@@ -1,0 +1,262 @@
+"""Every fault is found where it is, and a log without faults is left in peace."""
+
+import dataclasses
+import functools
+import math
+
+import numpy as np
+import pytest
+
+from codrl_mj.actuators import Drive, GearMotor, SampledLoop, Supply
+from codrl_mj.identify.checks import check
+from codrl_mj.identify.contradictions import FACTORS, name_of_factor
+from codrl_mj.identify.excitations import Excitation
+from codrl_mj.identify.synthetic import Load, Sampler, Sensor, run, simulate
+
+MOTORS = {
+    "small": GearMotor(0.94, 3.6e-4, 0.036, 0.036, 1.35e-5, coulomb_friction=5e-3, viscous_friction=1e-6),
+    "geared": GearMotor(2.2, 1.3e-3, 0.014, 0.014, 2e-6, gear_ratio=30.0, coulomb_friction=1e-3),
+    "fast": GearMotor(8.4, 1.16e-3, 0.042, 0.042, 4e-6, coulomb_friction=1e-3, viscous_friction=3e-6),
+}
+RATE = 5000.0
+STEP = 2.0 * math.pi / 4096
+
+
+def drive_of(motor, sag=0.0):
+    return Drive(MOTORS[motor], SampledLoop(), Supply(12.0, sag * MOTORS[motor].resistance))
+
+
+def excitation_of(motor, kind):
+    clock = 4.0 * MOTORS[motor].electrical_time_constant
+    return Excitation(kind, 6.0, 1.0, frequency=2.0 if kind == "square" else 1.0, highest=150.0, clock=clock)
+
+
+@functools.cache
+def logged(motor="small", kind="prbs", sag=0.0, jitter=0.0, dropped=0.0, seed=0, changes=()):
+    """A log with noise and quantisation, and a fault: (signal, field, value)."""
+    one, drive = MOTORS[motor], drive_of(motor, sag)
+    load = Load(3.0 * one.rotor_inertia * one.gear_ratio**2 + 1e-4)
+    course = run(drive, excitation_of(motor, kind), load)
+    peak, fastest = np.abs(course.current).max(), np.abs(course.speed).max()
+    sensors = {
+        "current": Sensor(0.01 * peak),
+        "torque": Sensor(0.01 * peak * one.torque_constant * one.gear_ratio),
+        "velocity": Sensor(0.01 * fastest),
+        "position": Sensor(resolution=STEP),
+    }
+    for signal, field, value in changes:
+        sensors[signal] = dataclasses.replace(sensors.get(signal, Sensor()), **{field: value})
+    sampler = Sampler(RATE, jitter, dropped, mean_voltage=True)
+    return simulate(drive, excitation_of(motor, kind), load, sensors, sampler, seed)
+
+
+def scaled(log, **factors):
+    """Signals times a factor, as by a wrong unit or sign."""
+    signals = {name: factors.get(name, 1.0) * values for name, values in log.signals.items()}
+    steps = {name: abs(factors.get(name, 1.0)) * step for name, step in log.resolution.items()}
+    return dataclasses.replace(log, signals=signals, resolution=steps)
+
+
+def without(log, *names):
+    return dataclasses.replace(log, signals={name: one for name, one in log.signals.items() if name not in names})
+
+
+def replaced(log, **signals):
+    return dataclasses.replace(log, signals={**log.signals, **signals})
+
+
+def found(log, kind, motor=None):
+    return [one for one in check(log, motor) if one.check == kind]
+
+
+CLEAN = [(motor, kind) for motor in MOTORS for kind in ("slow_sine", "square", "chirp", "prbs")]
+FEW = [CLEAN[0], CLEAN[3], CLEAN[7]]
+
+
+@pytest.mark.parametrize(
+    ("motor", "kind"), [pytest.param(*one, marks=() if one in FEW else pytest.mark.matrix) for one in CLEAN]
+)
+def test_a_log_without_faults_is_left_in_peace(motor, kind):
+    findings = check(logged(motor, kind), MOTORS[motor])
+    assert [one for one in findings if one.severity != "info"] == []
+    assert {one.check for one in findings} <= {"excitation"}
+
+
+def test_a_slow_log_is_told_that_it_does_not_show_the_inductance():
+    assert "inductance" in found(logged(kind="slow_sine"), "excitation")[0].message
+    assert found(logged(kind="prbs"), "excitation") == []
+
+
+SIGNS = {
+    "current": ("-current", lambda log: without(scaled(log, current=-1.0), "torque")),
+    "voltage": ("-voltage", lambda log: without(scaled(log, voltage=-1.0), "torque")),
+    "position": ("-position", lambda log: scaled(log, position=-1.0)),
+    "motion": ("-position, -velocity", lambda log: scaled(log, position=-1.0, velocity=-1.0)),
+    "torque": ("-torque", lambda log: scaled(log, torque=-1.0)),
+    "torque alone": ("no voltage", lambda log: without(scaled(log, torque=-1.0), "voltage", "current")),
+}
+UNITS = {
+    "position in degrees": lambda log: scaled(log, position=180.0 / math.pi),
+    "position in degrees, alone": lambda log: without(scaled(log, position=180.0 / math.pi), "velocity"),
+    "motion in degrees": lambda log: scaled(log, position=180.0 / math.pi, velocity=180.0 / math.pi),
+    "velocity in rpm": lambda log: scaled(log, velocity=30.0 / math.pi),
+    "velocity in rpm, alone": lambda log: without(scaled(log, velocity=30.0 / math.pi), "position"),
+    "current in mA": lambda log: scaled(log, current=1000.0),
+    "torque in mN*m": lambda log: scaled(log, torque=1000.0),
+    "duty for voltage": lambda log: replaced(log, voltage=log.signals["duty"]),
+    "time in ms": lambda log: dataclasses.replace(log, time=1000.0 * log.time + 0.3 * np.arange(len(log.time))),
+}
+
+
+@pytest.mark.parametrize("name", SIGNS)
+def test_a_wrong_sign_is_an_error(name):
+    found_here = found(SIGNS[name][1](logged()), "sign")
+    assert [one.severity for one in found_here] == ["error"] * len(found_here) != []
+    assert "minus" in found_here[0].remedy
+
+
+@pytest.mark.parametrize("name", UNITS)
+def test_a_wrong_unit_is_found(name):
+    assert found(UNITS[name](logged()), "unit")
+
+
+@pytest.mark.matrix
+@pytest.mark.parametrize(("motor", "kind"), CLEAN)
+def test_wrong_signs_and_units_are_found_by_every_excitation(motor, kind):
+    log = logged(motor, kind)
+    assert [name for name, (_, make) in SIGNS.items() if not found(make(log), "sign")] == []
+    assert [name for name, make in UNITS.items() if not found(make(log), "unit")] == []
+
+
+def test_the_current_alone_needs_a_datasheet_for_its_unit():
+    log = without(scaled(logged(), current=1000.0), "torque")
+    assert found(log, "unit") == []
+    assert "thousandths" in found(log, "unit", MOTORS["small"])[0].message
+
+
+@pytest.mark.parametrize("name", FACTORS)
+def test_factors_have_names(name):
+    assert name_of_factor(1.02 * FACTORS[name]) == name == name_of_factor(-0.98 / FACTORS[name])
+
+
+def test_factors_without_a_name_may_be_gears():
+    assert "gear" in name_of_factor(4.3)
+
+
+@pytest.mark.parametrize("kind", ["chirp", "prbs"])
+@pytest.mark.parametrize("rows", [1.0, 2.0, 3.5])
+def test_a_late_current_is_found(kind, rows):
+    (one,) = found(logged(kind=kind, changes=(("current", "delay", rows / RATE),)), "lag")
+    assert one.severity == "warning"
+    assert float(one.message.split()[3]) == pytest.approx(rows, abs=0.3)
+    assert " after " in one.message
+
+
+@pytest.mark.parametrize("seconds", [0.003, 0.02])
+def test_a_late_velocity_is_found(seconds):
+    (one,) = found(logged(kind="slow_sine", changes=(("velocity", "delay", seconds),)), "lag")
+    assert float(one.message.split()[3]) == pytest.approx(1e3 * seconds, abs=0.2)
+
+
+def test_a_voltage_that_is_no_mean_is_found_where_it_changes_between_rows():
+    log, excitation = logged(), excitation_of("small", "prbs")
+    assert found(log, "voltage") == []
+    at_rows = replaced(log, voltage=excitation.voltage(log.time))
+    (one,) = found(at_rows, "voltage")
+    assert (one.severity, "half a row" in one.message) == ("warning", True)
+    (one,) = found(dataclasses.replace(at_rows, mean_voltage=False), "voltage")
+    assert one.severity == "info"
+
+
+def test_gaps_dropped_rows_and_jitter():
+    log = logged(dropped=0.05, jitter=0.1)
+    rows = np.flatnonzero(np.diff(log.row_numbers) > 1) + 1
+    (dropped,) = found(log, "dropped rows")
+    assert dropped.row == log.row_numbers[rows[0]]
+    missing = int(log.row_numbers[-1] - len(log.time))
+    assert dropped.message.startswith(f"{missing} rows missing")
+    assert found(log, "jitter")
+    keep = np.r_[0:1000, 3000:5001]
+    gap = dataclasses.replace(
+        logged(), time=logged().time[keep], signals={k: v[keep] for k, v in logged().signals.items()}, rows=keep + 1
+    )
+    assert [one.row for one in found(gap, "gap")] == [3001]
+    assert found(logged(), "jitter") == found(logged(), "gap") == found(logged(), "dropped rows") == []
+
+
+@pytest.mark.parametrize("kind", ["slow_sine", "prbs"])
+def test_outliers_are_found_where_they_are(kind):
+    clean = logged(kind=kind)
+    spoiled = clean.signals["current"].copy()
+    rows = np.arange(333, 5_000, 250)
+    spoiled[rows] += 5.0 * np.std(spoiled) * np.where(rows % 2, 1.0, -1.0)
+    (one,) = found(replaced(clean, current=spoiled), "outliers")
+    listed = [int(word) for word in one.message.partition("(")[2].rstrip(")").split(",")]
+    assert one.row == listed[0]
+    assert set(listed) <= {*rows, *(rows + 1)}  # or the row before, where that leaves its neighbours too
+    assert one.severity == "info"
+    assert found(clean, "outliers") == []
+
+
+def test_a_clipped_current_is_found():
+    log = logged()
+    limit = 0.6 * np.abs(log.signals["current"]).max()
+    clipped = found(replaced(log, current=np.clip(log.signals["current"], -limit, limit)), "saturation")
+    assert {one.row for one in clipped} == {
+        1 + int(np.argmax(log.signals["current"] >= limit)),
+        1 + int(np.argmax(log.signals["current"] <= -limit)),
+    }
+
+
+def test_coarse_sensors_are_found():
+    coarse = logged(changes=(("position", "resolution", 1.0), ("current", "resolution", 2.0)))
+    assert {one.message.split()[0] for one in found(coarse, "resolution")} == {"current", "position"}
+    assert found(logged(), "resolution") == []
+
+
+@pytest.mark.parametrize("motor", MOTORS)
+def test_a_supply_that_sags_unseen_is_found_where_the_duty_varies(motor):
+    (one,) = found(logged(motor, "chirp", sag=0.25), "sag")
+    # at half of the duty: d^2*R/4
+    assert float(one.message.split()[5]) == pytest.approx(0.0625 * MOTORS[motor].resistance, rel=0.3)
+    assert found(logged(motor, "chirp"), "sag") == []
+
+
+def test_a_wrapped_position_and_too_much_voltage_are_found():
+    log = logged(kind="slow_sine")
+    wrapped = found(replaced(log, position=log.signals["position"] % (2.0 * math.pi)), "wrapped")
+    turns = np.flatnonzero(np.diff(np.floor(log.signals["position"] / (2.0 * math.pi))) != 0.0)
+    assert [one.row for one in wrapped] == [turns[0] + 2]
+    assert "times that of the supply" in found(replaced(log, bus=0.4 * log.signals["bus"]), "unit")[0].message
+
+
+def test_gravity_tells_a_zero_at_the_top():
+    drive, load = drive_of("geared"), Load(2e-2, gravity=0.8)
+    log = simulate(
+        drive, Excitation("slow_sine", 6.0, 4.0), load, {"position": Sensor(resolution=STEP)}, Sampler(500.0)
+    )
+    log = without(log, "voltage", "current")
+    assert found(log, "sign") == []
+    turned = replaced(log, position=log.signals["position"] + math.pi)
+    assert "at the top" in found(turned, "sign")[0].message
+
+
+def test_a_torque_that_does_not_move_it_is_found():
+    log = without(logged("geared", "square"), "voltage", "current")
+    assert found(log, "torque") == []
+    other = np.random.default_rng(0).standard_normal(20)[np.arange(len(log.time)) // 251]
+    assert found(replaced(log, torque=log.signals["torque"] + 0.3 * other), "torque")
+
+
+def test_a_held_or_one_way_shaft_is_told():
+    held = simulate(drive_of("small"), Excitation("locked_prbs", 6.0, 1.0), Load(), {"current": Sensor(0.05)})
+    assert "stands still" in found(held, "excitation")[0].message
+    assert all(one.severity == "info" for one in check(held))
+    one_way = simulate(drive_of("small"), Excitation("square", 6.0, 0.4, frequency=1.0), Load(1e-4))
+    assert "one way only" in found(one_way, "excitation")[-1].message
+
+
+def test_a_log_that_says_nothing_is_an_error():
+    log = simulate(drive_of("small"), Excitation("slow_sine", 6.0, 1.0), Load(1e-4))
+    constant = replaced(log, voltage=np.zeros(len(log.time)))
+    assert "error" in [one.severity for one in found(constant, "excitation")]

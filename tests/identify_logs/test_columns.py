@@ -1,0 +1,95 @@
+"""The mapping of columns to signals."""
+
+import math
+
+import numpy as np
+import pytest
+
+from codrl_mj.identify.columns import parse_columns, twos_complement
+
+TABLE = {"t": np.array([0.0, 1.0]), "a": np.array([2.0, -3.0]), "b": np.array([5.0, 7.0]), "motor current": np.ones(2)}
+
+
+def value(entry):
+    name = entry.partition("=")[0]
+    return parse_columns(f"time=t:s,{entry}")[name].value({**TABLE, "k": 4.0})
+
+
+@pytest.mark.parametrize(
+    ("entry", "expected"),
+    [
+        ("voltage=a*b:V", [10.0, -21.0]),
+        ("voltage=-a*b/k + 1:V", [-1.5, 6.25]),
+        ("voltage=a*b", [10.0, -21.0]),  # of a formula the unit may be left out
+        ("current=a:mA", [0.002, -0.003]),
+        ("position=a:deg", np.deg2rad([2.0, -3.0])),
+        ("position=a:turn", [4.0 * math.pi, -6.0 * math.pi]),
+        ("velocity=b:rpm", np.array([5.0, 7.0]) * 2.0 * math.pi / 60.0),
+        ("torque=a:mNm", [0.002, -0.003]),
+        ("torque=a:kgf*cm", np.array([2.0, -3.0]) * 9.80665 / 100.0),
+        ("temperature=b:K", [-268.15, -266.15]),
+        ("duty=b:percent", [0.05, 0.07]),
+        ("current='motor current':A", [1.0, 1.0]),
+        ("current=abs(a) - sqrt(k) + sign(a)*pi:A", [math.pi, 1.0 - math.pi]),
+        ("command=a:deg", np.deg2rad([2.0, -3.0])),
+    ],
+)
+def test_formulas_and_units(entry, expected):
+    np.testing.assert_allclose(value(entry), expected, rtol=1e-12)
+
+
+def test_twos_complement_is_what_a_cast_makes_of_it():
+    numbers = np.arange(0, 65536, 7)
+    np.testing.assert_array_equal(twos_complement(numbers, 16), numbers.astype(np.uint16).astype(np.int16))
+
+
+def test_unwrap_undoes_what_wraps():
+    angle = np.linspace(0.0, 2000.0, 101)
+    found = parse_columns("time=t:s,position=unwrap(q, 360):deg")["position"].value({"t": angle, "q": angle % 360.0})
+    np.testing.assert_allclose(found, np.deg2rad(angle), atol=1e-12)
+
+
+def test_mean_is_a_declaration_of_voltages():
+    assert parse_columns("time=t:s,voltage=mean(a*b):V")["voltage"].mean
+    assert not parse_columns("time=t:s,voltage=a*b:V")["voltage"].mean
+
+
+def test_mappings_are_as_good_as_text():
+    assert parse_columns({"time": "t:s", "current": "a:A"}) == parse_columns("time=t:s, current=a:A")
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("time=t:s", "nothing but time"),
+        ("current=a:A", "no time"),
+        ("time=t:s,current=a", "current=a:A"),  # the remedy
+        ("time=t,current=a:A", "time=t:s"),
+        ("time=t:s,current=a:V", "no unit of current"),
+        ("time=t:s,current=a:blub", "blub"),
+        ("time=t:s,velocity=a:Hz", "rad/s"),
+        ("time=t:s,velocity=a:1/s", "turns or radians"),
+        ("time=t:s,currant=a:A", "did you mean current"),
+        ("time=t:s,current=a:A,current=b:A", "twice"),
+        ("time=t:s,current=a:A:V", "two colons"),
+        ("time=t:s,current", "signal=formula:unit"),
+        ("time=t:s,current=a b:A", "no formula"),
+        ("time=t:s,current=a**2:A", "not allowed"),
+        ("time=t:s,current=a[0]:A", "not allowed"),
+        ("time=t:s,current=a.real:A", "not allowed"),
+        ("time=t:s,current=[a for a in b]:A", "not allowed"),
+        ("time=t:s,current=open('x'):A", "unknown function open"),
+        ("time=t:s,current=(lambda: 1)():A", "not allowed"),
+        ("time=t:s,current=twos_complement(a):A", "takes 2 arguments"),
+        ("time=t:s,current=twos_complement(a, b):A", "must be a number"),
+        ("time=t:s,current=mean(a):A", "unknown function mean"),
+    ],
+)
+def test_what_is_refused_says_why(text, says):
+    with pytest.raises(ValueError, match=says.replace("(", r"\(")):
+        parse_columns(text)
+
+
+def test_a_column_that_is_not_there_is_named():
+    with pytest.raises(ValueError, match="unknown column"):
+        value("current=c*2:A")

@@ -1,0 +1,175 @@
+"""Logs from files."""
+
+import gzip
+import json
+
+import numpy as np
+import pytest
+
+from codrl_mj.identify.log import Log, find_resolution, usable
+from codrl_mj.identify.reading import read_log
+from codrl_mj.identify.synthetic import write_log
+
+COLUMNS = "time=t:s,current=i:A"
+
+
+def write(folder, text, name="log.csv"):
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_csv(tmp_path, separator):
+    rows = ["t,i,other", "10,1.5,x", "10.5, 2e0,y", "", "11,-3,z"]
+    log = read_log(write(tmp_path, "\n".join(rows).replace(",", separator)), COLUMNS)
+    np.testing.assert_array_equal(log.time, [0.0, 0.5, 1.0])
+    np.testing.assert_array_equal(log.signals["current"], [1.5, 2.0, -3.0])
+    assert log.name == "log"
+    assert log.has("current")
+    assert not log.has("current", "voltage")
+    assert log.findings == ()
+
+
+ROWS = {"t": [0.0, 1.0, 2.0], "i": [4.0, 5.0, 7.0]}
+ENTRIES = [dict(zip(ROWS, row, strict=True)) for row in zip(*ROWS.values(), strict=True)]
+
+
+@pytest.mark.parametrize("content", [ROWS, ENTRIES, {"entries": ENTRIES, "gain": 2, "name": "x"}])
+@pytest.mark.parametrize("packed", [False, True])
+def test_json(tmp_path, content, packed):
+    path = tmp_path / ("log.json.gz" if packed else "log.json")
+    text = json.dumps(content).encode()
+    path.write_bytes(gzip.compress(text) if packed else text)
+    log = read_log(path, COLUMNS)
+    np.testing.assert_array_equal(log.signals["current"], ROWS["i"])
+    assert log.name == "log"
+    assert log.constants == ({"gain": 2.0} if "gain" in content else {})
+
+
+def test_constants_of_a_file_count_in_formulas(tmp_path):
+    path = write(tmp_path, json.dumps({"entries": ENTRIES, "gain": 2}), "log.json")
+    np.testing.assert_array_equal(read_log(path, "time=t:s,current=i*gain:A").signals["current"], [8.0, 10.0, 14.0])
+
+
+def test_rows_that_cannot_be_used_are_left_out_and_named(tmp_path):
+    lines = ["t,i"] + [f"{k},{k}" for k in range(20)]
+    lines[4], lines[8], lines[12] = "3,", "5.5,7", "11"  # a value is missing; the clock goes back; the row is cut
+    log = read_log(write(tmp_path, "\n".join(lines)), COLUMNS)
+    np.testing.assert_array_equal(np.setdiff1d(np.arange(1, 21), log.row_numbers), [4, 8, 12])
+    np.testing.assert_array_equal(log.row_numbers, log.time + 1.0)
+    assert {(one.check, one.row) for one in log.findings} == {("missing", 4), ("stamps", 8), ("missing", 12)}
+    assert [one.severity for one in log.findings if one.check == "stamps"] == ["error"]
+
+
+def test_only_leaves_out_rows_and_leaves_a_gap(tmp_path):
+    lines = ["t,i,on"] + [f"{k},{k},{'false' if 20 <= k < 40 else 'true'}" for k in range(60)]
+    log = read_log(write(tmp_path, "\n".join(lines)), f"{COLUMNS},only=on")
+    assert len(log.time) == 40
+    assert usable(log) == [slice(0, 20), slice(20, 40)]
+
+
+def test_a_register_with_a_sign_is_seen(tmp_path):
+    numbers = np.round(100.0 * np.sin(np.arange(60.0))).astype(np.int16)
+    path = write(tmp_path, "\n".join(["t,i"] + [f"{k},{n.astype(np.uint16)}" for k, n in enumerate(numbers)]))
+    (found,) = read_log(path, COLUMNS).findings
+    assert (found.check, found.row) == ("register", 1 + int(np.argmax(numbers < 0)))
+    log = read_log(path, "time=t:s,current=twos_complement(i, 16):A")
+    assert log.findings == ()
+    np.testing.assert_array_equal(log.signals["current"], numbers)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("t,i\n1,2\n2,a\n", "i in row 2 is 'a'"),
+        ("t;i\n1;2,5\n2;3,5\n", "decimal point"),
+        ("t,t\n1,2\n", "name the columns"),
+        ("t,i\n1,2\n", "cannot be used"),
+        ("t,i\n3,2\n2,2\n1,2\n", "2 of 3 rows"),
+        ("t,j\n1,2\n2,2\n", "unknown column i"),
+        ("", "name the columns"),
+    ],
+)
+def test_bad_files_say_what_is_wrong(tmp_path, text, says):
+    with pytest.raises(ValueError, match=says):
+        read_log(write(tmp_path, text), COLUMNS)
+
+
+def test_unknown_kinds_of_files(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no log at .*nowhere"):
+        read_log(tmp_path / "nowhere.csv", COLUMNS)
+    for name, says in (("a.mat", "must be .csv"), ("a.json", "JSON must be"), ("a.csv.gz", "gzip")):
+        with pytest.raises(ValueError, match=says):
+            read_log(write(tmp_path, "[1]", name), COLUMNS)
+
+
+def test_parquet_is_read_by_pyarrow_and_says_so_without(tmp_path, monkeypatch):
+    path = write(tmp_path, "", "log.parquet")
+    monkeypatch.setitem(__import__("sys").modules, "pyarrow.parquet", None)
+    with pytest.raises(ValueError, match="pip install pyarrow"):
+        read_log(path, COLUMNS)
+
+    class Table:
+        @staticmethod
+        def read_table(given):
+            assert given == path
+            return Table
+
+        @staticmethod
+        def to_pydict():
+            return ROWS
+
+    monkeypatch.setitem(__import__("sys").modules, "pyarrow.parquet", Table)
+    np.testing.assert_array_equal(read_log(path, COLUMNS).signals["current"], ROWS["i"])
+
+
+@pytest.mark.parametrize("name", ["log.csv", "log.csv.gz"])
+@pytest.mark.parametrize("mean", [False, True])
+def test_what_is_written_is_read_again(tmp_path, name, mean):
+    random = np.random.default_rng(0)
+    signals = {signal: random.standard_normal(50) for signal in ("voltage", "current", "duty", "temperature")}
+    log = Log("log", np.cumsum(random.uniform(0.5, 1.5, 50)) * 1e-3, signals, mean_voltage=mean)
+    again = read_log(tmp_path / name, write_log(tmp_path / name, log))
+    assert again.mean_voltage is mean
+    np.testing.assert_allclose(again.time, log.time - log.time[0], atol=1e-9)
+    for signal, values in signals.items():
+        np.testing.assert_allclose(again.signals[signal], values, rtol=1e-8)
+
+
+def test_a_log_holds_what_it_says():
+    time = np.arange(5.0)
+    with pytest.raises(ValueError, match="unknown signal"):
+        Log("x", time, {"currant": time})
+    with pytest.raises(ValueError, match="shape"):
+        Log("x", time, {"current": time[1:]})
+    with pytest.raises(ValueError, match="finite"):
+        Log("x", time, {"current": np.where(time == 2.0, np.nan, time)})
+    with pytest.raises(ValueError, match=r"time\[3\]"):
+        Log("x", np.array([0.0, 1.0, 2.0, 2.0, 3.0]), {"current": time})
+    part = Log("x", time, {"current": time}).part(slice(2, 4))
+    np.testing.assert_array_equal(part.row_numbers, [3, 4])
+    np.testing.assert_array_equal(part.signals["current"], [2.0, 3.0])
+
+
+def test_usable_stretches_have_no_gap_and_two_rows_at_least():
+    time = np.array([0.0, 1.0, 2.0, 4.0, 5.0, 20.0, 40.0, 41.0, 42.0])
+    log = Log("x", time, {"current": time})
+    assert usable(log) == [slice(0, 5), slice(6, 9)]
+    assert usable(log, 1.5) == [slice(0, 3), slice(3, 5), slice(6, 9)]
+    with pytest.raises(ValueError, match="longest"):
+        usable(log, 1.0)
+
+
+@pytest.mark.parametrize("step", [2.0 * np.pi / 4096, 0.0088, 3.0])
+@pytest.mark.parametrize("every", [1, 2])
+def test_resolution_is_found(step, every):
+    levels = np.round(np.random.default_rng(1).normal(0.0, 40.0, 500)) * every
+    levels[0] += every > 1  # a single odd level: neighbours do not occur
+    assert find_resolution(0.1 + step * levels) == pytest.approx(step, rel=1e-9)
+
+
+def test_what_is_continuous_or_constant_has_no_resolution():
+    assert find_resolution(np.random.default_rng(0).standard_normal(1000)) == 0.0
+    assert find_resolution(np.zeros(9)) == 0.0
+    assert find_resolution(np.array([-1.0, 1.0, 1.0])) == 0.0
