@@ -6,7 +6,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, environment
+from codrl_mj.cli.environments import environment
+from codrl_mj.cli.fields import AS_TRAINED, ActuatorName
 from codrl_mj.cli.subject import Source
 
 

@@ -11,13 +11,13 @@ import json
 import re
 import textwrap
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.actuators import FAMILIES, NAMED, Actuator, Ideal, actuator_over, identified_ranges
+from codrl_mj.actuators import FAMILIES, NAMED, Actuator, Ideal
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import parts
 from codrl_mj.foreign.config import EVERY, ForeignConfig, is_gymnasium_id
@@ -71,7 +71,7 @@ def flags(kind: type, defaults: Any = None, leaving_out: tuple[str, ...] = (), a
     return dataclasses.make_dataclass(f"{kind.__name__}Fields", [*fields, *adding], frozen=True)
 
 
-def _task_options() -> dict[str, tuple[Any, str]]:
+def task_options() -> dict[str, tuple[Any, str]]:
     """Name -> type and description of every option that a task has."""
     kinds: dict[str, Any] = {name: task.options for name, task in TASKS.items()}
     return {
@@ -125,13 +125,13 @@ def environment_fields(defaults: EnvConfig | ForeignConfig, name: str | None, ta
         options = defaults.as_mapping()["options"]
         of_tasks = [
             (option, Annotated[hint | None, tyro.conf.arg(help=text)], options.get(option))
-            for option, (hint, text) in _task_options().items()
+            for option, (hint, text) in task_options().items()
         ]
         env = flags(EnvConfig, defaults, ("task", "actuator", "options"), of_tasks)
         family = type(defaults.actuators[0])
     if name not in (None, AS_TRAINED, AS_CONFIGURED):
         with contextlib.suppress(ValueError, OSError):  # the verb says so better
-            family = type(_named(str(name), task)[0])
+            family = type(named_actuators(str(name), task)[0])
     over = flags(Actuator if issubclass(family, Ideal) else family)
     return [
         ("actuators", Actuators, ()),
@@ -154,140 +154,11 @@ def _foreign_flags(defaults: ForeignConfig) -> Any:
     return flags(ForeignConfig, defaults, ("task", "actuators", "randomize", "options"), adding)
 
 
-def _named(name: str, task: str) -> tuple[Any, ...]:
+def named_actuators(name: str, task: str) -> tuple[Any, ...]:
     """The actuators that a name stands for in a task, or in an environment of somebody else's."""
     if is_gymnasium_id(task):
         return ForeignConfig(task, {EVERY: name}).actuator
     return resolve_actuators(name, find_task(task))
-
-
-def default_actuator(task: str) -> str:
-    """The name of what a task goes through unless told otherwise; in an environment of somebody else's nothing."""
-    return "ideal" if is_gymnasium_id(task) else find_task(task).default_actuator
-
-
-def through(actuators: Sequence[str], name: str) -> str:
-    """What to call what `--actuators`, or else `--actuator`, says."""
-    return "-".join(dict.fromkeys(Path(each.rpartition("=")[2]).stem for each in actuators)) or name
-
-
-def environment(verb: Any, task: str, name: str, known: Any = None) -> EnvConfig | ForeignConfig:
-    """The environment that a verb's flags describe.
-
-    Args:
-        verb: has the fields of `environment_fields`.
-        task: the task's name, or the id of an environment of somebody else's.
-        name: a named actuator, or `AS_TRAINED` or `AS_CONFIGURED`.
-        known: the environment whose actuators these stand for.
-
-    Raises:
-        ValueError: unknown name, value out of bounds, or fields set over the ideal actuator, which has none.
-    """
-    if is_gymnasium_id(task):
-        return _foreign_environment(verb, task, name, known)
-    given: dict[str, Any] = dict(vars(verb.env))
-    nested: dict[str, Any] = {name: vars(given.pop(name)) for name in ("disturbances", "joint")}
-    options = {name: value for name in _task_options() if (value := given.pop(name, None)) is not None}
-    given["randomize"] = _ranges(given["randomize"], name)
-    from codrl_mj.specs import matched_by, refuse_unmatched
-
-    actuators = list(known.actuators if name in (AS_TRAINED, AS_CONFIGURED) else _named(name, task))
-    definition = find_task(task)
-    for pattern, other in _patterns(verb.actuators).items():
-        matched = matched_by(pattern, [[motor] for motor in definition.motors])
-        if not matched:
-            refuse_unmatched(pattern, [[motor] for motor in definition.motors])
-        for index in matched:
-            actuators[index] = resolve_actuators(other, definition)[index]
-    changed = [actuator_over(one, _given(verb.actuator_fields)) for one in actuators]
-    return EnvConfig(task, changed, options=options, **given, **nested)
-
-
-def _foreign_environment(verb: Any, task: str, name: str, known: Any) -> ForeignConfig:
-    """`environment` of somebody else's."""
-    given: dict[str, Any] = dict(vars(verb.env))
-    options = {key: _value(text) for key, text in _pairs(given.pop("options"), "--env.options", str.partition).items()}
-    disturbances = vars(given.pop("disturbances"))
-    actuators = _patterns(verb.actuators)
-    if actuators and name not in (AS_TRAINED, AS_CONFIGURED, "ideal"):
-        raise ValueError(
-            f"--actuator {name}: is for all motors, and --actuators for single ones: leave one of them out"
-        )
-    if not actuators and name in (AS_TRAINED, AS_CONFIGURED) and known is not None:
-        actuators = known.actuators
-    elif not actuators:
-        actuators = dict.fromkeys([EVERY] if known is None else known.actuators, name)
-    if "identified" in (given["randomize"] or ()) and verb.actuators:
-        every = [(pattern, _ranges(("identified",), str(one))) for pattern, one in actuators.items()]
-        drawn = [f"{pattern}:{text}" for pattern, texts in every for text in texts]
-        given["randomize"] = (*(one for one in given["randomize"] if one != "identified"), *drawn)
-    given["randomize"] = _ranges(given["randomize"], name)
-    made = ForeignConfig(task, actuators).actuators
-    over = _given(verb.actuator_fields)
-    changed = {pattern: actuator_over(one, over) for pattern, one in made.items()}
-    return ForeignConfig(task, changed, options=options, disturbances=disturbances, **given)
-
-
-def _patterns(items: Sequence[str]) -> dict[str, Any]:
-    """Pattern -> what is behind these actuators, of PATTERN=NAME and of files."""
-    found: dict[str, Any] = {}
-    for item in items:
-        if "=" not in item and Path(item).suffix in (".yaml", ".yml", ".json"):
-            import yaml
-
-            content = yaml.safe_load(Path(item).read_text())
-            if not isinstance(content, Mapping):
-                raise ValueError(f"--actuators {item}: the file must have a mapping of patterns to actuators")
-            found |= content
-        else:
-            found |= _pairs([item], "--actuators")
-    return found
-
-
-def _pairs(items: Sequence[str], flag: str, split: Callable[[str, str], Any] = str.rpartition) -> dict[str, str]:
-    """Name -> value of NAME=VALUE.
-
-    Args:
-        items: these.
-        flag: whose they are.
-        split: at which '=': at the last, where names may be regular expressions, or at the first.
-
-    Raises:
-        ValueError: there is no '='.
-    """
-    pairs = {}
-    for item in items:
-        name, equals, value = split(item, "=")
-        if not equals or not name:
-            raise ValueError(f"{flag} {item}: must be NAME=VALUE")
-        pairs[name] = value
-    return pairs
-
-
-def _value(text: str) -> Any:
-    """What a text is as JSON, or else the text itself."""
-    try:
-        return json.loads(text)
-    except ValueError:
-        return text
-
-
-def _ranges(randomize: Any, actuator: str) -> Any:
-    """What `--env.randomize` says, `identified` replaced by the intervals that the actuator's file has.
-
-    Raises:
-        ValueError: the actuator is no file that has any.
-    """
-    if randomize is None or "identified" not in randomize:
-        return randomize
-    if Path(actuator).suffix not in (".yaml", ".yml", ".json"):
-        raise ValueError(
-            f"--env.randomize identified: draws within the intervals of a file; --actuator is {actuator!r}, must be "
-            "one that `codrl-mj identify` wrote"
-        )
-    others = [one for one in randomize if one != "identified"]
-    named = {one.partition("=")[0].strip() for one in others}
-    return (*others, *(f"{name}={text}" for name, text in identified_ranges(actuator).items() if name not in named))
 
 
 def scan(arguments: Sequence[str], *names: str) -> argparse.Namespace:
@@ -338,12 +209,3 @@ def with_environment(verb: Any, arguments: Sequence[str]) -> Any:
     made = dataclasses.make_dataclass(verb.__name__, fields, bases=(verb,), frozen=True)
     made.__doc__ = verb.__doc__
     return made
-
-
-def _given(fields: Any) -> dict[str, Any]:
-    """What was set, nested."""
-    return {
-        name: _given(value) if dataclasses.is_dataclass(value) else value
-        for name, value in vars(fields).items()
-        if value is not None
-    }

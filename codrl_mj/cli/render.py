@@ -6,7 +6,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, default_actuator, environment, is_task, through
+from codrl_mj.cli.environments import default_actuator, environment, through
+from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, is_task
 from codrl_mj.cli.subject import Source
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import did_you_mean

@@ -10,15 +10,13 @@ import tyro
 
 from codrl_mj.agents import AGENTS
 from codrl_mj.agents.presets import SETTINGS
+from codrl_mj.cli.environments import default_actuator, environment, through
 from codrl_mj.cli.fields import (
     AS_CONFIGURED,
     ActuatorName,
-    default_actuator,
-    environment,
     environment_fields,
     flags,
     scan,
-    through,
 )
 from codrl_mj.foreign.config import environment_from
 from codrl_mj.runs.layout import finished

@@ -9,7 +9,7 @@ import yaml
 
 from codrl_mj.actuators import Drive, identified_ranges, resolve
 from codrl_mj.cli import main
-from codrl_mj.cli.fields import environment
+from codrl_mj.cli.environments import environment
 from codrl_mj.cli.train import train_verb
 from codrl_mj.identify.result import Estimate, Identified
 from tests.identify import bench
