@@ -42,6 +42,7 @@ XML = """
 </mujoco>
 """
 REACH, NEAR = 0.36, 0.03  # [m]
+SHOULDER = np.array([0.0, 0.3])  # [m], x and z
 
 
 class ServoArm(MujocoEnv):
@@ -59,13 +60,17 @@ class ServoArm(MujocoEnv):
             path.write_text(XML)
             space = spaces.Box(-np.inf, np.inf, (10,), np.float64)
             super().__init__(str(path), 5, space, camera_name="side", **options)
-        self._target = np.zeros(2)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Ask the servos for an angle each."""
         self.do_simulation(action, self.frame_skip)
         distance = float(np.linalg.norm(self._way()))
         return self._seen(), -distance, False, False, {"is_success": distance < NEAR}
+
+    @property
+    def _target(self) -> np.ndarray:
+        """Of the hand [m], from the shoulder; where all of an environment's state should be: in MuJoCo's."""
+        return self.data.mocap_pos[0, ::2] - SHOULDER
 
     def _way(self) -> np.ndarray:
         """From the hand to the target [m]."""
@@ -80,8 +85,7 @@ class ServoArm(MujocoEnv):
     def reset_model(self) -> np.ndarray:
         """Start at rest somewhere, with a target within reach."""
         angle, radius = self.np_random.uniform(-np.pi, np.pi), self.np_random.uniform(0.12, REACH)
-        self._target = radius * np.array([np.cos(angle), np.sin(angle)])
-        self.data.mocap_pos[0] = self._target[0], 0.0, 0.3 + self._target[1]
+        self.data.mocap_pos[0, ::2] = SHOULDER + radius * np.array([np.cos(angle), np.sin(angle)])
         self.set_state(self.np_random.uniform(-1.0, 1.0, 2), np.zeros(2))
         return self._seen()
 

@@ -20,11 +20,10 @@ import yaml
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "examples"))  # where servo_arm is
 
-from codrl_mj.actuators import mapping_of  # noqa: E402
 from codrl_mj.evaluation import evaluate  # noqa: E402
 from codrl_mj.runs.files import writing  # noqa: E402
 from codrl_mj.runs.policies import load_policy  # noqa: E402
-from codrl_mj.sizing import Choice, choose, demands_of  # noqa: E402
+from codrl_mj.sizing import Choice, actuators_of, choose, demands_of  # noqa: E402
 from codrl_mj.training import TrainConfig, train  # noqa: E402
 
 SAC: dict[str, Any] = {"hidden": [64, 64], "batch_size": 128, "learning_starts": 2000, "learning_rate": 1e-3}
@@ -109,16 +108,14 @@ def _motors(folder: Path, ideal: Path) -> dict[str, Any]:
     if not all(path.exists() for path in files.values()):
         found: dict[str, dict[str, Any]] = {name: {} for name in files}
         for motor, demand in demands_of(ideal, episodes=5, trust=True).items():
-            pattern = motor or ".*"
             ranked = choose(demand)
-            smaller = _smaller(ranked)
-            for name, choice in (("chosen", ranked[0]), ("smaller", smaller)):
-                found[name][pattern] = mapping_of(choice.behind(demand.model_gear))
+            for name, choice in (("chosen", ranked[0]), ("smaller", _smaller(ranked))):
+                found[name][motor] = choice, demand
                 verdict = choice.lacks or "does it"
-                print(f"{pattern} {name}: {choice.name}, gear {choice.ratio:.4g}, {choice.power:.0f} W: {verdict}")
+                print(f"{motor} {name}: {choice.name}, gear {choice.ratio:.4g}, {choice.power:.0f} W: {verdict}")
         for name, path in files.items():
             with writing(path) as temporary:
-                temporary.write_text(yaml.safe_dump(found[name], sort_keys=False))
+                temporary.write_text(yaml.safe_dump(actuators_of(found[name]), sort_keys=False))
     return {name: yaml.safe_load(path.read_text()) for name, path in files.items()}
 
 

@@ -557,8 +557,9 @@ BAD = one_check(name="b <i>", group="motor", worst=math.nan, where="x < y & z", 
 SAMPLE = Certificate("sample", (one_check(task="pendulum"), BAD), (Skipped("s", "why", "motor"),), True, 1.0)
 
 
-def test_the_page_is_well_formed_self_contained_and_has_everything(certificate, some_caught):
-    text = page.html(certificate, some_caught)
+@pytest.mark.matrix
+def test_the_page_is_well_formed_self_contained_and_has_everything(certificate, caught):
+    text = page.html(certificate, caught)
     parsed = Page(text)
     assert parsed.fetched == []
     assert re.findall(r"url\(|@import|https?://", text) == []
@@ -567,7 +568,7 @@ def test_the_page_is_well_formed_self_contained_and_has_everything(certificate, 
     words = " ".join(parsed.words)
     for check in certificate.checks:
         assert check.name in words
-    for outcome in some_caught:
+    for outcome in caught:
         assert outcome.mutation in words
     assert text.count('class="plot"') == sum(len(check.plots) for check in certificate.checks) > 20
     assert "✓ passed" in words

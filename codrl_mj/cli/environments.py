@@ -2,11 +2,12 @@
 
 import dataclasses
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from codrl_mj.actuators import actuator_over, identified_ranges
+from codrl_mj.actuators import IDEAL, actuator_over, identified_ranges
 from codrl_mj.cli.fields import AS_CONFIGURED, AS_TRAINED, named_actuators, task_options
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.foreign.config import EVERY, ForeignConfig, is_gymnasium_id
@@ -61,19 +62,19 @@ def _foreign_environment(verb: Any, task: str, name: str, known: Any) -> Foreign
     options = {key: _value(text) for key, text in _pairs(given.pop("options"), "--env.options", str.partition).items()}
     disturbances = vars(given.pop("disturbances"))
     actuators = _patterns(verb.actuators)
-    if actuators and name not in (AS_TRAINED, AS_CONFIGURED, "ideal"):
-        raise ValueError(
-            f"--actuator {name}: is for all motors, and --actuators for single ones: leave one of them out"
-        )
-    if not actuators and name in (AS_TRAINED, AS_CONFIGURED) and known is not None:
-        actuators = known.actuators
-    elif not actuators:
-        actuators = dict.fromkeys([EVERY] if known is None else known.actuators, name)
     if "identified" in (given["randomize"] or ()) and verb.actuators:
         every = [(pattern, _ranges(("identified",), str(one))) for pattern, one in actuators.items()]
         drawn = [f"{pattern}:{text}" for pattern, texts in every for text in texts]
         given["randomize"] = (*(one for one in given["randomize"] if one != "identified"), *drawn)
     given["randomize"] = _ranges(given["randomize"], name)
+    if name in (AS_TRAINED, AS_CONFIGURED):
+        base = known.actuators
+    else:
+        base = dict.fromkeys([EVERY] if known is None else known.actuators, name)
+    if not actuators:
+        actuators = base
+    elif any(one != IDEAL for one in ForeignConfig(task, base).actuator):
+        actuators = _overlaid(ForeignConfig(task, base, options=options), actuators)
     made = ForeignConfig(task, actuators).actuators
     over = _given(verb.actuator_fields)
     changed = {pattern: actuator_over(one, over) for pattern, one in made.items()}
@@ -82,18 +83,40 @@ def _foreign_environment(verb: Any, task: str, name: str, known: Any) -> Foreign
 
 def _patterns(items: Sequence[str]) -> dict[str, Any]:
     """Pattern -> what is behind these actuators, of PATTERN=NAME and of files."""
+    from codrl_mj.specs import resolve_patterns
+
     found: dict[str, Any] = {}
     for item in items:
         if "=" not in item and Path(item).suffix in (".yaml", ".yml", ".json"):
             import yaml
 
-            content = yaml.safe_load(Path(item).read_text())
-            if not isinstance(content, Mapping):
-                raise ValueError(f"--actuators {item}: the file must have a mapping of patterns to actuators")
-            found |= content
+            try:
+                content = yaml.safe_load(Path(item).read_text())
+                if not isinstance(content, Mapping):
+                    raise ValueError("must be a mapping of patterns to actuators")
+                found |= resolve_patterns(content, f"the file {item}")
+            except (yaml.YAMLError, UnicodeDecodeError, ValueError) as error:
+                raise ValueError(f"--actuators {item}: {error}") from None
         else:
             found |= _pairs([item], "--actuators")
     return found
+
+
+def _overlaid(base: ForeignConfig, patterns: Mapping[str, Any]) -> dict[str, Any]:
+    """What drives an environment's motors: some patterns, and what else it has, motor by motor."""
+    from codrl_mj.specs import matched_by, names_of
+
+    env: Any = base.make()
+    names = names_of(env.unwrapped.model)
+    env.close()
+    taken = {index for pattern in patterns for index in matched_by(pattern, names)}
+    left = {
+        re.escape(names[index][0]): actuator
+        for pattern, actuator in base.actuators.items()
+        for index in matched_by(pattern, names)
+        if index not in taken
+    }
+    return {**left, **patterns}
 
 
 def _pairs(items: Sequence[str], flag: str, split: Callable[[str, str], Any] = str.rpartition) -> dict[str, str]:
@@ -111,7 +134,7 @@ def _pairs(items: Sequence[str], flag: str, split: Callable[[str, str], Any] = s
     for item in items:
         name, equals, value = split(item, "=")
         if not equals or not name:
-            raise ValueError(f"{flag} {item}: must be NAME=VALUE")
+            raise ValueError(f"{flag} {item}: must be NAME=VALUE, or for --actuators a YAML file")
         pairs[name] = value
     return pairs
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.cli.environments import environment
+from codrl_mj.cli.environments import environment, through
 from codrl_mj.cli.fields import AS_TRAINED, ActuatorName
 from codrl_mj.cli.subject import Source
 
@@ -53,7 +53,7 @@ class Evaluate:
                 not self.stochastic,
                 on_step=lambda _, ended: bar.update(row, completed=ended),
             )
-        print_evaluations({f"{self.policy.name} on {self.actuator_name}": evaluation})
+        print_evaluations({f"{self.policy.name} on {through(self.actuators, self.actuator_name)}": evaluation})
         if self.out is not None:
             from codrl_mj.runs.files import write_json
 

@@ -26,8 +26,13 @@ from codrl_mj.tasks import TASKS, find_task, resolve_actuators
 
 
 def is_task(word: str) -> bool:
-    """Whether a word is a task's name, `module:NAME`, as one of somebody's own is named, or an id of Gymnasium's."""
-    return word in TASKS or is_gymnasium_id(word) or re.fullmatch(r"[\w.]+:[\w.]+", word) is not None
+    """Whether a word is a task's name, `module:NAME`, as one of somebody's own is named, or an id of Gymnasium's.
+
+    A folder's name may look like an id, `runs/swing-v2`; then it is the folder's.
+    """
+    if word in TASKS or re.fullmatch(r"[\w.]+:[\w.]+", word) is not None:
+        return True
+    return is_gymnasium_id(word) and not Path(word).is_dir()
 
 
 @functools.cache
@@ -144,7 +149,11 @@ def _foreign_flags(defaults: ForeignConfig) -> Any:
     """Flags for an environment of somebody else's."""
     docs = field_docs(ForeignConfig)
     draws = defaults.randomize or {}
-    written = tuple(f"{pattern}:{name}={text}" for pattern, own in draws.items() for name, text in own.items())
+    written = tuple(
+        f"{name}={one}" if isinstance(one, str) else f"{name}:{field}={text}"
+        for name, one in draws.items()
+        for field, text in ({"": one} if isinstance(one, str) else one).items()
+    )
     options = tuple(f"{name}={json.dumps(value)}" for name, value in defaults.options.items())
     about = "Keyword arguments of the environment, such as frame_skip=2: their values as JSON, or else as text."
     adding = [
@@ -172,15 +181,17 @@ def scan(arguments: Sequence[str], *names: str) -> argparse.Namespace:
         The values, `task`, None if none is named, and `trust`.
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    for name in names:
+    for name in (*names, "task"):
         parser.add_argument(f"--{name}")
     parser.add_argument("--trust", action="store_true")
     try:
         chosen, _ = parser.parse_known_args(arguments)
     except argparse.ArgumentError:  # a flag without its value: the real parser says so better
-        chosen = argparse.Namespace(**dict.fromkeys(names), trust=False)
+        chosen = argparse.Namespace(**dict.fromkeys((*names, "task")), trust=False)
     behind = itertools.pairwise(["", *arguments])
-    chosen.task = next((word for flag, word in behind if is_task(word) and not flag.startswith("--")), None)
+    chosen.task = chosen.task or next(
+        (word for flag, word in behind if is_task(word) and not flag.startswith("--")), None
+    )
     return chosen
 
 

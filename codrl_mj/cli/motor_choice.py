@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -85,8 +84,8 @@ class Choose:
 
     Each is taken at its best gear. It does the task if voltage, largest current and heat hold with the margin, its heat
     is known, and the rotor leaves half to the load; smallest means by the most mechanical power at its supply. A run
-    with several motors gets one for each of them, and with --out the file actuators.yaml, which train, evaluate and
-    render take as --actuators FILE.
+    with several motors gets one for each of them. With --out there is the file actuators.yaml, which train, evaluate
+    and render take as --actuators FILE.
 
     Example: codrl-mj motor choose pendulum --top 5 --out chosen, or codrl-mj motor choose runs/Hopper_v5-sac-ideal-0
     """
@@ -130,11 +129,11 @@ class Choose:
         for choice in shown if self.out is not None else ():
             assert self.out is not None
             _draw(choice.drive, demand, choice.name, self.out / f"{Path(choice.name).stem}.png")
+        self._write({self.motor or "": (choices[0], demand)})
         return 0
 
     def _for_each(self, demands: Mapping[str, Any]) -> int:
         """Choose for each of several motors, and say how to go on."""
-        from codrl_mj.actuators import mapping_of
         from codrl_mj.cli.terminal import console
         from codrl_mj.sizing import choose
 
@@ -149,18 +148,21 @@ class Choose:
             if choice.lacks:
                 text = f"{name}: none does it; {choice.name} comes nearest at gear {choice.ratio:.4g}: {choice.lacks}"
                 console().print(text, markup=False, highlight=False)
-        if self.out is not None:
-            import yaml
-
-            from codrl_mj.runs.files import writing
-
-            content = {
-                re.escape(name): mapping_of(choice.behind(demands[name].model_gear)) for name, choice in best.items()
-            }
-            with writing(self.out / "actuators.yaml") as temporary:
-                temporary.write_text(yaml.safe_dump(content, sort_keys=False))
-            print(f"wrote {self.out / 'actuators.yaml'}")
+        self._write({name: (choice, demands[name]) for name, choice in best.items()})
         return 0
+
+    def _write(self, choices: Mapping[str, Any]) -> None:
+        """Leave what --actuators takes."""
+        if self.out is None:
+            return
+        import yaml
+
+        from codrl_mj.runs.files import writing
+        from codrl_mj.sizing import actuators_of
+
+        with writing(self.out / "actuators.yaml") as temporary:
+            temporary.write_text(yaml.safe_dump(actuators_of(choices), sort_keys=False))
+        print(f"wrote {self.out / 'actuators.yaml'}")
 
 
 def _ranking(choices: Iterable[Any], title: str, driven: Sequence[str] = ()) -> Any:

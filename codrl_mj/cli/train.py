@@ -18,7 +18,7 @@ from codrl_mj.cli.fields import (
     flags,
     scan,
 )
-from codrl_mj.foreign.config import environment_from
+from codrl_mj.foreign.config import ForeignConfig, environment_from
 from codrl_mj.runs.layout import finished
 from codrl_mj.tasks import TASKS
 from codrl_mj.training.config import TrainConfig, default_agent, read_config
@@ -139,6 +139,8 @@ class Train:
         parts = config.task, config.agent.name, through(self.actuators, self.actuator_name), str(config.seed)
         name = "-".join(re.sub(r"[^\w.]+", "_", part) for part in parts)
         out = self.resume or self.out or Path("runs") / name
+        if isinstance(config.env, ForeignConfig):
+            config.env.make().close()  # what is wrong with it is said before there is a bar
         with training_bars({f"{config.agent.name.upper()} on {config.task}": (config, out)}):
             train(
                 config,

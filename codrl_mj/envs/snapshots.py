@@ -8,9 +8,9 @@ import numpy as np
 
 
 def time_limits(env: "gymnasium.Env[Any, Any]") -> list[Any]:
-    """The time limits among an environment's wrappers, from the outermost; it may be one itself."""
+    """The time limits among an environment's wrappers, from the outermost to what has snapshots of its own."""
     limits = []
-    while isinstance(env, gymnasium.Wrapper):
+    while isinstance(env, gymnasium.Wrapper) and not hasattr(type(env), "snapshot"):
         if "_elapsed_steps" in vars(env):  # TimeLimit, or what rl-zoo3 puts in its place
             limits.append(env)
         env = env.env

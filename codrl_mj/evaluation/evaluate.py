@@ -166,7 +166,7 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
     goals = [_time_to_goal(definition, episode) for episode in episodes]
     reached = np.array([time for time in goals if time is not None])
     success = None
-    if definition is not None or episodes[0].succeeded is not None:
+    if definition is not None or any(one.succeeded is not None for one in episodes):
         success = wilson_rate(len(reached), len(episodes))
     driven = [_driven(definition, episode) for episode in episodes]
     return Evaluation(

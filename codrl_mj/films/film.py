@@ -7,6 +7,7 @@ simulation; an environment of somebody else's draws itself while it runs.
 import contextlib
 import dataclasses
 import itertools
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -211,6 +212,27 @@ class _FilmedScene:
         """Nothing is held."""
 
 
+class Frames(Sequence[np.ndarray]):
+    """Images, packed: those of an episode would fill a gigabyte."""
+
+    def __init__(self) -> None:
+        """Begin with none."""
+        self._packed: list[tuple[tuple[int, ...], bytes]] = []
+
+    def add(self, image: Any) -> None:
+        """Append one, (height, width, 3), uint8."""
+        self._packed.append((image.shape, zlib.compress(image.tobytes(), 1)))
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self._packed)
+
+    def __getitem__(self, index: Any) -> Any:
+        """The image at an index."""
+        shape, packed = self._packed[index]
+        return np.frombuffer(zlib.decompress(packed), np.uint8).reshape(shape)
+
+
 class Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Keeps an image of every instant of an episode: `frames`."""
 
@@ -230,16 +252,17 @@ class Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
         if not pretty and hasattr(env.unwrapped, "model"):
             quality = env.unwrapped.model.vis.quality
             quality.shadowsize = quality.offsamples = 0
-        self.frames: list[np.ndarray] = []
+        self.frames = Frames()
 
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
         """Start an episode, and its film."""
         result = self.env.reset(**options)
-        self.frames = [self.env.render()]  # type: ignore[list-item]
+        self.frames = Frames()
+        self.frames.add(self.env.render())
         return result
 
     def step(self, action: Any) -> Any:
         """Advance by one environment step."""
         result = self.env.step(action)
-        self.frames.append(self.env.render())  # type: ignore[arg-type]
+        self.frames.add(self.env.render())
         return result

@@ -1,10 +1,11 @@
 """One description of an environment of somebody else's with motors, as run folders keep it."""
 
+import contextlib
 import dataclasses
 import functools
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import gymnasium
@@ -16,6 +17,7 @@ from codrl_mj.disturbances import OFF, Disturbances, resolve_disturbances
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.distributions import Distribution, parse
 from codrl_mj.fields import check_names
+from codrl_mj.foreign.model_fields import PREFIX
 from codrl_mj.tasks import TASKS
 
 EVERY = ".*"
@@ -53,8 +55,9 @@ class ForeignConfig:
     """Imperfections of the commands' way, once an environment step; each is off at 0."""
     randomize: Any = None
     """What to draw at every reset, as PATTERN:FIELD=DISTRIBUTION, such as '.*:motor.resistance=uniform(0.4, 0.6)';
-    without a pattern, for all of them. In Python and in files a mapping of patterns to mappings of fields to
-    distributions, as it is kept."""
+    without a pattern, for all of them; or of the model, model.gravity, model.mass.BODY, model.damping.JOINT. In Python
+    and in files a mapping of patterns to mappings of fields to distributions, and of the model's fields, as it is kept.
+    """
     options: Any = dataclasses.field(default_factory=dict)
     """Keyword arguments of the environment, such as frame_skip; JSON has to hold them."""
 
@@ -70,13 +73,19 @@ class ForeignConfig:
             raise ValueError(f"actuators = {self.actuators!r}: must name what drives what, such as {{'.*': 'lag'}}")
         self._set("actuators", resolve_patterns(self.actuators, f"the environment {self.task}"))
         self._set("disturbances", resolve_disturbances(self.disturbances))
+        for name in ("observe_actuator", "allow_unstable"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name} = {getattr(self, name)!r}: must be true or false")
         limit = self.max_episode_steps
         if limit is not None and (isinstance(limit, bool) or not isinstance(limit, int) or limit < 1):
             raise ValueError(f"max_episode_steps = {limit!r}: must be an integer >= 1")
         if self.randomize is not None:
             self._set("randomize", _distributions(self.randomize, tuple(self.actuators)))
+        taken = {"env_id", "disable_env_checker", "render_mode", *(field.name for field in dataclasses.fields(self))}
         try:
             self._set("options", json.loads(json.dumps(dict(self.options))))
+            if wrong := taken & self.options.keys():
+                raise ValueError(f"{wrong.pop()!r} is no argument of the environment's")
         except (TypeError, ValueError) as error:
             raise ValueError(
                 f"options = {self.options!r}: must be a mapping that JSON can hold ({error}); register an environment "
@@ -109,7 +118,8 @@ class ForeignConfig:
     @property
     def action_space(self) -> spaces.Space[Any]:
         """The environment's own actions; commands have others of the same kind."""
-        return _action_space(self.spec.id, json.dumps(self.options))
+        with self._saying_so():
+            return _action_space(self.spec.id, json.dumps(self.options))
 
     @property
     def time_limit(self) -> int | None:
@@ -118,14 +128,14 @@ class ForeignConfig:
 
     @property
     def as_posed(self) -> "ForeignConfig":
-        """The environment with the time limit that it was registered with."""
-        return dataclasses.replace(self, max_episode_steps=None)
+        """The environment with the time limit that it was registered with, if with any."""
+        return self if self.spec.max_episode_steps is None else dataclasses.replace(self, max_episode_steps=None)
 
     @property
     def modules(self) -> set[str]:
         """Names of the modules that decide on what it does: of the environment and the actuators' families."""
-        own = getattr(self._creator, "__module__", "")
-        return {type(one).__module__ for one in self.actuator} | ({own} if own else set())
+        own = getattr(self._creator, "__module__", ""), self.task.rpartition(":")[0]
+        return {type(one).__module__ for one in self.actuator} | {name for name in own if name}
 
     @property
     def _creator(self) -> Any:
@@ -169,19 +179,43 @@ class ForeignConfig:
         """
         from codrl_mj.foreign.environments import make
 
+        self.check_limit()
         names = ("action", "observe_actuator", "randomize", "allow_unstable")
         limit: dict[str, Any] = {}
         if self.max_episode_steps is not None:
             limit = {"max_episode_steps": self.max_episode_steps}
-        return make(
-            self.spec.id,
-            self.actuators,
-            **{name: getattr(self, name) for name in names},
-            disturbances=None if self.disturbances == OFF else self.disturbances,
-            disable_env_checker=True,
-            **limit,
-            **{**self.options, **view},
-        )
+        with self._saying_so():
+            return make(
+                self.spec.id,
+                self.actuators,
+                **{name: getattr(self, name) for name in names},
+                disturbances=None if self.disturbances == OFF else self.disturbances,
+                disable_env_checker=True,
+                **limit,
+                **{**self.options, **view},
+            )
+
+    @contextlib.contextmanager
+    def _saying_so(self) -> Iterator[None]:
+        """Name the environment in errors of making it, and its options where it does not take them."""
+        try:
+            yield
+        except TypeError as error:
+            raise ValueError(f"options = {self.options!r}: {self.task} does not take them: {error}") from None
+        except ValueError as error:
+            raise ValueError(f"{self.task}: {error}") from None
+
+    def check_limit(self) -> None:
+        """Refuse an environment whose episodes need not end.
+
+        Raises:
+            ValueError: it has no time limit.
+        """
+        if self.time_limit is None:
+            raise ValueError(
+                f"max_episode_steps = None: {self.task} was registered without a time limit, and its episodes might "
+                "never end: give one, in environment steps"
+            )
 
     def make_sb3(self, num_envs: int) -> Any:
         """Some of the environments, stepped one by one, as one Stable-Baselines3 `VecEnv`.
@@ -250,39 +284,49 @@ def _action_space(task: str, options: str) -> spaces.Space[Any]:
     return space
 
 
-def _distributions(given: Any, patterns: tuple[str, ...]) -> dict[str, dict[str, str]]:
-    """Pattern -> field -> text of a distribution.
+def _distributions(given: Any, patterns: tuple[str, ...]) -> dict[str, Any]:
+    """Pattern -> field -> text of a distribution; and field of the model -> text.
 
     Raises:
         ValueError: it is neither a mapping of mappings nor a list of PATTERN:FIELD=DISTRIBUTION, or a text is none.
     """
     if not isinstance(given, Mapping):
         given = _spread(given, patterns)
-    if not given or not all(isinstance(each, Mapping) for each in given.values()):
+    of_model = {name: one for name, one in given.items() if str(name).startswith(PREFIX)}
+    of_motors = {pattern: each for pattern, each in given.items() if pattern not in of_model}
+    if not given or not all(isinstance(each, Mapping) for each in of_motors.values()):
         raise ValueError(
             f"randomize = {given!r}: must be a mapping of the actuators' patterns to mappings of fields to "
             f"distributions, such as {{{patterns[0]!r}: {{'motor.resistance': 'uniform(0.4, 0.6)'}}}}"
         )
     try:
-        return {
-            pattern: {name: str(one if isinstance(one, Distribution) else parse(one)) for name, one in each.items()}
-            for pattern, each in given.items()
+        return {pattern: {name: _text(one) for name, one in each.items()} for pattern, each in of_motors.items()} | {
+            name: _text(one) for name, one in of_model.items()
         }
     except ValueError as error:
         raise ValueError(f"randomize: {error}") from None
 
 
-def _spread(items: Any, patterns: tuple[str, ...]) -> dict[str, dict[str, str]]:
-    """What a list of [PATTERN:]FIELD=DISTRIBUTION says of each pattern."""
-    found: dict[str, dict[str, str]] = {}
+def _text(distribution: Any) -> str:
+    return str(distribution if isinstance(distribution, Distribution) else parse(distribution))
+
+
+def _spread(items: Any, patterns: tuple[str, ...]) -> dict[str, Any]:
+    """What a list of [PATTERN:]FIELD=DISTRIBUTION says of each pattern, and of the model."""
+    found: dict[str, Any] = {}
     for item in [items] if isinstance(items, str) else items:
-        match = re.fullmatch(r"(?:(.*):)?\s*([\w.]+)\s*=\s*(\w+\(.*\))\s*", str(item))
+        match = re.fullmatch(r"(?:(.*):)?\s*([^:=]+?)\s*=\s*(\w+\(.*\))\s*", str(item))
         if match is None:
             raise ValueError(
                 f"randomize: {item!r}: must be [PATTERN:]FIELD=DISTRIBUTION, such as "
                 "'.*:motor.resistance=uniform(0.4, 0.6)'"
             )
         pattern, name, text = match.groups()
+        if pattern is None and name.startswith(PREFIX):
+            if name in found:
+                raise ValueError(f"randomize: {name} is named twice: give it one distribution")
+            found[name] = text
+            continue
         for one in patterns if pattern is None else (pattern,):
             if name in found.setdefault(one, {}):
                 raise ValueError(f"randomize: {name} is named twice for {one!r}: give it one distribution")

@@ -35,7 +35,7 @@ def make(
     *,
     action: str = "force",
     observe_actuator: bool = False,
-    randomize: Mapping[str, Mapping[str, Any]] | None = None,
+    randomize: Mapping[str, Any] | None = None,
     disturbances: Any = None,
     allow_unstable: bool = False,
     **options: Any,
@@ -56,10 +56,12 @@ def make(
             many amperes as volts.
         observe_actuator: whether the observation ends with what the motors' sensors say, motor by motor.
         randomize: pattern -> field -> distribution (or its text): what is drawn for the motors of a pattern at every
-            reset. What was drawn is in the reset's info, `randomization`. The generator is not the environment's: its
-            initial states are the same as without.
-        disturbances: delay, quantum and rate of the commands, once an environment step: see `codrl_mj.Disturbances`.
-            Of a plain motor in its force [N or N*m] before the gear, of others in what their control stands for.
+            reset; and of the model `model.mass.BODY`, `model.gravity` and `model.damping.JOINT` -> distribution. What
+            was drawn is in the reset's info, `randomization`. The generator is not the environment's: its initial
+            states are the same as without.
+        disturbances: delay, quantum and rate of the commands, and load pulses, once an environment step: see
+            `codrl_mj.Disturbances`. Of a plain motor in its force [N or N*m] before the gear, of others in what their
+            control stands for.
         allow_unstable: as for `codrl_mj.motorise`.
         **options: of `gymnasium.make` and the environment, such as `render_mode` and `max_episode_steps`.
 

@@ -60,7 +60,7 @@ class MotorsRecorder:
 
     @contextlib.contextmanager
     def watching(self) -> Iterator[None]:
-        """Record what the environment does in the block: one step of it."""
+        """Record what the environment does in the block, one step of it; not in two threads at once."""
         self._rows, plain, began = [], mujoco.mj_step, self._data.time
 
         def each(model: mujoco.MjModel, data: mujoco.MjData, nstep: int = 1) -> None:

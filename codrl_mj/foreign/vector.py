@@ -1,6 +1,6 @@
 """Motorised environments side by side, as Stable-Baselines3 trains in them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium
@@ -25,7 +25,11 @@ class MotorisedVectorEnv(SteppedVectorEnv):
         drawn = []
         for each in self.of_each("randomization"):
             patterns = {pattern: own for pattern, own in each.items() if pattern != "rejected"}
-            drawn.append({f"{pattern}:{name}": one for pattern, own in patterns.items() for name, one in own.items()})
+            motors = {pattern: own for pattern, own in patterns.items() if isinstance(own, Mapping)}
+            of_model = {name: one for name, one in patterns.items() if name not in motors}
+            drawn.append(
+                of_model | {f"{pattern}:{name}": one for pattern, own in motors.items() for name, one in own.items()}
+            )
         return {name: np.array([one[name] for one in drawn]) for name in drawn[0]}
 
 

@@ -2,12 +2,13 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from codrl_mj.actuators import Drive
+from codrl_mj.actuators import Drive, mapping_of
 from codrl_mj.catalogue import motor_names
 from codrl_mj.motor_design.drives import find_drive, find_entry
 from codrl_mj.sizing.bounds import SURELY, VERDICTS, Feasibility, feasibility, margin, most_power
@@ -71,6 +72,19 @@ class Choice(NamedTuple):
     def ratio(self) -> float:
         """Turns of the rotor for one of the joint; on a slide rad/m."""
         return 1.0 / self.drive.arm_radius
+
+
+def actuators_of(choices: Mapping[str, tuple[Choice, Demand]]) -> dict[str, Any]:
+    """What `codrl_mj.make` and `--actuators` take: pattern -> fields of the actuator.
+
+    Args:
+        choices: name of a motor of the model -> what was chosen for it, and for what; of a single one the name may be
+            empty.
+    """
+    return {
+        re.escape(name) if name else ".*": mapping_of(choice.behind(demand.model_gear))
+        for name, (choice, demand) in choices.items()
+    }
 
 
 def catalogued(name: str, gear_ratio: float | None = None, voltage: float | None = None) -> Catalogued:

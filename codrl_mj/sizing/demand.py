@@ -12,7 +12,7 @@ from codrl_mj.engine.reading import motors
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import Episode, run_episodes
 from codrl_mj.fields import did_you_mean
-from codrl_mj.foreign.config import ForeignConfig
+from codrl_mj.foreign.config import ForeignConfig, is_gymnasium_id
 from codrl_mj.sizing.scripted import Scripted, StateObserved
 from codrl_mj.sizing.swing import Swing
 from codrl_mj.tasks import Task, find_task
@@ -69,7 +69,7 @@ def demand_of(
     """
     found = demands_of(what, episodes, seed, trust)
     if motor is None and len(found) > 1:
-        raise ValueError(f"motor = None: {what} has {len(found)} motors: must be one of {', '.join(found)}")
+        raise ValueError(f"{what} has {len(found)} motors: motor must be one of {', '.join(found)}")
     if motor is None:
         return next(iter(found.values()))
     if motor not in found:
@@ -97,6 +97,10 @@ def demands_of(what: str | Path, episodes: int = EPISODES, seed: int = 0, trust:
         return {"": _read(path)}
     if path.is_dir():
         return _of_run(path, episodes, seed, trust)
+    if is_gymnasium_id(what):
+        raise ValueError(
+            f"{what}: there is no scripted controller for it; train it with --actuator ideal and name the run"
+        )
     task = find_task(str(what))
     _alone(task)
     env = _resolved(EnvConfig(str(what), "ideal"))

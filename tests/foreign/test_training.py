@@ -217,6 +217,53 @@ def test_an_episode_survives_its_file(tmp_path):
 # -- the command line -----------------------------------------------------------------------------------------
 
 
+def test_motors_that_are_not_named_stay_what_they_were():
+    line = "evaluate two --actuators joint0=lag --episodes 1 --out result.json"
+    two = config(ForeignConfig("Reacher-v5", {"joint.*": "maxon-re65"}))
+    train(dataclasses.replace(two, total_steps=50), Path("two"), tensorboard=False)
+    assert main(line.split()) == 0
+    motors = json.loads(Path("result.json").read_text())["motors"]
+    assert motors["joint0"]["peak_voltage"] is None
+    assert motors["joint1"]["peak_voltage"] > 0.0
+
+
+def test_draws_of_the_model_survive_files_and_flags():
+    env = ForeignConfig("Reacher-v5", {".*": "lag"}, randomize={"model.gravity": "uniform(0.9, 1.1)"})
+    assert TrainConfig.from_mapping(json.loads(json.dumps(config(env).as_mapping())), whole=True).env == env
+    both = ["model.gravity=uniform(0.9, 1.1)", ".*:time_constant=uniform(0.01, 0.02)"]
+    other = ForeignConfig("Reacher-v5", {".*": "lag"}, randomize=both)
+    assert other.randomize == {"model.gravity": "uniform(0.9, 1.1)", ".*": {"time_constant": "uniform(0.01, 0.02)"}}
+    envs = other.make_sb3(2)
+    envs.reset()
+    drawn = envs.randomization
+    assert set(drawn) == {"model.gravity", ".*:time_constant"}
+    assert drawn["model.gravity"].shape == (2,)
+    train(dataclasses.replace(config(other), total_steps=50), Path("run"), tensorboard=False)
+    assert main(["evaluate", "run", "--episodes", "1"]) == 0
+
+
+def test_an_environment_without_a_time_limit_needs_one():
+    gym.register("ForeignEndless-v0", BareEnv)
+    try:
+        endless = ForeignConfig("ForeignEndless-v0", {".*": "lag"})
+        with pytest.raises(ValueError, match="registered without a time limit"):
+            endless.make()
+        limited = dataclasses.replace(endless, max_episode_steps=5)
+        assert limited.as_posed.time_limit == 5
+        assert evaluate(RandomPolicy(limited.make().action_space), limited, 1).length.mean == 5
+    finally:
+        gym.registry.pop("ForeignEndless-v0")
+
+
+def test_a_policy_of_stable_baselines_is_evaluated_by_the_id(capsys):
+    from stable_baselines3 import PPO
+
+    PPO("MlpPolicy", "Reacher-v5", n_steps=8, batch_size=8).save("policy.zip")
+    line = "evaluate policy.zip --task Reacher-v5 --agent ppo --trust --actuator maxon-re65 --episodes 1"
+    assert main(line.split()) == 0
+    assert "policy.zip on maxon-re65" in capsys.readouterr().out
+
+
 def test_a_run_is_evaluated_on_other_motors(reacher, capsys):
     assert load_config(reacher).env.actuators == {".*": IDEAL}
     line = f"evaluate {reacher} --actuators joint0=maxon-re65 joint1=lag --episodes 2 --out result.json"
@@ -267,11 +314,14 @@ def test_an_episode_is_filmed_with_the_strip_of_a_motor(reacher, capsys):
     ("line", "message"),
     [
         ("train HalfCheetah-v5 --actuators thigh=lag", "'thigh': no actuator has such a name"),
-        ("train HalfCheetah-v5 --actuator lag --actuators bthigh=lag", "leave one of them out"),
+        ("train Reacher-v5 --env.options nope=3", "options = .*nope.*Reacher-v5 does not take them"),
+        ("train Reacher-v5 --env.options action=1", "'action' is no argument of the environment's"),
+        ("train Reacher-v5 --env.randomize motor.resistance", r"must be \[PATTERN:\]FIELD=DISTRIBUTION"),
         ("train HalfCheetah-v5 --actuators bthigh", "must be NAME=VALUE"),
         ("train Cheetah-v5", "Cheetah.* doesn't exist"),
         ("train HalfCheetah-v5 --agent dqn", "cannot act in the Box actions of HalfCheetah-v5"),
-        ("train CartPole-v1", "CartPole-v1: no model was built|no model was built inside"),
+        ("train CartPole-v1", "CartPole-v1: actuators = .* no model was built inside"),
+        ("motor choose Reacher-v5", "no scripted controller for it; train it"),
     ],
 )
 def test_what_cannot_be_costs_one_line(capfd, line, message):
