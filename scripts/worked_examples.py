@@ -30,7 +30,7 @@ SAC: dict[str, Any] = {"hidden": [64, 64], "batch_size": 128, "learning_starts":
 EXAMPLES: dict[str, tuple[str, int]] = {
     # name -> id, environment steps of a training
     "double pendulum": ("InvertedDoublePendulum-v5", 15_000),
-    "cheetah": ("HalfCheetah-v5", 40_000),
+    "cheetah": ("HalfCheetah-v5", 20_000),
     "servo arm": ("servo_arm:ServoArm-v0", 15_000),
 }
 THROUGH = ("ideal", "chosen", "smaller")
