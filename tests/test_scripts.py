@@ -45,3 +45,14 @@ def test_the_table_of_furuta(tmp_path):
     for line in lines[2:]:
         for cell in line.split("|")[2:-1]:
             assert 0.0 <= float(cell.split()[0]) <= 250.0
+
+
+def test_the_worked_examples(tmp_path):
+    options = "--only", "servo arm", "--seeds", 1, "--steps", 0.01, "--runs", tmp_path / "runs", "--out", tmp_path
+    printed = run("worked_examples.py", *options)
+    rows = (tmp_path / "worked_examples.csv").read_text().splitlines()
+    assert len(rows) == 1 + 3 * 3  # an agent for each way to train, on each
+    assert printed.splitlines()[-1].startswith("| servo arm | smaller |")
+    assert {path.name for path in (tmp_path / "runs" / "servo_arm").glob("*-0")} == {"ideal-0", "chosen-0", "smaller-0"}
+    again = run("worked_examples.py", *options)  # nothing is left to do
+    assert again.splitlines()[-1] == printed.splitlines()[-1]

@@ -17,11 +17,12 @@ from codrl_mj.disturbances import OFF, Disturbances, resolve_disturbances
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.distributions import Distribution, parse
 from codrl_mj.fields import check_names
-from codrl_mj.foreign.model_fields import PREFIX
 from codrl_mj.tasks import TASKS
 
 EVERY = ".*"
 """The pattern of all actuators of a model."""
+PREFIX = "model."
+"""Of the fields that are the model's."""
 _ID = re.compile(r"(?:[\w.]+:)?(?:[\w-]+/)?[\w.-]+-v\d+")
 
 

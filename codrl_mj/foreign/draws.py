@@ -11,7 +11,8 @@ from codrl_mj.engine.plugin import PLUGIN_HEAD
 from codrl_mj.envs.distributions import Distribution, parse
 from codrl_mj.envs.randomization import LIMIT
 from codrl_mj.fields import check_names
-from codrl_mj.foreign.model_fields import PREFIX, ModelFields
+from codrl_mj.foreign.config import PREFIX
+from codrl_mj.foreign.model_fields import ModelFields
 
 _JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 

@@ -9,7 +9,6 @@ from codrl_mj.envs.distributions import Distribution
 from codrl_mj.fields import check_names
 from codrl_mj.physics.variation import field_of
 
-PREFIX = "model."
 _FIELDS = {"mass": ("body_mass", "body_inertia"), "damping": ("dof_damping",), "gravity": ("opt.gravity",)}
 
 
