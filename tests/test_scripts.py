@@ -1,5 +1,6 @@
 """The short programs in `scripts/` that use nothing but the public interface."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from codrl_mj.runs.summaries import read_run
+from codrl_mj.training import load_config
 
 pytestmark = pytest.mark.matrix
 SCRIPTS = Path(__file__).parent.parent / "scripts"
@@ -56,3 +58,14 @@ def test_the_worked_examples(tmp_path):
     assert {path.name for path in (tmp_path / "runs" / "servo_arm").glob("*-0")} == {"ideal-0", "chosen-0", "smaller-0"}
     again = run("worked_examples.py", *options)  # nothing is left to do
     assert again.splitlines()[-1] == printed.splitlines()[-1]
+
+
+def test_from_a_bench_log_to_a_policy(tmp_path):
+    printed = run("bench_to_policy.py", "--seeds", 1, "--total-steps", 300, "--out", tmp_path)
+    numbers = r"(\w+): \S+ \[(\S+), (\S+)\] .*identified; real (\d\S+)"
+    found = {name: tuple(map(float, rest)) for name, *rest in re.findall(numbers, printed)}
+    assert {"resistance", "inductance", "back_emf_constant", "coulomb_friction", "rotor_inertia"} <= found.keys()
+    assert all(low <= real <= high for low, high, real in found.values())
+    config = load_config(tmp_path / "identified-0")
+    assert len(config.env.randomize) >= 5
+    assert printed.splitlines()[-1].startswith("| identified |")
