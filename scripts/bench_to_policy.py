@@ -46,7 +46,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/bench_to_policy"), help="folder for all of it")
     parser.add_argument("--seeds", type=int, default=3, help="trainings of each kind")
-    parser.add_argument("--total-steps", type=int, default=6000, help="environment steps of a training")
+    parser.add_argument("--total-steps", type=int, default=15_000, help="environment steps of a training")
     options = parser.parse_args()
     logs = list(_bench())
     found = identify(logs[:2], "free", {"gear_ratio": 20.0, "load_inertia": 0.0}, held_out=logs[2:])
