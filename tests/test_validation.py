@@ -93,6 +93,7 @@ def test_tolerances_are_those_promised(certificate):
             assert check.tolerance <= 0.1
 
 
+@pytest.mark.matrix
 def test_the_whole_form_has_the_same_checks_with_more_samples(certificate):
     quick = {
         check.name: check.samples
@@ -180,6 +181,7 @@ def functions():
     }
 
 
+@pytest.mark.matrix
 def test_a_wrong_function_can_be_called_as_the_right_one():
     """Otherwise its check fails because of the call, and not because of the fault."""
     replacing = set()
@@ -392,6 +394,7 @@ def test_a_model_of_ones_own_passes_what_applies_and_is_told_what_does_not():
     assert all(check.task == "two motors" for check in result.checks)
 
 
+@pytest.mark.matrix
 def test_every_check_of_a_model_can_fail():
     model, failed = rotor(), set()
     with wrong_loop(("+ parameters.ki * integral", "- parameters.ki * integral")):
