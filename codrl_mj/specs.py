@@ -13,9 +13,10 @@ from codrl_mj.engine.reading import check_shafts
 from codrl_mj.fields import did_you_mean
 from codrl_mj.plugin import FAMILY, NAME
 
-_JOINT = {mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT}
+ON_JOINT = {mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT}
+"""Transmissions of actuators that drive a joint."""
 _JOINTS = {mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE}
-_SHAFTS = {*_JOINT, mujoco.mjtTrn.mjTRN_TENDON, mujoco.mjtTrn.mjTRN_SLIDERCRANK, mujoco.mjtTrn.mjTRN_SITE}
+_SHAFTS = {*ON_JOINT, mujoco.mjtTrn.mjTRN_TENDON, mujoco.mjtTrn.mjTRN_SLIDERCRANK, mujoco.mjtTrn.mjTRN_SITE}
 _DYNAMICS = {
     mujoco.mjtDyn.mjDYN_NONE,
     mujoco.mjtDyn.mjDYN_INTEGRATOR,
@@ -99,7 +100,7 @@ def resolve_patterns(actuators: Mapping[str, Any], whose: str) -> dict[str, Actu
 def names_of(model: mujoco.MjModel) -> list[list[str]]:
     """What patterns can match of each actuator of a compiled model: its name, and that of what it drives."""
     kinds = {mujoco.mjtTrn.mjTRN_TENDON: model.tendon, mujoco.mjtTrn.mjTRN_BODY: model.body}
-    kinds |= dict.fromkeys(_JOINT, model.joint)
+    kinds |= dict.fromkeys(ON_JOINT, model.joint)
     kinds |= dict.fromkeys((mujoco.mjtTrn.mjTRN_SITE, mujoco.mjtTrn.mjTRN_SLIDERCRANK), model.site)
     names = []
     for index in range(model.nactuator):
@@ -164,7 +165,7 @@ def _refusal(model: mujoco.MjModel, target: mujoco.MjsActuator, index: int, actu
             return f"its force is not gain*input + bias over one shaft, but {kind.name}"
     if model.actuator_ctrlnum[index] != 1 or model.actuator_outnum[index] != 1:
         return f"it has {model.actuator_ctrlnum[index]} controls and {model.actuator_outnum[index]} forces, not one"
-    if transmission in _JOINT and mujoco.mjtJoint(model.jnt_type[first]) not in _JOINTS:
+    if transmission in ON_JOINT and mujoco.mjtJoint(model.jnt_type[first]) not in _JOINTS:
         return "its joint is neither a hinge nor a slide"
     if transmission == mujoco.mjtTrn.mjTRN_SITE and second >= 0:
         return "its site has a reference site"
@@ -174,7 +175,7 @@ def _refusal(model: mujoco.MjModel, target: mujoco.MjsActuator, index: int, actu
         return "its control is delayed (delay), which MuJoCo does not tell plugins"
     if actuator.MOTION and dynamics != mujoco.mjtDyn.mjDYN_NONE:
         return "its control is filtered before it becomes what a servo is asked for"
-    if actuator.additions.friction and transmission not in (*_JOINT, mujoco.mjtTrn.mjTRN_TENDON):
+    if actuator.additions.friction and transmission not in (*ON_JOINT, mujoco.mjtTrn.mjTRN_TENDON):
         return "it drives neither a joint nor a tendon, which the friction that its motor brings would need"
     if model.actuator_user[index].any():
         return "it has user data, where its motor's parameters have to go"
@@ -208,7 +209,7 @@ def _drive(spec: mujoco.MjSpec, model: mujoco.MjModel, index: int, actuator: Act
     target.armature += added.armature
     target.damping[0] += added.damping
     if added.friction:
-        on_joint = mujoco.mjtTrn(model.actuator_trntype[index]) in _JOINT
+        on_joint = mujoco.mjtTrn(model.actuator_trntype[index]) in ON_JOINT
         driven = spec.joint(target.target) if on_joint else spec.tendon(target.target)
         driven.frictionloss += added.friction * abs(model.actuator_gear[model.actuator_outadr[index], 0])
 

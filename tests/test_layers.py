@@ -50,7 +50,7 @@ ALLOWED = {
     },
     "sizing": {
         *("actuators", "catalogue", "engine", "envs.config", "evaluation", "fields", "foreign", "motor_design"),
-        *("runs.policies", "tasks", "training"),
+        *("runs.policies", "specs", "tasks", "training"),
     },
     "validation": {"actuators", "catalogue", "engine", "physics", "runs.files", "tasks", "tasks.assets"},
     "study": {

@@ -140,14 +140,12 @@ def _numbers(texts: tuple[str, ...]) -> dict[str, float]:
 
 def print_identified(found: Any) -> None:
     """Print parameters and errors of the simulation, and what is to be known of them."""
-    from rich import box
     from rich.markup import escape
-    from rich.table import Table
 
+    from codrl_mj.cli.look import titled_table
     from codrl_mj.cli.terminal import console
 
-    look: Any = {"title_justify": "left", "box": box.SIMPLE_HEAD, "pad_edge": False, "padding": (0, 1, 0, 0)}
-    table = Table(title=escape(f"Identified from {', '.join(found.logs)}"), **look)
+    table = titled_table(f"Identified from {', '.join(found.logs)}")
     for name in ("parameter", "value", "95 % interval", "unit", "status", "why"):
         table.add_column(name, justify="right" if name in ("value", "95 % interval") else "left", overflow="fold")
     for one in found.estimates:
@@ -157,7 +155,7 @@ def print_identified(found: Any) -> None:
     console().print(table)
     if found.fitted or found.held_out:
         units = {"position": "rad", "velocity": "rad/s"}
-        table = Table(title="Errors of the simulation, mean absolute", **look)
+        table = titled_table("Errors of the simulation, mean absolute")
         for name in ("log", "", "of", "open loop, 0.5 s", "closed loop"):
             table.add_column(name, justify="right" if "loop" in name else "left")
         for kind, several in (("fitted", found.fitted), ("held out", found.held_out)):

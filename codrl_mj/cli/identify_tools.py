@@ -64,13 +64,13 @@ class Check:
 
 def findings_table(title: str, findings: Sequence[Any]) -> Any:
     """Findings of `codrl_mj.identify.checks.check` as a rich table, or a line where there are none."""
-    from rich import box
     from rich.markup import escape
-    from rich.table import Table
+
+    from codrl_mj.cli.look import titled_table
 
     if not findings:
         return f"{escape(title)}: nothing is wrong with it"
-    table = Table(title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    table = titled_table(title)
     for header in ("", "check", "row", "what", "remedy"):
         table.add_column(header, overflow="fold", justify="right" if header == "row" else "left")
     for one in findings:
@@ -145,16 +145,11 @@ class Plan:
         return 0
 
     def _print(self, found: Any, goals: dict[str, float]) -> None:
-        from rich import box
-        from rich.markup import escape
-        from rich.table import Table
-
+        from codrl_mj.cli.look import titled_table
         from codrl_mj.cli.terminal import console
 
         title = f"{self.name}: errors to be expected [%]"
-        table = Table(
-            title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0)
-        )
+        table = titled_table(title)
         heads = "excitation", "kHz", "V", "peak A", "rms A", *(f"{_SHORT[name]}\n≤ {goals[name]:.0%}" for name in goals)
         for head in heads:
             table.add_column(head, justify="left" if head == "excitation" else "right")

@@ -297,13 +297,9 @@ class Motor:
 
 def _table(title: str, *columns: str, left: int) -> Any:
     """A rich table whose first `left` columns, and those of words, are aligned to the left."""
-    from rich import box
-    from rich.markup import escape
-    from rich.table import Table
+    from codrl_mj.cli.look import titled_table
 
-    table = Table(
-        title=escape(title) or None, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0)
-    )
+    table = titled_table(title)
     for index, name in enumerate(columns):
         words = index < left or name in ("unit", "how it came about", "source")
         table.add_column(name, justify="left" if words else "right", overflow="fold")

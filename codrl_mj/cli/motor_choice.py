@@ -49,13 +49,16 @@ class Feasible:
 
     def run(self) -> int:
         """Print the bounds, and the verdict last."""
+        from codrl_mj.cli.look import titled_table
         from codrl_mj.cli.terminal import console
         from codrl_mj.sizing import SURELY_NOT, catalogued, demand_of, feasibility
 
         drive, continuous, unknown = catalogued(self.name, self.gear_ratio, self.voltage)
         demand = demand_of(self.asked, trust=self.trust, motor=self.motor)
         found = feasibility(drive, demand, continuous)
-        table = _table(f"{self.name}, gear {1.0 / drive.arm_radius:.4g}, {drive.voltage_limit:g} V: {demand.source}")
+        table = titled_table(
+            f"{self.name}, gear {1.0 / drive.arm_radius:.4g}, {drive.voltage_limit:g} V: {demand.source}"
+        )
         for header in ("bound", "of", "needs", "has", "unit", "", "says"):
             table.add_column(header, justify="right" if header in ("needs", "has") else "left")
         for bound in found.bounds:
@@ -167,7 +170,9 @@ class Choose:
 
 def _ranking(choices: Iterable[Any], title: str, driven: Sequence[str] = ()) -> Any:
     """A row for each choice; of several motors, each with what it drives."""
-    table = _table(title)
+    from codrl_mj.cli.look import titled_table
+
+    table = titled_table(title)
     if driven:
         table.add_column("drives", overflow="fold")
     columns = ("motor", "gear", "supply\n[V]", "power\n[W]", "does\nit", "margin", "rotor's\nshare", "peak\n[A]")
@@ -183,14 +188,6 @@ def _ranking(choices: Iterable[Any], title: str, driven: Sequence[str] = ()) -> 
             *(f"{choice.feasibility.margin:.0%}", f"{asked.own_share:.0%}", *(f"{number:.3g}" for number in numbers)),
         )
     return table
-
-
-def _table(title: str) -> Any:
-    from rich import box
-    from rich.markup import escape
-    from rich.table import Table
-
-    return Table(title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
 
 
 def _mark(holds: bool) -> str:

@@ -4,20 +4,16 @@ import datetime
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from rich import box
 from rich.markup import escape
 from rich.table import Table
 
+from codrl_mj.cli.look import titled_table
 from codrl_mj.evaluation import MEASURES, Evaluation
 from codrl_mj.evaluation.measures import Interval, Quartiles
 from codrl_mj.runs.summaries import Comparison, RunSummary
 
 _COLUMNS = 3  # evaluations side by side
 _NOTHING = "–"
-
-
-def _table(title: str) -> Table:
-    return Table(title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
 
 
 def evaluation_tables(evaluations: Mapping[str, Evaluation], details: bool = True) -> list[Table]:
@@ -50,7 +46,7 @@ _SHOWN = ("returns", "failure")  # whole in the first table, or by what is in it
 def _compact(evaluations: Mapping[str, Evaluation]) -> Table:
     """A row for each evaluation; measures that none of them has are left out."""
     counts = sorted({evaluation.episodes for evaluation in evaluations.values()})
-    table = _table(f"{' or '.join(map(str, counts))} episodes a row: means [95 % bootstrap interval]")
+    table = titled_table(f"{' or '.join(map(str, counts))} episodes a row: means [95 % bootstrap interval]")
     table.add_column("policy", overflow="fold")
     shown = {
         name: as_text
@@ -84,7 +80,7 @@ _OF_MOTORS = {
 def _motors(title: str, evaluation: Evaluation) -> Table:
     """A row for each of several motors; measures that none of them has are left out."""
     shown = [name for name in _OF_MOTORS if any(one.get(name) is not None for one in evaluation.motors.values())]
-    table = _table(f"motors of {title}: energies of an episode")
+    table = titled_table(f"motors of {title}: energies of an episode")
     table.add_column("motor", overflow="fold")
     for name in shown:
         table.add_column(_OF_MOTORS[name], justify="right", no_wrap=True)
@@ -95,7 +91,7 @@ def _motors(title: str, evaluation: Evaluation) -> Table:
 
 def _details(evaluations: Mapping[str, Evaluation]) -> Table:
     """A column for each evaluation, a row for each measure that one of them has and `_compact` does not show whole."""
-    table = _table("mean [95 % interval], or median [quartiles]")
+    table = titled_table("mean [95 % interval], or median [quartiles]")
     table.add_column("measure", no_wrap=True)
     for title in evaluations:
         table.add_column(escape(title), justify="right", overflow="fold")
@@ -123,7 +119,7 @@ def _text(value: Any, scale: float = 1.0) -> str:
 
 def run_table(runs: Sequence[RunSummary]) -> Table:
     """A row for each run."""
-    table = _table(f"{len(runs)} run{'' if len(runs) == 1 else 's'}")
+    table = titled_table(f"{len(runs)} run{'' if len(runs) == 1 else 's'}")
     for header in ("run", "task", "agent", "actuator"):
         table.add_column(header, overflow="fold")
     for header in ("seed", "steps", "state", "training\nreturn", "evaluated\nreturn", "modified"):
@@ -159,7 +155,7 @@ def comparison_tables(comparison: Comparison) -> list[Table]:
 
 
 def _side_by_side(title: str, names: Sequence[str], rows: Mapping[str, Sequence[Any]], columns: Sequence[int]) -> Table:
-    table = _table(title)
+    table = titled_table(title)
     table.add_column("", overflow="fold")
     for column in columns:
         table.add_column(escape(names[column]), justify="right", overflow="fold")

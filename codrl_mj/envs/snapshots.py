@@ -17,6 +17,18 @@ def time_limits(env: "gymnasium.Env[Any, Any]") -> list[Any]:
     return limits
 
 
+def elapsed_steps(env: "gymnasium.Env[Any, Any]") -> np.ndarray:
+    """The steps that the `time_limits` have counted, int64; -1 before the first reset."""
+    counted = [limit._elapsed_steps for limit in time_limits(env)]
+    return np.array([-1 if steps is None else steps for steps in counted], dtype=np.int64)
+
+
+def set_elapsed_steps(env: "gymnasium.Env[Any, Any]", elapsed: np.ndarray) -> None:
+    """Let the `time_limits` have counted what `elapsed_steps` returned."""
+    for limit, steps in zip(time_limits(env), elapsed.tolist(), strict=True):
+        limit._elapsed_steps = None if steps < 0 else steps
+
+
 def check_snapshot(snapshot: Mapping[str, np.ndarray], expected: Mapping[str, np.ndarray]) -> None:
     """Refuse a snapshot of other entries, shapes or types than those of the environment's own.
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from codrl_mj.envs.snapshots import check_snapshot, time_limits
+from codrl_mj.envs.snapshots import check_snapshot, elapsed_steps, set_elapsed_steps
 from codrl_mj.physics import Signals
 
 Array = np.ndarray
@@ -26,6 +26,7 @@ class SteppedVectorEnv(SyncVectorEnv[Array, Array]):
         """
         super().__init__(makers, autoreset_mode=AutoresetMode.SAME_STEP)
         self.signals: Signals | None = None  # of the last step, each an array of shape (N,) or (N, motors)
+        self._signal_names = self.of_each("signal_names")[0]
 
     @property
     def arm_radii(self) -> Array:
@@ -49,7 +50,7 @@ class SteppedVectorEnv(SyncVectorEnv[Array, Array]):
         others = last if ended.all() else infos
         self.signals = {
             name: np.where(ended.reshape(-1, *[1] * (last[name].ndim - 1)), last[name], others[name])
-            for name in self.envs[0].get_wrapper_attr("signal_names")
+            for name in self._signal_names
         }
         return observations, rewards, terminated, truncated, infos
 
@@ -61,13 +62,9 @@ class SteppedVectorEnv(SyncVectorEnv[Array, Array]):
     def snapshot(self) -> dict[str, Array]:
         """Everything that the future depends on, as plain arrays: the environments' own, and their bookkeeping."""
         each = [snapshot() for snapshot in self.of_each("snapshot")]
-        started = [
-            [-1 if limit._elapsed_steps is None else limit._elapsed_steps for limit in time_limits(env)]
-            for env in self.envs
-        ]
         return {
             **{name: np.stack([one[name] for one in each]) for name in each[0]},
-            "elapsed": np.array(started, dtype=np.int64),
+            "elapsed": np.stack([elapsed_steps(env) for env in self.envs]),
             "observations": self._observations.copy(),
         }
 
@@ -90,9 +87,8 @@ class SteppedVectorEnv(SyncVectorEnv[Array, Array]):
         if begun[0] is not None:
             self._keep(np.stack(begun))
             return self._observations.copy()
-        for env, elapsed in zip(self.envs, snapshot["elapsed"].tolist(), strict=True):
-            for limit, steps in zip(time_limits(env), elapsed, strict=True):
-                limit._elapsed_steps = None if steps < 0 else steps
+        for env, elapsed in zip(self.envs, snapshot["elapsed"], strict=True):
+            set_elapsed_steps(env, elapsed)
         self._keep(snapshot["observations"])
         return None
 

@@ -10,6 +10,7 @@ from codrl_mj.actuators import ActuatorModel, Command
 from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.physics.disturber import Disturber
+from codrl_mj.specs import ON_JOINT
 
 
 def command_of(actuator: ActuatorModel, name: str, pattern: str) -> Command | None:
@@ -141,16 +142,13 @@ class CommandsWay:
         return arrived
 
 
-_JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-
-
 def _dof(model: mujoco.MjModel, index: int) -> int:
     """The degree of freedom that a motor drives.
 
     Raises:
         ValueError: it drives no joint.
     """
-    if mujoco.mjtTrn(model.actuator_trntype[index]) not in _JOINT:
+    if mujoco.mjtTrn(model.actuator_trntype[index]) not in ON_JOINT:
         raise ValueError(
             f"disturbances.pulse_force: {model.actuator(index).name or f'actuator {index}'} drives no joint on which a "
             "load could act; give only command_delay, command_quantum and command_rate"

@@ -13,8 +13,7 @@ from codrl_mj.envs.randomization import LIMIT
 from codrl_mj.fields import check_names
 from codrl_mj.foreign.config import PREFIX
 from codrl_mj.foreign.model_fields import ModelFields
-
-_JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+from codrl_mj.specs import ON_JOINT
 
 
 class Draws:
@@ -182,7 +181,7 @@ class Exchange:
         """Where the friction of what an actuator drives is."""
         model, kind = self._model, mujoco.mjtTrn(self._model.actuator_trntype[index])
         driven = int(model.actuator_trnid[index, 0])
-        if kind in _JOINT:
+        if kind in ON_JOINT:
             return model.dof_frictionloss, int(model.jnt_dofadr[driven])
         if kind == mujoco.mjtTrn.mjTRN_TENDON:
             return model.tendon_frictionloss, driven

@@ -18,7 +18,7 @@ from gymnasium.utils import RecordConstructorArgs, seeding
 from codrl_mj.actuators import ActuatorModel, Command
 from codrl_mj.disturbances import resolve_disturbances
 from codrl_mj.engine.reading import bring_to_rest, motors, slots
-from codrl_mj.envs.snapshots import check_snapshot, time_limits
+from codrl_mj.envs.snapshots import check_snapshot, elapsed_steps, set_elapsed_steps
 from codrl_mj.foreign.building import Building
 from codrl_mj.foreign.commands import command_of
 from codrl_mj.foreign.readings import Sensors, readings
@@ -302,13 +302,12 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         are no `MujocoEnv` of Gymnasium's nobody knows where their state is: the snapshot has the generators, and
         `restore` starts an episode.
         """
-        elapsed = [-1 if limit._elapsed_steps is None else limit._elapsed_steps for limit in time_limits(self.env)]
         found = {
             "environment": np.frombuffer(self._motorised_id.encode(), dtype=np.uint8).copy(),
             **(state_of(self._data) if self._whole else {}),
             "generator": words_of(self.unwrapped.np_random),
             "motors_generator": words_of(self._generator),
-            "elapsed_steps": np.array(elapsed, dtype=np.int64),
+            "elapsed_steps": elapsed_steps(self.env),
         }
         return found | {name: array.copy() for name, array in self._simulated.memory.items()}
 
@@ -344,8 +343,7 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         set_state_of(self._data, snapshot["state"], snapshot["computed"])
         if "disturbances" in expected:
             self._simulated.memory["disturbances"][:] = snapshot["disturbances"]
-        for limit, steps in zip(time_limits(self.env), snapshot["elapsed_steps"].tolist(), strict=True):
-            limit._elapsed_steps = None if steps < 0 else steps
+        set_elapsed_steps(self.env, snapshot["elapsed_steps"])
         return None
 
     @property

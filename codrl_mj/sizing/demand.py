@@ -182,6 +182,8 @@ def _gathered(source: str, env: EnvConfig | ForeignConfig, ran: list[Episode]) -
     """The demands on all motors, from episodes of one environment."""
     import mujoco
 
+    from codrl_mj.specs import ON_JOINT
+
     task, swing = find_task(env.task) if isinstance(env, EnvConfig) else None, None
     ends = [_reaches(task, one) for one in ran]
     if None not in ends:
@@ -201,8 +203,7 @@ def _gathered(source: str, env: EnvConfig | ForeignConfig, ran: list[Episode]) -
         name = ran[0].motors[number] if len(outputs) > 1 else ""
         before = [_speeds(task, one, number) for one in ran]
         kind, driven = mujoco.mjtTrn(model.actuator_trntype[index]), model.actuator_trnid[index, 0]
-        on_joint = kind in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-        sliding = on_joint and model.jnt_type[driven] == mujoco.mjtJoint.mjJNT_SLIDE
+        sliding = kind in ON_JOINT and model.jnt_type[driven] == mujoco.mjtJoint.mjJNT_SLIDE
         gear = 1.0 if task is not None else abs(float(model.actuator_gear[model.actuator_outadr[index], 0])) or 1.0
         found[name] = Demand(
             source=f"{source}: {name}" if name else source,

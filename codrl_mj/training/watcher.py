@@ -66,6 +66,7 @@ class Watcher(BaseCallback):
 
     def _on_training_start(self) -> None:
         """Continue from the last checkpoint, now that the model has set itself up to start from nothing."""
+        self._arms = self.training_env.arm_radii  # type: ignore[attr-defined]
         state = self._resumed = load_checkpoint(self._out / folder.CHECKPOINTS, self._identity)
         rows: dict[str, np.ndarray | None] = {"episodes": None, "reports": None}
         if state is not None:
@@ -105,9 +106,8 @@ class Watcher(BaseCallback):
         # of every step since the last call, where an agent's compiled loop takes several
         signals = self.locals.get("signals", self.training_env.signals)  # type: ignore[attr-defined]
         if signals is not None:
-            arms = self.training_env.arm_radii  # type: ignore[attr-defined]
-            errors = np.subtract(signals["desired_force"], signals["actual_force"]).reshape(-1, len(arms))
-            errors = (errors * arms).ravel()
+            errors = np.subtract(signals["desired_force"], signals["actual_force"]).reshape(-1, len(self._arms))
+            errors = (errors * self._arms).ravel()
             self._squares += float(np.dot(errors, errors))
             self._samples += errors.size
         for info in self.locals["infos"]:
