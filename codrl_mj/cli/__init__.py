@@ -14,6 +14,7 @@ from codrl_mj.cli.fields import with_environment
 from codrl_mj.cli.identify import Identify, identify_verb
 from codrl_mj.cli.motor import Motor
 from codrl_mj.cli.render import Render
+from codrl_mj.cli.report import Report
 from codrl_mj.cli.reproduce import Reproduce
 from codrl_mj.cli.runs import Runs
 from codrl_mj.cli.study import Study
@@ -26,6 +27,7 @@ VERBS: dict[str, Any] = {
     "evaluate": Evaluate,
     "runs": Runs,
     "render": Render,
+    "report": Report,
     "motor": Motor,
     "identify": Identify,
     "validate": Validate,
