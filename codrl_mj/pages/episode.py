@@ -81,9 +81,8 @@ class _Line:
 
     before: str
     """Of their labels."""
-    place: int
-    alone: bool
-    """Whether it is the only one: its colours then tell signals apart, otherwise motors."""
+    place: int | None
+    """Among all of them; None where it is the only one. Its colour beside others."""
     tags: tuple[str, ...]
     actuator: Any
     episode: Episode
@@ -123,7 +122,6 @@ class _Line:
 
     def curve(self, label: str, values: np.ndarray, colour: int, held: bool = True, dashed: bool = False) -> Curve:
         """A curve over the integration steps; what is held begins with them, what is not is at their ends."""
-        place = colour if self.alone else self.place
         kept = slice(None, None, self.stride)
         values = np.asarray(values, dtype=float)
         time = self.timestep * (np.arange(len(values)) + (not held))
@@ -132,7 +130,8 @@ class _Line:
         else:
             time, values = time[kept], values[kept]
         style: Any = "step" if held else "line"
-        return Curve(self.before + label, time, values, style=style, colour=place, dashed=dashed, tags=self.tags)
+        more: Any = {"style": style, "colour": colour, "shared": self.place, "dashed": dashed, "tags": self.tags}
+        return Curve(self.before + label, time, values, **more)
 
 
 def episode_section(shown: Sequence[Shown], joined: Iterable[Markup] = ()) -> Markup:
@@ -209,7 +208,7 @@ def _lines(shown: Sequence[Shown]) -> list[_Line]:
         several = isinstance(one.episode.actuator, tuple)
         actuator = one.episode.actuator[motor] if several else one.episode.actuator
         before = f"{', '.join(words)}: " if words else ""
-        made.append(_Line(before, place, len(pairs) == 1, tags, actuator, one.episode, motor, stride))
+        made.append(_Line(before, place if len(pairs) > 1 else None, tags, actuator, one.episode, motor, stride))
     return made
 
 
@@ -366,14 +365,13 @@ def torque_speed(lines: Sequence[_Line]) -> Plot | None:
         grid = np.linspace(-width, width, 401)
         ends = limits(line.actuator, grid)
         highest = max(highest, min(3.0 * most, 1.1 * float(np.abs(ends[1]).max()) if ends else most))
-        colour = 1 if line.alone else line.place
         for bound, label in zip(ends or (), ("lowest", "highest"), strict=False):
-            more: Any = {"colour": 0 if line.alone else line.place, "filled": label == "highest", "tags": line.tags}
+            more: Any = {"colour": 0, "shared": line.place, "filled": label == "highest", "tags": line.tags}
             curves.append(Curve(f"{line.before}{label} possible", grid, bound, dashed=True, **more))
         stride = max(line.stride, len(speed) // 3000, 1)
         times = line.timestep * np.arange(len(speed))[::stride]
-        curves.append(Curve(f"{line.before}episode", speed[::stride], torque[::stride], style="trail", colour=colour,
-                            tags=line.tags, times=times))  # fmt: skip
+        trail: Any = {"style": "trail", "colour": 1, "shared": line.place, "tags": line.tags, "times": times}
+        curves.append(Curve(f"{line.before}episode", speed[::stride], torque[::stride], **trail))
     title = "Torque and speed, within what the motor can do"
     return Plot(title, "speed of the output [rad/s]", "torque of the output [N·m]", tuple(curves), y_most=highest)
 

@@ -13,7 +13,7 @@ const codrl = (() => {
   const number = (value) => {
     if (value == null || Number.isNaN(value)) return "–";
     const size = Math.abs(value);
-    const text = value === 0 ? "0" : size >= 1e5 || size < 1e-3 ? value.toExponential(2)
+    const text = value === 0 ? "0" : size >= 1e7 || size < 1e-4 ? Number(value.toPrecision(3)).toExponential()
       : String(Number(value.toPrecision(4)));
     return text.replace(/-/g, "\u2212");
   };
@@ -195,14 +195,17 @@ const codrl = (() => {
       return low < high ? [low, high] : Number.isFinite(low) ? (this.spec.x.log ? [low / 2, low * 2] : [low - 0.5, low + 0.5]) : [0, 1];
     }
 
-    colour(curve) { return css(curve.style === "reference" ? "--ref" : `--c${curve.colour % 6}`); }
+    kind(curve) {
+      return curve.style === "reference" ? "ref" : `c${(this.several ? curve.shared ?? curve.colour : curve.colour) % 6}`;
+    }
+
+    colour(curve) { return css(`--${this.kind(curve)}`); }
 
     legend() {
       this.at = make("span", { class: "at" });
       const list = make("ul", { class: "legend" }, make("li", {}, this.at));
       for (const curve of this.curves) {
-        const kind = curve.style === "reference" ? "ref" : `c${curve.colour % 6}`;
-        const swatch = make("span", { class: `swatch ${kind} ${curve.style}${curve.dashed ? " dashed" : ""}`, "aria-hidden": "true" });
+        const swatch = curve.swatch = make("span", { "aria-hidden": "true" });
         curve.value = make("span", { class: "value" });
         curve.button = make("button", { type: "button", "aria-pressed": "true" }, swatch, curve.label, " ", curve.value);
         curve.button.addEventListener("click", () => {
@@ -211,7 +214,6 @@ const codrl = (() => {
           this.select();
         });
         curve.item = make("li", {}, curve.button);
-        curve.item.hidden = !seen(curve.tags);
         list.append(curve.item);
       }
       for (const shade of this.shades) {
@@ -221,6 +223,18 @@ const codrl = (() => {
       }
       this.said = make("output", { class: "hidden", "aria-live": "polite" });
       this.box.after(list, this.said);
+      this.choose();
+    }
+
+    /** What is shown; one run and motor alone has its signals in different colours, several have one colour each. */
+    choose() {
+      const shown = this.curves.filter((curve) => curve.on && seen(curve.tags));
+      this.several = new Set(shown.filter((curve) => curve.shared != null).map((curve) => curve.tags.join())).size > 1;
+      for (const curve of this.curves) {
+        curve.item.hidden = !seen(curve.tags);
+        curve.swatch.className = `swatch ${this.kind(curve)} ${curve.style}${curve.dashed ? " dashed" : ""}`;
+        if (curve.dot) curve.dot.className = `dot ${this.kind(curve)}`;
+      }
     }
 
     draw() {
@@ -266,7 +280,7 @@ const codrl = (() => {
       this.line = make("div", { class: "now" });
       this.u.over.append(this.line);
       for (const trail of this.trails) if (trail.times) {
-        trail.dot = make("div", { class: `dot c${trail.colour % 6}` });
+        trail.dot = make("div", { class: `dot ${this.kind(trail)}` });
         this.u.over.append(trail.dot);
       }
       this.gestures();
@@ -405,7 +419,7 @@ const codrl = (() => {
     }
 
     select() {
-      for (const curve of this.curves) curve.item.hidden = !seen(curve.tags);
+      this.choose();
       for (const shade of this.shades) shade.item.hidden = !seen(shade.tags) || !shade.spans.length;
       if (!this.u) return;
       this.u.batch(() => {

@@ -33,6 +33,8 @@ class Curve:
     """A step holds its value until the next point; a trail is dots in any order."""
     colour: int | None = None
     """Which of six colours; None: the next."""
+    shared: int | None = None
+    """Its colour while curves with other tags are shown beside it."""
     dashed: bool = False
     """Whether the line is dashed."""
     filled: bool = False
@@ -124,6 +126,7 @@ def as_json(plot: Plot) -> str:
             "dashed": curve.dashed,
             "filled": curve.filled,
             "colour": curve.colour,
+            "shared": curve.shared,
             "tags": curve.tags,
         }
         return found | ({"times": stored(curve.times)} if curve.times is not None else {})
@@ -219,6 +222,9 @@ def still(plot: Plot, width: float = 6.4, height: float = 3.2) -> str:
         axes.tick_params(colors=ink, which="both")
         axes.spines[:].set_color(ink)
         axes.grid(color=ink, alpha=0.25)
+        for axis in (axes.xaxis, axes.yaxis):
+            if axis.get_scale() == "linear":
+                axis.get_major_locator().set_params(nbins=5)
         if len(plot.curves) > 1:
             axes.legend(fontsize=8, frameon=False, labelcolor=ink)
         buffer = io.StringIO()
