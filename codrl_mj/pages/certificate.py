@@ -51,7 +51,7 @@ def _group(name: str, title: str, certificate: Certificate) -> page.Section:
     body = [page.paragraph(f"{title}.")] if checks else []
     for task in dict.fromkeys(check.task for check in checks):
         own = [check for check in checks if check.task == task]
-        body.append(page.heading(task) if task else "")
+        body.append(page.heading(task) if task else Markup())
         caption = f"Checks of {name}{f', {task}' if task else ''}"
         body.append(page.table(caption, _CHECKS, map(_row, own), numbers=range(2, 6), cards=True))
         body.append(page.plots(plot for check in own for plot in check.plots))

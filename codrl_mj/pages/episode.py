@@ -298,32 +298,26 @@ def _run_plots(shown: Sequence[Shown]) -> list[Plot]:
     """States and reward of the runs."""
     found: list[Plot] = []
     groups: dict[str, list[Curve]] = {}
+    rewards = []
+    several = len(shown) > 1
     for place, one in enumerate(shown):
-        before, tags = (f"{one.name}: " if len(shown) > 1 else ""), (f"run:{place}",)
+        before = f"{one.name}: " if several else ""
+        own: Any = {"shared": place if several else None, "tags": (f"run:{place}",)}
         time = np.concatenate([[0.0], one.episode.time])
-        own: dict[str, int] = {}
+        counts: dict[str, int] = {}
         for index, name in enumerate(_state_names(one)):
             unit = (re.search(r"\[(.*)\]", name) or [name, "1"])[1]
-            label, count = name.partition(" [")[0], own.get(unit, 0)
-            own[unit] = count + 1
+            count = counts[unit] = counts.get(unit, -1) + 1
             if count < _MOST_STATES:
-                colour, dashed = (place, count > 0) if len(shown) > 1 else (count, False)
-                curve = Curve(
-                    before + label, time, one.episode.state[:, index], colour=colour, dashed=dashed, tags=tags
-                )
+                more = {"colour": count, "dashed": several and count > 0, **own}
+                curve = Curve(before + name.partition(" [")[0], time, one.episode.state[:, index], **more)
                 groups.setdefault(unit, []).append(curve)
+        held = np.append(one.episode.reward, one.episode.reward[-1])
+        rewards.append(Curve(f"{before}reward", time, held, style="step", colour=5, **own))
     for unit, curves in groups.items():
         names = list(dict.fromkeys(curve.label.rpartition(": ")[2].replace("_", " ") for curve in curves))
         title = f"State: {', '.join(names)}" if len(names) < 4 else f"States in {unit}"
         found.append(Plot(title, _TIME, f"state [{unit}]", tuple(curves), clock=True))
-    rewards = []
-    for place, one in enumerate(shown):
-        before, tags = (f"{one.name}: " if len(shown) > 1 else ""), (f"run:{place}",)
-        time, values = np.concatenate([[0.0], one.episode.time]), one.episode.reward
-        held = np.append(values, values[-1])
-        rewards.append(
-            Curve(f"{before}reward", time, held, style="step", colour=place if len(shown) > 1 else 5, tags=tags)
-        )
     found.append(Plot("Reward of each step", _TIME, "reward", tuple(rewards), clock=True))
     return found
 

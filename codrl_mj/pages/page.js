@@ -274,7 +274,7 @@ const codrl = (() => {
         hooks: {
           drawClear: [(u) => this.shaded(u)], draw: [(u) => { this.trailed(u); this.now(); }],
           setCursor: [() => this.read()],
-          setScale: [(u, key) => { if (key === "x" && this.clock) this.share(); }],
+          setScale: [(u, key) => { if (key === "x" && this.clock && this.ready) this.share(); }],
         },
       }, data, this.box);
       this.line = make("div", { class: "now" });
@@ -285,6 +285,8 @@ const codrl = (() => {
       }
       this.gestures();
       this.select();
+      if (this.clock && clock.window) this.u.setScale("x", { min: clock.window[0], max: clock.window[1] });
+      this.ready = true;
     }
 
     size() { return { width: Math.max(this.box.clientWidth, 120), height: this.box.clientHeight }; }
@@ -462,6 +464,7 @@ const codrl = (() => {
 
     share() {
       const { min, max } = this.u.scales.x;
+      clock.window = [min, max];
       for (const plot of plots) if (plot.clock && plot !== this && plot.u && (plot.u.scales.x.min !== min || plot.u.scales.x.max !== max)) {
         plot.u.setScale("x", { min, max });
       }

@@ -222,9 +222,9 @@ def still(plot: Plot, width: float = 6.4, height: float = 3.2) -> str:
         axes.tick_params(colors=ink, which="both")
         axes.spines[:].set_color(ink)
         axes.grid(color=ink, alpha=0.25)
-        for axis in (axes.xaxis, axes.yaxis):
+        for which, axis in (("x", axes.xaxis), ("y", axes.yaxis)):
             if axis.get_scale() == "linear":
-                axis.get_major_locator().set_params(nbins=5)
+                axes.locator_params(axis=which, nbins=5)
         if len(plot.curves) > 1:
             axes.legend(fontsize=8, frameon=False, labelcolor=ink)
         buffer = io.StringIO()

@@ -198,7 +198,10 @@ def _value(value: Any) -> str:
 
 def _learning(runs: Sequence[_Run]) -> Markup:
     """Curves from the runs' tables."""
-    returns, errors, evaluations, notes = [], [], [], []
+    notes: list[Markup] = []
+    returns: list[Curve] = []
+    errors: list[Curve] = []
+    evaluations: list[Curve] = []
     for place, run in enumerate(runs):
         before, colour = (f"{run.name}: ", place) if len(runs) > 1 else ("", None)
         reports = _reports(run.summary.path / PROGRESS)

@@ -157,7 +157,7 @@ def test_motors_of_somebody_elses_robot_are_filmed():
 def test_bad_input_is_refused_before_anything_is_run(tmp_path):
     with pytest.raises(ValueError, match="runs: none was given"):
         report([], tmp_path / "r.html")
-    with pytest.raises(ValueError, match="must be .html"):
+    with pytest.raises(ValueError, match=r"must be \.html"):
         report([RUNS / "pendulum"], tmp_path / "r.pdf")
     with pytest.raises(FileNotFoundError, match="no run at"):
         report([tmp_path], tmp_path / "r.html")
