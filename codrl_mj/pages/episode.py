@@ -218,13 +218,13 @@ def _motor_plots(lines: Sequence[_Line]) -> list[Plot]:
     unit = "force [N] or torque [N·m]" if force else "torque [N·m]"
     torque, error, current, voltage, power, warmth = ([] for _ in range(6))  # type: ignore[var-annotated]
     for line in lines:
-        torque += [line.curve("desired", line.desired, 0, dashed=True), line.curve("actual", line.actual, 1)]
+        torque += [line.curve("actual", line.actual, 1), line.curve("desired", line.desired, 0, dashed=True)]
         error.append(line.curve("desired less actual", line.desired - line.actual, 4))
         electric = line.has("current", "voltage")
         if line.has("current"):
-            if line.has("reference_current"):
-                current.append(line.curve("reference", line.trace("reference_current"), 0, dashed=True))
             current.append(line.curve("current", line.trace("current"), 1, held=False))
+        if line.has("current", "reference_current"):
+            current.append(line.curve("reference", line.trace("reference_current"), 0, dashed=True))
         if line.has("voltage"):
             voltage.append(line.curve("voltage", line.trace("voltage"), 2))
         power.append(line.curve("mechanical", line.actual * line.speed, 1))

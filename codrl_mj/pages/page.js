@@ -258,6 +258,7 @@ const codrl = (() => {
       this.u = new uPlot({
         ...this.size(),
         legend: { show: false },
+        padding: [8, 10, 0, 0],
         cursor: {
           y: false, drag: { x: true, y: false, setScale: true }, sync: this.clock ? { key: "clock", setSeries: false } : undefined,
           points: { size: 6 }, dataIdx: (u, series, index) => this.nearest(u, series, index),
@@ -268,7 +269,7 @@ const codrl = (() => {
           y: { distr: this.spec.y.log ? 3 : 1, range: (u, low, high) => this.up(low, high) },
         },
         axes: [{ ...axis("x"), space: 56, size: 28, ...(this.clock ? {} : { label: this.spec.x.label, labelSize: 20, labelGap: 0, labelFont: "12px system-ui, sans-serif" }) },
-          { ...axis("y"), space: 24, size: (u, values) => 14 + 7 * Math.max(2, ...(values ?? []).map((text) => (text ?? "").length)) }],
+          { ...axis("y"), space: 24, size: (u, values) => this.clock ? 66 : 14 + 7 * Math.max(2, ...(values ?? []).map((text) => (text ?? "").length)) }],
         bands: order.filter((curve) => curve.filled).map((curve) => ({ series: [curve.index, curve.index - 1], fill: () => css("--filled"), show: true })),
         series: [{}, ...order.map((curve) => this.series(curve))],
         hooks: {

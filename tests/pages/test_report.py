@@ -136,7 +136,7 @@ def test_several_motors_can_be_chosen():
     two = dataclasses.replace(one, **arrays, actuator=(one.actuator,) * 2, motors=("left", "right"))
     section = str(episode_section([Shown("arm", env, two, None, "none was asked for")]))
     expected = [
-        (f"{side}: {what}", f"motor:{place}") for place, side in enumerate(two.motors) for what in ("desired", "actual")
+        (f"{side}: {what}", f"motor:{place}") for place, side in enumerate(two.motors) for what in ("actual", "desired")
     ]
     assert motors_of(section) == expected
     assert section.count('name="show-motor"') == 2
