@@ -33,7 +33,7 @@ WITH_PYTHON = [name for name, text in PAGES.items() if "```python" in text and n
 LONG = {f"docs/{name}.md" for name in ("actuators", "foreign", "identify", "motors", "sarsa", "studies")}
 """What takes more than three seconds even so."""
 COMMANDS = [
-    (name, command.replace("\\\n", ""))
+    pytest.param(name, command.replace("\\\n", ""), marks=pytest.mark.matrix if name != "README.md" else [])
     for name, text in PAGES.items()
     for command in re.findall(r"^(?:\$ )?codrl-mj ((?:.*\\\n)*.*)$", text, re.MULTILINE)
     if not re.search(r"\b(?:NAME|LOG|RUN)\b", command)  # a form, not an example
