@@ -130,12 +130,8 @@ def _code_digest(*others: str | Path) -> str:
         for path in sorted(root.rglob(pattern)):
             digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes() + b"\0")
     for other in others:
-        file = (
-            other if isinstance(other, Path) else getattr(sys.modules[other], "__file__", None)
-        )  # a notebook has none
-        if file is not None and not any(
-            Path(file).is_relative_to(ours) for ours in (package, asset_folder())
-        ):  # a notebook has none
+        file = getattr(sys.modules[other], "__file__", None) if isinstance(other, str) else other  # a notebook has none
+        if file is not None and not any(Path(file).is_relative_to(ours) for ours in (package, asset_folder())):
             digest.update(Path(file).read_bytes())
     return digest.hexdigest()
 
