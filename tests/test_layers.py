@@ -24,7 +24,7 @@ ALLOWED = {
     "specs": {"actuators", "engine", "fields", "plugin"},
     "physics": {"actuators", "disturbances", "engine", "fields", "tasks", "tasks.assets"},
     "envs.distributions": {"fields"},
-    "envs.config": {"actuators", "disturbances", "envs.distributions", "fields", "tasks"},
+    "envs.config": {"actuators", "disturbances", "envs.distributions", "fields", "tasks", "tasks.assets"},
     "envs": {
         *("actuators", "disturbances", "engine", "envs.config", "envs.distributions", "fields", "physics", "tasks"),
     },
@@ -98,7 +98,7 @@ FOREIGN = {
     "motor_design": {"control", "matplotlib", "numpy", "scipy"},
     "identify": {"numba", "numpy", "scipy", "yaml"},
     "pages.plots": {"matplotlib", "numpy"},
-    "pages": {"jinja2", "markupsafe", "numpy"},
+    "pages": {"jinja2", "markupsafe", "numpy", "scipy"},
     "plugin": {"mujoco"},
     "engine": {"mujoco", "numba", "llvmlite", "numpy"},
     "specs": {"mujoco", "numpy"},

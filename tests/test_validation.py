@@ -540,7 +540,7 @@ def test_the_page_is_well_formed_self_contained_and_has_everything(certificate, 
 
 def test_a_failure_is_on_top_and_not_by_colour_alone():
     words = Parsed(page.html(SAMPLE)).text
-    assert words.index("✗ FAILED: 1 of 2 checks") < words.index("Contents")
+    assert words.index("✗ FAILED: 1 of 2 checks") < words.index("Checks of ")
     assert "b <i>" in words
     assert "x < y & z" in words
     assert words.count("✗ FAILED") == 2
