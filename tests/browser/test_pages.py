@@ -37,7 +37,7 @@ def pages(tmp_path_factory):
     report([RUN], folder / "report.html", joined=lambda _: (joined,))
     report([RUN, RUN.parent / "cartpole"], folder / "two.html")
     motor_page("qube", find_drive("quanser-qube-servo-2"), find_entry("quanser-qube-servo-2"), folder / "motor.html")
-    evil = "<img src=http://there/x onerror=alert(1)>"
+    evil = "<img src=http://there/x onerror=alert(1)>" + "x" * 90
     plot = Plot(evil, f"{evil} [s]", evil, (Curve(evil, np.arange(9.0), np.arange(9.0)),))
     section = builder.Section("s", evil, builder.plot(plot) + builder.table(evil, (evil,), [(evil,)]))
     builder.write(folder / "evil.html", builder.page(evil, evil, Markup(), [section]))
