@@ -95,7 +95,8 @@ supply, ms how late commands arrive.
 Trained at 18 V, policies lose nothing down to 7 V and behind 8 ms of delay, and swing up at 5 V still. Trained at 6 V
 they are the best at 5 V, and pay with 3 to 22 of 232 where there is more. Trained on the ideal arm they are a matter of
 their seed: one learns to swing up with all the torque there is, gets the most of all, 240, at 18 V, and fails from 10 V
-down and in half of the episodes behind 4 or 6 ms; the second fails from 7 V down, the third at 5 V. With 6 ms of delay, two seeds of three no longer swing up from 6 V down.
+down and in half of the episodes behind 4 or 6 ms; the second fails from 7 V down, the third at 5 V.
+Trained with 6 ms of delay, two seeds of three no longer swing up from 6 V down.
 
 ## Arguments
 
