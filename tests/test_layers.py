@@ -44,6 +44,7 @@ ALLOWED = {
         *("actuators", "envs", "envs.config", "evaluation.measures", "physics", "runs.files", "runs.policies", "tasks"),
     },
     "films": {"actuators", "envs", "envs.config", "evaluation", "physics", "runs.files"},
+    "replay": {"envs", "envs.config", "evaluation", "runs.files"},
     "training": {
         *("actuators", "agents", "disturbances", "envs", "envs.config", "evaluation", "runs.files", "runs.layout"),
         *("runs.policies", "tasks", "tasks.assets", "fields", "foreign"),
@@ -66,6 +67,7 @@ ALLOWED = {
             "foreign",
             "identify",
             "motor_design",
+            "replay",
             "runs.files",
             "runs.layout",
             "runs.policies",
@@ -99,6 +101,7 @@ FOREIGN = {
     "envs.config": {"gymnasium", "numpy"},
     "envs": {"gymnasium", "numpy", "numba", "mujoco", "stable_baselines3", "pygame"},
     "evaluation.measures": {"numpy", "scipy"},
+    "replay": {"mujoco", "numpy"},
     "runs.files": set(),
     "runs.summaries": set(),
 }
