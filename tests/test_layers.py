@@ -45,6 +45,7 @@ ALLOWED = {
     },
     "films": {"actuators", "envs", "envs.config", "evaluation", "physics", "runs.files"},
     "replay": {"envs", "envs.config", "evaluation", "runs.files"},
+    "view": {"actuators", "envs.config", "evaluation", "fields", "replay"},
     "training": {
         *("actuators", "agents", "disturbances", "envs", "envs.config", "evaluation", "runs.files", "runs.layout"),
         *("runs.policies", "tasks", "tasks.assets", "fields", "foreign"),
@@ -78,6 +79,7 @@ ALLOWED = {
             "tasks",
             "training",
             "validation",
+            "view",
         ),
     },
     "__main__": {"cli"},
@@ -102,6 +104,7 @@ FOREIGN = {
     "envs": {"gymnasium", "numpy", "numba", "mujoco", "stable_baselines3", "pygame"},
     "evaluation.measures": {"numpy", "scipy"},
     "replay": {"mujoco", "numpy"},
+    "view": {"gymnasium", "mujoco", "numpy", "trimesh", "viser", "websockets"},
     "runs.files": set(),
     "runs.summaries": set(),
 }

@@ -20,6 +20,7 @@ from codrl_mj.cli.runs import Runs
 from codrl_mj.cli.study import Study
 from codrl_mj.cli.train import Train, train_verb
 from codrl_mj.cli.validate import Validate
+from codrl_mj.cli.view import View
 from codrl_mj.training import TrainingStoppedError
 
 VERBS: dict[str, Any] = {
@@ -28,6 +29,7 @@ VERBS: dict[str, Any] = {
     "runs": Runs,
     "render": Render,
     "replay": Replay,
+    "view": View,
     "motor": Motor,
     "identify": Identify,
     "validate": Validate,
@@ -41,6 +43,7 @@ _MADE: dict[str, Callable[[list[str]], Any]] = {
     "evaluate": functools.partial(with_environment, Evaluate),
     "render": functools.partial(with_environment, Render),
     "replay": functools.partial(with_environment, Replay),
+    "view": functools.partial(with_environment, View),
 }
 """Those whose flags depend on the rest of the command line."""
 

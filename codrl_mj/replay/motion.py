@@ -64,7 +64,7 @@ def motion(
     chosen = _instants(np.asarray(time))
     poses = np.empty((len(chosen), model.nbody, 7))
     for row, index in zip(poses, chosen, strict=True):
-        _read(show(states[index]), seen, row)
+        read_poses(show(states[index]), seen, row)
     spread = np.ptp(poses, axis=0).max(axis=1)
     bodies = np.array([body for body in sorted({one.body for one in seen}) if spread[body] > 1e-9], dtype=int)
     return Motion(model, seen, np.asarray(time)[chosen], bodies, _steady(poses[:, bodies]), poses[0], camera)
@@ -114,8 +114,14 @@ def _instants(time: np.ndarray) -> np.ndarray:
     return np.unique([*range(0, len(time), stride), len(time) - 1])
 
 
-def _read(data: mujoco.MjData, seen: list[Shape], poses: np.ndarray) -> None:
-    """Read the bodies' poses, (bodies, 7); where geoms were moved along a hill, from one of their geoms."""
+def read_poses(data: mujoco.MjData, seen: list[Shape], poses: np.ndarray) -> None:
+    """Read where the bodies are; where geoms were moved along a hill, from one of their geoms.
+
+    Args:
+        data: the simulation, its kinematics up to date.
+        seen: its shapes.
+        poses: filled with positions and quaternions, shape (bodies, 7).
+    """
     poses[:, :3], poses[:, 3:] = data.xpos, data.xquat
     done = set()
     for shape in seen:

@@ -10,6 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from codrl_mj.replay.camera import first_view
 from codrl_mj.replay.motion import Motion
 from codrl_mj.replay.shapes import TRIANGLES, mesh, thinned
 from codrl_mj.runs.files import writing
@@ -19,8 +20,6 @@ _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; connect-src blob:"
 )
 """What the browser itself holds the page to: nothing is fetched."""
-_MUJOCO_ELEVATION, _ELEVATION = -45.0, -20.0
-"""Of a free camera [degrees]: MuJoCo's, of models that say nothing, which looks down on a robot; ours for these."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,10 +96,10 @@ def _content(what: Motion) -> dict[str, Any]:
     """What the viewer reads; numbers of which there are many as base64."""
     places = {int(body): place for place, body in enumerate(what.bodies)}
     used = list(dict.fromkeys(one.mesh for one in what.shapes if one.mesh is not None))
-    centre, extent = _extent(what)
+    view = first_view(what.model, what.shapes, what.still, set(what.bodies.tolist()), what.camera)
     return {
-        "extent": extent,
-        "camera": _camera(what, centre, extent),
+        "extent": view.extent,
+        "camera": {"eye": _rounded(view.eye), "at": _rounded(view.at), "fovy": view.fovy},
         "time": _packed(what.time.astype(np.float32)),
         "bodies": [what.model.body(int(body)).name for body in what.bodies],
         "poses": _packed(what.poses),
@@ -140,39 +139,6 @@ def _meshes(model: mujoco.MjModel, used: list[tuple[str, int]]) -> list[dict[str
             }
         )
     return made
-
-
-def _extent(what: Motion) -> tuple[np.ndarray, float]:
-    """Middle of what moves at the first instant [m], and how far it reaches from there; of all, if nothing moves."""
-    reaches = []
-    for one in what.shapes:
-        if one.geom is not None and one.body in what.bodies:
-            offset = np.empty(3)
-            mujoco.mju_rotVecQuat(offset, one.position, what.still[one.body, 3:])
-            middle, radius = what.still[one.body, :3] + offset, what.model.geom_rbound[one.geom]
-            reaches += [middle - radius, middle + radius]
-    if not reaches:
-        return np.array(what.model.stat.center), float(what.model.stat.extent)
-    low, high = np.min(reaches, axis=0), np.max(reaches, axis=0)
-    return (low + high) / 2, float(np.linalg.norm(high - low)) / 2
-
-
-def _camera(what: Motion, centre: np.ndarray, extent: float) -> dict[str, Any]:
-    """Where it is first seen from: eye, what it looks at, and vertical field of view [degrees]."""
-    model = what.model
-    if what.camera is not None:
-        data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_camlight(model, data)
-        index = model.camera(what.camera).id
-        eye, forward = data.cam_xpos[index], -data.cam_xmat[index].reshape(3, 3)[:, 2]
-        ahead = max(float((centre - eye) @ forward), 0.5 * extent)
-        return {"eye": _rounded(eye), "at": _rounded(eye + ahead * forward), "fovy": float(model.cam_fovy[index])}
-    view = model.vis.global_
-    down = _ELEVATION if view.elevation == _MUJOCO_ELEVATION else view.elevation
-    azimuth, elevation = np.radians([view.azimuth, down])
-    forward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-    return {"eye": _rounded(centre - 2.6 * extent * forward), "at": _rounded(centre), "fovy": 45.0}
 
 
 def _packed(values: np.ndarray) -> str:
