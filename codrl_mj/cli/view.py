@@ -1,6 +1,7 @@
 """`codrl-mj view`."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -68,9 +69,11 @@ class View:
             if (subject / "best").is_dir():
                 other = "best" if self.source.which == "last" else "last"
                 found[other] = lambda: dataclasses.replace(self.source, which=other).load(subject).policy
-        for run in self.policies:
-            found[run.name] = lambda run=run: self.source.load(run).policy
+        found |= {run.name: functools.partial(self._policy_of, run) for run in self.policies}
         return found
+
+    def _policy_of(self: Any, run: Path) -> Any:
+        return self.source.load(run).policy
 
 
 def _browser() -> Any:

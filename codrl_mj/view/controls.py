@@ -67,7 +67,8 @@ def _within(settings: Any, path: tuple[str, ...], scale: float | None) -> list[C
             found.append(Control(own, "", value))
         elif isinstance(value, int | float):
             unit = field.metadata.get("unit", "")
-            ends = _slider(value, *field.metadata.get("between", (None, None)), scale if unit == "V" else None)
+            low, high = field.metadata.get("between", (None, None))
+            ends = _slider(value, low, high, scale if unit == "V" else None)
             found.append(Control(own, unit, value, *ends))
     return found
 

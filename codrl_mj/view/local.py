@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import http
+import io
 from collections.abc import Iterator
 from typing import Any
 from urllib.parse import urlsplit
@@ -26,7 +27,7 @@ class LocalServer(viser.ViserServer):
         Args:
             port: to listen at; where it is taken, the next free one.
         """
-        with _checked_requests():
+        with _checked_requests(), contextlib.redirect_stdout(io.StringIO()):  # viser prints a table of addresses
             super().__init__(host=HOST, port=port, verbose=False)
 
     def request_share_url(self, verbose: bool = True) -> str | None:  # noqa: ARG002

@@ -27,7 +27,7 @@ def browser():
 
 def field(page, label):
     """The input beside a label."""
-    return page.locator(f"xpath=//label[text()='{label}']/following::input[1]")
+    return page.locator(f"xpath=//label[text()='{label}']/following::input[not(@type='hidden')][1]")
 
 
 def shown(browser, page):
