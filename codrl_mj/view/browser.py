@@ -19,6 +19,7 @@ _PLOT_EVERY = 0.2  # s, of wall clock
 _POINTS = 400
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")  # colour-blind safe (Okabe and Ito)
 _AXES = {"x": 0, "y": 1, "z": 2}
+_WANTED = ("desired", "reference")  # signals that are drawn first
 _DELAY_STEPS = 5  # environment steps, where the slider of the delay ends
 Docs = Callable[[type], Mapping[str, str]]
 
@@ -116,9 +117,12 @@ class Browser:
         if self._status.content != text:
             self._status.content = text
         problem = self._refusal or session.problem or ""
-        shown = f"⚠ **{'Not simulated' if session.waits else 'Refused'}:** {_plain(problem)}" if problem else ""
+        title = "Not simulated" if session.waits else "Refused"
+        shown = f"⚠ **{title}:** {_plain(problem)}" if problem else ""
         if self._problem.content != shown:
             self._problem.content, self._problem.visible = shown, bool(shown)
+            for client in self.server.get_clients().values() if shown else ():  # the panel may be scrolled away from it
+                client.add_notification(title, problem, color="red", auto_close_seconds=8.0)
 
     def _plot(self) -> None:
         kept = list(self.session.signals)
@@ -201,7 +205,7 @@ class Browser:
         for actuator in session.patterns.values():
             units |= {name: f"{name.split('_')[-1]} [{unit}]" for name, unit in actuator.SIGNAL_UNITS.items()}
         groups: dict[str, list[str]] = {}
-        for name in session.trace_names:
+        for name in sorted(session.trace_names, key=lambda name: not name.startswith(_WANTED)):
             if name in units:
                 groups.setdefault(units[name], []).append(name)
         with gui.add_folder("signals"):
