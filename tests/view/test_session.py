@@ -1,11 +1,13 @@
 """A session does what MuJoCo does, and what cannot be simulated is not."""
 
 import dataclasses
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 
+from codrl_mj.cli import main
 from codrl_mj.foreign.config import environment_from
 from codrl_mj.view.controls import controls, nested
 from codrl_mj.view.session import PUSH_DURATION, Session
@@ -134,3 +136,30 @@ def test_an_endless_voltage_ends_at_the_end_of_its_slider():
     assert voltage.parsed(12.0) == 12.0
     assert ("supply", "voltage") not in [one.path for one in controls(Actuator())]
     assert nested(("supply", "voltage"), 12.0) == {"supply": {"voltage": 12.0}}
+
+
+def test_the_command_line_offers_the_runs_policy_and_those_of_others(monkeypatch):
+    seen = {}
+
+    class Fake:
+        url = "http://127.0.0.1:0"
+
+        def __init__(self, session, _port, title, _docs):
+            seen.update(session=session, title=title)
+
+        def run(self):
+            assert seen["session"].step()
+
+        def close(self):
+            seen["closed"] = True
+
+    monkeypatch.setattr("codrl_mj.cli.view._browser", lambda: Fake)
+    run = Path(__file__).parents[1] / "fixtures" / "earlier" / "cartpole"
+    assert main(["view", str(run), "--policies", str(run), "--actuator", "weaker"]) == 0
+    made = seen["session"]
+    assert list(made.policies) == ["last", "cartpole", "random"]  # none of its actions does nothing
+    assert made.chosen == "last"
+    made.choose("cartpole")
+    assert made.step()
+    assert seen["title"] == "cartpole on weaker"
+    assert seen["closed"]
