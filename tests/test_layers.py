@@ -44,6 +44,8 @@ ALLOWED = {
         *("actuators", "envs", "envs.config", "evaluation.measures", "physics", "runs.files", "runs.policies", "tasks"),
     },
     "films": {"actuators", "envs", "envs.config", "evaluation", "physics", "runs.files"},
+    "replay": {"envs", "envs.config", "evaluation", "runs.files"},
+    "view": {"actuators", "envs.config", "evaluation", "fields", "replay"},
     "training": {
         *("actuators", "agents", "disturbances", "envs", "envs.config", "evaluation", "runs.files", "runs.layout"),
         *("runs.policies", "tasks", "tasks.assets", "fields", "foreign"),
@@ -66,6 +68,7 @@ ALLOWED = {
             "foreign",
             "identify",
             "motor_design",
+            "replay",
             "runs.files",
             "runs.layout",
             "runs.policies",
@@ -76,6 +79,7 @@ ALLOWED = {
             "tasks",
             "training",
             "validation",
+            "view",
         ),
     },
     "__main__": {"cli"},
@@ -99,6 +103,8 @@ FOREIGN = {
     "envs.config": {"gymnasium", "numpy"},
     "envs": {"gymnasium", "numpy", "numba", "mujoco", "stable_baselines3", "pygame"},
     "evaluation.measures": {"numpy", "scipy"},
+    "replay": {"mujoco", "numpy"},
+    "view": {"gymnasium", "mujoco", "numpy", "trimesh", "viser", "websockets"},
     "runs.files": set(),
     "runs.summaries": set(),
 }
