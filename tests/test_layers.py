@@ -24,7 +24,7 @@ ALLOWED = {
     "specs": {"actuators", "engine", "fields", "plugin"},
     "physics": {"actuators", "disturbances", "engine", "fields", "tasks", "tasks.assets"},
     "envs.distributions": {"fields"},
-    "envs.config": {"actuators", "disturbances", "envs.distributions", "fields", "tasks"},
+    "envs.config": {"actuators", "disturbances", "envs.distributions", "fields", "tasks", "tasks.assets"},
     "envs": {
         *("actuators", "disturbances", "engine", "envs.config", "envs.distributions", "fields", "physics", "tasks"),
     },
