@@ -44,6 +44,8 @@ ALLOWED = {
         *("actuators", "envs", "envs.config", "evaluation.measures", "physics", "runs.files", "runs.policies", "tasks"),
     },
     "films": {"actuators", "envs", "envs.config", "evaluation", "physics", "runs.files"},
+    "replay": {"envs", "envs.config", "evaluation", "runs.files"},
+    "view": {"actuators", "envs.config", "evaluation", "fields", "replay"},
     "training": {
         *("actuators", "agents", "disturbances", "envs", "envs.config", "evaluation", "runs.files", "runs.layout"),
         *("runs.policies", "tasks", "tasks.assets", "fields", "foreign"),
@@ -63,7 +65,7 @@ ALLOWED = {
     "identify": {"actuators", "catalogue", "fields", "runs.files"},
     "pages": {
         *("__init__", "actuators", "catalogue", "evaluation", "films", "foreign", "identify", "motor_design"),
-        *("pages.plots", "runs.files", "runs.layout", "runs.policies", "runs.summaries", "tasks", "training"),
+        *("pages.plots", "replay", "runs.files", "runs.layout", "runs.policies", "runs.summaries", "tasks", "training"),
         "validation",
     },
     "cli": {
@@ -73,6 +75,7 @@ ALLOWED = {
             "identify",
             "motor_design",
             "pages",
+            "replay",
             "runs.files",
             "runs.layout",
             "runs.policies",
@@ -83,6 +86,7 @@ ALLOWED = {
             "tasks",
             "training",
             "validation",
+            "view",
         ),
     },
     "__main__": {"cli"},
@@ -108,6 +112,8 @@ FOREIGN = {
     "envs.config": {"gymnasium", "numpy"},
     "envs": {"gymnasium", "numpy", "numba", "mujoco", "stable_baselines3", "pygame"},
     "evaluation.measures": {"numpy", "scipy"},
+    "replay": {"mujoco", "numpy"},
+    "view": {"gymnasium", "mujoco", "numpy", "trimesh", "viser", "websockets"},
     "runs.files": set(),
     "runs.summaries": set(),
 }

@@ -50,7 +50,9 @@ def test_the_wheel_has_every_module_model_and_the_type_marker(wheel):
     assert len(modules) > 30
     assert len(settings) == 5
     assert len(models) >= 5
-    assert names >= modules | models | settings | pages | {"codrl_mj/py.typed"}
+    replay = {f"codrl_mj/replay/{name}" for name in ("page.html", "replay.css", "replay.js")}
+    three = {f"codrl_mj/replay/three/{name}" for name in ("three.min.js", "LICENSE", "README.md")}
+    assert names >= modules | models | settings | pages | replay | three | {"codrl_mj/py.typed"}
     assert not [name for name in names if name.startswith(("tests", "scripts", "assets", "docs"))]
 
 

@@ -1,1 +1,1 @@
-"""Pages in Chromium."""
+"""Pages in a browser; `make browser` runs these."""
