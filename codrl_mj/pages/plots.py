@@ -222,9 +222,10 @@ def still(plot: Plot, width: float = 6.4, height: float = 3.2) -> str:
         axes.tick_params(colors=ink, which="both")
         axes.spines[:].set_color(ink)
         axes.grid(color=ink, alpha=0.25)
-        for which, axis in (("x", axes.xaxis), ("y", axes.yaxis)):
-            if axis.get_scale() == "linear":
-                axes.locator_params(axis=which, nbins=5)
+        if axes.get_xscale() == "linear":
+            axes.locator_params(axis="x", nbins=5)
+        if axes.get_yscale() == "linear":
+            axes.locator_params(axis="y", nbins=5)
         if len(plot.curves) > 1:
             axes.legend(fontsize=8, frameon=False, labelcolor=ink)
         buffer = io.StringIO()
