@@ -16,8 +16,8 @@ from codrl_mj.identify.segments import Segment
 LEAST_LOGS = 5
 """From so many logs on whole logs are resampled; below, blocks of them."""
 DRAWS = 500
-FLAT = 1e-7
-"""Directions in which the squared residuals change by less than this share of the most do not count as known."""
+FLAT = 1e-12
+"""Of parameters in units in which each alone is known to 1, a direction counts as known to 1e6 at worst."""
 SLACK = 1e-3
 """Share of the cost that a fit may be better by luck: dry friction has many minima."""
 
@@ -52,8 +52,11 @@ def _sums(fit: Fit, groups: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _inverse(matrix: np.ndarray, scales: np.ndarray) -> np.ndarray:
-    scaled = matrix * np.outer(scales, scales)
-    return np.asarray(np.linalg.pinv(scaled, rcond=FLAT, hermitian=True) * np.outer(scales, scales))
+    """The inverse, large and never 0 along what is not known; none of it is lost beside what is known far better."""
+    known = np.diag(matrix) * scales**2
+    units = scales / np.sqrt(np.maximum(known, 1e-16 * known.max() + 1e-300))
+    values, vectors = np.linalg.eigh(matrix * np.outer(units, units))
+    return np.asarray((vectors / np.maximum(values, FLAT)) @ vectors.T * np.outer(units, units))
 
 
 def resampling(fit: Fit, segments: Sequence[Segment], scales: np.ndarray, seed: int) -> np.ndarray:

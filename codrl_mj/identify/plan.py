@@ -154,7 +154,8 @@ def _options(
             duration,
             frequency=2.0 if kind == "square" else 0.5,
             highest=min(200.0, 0.5 / constant),
-            clock=max(round(4.0 * constant * rate), 1) / rate if together else 4.0 * constant,
+            # an even number of rows, so that a fit of every second one still has the voltage
+            clock=2 * max(round(2.0 * constant * rate), 1) / rate if together else 4.0 * constant,
         )
         held = dataclasses.replace(load, locked=load.locked or excitation.locked)
         time = sample_times(drive, duration)

@@ -85,7 +85,7 @@ def _turned() -> Any:
     def turned(
         duration: float, given: float, slope: float, position: float, speed: float, moved: Any
     ) -> tuple[float, float]:
-        pieces = math.ceil(duration / LONGEST_SUBSTEP - 1e-6)
+        pieces = max(math.ceil(duration / LONGEST_SUBSTEP - 1e-6), 1)
         step = duration / pieces
         damped = 0.5 * step * (moved.viscous + moved.braking) / moved.inertia
         for piece in range(pieces):

@@ -299,12 +299,7 @@ def _compiled() -> tuple[Callable[..., Any], Callable[..., Any]]:
 
 
 def _step_shaft(
-    parameters: Any,
-    duration: float,
-    torque: float,
-    moved: Any,
-    speed: float,
-    angle: float,
+    parameters: Any, duration: float, torque: float, moved: Any, speed: float, angle: float
 ) -> tuple[float, float]:
     """Speed and angle of the rotor after a short time; dry friction at most stops it.
 
