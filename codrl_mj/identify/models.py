@@ -52,20 +52,7 @@ class ShaftModel(Model):
         if self.driven_by == "voltage":
             gain /= number["resistance"]
             braking = gain * ratio * number.get("back_emf_constant", number["torque_constant"])
-        return simulation.Moved(
-            number["inertia"],
-            number["mgl"],
-            number["constant_torque"],
-            number["coulomb_friction"] * ratio,
-            number["viscous_friction"] * ratio**2,
-            number["gear_efficiency"],
-            number["stribeck_friction"] * ratio,
-            number["stribeck_speed"] / ratio,
-            2.0,
-            0.0,
-            gain,
-            braking,
-        )
+        return simulation.moved(number, gain, braking)
 
     def at(self, values: np.ndarray) -> Simulate:
         """Of positions [rad] or speeds [rad/s]."""

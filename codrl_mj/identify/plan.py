@@ -17,8 +17,9 @@ import numpy as np
 
 from codrl_mj.actuators import Drive
 from codrl_mj.fields import check, check_names, real
+from codrl_mj.identify import simulation
 from codrl_mj.identify.excitations import KINDS, Excitation
-from codrl_mj.identify.synthetic import FREE, Course, Load, play, sample_times, turn
+from codrl_mj.identify.synthetic import FREE, Course, Load, moved, run, sample_times
 from codrl_mj.runs.files import writing
 
 GOALS = {
@@ -162,7 +163,7 @@ def _options(
         shape = excitation.voltage(np.floor(time * rate + 1e-6) / rate if together else time) / excitation.amplitude
         amplitude = excitation.amplitude
         for _ in range(8):  # the response is nearly in proportion to the voltage
-            course = play(drive, amplitude * shape, held)
+            course = run(drive, amplitude * shape, held)
             peak, rms = float(np.abs(course.current).max()), float(np.sqrt(np.mean(course.current**2)))
             excess = max(peak / limits[0], rms / limits[1])
             if excess <= 1.0:
@@ -215,15 +216,19 @@ def _electrical(drive: Drive, course: Course, told: np.ndarray, rate: float, sen
 
 def _mechanical(drive: Drive, course: Course, load: Load, rate: float, sensing: Sensing) -> dict[str, float]:
     """Relative errors by the position; those that the datasheet leaves at 0 are left out."""
-    torque = drive.motor.torque_constant * course.current
+    ratio, shaft = drive.motor.gear_ratio, moved(drive, load)
+    # by the names of a motor, at the rotor
+    fields = {"inertia": ratio**2, "coulomb_friction": ratio, "viscous_friction": ratio**2}
     time = _row_times(course, rate, sensing)
     free = np.linalg.qr(np.column_stack([np.ones(time.shape[1]), np.arange(time.shape[1])]))[0]
     noise = 2.0 * math.pi / sensing.encoder / math.sqrt(12.0)
     names = [name for name in _MECHANICAL if _value(drive, load, name) > 0.0]
+    still = np.zeros(len(course.time))
 
     def see(name: str, value: float) -> np.ndarray:
-        changed, moved = _changed(drive, load, name, value)
-        seen = np.interp(time, course.time, turn(changed, torque, moved)) / noise
+        changed = shaft._replace(**{name.removesuffix("_friction"): value * fields[name]})
+        angle = simulation.moving()(course.time, course.current, still, 0.0, 0.0, changed)[0]
+        seen = np.interp(time, course.time, angle) / noise
         return (seen - seen @ free @ free.T).ravel()
 
     slopes = [_slope(lambda value, name=name: see(name, value), _value(drive, load, name)) for name in names]  # type: ignore[misc]
@@ -274,14 +279,3 @@ def _value(drive: Drive, load: Load, name: str) -> float:
     if name == "inertia":
         return motor.rotor_inertia + load.inertia / motor.gear_ratio**2
     return float(getattr(motor, name))
-
-
-def _changed(drive: Drive, load: Load, name: str, value: float) -> tuple[Drive, Load]:
-    """With another value; the load takes a change of the inertia if it can."""
-    motor = drive.motor
-    if name == "inertia":
-        more = (value - _value(drive, load, name)) * motor.gear_ratio**2
-        if load.inertia + more >= 0.0:
-            return drive, dataclasses.replace(load, inertia=load.inertia + more)
-        return drive.replaced({"motor.rotor_inertia": value}), load
-    return drive.replaced({f"motor.{name}": value}), load

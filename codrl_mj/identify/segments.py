@@ -92,7 +92,7 @@ def sensor_deviation(log: Log, name: str) -> float:
 
 
 def moves(log: Log) -> bool:
-    """Whether the shaft moves, by more than an encoder flickers or a velocity is noisy; not, where neither is logged."""
+    """Whether the shaft moves, by more than an encoder flickers or a velocity is noisy; no where neither is logged."""
     if log.has("position"):
         return float(np.ptp(log.signals["position"])) > max(STILL * log.resolution.get("position", 0.0), 1e-4)
     if not log.has("velocity"):
