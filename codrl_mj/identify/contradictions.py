@@ -157,7 +157,7 @@ def _mechanical(log: Log, effort: str) -> Iterator[Finding]:
     balance = torque_balance(log, effort) or quick
     if balance is None:
         return
-    values, certain = balance.values, balance.certainty
+    certain = balance.certainty
     both = [one.certainty.get("inertia", 0.0) for one in (balance, quick) if one is not None]
     heavy, hangs = max(both, key=abs), certain.get("gravity", 0.0)
     if heavy < -_CERTAIN or (hangs < -_CERTAIN and heavy < -3.0):

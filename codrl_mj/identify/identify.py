@@ -28,6 +28,8 @@ NARROWEST_OF = {"inductance": 0.02}
 BIASED = 0.5
 """The self-test fails where it is off by more than this share of the widest interval."""
 STEPS_OF_A_STAGE = 8 + 4
+AT_BOUND = 1e-3
+"""Nearer to a bound, in the parameter's scale, a value is at it."""
 RAREST = 0.05
 """Rows that are farther apart [s] say too little within the time that is foretold."""
 UNEXPLAINED = 8.0
@@ -236,7 +238,8 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
     # an error that goes with a row's time is half as large at the rate of the logs, one with its root more than that
     rate = (2.0 if isinstance(part.stage, Winding) else 1.0) * np.abs(halved - fit.values)
     curved = honesty.curvature(fit, part.segments, scales)
-    spread = honesty.Spread(curved, resampled, logs, np.abs(tested - fit.values), rate)
+    lost = honesty.unexplained(fit, part.segments) if isinstance(part.stage, Winding) else 0.0
+    spread = honesty.Spread(curved, resampled, logs, np.abs(tested - fit.values), rate, lost * np.abs(fit.values))
     directions = part.unknown_directions(scales)
     on_step()
     made = []
@@ -249,8 +252,8 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
         share = half / scales[place]
         own = [direction for direction in directions if name in direction]
         none = most if name == "gear_efficiency" else least
-        nothing = name in FRICTION and abs(value - none) <= 1e-4 * model.scales[place]
-        at_bound = min(value - least, most - value) <= 1e-4 * model.scales[place]
+        nothing = name in FRICTION and abs(value - none) <= AT_BOUND * model.scales[place]
+        at_bound = min(value - least, most - value) <= AT_BOUND * model.scales[place]
         status: Status = "identified"
         why = ""
         if own and (len(own[0]) > 1):

@@ -43,8 +43,8 @@ ROWS = {
     "prbs 5 kHz, jitter 10 %": {"jitter": 0.1},
     "prbs 5 kHz, encoder of 512 steps": {"encoder": 512},
 }
-"""Name -> arguments of `logged`. The voltage of a row: the mean to the next one, what it is at the time while it changes
-by a clock of its own, or what holds until the next one, changing together with the rows."""
+"""Name -> arguments of `logged`. The voltage of a row: the mean to the next one; what it is at the time, while it changes
+by a clock of its own; or what holds until the next one, changing together with the rows."""
 
 
 def motor_of(draw: int) -> GearMotor:
@@ -177,16 +177,14 @@ def main():
     parser.add_argument("--only", nargs="*", help="rows whose names begin so")
     options = parser.parse_args()
     rows = FAULTS if options.faults else {name: lambda draw, row=row: logged(draw, **row) for name, row in ROWS.items()}
-    print(f"identified, of these within the interval, largest error, of {options.draws} draws")
+    print(f"of {options.draws} draws: identified, of these within the interval, largest error, beyond the goal")
     print(f"| | {' | '.join(NAMES)} | said |\n| --- | {'--- | ' * len(NAMES)}--- |")
     for name, make in rows.items():
         if options.only and not name.startswith(tuple(options.only)):
             continue
         counts, errors, said = measured(make, options.draws)
-        cells = [
-            f"{n}, {inside}{f', {100.0 * max(errors[one], key=abs):.2g} %' if n else ''}{f' ({off} off)' if off else ''}"
-            for one, (n, inside, off) in counts.items()
-        ]
+        worst = {one: f", {100.0 * max(several, key=abs):.2g} %" if several else "" for one, several in errors.items()}
+        cells = [f"{n}, {inside}{worst[one]}, {off} off" for one, (n, inside, off) in counts.items()]
         print(f"| {name} | {' | '.join(cells)} | {dict(said)} |", flush=True)
 
 
