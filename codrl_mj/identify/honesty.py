@@ -37,7 +37,7 @@ class Spread:
 
     @property
     def total(self) -> np.ndarray:
-        """The largest of the first three, and what the rate does, as what is independent adds up; and then the biases."""
+        """The largest of the first three, and what the rate does, as what is independent adds up; then the biases."""
         wide = np.maximum(np.maximum(self.curvature, self.resampling), self.logs)
         return np.asarray(np.sqrt(wide**2 + self.half_rate**2) + self.self_test + self.unexplained)
 
@@ -45,8 +45,8 @@ class Spread:
 def unexplained(fit: Fit, segments: Sequence[Segment]) -> float:
     """Share by which a factor of the input may be off for what is not explained.
 
-    Errors of the input, as of a voltage that changes between the rows, attenuate its factor by a multiple of their share
-    of the variance: 2 to 4.6 of PRBS whose clock is 1 to 4 rows; no fit of fewer rows shows it.
+    Errors of the input, as of a voltage that changes between the rows, attenuate its factor by a multiple of their
+    share of the variance: 2 to 4.6 of PRBS whose clock is 1 to 4 rows; no fit of fewer rows shows it.
     """
     rest = sum(one.deviation**2 * float(fit.weights(i) @ fit.residuals[i] ** 2) for i, one in enumerate(segments))
     return ATTENUATION * rest / max(sum(float(np.var(one.measured)) * len(one.measured) for one in segments), 1e-300)

@@ -63,14 +63,14 @@ def identify(
         estimated: parameters to fit that are otherwise taken as known, such as `torque_gain`.
         segment: time [s] that the shaft is simulated for at once, >= 0.05: short where it tips over by itself, a second
             or two where it only sticks and slides.
-        base: the mapping of a drive that gives what the logs do not tell.
+        base: the mapping of a drive that gives what the logs do not tell, and the gear where `known` does not.
         on_progress: called with what is being done, steps done and steps in all.
         seed: of the resampling.
 
     Raises:
         ValueError: unknown names, values out of bounds, or logs that tell nothing; the message says what is missing.
     """
-    given = _checked(logs, rig, known or {}, friction, estimated)
+    given = _checked(logs, rig, _with_gear(known or {}, base), friction, estimated)
     if not segment >= 0.05:
         raise ValueError(f"segment = {segment!r}: must be >= 0.05 s; {SEGMENT:g} is the default")
     rig = rig or ("pendulum" if "mgl" in given else "free")
@@ -164,6 +164,15 @@ def _checked(
             "rig = None: what the output moves decides what is fitted, and must be said: pendulum, free or load"
         )
     return dict(known)
+
+
+def _with_gear(known: Mapping[str, float], base: Mapping[str, Any] | None) -> dict[str, float]:
+    """What is known, the gear of a motor with one too: otherwise its numbers would be those of the output."""
+    from codrl_mj.actuators import Drive, actuator_from_mapping
+
+    drive = None if base is None else actuator_from_mapping(base)
+    ratio = drive.motor.gear_ratio if isinstance(drive, Drive) else 1.0
+    return {**({} if ratio == 1.0 else {"gear_ratio": ratio}), **known}
 
 
 def _electrical(logs: Sequence[Log]) -> list[Log]:

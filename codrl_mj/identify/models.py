@@ -239,7 +239,8 @@ def _shaft_regression(
             position, speed = segment.state[0] + turned(segment.measured, times), segment.measured
         columns = np.sin(position), np.ones(len(times)), np.sign(speed) * (np.abs(speed) > 0.0), speed, segment.inputs
         sums = [turned(one, times) for one in columns]
-        edges = np.unique(np.searchsorted(times, np.arange(times[0], times[-1] + 1e-9, 2.5 * window)))
+        edges = np.searchsorted(times, np.arange(times[0], times[-1] + 1e-9, 2.5 * window))
+        edges = np.unique(np.minimum(edges, len(times) - 1))
         rows.append(np.stack([np.diff(speed[edges]), *(np.diff(one[edges]) for one in sums)], axis=1))
         inputs.append(segment.inputs)
         turning.append(speed)

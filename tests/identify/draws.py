@@ -43,8 +43,8 @@ ROWS = {
     "prbs 5 kHz, jitter 10 %": {"jitter": 0.1},
     "prbs 5 kHz, encoder of 512 steps": {"encoder": 512},
 }
-"""Name -> arguments of `logged`. The voltage of a row: the mean to the next one; what it is at the time, while it changes
-by a clock of its own; or what holds until the next one, changing together with the rows."""
+"""Name -> arguments of `logged`. The voltage of a row: the mean to the next one; what it is at the time, while it
+changes by a clock of its own; or what holds until the next one, changing together with the rows."""
 
 
 def motor_of(draw: int) -> GearMotor:
