@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from codrl_mj import cli
 from codrl_mj.cli import main
+from codrl_mj.cli.identify_tools import Check, Simulate
 
 PAGE = (Path(__file__).parent.parent / "docs" / "tutorial_log_to_policy.md").read_text()
 FILES = dict(re.findall(r"```yaml\n# (\S+)\n(.*?)```", PAGE, re.DOTALL))
@@ -26,6 +28,15 @@ def run(command, **short):
     assert main(words) == 0
 
 
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_commands_are_understood(command, monkeypatch):
+    parsed = []
+    for verb in (*cli.VERBS.values(), Check, Simulate):
+        monkeypatch.setattr(verb, "run", lambda self: parsed.append(self) or 0)
+    assert main(shlex.split(command)) == 0
+    assert len(parsed) == 1
+
+
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
     """A folder in which the page has been followed until the training; logs of 2 s."""
@@ -39,6 +50,7 @@ def bench(tmp_path_factory):
         yield folder
 
 
+@pytest.mark.matrix
 def test_the_fit_finds_the_motor_of_the_bench(bench, capsys, monkeypatch):
     monkeypatch.chdir(bench)
     real = yaml.safe_load(FILES["real.yaml"])["motor"]
