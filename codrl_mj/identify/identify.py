@@ -291,7 +291,13 @@ def _weights(part: Fitted) -> dict[str, float]:
         return {}
     model, number = part.model, part.model.all_values(part.fit.values)
     moved = model.moved(part.fit.values)
-    speeds = np.concatenate([_speeds(model, one) for one in part.segments])
+    every = [slice(None, None, max(len(one.times) // 20, 1)) for one in part.segments]
+    speeds = np.concatenate(
+        [
+            one.measured if model.output == "velocity" else np.diff(one.measured[rows]) / np.diff(one.times[rows])
+            for one, rows in zip(part.segments, every, strict=True)
+        ]
+    )
     speed = max(float(np.sqrt(np.mean(speeds**2))), 1e-9) * number["gear_ratio"]
     inputs = np.concatenate([one.inputs for one in part.segments])
     torque = float(np.sqrt(np.mean(inputs**2))) * moved.gain / number["gear_ratio"]
@@ -303,14 +309,6 @@ def _weights(part: Fitted) -> dict[str, float]:
         "stribeck_friction": whole,
         "gear_efficiency": min(whole / torque, 1.0),
     }
-
-
-def _speeds(model: Any, segment: Any) -> np.ndarray:
-    if model.output == "velocity":
-        return np.asarray(segment.measured)
-    return np.diff(segment.measured[:: max(len(segment.times) // 20, 1)]) / np.diff(
-        segment.times[:: max(len(segment.times) // 20, 1)]
-    )
 
 
 def _text(direction: Mapping[str, float]) -> str:
@@ -371,17 +369,13 @@ def _warnings(part: Fitted) -> list[str]:
             for name, text in unlike.items()
         ]
     values = np.array([one.values for one in part.tried])
-    best = min(_cost_of(one) for one in part.tried)
-    near = np.array([_cost_of(one) < 1.1 * best for one in part.tried])
+    costs = np.array([np.mean(np.abs(np.concatenate(one.residuals))) for one in part.tried])
+    near = costs < 1.1 * costs.min()
     apart = np.ptp(values[near], axis=0) / np.maximum(np.abs(part.fit.values), part.model.scales)
     if np.any(apart > 0.2):
         names = ", ".join(name for name, one in zip(part.fit.names, apart, strict=True) if one > 0.2)
         found.append(f"several minima: starts ended within 10 % of the best cost, but apart in {names}")
     return found
-
-
-def _cost_of(fit: Any) -> float:
-    return float(np.mean(np.abs(np.concatenate(fit.residuals))))
 
 
 def _predictions(shaft: Fitted | None, logs: Sequence[Log]) -> tuple[Prediction, ...]:

@@ -19,6 +19,7 @@ from codrl_mj.actuators import Drive
 from codrl_mj.fields import check, check_names, real
 from codrl_mj.identify import simulation
 from codrl_mj.identify.excitations import KINDS, Excitation
+from codrl_mj.identify.parameters import ELECTRICAL
 from codrl_mj.identify.synthetic import FREE, Course, Load, moved, run, sample_times
 from codrl_mj.runs.files import writing
 
@@ -77,8 +78,7 @@ class Option(NamedTuple):
     @property
     def worst(self) -> float:
         """The largest error over its goal; infinite where one of the electrical parameters cannot be seen."""
-        needed = ("resistance", "inductance", "back_emf_constant")
-        if any(name not in self.errors for name in needed):
+        if any(name not in self.errors for name in ELECTRICAL):
             return math.inf
         return max(error / GOALS[name] for name, error in self.errors.items())
 
@@ -179,7 +179,6 @@ def _options(
     return options
 
 
-_ELECTRICAL = ("resistance", "inductance", "back_emf_constant")
 _MECHANICAL = ("inertia", "coulomb_friction", "viscous_friction")
 _STEP = 1e-3  # of a parameter, relative, by which it is changed
 
@@ -196,7 +195,7 @@ def _electrical(drive: Drive, course: Course, told: np.ndarray, rate: float, sen
         found: np.ndarray = lfilter([0.0, gain], [1.0, -decay], voltage - back_emf_constant * middle)
         return found
 
-    given = {name: _value(drive, FREE, name) for name in _ELECTRICAL}
+    given = {name: _value(drive, FREE, name) for name in ELECTRICAL}
     base = current(course.voltage, **given)
     time = _row_times(course, rate, sensing).ravel()
     noise = sensing.current_noise * max(float(np.abs(base).max()), 1e-300)
@@ -207,11 +206,11 @@ def _electrical(drive: Drive, course: Course, told: np.ndarray, rate: float, sen
 
     slopes = [
         _slope(lambda value, name=name: see(current(course.voltage, **{**given, name: value})), given[name])  # type: ignore[misc]
-        for name in _ELECTRICAL
+        for name in ELECTRICAL
     ]
     later = see(np.concatenate([base[:1], base[:-1]])) - see(base)
     wrong = see(current(told, **given)) - see(base)
-    return _errors(_ELECTRICAL, np.column_stack([*slopes, later, np.ones(len(time))]), wrong)
+    return _errors(ELECTRICAL, np.column_stack([*slopes, later, np.ones(len(time))]), wrong)
 
 
 def _mechanical(drive: Drive, course: Course, load: Load, rate: float, sensing: Sensing) -> dict[str, float]:

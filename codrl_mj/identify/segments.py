@@ -113,23 +113,17 @@ def cut(log: Log, longest: float) -> list[slice]:
     return found
 
 
-def mean_speeds(log: Log, rows: slice) -> np.ndarray:
-    """Mean speed [rad/s] from each row to the next, shape (m,), of a log with position or velocity, else 0."""
-    times = log.time[rows]
-    if not moves(log):
-        return np.zeros(len(times))
-    if log.has("position"):
-        middles = times + 0.5 * np.diff(times, append=2.0 * times[-1] - times[-2])
-        return speeds(times, log.signals["position"][rows], middles)
-    velocity = log.signals["velocity"][rows]
-    return 0.5 * (velocity + np.append(velocity[1:], velocity[-1]))
-
-
 def turning(log: Log) -> np.ndarray:
-    """Mean speed [rad/s] from each row to the next, shape (n,), by the positions around it."""
+    """Mean speed [rad/s] from each row to the next, shape (n,), by positions around it or velocities; 0 if locked."""
     found = np.zeros(len(log.time))
-    for stretch in usable(log):
-        found[stretch] = mean_speeds(log, stretch)
+    for rows in usable(log) if moves(log) else ():
+        times = log.time[rows]
+        if log.has("position"):
+            middles = times + 0.5 * np.diff(times, append=2.0 * times[-1] - times[-2])
+            found[rows] = speeds(times, log.signals["position"][rows], middles)
+        else:
+            velocity = log.signals["velocity"][rows]
+            found[rows] = 0.5 * (velocity + np.append(velocity[1:], velocity[-1]))
     return found
 
 
@@ -198,12 +192,12 @@ def shaft_segments(
     return made
 
 
-def initial_state(log: Log, rows: slice, window: float = 0.03) -> np.ndarray:
-    """Position and speed at the first row, from the rows around it: a parabola within half a window, or five rows."""
+def initial_state(log: Log, rows: slice) -> np.ndarray:
+    """Position and speed at the first row, from the rows around it: a parabola within 15 ms, or five rows."""
     time = log.time[rows.start]
     stretch = next(one for one in usable(log) if one.start <= rows.start < one.stop)
-    first = max(min(int(np.searchsorted(log.time, time - 0.5 * window)), rows.start - 2), stretch.start)
-    last = min(max(int(np.searchsorted(log.time, time + 0.5 * window)), rows.start + 3), stretch.stop)
+    first = max(min(int(np.searchsorted(log.time, time - 0.015)), rows.start - 2), stretch.start)
+    last = min(max(int(np.searchsorted(log.time, time + 0.015)), rows.start + 3), stretch.stop)
     near = slice(first, last)
     degree = min(2, last - first - 1)
     fitted = np.polynomial.polynomial.polyfit(log.time[near] - time, log.signals["position"][near], degree)
