@@ -1,19 +1,31 @@
 # Every target makes the .venv it needs, from nothing.
 PYTHON ?= python3
 BIN := .venv/bin
-STAMP := .venv/.installed
+PACKAGE := .venv/.installed
+STAMP := .venv/.installed-dev
+DOCS := .venv/.installed-docs
+INSTALL = $(BIN)/pip install --quiet --constraint constraints.txt --editable
 
 .PHONY: install demo test check lint bench soak results docs clean
 
 install: $(STAMP)
 
-$(STAMP): pyproject.toml constraints.txt
+$(PACKAGE): pyproject.toml constraints.txt
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	@echo "installing into .venv (a few minutes the first time) ..."
-	@$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[all,dev]"
+	@$(INSTALL) ".[all]"
 	@touch $@
 
-demo: $(STAMP)  ## cross-validate, train on the ideal and on the weak actuator, deploy both, film it
+$(STAMP): $(PACKAGE)
+	@echo "installing what the tests need ..."
+	@$(INSTALL) ".[all,dev]"
+	@touch $@
+
+$(DOCS): $(PACKAGE)
+	@$(INSTALL) ".[all,docs]"
+	@touch $@
+
+demo: $(PACKAGE)  ## cross-validate, train on the ideal and on the weak actuator, deploy both, film it
 	@$(BIN)/python scripts/demo.py
 
 test: $(STAMP)  ## in two processes, each with whole files: a file's tests share what is slow to make
@@ -29,7 +41,7 @@ lint: $(STAMP)
 	@$(BIN)/codespell
 
 bench: $(STAMP)  ## speed beside other libraries, which are installed for it
-	@$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[bench]"
+	@$(INSTALL) ".[bench]"
 	@$(BIN)/python scripts/benchmark.py
 
 soak: $(STAMP)  ## a million steps: memory, threads, episodes
@@ -39,9 +51,11 @@ results: $(STAMP)  ## docs/results/ anew: hours; what is finished in runs/ is no
 	@$(BIN)/codrl-mj reproduce
 	@$(BIN)/codrl-mj study mismatch
 
-docs: $(STAMP)  ## write docs/environments/ and docs/actuators_in_numbers.md anew from the code
+docs: $(DOCS)  ## the site in build/site, and the pages that are written from the code
 	@$(BIN)/python scripts/environment_pages.py
 	@$(BIN)/python scripts/actuator_numbers.py
+	@$(BIN)/python scripts/command_line_page.py
+	@$(BIN)/zensical build --strict --config-file zensical.toml
 
 clean:  ## everything but what was trained
 	rm -rf .venv .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist

@@ -11,6 +11,9 @@ import re
 import sys
 from pathlib import Path
 
+import gymnasium
+from PIL import Image
+
 from codrl_mj.actuators import Drive
 from codrl_mj.cli.fields import field_docs
 from codrl_mj.envs import ActuatedEnv
@@ -88,7 +91,8 @@ def page(task_name: str) -> str:
     }
     rows = "\n".join(f"| {name} | {value} |" for name, value in facts.items())
     return (
-        f"# {_title(task_name)}\n\n{summary}\n\n| | |\n| --- | --- |\n{rows}\n\n{body}\n\n"
+        f"# {_title(task_name)}\n\n{summary}\n\n![{_title(task_name)}]({task_name}.png)\n\n"
+        f"| | |\n| --- | --- |\n{rows}\n\n{body}\n\n"
         f"## Arguments of every environment\n\n{common_arguments()}\n"
     )
 
@@ -123,6 +127,18 @@ def index() -> str:
     )
 
 
+def picture(task_name: str) -> Image.Image:
+    """The task after a few random actions."""
+    env = gymnasium.make(TASKS[task_name].env_id, render_mode="rgb_array", width=480, height=360, pretty=True)
+    env.action_space.seed(1)
+    env.reset(seed=1)
+    for _ in range(8):
+        env.step(env.action_space.sample())
+    image = Image.fromarray(env.render())  # type: ignore[arg-type]
+    env.close()
+    return image
+
+
 def pages() -> dict[str, str]:
     """Every page by its file name."""
     return {"README.md": index()} | {f"{name}.md": page(name) for name in TASKS}
@@ -137,6 +153,10 @@ def main() -> int:
         with writing(options.out / name) as temporary:
             temporary.write_text(text)
         print(f"wrote {options.out / name}")
+    for name in TASKS:
+        with writing(options.out / f"{name}.png") as temporary:
+            picture(name).save(temporary, format="png", optimize=True)
+        print(f"wrote {options.out / name}.png")
     return 0
 
 

@@ -48,7 +48,7 @@ def _table(text):
 def test_the_pages_are_what_the_code_says_and_there_are_no_others():
     pages = _generator().pages()
     assert pages.keys() == {"README.md"} | {f"{task}.md" for task in TASKS}
-    assert {path.name for path in FOLDER.iterdir()} == pages.keys()
+    assert {path.name for path in FOLDER.glob("*.md")} == pages.keys()
     for name, text in pages.items():
         assert (FOLDER / name).read_text() == text, f"docs/environments/{name} is stale: run make docs"
 
@@ -56,8 +56,9 @@ def test_the_pages_are_what_the_code_says_and_there_are_no_others():
 def test_make_docs_writes_them(tmp_path):
     command = [sys.executable, str(ROOT / "scripts" / "environment_pages.py"), "--out", str(tmp_path)]
     subprocess.run(command, check=True, capture_output=True, timeout=120)
-    for path in FOLDER.iterdir():
+    for path in FOLDER.glob("*.md"):
         assert (tmp_path / path.name).read_text() == path.read_text()
+    assert {path.name for path in tmp_path.glob("*.png")} == {f"{task}.png" for task in TASKS}
     assert re.search(r"^docs: .*\n\t.*scripts/environment_pages\.py$", (ROOT / "Makefile").read_text(), re.MULTILINE)
 
 

@@ -101,6 +101,8 @@ def _sources(sources: Mapping[str, Any], printed: list[str]) -> dict[str, str]:
     """The source of each printed value, from the values of each source."""
     found: dict[str, str] = {}
     for source, values in sources.items():
+        if isinstance(values, str) and values != _THE_REST:
+            raise ValueError(f'sources.{source!r} = {values!r}: must be a list of entries, or "{_THE_REST}"')
         if values != _THE_REST:
             check_names(values, printed, "entry", f"sources.{source!r}: ")
             found |= dict.fromkeys(values, source)

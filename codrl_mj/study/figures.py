@@ -6,17 +6,18 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.evaluation.measures import Interval
 from codrl_mj.runs.files import writing
 
 COLOURS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9")
 """Of Okabe and Ito's palette, which the colour-blind can tell apart."""
 MARKERS = ("o", "s", "^", "D", "v", "P")
 _MISSING = "#d9d9d9"
+_SVG = {"svg.hashsalt": "codrl_mj", "svg.fonttype": "none", "font.sans-serif": ["DejaVu Sans", "sans-serif"]}
+"""The same bytes for the same figure; text as text, which a reader can search and edit."""
 
 
 def heat_map(path: Path, values: np.ndarray, rows: Sequence[str], columns: Sequence[str], title: str) -> None:
-    """Draw mean returns as a heat map with the numbers in it.
+    """Draw mean returns as a heat map with the numbers in it; framed is what is tested where it was trained.
 
     Args:
         path: SVG file.
@@ -26,21 +27,26 @@ def heat_map(path: Path, values: np.ndarray, rows: Sequence[str], columns: Seque
         title: above it.
     """
     from matplotlib.figure import Figure
+    from matplotlib.patches import Rectangle
 
     figure = Figure(figsize=(2.9 + 0.72 * len(columns), 1.9 + 0.34 * len(rows)), layout="constrained")
     axes: Any = figure.subplots()
     import matplotlib
 
     colours = matplotlib.colormaps["cividis"].with_extremes(bad=_MISSING)
-    image = axes.imshow(np.ma.masked_invalid(values), cmap=colours, aspect="auto")
-    axes.set_xticks(range(len(columns)), columns, rotation=35, ha="right", rotation_mode="anchor")
-    axes.set_yticks(range(len(rows)), rows)
-    axes.set(xlabel="tested on", ylabel="trained on", title=title)
+    image = axes.pcolormesh(np.ma.masked_invalid(values), cmap=colours)  # vectors: small, and sharp in print
+    axes.invert_yaxis()
+    axes.set_xticks(np.arange(len(columns)) + 0.5, columns, rotation=35, ha="right", rotation_mode="anchor")
+    axes.set_yticks(np.arange(len(rows)) + 0.5, rows)
+    axes.set(xlabel="tested on", ylabel="trained on", title=f"{title}: mean returns")
     for (row, column), value in np.ndenumerate(values):
         text = f"{value:.0f}".replace("-", "\N{MINUS SIGN}") if np.isfinite(value) else "–"
         colour = _legible_on(image.cmap(image.norm(value))) if np.isfinite(value) else "black"
-        axes.text(column, row, text, ha="center", va="center", fontsize=9, color=colour)
-    figure.colorbar(image, ax=axes, label="mean return")
+        axes.text(column + 0.5, row + 0.5, text, ha="center", va="center", fontsize=9, color=colour)
+        if rows[row] == columns[column]:  # trained on what it is tested on
+            axes.add_patch(
+                Rectangle((column + 0.03, row + 0.04), 0.94, 0.92, fill=False, edgecolor=colour, linewidth=1.2)
+            )
     save(figure, path)
 
 
@@ -53,15 +59,15 @@ def _legible_on(background: Sequence[float]) -> str:
 
 def points(
     path: Path,
-    series: Mapping[str, Mapping[str, tuple[Interval, np.ndarray]]],
+    series: Mapping[str, Mapping[str, np.ndarray]],
     tests: Sequence[str],
     title: str,
 ) -> None:
-    """Draw interquartile means with their intervals, and every run as a small dot, over the test conditions.
+    """Draw means with a line from the worst run to the best, and every run as a small dot, over the test conditions.
 
     Args:
         path: SVG file.
-        series: label -> test condition -> interquartile mean, and the runs' mean returns.
+        series: label -> test condition -> the runs' mean returns, shape (runs,).
         tests: the test conditions, in order.
         title: above it.
     """
@@ -74,14 +80,12 @@ def points(
         there = [test for test in tests if test in by_test]
         places = np.array([tests.index(test) + shift for test in there])
         colour, marker = COLOURS[index % len(COLOURS)], MARKERS[index % len(MARKERS)]
-        means = np.array([by_test[test][0] for test in there]).reshape(-1, 3)
-        below, above = means[:, 0] - means[:, 1], means[:, 2] - means[:, 0]
-        spread = np.nan_to_num(np.maximum([below, above], 0.0))  # rounding; a single run has no interval
-        axes.errorbar(
-            places, means[:, 0], spread, fmt=marker, color=colour, markersize=7, capsize=3, linewidth=1.4, label=label
-        )
+        means = [by_test[test].mean() for test in there]
+        axes.plot(places, means, marker, color=colour, markersize=7, label=label)
+        lowest, highest = np.array([[by_test[test].min(), by_test[test].max()] for test in there]).reshape(-1, 2).T
+        axes.vlines(places, lowest, highest, color=colour, linewidth=1.4)
         for place, test in zip(places, there, strict=True):
-            runs = by_test[test][1]
+            runs = by_test[test]
             axes.plot(np.full(len(runs), place + 0.07), runs, ".", color=colour, markersize=4, alpha=0.6)
     axes.set_xticks(range(len(tests)), tests, rotation=20, ha="right", rotation_mode="anchor")
     for edge in np.arange(len(tests) - 1) + 0.5:
@@ -94,41 +98,10 @@ def points(
     save(figure, path)
 
 
-def probabilities(path: Path, questions: Mapping[str, Mapping[str, Interval]], title: str) -> None:
-    """Draw probabilities of improvement with their intervals, beside the line of no improvement.
-
-    Args:
-        path: SVG file.
-        questions: what is asked -> test condition -> the probability.
-        title: above it.
-    """
-    from matplotlib.figure import Figure
-
-    sizes = [len(rows) for rows in questions.values()]
-    height = 1.1 + sum(0.42 + 0.24 * size for size in sizes)
-    figure = Figure(figsize=(7.0, height), layout="constrained")
-    ratios = [0.7 + size for size in sizes]
-    every = figure.subplots(len(sizes), 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0]
-    for axes, (question, rows) in zip(every, questions.items(), strict=True):
-        means = np.array(list(rows.values())).reshape(-1, 3)
-        places = np.arange(len(rows))[::-1]
-        spread = np.nan_to_num(np.maximum([means[:, 0] - means[:, 1], means[:, 2] - means[:, 0]], 0.0))
-        axes.axvline(0.5, color="0.4", linewidth=1, linestyle="--")
-        axes.errorbar(means[:, 0], places, xerr=spread, fmt="o", color=COLOURS[1], capsize=3, linewidth=1.4)
-        axes.set_yticks(places, rows, fontsize=9)
-        axes.set(xlim=(-0.03, 1.03), ylim=(-0.6, len(rows) - 0.4))
-        axes.set_title(question, loc="left", fontsize=9)
-        axes.grid(axis="x", color="0.9")
-        axes.set_axisbelow(True)
-    every[-1].set_xlabel("probability of improvement (0.5: none)")
-    figure.suptitle(title)
-    save(figure, path)
-
-
 def save(figure: Any, path: Path) -> None:
     """Write a figure on white as SVG; the same bytes for the same figure."""
     import matplotlib
 
     figure.set_facecolor("white")
-    with writing(path) as temporary, matplotlib.rc_context({"svg.hashsalt": "codrl_mj"}):
+    with writing(path) as temporary, matplotlib.rc_context(_SVG):
         figure.savefig(temporary, format="svg", metadata={"Date": None})

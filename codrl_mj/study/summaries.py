@@ -110,23 +110,6 @@ def _mean(values: Iterable[float | None]) -> float | None:
     return float(np.mean(known)) if known else None
 
 
-def over_all_tests(results: Results, trials: Sequence[Trial]) -> tuple[int, Interval] | None:
-    """Interquartile mean over the runs of an arm and all its tests together, with a 95 % interval over the runs.
-
-    Args:
-        results: of the study.
-        trials: of one arm.
-
-    Returns:
-        The number of runs that were tested on everything, and the mean; None if there are none.
-    """
-    scores = _scores(results, trials)
-    if not scores:
-        return None
-    table = np.stack([of.values for of in scores.values()], axis=1)
-    return len(table), interquartile_mean_interval([table])
-
-
 def judge(results: Results, comparisons: Sequence[Comparison]) -> Verdict | None:
     """The answer to a question in one or several tests.
 

@@ -1,94 +1,151 @@
-"""The mismatch study's numbers as files: every run as CSV, everything that was computed from them as JSON."""
+"""The mismatch study's numbers as CSV files: of every run, trial, comparison, training and actuator."""
 
 import csv
-import dataclasses
 import math
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from codrl_mj.evaluation.measures import Interval
-from codrl_mj.runs.files import write_json, writing
-from codrl_mj.study.mismatch import Results
-from codrl_mj.study.summaries import MEASURES, Summary, measure
+from codrl_mj.runs.files import writing
+from codrl_mj.study.conditions import every_condition
+from codrl_mj.study.mismatch import Results, cell_name
+from codrl_mj.study.plan import Comparison, Plan, Trial
+from codrl_mj.study.summaries import MEASURES, Summary, Verdict, by_question, judge, measure
 
-RUNS, RESULTS = "runs.csv", "results.json"
-"""A row for every policy and test; trials, comparisons and what is missing."""
-COLUMNS = (
-    "task",
-    "agent",
-    "trained",
-    "tested",
-    "seed",
-    "episodes",
-    "return",
-    "return_low",
-    "return_high",
-    *MEASURES,
-)
-"""Columns of `RUNS`: `return` is the mean over the episodes, within 95 % bounds. Units as in docs/evaluation.md."""
+RUNS, TRIALS, COMPARISONS = "runs.csv", "trials.csv", "comparisons.csv"
+"""Rows are: a policy and a test; all policies of an arm on a test; a question, on one test or over several."""
+ARRIVALS, ACTUATORS = "arrivals.csv", "actuators.csv"
+"""Rows are: a training, with when it met the goal; an actuator, with what its name stands for."""
 
 
 def write(results: Results, summary: Summary, folder: Path) -> list[Path]:
-    """Write both files into a folder."""
-    with writing(folder / RUNS) as temporary, temporary.open("w", newline="") as file:
-        rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(COLUMNS)
-        for result in results.trials.values():
-            arm = result.trial.arm
-            for seed, evaluation in result.evaluations.items():
-                returns = evaluation["returns"]
-                rows.writerow(
-                    [
-                        *(arm.task, arm.agent, arm.name, result.trial.test.name, seed, evaluation["episodes"]),
-                        *(returns[key] for key in ("mean", "low", "high")),
-                        *(measure(name, evaluation) for name in MEASURES),
-                    ]
-                )
-    write_json(folder / RESULTS, as_mapping(results, summary))
-    return [folder / RUNS, folder / RESULTS]
+    """Write the files into a folder; units are those of docs/evaluation.md."""
+    tables = {
+        RUNS: _runs(results),
+        TRIALS: _trials(results, summary),
+        COMPARISONS: _comparisons(results, summary),
+        ARRIVALS: _arrivals(results),
+        ACTUATORS: _actuators(results),
+    }
+    for name, rows in tables.items():
+        _write(folder / name, list(rows))
+    return [folder / name for name in tables]
 
 
-def as_mapping(results: Results, summary: Summary) -> dict[str, Any]:
-    """Everything as JSON-serialisable values; intervals are mappings of `mean`, `low` and `high`, null if unknown."""
-    trials = {}
-    for name, result in results.trials.items():
-        arm, of_it = result.trial.arm, summary.trials.get(name)
-        trials[name] = {
-            "task": arm.task,
-            "trained": arm.name,
-            "tested": result.trial.test.name,
-            "returns": {seed: evaluation["returns"]["mean"] for seed, evaluation in result.evaluations.items()},
-            "summary": None if of_it is None else _plain(dataclasses.asdict(of_it)),
+def _write(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """A table whose header is the first row's keys; NaN and None are empty cells."""
+    with writing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        out = csv.DictWriter(file, rows[0] if rows else [], lineterminator="\n")
+        out.writeheader()
+        out.writerows({key: "" if _unknown(value) else value for key, value in row.items()} for row in rows)
+
+
+def _unknown(value: Any) -> bool:
+    return value is None or (isinstance(value, float) and math.isnan(value))
+
+
+def _runs(results: Results) -> Iterable[dict[str, Any]]:
+    for result in results.trials.values():
+        arm = result.trial.arm
+        for seed, evaluation in result.evaluations.items():
+            returns = evaluation["returns"]
+            yield {
+                "task": arm.task,
+                "agent": arm.agent,
+                "trained": arm.name,
+                "tested": result.trial.test.name,
+                "seed": seed,
+                "episodes": evaluation["episodes"],
+                "return": returns["mean"],
+                "return_low": returns["low"],
+                "return_high": returns["high"],
+                **{name: measure(name, evaluation) for name in MEASURES},
+            }
+
+
+def _trials(results: Results, summary: Summary) -> Iterable[dict[str, Any]]:
+    for name, of in summary.trials.items():
+        trial, (middle, low, high) = results.trials[name].trial, of.interquartile_mean
+        yield {
+            "task": trial.arm.task,
+            "trained": trial.arm.name,
+            "tested": trial.test.name,
+            "runs": of.runs,
+            "mean": of.mean,
+            "lowest": of.lowest,
+            "highest": of.highest,
+            "interquartile_mean": middle,
+            "interquartile_low": low,
+            "interquartile_high": high,
+            **of.measures,
         }
-    comparisons = [
-        {"experiment": experiment, "task": task, "outcome": verdict.outcome, **_plain(dataclasses.asdict(verdict))}
-        for experiment, of in results.plans.items()
-        for task, plan in of.items()
-        for pair in plan.comparisons
-        if (verdict := summary.verdicts.get(pair)) is not None
-    ]
+
+
+def _comparisons(results: Results, summary: Summary) -> Iterable[dict[str, Any]]:
+    for experiment, of in results.plans.items():
+        for task, plan in of.items():
+            for pair in plan.comparisons:
+                if pair in summary.verdicts:
+                    yield _row(experiment, task, summary.verdicts[pair])
+        yield from (_row(experiment, over, verdict) for over, verdict in pooled(results, of))
+
+
+def _row(experiment: str, task: str, verdict: Verdict) -> dict[str, Any]:
+    probability, low, high = verdict.probability
     return {
-        "config": _plain(dataclasses.asdict(results.config)),
-        "runs": results.runs,
-        "seconds": results.seconds,
-        "codes": dict(results.codes),
-        "untrained": list(results.untrained),
-        "untested": list(results.untested),
-        "failures": dict(results.failures),
-        "arrivals": {name: dataclasses.asdict(arrivals) for name, arrivals in results.arrivals.items()},
-        "trials": trials,
-        "comparisons": comparisons,
+        "experiment": experiment,
+        "task": task,
+        "question": verdict.question,
+        "tests": "; ".join(verdict.tests),
+        "runs_one": verdict.runs[0],
+        "runs_other": verdict.runs[1],
+        "one": verdict.one,
+        "other": verdict.other,
+        "probability_of_improvement": probability,
+        "low": low,
+        "high": high,
+        "outcome": verdict.outcome,
     }
 
 
-def _plain(value: Any) -> Any:
-    """JSON-serialisable values; NaN, which JSON has not, as None."""
-    if isinstance(value, Interval):
-        return {name: _plain(number) for name, number in value._asdict().items()}
-    if isinstance(value, dict):
-        return {key: _plain(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
-    if isinstance(value, Path):
-        return str(value)
-    return None if isinstance(value, float) and math.isnan(value) else value
+def pooled(results: Results, of: Mapping[str, Plan]) -> list[tuple[str, Verdict]]:
+    """The questions of an experiment over all tests of each task, and over all tasks, where there are several."""
+    comparisons: list[Comparison] = [pair for plan in of.values() for pair in plan.comparisons]
+    verdicts = []
+    for pairs in by_question(comparisons).values():
+        by_task = {task: [pair for pair in pairs if pair.one.arm.task == task] for task in of}
+        groups = {task: mine for task, mine in by_task.items() if len(mine) > 1}
+        groups |= {"all tasks": pairs} if sum(map(bool, by_task.values())) > 1 else {}
+        verdicts += [(label, verdict) for label, group in groups.items() if (verdict := judge(results, group))]
+    return verdicts
+
+
+def _arrivals(results: Results) -> Iterable[dict[str, Any]]:
+    arms = {(result.trial.arm.task, result.trial.arm.name): result.trial.arm for result in results.trials.values()}
+    for (task, name), arm in arms.items():
+        own = results.trials.get(Trial(arm, arm.condition).name)
+        for seed in range(results.config.seeds):
+            met = results.arrivals.get(cell_name(task, name, seed))
+            if met is not None:
+                tested = own.evaluations.get(seed) if own else None
+                yield {
+                    "task": task,
+                    "trained": name,
+                    "seed": seed,
+                    "episodes": met.episodes,
+                    "arrived": met.arrived,
+                    "first": met.first,
+                    "return_in_test_there": tested["returns"]["mean"] if tested else None,
+                }
+
+
+def _actuators(results: Results) -> Iterable[dict[str, Any]]:
+    used = {name for of in results.plans.values() for plan in of.values() for name in _names(plan.trials)}
+    for task in results.config.tasks:
+        for name, condition in every_condition(task).items():
+            if name in used:
+                yield {"task": task, "name": name, "is": condition.description}
+
+
+def _names(trials: Iterable[Trial]) -> set[str]:
+    return {name for trial in trials for name in (trial.test.name, trial.arm.condition.name)}

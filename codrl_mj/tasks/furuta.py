@@ -2,8 +2,6 @@
 
 ## Description
 
-![The rotary pendulum: cube, arm and rod](../furuta.png)
-
 An arm (0.095 kg, 85 mm) turns about a vertical shaft; a rod (0.024 kg, 129 mm) hangs from a hinge at its end and swings
 across it, under a gravity of 9.81 m/s^2. The actuator turns the arm: the rod has none. It is the task that one can buy,
 so its own actuator is a motor of the catalogue, `quanser-qube-servo-2`, behind a drive; there are no actuators of the

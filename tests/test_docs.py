@@ -1,0 +1,101 @@
+"""What the pages tell a reader to type works as it stands: Python, commands, links."""
+
+import contextlib
+import re
+import shlex
+import sys
+from pathlib import Path
+
+import gymnasium
+import pytest
+
+from codrl_mj import cli
+from codrl_mj.agents import PPOConfig
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.study import mismatch
+from codrl_mj.training import TrainConfig, train
+
+ROOT = Path(__file__).parent.parent
+PAGES = {
+    str(path.relative_to(ROOT)): path.read_text()
+    for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    if "results" not in path.parts
+}
+ELSEWHERE = {"README.md", "docs/own_robot.md", "docs/training.md", "docs/other_agents.md", "docs/randomization.md"}
+"""Pages whose Python has tests of its own, which look at what comes out."""
+SHORT = {
+    "80_000": "500",
+    "episodes=100": "episodes=1",
+    "max_episode_steps=3000": "max_episode_steps=50",
+}
+"""What takes a reader minutes -> what takes a test seconds."""
+WITH_PYTHON = [name for name, text in PAGES.items() if "```python" in text and name not in ELSEWHERE]
+LONG = {f"docs/{name}.md" for name in ("actuators", "foreign", "identify", "motors", "sarsa", "studies")}
+"""What takes more than three seconds even so."""
+COMMANDS = [
+    pytest.param(name, command.replace("\\\n", ""), marks=pytest.mark.matrix if name != "README.md" else [])
+    for name, text in PAGES.items()
+    for command in re.findall(r"^(?:\$ )?codrl-mj ((?:.*\\\n)*.*)$", text, re.MULTILINE)
+    if not re.search(r"\b(?:NAME|LOG|RUN)\b", command)  # a form, not an example
+]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run folder, after one rollout."""
+    out = tmp_path_factory.mktemp("runs") / "mine"
+    agent = PPOConfig(rollout_steps=64, batch_size=64, epochs=1)
+    train(TrainConfig(EnvConfig("cartpole"), agent, total_steps=64, num_envs=1, evaluation_episodes=1), out)
+    return out
+
+
+@pytest.fixture(autouse=True)
+def folder_of_a_reader(trained, tmp_path, monkeypatch):
+    """An empty folder, but for the files that pages speak of."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    Path("examples").symlink_to(ROOT / "examples")
+    Path("half_cheetah.xml").symlink_to(Path(gymnasium.__file__).parent / "envs/mujoco/assets/half_cheetah.xml")
+    written = re.search(r"```toml\n(.*?)```", PAGES["docs/own_motor.md"], re.DOTALL)
+    Path("my_motor.toml").write_text(written[1])
+    Path("car.yaml").write_text(re.search(r"```yaml\n(.*?)```", PAGES["docs/training.md"], re.DOTALL)[1])
+    family = re.search(r"```python\n(import dataclasses\n.*?)```", PAGES["docs/actuators.md"], re.DOTALL)
+    Path("my_gearbox.py").write_text(family[1])
+    Path("runs").mkdir()
+    for run in ("mine", "through"):
+        Path("runs", run).symlink_to(trained)
+    yield
+    sys.modules.pop("my_gearbox", None)
+
+
+@pytest.mark.parametrize(
+    "page", [pytest.param(name, marks=pytest.mark.matrix if name in LONG else []) for name in WITH_PYTHON]
+)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_the_python_of_a_page_runs(page, monkeypatch):
+    monkeypatch.setattr(mismatch, "compute", lambda *_: None)  # hours
+    namespace = {}
+    for block in re.findall(r"```python\n(.*?)```", PAGES[page], re.DOTALL):
+        for long, short in SHORT.items():
+            block = block.replace(long, short)
+        exec(compile(block, page, "exec"), namespace)  # one after the other, as a reader would
+    for name in ("env", "envs"):
+        if name in namespace and hasattr(namespace[name], "close"):
+            namespace[name].close()
+
+
+@pytest.mark.parametrize(("page", "command"), COMMANDS)
+def test_a_command_of_a_page_is_understood(page, command, monkeypatch):
+    parsed = []
+    for verb in cli.VERBS.values():
+        monkeypatch.setattr(verb, "run", lambda self: parsed.append(self) or 0)
+    with contextlib.suppress(SystemExit):
+        assert cli.main(shlex.split(command, comments=True)) == 0
+    assert len(parsed) == 1
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_a_page_links_to_what_exists(page):
+    for link in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", PAGES[page]):
+        if not link.startswith("http"):
+            assert ((ROOT / page).parent / link).exists(), link
