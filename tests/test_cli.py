@@ -10,17 +10,20 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium
 import imageio
 import numpy as np
 import pytest
 
-from codrl_mj import TASKS, CurrentLoop, Ideal, Lag, Motor, Supply, named_actuator
+from codrl_mj import TASKS, CurrentLoop, Ideal, Lag, Motor, Supply, named_actuator, register
 from codrl_mj.actuators import NAMED
 from codrl_mj.agents.presets import ELSEWHERE, PRESETS
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import evaluate, run_episodes
+from codrl_mj.foreign.config import ForeignConfig
 from codrl_mj.runs.policies import load_policy
+from codrl_mj.tasks import find_task
 from codrl_mj.training import TrainConfig, folder, load_config
 from tests.matrix import but
 
@@ -347,6 +350,20 @@ def test_the_source_of_a_family_is_part_of_what_a_run_was_made_with(own_family, 
         digests.append(folder.provenance(TrainConfig(EnvConfig("pendulum", "own_family:Slow")))["code"])
     folder._code_digest.cache_clear()
     assert len({*digests, folder.provenance(TrainConfig(EnvConfig("pendulum")))["code"]}) == 3
+
+
+def test_so_is_the_file_of_a_model_of_somebody_s_own(tmp_path):
+    arm, path = find_task("tests.own_project.arm:TASK"), tmp_path / "arm.xml"
+    register(dataclasses.replace(arm, name="copied_arm", env_id="tests/CopiedArm-v0", asset=str(path)))
+    own, foreign = EnvConfig("copied_arm", "lag"), ForeignConfig("HalfCheetah-v5", options={"xml_file": str(path)})
+    digests = []
+    model = (Path(gymnasium.__file__).parent / "envs/mujoco/assets/half_cheetah.xml").read_text()
+    for text in (model, f"{model}<!-- changed -->"):
+        path.write_text(text)
+        folder._code_digest.cache_clear()
+        digests += [folder.provenance(TrainConfig(env))["code"] for env in (own, foreign)]
+    folder._code_digest.cache_clear()
+    assert len(set(digests)) == 4
 
 
 def test_a_task_and_an_agent_of_somebody_s_own_are_trained_by_where_they_are(capsys):

@@ -5,6 +5,7 @@ Light to import: nothing is compiled, and no engine loaded.
 
 import dataclasses
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -15,6 +16,7 @@ from codrl_mj.disturbances import MOVED, OFF, PLAIN, Disturbances, Joint, resolv
 from codrl_mj.envs.distributions import Distribution, parse
 from codrl_mj.fields import check_names
 from codrl_mj.tasks import Task, find_task, reference_of, resolve_actuators
+from codrl_mj.tasks.assets import asset_path
 
 
 class UnknownOptionError(ValueError, TypeError):
@@ -140,6 +142,11 @@ class EnvConfig:
     def modules(self) -> set[str]:
         """Names of the modules that decide on what it does."""
         return {type(self.actuators[0]).__module__, find_task(self.task).reward.__module__}
+
+    @property
+    def models(self) -> set[Path]:
+        """Model files that decide on what it does."""
+        return {asset_path(find_task(self.task).asset).resolve()}
 
     @property
     def interface(self) -> dict[str, Any]:

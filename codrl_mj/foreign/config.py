@@ -6,6 +6,7 @@ import functools
 import json
 import re
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -137,6 +138,12 @@ class ForeignConfig:
         """Names of the modules that decide on what it does: of the environment and the actuators' families."""
         own = getattr(self._creator, "__module__", ""), self.task.rpartition(":")[0]
         return {type(one).__module__ for one in self.actuator} | {name for name in own if name}
+
+    @property
+    def models(self) -> set[Path]:
+        """Files among its options, such as `xml_file`; what else the environment reads is not known."""
+        given = (Path(value) for value in self.options.values() if isinstance(value, str))
+        return {path.resolve() for path in given if path.is_file()}
 
     @property
     def _creator(self) -> Any:

@@ -109,16 +109,19 @@ def check_same(run: Path, config: TrainConfig, accept_changes: bool) -> None:
 def provenance(config: TrainConfig) -> dict[str, Any]:
     """What a run's result depends on besides its configuration: package versions, and a digest of code.
 
-    The code is ours, and the files of task, agent and family of actuators where these are somebody's own.
+    The code is ours, and the files of task, model, agent and family of actuators where these are somebody's own.
     """
     modules = {*config.env.modules, type(config.agent).__module__}
     versions = {package: importlib.metadata.version(package) for package in _PACKAGES}
-    return {"versions": {"python": platform.python_version(), **versions}, "code": _code_digest(*sorted(modules))}
+    return {
+        "versions": {"python": platform.python_version(), **versions},
+        "code": _code_digest(*sorted(modules), *sorted(config.env.models)),
+    }
 
 
 @functools.cache
-def _code_digest(*modules: str) -> str:
-    """SHA-256 over the package's Python files and models, and the files of modules that are none of these."""
+def _code_digest(*others: str | Path) -> str:
+    """SHA-256 over the package's Python files and models, and those modules and model files that are none of these."""
     from codrl_mj.tasks.assets import asset_folder
 
     package = Path(__file__).parents[1]
@@ -126,9 +129,9 @@ def _code_digest(*modules: str) -> str:
     for root, pattern in ((package, "*.py"), (asset_folder(), "*.xml")):
         for path in sorted(root.rglob(pattern)):
             digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes() + b"\0")
-    for module in modules:
-        file = getattr(sys.modules[module], "__file__", None)  # a notebook has none
-        if file is not None and not Path(file).is_relative_to(package):
+    for other in others:
+        file = getattr(sys.modules[other], "__file__", None) if isinstance(other, str) else other  # a notebook has none
+        if file is not None and not any(Path(file).is_relative_to(ours) for ours in (package, asset_folder())):
             digest.update(Path(file).read_bytes())
     return digest.hexdigest()
 

@@ -85,15 +85,19 @@ PRESETS: dict[str, dict[str, Preset]] = {
                 rollout_steps=4096,
                 batch_size=512,
                 epochs=8,
+                gamma=0.98,
                 gae_lambda=0.95,
                 target_kl=None,
                 log_std_init=-0.5,
                 unit_actions=True,
-                input_scale=(1.0, 1.0, 1.0, 1.0, 0.05, 0.05),
+                input_scale=(1.0, 1.0, 1.0, 1.0, 0.1, 0.1),
             ),
             total_steps=200_000,
-            num_envs=16,
-            about="Ours, for commands of torque, current and voltage alike: actions in units of the largest.",
+            num_envs=32,
+            about=(
+                "Ours, for commands of torque, current and voltage alike: actions in units of the largest. With 16 "
+                "environments, a discount of 0.99 and speeds times 0.05 some learnt to whirl the rod, not to hold it."
+            ),
         )
     },
     ELSEWHERE: {
