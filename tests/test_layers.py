@@ -54,7 +54,8 @@ ALLOWED = {
         *("actuators", "catalogue", "engine", "envs.config", "evaluation", "fields", "foreign", "motor_design"),
         *("runs.policies", "specs", "tasks", "training"),
     },
-    "validation": {"actuators", "catalogue", "engine", "physics", "runs.files", "tasks", "tasks.assets"},
+    "pages.plots": set(),
+    "validation": {"actuators", "catalogue", "engine", "pages.plots", "physics", "runs.files", "tasks", "tasks.assets"},
     "study": {
         *("actuators", "disturbances", "envs.config", "evaluation", "evaluation.measures", "fields", "films"),
         *("runs.files", "runs.policies", "tasks", "training"),
@@ -62,6 +63,11 @@ ALLOWED = {
     "rl_zoo3": set(),
     "motor_design": {"actuators", "catalogue", "fields", "runs.files"},
     "identify": {"actuators", "catalogue", "fields", "runs.files"},
+    "pages": {
+        *("__init__", "actuators", "catalogue", "evaluation", "films", "foreign", "identify", "motor_design"),
+        *("pages.plots", "runs.files", "runs.layout", "runs.policies", "runs.summaries", "tasks", "training"),
+        "validation",
+    },
     "cli": {
         *("actuators", "agents", "disturbances", "envs.config", "evaluation", "evaluation.measures", "fields", "films"),
         *(
@@ -69,6 +75,7 @@ ALLOWED = {
             "identify",
             "motor_design",
             "replay",
+            "pages",
             "runs.files",
             "runs.layout",
             "runs.policies",
@@ -94,6 +101,8 @@ FOREIGN = {
     "catalogue": {"pint"},
     "motor_design": {"control", "matplotlib", "numpy", "scipy"},
     "identify": {"numba", "numpy", "scipy", "yaml"},
+    "pages.plots": {"matplotlib", "numpy"},
+    "pages": {"jinja2", "markupsafe", "numpy", "scipy"},
     "plugin": {"mujoco"},
     "engine": {"mujoco", "numba", "llvmlite", "numpy"},
     "specs": {"mujoco", "numpy"},

@@ -15,6 +15,7 @@ from codrl_mj.cli.identify import Identify, identify_verb
 from codrl_mj.cli.motor import Motor
 from codrl_mj.cli.render import Render
 from codrl_mj.cli.replay import Replay
+from codrl_mj.cli.report import Report
 from codrl_mj.cli.reproduce import Reproduce
 from codrl_mj.cli.runs import Runs
 from codrl_mj.cli.study import Study
@@ -30,6 +31,7 @@ VERBS: dict[str, Any] = {
     "render": Render,
     "replay": Replay,
     "view": View,
+    "report": Report,
     "motor": Motor,
     "identify": Identify,
     "validate": Validate,
