@@ -196,7 +196,7 @@ def still(plot: Plot, width: float = 6.4, height: float = 3.2) -> str:
         figure = Figure(figsize=(width, height))
         figure.subplots_adjust(0.13, 0.17, 0.985, 0.97)
         FigureCanvasSVG(figure)
-        axes = figure.subplots()
+        axes: Any = figure.subplots()
         for index, curve in enumerate(plot.curves[:12]):
             x, y = thinned(curve.x, _drawable(curve.y, plot.y_log), _STILL)
             colour = ink if curve.reference else _PALETTE[(index if curve.colour is None else curve.colour) % 6]
