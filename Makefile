@@ -6,7 +6,7 @@ STAMP := .venv/.installed-dev
 DOCS := .venv/.installed-docs
 INSTALL = $(BIN)/pip install --quiet --constraint constraints.txt --editable
 
-.PHONY: install demo test check lint bench soak results docs clean
+.PHONY: install demo test check browser lint bench soak results docs clean
 
 install: $(STAMP)
 
@@ -29,10 +29,13 @@ demo: $(PACKAGE)  ## cross-validate, train on the ideal and on the weak actuator
 	@$(BIN)/python scripts/demo.py
 
 test: $(STAMP)  ## in two processes, each with whole files: a file's tests share what is slow to make
-	@$(BIN)/python -m pytest -m "not slow and not matrix" -n 2 --dist loadfile --no-loadscope-reorder
+	@$(BIN)/python -m pytest -m "not slow and not matrix and not browser" -n 2 --dist loadfile --no-loadscope-reorder
 
 check: $(STAMP)  ## the full matrices, of which make test runs a few combinations
 	@$(BIN)/python -m pytest -m matrix -n 2 --dist loadfile --no-loadscope-reorder
+
+browser: $(STAMP)  ## look at pages in Chromium, which it says how to get if there is none
+	@$(BIN)/python -m pytest -m browser
 
 lint: $(STAMP)
 	@$(BIN)/ruff check .

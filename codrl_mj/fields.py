@@ -43,13 +43,20 @@ def real(
             and (most is None or value <= most)
         )
 
-    return _bounded(default, holds, text, optional, unit, float)
+    low, high = (next((limit for limit in pair if limit is not None), None) for pair in ((above, least), (below, most)))
+    return _bounded(default, holds, text, optional, unit, float, (low, high))
 
 
 def integer(default: int | None, least: int, optional: bool = False, unit: str = "") -> Any:
     """A field for an integer of at least `least`; `optional`, or a default of None, lets it be None."""
     return _bounded(
-        default, lambda value: _is_integer(value) and value >= least, f"an integer >= {least}", optional, unit, int
+        default,
+        lambda value: _is_integer(value) and value >= least,
+        f"an integer >= {least}",
+        optional,
+        unit,
+        int,
+        (least, None),
     )
 
 
@@ -191,8 +198,9 @@ def _bounded(
     optional: bool = False,
     unit: str = "",
     kind: type | None = None,
+    between: tuple[float | None, float | None] = (None, None),
 ) -> Any:
-    metadata = {"bound": (holds, text, optional or default is None, kind), "unit": unit}
+    metadata = {"bound": (holds, text, optional or default is None, kind), "unit": unit, "between": between}
     return dataclasses.field(default=default, metadata=metadata)
 
 

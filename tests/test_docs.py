@@ -38,7 +38,7 @@ SHORT = {
 }
 """What takes a reader minutes -> what takes a test seconds."""
 WITH_PYTHON = [name for name, text in PAGES.items() if "```python" in text and name not in ELSEWHERE]
-LONG = {f"docs/{name}.md" for name in ("actuators", "foreign", "identify", "motors", "sarsa", "studies")}
+LONG = {f"docs/{name}.md" for name in ("actuators", "foreign", "identify", "motors", "report", "sarsa", "studies")}
 """What takes more than three seconds even so."""
 COMMANDS = [
     pytest.param(name, command.replace("\\\n", ""), marks=pytest.mark.matrix if name != "README.md" else [])

@@ -24,7 +24,7 @@ ALLOWED = {
     "specs": {"actuators", "engine", "fields", "plugin"},
     "physics": {"actuators", "disturbances", "engine", "fields", "tasks", "tasks.assets"},
     "envs.distributions": {"fields"},
-    "envs.config": {"actuators", "disturbances", "envs.distributions", "fields", "tasks"},
+    "envs.config": {"actuators", "disturbances", "envs.distributions", "fields", "tasks", "tasks.assets"},
     "envs": {
         *("actuators", "disturbances", "engine", "envs.config", "envs.distributions", "fields", "physics", "tasks"),
     },
@@ -44,6 +44,8 @@ ALLOWED = {
         *("actuators", "envs", "envs.config", "evaluation.measures", "physics", "runs.files", "runs.policies", "tasks"),
     },
     "films": {"actuators", "envs", "envs.config", "evaluation", "physics", "runs.files"},
+    "replay": {"envs", "envs.config", "evaluation", "runs.files"},
+    "view": {"actuators", "envs.config", "evaluation", "fields", "replay"},
     "training": {
         *("actuators", "agents", "disturbances", "envs", "envs.config", "evaluation", "runs.files", "runs.layout"),
         *("runs.policies", "tasks", "tasks.assets", "fields", "foreign"),
@@ -52,7 +54,8 @@ ALLOWED = {
         *("actuators", "catalogue", "engine", "envs.config", "evaluation", "fields", "foreign", "motor_design"),
         *("runs.policies", "specs", "tasks", "training"),
     },
-    "validation": {"actuators", "catalogue", "engine", "physics", "runs.files", "tasks", "tasks.assets"},
+    "pages.plots": set(),
+    "validation": {"actuators", "catalogue", "engine", "pages.plots", "physics", "runs.files", "tasks", "tasks.assets"},
     "study": {
         *("actuators", "disturbances", "envs.config", "evaluation", "evaluation.measures", "fields", "films"),
         *("runs.files", "runs.policies", "tasks", "training"),
@@ -60,12 +63,19 @@ ALLOWED = {
     "rl_zoo3": set(),
     "motor_design": {"actuators", "catalogue", "fields", "runs.files"},
     "identify": {"actuators", "catalogue", "fields", "runs.files"},
+    "pages": {
+        *("__init__", "actuators", "catalogue", "evaluation", "films", "foreign", "identify", "motor_design"),
+        *("pages.plots", "runs.files", "runs.layout", "runs.policies", "runs.summaries", "tasks", "training"),
+        "validation",
+    },
     "cli": {
         *("actuators", "agents", "disturbances", "envs.config", "evaluation", "evaluation.measures", "fields", "films"),
         *(
             "foreign",
             "identify",
             "motor_design",
+            "replay",
+            "pages",
             "runs.files",
             "runs.layout",
             "runs.policies",
@@ -76,6 +86,7 @@ ALLOWED = {
             "tasks",
             "training",
             "validation",
+            "view",
         ),
     },
     "__main__": {"cli"},
@@ -90,6 +101,8 @@ FOREIGN = {
     "catalogue": {"pint"},
     "motor_design": {"control", "matplotlib", "numpy", "scipy"},
     "identify": {"numba", "numpy", "scipy", "yaml"},
+    "pages.plots": {"matplotlib", "numpy"},
+    "pages": {"jinja2", "markupsafe", "numpy", "scipy"},
     "plugin": {"mujoco"},
     "engine": {"mujoco", "numba", "llvmlite", "numpy"},
     "specs": {"mujoco", "numpy"},
@@ -99,6 +112,8 @@ FOREIGN = {
     "envs.config": {"gymnasium", "numpy"},
     "envs": {"gymnasium", "numpy", "numba", "mujoco", "stable_baselines3", "pygame"},
     "evaluation.measures": {"numpy", "scipy"},
+    "replay": {"mujoco", "numpy"},
+    "view": {"gymnasium", "mujoco", "numpy", "trimesh", "viser", "websockets"},
     "runs.files": set(),
     "runs.summaries": set(),
 }

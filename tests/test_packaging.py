@@ -45,10 +45,14 @@ def test_the_wheel_has_every_module_model_and_the_type_marker(wheel):
     modules = {path.relative_to(REPOSITORY).as_posix() for path in package.rglob("*.py")}
     models = {f"codrl_mj/_assets/{path.relative_to(assets).as_posix()}" for path in assets.rglob("*") if path.is_file()}
     settings = {path.relative_to(REPOSITORY).as_posix() for path in (package / "rl_zoo3").glob("*.yml")}
+    pages = {f"codrl_mj/pages/{name}" for name in ("page.html.jinja", "parts.html.jinja", "page.css", "page.js")}
+    pages |= {f"codrl_mj/pages/uplot/{name}" for name in ("uPlot.iife.min.js", "uPlot.min.css", "LICENSE")}
     assert len(modules) > 30
     assert len(settings) == 5
     assert len(models) >= 5
-    assert names >= modules | models | settings | {"codrl_mj/py.typed"}
+    replay = {f"codrl_mj/replay/{name}" for name in ("page.html", "replay.css", "replay.js")}
+    three = {f"codrl_mj/replay/three/{name}" for name in ("three.min.js", "LICENSE", "README.md")}
+    assert names >= modules | models | settings | replay | three | pages | {"codrl_mj/py.typed"}
     assert not [name for name in names if name.startswith(("tests", "scripts", "assets", "docs"))]
 
 

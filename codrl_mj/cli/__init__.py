@@ -14,11 +14,14 @@ from codrl_mj.cli.fields import with_environment
 from codrl_mj.cli.identify import Identify, identify_verb
 from codrl_mj.cli.motor import Motor
 from codrl_mj.cli.render import Render
+from codrl_mj.cli.replay import Replay
+from codrl_mj.cli.report import Report
 from codrl_mj.cli.reproduce import Reproduce
 from codrl_mj.cli.runs import Runs
 from codrl_mj.cli.study import Study
 from codrl_mj.cli.train import Train, train_verb
 from codrl_mj.cli.validate import Validate
+from codrl_mj.cli.view import View
 from codrl_mj.training import TrainingStoppedError
 
 VERBS: dict[str, Any] = {
@@ -26,6 +29,9 @@ VERBS: dict[str, Any] = {
     "evaluate": Evaluate,
     "runs": Runs,
     "render": Render,
+    "replay": Replay,
+    "view": View,
+    "report": Report,
     "motor": Motor,
     "identify": Identify,
     "validate": Validate,
@@ -38,6 +44,8 @@ _MADE: dict[str, Callable[[list[str]], Any]] = {
     "identify": identify_verb,
     "evaluate": functools.partial(with_environment, Evaluate),
     "render": functools.partial(with_environment, Render),
+    "replay": functools.partial(with_environment, Replay),
+    "view": functools.partial(with_environment, View),
 }
 """Those whose flags depend on the rest of the command line."""
 

@@ -15,9 +15,9 @@ class Identify:
     """Identify a motor from its bench logs: every number with an interval, and whether it can be relied on.
 
     Voltage and current tell the winding; torque, current or voltage, and a position or velocity, tell inertia, load and
-    friction. The folder gets actuator.yaml, which --actuator takes, and result.json; --env.randomize identified then
-    draws within the intervals. What was not identified is refused until it is given with --known. Before that: codrl-mj
-    identify check, plan and simulate. docs/identify.md has more.
+    friction. The folder gets actuator.yaml, which --actuator takes, result.json and report.html; --env.randomize
+    identified then draws within the intervals. What was not identified is refused until it is given with --known.
+    Before that: codrl-mj identify check, plan and simulate. docs/identify.md has more.
 
     Example: codrl-mj identify swing1.csv swing2.csv --columns time=t:s,voltage=duty*vbus:V,current=i:A,position=q:rad
     --rig pendulum --known mgl=2.81 --friction auto --holdout swing3.csv --out motor
@@ -46,7 +46,7 @@ class Identify:
     holdout: tuple[Path, ...] = ()
     """Logs that are only foretold."""
     out: Path | None = None
-    """Folder for actuator.yaml and result.json."""
+    """Folder for actuator.yaml, result.json, and report.html with what the fit looks like."""
     ignore_errors: tyro.conf.FlagCreatePairsOff[bool] = False
     """Fit logs that the checks find errors in."""
     as_json: AsJson = False
@@ -83,7 +83,20 @@ class Identify:
             for path in found.write(self.out):
                 if not self.as_json:
                     print(f"wrote {path}")
+            self._write_page(found, self.out / "report.html")
         return 0
+
+    def _write_page(self, found: Any, path: Path) -> None:
+        """Write the page, where what draws it is installed: the numbers are written already."""
+        try:
+            from codrl_mj.pages.identification import identification_page
+
+            identification_page(found, path)
+            told = f"wrote {path}"
+        except ModuleNotFoundError as error:
+            told = f"no {path}: {error}; pages need the extra 'validate': pip install 'codrl-mj[validate]'"
+        if not self.as_json:
+            print(told)
 
     def _base(self) -> Any:
         from codrl_mj.motor_design import find_drive

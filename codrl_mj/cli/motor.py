@@ -122,6 +122,8 @@ class Show:
     changes: Settings = Changes()
     out: Path | None = None
     """Folder for torque_speed.png."""
+    html: Path | None = None
+    """Page with all of this, the current loop and its steps: one .html file."""
     as_json: AsJson = False
 
     def run(self) -> int:
@@ -135,6 +137,12 @@ class Show:
             _print_json(found)
         else:
             _print_explained(self.name, found)
+        if self.html is not None:
+            from codrl_mj.pages.motor import motor_page
+
+            motor_page(self.name, drive, entry, self.html)
+            if not self.as_json:
+                print(f"wrote {self.html}")
         return _save(figure, self.out, "torque_speed.png", self.as_json)
 
 

@@ -6,12 +6,10 @@ from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.cli.environments import default_actuator, environment, through
-from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, is_task
-from codrl_mj.cli.subject import Source
+from codrl_mj.cli.fields import AS_TRAINED, ActuatorName
+from codrl_mj.cli.subject import Source, policy_and_environment, title_of
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import did_you_mean
-from codrl_mj.foreign.config import environment_from
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,18 +48,10 @@ class Render:
     def run(self: Any) -> int:
         """Run the episode and film it."""
         from codrl_mj.cli.terminal import progress_bar
-        from codrl_mj.evaluation import RandomPolicy, run_episodes, save_episode
+        from codrl_mj.evaluation import run_episodes, save_episode
         from codrl_mj.films.film import Filmed, Panel, film
-        from codrl_mj.runs.policies import Policy
 
-        if is_task(self.subject):
-            known = environment_from({"task": self.subject})
-            env = environment(self, known.task, self.actuator_name, known)
-            policy: Policy = RandomPolicy(env.make().action_space, self.seed)
-        else:
-            loaded = self.source.load(Path(self.subject))
-            policy, env = loaded.policy, environment(self, loaded.env.task, self.actuator_name, loaded.env)
-            loaded.check_interface(env)
+        policy, env = policy_and_environment(self)
         filmed: list[Filmed] = []
 
         def make() -> Any:
@@ -72,7 +62,7 @@ class Render:
             return filmed[-1]
 
         (episode,) = run_episodes(policy, make, 1, self.seed)
-        title = f"{Path(self.subject).name} on {self._name()}: return {episode.total:.0f}"
+        title = f"{title_of(self)}: return {episode.total:.0f}"
         if episode.motors:
             title += f"; {episode.motors[self._motor(episode)]}"
         panel = Panel(title, env.task, episode.actuator, episode, self._motor(episode))
@@ -95,12 +85,6 @@ class Render:
             save_episode(episode, self.trajectory)
             print(f"wrote {self.trajectory}")
         return 0
-
-    def _name(self: Any) -> str:
-        """Of what the episode runs on."""
-        if self.actuator_name == AS_TRAINED and is_task(self.subject):
-            return through(self.actuators, default_actuator(self.subject))
-        return through(self.actuators, self.actuator_name)
 
     def _motor(self, episode: Any) -> int:
         """Which of the motors the strip shows."""

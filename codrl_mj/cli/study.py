@@ -41,8 +41,8 @@ class Computed:
     def run(self: Any) -> int:
         """Compute what is missing and write the page; 1 if something failed."""
         from codrl_mj.cli.terminal import progress_bar
+        from codrl_mj.runs.files import check_writable
         from codrl_mj.study.parallel import Workers
-        from codrl_mj.validation.page import check_writable
 
         plan, workers = self.plan(), Workers(self.jobs, self.backend, self.address)
         if self.dry_run:

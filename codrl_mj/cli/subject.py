@@ -6,6 +6,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from codrl_mj.cli.environments import default_actuator, environment, through
+from codrl_mj.cli.fields import AS_TRAINED, is_task
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.foreign.config import ForeignConfig, environment_from
 
@@ -94,3 +96,33 @@ class Source:
         else:
             policy = load_sb3_zip(path, self.agent or "", self.trust)
         return Subject(policy, environment_from({"task": self.task}))
+
+
+def policy_and_environment(verb: Any) -> tuple[Any, EnvConfig | ForeignConfig]:
+    """What acts, and in what, by a verb's `subject` and its flags: of a task or an id random actions.
+
+    Raises:
+        FileNotFoundError: there is no such run.
+        ValueError: the run cannot be loaded, or the flags do not fit it.
+    """
+    if is_task(verb.subject):
+        from codrl_mj.evaluation import RandomPolicy
+
+        known = environment_from({"task": verb.subject})
+        env = environment(verb, known.task, verb.actuator_name, known)
+        made = env.make()
+        space = made.action_space
+        made.close()
+        return RandomPolicy(space, verb.seed), env
+    loaded = verb.source.load(Path(verb.subject))
+    env = environment(verb, loaded.env.task, verb.actuator_name, loaded.env)
+    loaded.check_interface(env)
+    return loaded.policy, env
+
+
+def title_of(verb: Any) -> str:
+    """What acts, and what its episode runs on."""
+    name = verb.actuator_name
+    if name == AS_TRAINED and is_task(verb.subject):
+        name = default_actuator(verb.subject)
+    return f"{Path(verb.subject).name} on {through(verb.actuators, name)}"

@@ -20,7 +20,6 @@ from codrl_mj.training import TrainConfig
 from codrl_mj.training.history import REPORT_COLUMNS
 from codrl_mj.validation import GROUPS, Caught, Certificate, Check
 from codrl_mj.validation.mutations import margin
-from codrl_mj.validation.page import margin_text
 
 
 def console() -> Console:
@@ -119,7 +118,7 @@ def print_checks(checks: Sequence[Check], title: str = "MuJoCo against Gymnasium
         table.add_column(column, justify=justify, no_wrap=column in ("worst", "allowed", "verdict"))  # type: ignore[arg-type]
     for check in checks:
         verdict = "[green]passed" if check.passed else "[red]FAILED"
-        numbers = f"{check.samples:,}", f"{check.worst:.1e}", f"{check.tolerance:.0e}", margin_text(check)
+        numbers = f"{check.samples:,}", f"{check.worst:.1e}", f"{check.tolerance:.0e}", check.margin
         table.add_row(check.name, *numbers, check.unit, verdict)
     console().print(table)
     for check in checks:

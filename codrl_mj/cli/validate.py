@@ -37,14 +37,15 @@ class Validate:
     def run(self) -> int:
         """Validate and print a table for each group."""
         from codrl_mj.cli.terminal import print_certificate, print_mutations, progress_bar
-        from codrl_mj.validation import own_model, page, try_mutations, validate, validate_model
+        from codrl_mj.runs.files import check_writable
+        from codrl_mj.validation import own_model, try_mutations, validate, validate_model
         from codrl_mj.validation.mutations import faulty, unfailed
 
         if self.model is not None and (self.tasks or self.mutations):
             raise ValueError("--model: give a model or tasks, and no --mutations, which are faults of the tasks")
         tasks = faulty(self.tasks) if self.mutations else self.tasks
         if self.out is not None:
-            page.check_writable(self.out)
+            check_writable(self.out)
         model = None if self.model is None else own_model.load(self.model)
         with progress_bar("{task.completed}/{task.total}") as bar:
             row = bar.add_task("validating", total=None)
@@ -62,6 +63,8 @@ class Validate:
         if caught:
             print_mutations(caught, blind)
         if self.out is not None:
-            for file in page.write(certificate, self.out, caught):
+            from codrl_mj.pages.certificate import write
+
+            for file in write(certificate, self.out, caught):
                 print(f"wrote {file}")
         return 0 if certificate.passed and not blind and all(outcome.failed for outcome in caught) else 1

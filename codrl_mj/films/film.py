@@ -123,7 +123,8 @@ def _encoding(out: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
             yield lambda frame: imageio.imwrite(folder / f"frame_{next(counter):05d}.png", frame)
         return
     options: dict[str, Any] = (
-        {"fps": fps, "codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+        {"fps": fps, "codec": "libx264", "quality": None, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+        | {"output_params": ["-preset", "veryfast", "-crf", "18"]}  # half the time of the default, and a smaller file
         if out.suffix == ".mp4"
         else {"duration": 1000 / fps, "loop": 0}  # ms
     )

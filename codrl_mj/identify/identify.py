@@ -16,6 +16,7 @@ from codrl_mj.identify.prediction import Prediction, predict
 from codrl_mj.identify.result import Estimate, Identified, Status
 from codrl_mj.identify.segments import BLOCK, SEGMENT, moves, shifted
 from codrl_mj.identify.stages import Fitted, Shaft, Winding, fitted
+from codrl_mj.identify.traces import correlations, fitted_traces
 
 WIDEST = 0.3
 """An interval of more than this share of the value to either side is too wide; of the whole friction, for friction."""
@@ -119,6 +120,8 @@ def identify(
         _predictions(shaft, [log for log in held_out if moves(log)]),
         tuple(warnings),
         base,
+        (*fitted_traces("winding", winding), *fitted_traces("shaft", shaft)),
+        {"winding": correlations(winding), "shaft": correlations(shaft)},
     )
 
 

@@ -10,6 +10,7 @@ from codrl_mj.identify.estimate import settled_state
 from codrl_mj.identify.log import Log, usable
 from codrl_mj.identify.models import ShaftModel
 from codrl_mj.identify.segments import initial_state, shaft_segments
+from codrl_mj.identify.traces import Trace, trace
 
 HORIZON = 0.5
 """Time [s] that is foretold at once,"""
@@ -28,6 +29,8 @@ class Prediction:
     """Over `HORIZON`, under the logged input, each time from the state that its first `KNOWN` tell."""
     closed_loop: float | None
     """Over the whole log, under the law by which the servo makes a voltage of its error; None where there is none."""
+    trace: Trace | None = dataclasses.field(default=None, compare=False, repr=False)
+    """What `open_loop` is the error of; in no file."""
 
 
 def predict(model: ShaftModel, values: np.ndarray, log: Log) -> Prediction:
@@ -38,13 +41,15 @@ def predict(model: ShaftModel, values: np.ndarray, log: Log) -> Prediction:
         values: its parameters, shape (p,).
         log: with what drives the shaft.
     """
-    simulate, found = model.at(values), []
+    simulate, found, pieces = model.at(values), [], []
     for segment in shaft_segments([log], model.driven_by, model.output, HORIZON):
         known = max(int(np.searchsorted(segment.times, segment.times[0] + KNOWN)), 5)
         state = settled_state(model, values, segment.first(known))
-        found.append(np.abs(simulate(segment, state) - segment.measured)[known:])
-    errors = np.concatenate(found)
-    return Prediction(log.name, model.output, float(errors.mean()), closed_loop_error(model, values, log))
+        simulated = simulate(segment, state)
+        found.append(np.abs(simulated - segment.measured)[known:])
+        pieces.append((segment.times, segment.measured, simulated))
+    errors, foretold = np.concatenate(found), trace(log.name, "shaft", model.output, pieces)
+    return Prediction(log.name, model.output, float(errors.mean()), closed_loop_error(model, values, log), foretold)
 
 
 def closed_loop_error(model: ShaftModel, values: np.ndarray, log: Log) -> float | None:

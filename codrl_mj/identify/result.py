@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from codrl_mj.identify.parameters import PARAMETERS
 from codrl_mj.identify.prediction import Prediction
+from codrl_mj.identify.traces import Trace
 from codrl_mj.runs.files import write_json, writing
 
 Status = Literal["identified", "given", "ratio", "unidentifiable", "refused"]
@@ -64,6 +65,10 @@ class Identified:
     warnings: tuple[str, ...]
     base: Mapping[str, Any] | None = None
     """The drive that gives what the logs do not tell, as a mapping; None: none."""
+    traces: tuple[Trace, ...] = ()
+    """Winding and shaft beside the logs that were fitted; in no file."""
+    correlations: Mapping[str, Mapping[str, Mapping[str, float]]] = dataclasses.field(default_factory=dict)
+    """Of the parameters of `winding` and `shaft`, each with each."""
 
     def __getitem__(self, name: str) -> Estimate:
         """A parameter by its name."""
@@ -110,7 +115,11 @@ class Identified:
 
     def as_mapping(self) -> dict[str, Any]:
         """As JSON-serialisable values."""
-        return dataclasses.asdict(self) | {"problem": self.problem()}
+        found = dataclasses.asdict(self) | {"problem": self.problem()}
+        del found["traces"]
+        for one in (*found["fitted"], *found["held_out"]):
+            del one["trace"]
+        return found
 
     def as_file(self) -> dict[str, Any]:
         """What an actuator's file holds: a drive's fields, and `identified`, which has its intervals or its problem."""

@@ -61,7 +61,8 @@ _EGL_PLATFORM_SURFACELESS = 0x31DD
 class OffscreenRenderer:
     """Draws a model into RGB arrays.
 
-    By default shadows, reflections and multisampling are off: on a CPU renderer they cost ten times the rest.
+    By default shadows, reflections and multisampling are off: on a CPU renderer they cost ten times the rest. What is
+    left goes for the larger part into the sky, which is drawn once for each pose of the camera.
     """
 
     def __init__(
@@ -90,7 +91,9 @@ class OffscreenRenderer:
         self._pretty = pretty
         model.vis.quality.offsamples = 8 if pretty else 0
         model.vis.quality.shadowsize = 4096 if pretty else 0
-        self._new = functools.partial(mujoco.Renderer, model, height=int(height), width=int(width))
+        self._model, self._size = model, (int(width), int(height))
+        self._sky: tuple[bytes, np.ndarray] = (b"", np.empty(0))
+        self._sky_apart = not pretty and _only_sky_is_black(model)
         self._renderer: mujoco.Renderer | None = self._make()
         _open.add(self)
         _watch_process()
@@ -103,6 +106,16 @@ class OffscreenRenderer:
             return self._new()
         except Exception as error:  # each backend raises its own kind, most of them not exported
             raise RenderingUnavailableError(_no_context(error)) from error
+
+    def _new(self) -> mujoco.Renderer:
+        """With a frame buffer no larger than the image: all of it is cleared for each."""
+        limits, (width, height) = self._model.vis.global_, self._size
+        largest = limits.offwidth, limits.offheight
+        limits.offwidth, limits.offheight = self._size
+        try:
+            return mujoco.Renderer(self._model, height=height, width=width)
+        finally:
+            limits.offwidth, limits.offheight = largest
 
     def render(self, data: mujoco.MjData) -> np.ndarray:
         """Draw the data's present positions (their kinematics must be up to date).
@@ -120,7 +133,25 @@ class OffscreenRenderer:
         flags = self._renderer.scene.flags
         flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._pretty
         flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = self._pretty
-        return self._renderer.render()
+        if not self._sky_apart:
+            return self._renderer.render()
+        sky = self._drawn_sky(self._renderer)
+        flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = False
+        image = self._renderer.render()
+        flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = True
+        red, green, blue = np.moveaxis(image, 2, 0)
+        image += sky * ((red | green | blue) == 0)[..., None]
+        return image
+
+    def _drawn_sky(self, renderer: mujoco.Renderer) -> np.ndarray:
+        """What the camera sees where there is nothing, (height, width, 3), uint8."""
+        scene = renderer.scene
+        view = bytes(np.concatenate([np.append(camera.forward, camera.up) for camera in scene.camera]))
+        if view != self._sky[0]:
+            scene.ngeom, count = 0, scene.ngeom
+            self._sky = view, renderer.render()
+            scene.ngeom = count
+        return self._sky[1]
 
     def close(self) -> None:
         """Free the OpenGL context; harmless when repeated, or when somebody ended the context."""
@@ -131,6 +162,21 @@ class OffscreenRenderer:
     def __del__(self) -> None:
         """Free the OpenGL context."""
         self.close()
+
+
+def _only_sky_is_black(model: mujoco.MjModel) -> bool:
+    """Whether of a picture without sky only the sky's pixels are black.
+
+    All else is lit by the headlight's ambient part, opaque, and has no picture on it.
+    """
+    light = model.vis.headlight
+    colours = np.vstack([model.geom_rgba, model.site_rgba, model.mat_rgba])
+    return bool(
+        light.active
+        and (model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).all()
+        and (colours[:, 3] == 1).all()
+        and colours[:, :3].max(axis=1, initial=0).min(initial=1) * light.ambient.min() > 2 / 255
+    )
 
 
 def _make_current(renderer: mujoco.Renderer) -> bool:

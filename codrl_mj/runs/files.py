@@ -64,6 +64,21 @@ def _umask() -> int:
     return mask
 
 
+def check_writable(folder: Path) -> None:
+    """Find out before hours of work whether `folder` can hold results; makes nothing.
+
+    Raises:
+        OSError: it is a file, or lies below one, or below a folder that may not be written to.
+    """
+    present = folder.absolute()
+    while not present.exists():
+        present = present.parent
+    if not present.is_dir():
+        raise NotADirectoryError(f"cannot write to {folder}: {present} is not a folder")
+    if not os.access(present, os.W_OK | os.X_OK):
+        raise PermissionError(f"cannot write to {folder}: no permission to write in {present}")
+
+
 def write_json(path: Path, content: Any) -> None:
     """Write `content` as indented JSON, whole or not at all."""
     with writing(path) as temporary:

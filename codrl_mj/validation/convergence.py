@@ -21,13 +21,14 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import IDEAL, Actuator, ActuatorModel, CurrentLoop, Motor
+from codrl_mj.pages.plots import Plot
 from codrl_mj.physics import SimulationDivergedError
 from codrl_mj.tasks import Task, find_task
 from codrl_mj.validation.compare import NO_TWIN, actuators_of, physics_of
 from codrl_mj.validation.continuous import equations_of, solve
 from codrl_mj.validation.free_runs import free_run, obstacle
 from codrl_mj.validation.order import Family, order_check
-from codrl_mj.validation.outcome import Check, Plot, Skipped
+from codrl_mj.validation.outcome import Check, Skipped
 
 
 def _states(

@@ -27,6 +27,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from codrl_mj.actuators import ActuatorModel
+from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.physics import SimulationDivergedError
 from codrl_mj.tasks import Task, find_task
 from codrl_mj.validation.compare import STAND_IN, actuators_named, forces_of, physics_of
@@ -34,7 +35,7 @@ from codrl_mj.validation.convergence import analogues, ideals
 from codrl_mj.validation.free_runs import free_run, obstacle
 from codrl_mj.validation.ledger import Ledger, Meter, keep
 from codrl_mj.validation.order import TOLERANCE, Family, order_check
-from codrl_mj.validation.outcome import Check, Curve, Plot, Skipped
+from codrl_mj.validation.outcome import Check, Skipped
 from codrl_mj.validation.worst import worst_of
 
 ACTUATORS = ("paper", "weak", "weaker", "open_loop")

@@ -10,9 +10,10 @@ import numpy as np
 from scipy import linalg
 
 from codrl_mj.actuators import Actuator
+from codrl_mj.pages.plots import Plot
 from codrl_mj.validation.motor_loops import Loop, run, unlimited
 from codrl_mj.validation.order import Family, order_check
-from codrl_mj.validation.outcome import Check, Plot
+from codrl_mj.validation.outcome import Check
 from codrl_mj.validation.worst import worst_of
 
 

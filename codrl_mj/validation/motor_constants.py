@@ -10,8 +10,9 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from codrl_mj.actuators import Motor
+from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.validation.motor_loops import Loop
-from codrl_mj.validation.outcome import Check, Curve, Plot
+from codrl_mj.validation.outcome import Check
 from codrl_mj.validation.rotors import FREE, HELD, drive, driven_by_voltage, motors_on
 from codrl_mj.validation.worst import worst_of
 

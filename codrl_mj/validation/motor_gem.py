@@ -14,8 +14,9 @@ import importlib.util
 import numpy as np
 
 from codrl_mj.actuators import Motor
+from codrl_mj.pages.plots import Plot
 from codrl_mj.validation.order import Family, order_check
-from codrl_mj.validation.outcome import Check, Plot
+from codrl_mj.validation.outcome import Check
 from codrl_mj.validation.rotors import FREE, Record, drive, driven_by_voltage, motors_on
 
 SUPPLY = 12.0

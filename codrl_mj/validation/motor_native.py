@@ -20,8 +20,9 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from codrl_mj.actuators import Motor
+from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.validation.order import Family, order_check
-from codrl_mj.validation.outcome import Check, Curve, Plot
+from codrl_mj.validation.outcome import Check
 from codrl_mj.validation.rotors import (
     FREE,
     HELD,

@@ -13,8 +13,9 @@ import numpy as np
 from scipy import signal
 
 from codrl_mj.actuators import Actuator
+from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.validation.motor_loops import Loop, run, unlimited
-from codrl_mj.validation.outcome import Check, Curve, Plot
+from codrl_mj.validation.outcome import Check
 from codrl_mj.validation.rotors import HELD, drive, motors_on
 from codrl_mj.validation.worst import worst_of
 

@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from codrl_mj.validation.outcome import Check, Curve, Plot
+from codrl_mj.pages.plots import Curve, Plot
+from codrl_mj.validation.outcome import Check
 
 
 class Slope(NamedTuple):

@@ -1,40 +1,9 @@
-"""What a check reports: its oracle, its tolerance, the worst case found and where; and curves to look at."""
+"""What a check reports: its oracle, its tolerance, the worst case found and where; and plots to look at."""
 
 import dataclasses
+import math
 
-import numpy as np
-
-
-@dataclasses.dataclass(frozen=True)
-class Curve:
-    """One line of a plot."""
-
-    label: str
-    """Its name in the legend."""
-    x: np.ndarray
-    """Shape (n,)."""
-    y: np.ndarray
-    """Shape (n,)."""
-    reference: bool = False
-    """Whether it is drawn as a reference (the oracle, a promised slope, a bound) rather than as a result."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Plot:
-    """A plot that shows what a check compared."""
-
-    title: str
-    """What is shown."""
-    x_label: str
-    """With its unit."""
-    y_label: str
-    """With its unit."""
-    curves: tuple[Curve, ...]
-    """The lines."""
-    x_log: bool = False
-    """Whether the horizontal axis is logarithmic."""
-    y_log: bool = False
-    """Whether the vertical axis is logarithmic."""
+from codrl_mj.pages.plots import Plot
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +35,16 @@ class Check:
     def passed(self) -> bool:
         """Whether the port is right as far as this check sees; a NaN is a failure."""
         return bool(self.worst <= self.tolerance)
+
+    @property
+    def margin(self) -> str:
+        """Tolerance over worst case, as text."""
+        if self.worst == 0.0:
+            return "exact"
+        if not math.isfinite(self.worst) or self.tolerance == 0.0:
+            return "0"
+        ratio = self.tolerance / self.worst
+        return f"{ratio:.2g}" if ratio >= 1.005 or ratio < 1.0 else f"{ratio:.4g}"
 
 
 @dataclasses.dataclass(frozen=True)

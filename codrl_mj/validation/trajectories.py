@@ -13,12 +13,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from codrl_mj.actuators import Actuator, ActuatorModel, Ideal
+from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.physics import SimulationDivergedError
 from codrl_mj.tasks import Task, find_task, named_actuator
 from codrl_mj.validation.compare import NO_TWIN, SEVERAL_MOTORS, Worst, both, differences, last_signals
 from codrl_mj.validation.drives import FITTED, runs
 from codrl_mj.validation.growth import ROUNDING, Growth, lyapunov_exponent
-from codrl_mj.validation.outcome import Check, Curve, Plot, Skipped
+from codrl_mj.validation.outcome import Check, Skipped
 
 TOLERANCE = 1e-9
 """Of the difference: rounding (1e-16), a thousand steps, and the growth of tasks that are not chaotic."""

@@ -7,11 +7,14 @@ import unittest.mock
 import warnings
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 from gymnasium.error import DependencyNotInstalled
 
+from codrl_mj.envs.single import ActuatedEnv
 from codrl_mj.envs.window import Window
+from codrl_mj.physics.offscreen import OffscreenRenderer
 from codrl_mj.physics.registry import PHYSICS
 from codrl_mj.tasks import TASKS
 from tests.tasks.faces import every_rebuilt
@@ -269,3 +272,45 @@ print(env.step(1)[1])
     assert done.stdout.endswith("1.0\n")  # the environment itself goes on
     assert "Traceback" not in done.stderr
     assert done.returncode == 0
+
+
+@pytest.mark.parametrize("camera", ["fixed", "close"])
+@every_rebuilt
+def test_the_sky_apart_makes_the_same_picture(task, camera):
+    """The scene composed of what is drawn anew and the sky that is kept is MuJoCo's own, to the pixel."""
+    env = ActuatedEnv(task, "ideal")
+    env.reset(seed=0)
+    renderer = OffscreenRenderer(env.model, 120, 90, camera)
+    plain = mujoco.Renderer(env.model, 90, 120)
+    for _ in range(2):
+        env.step(env.action_space.sample())
+        env.physics.show(env.physics.state)
+        plain.update_scene(env.data, camera)
+        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            plain.scene.flags[flag] = False
+        np.testing.assert_array_equal(renderer.render(env.data), plain.render())
+    renderer.close()
+    plain.close()
+
+
+def test_a_black_thing_is_not_taken_for_the_sky():
+    model = mujoco.MjModel.from_xml_string(BLACK)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    image = OffscreenRenderer(model, 64, 64).render(data)
+    assert (image[32, 32] == 0).all()
+    assert image[2, 2].min() > 200
+
+
+BLACK = """
+<mujoco>
+  <asset>
+    <texture type="skybox" builtin="flat" rgb1="1 1 1" rgb2="1 1 1" width="8" height="8"/>
+    <material name="coal" rgba="0 0 0 1" specular="0"/>
+  </asset>
+  <worldbody>
+    <camera name="fixed" pos="0 -3 0" xyaxes="1 0 0 0 0 1"/>
+    <geom type="box" size=".5 .5 .5" material="coal"/>
+  </worldbody>
+</mujoco>
+"""

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import optimize
 
+from codrl_mj.pages.plots import Plot
 from codrl_mj.validation.order import Family, fit_slope, order_check
-from codrl_mj.validation.outcome import Plot
 from codrl_mj.validation.worst import worst_of
 
 STEPS = 0.1 / 2.0 ** np.arange(5)

@@ -1,0 +1,44 @@
+"""`codrl-mj replay`."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from codrl_mj.cli.fields import AS_TRAINED, ActuatorName
+from codrl_mj.cli.subject import Source, policy_and_environment, title_of
+
+
+@dataclasses.dataclass(frozen=True)
+class Replay:
+    """Write one episode as a page in three dimensions: to be turned, scrubbed and played at any speed.
+
+    Example: codrl-mj replay runs/cartpole-ppo-weaker-0 --out balance.html, or codrl-mj replay Ant-v5 (random actions).
+    """
+
+    subject: Annotated[
+        tyro.conf.Positional[str],
+        tyro.conf.arg(
+            help="Run folder, a folder with a policy alone, or a Stable-Baselines3 zip (see --trust); or a task name "
+            "for random actions."
+        ),
+    ]
+    source: tyro.conf.OmitArgPrefixes[Source] = Source()
+    actuator_name: ActuatorName = AS_TRAINED
+    seed: int = 0
+    """Seed of the episode."""
+    out: Path = Path("episode.html")
+    """File to write."""
+
+    def run(self: Any) -> int:
+        """Run the episode and write it."""
+        from codrl_mj.evaluation import run_episodes
+        from codrl_mj.replay import motion_of_episode, write_replay
+
+        policy, env = policy_and_environment(self)
+        (episode,) = run_episodes(policy, env.make, 1, self.seed)
+        title = f"{title_of(self)}: return {episode.total:.0f}"
+        write_replay(motion_of_episode(episode, env), self.out, title)
+        print(f"wrote {self.out} ({self.out.stat().st_size / 1e6:.1f} MB)")
+        return 0

@@ -1,0 +1,88 @@
+"""`codrl-mj view`."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, field_docs, is_task
+from codrl_mj.cli.subject import Source, policy_and_environment, title_of
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """Watch a simulation live in a browser: pause, push, set motor, loop, supply and delay, see what the motors do.
+
+    Example: codrl-mj view runs/cartpole-ppo-weaker-0, or codrl-mj view furuta (random actions).
+    """
+
+    subject: Annotated[
+        tyro.conf.Positional[str],
+        tyro.conf.arg(
+            help="Run folder, a folder with a policy alone, or a Stable-Baselines3 zip (see --trust); or a task name "
+            "or an environment's id."
+        ),
+    ]
+    source: tyro.conf.OmitArgPrefixes[Source] = Source()
+    actuator_name: ActuatorName = AS_TRAINED
+    seed: int = 0
+    """Seed of the first episode."""
+    policies: tuple[Path, ...] = ()
+    """Other run folders whose policies can be chosen."""
+    port: int = 8080
+    """Where to listen, on this machine alone; the next free one, where it is taken."""
+    native: bool = False
+    """MuJoCo's own viewer instead of a browser; needs a display."""
+
+    def run(self: Any) -> int:
+        """Serve until Ctrl-C."""
+        from codrl_mj.view.session import Session
+
+        if self.native:
+            from codrl_mj.view.native import check_display, run
+
+            check_display()
+        else:
+            browser = _browser()
+        policy, env = policy_and_environment(self)
+        session = Session(env, self._policies(policy), self.seed)
+        if self.native:
+            run(session)
+            return 0
+        shown = browser(session, self.port, title_of(self), field_docs)
+        print(f"{shown.url} (on this machine alone; Ctrl-C ends it)", flush=True)
+        try:
+            shown.run()
+        finally:
+            shown.close()
+        return 0
+
+    def _policies(self: Any, given: Any) -> dict[str, Callable[[], Any]]:
+        """Name -> policy, made when it is chosen: what is watched, its other one, and other runs."""
+        found: dict[str, Callable[[], Any]] = {}
+        subject = Path(self.subject)
+        if not is_task(self.subject):
+            found[self.source.which] = lambda: given
+            if (subject / "best").is_dir():
+                other = "best" if self.source.which == "last" else "last"
+                found[other] = lambda: dataclasses.replace(self.source, which=other).load(subject).policy
+        found |= {run.name: functools.partial(self._policy_of, run) for run in self.policies}
+        return found
+
+    def _policy_of(self: Any, run: Path) -> Any:
+        return self.source.load(run).policy
+
+
+def _browser() -> Any:
+    try:
+        from codrl_mj.view.browser import Browser
+    except ModuleNotFoundError as error:
+        if (error.name or "").split(".")[0] not in ("viser", "trimesh", "websockets"):
+            raise
+        raise RuntimeError(
+            f"the live view needs the extra 'view' ({error}): pip install 'codrl-mj[view]'; or pass --native"
+        ) from None
+    return Browser

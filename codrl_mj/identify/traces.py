@@ -1,0 +1,65 @@
+"""What a fit made of its logs over time, and which parameters it could hardly tell apart: to be looked at."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+
+class Trace(NamedTuple):
+    """A simulation beside what was measured, in pieces that each begin from a state of their own."""
+
+    log: str
+    part: str
+    """`winding` or `shaft`."""
+    output: str
+    """What is compared: `current` [A], `position` [rad] or `velocity` [rad/s]."""
+    time: np.ndarray
+    """[s], shape (n,)."""
+    measured: np.ndarray
+    """Shape (n,)."""
+    simulated: np.ndarray
+    """Shape (n,)."""
+    starts: np.ndarray
+    """Rows at which pieces begin."""
+
+
+def trace(log: str, part: str, output: str, pieces: Any) -> Trace:
+    """A trace of some (times, measured, simulated), each of shape (m,)."""
+    times, measured, simulated = (np.concatenate(column) for column in zip(*pieces, strict=True))
+    starts = np.cumsum([0, *(len(piece[0]) for piece in pieces)])[:-1]
+    return Trace(log, part, output, times, measured, simulated, starts)
+
+
+def fitted_traces(name: str, part: Any) -> tuple[Trace, ...]:
+    """The fit of each log of a `Fitted` part; none where the part was not fitted.
+
+    Args:
+        name: of the part.
+        part: it, or None.
+    """
+    if part is None:
+        return ()
+    pieces: dict[int, list[Any]] = {}
+    for segment, residuals in zip(part.segments, part.fit.residuals, strict=True):
+        simulated = segment.measured + residuals * segment.deviation
+        pieces.setdefault(segment.log, []).append((segment.times, segment.measured, simulated))
+    output = "current" if name == "winding" else part.model.output
+    return tuple(trace(part.logs[place].name, name, output, several) for place, several in pieces.items())
+
+
+def correlations(part: Any) -> dict[str, dict[str, float]]:
+    """Correlations of a `Fitted` part's parameters, by its Jacobian: near 1 or -1, one may stand for the other.
+
+    Args:
+        part: it, or None.
+    """
+    if part is None or not part.fit.names:
+        return {}
+    fit = part.fit
+    rows = np.concatenate([np.sqrt(fit.weights(i))[:, None] * one for i, one in enumerate(fit.jacobians)])
+    size = np.linalg.norm(rows, axis=0)
+    scaled = rows / np.where(size > 0.0, size, 1.0)
+    covariance = np.linalg.pinv(scaled.T @ scaled)
+    spread = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    found = np.clip(covariance / np.outer(spread, spread), -1.0, 1.0)
+    return {name: dict(zip(fit.names, row.tolist(), strict=True)) for name, row in zip(fit.names, found, strict=True)}

@@ -1,0 +1,161 @@
+"""The certificate as files: JSON, and a page with plots."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from codrl_mj.pages import page
+from codrl_mj.runs.files import check_writable, writing
+from codrl_mj.validation.certificate import GROUPS, Certificate, versions
+from codrl_mj.validation.mutations import Caught, margin, unfailed
+from codrl_mj.validation.outcome import Check
+
+JSON_NAME, HTML_NAME = "certificate.json", "certificate.html"
+_CHECKS = ("check", "oracle", "samples", "worst", "allowed", "margin", "unit", "where", "verdict")
+_PASSED, _FAILED = Markup('<strong class="good">✓ passed</strong>'), Markup('<strong class="bad">✗ FAILED</strong>')
+
+
+def html(certificate: Certificate, caught: Sequence[Caught] = ()) -> str:
+    """The page.
+
+    Args:
+        certificate: what was found.
+        caught: what mutations did, if they were tried.
+    """
+    passed, count = sum(check.passed for check in certificate.checks), len(certificate.checks)
+    word = "passed" if certificate.passed else "FAILED"
+    top = [page.verdict(certificate.passed, f"{word}: {passed} of {count} checks")]
+    if certificate.quick:
+        top.append(page.note("The quick form: fewer states, runs and step sizes than in the full one."))
+    top.append(
+        page.paragraph(
+            "Each check has an oracle, a tolerance, and the worst case that was found. The margin is tolerance over "
+            "worst case: a check passes while it is at least 1."
+        )
+    )
+    software = page.definitions(versions().items())
+    top.append(page.folded(f"Made in {certificate.seconds:.0f} s, with this software", software))
+    sections = [_group(name, title, certificate) for name, title in GROUPS.items()]
+    sections += [_mutations(certificate, caught), _skipped(certificate)]
+    return page.page(
+        f"Is the port right? {certificate.subject}", "Certificate of validation", page.joined(top), sections
+    )
+
+
+def _group(name: str, title: str, certificate: Certificate) -> page.Section:
+    checks = [check for check in certificate.checks if check.group == name]
+    body = [page.paragraph(f"{title}.")] if checks else []
+    for task in dict.fromkeys(check.task for check in checks):
+        own = [check for check in checks if check.task == task]
+        body.append(page.heading(task) if task else Markup())
+        caption = f"Checks of {name}{f', {task}' if task else ''}"
+        body.append(page.table(caption, _CHECKS, map(_row, own), numbers=range(2, 6), cards=True))
+        body.append(page.plots(plot for check in own for plot in check.plots))
+    good = sum(check.passed for check in checks)
+    mark = Markup('<span class="{}">({} {} of {})</span>').format(
+        *(("good", "✓") if good == len(checks) else ("bad", "✗")), good, len(checks)
+    )
+    return page.Section(name, name.capitalize(), page.joined(body), mark)
+
+
+def _row(check: Check) -> page.Row:
+    worst, allowed = (f"{value:.2g}" for value in (check.worst, check.tolerance))
+    cells = check.name, check.oracle, f"{check.samples:,}", worst, allowed, check.margin, check.unit, check.where
+    return page.Row((*cells, _PASSED if check.passed else _FAILED), "" if check.passed else "failed")
+
+
+def _mutations(certificate: Certificate, caught: Sequence[Caught]) -> page.Section:
+    if not caught:
+        return page.Section("mutations", "Mutations", Markup())
+    rows = []
+    for one in caught:
+        clearest, cells = one.clearest, [one.mutation, one.task or "the motor", f"{len(one.failed)} of {one.made}"]
+        if clearest is None:
+            missed = Markup('<strong class="bad">✗ MISSED</strong>')
+            rows.append(page.Row((*cells, "none", "", "", "", missed), "failed"))
+        else:
+            values = (f"{value:.2g}" for value in (clearest.worst, clearest.tolerance, margin(clearest)))
+            found = Markup('<strong class="good">✓ caught</strong>')
+            rows.append(page.Row((*cells, f"{clearest.group}: {clearest.name}", *values, found)))
+    columns = "fault", "in", "failed", "clearest check", "worst", "allowed", "beyond", "verdict"
+    blind = unfailed(certificate.checks, caught)
+    told = "; ".join(f"{check.group}, {check.task}: {check.name}" for check in blind)
+    body = (
+        page.paragraph(
+            "The certificate put to the test: each fault was made on purpose, and the quick checks were run with it. "
+            "“Beyond” is how many times its tolerance the clearest of the failed checks was."
+        ),
+        page.table("Faults made on purpose", columns, rows, numbers=(2, 4, 5, 6), cards=True),
+        page.note(f"✗ No fault fails these checks: {told}", bad=True)
+        if blind
+        else page.paragraph("Every check of the certificate is failed by at least one of the faults."),
+    )
+    return page.Section("mutations", "Mutations", page.joined(body))
+
+
+def _skipped(certificate: Certificate) -> page.Section:
+    rows = [(skip.name, skip.group, skip.reason) for skip in certificate.skipped]
+    body = page.table("What was not checked", ("what", "group", "why"), rows, cards=True) if rows else Markup()
+    return page.Section("skipped", "Not checked", body)
+
+
+def summary(content: Mapping[str, Any]) -> Markup:
+    """What a `certificate.json` says, in short."""
+    checks = content["checks"]
+    rows = []
+    for name in dict.fromkeys(check["group"] for check in checks):
+        own = [check for check in checks if check["group"] == name]
+        good = sum(check["passed"] for check in own)
+        rows.append((name, GROUPS.get(name, ""), f"{good} of {len(own)}"))
+    passed = content["verdict"] == "passed"
+    whole = f"{content['verdict']}: {sum(check['passed'] for check in checks)} of {len(checks)} checks"
+    return page.joined(
+        (
+            page.verdict(passed, whole),
+            page.paragraph(f"Of {content['subject']}, made {content['made']}{', the quick form' * content['quick']}."),
+            page.table("Checks passed", ("group", "what", "passed"), rows, numbers=(2,)),
+        )
+    )
+
+
+def caught_mapping(caught: Sequence[Caught]) -> list[dict[str, Any]]:
+    """What mutations did, for JSON."""
+    rows = []
+    for outcome in caught:
+        clearest = outcome.clearest
+        row: dict[str, Any] = {"mutation": outcome.mutation, "task": outcome.task, "made": outcome.made}
+        row["failed"] = [f"{check.group}: {check.name}" for check in outcome.failed]
+        if clearest is not None:
+            worst = clearest.worst if math.isfinite(clearest.worst) else str(clearest.worst)
+            row |= {"clearest": f"{clearest.group}: {clearest.name}", "worst": worst, "allowed": clearest.tolerance}
+        rows.append(row)
+    return rows
+
+
+def write(certificate: Certificate, folder: Path, caught: Sequence[Caught] = ()) -> tuple[Path, Path]:
+    """Write `certificate.json` and `certificate.html` into a folder, whole or not at all; older ones are replaced.
+
+    Returns:
+        The two files.
+
+    Raises:
+        OSError: the folder cannot be written to.
+    """
+    content = certificate.as_mapping()
+    if caught:
+        content |= {
+            "mutations": caught_mapping(caught),
+            "failed by no mutation": [
+                f"{check.group}: {check.task}: {check.name}" for check in unfailed(certificate.checks, caught)
+            ],
+        }
+    text, found = json.dumps(content, indent=2, allow_nan=False) + "\n", html(certificate, caught)
+    check_writable(folder)
+    with writing(folder / JSON_NAME) as json_file, writing(folder / HTML_NAME) as html_file:
+        json_file.write_text(text, encoding="utf-8")
+        html_file.write_text(found, encoding="utf-8")
+    return folder / JSON_NAME, folder / HTML_NAME

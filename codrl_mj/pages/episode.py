@@ -1,0 +1,374 @@
+"""One episode of each of some runs: film and plots on one clock."""
+
+import dataclasses
+import re
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from markupsafe import Markup
+
+from codrl_mj.actuators import Drive, Ideal
+from codrl_mj.evaluation import Episode, run_episodes
+from codrl_mj.films.film import Filmed
+from codrl_mj.films.scene import SceneFilm, scene_film
+from codrl_mj.foreign.config import ForeignConfig
+from codrl_mj.pages import page
+from codrl_mj.pages.loop import limits, no_load_speed
+from codrl_mj.pages.plots import POINTS, Curve, Plot, Shade, spans
+
+_SIZE = 480, 360
+_BUDGET = 400_000
+"""Points of all curves of an episode: two megabytes."""
+_MANY = 3
+"""Of more motors than this only one is shown at first."""
+_MOST_STATES = 12
+"""Lines of a plot of states."""
+
+
+class Shown(NamedTuple):
+    """An episode of a run."""
+
+    name: str
+    """The run's."""
+    env: Any
+    """What it ran in."""
+    episode: Episode
+    """What happened."""
+    film: SceneFilm | None
+    """The scene; None: `problem`."""
+    problem: str | None
+    """Why there is no film."""
+
+
+def show(name: str, env: Any, policy: Any, seed: int, filmed: bool = True) -> Shown:
+    """Run an episode and film it; where nothing can be drawn, without a film.
+
+    Args:
+        name: of the run.
+        env: an `EnvConfig` or a `ForeignConfig`.
+        policy: chooses the actions.
+        seed: of the episode.
+        filmed: whether to film it.
+    """
+    problem = None if filmed else "none was asked for"
+    made: list[Filmed] = []
+
+    def make() -> Any:
+        made.append(Filmed(env.make(**env.view(*_SIZE))))
+        return made[-1]
+
+    foreign = isinstance(env, ForeignConfig)
+    if foreign and filmed:
+        try:
+            (episode,) = run_episodes(policy, make, 1, seed)
+            return Shown(name, env, episode, scene_film(env.task, episode, *_SIZE, made[0].frames), None)
+        except Exception as error:  # each renderer raises its own kind
+            problem = f"{type(error).__name__}: {error}"
+    (episode,) = run_episodes(policy, env.make, 1, seed)
+    film = None
+    if filmed and not foreign:
+        try:
+            film = scene_film(env.task, episode, *_SIZE)
+        except Exception as error:  # as above, and libraries that are not installed
+            problem = f"{type(error).__name__}: {error}"
+    return Shown(name, env, episode, film, problem)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Line:
+    """One motor of one run: what its curves are called, and when they are shown."""
+
+    before: str
+    """Of their labels."""
+    place: int | None
+    """Among all of them; None where it is the only one. Its colour beside others."""
+    tags: tuple[str, ...]
+    actuator: Any
+    episode: Episode
+    motor: int
+    stride: int
+    """Every so many integration steps are drawn."""
+
+    @property
+    def timestep(self) -> float:
+        return self.episode.timestep
+
+    def trace(self, name: str) -> np.ndarray:
+        """A column of the trace."""
+        values = self.episode.trace[name]
+        return np.asarray(values if values.ndim == 1 else values[:, self.motor], dtype=float)
+
+    @property
+    def desired(self) -> np.ndarray:
+        """Torque asked for at the shaft in each integration step [N*m]."""
+        asked = self.episode.signals["desired_force"]
+        asked = asked if asked.ndim == 1 else asked[:, self.motor]
+        return np.repeat(np.asarray(asked, dtype=float), self.episode.inner_steps) * self.actuator.arm_radius
+
+    @property
+    def actual(self) -> np.ndarray:
+        """And delivered."""
+        return self.trace("actual_force") * self.actuator.arm_radius
+
+    @property
+    def speed(self) -> np.ndarray:
+        """Of the shaft at the end of each [rad/s]."""
+        return self.trace("speed") / self.actuator.arm_radius
+
+    def has(self, *names: str) -> bool:
+        """Whether its family has these signals."""
+        return not isinstance(self.actuator, Ideal) and set(names) <= set(self.actuator.Signals._fields)
+
+    def curve(self, label: str, values: np.ndarray, colour: int, held: bool = True, dashed: bool = False) -> Curve:
+        """A curve over the integration steps; what is held begins with them, what is not is at their ends."""
+        kept = slice(None, None, self.stride)
+        values = np.asarray(values, dtype=float)
+        time = self.timestep * (np.arange(len(values)) + (not held))
+        if held:
+            time, values = np.append(time[kept], time[-1] + self.timestep), np.append(values[kept], values[-1])
+        else:
+            time, values = time[kept], values[kept]
+        style: Any = "step" if held else "line"
+        more: Any = {"style": style, "colour": colour, "shared": self.place, "dashed": dashed, "tags": self.tags}
+        return Curve(self.before + label, time, values, **more)
+
+
+def episode_section(shown: Sequence[Shown], joined: Iterable[Markup] = ()) -> Markup:
+    """Films, controls and plots of some episodes side by side.
+
+    Args:
+        shown: the episodes.
+        joined: what else follows the clock: see `codrl_mj.pages.page.clocked`.
+    """
+    lines = _lines(shown)
+    end = max(float(one.episode.time[-1]) for one in shown)
+    films = [page.film(_caption(one, len(shown) > 1), one.film.video, one.film.rate, one.film.still)
+             for one in shown if one.film is not None]  # fmt: skip
+    notes = [page.note(f"No film of {one.name}: {one.problem}") for one in shown if one.film is None]
+    stage = [
+        *notes,
+        Markup('<div class="pinned">{}{}</div>').format(
+            Markup('<div class="films">{}</div>').format(page.joined(films)) if films else "",
+            page.transport(end, min(float(one.episode.time[0]) for one in shown)),
+        ),
+        _selectors(shown),
+        *joined,
+    ]
+    diagram = torque_speed(lines)
+    if diagram is not None:
+        stage.append(page.plot(diagram))
+    right = [page.plot(one, low=True) for one in (*_motor_plots(lines), *_run_plots(shown))]
+    ends = [page.paragraph(_caption(one, True), "soft") for one in shown] if not films else []
+    if lines and lines[0].stride > 1:
+        ends.append(page.paragraph(f"Plots have every {lines[0].stride}th integration step.", "soft"))
+    return page.joined(
+        (
+            page.paragraph(
+                "Film and plots share a clock: play the film, or drag in any plot over time. Torque, current and speed "
+                "are the motor's own, at its shaft."
+            ),
+            *ends,
+            Markup('<div class="episode"><div class="stage">{}</div><div class="stack">{}</div></div>').format(
+                page.joined(stage), page.joined(right)
+            ),
+        )
+    )
+
+
+def _caption(one: Shown, named: bool) -> str:
+    episode = one.episode
+    over = f"{'ended' if episode.terminated else 'time limit'} at {episode.time[-1]:.2f} s"
+    return f"{one.name + ': ' if named else ''}return {page.number(episode.total)}, {over}"
+
+
+def _selectors(shown: Sequence[Shown]) -> Markup:
+    motors = _motors(shown)
+    boxes = [page.selector("Runs", "run", [one.name for one in shown])] if len(shown) > 1 else []
+    if len(motors) > 1:
+        boxes.append(page.selector("Motors", "motor", motors, 0 if len(motors) > _MANY else None))
+    return Markup('<div class="selectors">{}</div>').format(page.joined(boxes)) if boxes else Markup()
+
+
+def _motors(shown: Sequence[Shown]) -> list[str]:
+    """Names of the motors of all runs."""
+    return list(dict.fromkeys(name for one in shown for name in one.episode.motors or ("motor",)))
+
+
+def _lines(shown: Sequence[Shown]) -> list[_Line]:
+    """Every motor of every run."""
+    motors, pairs = _motors(shown), [(one, k) for one in shown for k in range(max(len(one.episode.motors), 1))]
+    most = max(POINTS // 4, _BUDGET // (10 * len(pairs)))
+    stride = max(-(-len(one.episode.trace["speed"]) // most) for one in shown)
+    made = []
+    for place, (one, motor) in enumerate(pairs):
+        names = one.episode.motors or ("motor",)
+        words = [one.name] * (len(shown) > 1) + [names[motor]] * (len(names) > 1)
+        tags = f"run:{shown.index(one)}", f"motor:{motors.index(names[motor])}"
+        several = isinstance(one.episode.actuator, tuple)
+        actuator = one.episode.actuator[motor] if several else one.episode.actuator
+        before = f"{', '.join(words)}: " if words else ""
+        made.append(_Line(before, place if len(pairs) > 1 else None, tags, actuator, one.episode, motor, stride))
+    return made
+
+
+def _motor_plots(lines: Sequence[_Line]) -> list[Plot]:
+    """What the motors did."""
+    force = all(isinstance(line.actuator, Ideal) for line in lines)
+    unit = "force [N] or torque [N·m]" if force else "torque [N·m]"
+    torque, error, current, voltage, power, warmth = ([] for _ in range(6))  # type: ignore[var-annotated]
+    for line in lines:
+        torque += [line.curve("actual", line.actual, 1), line.curve("desired", line.desired, 0, dashed=True)]
+        error.append(line.curve("desired less actual", line.desired - line.actual, 4))
+        electric = line.has("current", "voltage")
+        if line.has("current"):
+            current.append(line.curve("current", line.trace("current"), 1, held=False))
+        if line.has("current", "reference_current"):
+            current.append(line.curve("reference", line.trace("reference_current"), 0, dashed=True))
+        if line.has("voltage"):
+            voltage.append(line.curve("voltage", line.trace("voltage"), 2))
+        power.append(line.curve("mechanical", line.actual * line.speed, 1))
+        if electric:
+            amperes, volts = line.trace("current"), line.trace("voltage")
+            power.append(line.curve("electrical", volts * amperes, 2, dashed=True))
+            if line.actuator.winding is not None:
+                power.append(line.curve("heat in the winding", line.actuator.winding[0] * amperes**2, 4))
+        if line.has("temperature") and np.ptp(line.trace("temperature")) > 0.0:
+            warmth.append(line.curve("winding", line.trace("temperature"), 4, held=False))
+    shades = tuple(_shade(line) for line in lines if line.has("saturated"))
+    found = [
+        Plot("Torque at the shaft" if not force else "Force", _TIME, unit, tuple(torque), clock=True, shades=shades)
+    ]
+    if any(np.ptp(curve.y) > 0.0 or curve.y.any() for curve in error):
+        found.append(Plot("Error: desired less actual", _TIME, unit, tuple(error), clock=True))
+    if current:
+        found.append(Plot("Current and its reference", _TIME, "current [A]", tuple(current), clock=True))
+    if voltage:
+        curves = (*voltage, *_voltage_limits(lines, voltage))
+        found.append(Plot("Voltage and its limit", _TIME, "voltage [V]", curves, clock=True, shades=shades))
+    found += _other_signals(lines)
+    if not force:
+        found.append(Plot("Power and losses", _TIME, "power [W]", tuple(power), clock=True))
+    if warmth:
+        found.append(Plot("Temperature", _TIME, "temperature [°C]", tuple(warmth), clock=True))
+    return found
+
+
+_TIME = "time [s]"
+
+
+def _shade(line: _Line) -> Shade:
+    times = line.timestep * np.arange(len(line.trace("saturated")) + 1)
+    return Shade(f"{line.before}saturated", spans(times, line.trace("saturated")), line.tags)
+
+
+def _voltage_limits(lines: Sequence[_Line], drawn: Sequence[Curve]) -> list[Curve]:
+    """The supply's voltages, where they come near: a limit far off would press the curve flat."""
+    highest = max(float(np.nanmax(np.abs(curve.y))) for curve in drawn)
+    each = {line.actuator.voltage_limit: line.tags for line in lines if line.has("voltage")}
+    found = []
+    for limit, tags in each.items():
+        if limit is not None and limit < max(4.0 * highest, 1e-9):
+            ends = np.array([0.0, max(curve.x[-1] for curve in drawn)])
+            own = tags if len(each) > 1 else ()
+            found += [
+                Curve(f"{side}{limit:g} V", ends, np.full(2, float(f"{side}{limit}")), True, tags=own) for side in "+-"
+            ]
+    return found
+
+
+_KNOWN = ("current", "reference_current", "voltage", "temperature", "saturated")
+
+
+def _other_signals(lines: Sequence[_Line]) -> list[Plot]:
+    """Signals that only some families have."""
+    names = dict.fromkeys(name for line in lines for name in line.actuator.Signals._fields if name not in _KNOWN)
+    found = []
+    for name in names:
+        own = [line for line in lines if line.has(name)]
+        unit = own[0].actuator.SIGNAL_UNITS.get(name, "").replace("*", "·") if own else ""
+        curves = tuple(line.curve(name.replace("_", " "), line.trace(name), 3) for line in own)
+        if own:
+            title = name.replace("_", " ").capitalize()
+            found.append(Plot(title, _TIME, f"{name.replace('_', ' ')} [{unit}]", curves, clock=True))
+    return found
+
+
+def _run_plots(shown: Sequence[Shown]) -> list[Plot]:
+    """States and reward of the runs."""
+    found: list[Plot] = []
+    groups: dict[str, list[Curve]] = {}
+    rewards = []
+    several = len(shown) > 1
+    for place, one in enumerate(shown):
+        before = f"{one.name}: " if several else ""
+        own: Any = {"shared": place if several else None, "tags": (f"run:{place}",)}
+        time = np.concatenate([[0.0], one.episode.time])
+        counts: dict[str, int] = {}
+        for index, name in enumerate(_state_names(one)):
+            unit = (re.search(r"\[(.*)\]", name) or [name, "1"])[1]
+            count = counts[unit] = counts.get(unit, -1) + 1
+            if count < _MOST_STATES:
+                more = {"colour": count, "dashed": several and count > 0, **own}
+                curve = Curve(before + name.partition(" [")[0], time, one.episode.state[:, index], **more)
+                groups.setdefault(unit, []).append(curve)
+        held = np.append(one.episode.reward, one.episode.reward[-1])
+        rewards.append(Curve(f"{before}reward", time, held, style="step", colour=5, **own))
+    for unit, curves in groups.items():
+        names = list(dict.fromkeys(curve.label.rpartition(": ")[2].replace("_", " ") for curve in curves))
+        title = f"State: {', '.join(names)}" if len(names) < 4 else f"States in {unit}"
+        found.append(Plot(title, _TIME, f"state [{unit}]", tuple(curves), clock=True))
+    found.append(Plot("Reward of each step", _TIME, "reward", tuple(rewards), clock=True))
+    return found
+
+
+def _state_names(one: Shown) -> Sequence[str]:
+    """Of the state's entries, with units."""
+    from codrl_mj.tasks import find_task
+
+    if not isinstance(one.env, ForeignConfig):
+        return find_task(one.env.task).state_names
+    env: Any = one.env.make()
+    try:
+        model = env.unwrapped.model
+        names: list[str] = []
+        speeds: list[str] = []
+        counts = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # free, ball, slide, hinge: entries of qpos and of qvel
+        for index, kind in enumerate(model.jnt_type.tolist()):
+            joint = model.joint(index).name or f"joint {index}"
+            unit = "m" if kind in (0, 2) else "rad"
+            for count, made, own in zip(counts[kind], (names, speeds), (unit, f"{unit}/s"), strict=True):
+                made += [f"{joint}{f' {k}' if count > 1 else ''} [{own}]" for k in range(count)]
+        return [*names, *speeds]
+    finally:
+        env.close()
+
+
+def torque_speed(lines: Sequence[_Line]) -> Plot | None:
+    """The points of episodes in the plane of speed and torque, within what the motors can do."""
+    curves: list[Curve] = []
+    highest = 0.0
+    own = [line for line in lines if not isinstance(line.actuator, Ideal)]
+    if not own:
+        return None
+    for line in own:
+        ratio = line.actuator.motor.gear_ratio if isinstance(line.actuator, Drive) else 1.0
+        speed, torque = line.speed / ratio, line.actual * ratio
+        width = max(1.15 * _finite(no_load_speed(line.actuator)), 1.1 * float(np.abs(speed).max()), 1e-6)
+        most = max(float(np.abs(torque).max()), float(np.abs(line.desired).max()) * ratio, 1e-9)
+        grid = np.linspace(-width, width, 401)
+        ends = limits(line.actuator, grid)
+        highest = max(highest, min(3.0 * most, 1.1 * float(np.abs(ends[1]).max()) if ends else most))
+        for bound, label in zip(ends or (), ("lowest", "highest"), strict=False):
+            more: Any = {"colour": 0, "shared": line.place, "filled": label == "highest", "tags": line.tags}
+            curves.append(Curve(f"{line.before}{label} possible", grid, bound, dashed=True, **more))
+        stride = max(line.stride, len(speed) // 3000, 1)
+        times = line.timestep * np.arange(len(speed))[::stride]
+        trail: Any = {"style": "trail", "colour": 1, "shared": line.place, "tags": line.tags, "times": times}
+        curves.append(Curve(f"{line.before}episode", speed[::stride], torque[::stride], **trail))
+    title = "Torque and speed, within what the motor can do"
+    return Plot(title, "speed of the output [rad/s]", "torque of the output [N·m]", tuple(curves), y_most=highest)
+
+
+def _finite(value: float) -> float:
+    return value if np.isfinite(value) else 0.0

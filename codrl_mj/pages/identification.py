@@ -1,0 +1,211 @@
+"""What identification found: data and fit, residuals, intervals, correlations, and what to do better on the bench."""
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from markupsafe import Markup
+
+from codrl_mj.identify.result import USABLE, Identified
+from codrl_mj.identify.traces import Trace
+from codrl_mj.pages import page
+from codrl_mj.pages.plots import Curve, Plot
+
+_UNITS = {"current": "A", "position": "rad", "velocity": "rad/s"}
+_LAGS = 400
+_STRONG = 0.9
+_ADVICE = {
+    "resistance": "lock the rotor, drive it with steps of voltage (PRBS), log voltage and current at the terminals",
+    "inductance": "lock the rotor, and log several rows within L/R of every step of the voltage",
+    "back_emf_constant": "log voltage and current while the shaft turns fast: a slow, large sine of the voltage",
+    "torque_constant": "measure it with a known mass (--known mgl=…), or give the datasheet's with --known",
+    "torque_gain": "hang a known mass and give --known mgl=…: all torques scale with it",
+    "inertia": "accelerate and brake hard: steps of the input, in both directions",
+    "rotor_inertia": "log the motor without its load, or give --known load_inertia=…",
+    "mgl": "let it swing further from the middle, or weigh it and give --known mgl=…",
+    "constant_torque": "move the load up and down, several times",
+    "coulomb_friction": "pass standstill often: a slow sine, in both directions",
+    "viscous_friction": "hold several speeds up to the highest, in both directions",
+    "gear_efficiency": "repeat the motion with two loads at least, driving and braking",
+    "stribeck_friction": "creep: log very slow motion out of standstill",
+    "stribeck_speed": "creep: log speeds from standstill to where friction is least",
+}
+
+
+def identification_page(found: Identified, out: Path) -> Path:
+    """Write the page of what identification found.
+
+    Args:
+        found: it.
+        out: the page, an .html file.
+
+    Returns:
+        `out`.
+
+    Raises:
+        ValueError: `out` is no .html file.
+    """
+    winding = [one for one in found.traces if one.part == "winding"]
+    shaft = [one for one in found.traces if one.part == "shaft"]
+    foretold = [one.trace for one in found.held_out if one.trace is not None]
+    fits = (
+        *(
+            [page.heading("Winding: the current under the logged voltage"), *map(_looked_at, winding)]
+            if winding
+            else ()
+        ),
+        *([page.heading("Shaft, piece by piece"), *map(_looked_at, shaft)] if shaft else ()),
+    )
+    sections = [
+        page.Section("parameters", "Parameters", _parameters(found)),
+        page.Section("better", "What to do better on the bench", _advice(found)),
+        page.Section("errors", "Errors of the simulation", _errors(found)),
+        page.Section("fits", "Logs that were fitted", page.joined(fits)),
+        page.Section("held-out", "Logs that were only foretold", page.joined(map(_looked_at, foretold))),
+        page.Section("correlations", "Which parameters can stand for each other", _correlations(found)),
+    ]
+    title = f"Identified from {', '.join(found.logs)}"
+    return page.write(out, page.page(title, "A motor from its bench logs", _top(found), sections))
+
+
+def _top(found: Identified) -> Markup:
+    problem = found.problem()
+    by = f", driven by its {found.driven_by}" if found.driven_by else ""
+    good = sum(one.status in USABLE for one in found.estimates)
+    late = [
+        f"the input of the {part} is late by {rows:g} row{'s' * (abs(rows) != 1)}, which is allowed for"
+        for part, rows in found.delays.items()
+        if rows
+    ]
+    told = (
+        f"{good} of {len(found.estimates)} numbers can be relied on. Rig: {found.rig}{by}; friction: {found.friction}"
+    )
+    usable = "usable as an actuator" if problem is None else "not to be used as an actuator"
+    parts = [page.verdict(problem is None, usable), page.paragraph("; ".join([told, *late]) + ".", "lead")]
+    parts += [page.note(problem, bad=True)] if problem is not None else []
+    return page.joined((*parts, *map(page.note, found.warnings)))
+
+
+def _parameters(found: Identified) -> Markup:
+    rows = []
+    for one in found.estimates:
+        interval = "" if one.status == "given" else f"{page.number(one.low)} to {page.number(one.high)}"
+        half = 50.0 * (one.high - one.low) / abs(one.value) if one.value else math.nan
+        worst = max(one.causes, key=lambda cause: one.causes[cause]) if one.causes else ""
+        good = one.status in USABLE
+        status = Markup('<strong class="{}">{} {}</strong>').format(
+            *(("good", "✓") if good else ("bad", "✗")), one.status
+        )
+        share = f"{half:.2g} %" if interval and math.isfinite(half) else ""
+        cells = (one.name.replace("_", " "), page.number(one.value), interval, share, _unit(one.unit), status, one.why)
+        rows.append(page.Row((*cells, worst.replace("_", " ")), "" if good else "failed"))
+    columns = ("parameter", "value", "95 % interval", "half of it", "unit", "status", "why", "above all by")
+    return page.table("Parameters with 95 % intervals", columns, rows, numbers=(1, 2, 3), cards=True)
+
+
+def _unit(text: str) -> str:
+    return text.replace("*", "·").replace("^2", "²").replace("ohm", "Ω")
+
+
+def _advice(found: Identified) -> Markup:
+    texts = [
+        Markup("<b>{}</b> is {}: {}.").format(one.name.replace("_", " "), one.status, _ADVICE[one.name])
+        for one in found.estimates
+        if one.status not in USABLE and one.name in _ADVICE
+    ]
+    told = Markup(
+        "<b>{}</b> and <b>{}</b> stand for each other (correlation {:+.2f}): give one of them with --known, or excite "
+        "what tells them apart."
+    )
+    texts += [told.format(*pair) for pair in _strong(found)]
+    if not found.held_out and found.driven_by:
+        texts.append(Markup("No log was held out: keep one back with --holdout, to see what the numbers foretell."))
+    if len(found.logs) < 2:
+        texts.append(Markup("A single log: a second one shows what differs from day to day."))
+    if not texts:
+        return page.paragraph("Nothing stands out: every number is identified or given, and a log was held out.")
+    return page.items([*texts, Markup("<code>codrl-mj identify plan</code> says which excitation tells what.")])
+
+
+def _strong(found: Identified) -> Iterable[tuple[str, str, float]]:
+    for table in found.correlations.values():
+        names = list(table)
+        for place, one in enumerate(names):
+            for other in names[place + 1 :]:
+                if abs(table[one][other]) >= _STRONG:
+                    yield one.replace("_", " "), other.replace("_", " "), table[one][other]
+
+
+def _errors(found: Identified) -> Markup:
+    rows = []
+    for kind, several in (("fitted", found.fitted), ("held out", found.held_out)):
+        for one in several:
+            errors = (page.number(error, 3) for error in (one.open_loop, one.closed_loop))
+            rows.append((one.log, kind, f"{one.output} [{_UNITS[one.output]}]", *errors))
+    if not rows:
+        return Markup()
+    columns = ("log", "", "of", "open loop, half a second", "closed loop")
+    told = page.paragraph(
+        "Mean absolute errors. Open loop: the simulation begins from where the shaft was and runs half a second under "
+        "the logged input. Closed loop: over the whole log under the servo's own law, where the log has a command."
+    )
+    return told + page.table("Errors of the simulation", columns, rows, numbers=(3, 4))
+
+
+def _looked_at(one: Trace) -> Markup:
+    """Data and simulation of a log, residuals and their autocorrelation."""
+    unit = _UNITS[one.output]
+    gaps = one.starts[1:]
+    time, simulated = (np.insert(values, gaps, np.nan) for values in (one.time, one.simulated))
+    time = np.where(np.isnan(time), np.interp(np.arange(len(time)), np.flatnonzero(~np.isnan(time)), one.time), time)
+    residuals = one.measured - one.simulated
+    curves = Curve("measured", one.time, one.measured, colour=0), Curve("simulated", time, simulated, colour=1)
+    off = np.insert(residuals, gaps, np.nan)
+    what = f"{one.log}: {one.output}"
+    return page.plots(
+        (
+            Plot(what, "time [s]", f"{one.output} [{unit}]", curves),
+            Plot(
+                f"{what}, residuals",
+                "time [s]",
+                f"measured less simulated [{unit}]",
+                (Curve("residual", time, off, colour=4),),
+            ),
+            _autocorrelation(what, one.time, residuals),
+        )
+    )
+
+
+def _autocorrelation(what: str, time: np.ndarray, residuals: np.ndarray) -> Plot:
+    """Of residuals; within the bounds, residuals know nothing of each other."""
+    from scipy.signal import correlate
+
+    centred = residuals - residuals.mean()
+    whole = correlate(centred, centred, method="fft")[len(centred) - 1 :]
+    count = min(_LAGS, len(centred) // 2)
+    lags = float(np.median(np.diff(time))) * np.arange(count + 1)
+    bound = 1.96 / math.sqrt(len(centred))
+    ends = lags[[0, -1]]
+    curves = (
+        Curve("autocorrelation", lags, whole[: count + 1] / max(whole[0], 1e-300), colour=3),
+        Curve("95 % of noise", ends, np.full(2, bound), reference=True),
+        Curve("95 % of noise, below", ends, np.full(2, -bound), reference=True),
+    )
+    return Plot(f"{what}, autocorrelation of residuals", "lag [s]", "share", curves)
+
+
+def _correlations(found: Identified) -> Markup:
+    parts = []
+    for part, table in found.correlations.items():
+        if len(table) > 1:
+            names = [name.replace("_", " ") for name in table]
+            rows = [(name, *map(_share, row.values())) for name, row in zip(names, table.values(), strict=True)]
+            caption = f"Correlations of the {part}'s parameters"
+            parts.append(page.table(caption, ("", *names), rows, numbers=range(1, 1 + len(names))))
+    return page.joined(parts)
+
+
+def _share(value: float) -> Markup:
+    strong = _STRONG <= abs(value) < 1.0 - 1e-9
+    return Markup("<b>{:+.2f}</b>" if strong else "{:+.2f}").format(value)

@@ -1,0 +1,197 @@
+"""What lies between what is asked of an actuator and what it delivers: steps, frequency response, torque and speed."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from codrl_mj.actuators import Actuator, ActuatorModel, Drive, Inputs, TorqueSpeed, parameters_type
+from codrl_mj.motor_design import LoopDesign, closed_loop, design, designs, open_loop, small_step, torque_limits
+from codrl_mj.motor_design import step as all_steps
+from codrl_mj.pages import page
+from codrl_mj.pages.plots import Curve, Plot
+
+_RIGHTS = (
+    ("sample_rate", "sample rate", "Hz"),
+    ("kp", "proportional gain", "V/A"),
+    ("ki", "integral gain", "V/(A·s)"),
+    ("gain_margin", "gain margin", "dB"),
+    ("phase_margin", "phase margin", "°"),
+    ("crossover", "crossover", "Hz"),
+    ("bandwidth", "bandwidth, to 1/√2,", "Hz"),
+    ("settling_time", "settled to 2 % in", "ms"),
+    ("overshoot", "overshoot", "%"),
+)
+_SCALES = {"settling_time": 1e3, "overshoot": 100.0}
+
+
+def loop_section(drives: Mapping[str, Drive]) -> Markup:
+    """Margins, Bode's diagram and a small step of the current loops of some drives, by their names."""
+    found: dict[str, LoopDesign] = {}
+    notes = []
+    for name, drive in drives.items():
+        try:
+            found[name] = design(drive)
+        except ValueError as error:
+            notes.append(page.note(f"{name}: {error}", bad=True))
+    if not found:
+        return page.joined(notes)
+    rows = [
+        (label, *(page.number(_right(one, field)) for one in found.values()), unit) for field, label, unit in _RIGHTS
+    ]
+    late = {name: "a sample of delay" if one.delayed else "no delay" for name, one in found.items()}
+    rows.append(("the voltage comes with", *late.values(), ""))
+    table = page.table("Current loop", ("", *found, "unit"), rows, numbers=range(1, 1 + len(found)))
+    known = {name: drives[name] for name in found}
+    return page.joined((*notes, table, page.plots((*_bode(known, found), *_small_steps(known)))))
+
+
+def _right(one: LoopDesign, field: str) -> float:
+    value = getattr(one, field)
+    return 20.0 * math.log10(value) if field == "gain_margin" else value * _SCALES.get(field, 1.0)
+
+
+def _bode(drives: Mapping[str, Drive], designed: Mapping[str, LoopDesign]) -> list[Plot]:
+    gains, phases = [], []
+    for place, (name, drive) in enumerate(drives.items()):
+        rate, one = drive.controller.sample_rate, designed[name]
+        frequencies = np.geomspace(np.nanmin([1e-3 * rate, 0.02 * one.crossover]), 0.49999 * rate, 500)
+        before = f"{name}: " if len(drives) > 1 else ""
+        for label, loop, dashed in (("open loop", open_loop(drive), True), ("closed loop", closed_loop(drive), False)):
+            values = loop(np.exp(2j * math.pi * frequencies / rate))
+            more: dict[str, Any] = {"colour": place if len(drives) > 1 else int(not dashed), "dashed": dashed}
+            decibels, degrees = 20.0 * np.log10(np.abs(values)), np.degrees(np.unwrap(np.angle(values)))
+            gains.append(Curve(before + label, frequencies, decibels, **more))
+            phases.append(Curve(before + label, frequencies, degrees, **more))
+        if len(drives) == 1:
+            margin = 20.0 * math.log10(one.gain_margin)
+            gains.append(_upright(f"gain margin {margin:.1f} dB", one.phase_crossover, -margin, 0.0))
+            if math.isfinite(one.phase_margin):
+                label = f"phase margin {one.phase_margin:.1f}°"
+                phases.append(_upright(label, one.crossover, -180.0, one.phase_margin - 180.0))
+    return [
+        Plot("Bode: gain", "frequency [Hz]", "gain [dB]", tuple(gains), x_log=True),
+        Plot("Bode: phase", "frequency [Hz]", "phase [°]", tuple(phases), x_log=True),
+    ]
+
+
+def _upright(label: str, x: float, low: float, high: float) -> Curve:
+    return Curve(label, np.array([x, x * (1.0 + 1e-6)]), np.array([low, high]), colour=3)
+
+
+def _small_steps(drives: Mapping[str, Drive]) -> list[Plot]:
+    curves = []
+    for place, (name, drive) in enumerate(drives.items()):
+        step, before = small_step(drive), f"{name}: " if len(drives) > 1 else ""
+        shown = slice(0, max(int(3.0 * np.searchsorted(step.time, step.settling_time())), 20))
+        time, asked = 1e3 * step.time[shown], step.reference[-1]
+        curves.append(
+            Curve(f"{before}current", time, step.current[shown] / asked, colour=place if len(drives) > 1 else 1)
+        )
+    curves.append(Curve("asked for", time, np.ones(len(time)), reference=True))
+    return [
+        Plot("A small step of the current, the shaft held", "time [ms]", "share of what is asked for", tuple(curves))
+    ]
+
+
+def step_plots(drive: Drive) -> list[Plot]:
+    """Current and voltage out of a demand that the voltage cannot meet, by kind of anti-windup."""
+    steps = all_steps(drive)
+    currents, volts = [], []
+    for kind, one in steps.recoveries.items():
+        shown = one.response.time <= 0.06
+        time = 1e3 * one.response.time[shown]
+        took = f"{1e3 * one.time:.2g} ms" if math.isfinite(one.time) else "over 100 ms"
+        currents.append(Curve(f"{kind.replace('_', ' ')}: back in {took}", time, one.response.current[shown]))
+        volts.append(Curve(kind.replace("_", " "), time, one.response.voltage[shown], style="step"))
+        asked = Curve("asked for", time, one.response.reference[shown], reference=True)
+    limit = drive.voltage_limit
+    ends = [Curve("supply", time[[0, -1]], np.full(2, side * limit), reference=True) for side in (1.0, -1.0)]
+    at = f"at {steps.speed:.4g} rad/s of the rotor"
+    return [
+        Plot(f"{steps.unreachable:.3g} A, out of reach, then {steps.reachable:.3g} A, {at}", "time [ms]", "current [A]",
+             (*currents, asked)),
+        Plot("Its voltage", "time [ms]", "voltage [V]", (*volts, *ends)),
+    ]  # fmt: skip
+
+
+def rates_table(drive: Drive) -> Markup:
+    """The loop at other sample rates, with and without delay."""
+    own = drive.controller.sample_rate, drive.controller.delayed
+    rows = []
+    for (rate, delayed), one in designs(drive).items():
+        name = f"{rate / 1e3:g} kHz, {'a sample' if delayed else 'no'} delay{' (as it is)' * ((rate, delayed) == own)}"
+        if isinstance(one, str):
+            rows.append((name, "not possible: " + one, *[""] * 5))
+        else:
+            rows.append((name, *(page.number(_right(one, field)) for field, _, _ in _RIGHTS[3:])))
+    columns = ("the loop at", *(f"{label} [{unit}]" for _, label, unit in _RIGHTS[3:]))
+    return page.table("Other sample rates", columns, rows, numbers=range(1, 7), cards=True)
+
+
+def held_step(actuators: Mapping[str, ActuatorModel], torques: Mapping[str, float], timestep: float) -> Plot | None:
+    """The torque after a step of what is asked for, the shaft held; None where nothing is of interest.
+
+    Args:
+        actuators: by their names.
+        torques: asked of each [N*m].
+        timestep: mechanical step [s].
+    """
+    curves = []
+    for name, actuator in actuators.items():
+        kind: Any = type(actuator)
+        if not actuator.tracks or actuator.MOTION or not kind.State._fields or torques[name] == 0.0:
+            continue
+        parameters, state, share = (
+            parameters_type(kind)(*actuator.numbers),
+            kind.State(*[0.0] * len(kind.State._fields)),
+            [0.0],
+        )
+        for tick in range(100):
+            asked = Inputs(torques[name], 0.0, 0.0, tick * timestep, 0.0)
+            state, torque, _ = kind.advance(parameters, timestep, state, asked)
+            share.append(torque / torques[name])
+        time = timestep * np.arange(len(share))
+        within = np.flatnonzero(np.abs(np.array(share) - share[-1]) > 0.02)
+        shown = min(max(3 * (within[-1] + 1) if len(within) else 0, 20), len(share))
+        curves.append(Curve(name, time[:shown], np.array(share[:shown])))
+    if not curves:
+        return None
+    longest = max(curves, key=lambda curve: len(curve.x)).x
+    curves.append(Curve("asked for", longest, np.ones(len(longest)), reference=True))
+    title = f"A step of the torque, the shaft held, at steps of {1e3 * timestep:.3g} ms"
+    return Plot(title, "time [s]", "share of what is asked for", tuple(curves))
+
+
+def limits(actuator: Any, speeds: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Lowest and highest torque [N*m] that an actuator delivers at speeds [rad/s]; None where it has no such limits.
+
+    The joint's friction, which the model has, is not taken off.
+    """
+    if isinstance(actuator, Drive):
+        free = {f"motor.{name}": 0.0 for name in ("coulomb_friction", "viscous_friction", "stribeck_friction")}
+        return torque_limits(actuator.replaced(free), speeds, actuator.controller.max_current)
+    if isinstance(actuator, TorqueSpeed):
+        ends = (actuator.stall_torque * (side - speeds / actuator.no_load_speed) for side in (-1.0, 1.0))
+        low, high = (np.clip(end, -actuator.max_torque, actuator.max_torque) for end in ends)
+        return low, high
+    if isinstance(actuator, Actuator) and actuator.voltage_limit is not None:
+        motor, volts = actuator.motor, actuator.voltage_limit
+        low, high = (
+            motor.torque_constant * (side * volts - motor.back_emf_constant * speeds) / motor.resistance
+            for side in (-1, 1)
+        )
+        return low, high
+    return None
+
+
+def no_load_speed(actuator: Any) -> float:
+    """Where the voltage makes no more torque [rad/s], before friction; infinite where nothing is known of it."""
+    if isinstance(actuator, TorqueSpeed):
+        return float(actuator.no_load_speed)
+    if isinstance(actuator, Drive | Actuator) and actuator.voltage_limit is not None:
+        constant = actuator.motor.back_emf_constant * getattr(actuator.motor, "gear_ratio", 1.0)
+        return float(actuator.voltage_limit / constant) if constant > 0.0 else math.inf
+    return math.inf

@@ -1,0 +1,136 @@
+"""A motor's page: its numbers and where they are from, what it can do, its current loop."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from codrl_mj.actuators import Drive
+from codrl_mj.catalogue import MotorEntry
+from codrl_mj.motor_design import abilities, explain, torque_limits
+from codrl_mj.pages import page
+from codrl_mj.pages.loop import loop_section, rates_table, step_plots
+from codrl_mj.pages.plots import Curve, Plot
+
+
+def motor_page(name: str, drive: Drive, entry: MotorEntry | None, out: Path) -> Path:
+    """Write a motor's page.
+
+    Args:
+        name: what the motor is called.
+        drive: it, with its drive.
+        entry: its datasheet, where it has one.
+        out: the page, an .html file.
+
+    Returns:
+        `out`.
+
+    Raises:
+        ValueError: `out` is no .html file.
+    """
+    known = explain(drive, entry)
+    sections = [
+        page.Section("abilities", "What it can do", _abilities(known, drive, entry)),
+        page.Section("loop", "Its current loop", _loop(name, drive)),
+        page.Section("numbers", "The motor, at its rotor", _numbers(known)),
+        page.Section("drive", "As it is simulated", _values("Fields of the drive", known["drive"])),
+    ]
+    kicker = "A motor"
+    top = Markup()
+    if entry is not None:
+        top = page.paragraph(f"{entry.manufacturer} {entry.product}, {entry.kind}.", "lead")
+        if entry.notes:
+            top += page.paragraph(" ".join(entry.notes.split()))
+        for text in known["disagreements"]:
+            top += page.note(f"The datasheet disagrees with itself: {text}")
+    return page.write(out, page.page(name, kicker, top, sections))
+
+
+def _values(caption: str, rows: Any) -> Markup:
+    made = [(row["name"].replace("_", " "), page.number(row["value"]), _unit(row["unit"])) for row in rows]
+    return page.table(caption, ("number", "value", "unit"), made, numbers=(1,))
+
+
+def _unit(text: str) -> str:
+    return text.replace("*", "·").replace("^2", "²").replace("ohm", "Ω").replace("degC", "°C")
+
+
+def _abilities(known: Mapping[str, Any], drive: Drive, entry: MotorEntry | None) -> Markup:
+    table = _values("At the output of its gear, past friction", known["abilities"])
+    try:
+        plots = page.plots([torque_speed(drive, entry)])
+    except ValueError as error:
+        plots = page.note(str(error))
+    return Markup('<div class="beside">{}{}</div>').format(plots, table)
+
+
+def torque_speed(drive: Drive, entry: MotorEntry | None = None) -> Plot:
+    """What a drive can do at the output of its gear, past friction, in all four quadrants.
+
+    Raises:
+        ValueError: it has no no-load speed to end the diagram at.
+    """
+    can, most = abilities(drive), drive.controller.max_current
+    if not 0.0 < can.no_load_speed < math.inf or can.stall_torque <= 0.0:
+        raise ValueError(
+            f"No torque-speed diagram: the no-load speed is {can.no_load_speed:g} rad/s and the stall torque "
+            f"{can.stall_torque:g} N·m."
+        )
+    half = np.linspace(0.0, 1.15 * can.no_load_speed, 300)[1:]
+    speeds = np.concatenate([-half[::-1], half])  # friction changes sign at standstill
+    bounds: list[tuple[str, float, int, bool]] = [(f"voltage, {drive.voltage_limit:g} V", math.inf, 0, False)]
+    if math.isfinite(most):
+        bounds.append((f"peak current, {most:.3g} A", most, 1, False))
+    continuous = getattr(entry and entry.numbers, "continuous_current", None)
+    if continuous is not None:
+        bounds.append((f"continuous current, {continuous:.3g} A", continuous, 2, True))
+    curves = []
+    for label, current, colour, dashed in bounds:
+        low, high = torque_limits(drive, speeds, current)
+        more: Any = {"colour": colour, "dashed": dashed}
+        curves += [Curve(f"{label}, lowest", speeds, low, **more), Curve(f"{label}, highest", speeds, high, **more)]
+    drawn = [*curves[:-1], Curve(**{**vars(curves[-1]), "filled": True})]
+    limit = float(torque_limits(drive, 0.0, most)[1])
+    ratio = drive.motor.gear_ratio
+    gear = f"behind a gear of {ratio:g}:1" if ratio != 1.0 else "without a gear"
+    return Plot(
+        f"Torque and speed {gear}, friction taken off",
+        "speed of the output [rad/s]",
+        "torque of the output [N·m]",
+        tuple(drawn),
+        y_most=1.25 * min(can.stall_torque, 3.0 * limit),
+    )
+
+
+def _loop(name: str, drive: Drive) -> Markup:
+    parts = [loop_section({name: drive})]
+    try:
+        parts += [page.heading("Out of saturation, by kind of anti-windup"), page.plots(step_plots(drive))]
+    except ValueError as error:
+        parts = [parts[0], page.note(str(error))]
+    return page.joined((*parts, rates_table(drive)))
+
+
+def _numbers(known: Mapping[str, Any]) -> Markup:
+    """Every number of a datasheet with its origin."""
+    if "numbers" not in known:
+        return Markup()
+    sources: list[str] = []
+    rows = []
+    for row in known["numbers"]:
+        sources += [source for source in row["sources"] if source not in sources]
+        places = ", ".join(str(1 + sources.index(source)) for source in row["sources"])
+        how = row["how"] + (" (estimated)" if row["name"] in known["estimated"] else "")
+        cells = row["name"].replace("_", " "), page.number(row["value"]), _unit(row["unit"]), how, places
+        rows.append(cells)
+    columns = ("number", "value", "unit", "how it came about", "source")
+    parts = [page.table("Numbers and where they are from", columns, rows, numbers=(1,), cards=True)]
+    parts.append(page.definitions((str(place), source) for place, source in enumerate(sources, 1)))
+    if known["estimated"]:
+        parts += [page.heading("Estimated"), page.definitions(known["estimated"].items())]
+    if known["unknown"]:
+        parts.append(page.paragraph(f"Not known: {', '.join(known['unknown']).replace('_', ' ')}.", "soft"))
+    return page.joined(parts)

@@ -1,0 +1,254 @@
+"""The builder of every page: sections of text, tables, plots and films, in one file that asks nothing of any server.
+
+All text is escaped; what is to stand as markup is `markupsafe.Markup`, which only this builder makes.
+"""
+
+import base64
+import functools
+import math
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jinja2
+from markupsafe import Markup
+
+from codrl_mj import __version__
+from codrl_mj.pages.plots import Plot, as_json, description, still
+from codrl_mj.runs.files import writing
+
+_HERE = Path(__file__).parent
+_POLICY = (
+    "default-src 'none'; img-src data: blob:; media-src data: blob:; style-src 'unsafe-inline'; "
+    "script-src 'unsafe-inline' blob:; worker-src blob:; frame-src data: blob:; connect-src data: blob:"
+)
+"""What the browser itself holds the page to: nothing is fetched."""
+
+
+class Section(NamedTuple):
+    """A part of a page with a heading."""
+
+    id: str
+    title: str
+    body: Markup
+    mark: Any = ""
+    """Beside its entry in the contents."""
+
+
+class Row(NamedTuple):
+    """A row of a table."""
+
+    cells: Sequence[Any]
+    kind: str = ""
+    """Its CSS class, such as `failed`."""
+
+
+@functools.cache
+def _templates() -> jinja2.Environment:
+    return jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_HERE),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+@functools.cache
+def _parts() -> Any:
+    return _templates().get_template("parts.html.jinja").module
+
+
+def _text(name: str) -> Markup:
+    return Markup((_HERE / name).read_text(encoding="utf-8"))
+
+
+def page(title: str, kicker: str, top: Markup, sections: Sequence[Section]) -> str:
+    """A page.
+
+    Args:
+        title: its heading.
+        kicker: a line above it: what kind of page this is.
+        top: what comes before the first section.
+        sections: the rest; those without a body are left out.
+    """
+    licence = (_HERE / "uplot" / "LICENSE").read_text(encoding="utf-8").strip()
+    return (
+        _templates()
+        .get_template("page.html.jinja")
+        .render(
+            title=title,
+            kicker=kicker,
+            top=top,
+            sections=[section for section in sections if section.body],
+            policy=Markup(_POLICY),
+            style=_text("uplot/uPlot.min.css") + _text("page.css"),
+            uplot=Markup("/* uPlot. {} */\n").format(Markup(licence)) + _text("uplot/uPlot.iife.min.js"),
+            script=_text("page.js"),
+            version=__version__,
+            made=time.strftime("%Y-%m-%d, %H:%M UTC", time.gmtime()),
+        )
+    )
+
+
+def write(path: Path, text: str) -> Path:
+    """Write a page, whole or not at all.
+
+    Raises:
+        ValueError: the suffix is none of a page.
+    """
+    if path.suffix not in (".html", ".htm"):
+        raise ValueError(f"page {path}: the suffix is {path.suffix!r}, must be .html; write {path.stem}.html")
+    with writing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return path
+
+
+def joined(parts: Iterable[Any], separator: str = "") -> Markup:
+    """Parts one after the other; what is no markup is escaped."""
+    return Markup(separator).join(parts)
+
+
+def paragraph(text: Any, kind: str = "") -> Markup:
+    """A paragraph, with a CSS class."""
+    return Markup('<p class="{}">{}</p>' if kind else "<p>{1}</p>").format(kind, text)
+
+
+def note(text: Any, bad: bool = False) -> Markup:
+    """What is to be noticed."""
+    return paragraph(text, "note bad" if bad else "note")
+
+
+def heading(text: Any) -> Markup:
+    """A heading within a section."""
+    return Markup("<h3>{}</h3>").format(text)
+
+
+def definitions(entries: Iterable[tuple[Any, Any]]) -> Markup:
+    """Names and what they are."""
+    return Markup("<dl>{}</dl>").format(joined(Markup("<dt>{}</dt><dd>{}</dd>").format(*entry) for entry in entries))
+
+
+def items(texts: Iterable[Any]) -> Markup:
+    """A list."""
+    return Markup("<ul>{}</ul>").format(joined(Markup("<li>{}</li>").format(text) for text in texts))
+
+
+def folded(summary: Any, body: Markup) -> Markup:
+    """Something to be unfolded."""
+    return Markup("<details><summary>{}</summary>{}</details>").format(summary, body)
+
+
+def verdict(good: bool, text: Any) -> Markup:
+    """Whether something is as it should be, not by colour alone."""
+    return Markup('<p class="verdict {}">{} {}</p>').format(*(("good", "✓") if good else ("bad", "✗")), text)
+
+
+def table(
+    caption: str, columns: Sequence[Any], rows: Iterable[Any], numbers: Iterable[int] = (), cards: bool = False
+) -> Markup:
+    """A table; the first column names its rows.
+
+    Args:
+        caption: what it is.
+        columns: their headings.
+        rows: each a `Row`, or a sequence of cells.
+        numbers: places of the columns of numbers.
+        cards: whether a phone shows each row as a card; otherwise the table scrolls by itself.
+    """
+    made = [row if isinstance(row, Row) else Row(row) for row in rows]
+    return Markup(_parts().table(caption, columns, made, cards, set(numbers)))
+
+
+def plot(what: Plot, low: bool = False) -> Markup:
+    """A plot.
+
+    Args:
+        what: its curves.
+        low: whether it is drawn less high.
+    """
+    picture = base64.b64encode(still(what, height=2.2 if low else 3.2).encode()).decode()
+    axes = f"{what.y_label} over {what.x_label}" if what.clock else what.y_label
+    data, about = Markup(as_json(what)), description(what)
+    return Markup(_parts().plot(what.title, axes, about, data, picture, what.clock, low))
+
+
+def plots(several: Iterable[Plot]) -> Markup:
+    """Plots side by side, where there is room."""
+    drawn = [plot(one) for one in several]
+    return Markup('<div class="plots">{}</div>').format(joined(drawn)) if drawn else Markup("")
+
+
+def image(picture: bytes, about: str, kind: str = "jpeg") -> Markup:
+    """A picture.
+
+    Args:
+        picture: a file's content.
+        about: what is seen, for those who do not see it.
+        kind: the file's type.
+    """
+    return Markup('<img src="data:image/{};base64,{}" alt="{}">').format(
+        kind, base64.b64encode(picture).decode(), about
+    )
+
+
+def film(caption: str, video: bytes, rate: float, poster: bytes | None = None) -> Markup:
+    """A film, which follows the page's clock and leads it while it plays.
+
+    Args:
+        caption: what is seen.
+        video: H.264 in an MP4 file.
+        rate: frames a second.
+        poster: a JPEG file for as long as nothing is seen.
+    """
+    encoded = (base64.b64encode(one).decode() if one else "" for one in (video, poster))
+    return Markup(_parts().film(caption, *encoded, f"{1.0 / rate:.6g}"))
+
+
+def transport(end: float, step: float) -> Markup:
+    """The controls of the page's clock: play, time, speed, zoom. There may be one in a page.
+
+    Args:
+        end: of the clock [s].
+        step: by which it is moved [s].
+    """
+    return Markup(_parts().transport(f"{end:.6g}", f"{step:.6g}"))
+
+
+def selector(legend: str, kind: str, names: Sequence[str], shown: int | None = None) -> Markup:
+    """Chooses what the curves with a tag `KIND:PLACE` show.
+
+    Args:
+        legend: what is chosen.
+        kind: of the tags.
+        names: of what may be chosen, by its place.
+        shown: what alone is shown at first; None: all.
+    """
+    entries = [(f"{kind}:{place}", name, shown in (None, place)) for place, name in enumerate(names)]
+    return Markup(_parts().selector(legend, kind, entries, False))
+
+
+def clocked(label: str, fragment: str, script: str) -> Markup:
+    """Something that shares the page's clock with films and plots, such as a replay in three dimensions.
+
+    Args:
+        label: what it is.
+        fragment: its HTML, taken as it is.
+        script: JavaScript that defines a function `setTime(seconds)`, which shows that instant. It sees `element`, the
+            fragment's parent, and `seek(seconds)`, to be called when the fragment itself is scrubbed.
+    """
+    return Markup(_parts().clocked(label, Markup(fragment), Markup(script)))
+
+
+def number(value: Any, digits: int = 4) -> str:
+    """A number as text; a dash where there is none."""
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return "–"
+    if isinstance(value, bool) or not isinstance(value, float | int):
+        return str(value)
+    if math.isinf(value):
+        return "∞" if value > 0 else "\N{MINUS SIGN}∞"
+    rounded = float(f"{value:.{digits}g}")
+    text = f"{rounded:,.0f}" if 1e3 <= abs(rounded) < 1e7 else f"{rounded:.{digits}g}"
+    return text.replace("-", "\N{MINUS SIGN}")

@@ -1,0 +1,386 @@
+"""A run's report, or that of several side by side: what they are, learned, achieved, and what their motors did."""
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from codrl_mj.actuators import ActuatorModel, Drive, Ideal
+from codrl_mj.evaluation.evaluate import MEASURES
+from codrl_mj.pages import certificate as certificates
+from codrl_mj.pages import page
+from codrl_mj.pages.episode import Shown, episode_section, show
+from codrl_mj.pages.loop import held_step, loop_section
+from codrl_mj.pages.plots import Curve, Plot
+from codrl_mj.runs.files import read_json
+from codrl_mj.runs.layout import PROGRESS, finished
+from codrl_mj.runs.policies import load_policy
+from codrl_mj.runs.summaries import RunSummary, compare, read_run
+from codrl_mj.training.folder import BEST, EPISODES, load_config
+from codrl_mj.training.history import WINDOW, read_episodes
+
+_DOTS = 4000
+_MOST_LOOPS = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class _Run:
+    summary: RunSummary
+    name: str
+    shown: Shown | None
+    """Its episode."""
+    problem: str | None
+    """Why there is none."""
+    actuators: Mapping[str, ActuatorModel]
+    """What it was trained through, by the names of motors or patterns."""
+
+
+def report(
+    runs: Sequence[Path],
+    out: Path,
+    *,
+    which: str = "last",
+    seed: int = 0,
+    trust: bool = False,
+    filmed: bool = True,
+    certificate: Path | None = None,
+    joined: Callable[[Sequence[Shown]], Sequence[Markup]] = lambda _: (),
+    on_part: Callable[[str], None] = lambda _: None,
+) -> Path:
+    """Write a report.
+
+    Args:
+        runs: run folders, at least one; also unfinished and damaged ones.
+        out: the page, an .html file.
+        which: `last` or `best`: whose policy acts in the episode. An unfinished run has only its best so far.
+        seed: of the episode.
+        trust: whether to import modules that a run folder names as its task, agent or actuator, which executes them.
+        filmed: whether to film the episode.
+        certificate: a `certificate.json`, or the folder of one; None: that in a run folder, if there is one.
+        joined: (episodes) -> parts that follow the clock of film and plots, made by `codrl_mj.pages.page.clocked`.
+        on_part: called with what is being done.
+
+    Returns:
+        `out`.
+
+    Raises:
+        FileNotFoundError: a folder is no run folder, or there is no such certificate.
+        ValueError: no run, or `out` is no .html file.
+    """
+    if not runs:
+        raise ValueError("runs: none was given; give one run folder or more")
+    if out.suffix not in (".html", ".htm"):
+        raise ValueError(f"page {out}: the suffix is {out.suffix!r}, must be .html")
+    summaries = [read_run(path) for path in runs]
+    found = [
+        _run(one, name, which, seed, trust, filmed, on_part)
+        for one, name in zip(summaries, _names(summaries), strict=True)
+    ]
+    on_part("page")
+    shown = [run.shown for run in found if run.shown is not None]
+    sections = [
+        page.Section("learning", "Learning", _learning(found)),
+        page.Section("evaluation", "Evaluation", _evaluation(found)),
+        page.Section("episode", "An episode", _episodes(found, shown, joined)),
+        page.Section("loop", "The loop between", _loop(found)),
+        page.Section("certificate", "Certificate", _certificate(runs, certificate)),
+        page.Section("settings", "Settings", _settings(found)),
+    ]
+    kinds = "Report of a run" if len(found) == 1 else f"Report of {len(found)} runs"
+    title = ", ".join(run.name for run in found)
+    return page.write(out, page.page(title, kinds, _top(found, shown), sections))
+
+
+def _names(summaries: Sequence[RunSummary]) -> list[str]:
+    """Names of the folders, with as much of their paths as tells them apart."""
+    for length in range(1, 4):
+        names = ["/".join(one.path.resolve().parts[-length:]) for one in summaries]
+        if len(set(names)) == len(names):
+            return names
+    return [f"{name} ({place})" for place, name in enumerate(names, 1)]
+
+
+def _run(
+    summary: RunSummary, name: str, which: str, seed: int, trust: bool, filmed: bool, on_part: Callable[[str], None]
+) -> _Run:
+    """A run with an episode, as far as there is one."""
+    try:
+        config = load_config(summary.path, trust)
+    except (ValueError, OSError, ImportError) as error:
+        return _Run(summary, name, None, str(error), {})
+    env = config.evaluation_env
+    actuators = _actuators(env)
+    policy = summary.path if which == "last" and finished(summary.path) else summary.path / BEST
+    if not (policy / "policy.json").is_file():
+        return _Run(summary, name, None, "the run has no policy yet: none was evaluated so far", actuators)
+    try:
+        on_part(f"{name}: episode")
+        return _Run(summary, name, show(name, env, load_policy(policy, trust), seed, filmed), None, actuators)
+    except (ValueError, OSError, ArithmeticError, RuntimeError, ModuleNotFoundError) as error:
+        return _Run(summary, name, None, f"{type(error).__name__}: {error}", actuators)
+
+
+def _actuators(env: Any) -> dict[str, ActuatorModel]:
+    if isinstance(env.actuators, Mapping):
+        return {pattern: one for pattern, one in env.actuators.items() if one is not None}
+    from codrl_mj.tasks import find_task
+
+    return dict(zip(find_task(env.task).motors, env.actuators, strict=True))
+
+
+def _top(runs: Sequence[_Run], shown: Sequence[Shown]) -> Markup:
+    """What it is, in sentences and a picture."""
+    told: list[Markup] = []
+    for run in runs:
+        text = (
+            Markup("<b>{}</b>: {}").format(run.name, _sentence(run.summary))
+            if len(runs) > 1
+            else _sentence(run.summary)
+        )
+        told.append(page.paragraph(text, "lead"))
+        if run.summary.state == "unfinished":
+            told.append(page.note("The training is not finished. Here is what there is so far."))
+        if run.summary.state == "damaged":
+            told.append(page.note(f"The run folder is damaged: {run.summary.problem}", bad=True))
+    if runs[0].summary.task:
+        told.append(page.paragraph(_about(runs[0].summary.task), "soft"))
+    still = next((one for one in shown if one.film is not None), None)
+    if still is None:
+        return page.joined(told)
+    about = f"{runs[0].summary.task}: the scene of an episode"
+    return Markup('<div class="intro"><div>{}</div>{}</div>').format(
+        page.joined(told), page.image(still.film.still, about) if still.film else ""
+    )
+
+
+def _sentence(run: RunSummary) -> str:
+    """What a run is and came to."""
+    agent = run.agent.upper() if run.agent else "An agent"
+    steps = f", trained for {run.steps:,} environment steps" if run.steps else ", not trained yet"
+    if run.steps and run.total_steps and run.state == "unfinished":
+        steps += f" of {run.total_steps:,}"
+    named = {"ideal": "the ideal actuator", "custom": "an actuator of its own", "drive": "a motor behind a drive"}
+    actuator = named.get(run.actuator or "", f"the actuator {run.actuator}")
+    text = f"{agent} on {run.task or 'an unknown task'} through {actuator}{steps}, seed {run.seed}."
+    if run.evaluation is not None and run.evaluation_return is not None:
+        text += (
+            f" Its policy returns {_value(run.evaluation['returns'])} over {run.evaluation.get('episodes')} episodes"
+        )
+        if isinstance(success := run.evaluation.get("success"), Mapping):
+            text += f" and succeeds in {100 * success['mean']:.3g} % of them"
+        text += "."
+    return text
+
+
+def _about(task: str) -> str:
+    """The first line of what a task says of itself."""
+    import importlib
+
+    try:
+        text = importlib.import_module(f"codrl_mj.tasks.{task}").__doc__ or ""
+    except ImportError:  # somebody else's
+        return f"The environment {task}."
+    return text.strip().partition("\n")[0]
+
+
+def _value(value: Any) -> str:
+    """A measure as text: a number, a mean or a median with its interval."""
+    if isinstance(value, Mapping):
+        middle = value.get("mean", value.get("median"))
+        return f"{page.number(middle)} [{page.number(value.get('low'))}, {page.number(value.get('high'))}]"
+    return page.number(value)
+
+
+def _learning(runs: Sequence[_Run]) -> Markup:
+    """Curves from the runs' tables."""
+    notes: list[Markup] = []
+    returns: list[Curve] = []
+    errors: list[Curve] = []
+    evaluations: list[Curve] = []
+    for place, run in enumerate(runs):
+        before, colour = (f"{run.name}: ", place) if len(runs) > 1 else ("", None)
+        reports = _reports(run.summary.path / PROGRESS)
+        try:
+            episodes = read_episodes(run.summary.path / EPISODES)
+        except (ValueError, OSError) as error:
+            episodes = np.empty((0, 4))
+            notes.append(page.note(f"No curve of {run.name}'s training episodes: {error}"))
+        if len(episodes):
+            steps, values = episodes[:, 1], episodes[:, 2]
+            stride = max(1, len(steps) // _DOTS)
+            if len(runs) == 1:
+                dots = steps[::stride], values[::stride]
+                returns.append(Curve("training episodes", *dots, reference=False, style="dots", colour=5))
+            sums = np.cumsum(np.concatenate([[0.0], values]))
+            ends = np.arange(1, len(values) + 1)
+            starts = np.maximum(0, ends - WINDOW)
+            means = (sums[ends] - sums[starts]) / (ends - starts)
+            returns.append(
+                Curve(f"{before}mean of {WINDOW} episodes", steps, means, colour=0 if colour is None else colour)
+            )
+        steps = reports.get("steps", np.empty(0))
+        for column, label, into, own in (
+            ("evaluation_return", "evaluations", evaluations, 1),
+            ("torque_error", "torque error", errors, 4),
+        ):
+            good = np.isfinite(reports.get(column, np.empty(0)))
+            if good.any():
+                values = reports[column][good]
+                curve = Curve(
+                    before + label,
+                    steps[good],
+                    values,
+                    colour=own if colour is None else colour,
+                    dashed=colour is not None,
+                )
+                into.append(curve)
+    found = []
+    if returns or evaluations:
+        found.append(Plot("Return while learning", "environment steps", "return", (*returns, *evaluations)))
+    if any(np.any(curve.y) for curve in errors):
+        title = "Torque asked for less torque delivered, rms"
+        found.append(Plot(title, "environment steps", "torque error [N·m]", tuple(errors)))
+    if not found and not notes:
+        notes.append(page.note("No learning curve yet: no training episode has ended."))
+    return page.joined((*notes, page.plots(found)))
+
+
+def _reports(path: Path) -> dict[str, np.ndarray]:
+    """The columns of a training's progress, whole rows only; empty where it cannot be read."""
+    import csv
+
+    try:
+        with path.open(newline="") as file:
+            rows = [row for row in csv.DictReader(file) if None not in row and None not in row.values()]
+        return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]} if rows else {}
+    except (OSError, ValueError, csv.Error):
+        return {}
+
+
+def _evaluation(runs: Sequence[_Run]) -> Markup:
+    """Measures with their intervals."""
+    known = [run for run in runs if run.summary.evaluation is not None]
+    notes = [
+        page.note(f"{run.name} has no evaluation: its last policy is evaluated when the training ends.")
+        for run in runs
+        if run.summary.evaluation is None
+    ]
+    if not known:
+        return page.joined(notes)
+    every = [dict(run.summary.evaluation or {}) for run in known]
+    rows = []
+    for name, field in MEASURES.items():
+        values = [one.get(name) for one in every]
+        if any(value is not None for value in values):
+            unit = field.metadata["unit"].replace("*", "·").replace("degC", "°C")
+            rows.append((field.metadata["label"], *map(_value, values), unit))
+    count = " and ".join(dict.fromkeys(str(one.get("episodes")) for one in every))
+    caption = f"Last policy, {count} episodes; 95 % intervals in brackets"
+    names = [run.name if len(known) > 1 else "value" for run in known]
+    table = page.table(caption, ("measure", *names, "unit"), rows, numbers=range(1, 1 + len(known)))
+    curves = []
+    for place, (run, one) in enumerate(zip(known, every, strict=True)):
+        returns = np.sort(np.array(one.get("episode_returns") or [], dtype=float))
+        if len(returns) > 1:
+            share = 100.0 * (np.arange(len(returns)) + 0.5) / len(returns)
+            curves.append(Curve(run.name if len(known) > 1 else "episodes", share, returns, colour=place, style="dots"))
+    title = "Returns of the evaluation's episodes, in order"
+    beside = page.plots([Plot(title, "share of episodes below [%]", "return", tuple(curves))] if curves else [])
+    parts = [Markup('<div class="beside">{}{}</div>').format(table, beside)]
+    for run, one in zip(known, every, strict=True):
+        parts.append(_motors(run.name, one.get("motors")))
+    return page.joined((*notes, *parts))
+
+
+def _motors(name: str, motors: Any) -> Markup:
+    """What each of several motors did."""
+    if not isinstance(motors, Mapping) or not motors:
+        return Markup()
+    measures = list(dict.fromkeys(measure for one in motors.values() for measure in one))
+    rows = []
+    for measure in measures:
+        values = [one.get(measure) for one in motors.values()]
+        if any(value is not None for value in values) and measure in MEASURES:
+            about = MEASURES[measure].metadata
+            rows.append((about["label"], *map(_value, values), about["unit"].replace("*", "·").replace("degC", "°C")))
+    columns = ("measure", *motors, "unit")
+    table = page.table(f"{name}: motor by motor", columns, rows, numbers=range(1, 1 + len(motors)))
+    return page.folded(f"{name}: motor by motor", table)
+
+
+def _episodes(
+    runs: Sequence[_Run], shown: Sequence[Shown], joined: Callable[[Sequence[Shown]], Sequence[Markup]]
+) -> Markup:
+    notes = [page.note(f"No episode of {run.name}: {run.problem}", bad=True) for run in runs if run.shown is None]
+    return page.joined((*notes, episode_section(shown, joined(shown)) if shown else ""))
+
+
+def _loop(runs: Sequence[_Run]) -> Markup:
+    """The loops of the drives, and steps of other actuators; each different one once."""
+    drives: dict[str, Drive] = {}
+    others: dict[str, ActuatorModel] = {}
+    torques: dict[str, float] = {}
+    timestep = math.nan
+    for run in runs:
+        for motor, actuator in run.actuators.items():
+            alone = len(run.actuators) == 1
+            name = (
+                (motor if len(runs) == 1 else run.name) if alone else f"{run.name}, {motor}" if len(runs) > 1 else motor
+            )
+            name = "motor" if name in (".*", "motor") else name
+            if isinstance(actuator, Drive):
+                same = [one for one in drives.values() if _loop_of(one) == _loop_of(actuator)]
+                if not same and len(drives) < _MOST_LOOPS:
+                    drives[name] = actuator
+            elif not isinstance(actuator, Ideal) and run.shown is not None and actuator not in others.values():
+                episode, timestep = run.shown.episode, run.shown.episode.timestep
+                asked = np.abs(np.asarray(episode.signals["desired_force"], dtype=float)).max() * actuator.arm_radius
+                others[name], torques[name] = actuator, float(0.5 * asked)
+    parts = [loop_section(drives)] if drives else []
+    plot = held_step(others, torques, timestep) if others else None
+    return page.joined((*parts, page.plots([plot] if plot is not None else [])))
+
+
+def _loop_of(drive: Drive) -> Any:
+    return drive.winding, drive.controller, drive.voltage_limit
+
+
+def _certificate(runs: Sequence[Path], given: Path | None) -> Markup:
+    """What the certificate says, if there is one."""
+    places = [path / certificates.JSON_NAME for path in runs]
+    if given is not None:
+        places = [given / certificates.JSON_NAME if given.is_dir() else given]
+    for place in places:
+        if given is None and not place.is_file():
+            continue
+        content = read_json(place, "certificate")
+        try:
+            return certificates.summary(content)
+        except (KeyError, TypeError) as error:
+            return page.note(f"{place} is no certificate: it has no {error}", bad=True)
+    return Markup()
+
+
+def _settings(runs: Sequence[_Run]) -> Markup:
+    """What differs between the runs, and all that they were made with."""
+    parts = []
+    if len(runs) > 1:
+        differing = compare([run.summary for run in runs]).configuration
+        rows = [(name, *map(_setting, values)) for name, values in differing.items()]
+        columns = ("setting", *(run.name for run in runs))
+        parts.append(page.table("What differs between the runs", columns, rows, cards=True))
+    for run in runs:
+        rows = [(name, _setting(value)) for name, value in run.summary.configuration.items()]
+        label = f"All settings of {run.name}"
+        if rows:
+            parts.append(page.folded(label, page.table(label, ("setting", "value"), rows)))
+    return page.joined(parts)
+
+
+def _setting(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)

@@ -1,0 +1,64 @@
+"""viser's server, for this machine alone."""
+
+import contextlib
+import functools
+import http
+import io
+from collections.abc import Iterator
+from typing import Any
+from urllib.parse import urlsplit
+
+import viser
+import websockets.asyncio.server
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+HOST = "127.0.0.1"
+_NAMES = (HOST, "localhost")
+"""As which a browser may ask for it: a page of somebody else's, or a name that was made to lead here, may not."""
+
+
+class LocalServer(viser.ViserServer):
+    """Listens on the loopback interface, answers pages of its own origin, and shares nothing through other hosts."""
+
+    def __init__(self, port: int) -> None:
+        """Begin to listen.
+
+        Args:
+            port: to listen at; where it is taken, the next free one.
+        """
+        with _checked_requests(), contextlib.redirect_stdout(io.StringIO()):  # viser prints a table of addresses
+            super().__init__(host=HOST, port=port, verbose=False)
+
+    def request_share_url(self, verbose: bool = True) -> str | None:  # noqa: ARG002
+        """Refused: a client may ask for a tunnel to viser's host."""
+        return None
+
+
+@contextlib.contextmanager
+def _checked_requests() -> Iterator[None]:
+    """Let servers that begin in the block refuse requests of other origins; viser has no setting for it."""
+    plain = websockets.asyncio.server.serve
+
+    @functools.wraps(plain)
+    def serve(handler: Any, *arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        def checked(connection: Any, request: Request) -> Response | None:
+            if not allowed(request.headers):
+                return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", Headers({"Content-Length": "0"}), b"")
+            return process_request(connection, request)
+
+        return plain(handler, *arguments, process_request=checked, **options)
+
+    websockets.asyncio.server.serve = serve  # type: ignore[assignment,misc]
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = plain  # type: ignore[misc]
+
+
+def allowed(headers: Any) -> bool:
+    """Whether a request comes from this machine's browser for this very server, or from no page at all."""
+    host, origins = headers.get_all("Host"), headers.get_all("Origin")
+    if len(host) != 1 or urlsplit(f"//{host[0]}").hostname not in _NAMES:
+        return False
+    return origins in ([], [f"http://{host[0]}"])

@@ -1,0 +1,271 @@
+"""A simulation under way: steps, pushes, other policies, other settings. No window, and no server."""
+
+import dataclasses
+import math
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+from gymnasium import spaces
+
+from codrl_mj.actuators import actuator_over
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.evaluation import RandomPolicy
+from codrl_mj.view.controls import nested
+
+_FOREVER = 10**9  # environment steps
+_DIVERGED = mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC
+HISTORY = 10.0
+"""What of the signals is remembered [s]."""
+PUSH_DURATION = 0.1
+"""How long a push lasts [s]."""
+
+
+class Zero:
+    """Does nothing."""
+
+    def __init__(self, action: Any) -> None:
+        """Take the action that does nothing."""
+        self._action = action
+
+    def predict(self, observation: np.ndarray, *, deterministic: bool = True) -> tuple[np.ndarray, Any]:  # noqa: ARG002
+        """The same action for each observation."""
+        return np.array([self._action] * len(observation)), None
+
+
+class Session:
+    """An environment, what acts in it, and what it did lately.
+
+    Settings that cannot be simulated, unstable ones among them, are not: `problem` says why, and steps wait until they
+    are set otherwise. So they do after a simulation left the finite numbers, until a reset.
+    """
+
+    def __init__(self, config: Any, policies: Mapping[str, Callable[[], Any]], seed: int = 0) -> None:
+        """Build the environment and start an episode.
+
+        Args:
+            config: its description, an `EnvConfig` or a `ForeignConfig`.
+            policies: by name, made when they are chosen; `random`, and `zero` where an action does nothing, are there
+                besides. The first one acts.
+            seed: of the first episode, and of random actions.
+
+        Raises:
+            ValueError: it cannot be built, or has no MuJoCo model.
+        """
+        self.config = dataclasses.replace(config, max_episode_steps=_FOREVER)
+        self.problem: str | None = None
+        self.again = True
+        """Whether an episode that ended begins anew by itself."""
+        self.signals: deque[tuple[float, np.ndarray]] = deque()
+        """Time [s], and a row of `trace_names` for each motor."""
+        self._seed, self._diverged, self._pushes = seed, False, {}  # type: ignore[var-annotated]
+        self.env = self._made()
+        self.policies = {**policies, "random": self._random}
+        if (action := self._nothing()) is not None:
+            self.policies["zero"] = lambda: Zero(action)
+        self.choose(next(iter(self.policies)))
+        self.reset()
+
+    # -- what is there ---------------------------------------------------------------------------------------
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The model."""
+        return self.env.unwrapped.model
+
+    @property
+    def data(self) -> mujoco.MjData:
+        """The simulation, with the poses of now."""
+        return self.env.unwrapped.data
+
+    @property
+    def patterns(self) -> dict[str, Any]:
+        """The actuators by the motor, or by the pattern of motors, that they drive."""
+        if isinstance(self.config, EnvConfig):
+            return dict(zip(self._recorder.motors, self.config.actuators, strict=True))
+        return dict(self.config.actuators)
+
+    @property
+    def bodies(self) -> list[str]:
+        """Names of the bodies that can be pushed, the last of a chain first."""
+        model = self.model
+        moves = [body for body in range(1, model.nbody) if model.body_weldid[body] and model.body_subtreemass[body] > 0]
+        return [model.body(body).name for body in reversed(moves) if model.body(body).name]
+
+    @property
+    def motors(self) -> tuple[str, ...]:
+        """Names of the motors."""
+        return tuple(self._recorder.motors)
+
+    @property
+    def trace_names(self) -> tuple[str, ...]:
+        """What the columns of a row of `signals` are."""
+        return tuple(self._recorder.trace_names)
+
+    @property
+    def step_duration(self) -> float:
+        """Environment step [s]."""
+        return float(self._recorder.step_duration)
+
+    @property
+    def waits(self) -> bool:
+        """Whether nothing can be simulated at present."""
+        return self.problem is not None
+
+    # -- what can be done ------------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Start another episode."""
+        if self._diverged:
+            self._diverged, self.problem = False, None
+        self.observation, _ = self.env.reset(seed=self._seed)
+        self._seed += 1
+        self.time = self.total = 0.0
+        self.ended = False
+        self.signals.clear()
+        self._pushes.clear()
+        self._posed()
+
+    def choose(self, name: str) -> None:
+        """Let another policy act.
+
+        Raises:
+            FileNotFoundError: its run has none.
+            ValueError: unknown, or it observes or commands something else than this environment has.
+        """
+        policy = self.policies[name]()
+        try:
+            space = self.env.observation_space
+            action, _ = policy.predict(np.zeros((1, *space.shape), space.dtype), deterministic=True)
+            fits = self.env.action_space.contains(np.asarray(action[0], self.env.action_space.dtype))
+        except (ValueError, RuntimeError) as error:
+            raise ValueError(f"policy {name}: does not fit this environment: {error}") from None
+        if not fits:
+            raise ValueError(f"policy {name}: its actions, such as {action[0]}, are none of {self.env.action_space}")
+        self.policy, self.chosen = policy, name
+
+    def push(self, body: str, force: float, axis: int = 0) -> None:
+        """Push a body at its centre of mass for `PUSH_DURATION`.
+
+        Args:
+            body: its name.
+            force: [N].
+            axis: of the world, 0 to 2.
+        """
+        vector = np.zeros(3)
+        vector[axis] = force
+        self._pushes[self.model.body(body).id] = (self.time + PUSH_DURATION, vector)
+
+    def set_actuator(self, pattern: str, path: tuple[str, ...], value: Any) -> None:
+        """Set a field of what drives a motor, or the motors of a pattern; the motion goes on, the motor is at rest."""
+        try:
+            changed = {**self.patterns, pattern: actuator_over(self.patterns[pattern], nested(path, value))}
+        except ValueError as error:
+            self.problem = str(error)
+            return
+        named = list(changed.values()) if isinstance(self.config, EnvConfig) else changed
+        self._rebuild("actuator" if isinstance(self.config, EnvConfig) else "actuators", named)
+
+    def set_disturbance(self, path: tuple[str, ...], value: Any) -> None:
+        """Set a field of the disturbances."""
+        (name,) = path
+        try:
+            changed = dataclasses.replace(self.config.disturbances, **{name: value})
+        except ValueError as error:
+            self.problem = str(error)
+            return
+        self._rebuild("disturbances", changed)
+
+    def step(self) -> bool:
+        """Advance by one environment step, if it can be simulated.
+
+        Returns:
+            Whether it was.
+        """
+        if self.waits:
+            return False
+        if self.ended and self.again:
+            self.reset()
+        data = self.data
+        data.xfrc_applied[:] = 0.0
+        for body, (end, force) in list(self._pushes.items()):
+            data.xfrc_applied[body, :3] = force
+            if self.time + 1e-9 >= end:
+                del self._pushes[body]
+                data.xfrc_applied[body] = 0.0
+        action, _ = self.policy.predict(np.asarray(self.observation)[np.newaxis], deterministic=True)
+        try:
+            self.observation, reward, terminated, truncated, _ = self.env.step(action[0])
+            if self._bad() or not np.isfinite(np.asarray(self.observation)).all():
+                raise ArithmeticError("the simulation left the finite numbers")
+        except ArithmeticError as error:
+            self.problem, self._diverged = f"{error}; reset, and set what drives it otherwise", True
+            return False
+        self._remember()
+        self.total += float(reward)
+        self.ended = bool(terminated or truncated)
+        self._posed()
+        return True
+
+    # -- within ----------------------------------------------------------------------------------------------
+
+    def _made(self) -> Any:
+        env: Any = self.config.make()
+        if getattr(env.unwrapped, "model", None) is None:
+            raise ValueError(f"{self.config.task} has no MuJoCo model to be shown")
+        self._recorder: Any = env.get_wrapper_attr("recorder")
+        return env
+
+    def _rebuild(self, field: str, value: Any) -> None:
+        """Go on in an environment with another setting, or say why that cannot be."""
+        positions, speeds = self.data.qpos.copy(), self.data.qvel.copy()
+        self.config = dataclasses.replace(self.config, **{field: value})
+        old = self.env, self._recorder
+        try:
+            self.env = self._made()
+            self.env.reset(seed=self._seed)
+        except ValueError as error:
+            self.env, self._recorder = old
+            self.problem = str(error)
+            return
+        old[0].close()
+        if not self._diverged:
+            self.data.qpos[:], self.data.qvel[:] = positions, speeds
+            mujoco.mj_forward(self.model, self.data)
+        self.problem, self._diverged = None, False
+
+    def _posed(self) -> None:
+        """Bring the poses up to date: a step leaves those of its beginning."""
+        physics = getattr(self.env.unwrapped, "physics", None)
+        if physics is None:
+            mujoco.mj_kinematics(self.model, self.data)
+        else:
+            physics.show(physics.state)
+
+    def _bad(self) -> bool:
+        """Whether MuJoCo found numbers that are none, and began anew by itself."""
+        return any(self.data.warning[kind].number for kind in _DIVERGED)
+
+    def _remember(self) -> None:
+        rows = self._recorder.trace()
+        for row in rows:
+            self.time += self.step_duration / len(rows)
+            self.signals.append((self.time, row.copy()))
+        while self.signals and self.signals[0][0] < self.time - HISTORY:
+            self.signals.popleft()
+
+    def _random(self) -> Any:
+        return RandomPolicy(self.env.action_space, self._seed)
+
+    def _nothing(self) -> Any:
+        """The action that does nothing; None if there is none."""
+        space, setup = self.env.action_space, getattr(self.env.unwrapped, "setup", None)
+        if isinstance(space, spaces.Box):
+            return np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)
+        if isinstance(space, spaces.Discrete) and setup is not None:
+            forces = {action: np.abs(setup.commands.force(action)).max() for action in range(int(space.n))}
+            least = min(forces, key=lambda action: forces[action])
+            return least if math.isclose(forces[least], 0.0, abs_tol=1e-12) else None
+        return None

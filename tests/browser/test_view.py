@@ -1,0 +1,98 @@
+"""The live view in Chromium."""
+
+import threading
+
+import pytest
+
+from codrl_mj.foreign.config import environment_from
+from codrl_mj.view.browser import Browser
+from codrl_mj.view.session import Session
+
+pytestmark = pytest.mark.browser
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """A pole on a motor, simulated in a thread of its own as in a terminal."""
+    config = environment_from({"task": "InvertedPendulum-v5", "actuators": {".*": "maxon-re65"}})
+    made = Browser(Session(config, {}), 0, "pole", lambda _: {})
+    ended = threading.Event()
+    thread = threading.Thread(target=lambda: made.run(ended.is_set))
+    thread.start()
+    yield made
+    ended.set()
+    thread.join()
+    made.close()
+
+
+def field(page, label):
+    """The input beside a label."""
+    return page.locator(f"xpath=//label[text()='{label}']/following::input[not(@type='hidden')][1]")
+
+
+def shown(browser, page):
+    page.wait_for_selector("text=real time", timeout=60_000)
+
+
+def test_it_simulates_in_real_time_and_is_paused_stepped_and_reset(browser, opened):
+    page = opened(browser.url)
+    shown(browser, page)
+    page.wait_for_timeout(2500)
+    assert browser._real == pytest.approx(1.0, abs=0.2)
+    page.get_by_role("button", name="Play or pause").click()
+    page.wait_for_selector("text=paused")
+    time = browser.session.time
+    page.get_by_role("button", name="Step").click()
+    page.wait_for_timeout(500)
+    assert browser.session.time == pytest.approx(time + browser.session.step_duration)
+    page.get_by_role("button", name="Reset").click()
+    page.wait_for_selector("text=0.00 s")
+    page.get_by_role("button", name="Play or pause").click()
+    page.wait_for_selector("text=plays")
+
+
+def test_a_push_moves_the_pole(browser, opened):
+    page = opened(browser.url)
+    shown(browser, page)
+    pushed = []
+    plain = browser.session.push
+    browser.session.push = lambda *given: pushed.append(given) or plain(*given)
+    page.get_by_role("button", name="Push forth").click()
+    page.wait_for_timeout(500)
+    del browser.session.push
+    ((body, force, axis),) = pushed
+    assert (body, axis) == ("pole", 0)
+    assert force > 0
+
+
+def test_settings_change_the_simulation_and_unstable_ones_are_said(browser, opened):
+    page = opened(browser.url)
+    shown(browser, page)
+    page.get_by_text("controller", exact=True).click()
+    page.get_by_text("more", exact=True).nth(1).click()
+    gain = page.get_by_label("kp [V/A]")
+    gain.fill("1000000")
+    gain.press("Enter")
+    page.wait_for_selector("text=/unstable: spectral radius/")
+    time = browser.session.time
+    page.wait_for_timeout(500)
+    assert browser.session.time == time
+    gain.fill("0")
+    gain.press("Enter")
+    page.wait_for_timeout(500)
+    assert browser.session.time != time
+    page.get_by_text("supply", exact=True).click()
+    voltage = field(page, "voltage [V]")
+    voltage.fill("7")
+    voltage.press("Enter")
+    page.wait_for_timeout(1500)
+    assert browser.session.patterns[".*"].supply.voltage == pytest.approx(7.0)
+
+
+def test_another_policy_acts(browser, opened):
+    page = opened(browser.url)
+    shown(browser, page)
+    page.get_by_label("policy").click()
+    page.get_by_role("option", name="zero").click()
+    page.wait_for_timeout(500)
+    assert browser.session.chosen == "zero"

@@ -1,0 +1,40 @@
+"""A motor's page: the numbers of its datasheet with their sources, and its loop."""
+
+import re
+
+import numpy as np
+
+from codrl_mj.cli import main
+from codrl_mj.motor_design import abilities, find_drive
+from codrl_mj.pages.loop import limits, no_load_speed
+from codrl_mj.pages.motor import torque_speed
+from tests.pages.parsed import check_alone
+
+
+def test_the_command_writes_a_page_with_every_number(tmp_path, capsys):
+    out = tmp_path / "motor.html"
+    assert main(["motor", "show", "quanser-qube-servo-2", "--html", str(out)]) == 0
+    assert f"wrote {out}" in capsys.readouterr().out
+    parsed = check_alone(out.read_text())
+    for word in ("8.4", "resistance", "gain margin", "Quanser", "Bode: gain"):
+        assert word in parsed.text
+    assert {"abilities", "loop", "numbers", "drive"} <= set(parsed.ids)
+
+
+def test_the_diagram_goes_through_stall_and_no_load():
+    drive = find_drive("maxon-ec45-flat-50w", gear_ratio=12.0)
+    can, plot = abilities(drive), torque_speed(drive)
+    highest = next(curve for curve in plot.curves if re.match("voltage.*highest", curve.label))
+    assert abs(np.interp(can.no_load_speed, highest.x, highest.y)) < 1e-3 * can.stall_torque
+    assert highest.y.max() > can.stall_torque  # braking
+    assert highest.y[highest.x > 0.0].max() < can.stall_torque
+
+
+def test_limits_before_friction_end_at_the_no_load_speed():
+    """kT*(V - kE*w)/R is 0 at V/kE."""
+    drive = find_drive("quanser-qube-servo-2", max_current=float("inf"))
+    low, high = limits(drive, np.array([0.0, no_load_speed(drive)]))
+    motor = drive.motor
+    assert high[0] == np.float64(motor.torque_constant * drive.voltage_limit / motor.resistance)
+    assert abs(high[1]) < 1e-12
+    assert low[0] == -high[0]

@@ -1,0 +1,163 @@
+"""A run's report: it has what a run has, says what it lacks, and stays small."""
+
+import base64
+import dataclasses
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from codrl_mj.cli import main
+from codrl_mj.evaluation import RandomPolicy, run_episodes
+from codrl_mj.foreign.config import ForeignConfig
+from codrl_mj.pages import episode as episodes
+from codrl_mj.pages.episode import Shown, episode_section, show
+from codrl_mj.pages.report import report
+from codrl_mj.physics.offscreen import RenderingUnavailableError
+from codrl_mj.runs.policies import load_policy
+from codrl_mj.training import load_config
+from tests.pages.parsed import Parsed, check_alone
+
+RUNS = Path(__file__).parents[1] / "fixtures" / "earlier"
+
+
+def no_film(*_, **__):
+    raise RenderingUnavailableError("cannot make an OpenGL context: none here")
+
+
+@pytest.fixture(scope="module")
+def text(tmp_path_factory):
+    """The report of a finished run, by the command."""
+    out = tmp_path_factory.mktemp("report") / "report.html"
+    assert main(["report", str(RUNS / "pendulum"), "--out", str(out)]) == 0
+    return out.read_text()
+
+
+def curves(text, title):
+    """Labels and arrays of a plot's curves."""
+    (found,) = (data for data in check_alone(text).data if data["title"] == title)
+    arrays = [np.frombuffer(base64.b64decode(one), "<f4") for one in found["arrays"]]
+    return {one["label"]: (arrays[one["x"]], arrays[one["y"]]) for one in found["curves"]}
+
+
+def test_a_report_is_one_small_file_with_every_section(text):
+    parsed = check_alone(text)
+    assert {"learning", "evaluation", "episode", "loop", "settings"} <= set(parsed.ids)
+    assert len(text) < 5_000_000
+    assert "seed 0" in parsed.text
+    video = re.search(r'src="data:video/mp4;base64,([^"]+)"', text)[1]
+    assert base64.b64decode(video[:64])[4:8] == b"ftyp"
+
+
+def test_the_plots_show_the_episode_that_the_film_shows(text):
+    """The oracle: the same episode, run anew."""
+    run = RUNS / "pendulum"
+    (episode,) = run_episodes(load_policy(run), load_config(run).evaluation_env.make, 1, 0)
+    drawn = curves(text, "Torque at the shaft")
+    arm = episode.actuator.arm_radius
+    np.testing.assert_allclose(drawn["actual"][1][:-1], episode.trace["actual_force"] * arm, rtol=1e-6)
+    steps = np.repeat(episode.signals["desired_force"], episode.inner_steps) * arm
+    np.testing.assert_allclose(drawn["desired"][1][:-1], steps, rtol=1e-6)
+    error = curves(text, "Error: desired less actual")["desired less actual"][1][:-1]
+    np.testing.assert_allclose(error, steps - episode.trace["actual_force"] * arm, atol=1e-6)
+    reward = curves(text, "Reward of each step")["reward"]
+    np.testing.assert_allclose(reward[1][:-1], episode.reward, rtol=1e-6)
+    assert reward[0][-1] == pytest.approx(episode.time[-1])
+    current, voltage = (episode.trace[name] for name in ("current", "voltage"))
+    power = curves(text, "Power and losses")
+    np.testing.assert_allclose(power["electrical"][1][:-1], current * voltage, rtol=1e-5, atol=1e-9)
+    (transport,) = re.findall(r'type="range" min="0" max="([^"]+)"', text)
+    assert float(transport) == pytest.approx(episode.time[-1])
+
+
+def test_without_opengl_there_is_no_film_and_everything_else(tmp_path, monkeypatch):
+    monkeypatch.setattr(episodes, "scene_film", no_film)
+    text = report([RUNS / "pendulum"], tmp_path / "r.html").read_text()
+    parsed = check_alone(text)
+    assert "No film of pendulum: RenderingUnavailableError: cannot make an OpenGL context" in parsed.text
+    assert "<video" not in text
+    assert len(parsed.data) > 8
+
+
+def test_an_unfinished_run_says_so_and_shows_what_there_is(tmp_path):
+    run = tmp_path / "a<b> & run"
+    shutil.copytree(RUNS / "pendulum", run)
+    for name in ("result.json", "evaluation.json", "policy.json", "policy.safetensors"):
+        (run / name).unlink()
+    parsed = check_alone(report([run], tmp_path / "r.html").read_text())
+    assert "The training is not finished" in parsed.text
+    assert "No episode of a<b> & run: the run has no policy yet" in parsed.text
+    assert "a<b> & run has no evaluation" in parsed.text
+    assert "Return while learning" in parsed.text
+
+
+def test_a_damaged_run_says_what_is_damaged(tmp_path):
+    shutil.copytree(RUNS / "cartpole", tmp_path / "run")
+    (tmp_path / "run" / "evaluation.json").write_text("{")
+    content = json.loads((tmp_path / "run" / "config.json").read_text())
+    content["train"]["agent"]["learning_rate"] = "nonsense"
+    (tmp_path / "run" / "config.json").write_text(json.dumps(content))
+    parsed = check_alone(report([tmp_path / "run"], tmp_path / "r.html").read_text())
+    assert "The run folder is damaged" in parsed.text
+    assert "evaluation.json is not a policy evaluation: it is truncated" in parsed.text
+    assert "No episode of run" in parsed.text
+
+
+def test_several_runs_stand_side_by_side(tmp_path, monkeypatch):
+    monkeypatch.setattr(episodes, "scene_film", no_film)
+    shutil.copytree(RUNS / "pendulum", tmp_path / "other")
+    certificate = {"verdict": "passed", "subject": "pendulum", "made": "then", "quick": True,
+                   "checks": [{"group": "motor", "passed": True}]}  # fmt: skip
+    (tmp_path / "other" / "certificate.json").write_text(json.dumps(certificate))
+    text = report([RUNS / "pendulum", tmp_path / "other"], tmp_path / "r.html").read_text()
+    parsed = check_alone(text)
+    assert {"pendulum: actual", "other: actual"} <= curves(text, "Torque at the shaft").keys()
+    assert text.count('name="show-run"') == 2
+    assert "passed: 1 of 1 checks" in parsed.text
+    assert "What differs between the runs" in parsed.text
+
+
+def motors_of(section):
+    """Labels and tags of the curves of torque."""
+    torque = next(data for data in Parsed(section).data if data["title"] == "Torque at the shaft")
+    return [(one["label"], one["tags"][1]) for one in torque["curves"]]
+
+
+def test_several_motors_can_be_chosen():
+    env = load_config(RUNS / "pendulum").evaluation_env
+    (one,) = run_episodes(load_policy(RUNS / "pendulum"), env.make, 1, 0)
+    arrays = {
+        field: {name: np.stack([values, 2.0 * values], axis=1) for name, values in getattr(one, field).items()}
+        for field in ("trace", "signals")
+    }
+    two = dataclasses.replace(one, **arrays, actuator=(one.actuator,) * 2, motors=("left", "right"))
+    section = str(episode_section([Shown("arm", env, two, None, "none was asked for")]))
+    expected = [
+        (f"{side}: {what}", f"motor:{place}") for place, side in enumerate(two.motors) for what in ("actual", "desired")
+    ]
+    assert motors_of(section) == expected
+    assert section.count('name="show-motor"') == 2
+    assert "No film of arm: none was asked for" in Parsed(section).text
+
+
+@pytest.mark.matrix
+def test_motors_of_somebody_elses_robot_are_filmed():
+    env = ForeignConfig("Reacher-v5", {"joint0": "maxon-ec45-flat-50w", "joint1": "quanser-qube-servo-2"})
+    shown = show("reacher", env, RandomPolicy(env.make().action_space), 0)
+    assert shown.problem is None
+    assert shown.film.rate == pytest.approx(1.0 / shown.episode.time[0])
+    section = str(episode_section([shown]))
+    assert [tag for _, tag in motors_of(section)] == ["motor:0", "motor:0", "motor:1", "motor:1"]
+    assert "State: target x, target y" in Parsed(section).text
+
+
+def test_bad_input_is_refused_before_anything_is_run(tmp_path):
+    with pytest.raises(ValueError, match="runs: none was given"):
+        report([], tmp_path / "r.html")
+    with pytest.raises(ValueError, match=r"must be \.html"):
+        report([RUNS / "pendulum"], tmp_path / "r.pdf")
+    with pytest.raises(FileNotFoundError, match="no run at"):
+        report([tmp_path], tmp_path / "r.html")

@@ -1,0 +1,165 @@
+"""A session does what MuJoCo does, and what cannot be simulated is not."""
+
+import dataclasses
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from codrl_mj.cli import main
+from codrl_mj.foreign.config import environment_from
+from codrl_mj.view.controls import controls, nested
+from codrl_mj.view.session import PUSH_DURATION, Session
+
+POLE, MOTOR = "InvertedPendulum-v5", "maxon-re65"
+
+
+def session(motor=MOTOR, policies=(), **arguments):
+    made = Session(environment_from({"task": POLE, "actuators": {".*": motor}, **arguments}), dict(policies))
+    made.choose("zero")
+    made.again = False
+    return made
+
+
+@pytest.fixture(scope="module")
+def motorised():
+    return session()
+
+
+def test_a_push_is_a_force_at_the_bodys_centre_of_mass():
+    made = session("ideal")
+    model, data = made.model, mujoco.MjData(made.model)
+    data.qpos[:], data.qvel[:] = made.data.qpos, made.data.qvel
+    made.push("pole", 3.0)
+    lasts = int(np.ceil(PUSH_DURATION / model.opt.timestep / 2)) * 2  # whole environment steps of two integration steps
+    for step in range(10):
+        assert made.step()
+        for inner in range(2):
+            data.xfrc_applied[model.body("pole").id, 0] = 3.0 if 2 * step + inner < lasts else 0.0
+            mujoco.mj_step(model, data)
+    assert abs(data.qvel).max() > 0.1
+    np.testing.assert_array_equal(made.data.qpos, data.qpos)
+
+
+def test_signals_are_those_of_every_integration_step(motorised):
+    motorised.reset()
+    for _ in range(5):
+        motorised.step()
+    times = [when for when, _ in motorised.signals]
+    np.testing.assert_allclose(times, 0.02 * np.arange(1, 11), atol=1e-12)
+    assert motorised.signals[-1][1].shape == (1, len(motorised.trace_names))
+    assert motorised.time == pytest.approx(0.2)
+
+
+def test_a_setting_goes_into_the_simulation_and_the_motion_goes_on(motorised):
+    motorised.reset()
+    motorised.step()
+    before = motorised.data.qpos.copy(), motorised.data.qvel.copy()
+    motorised.set_actuator(".*", ("supply", "voltage"), 7.0)
+    assert not motorised.waits
+    np.testing.assert_array_equal((motorised.data.qpos, motorised.data.qvel), before)
+    motorised.choose("random")
+    voltages = []
+    for _ in range(20):
+        motorised.step()
+    voltages = [row[0, motorised.trace_names.index("voltage")] for _, row in motorised.signals]
+    assert np.abs(voltages).max() == pytest.approx(7.0)
+    motorised.choose("zero")
+    motorised.set_disturbance(("command_delay",), 0.04)
+    assert motorised.env.get_wrapper_attr("spec") is not None
+    assert motorised.config.disturbances.command_delay == 0.04
+
+
+def test_what_is_unstable_is_said_and_not_simulated(motorised):
+    motorised.reset()
+    motorised.set_actuator(".*", ("controller", "kp"), 1e6)
+    assert "unstable: spectral radius" in motorised.problem
+    state = motorised.data.qpos.copy()
+    assert not motorised.step()
+    np.testing.assert_array_equal(motorised.data.qpos, state)
+    motorised.set_actuator(".*", ("motor", "resistance"), -1.0)
+    assert "resistance = -1.0: must be" in motorised.problem
+    motorised.set_actuator(".*", ("controller", "kp"), 0.0)
+    assert motorised.problem is None
+    assert motorised.step()
+
+
+def test_a_simulation_that_left_the_numbers_waits_for_a_reset():
+    made = session("ideal")
+    made.data.qvel[:] = np.nan
+    assert not made.step()
+    assert made.waits
+    made.set_disturbance(("command_delay",), 0.04)
+    made.reset()
+    assert not made.waits
+    assert made.step()
+    assert np.isfinite(made.data.qpos).all()
+
+
+def test_a_policy_for_another_environment_is_refused(motorised):
+    class Wide:
+        def predict(self, observation, **_):
+            return np.zeros((len(observation), 5)), None
+
+    motorised.policies["wide"] = Wide
+    with pytest.raises(ValueError, match="policy wide: its actions"):
+        motorised.choose("wide")
+    assert motorised.chosen == "zero"
+
+
+def test_controls_are_the_fields_with_their_bounds_and_units(motorised):
+    actuator = motorised.patterns[".*"]
+    found = {one.path: one for one in controls(actuator, 48.0)}
+    resistance = found["motor", "resistance"]
+    assert resistance.unit == "ohm"
+    assert resistance.value == actuator.motor.resistance
+    assert 0 < resistance.low < resistance.value < resistance.high
+    assert found["motor", "gear_efficiency"].high == 1.0  # its bound, not four times its value
+    assert found["controller", "anti_windup"].options == ("back_calculation", "clamping", "none")
+    assert found["controller", "delayed"].value is False
+    for path, one in found.items():
+        if one.low is not None and one.high is not None:  # both ends can be set
+            for end in (one.low, one.high):
+                part = getattr(actuator, path[0]) if len(path) > 1 else actuator
+                (field,) = [each for each in dataclasses.fields(part) if each.name == path[-1]]
+                holds, *_ = field.metadata["bound"]
+                assert holds(type(one.value)(one.parsed(end))), path
+
+
+def test_an_endless_voltage_ends_at_the_end_of_its_slider():
+    from codrl_mj import Actuator
+
+    (voltage,) = [one for one in controls(Actuator(), 48.0) if one.path == ("supply", "voltage")]
+    assert voltage.high == 48.0
+    assert voltage.parsed(48.0) == np.inf
+    assert voltage.parsed(12.0) == 12.0
+    assert ("supply", "voltage") not in [one.path for one in controls(Actuator())]
+    assert nested(("supply", "voltage"), 12.0) == {"supply": {"voltage": 12.0}}
+
+
+def test_the_command_line_offers_the_runs_policy_and_those_of_others(monkeypatch):
+    seen = {}
+
+    class Fake:
+        url = "http://127.0.0.1:0"
+
+        def __init__(self, session, _port, title, _docs):
+            seen.update(session=session, title=title)
+
+        def run(self):
+            assert seen["session"].step()
+
+        def close(self):
+            seen["closed"] = True
+
+    monkeypatch.setattr("codrl_mj.cli.view._browser", lambda: Fake)
+    run = Path(__file__).parents[1] / "fixtures" / "earlier" / "cartpole"
+    assert main(["view", str(run), "--policies", str(run), "--actuator", "weaker"]) == 0
+    made = seen["session"]
+    assert list(made.policies) == ["last", "cartpole", "random"]  # none of its actions does nothing
+    assert made.chosen == "last"
+    made.choose("cartpole")
+    assert made.step()
+    assert seen["title"] == "cartpole on weaker"
+    assert seen["closed"]
