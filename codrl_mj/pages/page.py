@@ -241,6 +241,12 @@ def clocked(label: str, fragment: str, script: str) -> Markup:
     return Markup(_parts().clocked(label, Markup(fragment), Markup(script)))
 
 
+def replay(what: Any, label: str, first: bool) -> Markup:
+    """A `codrl_mj.replay.Replay` on the page's clock; the first of a page brings the library along."""
+    library = Markup("<script>{}</script>").format(Markup(what.library)) if first else Markup()
+    return library + Markup("<figure>{}</figure>").format(clocked(label, what.fragment, what.script))
+
+
 def number(value: Any, digits: int = 4) -> str:
     """A number as text; a dash where there is none."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
