@@ -21,7 +21,15 @@ PAGES = {
     for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
     if "results" not in path.parts
 }
-ELSEWHERE = {"README.md", "docs/own_robot.md", "docs/training.md", "docs/other_agents.md", "docs/randomization.md"}
+TUTORIAL = "docs/tutorial_log_to_policy.md"
+ELSEWHERE = {
+    "README.md",
+    "docs/own_robot.md",
+    "docs/training.md",
+    "docs/other_agents.md",
+    "docs/randomization.md",
+    TUTORIAL,
+}
 """Pages whose Python has tests of its own, which look at what comes out."""
 SHORT = {
     "80_000": "500",
@@ -35,6 +43,7 @@ LONG = {f"docs/{name}.md" for name in ("actuators", "foreign", "identify", "moto
 COMMANDS = [
     pytest.param(name, command.replace("\\\n", ""), marks=pytest.mark.matrix if name != "README.md" else [])
     for name, text in PAGES.items()
+    if name != TUTORIAL
     for command in re.findall(r"^(?:\$ )?codrl-mj ((?:.*\\\n)*.*)$", text, re.MULTILINE)
     if not re.search(r"\b(?:NAME|LOG|RUN)\b", command)  # a form, not an example
 ]

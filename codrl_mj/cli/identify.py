@@ -58,14 +58,16 @@ class Identify:
         from codrl_mj.identify.reading import read_log
 
         logs, held_out = ([read_log(path, self.columns) for path in paths] for paths in (self.logs, self.holdout))
-        base = self._base()
+        known, base = _numbers(self.known), self._base()
+        if base is not None and "gear_ratio" in known:
+            base = base.replaced({"motor.gear_ratio": known["gear_ratio"]})
         self._check([*logs, *held_out], base)
         with progress_bar("{task.completed}/{task.total}") as bar:
             row = bar.add_task("identifying", total=None)
             found = identify(
                 logs,
                 self.rig,
-                _numbers(self.known),
+                known,
                 self.friction,
                 held_out,
                 self.estimate,

@@ -169,26 +169,31 @@ def voltage_balance(log: Log, duration: float = 0.0, sag: bool = False) -> Balan
     return regress(windows.mean_held("voltage"), voltage_terms(log, windows, sag)) if len(windows) else None
 
 
-def torque_terms(log: Log, windows: Windows) -> dict[str, np.ndarray] | None:
+def torque_terms(log: Log, windows: Windows, aside: bool = False) -> dict[str, np.ndarray] | None:
     """The terms of `torque_balance`; None without a motion."""
     speed, acceleration = speed_terms(log, windows), speed_terms(log, windows, 1)
     if speed is None or acceleration is None:
         return None
     one = windows.mean(np.ones(len(log.time)))
     terms = {"inertia": acceleration, "viscous": speed, "coulomb": np.sign(speed) * one, "constant": one}
-    return terms | ({"gravity": windows.mean(np.sin(log.signals["position"]))} if log.has("position") else {})
+    if log.has("position"):
+        terms["gravity"] = windows.mean(np.sin(log.signals["position"]))
+        if aside:
+            terms["gravity_aside"] = windows.mean(np.cos(log.signals["position"]))
+    return terms
 
 
-def torque_balance(log: Log, effort: str = "torque", duration: float = 0.3) -> Balance | None:
+def torque_balance(log: Log, effort: str = "torque", duration: float = 0.3, aside: bool = False) -> Balance | None:
     """Fits `inertia`*alpha + `gravity`*sin(q) + `viscous`*omega + `coulomb`*sign(omega) + `constant` to the effort.
 
     Args:
-        log: with the effort and a position or a velocity; gravity only with a position.
+        log: with the effort and a position or a velocity; gravity, and `gravity_aside`*cos(q), only with a position.
         effort: `torque`, `current` or `voltage`.
         duration: of a window [s].
+        aside: whether to regress on cos(q) too.
     """
     windows = Windows(log, duration)
-    terms = torque_terms(log, windows) if len(windows) else None
+    terms = torque_terms(log, windows, aside) if len(windows) else None
     if terms is None:
         return None
     return regress(windows.mean_held(effort) if effort == "voltage" else windows.mean(effort), terms)

@@ -22,13 +22,9 @@ def twos_complement(values: Any, bits: Any) -> Any:
     return (np.asarray(values) + whole / 2.0) % whole - whole / 2.0
 
 
-def _unwrap(values: Any, period: Any) -> Any:
-    return np.unwrap(values, period=float(period))
-
-
 FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
     "twos_complement": (2, twos_complement),
-    "unwrap": (2, _unwrap),
+    "unwrap": (2, lambda values, period: np.unwrap(values, period=float(period))),
     "abs": (1, np.abs),
     "sign": (1, np.sign),
     "sqrt": (1, np.sqrt),

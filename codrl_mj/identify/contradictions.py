@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.identify.balances import Balance, Windows, torque_balance, voltage_balance
+from codrl_mj.identify.balances import Balance, torque_balance, voltage_balance
 from codrl_mj.identify.lags import current_lag, motion_lag, velocity_lag
 from codrl_mj.identify.log import Finding, Log, find_resolution
+from codrl_mj.identify.segments import moves
 
 FACTORS = {
     "degrees and radians are confused": 180.0 / math.pi,
@@ -22,6 +23,7 @@ FACTORS = {
 }
 """What a factor between two numbers that should be equal tells."""
 _CERTAIN = 10.0  # coefficient over its standard error
+_TILTED = 0.03  # rad, by which a pendulum hangs beside position 0
 
 
 def name_of_factor(ratio: float) -> str:
@@ -41,31 +43,21 @@ def contradictions(log: Log, motor: Any = None) -> list[Finding]:
         motor: what its datasheet says, a `GearMotor`; None: nothing is known.
     """
     found: list[Finding] = [*_degrees(log)]
-    moves = _moves(log)
-    if log.has("position", "velocity") and moves:
+    turns = moves(log)
+    if log.has("position", "velocity") and turns:
         found += _velocity(log)
     electrical = voltage_balance(log) if log.has("voltage", "current") else None
     if log.has("voltage", "current"):
         found += [*_electrical(electrical), *_delay(log), *_sag(log, electrical)]
-    if not moves and (log.has("position") or log.has("velocity")):
+    if not turns and (log.has("position") or log.has("velocity")):
         text = "the shaft stands still, as if it were locked"
         found.append(Finding("info", "excitation", None, text, "leave position and velocity out if it is"))
     effort = next((name for name in ("torque", "current", "voltage") if log.has(name)), None)
-    if moves and effort is not None:
+    if turns and effort is not None:
         found += [*_mechanical(log, effort), *_motion(log)]
     if electrical is not None:
         found += [*_two_constants(log, electrical), *_datasheet(electrical, motor)]
     return found
-
-
-def _moves(log: Log) -> bool:
-    """Whether the shaft moves by more than noise and quantisation."""
-    if log.has("position"):
-        return float(np.ptp(log.signals["position"])) > max(10.0 * log.resolution.get("position", 0.0), 1e-4)
-    windows = Windows(log, 0.05, 1000)
-    if not log.has("velocity") or not len(windows):
-        return False
-    return float(np.std(windows.mean("velocity"))) > 0.3 * float(np.std(log.signals["velocity"]))
 
 
 def _degrees(log: Log) -> Iterator[Finding]:
@@ -165,17 +157,15 @@ def _mechanical(log: Log, effort: str) -> Iterator[Finding]:
     balance = torque_balance(log, effort) or quick
     if balance is None:
         return
-    values, certain = balance.values, balance.certainty
+    certain = balance.certainty
     both = [one.certainty.get("inertia", 0.0) for one in (balance, quick) if one is not None]
     heavy, hangs = max(both, key=abs), certain.get("gravity", 0.0)
     if heavy < -_CERTAIN or (hangs < -_CERTAIN and heavy < -3.0):
         text = f"the {effort} accelerates the wrong way: the inertia would be negative, by {-heavy:.0f} standard errors"
         remedy = f"give the {effort}, or position and velocity, a minus"
         yield Finding("error", "sign", None, text, remedy)
-    elif hangs < -_CERTAIN and abs(values["gravity"]) > 2.0 * balance.residual:
-        text = f"gravity pushes away from position 0 (m*g*l would be {values['gravity']:.3g}): 0 is at the top"
-        remedy = "write position=column-3.14159:rad, so that it hangs at 0; or the sign of the position is wrong"
-        yield Finding("warning", "sign", None, text, remedy)
+    elif log.has("position"):
+        yield from _zero(torque_balance(log, effort, aside=True), effort)
     large = 0.08 * float(np.std(log.signals[effort]))  # else it is what fast changes leave of rounding
     if effort == "torque" and balance.unexplained > 0.25 and balance.residual > large:
         text = f"the motion leaves {balance.unexplained:.0%} of the torque unexplained (mean over 0.3 s)"
@@ -184,6 +174,20 @@ def _mechanical(log: Log, effort: str) -> Iterator[Finding]:
             text += f"; {lag.unexplained:.0%} if the motion came {1e3 * lag.lag:.3g} ms later"
         remedy = "something else moves it, or the columns are not of one time: trust this log less than others"
         yield Finding("warning", "torque", None, text, remedy)
+
+
+def _zero(balance: Balance | None, effort: str) -> Iterator[Finding]:
+    """Where a pendulum hangs; beside 0 that is not told of a voltage, of which friction and back-EMF leave little."""
+    names = "gravity", "gravity_aside"
+    if balance is None or max(abs(balance.certainty.get(name, 0.0)) for name in names) < _CERTAIN:
+        return
+    along, aside = (balance.values.get(name, 0.0) for name in names)
+    zero, pull = math.atan2(-aside, along), math.hypot(along, aside)
+    if pull > 2.0 * balance.residual and abs(zero) > (2.5 if effort == "voltage" else _TILTED):
+        where = ", as if 0 were at the top" if abs(zero) > 2.5 else ""
+        text = f"gravity pulls towards position {zero:.3g} rad and not 0 (m*g*l about {pull:.3g}){where}"
+        remedy = f"write position=column{-zero:+.4g}:rad, so that it hangs at 0; or its sign is wrong"
+        yield Finding("warning", "zero", None, text, remedy)
 
 
 def _motion(log: Log) -> Iterator[Finding]:

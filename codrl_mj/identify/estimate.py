@@ -6,50 +6,52 @@ handful of unknowns however many segments there are.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
-from typing import Protocol
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 
+from codrl_mj.identify.parameters import DEFAULTS, PARAMETERS
 from codrl_mj.identify.segments import Segment
 
 DIFFERENCE = 1e-4
 """Step of finite differences, in the parameters' scales: dry friction makes smaller ones rough."""
-TOLERANCE = 1e-6
 FAR = 1e30
 SCREENING = 12
 """Evaluations from each start; the two that get farthest go on."""
-
-
 Simulate = Callable[[Segment, np.ndarray], np.ndarray]
 
 
-class Model(Protocol):
-    """What is fitted."""
+@dataclasses.dataclass(frozen=True, eq=False)
+class Model:
+    """What is fitted; `at` is a subclass's."""
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Free parameters."""
+    names: tuple[str, ...]
+    """Free parameters."""
+    known: Mapping[str, float]
+    """Values of the others."""
+    scales: np.ndarray
+    """What a change of each is measured by, > 0, shape (p,)."""
+    steps: ClassVar[np.ndarray]
+    """Steps of finite differences of the state, shape (s,)."""
 
     @property
     def lower(self) -> np.ndarray:
-        """Their least values, shape (p,)."""
+        """Least values, shape (p,)."""
+        return np.array([PARAMETERS[name].least for name in self.names])
 
     @property
     def upper(self) -> np.ndarray:
-        """Their largest values, shape (p,)."""
+        """Largest values, shape (p,)."""
+        return np.array([PARAMETERS[name].most for name in self.names])
 
-    @property
-    def scales(self) -> np.ndarray:
-        """What a change of each is measured by, > 0, shape (p,)."""
-
-    @property
-    def steps(self) -> np.ndarray:
-        """Steps of finite differences of the state, shape (s,)."""
+    def all_values(self, values: np.ndarray) -> dict[str, float]:
+        """Free and known parameters by name."""
+        return {**DEFAULTS, **self.known, **dict(zip(self.names, map(float, values), strict=True))}
 
     def at(self, values: np.ndarray) -> Simulate:
         """(segment, state at its beginning) -> what the sensor would have seen, shape (m,), for parameters (p,)."""
-        ...
+        raise NotImplementedError
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -200,8 +202,8 @@ def _minimise(problem: _Problem, start: np.ndarray, most: int) -> np.ndarray:
         loss="soft_l1",
         f_scale=problem.scale,
         max_nfev=most,
-        xtol=TOLERANCE,
-        ftol=TOLERANCE,
+        xtol=1e-6,
+        ftol=1e-6,
         gtol=1e-10,
     )
     return np.asarray(found.x)
@@ -264,16 +266,9 @@ def _refined(
     else:
         problem.reconsider(values)
     values = _minimise(problem, values, most)
-    return _fit_at(model, segments, values, problem.known, robust_scale(problem.residuals(values)))
-
-
-def _fit_at(
-    model: Model, segments: Sequence[Segment], values: np.ndarray, states: Sequence[np.ndarray], scale: float
-) -> Fit:
-    problem = _Problem(model, segments, scale)
-    problem.known = list(states)
+    problem.scale = robust_scale(problem.residuals(values))
     problem.reconsider(values)
     jacobians = problem.jacobians(values)
-    settled, residuals = problem.solve(values)
-    cost = robust_cost(np.concatenate(residuals), scale)
-    return Fit(model.names, values, cost, scale, tuple(residuals), tuple(jacobians), tuple(settled))
+    at, residuals = problem.solve(values)
+    cost = robust_cost(np.concatenate(residuals), problem.scale)
+    return Fit(model.names, values, cost, problem.scale, tuple(residuals), tuple(jacobians), tuple(at))

@@ -49,48 +49,35 @@ class Excitation:
     def voltage(self, time: np.ndarray) -> np.ndarray:
         """[V], of the shape of time [s]; 0 after the duration."""
         time = np.asarray(time, dtype=float)
-        return self.amplitude * np.where(time < self.duration, KINDS[self.kind][0](self, time), 0.0)
+        return self.amplitude * np.where(time < self.duration, KINDS[self.kind](self, time), 0.0)
 
 
-def slow_sine(excitation: Excitation, time: np.ndarray) -> np.ndarray:
-    """sin(2 pi f t)."""
+def _slow_sine(excitation: Excitation, time: np.ndarray) -> np.ndarray:
     return np.sin(2.0 * math.pi * excitation.frequency * time)
 
 
-def square(excitation: Excitation, time: np.ndarray) -> np.ndarray:
-    """Its sign."""
+def _square(excitation: Excitation, time: np.ndarray) -> np.ndarray:
     return np.where((excitation.frequency * time) % 1.0 < 0.5, 1.0, -1.0)
 
 
-def chirp(excitation: Excitation, time: np.ndarray) -> np.ndarray:
-    """A sine whose frequency grows in proportion to time."""
+def _chirp(excitation: Excitation, time: np.ndarray) -> np.ndarray:
     start, end = excitation.frequency, excitation.highest
     return np.sin(2.0 * math.pi * (start + 0.5 * (end - start) * time / excitation.duration) * time)
-
-
-def prbs(excitation: Excitation, time: np.ndarray) -> np.ndarray:
-    """Half of a PRBS, and half of a slow sine that turns the shaft back and forth."""
-    return 0.5 * _bits(excitation, time) + 0.5 * slow_sine(excitation, time)
-
-
-def locked_prbs(excitation: Excitation, time: np.ndarray) -> np.ndarray:
-    """A PRBS alone."""
-    return _bits(excitation, time)
-
-
-KINDS: dict[str, tuple[Callable[[Excitation, np.ndarray], np.ndarray], str]] = {
-    "slow_sine": (slow_sine, "turns slowly back and forth"),
-    "square": (square, "reverses at once"),
-    "chirp": (chirp, "a sine that becomes faster"),
-    "prbs": (prbs, "random steps on slow turning"),
-    "locked_prbs": (locked_prbs, "random steps, with the shaft held"),
-}
-"""Kind -> function of amplitude 1, what it does."""
 
 
 def _bits(excitation: Excitation, time: np.ndarray) -> np.ndarray:
     bits = _sequence()
     return bits[np.floor(time / excitation.clock + 1e-9).astype(int) % len(bits)]
+
+
+KINDS: dict[str, Callable[[Excitation, np.ndarray], np.ndarray]] = {
+    "slow_sine": _slow_sine,
+    "square": _square,  # reverses at once
+    "chirp": _chirp,  # its frequency grows in proportion to time
+    "prbs": lambda excitation, time: 0.5 * _bits(excitation, time) + 0.5 * _slow_sine(excitation, time),
+    "locked_prbs": _bits,  # with the shaft held
+}
+"""Kind -> function of amplitude 1."""
 
 
 @functools.cache

@@ -16,11 +16,11 @@ LEAST_LOGS = 3
 
 def foretold(stage: Shaft, logs: Sequence[Log], on_step: Callable[[], None]) -> np.ndarray:
     """Mean absolute error on each log of the fit to all others, from that to all, shape (n,)."""
-    segments, model, starts = stage.build(logs, 0)
+    segments, model, starts = stage.build(logs)
     whole, errors = estimate(model, segments, starts[:2])[0].values, []
     for place, log in enumerate(logs):
         others = [other for index, other in enumerate(logs) if index != place]
-        best, _ = estimate(model, stage.build(others, 0)[0], [whole], most=12)
+        best, _ = estimate(model, stage.build(others)[0], [whole], most=12)
         found = predict(model, best.values, log)
         errors.append(found.open_loop if found.closed_loop is None else found.closed_loop)
         on_step()

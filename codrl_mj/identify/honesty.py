@@ -16,8 +16,10 @@ from codrl_mj.identify.segments import Segment
 LEAST_LOGS = 5
 """From so many logs on whole logs are resampled; below, blocks of them."""
 DRAWS = 500
-FLAT = 1e-7
-"""Directions in which the squared residuals change by less than this share of the most do not count as known."""
+FLAT = 1e-12
+"""Of parameters in units in which each alone is known to 1, a direction counts as known to 1e6 at worst."""
+ATTENUATION = 6.0
+"""How much larger than the share of variance that is not explained the bias by errors of the input may be."""
 SLACK = 1e-3
 """Share of the cost that a fit may be better by luck: dry friction has many minima."""
 
@@ -31,12 +33,23 @@ class Spread:
     logs: np.ndarray
     self_test: np.ndarray
     half_rate: np.ndarray
+    unexplained: np.ndarray
 
     @property
     def total(self) -> np.ndarray:
-        """The largest of the first three, and what the rate does, as what is independent adds up; and then the bias."""
+        """The largest of the first three, and what the rate does, as what is independent adds up; then the biases."""
         wide = np.maximum(np.maximum(self.curvature, self.resampling), self.logs)
-        return np.asarray(np.sqrt(wide**2 + self.half_rate**2) + self.self_test)
+        return np.asarray(np.sqrt(wide**2 + self.half_rate**2) + self.self_test + self.unexplained)
+
+
+def unexplained(fit: Fit, segments: Sequence[Segment]) -> float:
+    """Share by which a factor of the input may be off for what is not explained.
+
+    Errors of the input, as of a voltage that changes between the rows, attenuate its factor by a multiple of their
+    share of the variance: 2 to 4.6 of PRBS whose clock is 1 to 4 rows; no fit of fewer rows shows it.
+    """
+    rest = sum(one.deviation**2 * float(fit.weights(i) @ fit.residuals[i] ** 2) for i, one in enumerate(segments))
+    return ATTENUATION * rest / max(sum(float(np.var(one.measured)) * len(one.measured) for one in segments), 1e-300)
 
 
 def _sums(fit: Fit, groups: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -52,8 +65,11 @@ def _sums(fit: Fit, groups: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _inverse(matrix: np.ndarray, scales: np.ndarray) -> np.ndarray:
-    scaled = matrix * np.outer(scales, scales)
-    return np.asarray(np.linalg.pinv(scaled, rcond=FLAT, hermitian=True) * np.outer(scales, scales))
+    """The inverse, large and never 0 along what is not known; none of it is lost beside what is known far better."""
+    known = np.diag(matrix) * scales**2
+    units = scales / np.sqrt(np.maximum(known, 1e-16 * known.max() + 1e-300))
+    values, vectors = np.linalg.eigh(matrix * np.outer(units, units))
+    return np.asarray((vectors / np.maximum(values, FLAT)) @ vectors.T * np.outer(units, units))
 
 
 def resampling(fit: Fit, segments: Sequence[Segment], scales: np.ndarray, seed: int) -> np.ndarray:

@@ -11,11 +11,11 @@ from codrl_mj.fields import check_names
 from codrl_mj.identify import honesty
 from codrl_mj.identify.friction import chosen_friction
 from codrl_mj.identify.log import Log
-from codrl_mj.identify.parameters import DEFAULTS, FRICTION, OF_RIG, PARAMETERS
+from codrl_mj.identify.parameters import DEFAULTS, ESTIMABLE, FRICTION, OF_RIG, PARAMETERS
 from codrl_mj.identify.prediction import Prediction, predict
 from codrl_mj.identify.result import Estimate, Identified, Status
-from codrl_mj.identify.segments import BLOCK, SEGMENT
-from codrl_mj.identify.stages import Fitted, Shaft, Winding, fitted, moves
+from codrl_mj.identify.segments import BLOCK, SEGMENT, moves, shifted
+from codrl_mj.identify.stages import Fitted, Shaft, Winding, fitted
 from codrl_mj.identify.traces import correlations, fitted_traces
 
 WIDEST = 0.3
@@ -29,6 +29,10 @@ NARROWEST_OF = {"inductance": 0.02}
 BIASED = 0.5
 """The self-test fails where it is off by more than this share of the widest interval."""
 STEPS_OF_A_STAGE = 8 + 4
+AT_BOUND = 1e-3
+"""Nearer to a bound, in the parameter's scale, a value is at it."""
+RAREST = 0.05
+"""Rows that are farther apart [s] say too little within the time that is foretold."""
 UNEXPLAINED = 8.0
 """Residuals of more standard deviations of the sensor in the mean are no noise,"""
 UNLIKE = 0.02
@@ -60,14 +64,14 @@ def identify(
         estimated: parameters to fit that are otherwise taken as known, such as `torque_gain`.
         segment: time [s] that the shaft is simulated for at once, >= 0.05: short where it tips over by itself, a second
             or two where it only sticks and slides.
-        base: the mapping of a drive that gives what the logs do not tell.
+        base: the mapping of a drive that gives what the logs do not tell, and the gear where `known` does not.
         on_progress: called with what is being done, steps done and steps in all.
         seed: of the resampling.
 
     Raises:
         ValueError: unknown names, values out of bounds, or logs that tell nothing; the message says what is missing.
     """
-    given = _checked(logs, rig, known or {}, friction, estimated)
+    given = _checked(logs, rig, _with_gear(known or {}, base), friction, estimated)
     if not segment >= 0.05:
         raise ValueError(f"segment = {segment!r}: must be >= 0.05 s; {SEGMENT:g} is the default")
     rig = rig or ("pendulum" if "mgl" in given else "free")
@@ -87,19 +91,18 @@ def identify(
     shaft, driven_by = None, _driven_by(logs)
     if driven_by is not None:
         moving = [log for log in logs if moves(log)]
-        stage = Shaft(
-            rig, "coulomb", driven_by, {**given, **_constant(given, winding, driven_by)}, tuple(estimated), segment
-        )
+        known = {**given, **_constant(given, winding, driven_by, estimated)}
+        stage = Shaft(rig, "coulomb", driven_by, known, tuple(estimated), segment, _output(moving) or "")
         stage = chosen_friction(stage, moving, friction, step("friction"))
         shaft = fitted(stage, moving, step("shaft"))
     estimates, warnings = [], []
     if winding is not None:
-        if shaft is not None and driven_by == "current":
+        if shaft is not None and driven_by != "voltage":
             winding = winding.refitted(Winding(given, shaft))
         estimates += _judged(winding, seed, step("winding"))
         warnings += _warnings(winding)
     if shaft is not None:
-        constant = _constant(given, winding, shaft.stage.driven_by)
+        constant = _constant(given, winding, shaft.stage.driven_by, estimated)
         shaft = shaft.refitted(dataclasses.replace(shaft.stage, known={**shaft.stage.known, **constant}))
         found = _judged(shaft, seed, step("shaft"))
         own = next((one for one in estimates if one.name == "back_emf_constant"), None) if constant else None
@@ -128,7 +131,6 @@ def _checked(
     if not logs:
         raise ValueError("logs: none was given; give one or more")
     check_names(known, PARAMETERS, "parameter", "known.")
-    check_names(estimated, PARAMETERS, "parameter", "estimated.")
     if rig is not None:
         check_names([rig], OF_RIG, "rig")
     check_names([friction], ("auto", "coulomb", "stribeck", "load", "both"), "friction")
@@ -145,11 +147,35 @@ def _checked(
             f"logs tell nothing ({have}): give voltage and current for the winding, or torque, current or voltage with "
             "a position or velocity that moves for the shaft"
         )
+    twice = sorted({*known} & {*estimated})
+    if twice:
+        raise ValueError(f"{', '.join(twice)}: both known and estimated, must be one of them; leave the other out")
+    driven_by, moving = _driven_by(logs), [log for log in logs if moves(log)]
+    possible = [name for name, only in ESTIMABLE.items() if only is None or only == driven_by]
+    if driven_by is not None or estimated:
+        check_names(estimated, possible, f"parameter of a shaft under a {driven_by}", "estimated.")
+    if moving and _output(moving) is None:
+        have = "; ".join(f"{log.name}: {'position' if log.has('position') else 'velocity'}" for log in moving)
+        raise ValueError(f"logs tell different things ({have}): give all that move a position, or all a velocity")
+    rare = [log for log in moving if log.step > RAREST]
+    if rare:
+        raise ValueError(
+            f"log {rare[0].name}: a row every {rare[0].step:.3g} s, must be at most {RAREST:g} s; log more often"
+        )
     if rig is None and "mgl" not in known and _driven_by(logs) is not None:
         raise ValueError(
             "rig = None: what the output moves decides what is fitted, and must be said: pendulum, free or load"
         )
     return dict(known)
+
+
+def _with_gear(known: Mapping[str, float], base: Mapping[str, Any] | None) -> dict[str, float]:
+    """What is known, the gear of a motor with one too: otherwise its numbers would be those of the output."""
+    from codrl_mj.actuators import Drive, actuator_from_mapping
+
+    drive = None if base is None else actuator_from_mapping(base)
+    ratio = drive.motor.gear_ratio if isinstance(drive, Drive) else 1.0
+    return {**({} if ratio == 1.0 else {"gear_ratio": ratio}), **known}
 
 
 def _electrical(logs: Sequence[Log]) -> list[Log]:
@@ -159,14 +185,24 @@ def _electrical(logs: Sequence[Log]) -> list[Log]:
 def _driven_by(logs: Sequence[Log]) -> str | None:
     """What drives the shaft: the nearest to it that all logs that move have."""
     moving = [log for log in logs if moves(log)]
-    return next(
-        (name for name in ("torque", "current", "voltage") if moving and all(m.has(name) for m in moving)), None
-    )
+    return _common(moving, "torque", "current", "voltage")
 
 
-def _constant(given: Mapping[str, float], winding: Fitted | None, driven_by: str) -> dict[str, float]:
+def _output(logs: Sequence[Log]) -> str | None:
+    """What a simulation of logs that move is compared with."""
+    return _common(logs, "position", "velocity")
+
+
+def _common(logs: Sequence[Log], *names: str) -> str | None:
+    """The first of these signals that all logs have."""
+    return next((name for name in names if logs and all(log.has(name) for log in logs)), None)
+
+
+def _constant(
+    given: Mapping[str, float], winding: Fitted | None, driven_by: str, estimated: Sequence[str]
+) -> dict[str, float]:
     """The back-EMF constant where it stands for the torque constant, which it is in SI units but for losses."""
-    if driven_by != "current" or "torque_constant" in given:
+    if driven_by != "current" or "torque_constant" in {*given, *estimated}:
         return {}
     if "back_emf_constant" in given:
         return {"torque_constant": given["back_emf_constant"]}
@@ -214,7 +250,8 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
     # an error that goes with a row's time is half as large at the rate of the logs, one with its root more than that
     rate = (2.0 if isinstance(part.stage, Winding) else 1.0) * np.abs(halved - fit.values)
     curved = honesty.curvature(fit, part.segments, scales)
-    spread = honesty.Spread(curved, resampled, logs, np.abs(tested - fit.values), rate)
+    lost = honesty.unexplained(fit, part.segments) if isinstance(part.stage, Winding) else 0.0
+    spread = honesty.Spread(curved, resampled, logs, np.abs(tested - fit.values), rate, lost * np.abs(fit.values))
     directions = part.unknown_directions(scales)
     on_step()
     made = []
@@ -226,15 +263,16 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
         causes = {field: float(getattr(spread, field)[place]) for field in vars(spread)}
         share = half / scales[place]
         own = [direction for direction in directions if name in direction]
-        nothing = name in FRICTION and least <= value <= least + 1e-6 * model.scales[place]
-        at_bound = min(value - least, most - value) <= 1e-6 * model.scales[place]
+        none = most if name == "gear_efficiency" else least
+        nothing = name in FRICTION and abs(value - none) <= AT_BOUND * model.scales[place]
+        at_bound = min(value - least, most - value) <= AT_BOUND * model.scales[place]
         status: Status = "identified"
         why = ""
         if own and (len(own[0]) > 1):
             status, why = "ratio", _text(own[0])
         elif own:
             status, why = "unidentifiable", "the logs are as likely whatever it is"
-        elif at_bound and not (nothing or name == "gear_efficiency"):
+        elif at_bound and not nothing:
             status, why = "refused", f"it ended at its bound, {value:g} {PARAMETERS[name].unit}".strip()
         elif math.isinf(causes["resampling"]):
             status, why = "refused", f"there are no two stretches of {BLOCK:g} s to resample: give a longer log"
@@ -256,7 +294,13 @@ def _weights(part: Fitted) -> dict[str, float]:
         return {}
     model, number = part.model, part.model.all_values(part.fit.values)
     moved = model.moved(part.fit.values)
-    speeds = np.concatenate([_speeds(model, one) for one in part.segments])
+    every = [slice(None, None, max(len(one.times) // 20, 1)) for one in part.segments]
+    speeds = np.concatenate(
+        [
+            one.measured if model.output == "velocity" else np.diff(one.measured[rows]) / np.diff(one.times[rows])
+            for one, rows in zip(part.segments, every, strict=True)
+        ]
+    )
     speed = max(float(np.sqrt(np.mean(speeds**2))), 1e-9) * number["gear_ratio"]
     inputs = np.concatenate([one.inputs for one in part.segments])
     torque = float(np.sqrt(np.mean(inputs**2))) * moved.gain / number["gear_ratio"]
@@ -270,14 +314,6 @@ def _weights(part: Fitted) -> dict[str, float]:
     }
 
 
-def _speeds(model: Any, segment: Any) -> np.ndarray:
-    if model.output == "velocity":
-        return np.asarray(segment.measured)
-    return np.diff(segment.measured[:: max(len(segment.times) // 20, 1)]) / np.diff(
-        segment.times[:: max(len(segment.times) // 20, 1)]
-    )
-
-
 def _text(direction: Mapping[str, float]) -> str:
     moves = ", ".join(f"{name} by {100.0 * share:+.0f} %" for name, share in direction.items())
     return f"changed together nothing is seen of it: {moves} (of friction: of all of it)"
@@ -288,12 +324,11 @@ def _completed(estimates: list[Estimate], given: Mapping[str, float]) -> list[Es
     named = {one.name: one for one in estimates}
     for name, value in given.items():
         named[name] = Estimate(name, value, value, value, "given")
-    if "back_emf_constant" not in named and "torque_constant" in named:
-        one = named["torque_constant"]
-        why = f"taken as the torque constant{': ' + one.why if one.why else ''}"
-        named["back_emf_constant"] = Estimate(
-            "back_emf_constant", one.value, one.low, one.high, one.status, why, one.causes
-        )
+    constants = {"torque_constant": "torque constant", "back_emf_constant": "back-EMF constant"}
+    for name, other in zip(constants, reversed(constants), strict=True):
+        if name not in named and other in named:
+            why = f"taken as the {constants[other]}{': ' + named[other].why if named[other].why else ''}"
+            named[name] = dataclasses.replace(named[other], name=name, why=why)
     ratio = given.get("gear_ratio", DEFAULTS["gear_ratio"])
     if "inertia" in named and "load_inertia" in given and "rotor_inertia" not in given:
         named["rotor_inertia"] = _rotor_inertia(named["inertia"], given["load_inertia"], ratio)
@@ -337,8 +372,8 @@ def _warnings(part: Fitted) -> list[str]:
             for name, text in unlike.items()
         ]
     values = np.array([one.values for one in part.tried])
-    best = min(_cost_of(one) for one in part.tried)
-    near = np.array([_cost_of(one) < 1.1 * best for one in part.tried])
+    costs = np.array([np.mean(np.abs(np.concatenate(one.residuals))) for one in part.tried])
+    near = costs < 1.1 * costs.min()
     apart = np.ptp(values[near], axis=0) / np.maximum(np.abs(part.fit.values), part.model.scales)
     if np.any(apart > 0.2):
         names = ", ".join(name for name, one in zip(part.fit.names, apart, strict=True) if one > 0.2)
@@ -346,13 +381,12 @@ def _warnings(part: Fitted) -> list[str]:
     return found
 
 
-def _cost_of(fit: Any) -> float:
-    return float(np.mean(np.abs(np.concatenate(fit.residuals))))
-
-
 def _predictions(shaft: Fitted | None, logs: Sequence[Log]) -> tuple[Prediction, ...]:
     if shaft is None:
         return ()
+    model, driven_by = shaft.model, shaft.model.driven_by
     return tuple(
-        predict(shaft.model, shaft.fit.values, log, shaft.delay) for log in logs if log.has(shaft.model.driven_by)
+        predict(model, shaft.fit.values, shifted(log, driven_by, shaft.delay))
+        for log in logs
+        if log.has(driven_by, model.output)
     )

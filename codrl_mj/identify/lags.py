@@ -28,13 +28,8 @@ class Lag(NamedTuple):
     """Residual at that shift over what was to be explained, root mean squares."""
 
 
-def velocity_lag(log: Log, longest: float = 0.1) -> Lag | None:
-    """How late the velocity is against the differentiated position; the gain is the velocity's over the position's.
-
-    Args:
-        log: with position and velocity.
-        longest: lag that is looked for [s]; at least 4 rows are.
-    """
+def velocity_lag(log: Log) -> Lag | None:
+    """How late, up to 0.1 s, the velocity is against the differentiated position, and its gain over that."""
     log = _beginning(log)
     windows = Windows(log, max(0.05, 4.0 * log.step), _WINDOWS)
     if not len(windows):
@@ -49,19 +44,14 @@ def velocity_lag(log: Log, longest: float = 0.1) -> Lag | None:
         gain = float(seen @ rate / (rate @ rate))
         return float(np.sqrt(np.mean((seen - gain * rate) ** 2))), gain
 
-    lag = _least(lambda lag: compare(lag)[0], log.step, longest, longest)
+    lag = _least(lambda lag: compare(lag)[0], log.step, 0.1, 0.1)
     (best, gain), (now, _) = compare(lag), compare(0.0)
     scale = abs(gain) * float(np.sqrt(np.mean(rate**2)))
     return Lag(lag, best / max(now, 1e-300), gain, best / max(scale, 1e-300))
 
 
-def current_lag(log: Log, longest: float = 20.0) -> Lag | None:
-    """How late the current is against the voltage, by the voltage balance.
-
-    Args:
-        log: with voltage and current.
-        longest: lag that is looked for, in rows.
-    """
+def current_lag(log: Log) -> Lag | None:
+    """How late, up to 20 rows, the current is against the voltage, by the voltage balance."""
     log = _beginning(log)
     windows = Windows(log, most=_WINDOWS)
     if not len(windows) or not np.any(log.signals["voltage"]):
@@ -75,17 +65,11 @@ def current_lag(log: Log, longest: float = 20.0) -> Lag | None:
             return np.inf, 1.0
         return balance.residual, balance.unexplained
 
-    return _compared(compare, log.step, 3.0 * log.step, longest * log.step)
+    return _compared(compare, log.step, 3.0 * log.step, 20.0 * log.step)
 
 
-def motion_lag(log: Log, effort: str = "torque", longest: float = 0.06) -> Lag | None:
-    """How late the motion is against what causes it, by the torque balance.
-
-    Args:
-        log: with the effort and a position or a velocity.
-        effort: `torque`, `current` or `voltage`.
-        longest: lag that is looked for [s].
-    """
+def motion_lag(log: Log) -> Lag | None:
+    """How late, up to 60 ms, the motion is against the torque that causes it, by the torque balance."""
     log = _beginning(log)
     windows = Windows(log, 0.3, _WINDOWS)
     terms = torque_terms(log, windows) if len(windows) else None
@@ -93,10 +77,10 @@ def motion_lag(log: Log, effort: str = "torque", longest: float = 0.06) -> Lag |
         return None
 
     def compare(lag: float) -> tuple[float, float]:
-        balance = regress(windows.mean_held(effort, lag), terms)
+        balance = regress(windows.mean_held("torque", lag), terms)
         return (np.inf, 1.0) if balance is None else (balance.residual, balance.unexplained)
 
-    return _compared(compare, log.step, longest, longest)
+    return _compared(compare, log.step, 0.06, 0.06)
 
 
 def _compared(compare: Callable[[float], tuple[float, float]], step: float, ahead: float, behind: float) -> Lag | None:

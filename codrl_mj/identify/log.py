@@ -108,19 +108,12 @@ class Log:
         return float(np.median(np.diff(self.time)))
 
 
-def usable(log: Log, longest: float = LONGEST_STEP) -> list[slice]:
+def usable(log: Log) -> list[slice]:
     """The stretches of a log without gaps, through which may be simulated by the time stamps; each of two rows or more.
 
-    Args:
-        log: the log.
-        longest: a longer step, in median steps, is a gap; 1.5 cuts at every dropped row too.
-
-    Raises:
-        ValueError: `longest` is not above 1.
+    What is dropped within one has to be seen by the stamps: its steps differ.
     """
-    if not longest > 1.0:
-        raise ValueError(f"longest = {longest!r}: must be a number of steps > 1, such as {LONGEST_STEP:g}")
-    gaps = np.flatnonzero(np.diff(log.time) > longest * log.step) + 1
+    gaps = np.flatnonzero(np.diff(log.time) > LONGEST_STEP * log.step) + 1
     edges = [0, *map(int, gaps), len(log.time)]
     return [slice(start, end) for start, end in itertools.pairwise(edges) if end - start >= 2]
 

@@ -1,44 +1,23 @@
 """A winding and a shaft as models that the estimator fits, with the starts that regression gives."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 
 from codrl_mj.identify import simulation
-from codrl_mj.identify.estimate import Simulate
+from codrl_mj.identify.differentiation import speeds
+from codrl_mj.identify.estimate import Model, Simulate
 from codrl_mj.identify.parameters import DEFAULTS, ELECTRICAL, FRICTION, OF_FRICTION, OF_RIG, PARAMETERS
 from codrl_mj.identify.segments import Segment
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Model:
-    names: tuple[str, ...]
-    """Free parameters."""
-    known: Mapping[str, float]
-    """Values of the others."""
-    scales: np.ndarray
-    """What a change of each is measured by, shape (p,)."""
-
-    @property
-    def lower(self) -> np.ndarray:
-        """Least values, shape (p,)."""
-        return np.array([PARAMETERS[name].least for name in self.names])
-
-    @property
-    def upper(self) -> np.ndarray:
-        """Largest values, shape (p,)."""
-        return np.array([PARAMETERS[name].most for name in self.names])
-
-    def all_values(self, values: np.ndarray) -> dict[str, float]:
-        """Free and known parameters by name."""
-        return {**DEFAULTS, **self.known, **dict(zip(self.names, map(float, values), strict=True))}
-
-
-class WindingModel(_Model):
+class WindingModel(Model):
     """L di/dt = u - R i - kE n w, exactly over each interval of a held voltage; the speed is its mean there."""
 
-    steps = np.array([1e-3])
+    steps: ClassVar = np.array([1e-3])
 
     def at(self, values: np.ndarray) -> Simulate:
         """Of currents [A]."""
@@ -53,7 +32,7 @@ class WindingModel(_Model):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class ShaftModel(_Model):
+class ShaftModel(Model):
     """Inertia, gravity, load and friction under a torque, a current or a voltage."""
 
     driven_by: str
@@ -61,7 +40,7 @@ class ShaftModel(_Model):
     output: str
     """`position` or `velocity`."""
 
-    steps = np.array([1e-4, 1e-3])
+    steps: ClassVar = np.array([1e-4, 1e-3])
 
     def moved(self, values: np.ndarray) -> simulation.Moved:
         """What a simulation takes."""
@@ -73,20 +52,7 @@ class ShaftModel(_Model):
         if self.driven_by == "voltage":
             gain /= number["resistance"]
             braking = gain * ratio * number.get("back_emf_constant", number["torque_constant"])
-        return simulation.Moved(
-            number["inertia"],
-            number["mgl"],
-            number["constant_torque"],
-            number["coulomb_friction"] * ratio,
-            number["viscous_friction"] * ratio**2,
-            number["gear_efficiency"],
-            number["stribeck_friction"] * ratio,
-            number["stribeck_speed"] / ratio,
-            2.0,
-            0.0,
-            gain,
-            braking,
-        )
+        return simulation.moved(number, gain, braking)
 
     def at(self, values: np.ndarray) -> Simulate:
         """Of positions [rad] or speeds [rad/s]."""
@@ -134,11 +100,7 @@ def _winding_rows(segment: Segment, count: int, ratio: float) -> np.ndarray:
 
 
 def _regressed(
-    columns: np.ndarray,
-    target: np.ndarray,
-    names: Sequence[str],
-    free: Sequence[str],
-    given: Mapping[str, float],
+    columns: np.ndarray, target: np.ndarray, names: Sequence[str], free: Sequence[str], given: Mapping[str, float]
 ) -> np.ndarray:
     """Least squares for the free ones of the columns' factors, the others being given."""
     rest = target - sum(columns[:, place] * given[name] for place, name in enumerate(names) if name not in free)
@@ -265,18 +227,20 @@ def _shaft_regression(
 
     Speeds are positions smoothed over `window` [s].
     """
-    from codrl_mj.identify.differentiation import speeds
+    from scipy.integrate import cumulative_trapezoid
 
+    turned = functools.partial(cumulative_trapezoid, initial=0.0)
     rows, inputs, turning = [], [], []
     for segment in segments:
         times, step = segment.times, float(np.median(np.diff(segment.times)))
-        position = segment.measured if output == "position" else np.zeros(len(times))
-        speed = segment.measured
         if output == "position":
-            speed = speeds(times, position, times, max(window, 5.0 * step))
+            position, speed = segment.measured, speeds(times, segment.measured, times, max(window, 5.0 * step))
+        else:
+            position, speed = segment.state[0] + turned(segment.measured, times), segment.measured
         columns = np.sin(position), np.ones(len(times)), np.sign(speed) * (np.abs(speed) > 0.0), speed, segment.inputs
-        sums = [np.concatenate([[0.0], np.cumsum(0.5 * (one[1:] + one[:-1]) * np.diff(times))]) for one in columns]
-        edges = np.unique(np.searchsorted(times, np.arange(times[0], times[-1] + 1e-9, 2.5 * window)))
+        sums = [turned(one, times) for one in columns]
+        edges = np.searchsorted(times, np.arange(times[0], times[-1] + 1e-9, 2.5 * window))
+        edges = np.unique(np.minimum(edges, len(times) - 1))
         rows.append(np.stack([np.diff(speed[edges]), *(np.diff(one[edges]) for one in sums)], axis=1))
         inputs.append(segment.inputs)
         turning.append(speed)

@@ -60,3 +60,10 @@ DEFAULTS = {
     "stribeck_speed": 1.0,
 }
 """What is taken for parameters that are neither fitted nor known."""
+ESTIMABLE = {
+    **dict.fromkeys([*OF_RIG["pendulum"], *OF_RIG["load"], *OF_FRICTION["both"], "torque_constant"]),
+    "torque_gain": "torque",
+    "back_emf_constant": "voltage",
+    "resistance": "voltage",
+}
+"""What a shaft can tell -> the only input under which it does; None: any."""

@@ -17,8 +17,10 @@ import numpy as np
 
 from codrl_mj.actuators import Drive
 from codrl_mj.fields import check, check_names, real
+from codrl_mj.identify import simulation
 from codrl_mj.identify.excitations import KINDS, Excitation
-from codrl_mj.identify.synthetic import FREE, Course, Load, play, sample_times, turn
+from codrl_mj.identify.parameters import ELECTRICAL
+from codrl_mj.identify.synthetic import FREE, Course, Load, moved, run, sample_times
 from codrl_mj.runs.files import writing
 
 GOALS = {
@@ -76,8 +78,7 @@ class Option(NamedTuple):
     @property
     def worst(self) -> float:
         """The largest error over its goal; infinite where one of the electrical parameters cannot be seen."""
-        needed = ("resistance", "inductance", "back_emf_constant")
-        if any(name not in self.errors for name in needed):
+        if any(name not in self.errors for name in ELECTRICAL):
             return math.inf
         return max(error / GOALS[name] for name, error in self.errors.items())
 
@@ -154,14 +155,15 @@ def _options(
             duration,
             frequency=2.0 if kind == "square" else 0.5,
             highest=min(200.0, 0.5 / constant),
-            clock=max(round(4.0 * constant * rate), 1) / rate if together else 4.0 * constant,
+            # an even number of rows, so that a fit of every second one still has the voltage
+            clock=2 * max(round(2.0 * constant * rate), 1) / rate if together else 4.0 * constant,
         )
         held = dataclasses.replace(load, locked=load.locked or excitation.locked)
         time = sample_times(drive, duration)
         shape = excitation.voltage(np.floor(time * rate + 1e-6) / rate if together else time) / excitation.amplitude
         amplitude = excitation.amplitude
         for _ in range(8):  # the response is nearly in proportion to the voltage
-            course = play(drive, amplitude * shape, held)
+            course = run(drive, amplitude * shape, held)
             peak, rms = float(np.abs(course.current).max()), float(np.sqrt(np.mean(course.current**2)))
             excess = max(peak / limits[0], rms / limits[1])
             if excess <= 1.0:
@@ -177,7 +179,6 @@ def _options(
     return options
 
 
-_ELECTRICAL = ("resistance", "inductance", "back_emf_constant")
 _MECHANICAL = ("inertia", "coulomb_friction", "viscous_friction")
 _STEP = 1e-3  # of a parameter, relative, by which it is changed
 
@@ -194,7 +195,7 @@ def _electrical(drive: Drive, course: Course, told: np.ndarray, rate: float, sen
         found: np.ndarray = lfilter([0.0, gain], [1.0, -decay], voltage - back_emf_constant * middle)
         return found
 
-    given = {name: _value(drive, FREE, name) for name in _ELECTRICAL}
+    given = {name: _value(drive, FREE, name) for name in ELECTRICAL}
     base = current(course.voltage, **given)
     time = _row_times(course, rate, sensing).ravel()
     noise = sensing.current_noise * max(float(np.abs(base).max()), 1e-300)
@@ -205,24 +206,28 @@ def _electrical(drive: Drive, course: Course, told: np.ndarray, rate: float, sen
 
     slopes = [
         _slope(lambda value, name=name: see(current(course.voltage, **{**given, name: value})), given[name])  # type: ignore[misc]
-        for name in _ELECTRICAL
+        for name in ELECTRICAL
     ]
     later = see(np.concatenate([base[:1], base[:-1]])) - see(base)
     wrong = see(current(told, **given)) - see(base)
-    return _errors(_ELECTRICAL, np.column_stack([*slopes, later, np.ones(len(time))]), wrong)
+    return _errors(ELECTRICAL, np.column_stack([*slopes, later, np.ones(len(time))]), wrong)
 
 
 def _mechanical(drive: Drive, course: Course, load: Load, rate: float, sensing: Sensing) -> dict[str, float]:
     """Relative errors by the position; those that the datasheet leaves at 0 are left out."""
-    torque = drive.motor.torque_constant * course.current
+    ratio, shaft = drive.motor.gear_ratio, moved(drive, load)
+    # by the names of a motor, at the rotor
+    fields = {"inertia": ratio**2, "coulomb_friction": ratio, "viscous_friction": ratio**2}
     time = _row_times(course, rate, sensing)
     free = np.linalg.qr(np.column_stack([np.ones(time.shape[1]), np.arange(time.shape[1])]))[0]
     noise = 2.0 * math.pi / sensing.encoder / math.sqrt(12.0)
     names = [name for name in _MECHANICAL if _value(drive, load, name) > 0.0]
+    still = np.zeros(len(course.time))
 
     def see(name: str, value: float) -> np.ndarray:
-        changed, moved = _changed(drive, load, name, value)
-        seen = np.interp(time, course.time, turn(changed, torque, moved)) / noise
+        changed = shaft._replace(**{name.removesuffix("_friction"): value * fields[name]})
+        angle = simulation.moving()(course.time, course.current, still, 0.0, 0.0, changed)[0]
+        seen = np.interp(time, course.time, angle) / noise
         return (seen - seen @ free @ free.T).ravel()
 
     slopes = [_slope(lambda value, name=name: see(name, value), _value(drive, load, name)) for name in names]  # type: ignore[misc]
@@ -273,14 +278,3 @@ def _value(drive: Drive, load: Load, name: str) -> float:
     if name == "inertia":
         return motor.rotor_inertia + load.inertia / motor.gear_ratio**2
     return float(getattr(motor, name))
-
-
-def _changed(drive: Drive, load: Load, name: str, value: float) -> tuple[Drive, Load]:
-    """With another value; the load takes a change of the inertia if it can."""
-    motor = drive.motor
-    if name == "inertia":
-        more = (value - _value(drive, load, name)) * motor.gear_ratio**2
-        if load.inertia + more >= 0.0:
-            return drive, dataclasses.replace(load, inertia=load.inertia + more)
-        return drive.replaced({"motor.rotor_inertia": value}), load
-    return drive.replaced({f"motor.{name}": value}), load

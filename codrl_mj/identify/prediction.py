@@ -33,17 +33,16 @@ class Prediction:
     """What `open_loop` is the error of; in no file."""
 
 
-def predict(model: ShaftModel, values: np.ndarray, log: Log, delay: int = 0) -> Prediction:
+def predict(model: ShaftModel, values: np.ndarray, log: Log) -> Prediction:
     """Errors of a model's simulations of a log.
 
     Args:
         model: the shaft's.
         values: its parameters, shape (p,).
         log: with what drives the shaft.
-        delay: rows by which the input is late.
     """
     simulate, found, pieces = model.at(values), [], []
-    for segment in shaft_segments([log], model.driven_by, delay, HORIZON):
+    for segment in shaft_segments([log], model.driven_by, model.output, HORIZON):
         known = max(int(np.searchsorted(segment.times, segment.times[0] + KNOWN)), 5)
         state = settled_state(model, values, segment.first(known))
         simulated = simulate(segment, state)

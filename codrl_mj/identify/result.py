@@ -55,8 +55,8 @@ class Identified:
     friction: str
     driven_by: str | None
     """What drives the shaft in the fit; None where only the winding was fitted."""
-    delays: Mapping[str, int]
-    """Rows by which the input of `winding` and `shaft` was found late."""
+    delays: Mapping[str, float]
+    """Rows by which the input of `winding` and `shaft` was found late; a voltage of the rows' times by half of one."""
     estimates: tuple[Estimate, ...]
     fitted: tuple[Prediction, ...]
     """Errors on the logs that were fitted."""

@@ -19,8 +19,8 @@ SHAFT_STEP = 5e-4
 """Rows that are nearer [s] are taken together for a shaft, which is slower: their mean input, their first position."""
 SPIKE = 50.0
 """A row is a spike where it sticks out by more than so many times what nine of ten rows do at most."""
-STILL = 3.0
-"""A shaft that moves by less than so many steps of its encoder is locked."""
+STILL = 10.0
+"""A shaft that moves by no more than so many steps of its encoder is locked."""
 
 
 class Segment(NamedTuple):
@@ -53,14 +53,15 @@ class Segment(NamedTuple):
         return self._replace(**{name: getattr(self, name)[:count] for name in several})
 
 
-def delayed(log: Log, name: str, rows: int) -> np.ndarray:
-    """A signal as it was some rows before (or, negative, after), the ends repeated."""
-    values = log.signals[name]
-    return (
-        np.concatenate([np.full(rows, values[0]), values[:-rows]])
-        if rows > 0
-        else (np.concatenate([values[-rows:], np.full(-rows, values[-1])]) if rows < 0 else values)
-    )
+def shifted(log: Log, name: str, rows: float) -> Log:
+    """A log whose signal is as it was some rows before (or, negative, after), the ends repeated; halves lie between."""
+    places, values = np.arange(len(log.time)), log.signals[name]
+    return log if rows == 0 else replaced(log, name, np.interp(places - rows, places, values))
+
+
+def replaced(log: Log, name: str, values: np.ndarray) -> Log:
+    """A log with another signal, shape (n,)."""
+    return dataclasses.replace(log, signals={**log.signals, name: values})
 
 
 def without_spikes(values: np.ndarray) -> np.ndarray:
@@ -90,12 +91,14 @@ def sensor_deviation(log: Log, name: str) -> float:
     return max(noise if noise > step else step / math.sqrt(12.0), 1e-6 * float(np.ptp(values)), 1e-12)
 
 
-def is_locked(log: Log) -> bool:
-    """Whether the shaft stands still throughout."""
+def moves(log: Log) -> bool:
+    """Whether the shaft moves, by more than an encoder flickers or a velocity is noisy; no where neither is logged."""
     if log.has("position"):
-        swing = float(np.ptp(log.signals["position"]))
-        return swing <= STILL * max(log.resolution.get("position", 0.0), 1e-6)
-    return bool(log.has("velocity") and not np.any(log.signals["velocity"]))
+        return float(np.ptp(log.signals["position"])) > max(STILL * log.resolution.get("position", 0.0), 1e-4)
+    if not log.has("velocity"):
+        return False
+    velocity, rows = log.signals["velocity"], max(min(round(0.05 / log.step), len(log.time) // 4), 1)
+    return float(np.std(np.convolve(velocity, np.full(rows, 1.0 / rows), "valid"))) > 0.3 * float(np.std(velocity))
 
 
 def cut(log: Log, longest: float) -> list[slice]:
@@ -110,69 +113,60 @@ def cut(log: Log, longest: float) -> list[slice]:
     return found
 
 
-def mean_speeds(log: Log, rows: slice) -> np.ndarray:
-    """Mean speed [rad/s] from each row to the next, shape (m,), of a log with position or velocity, else 0."""
-    times = log.time[rows]
-    if is_locked(log) or not (log.has("position") or log.has("velocity")):
-        return np.zeros(len(times))
-    if log.has("position"):
-        middles = times + 0.5 * np.diff(times, append=2.0 * times[-1] - times[-2])
-        return speeds(times, log.signals["position"][rows], middles)
-    velocity = log.signals["velocity"][rows]
-    return 0.5 * (velocity + np.append(velocity[1:], velocity[-1]))
-
-
 def turning(log: Log) -> np.ndarray:
-    """Mean speed [rad/s] from each row to the next, shape (n,), by the positions around it."""
+    """Mean speed [rad/s] from each row to the next, shape (n,), by positions around it or velocities; 0 if locked."""
     found = np.zeros(len(log.time))
-    for stretch in usable(log):
-        found[stretch] = mean_speeds(log, stretch)
+    for rows in usable(log) if moves(log) else ():
+        times = log.time[rows]
+        if log.has("position"):
+            middles = times + 0.5 * np.diff(times, append=2.0 * times[-1] - times[-2])
+            found[rows] = speeds(times, log.signals["position"][rows], middles)
+        else:
+            velocity = log.signals["velocity"][rows]
+            found[rows] = 0.5 * (velocity + np.append(velocity[1:], velocity[-1]))
     return found
 
 
-def winding_segments(logs: Sequence[Log], turned: Sequence[np.ndarray], delay: int = 0) -> list[Segment]:
+def winding_segments(logs: Sequence[Log], turned: Sequence[np.ndarray]) -> list[Segment]:
     """Segments of a block each, in which voltage and speed drive the current.
 
     Args:
         logs: each with voltage and current.
         turned: mean speed [rad/s] from each row to the next of each log, shape (n,).
-        delay: rows by which the voltage is late.
     """
     made: list[Segment] = []
     for place, (log, speed) in enumerate(zip(logs, turned, strict=True)):
-        volts = delayed(log, "voltage", delay)
-        deviation = sensor_deviation(log, "current")
+        volts, deviation = log.signals["voltage"], sensor_deviation(log, "current")
         for rows in cut(log, BLOCK):
-            current = log.signals["current"][rows]
-            still = np.zeros(len(current))
-            made.append(
-                Segment(
-                    place, len(made), rows, log.time[rows], volts[rows], still, speed[rows], current, deviation,
-                    current[:1],
-                )
-            )  # fmt: skip
+            times, current = log.time[rows], log.signals["current"][rows]
+            drive = times, volts[rows], np.zeros(len(times)), speed[rows]
+            made.append(Segment(place, len(made), rows, *drive, current, deviation, current[:1]))
     return made
 
 
 def shaft_segments(
-    logs: Sequence[Log], driven_by: str, delay: int = 0, longest: float = SEGMENT, shortest: float = SHAFT_STEP
+    logs: Sequence[Log], driven_by: str, output: str, longest: float = SEGMENT, shortest: float = SHAFT_STEP
 ) -> list[Segment]:
     """Segments in which a torque, a current or a voltage drives the shaft.
 
     Args:
-        logs: each with `driven_by` and a position, or a velocity.
+        logs: each with both of these.
         driven_by: the input. A voltage holds from row to row; what a sensor samples is joined by straight lines.
-        delay: rows by which the input is late.
+        output: `position` or `velocity`.
         longest: [s].
         shortest: step of time [s] below which rows are taken together.
     """
+    from scipy.integrate import cumulative_trapezoid
+
     made: list[Segment] = []
     block = -1
     for place, log in enumerate(logs):
-        given, output = delayed(log, driven_by, delay), output_of(log)
+        given = log.signals[driven_by]
         if driven_by != "voltage":
             given = without_spikes(given)
         measured, deviation = log.signals[output], sensor_deviation(log, output)
+        # without a position a log begins at 0: it turns on from there
+        angle = cumulative_trapezoid(measured, log.time, initial=0.0)
         together = max(int(shortest / log.step * (1.0 + 1e-6)), 1)
         began = -math.inf
         for rows in cut(log, longest):
@@ -185,32 +179,25 @@ def shaft_segments(
             if together > 1:
                 means = drive[:-1] + 0.5 * slopes[:-1] * np.diff(times)
                 edges = np.arange(0, len(times), together)
-                totals = np.diff(np.concatenate([[0.0], np.cumsum(means * np.diff(times))])[edges])
+                totals = np.diff(np.append(0.0, np.cumsum(means * np.diff(times)))[edges])
                 drive = np.append(totals / np.diff(times[edges]), drive[-1])
                 rows = slice(rows.start, rows.start + int(edges[-1]) + 1, together)
                 times, slopes = times[edges], np.zeros(len(edges))
-            made.append(
-                Segment(
-                    place, block, rows, times, drive, slopes, slopes, measured[rows], deviation,
-                    initial_state(log, rows),
-                )
-            )  # fmt: skip
+            state = (
+                initial_state(log, rows)
+                if output == "position"
+                else np.array([angle[rows.start], measured[rows.start]])
+            )
+            made.append(Segment(place, block, rows, times, drive, slopes, slopes, measured[rows], deviation, state))
     return made
 
 
-def output_of(log: Log) -> str:
-    """What a simulation of a shaft is compared with: its position or, without one, its velocity."""
-    return "position" if log.has("position") else "velocity"
-
-
-def initial_state(log: Log, rows: slice, window: float = 0.03) -> np.ndarray:
-    """Position and speed at the first row, from the rows around it: a parabola within half a window, or five rows."""
+def initial_state(log: Log, rows: slice) -> np.ndarray:
+    """Position and speed at the first row, from the rows around it: a parabola within 15 ms, or five rows."""
     time = log.time[rows.start]
-    if not log.has("position"):
-        return np.array([0.0, log.signals["velocity"][rows.start]])
     stretch = next(one for one in usable(log) if one.start <= rows.start < one.stop)
-    first = max(min(int(np.searchsorted(log.time, time - 0.5 * window)), rows.start - 2), stretch.start)
-    last = min(max(int(np.searchsorted(log.time, time + 0.5 * window)), rows.start + 3), stretch.stop)
+    first = max(min(int(np.searchsorted(log.time, time - 0.015)), rows.start - 2), stretch.start)
+    last = min(max(int(np.searchsorted(log.time, time + 0.015)), rows.start + 3), stretch.stop)
     near = slice(first, last)
     degree = min(2, last - first - 1)
     fitted = np.polynomial.polynomial.polyfit(log.time[near] - time, log.signals["position"][near], degree)
@@ -226,5 +213,4 @@ def halved(log: Log) -> Log:
     steps, volts = np.diff(log.time[:count]), log.signals["voltage"][:count]
     energy = volts[:-1] * steps
     mean = (energy[::2] + energy[1::2]) / (steps[::2] + steps[1::2])
-    signals = {**kept.signals, "voltage": np.append(mean, volts[-1])}
-    return dataclasses.replace(kept, signals=signals)
+    return replaced(kept, "voltage", np.append(mean, volts[-1]))

@@ -7,7 +7,7 @@ they mean here.
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,6 +47,25 @@ class Moved(NamedTuple):
     """Torque [N*m] that the motor loses for one [rad/s]: kT*kE/R where the input is a voltage, else 0."""
 
 
+def moved(number: Mapping[str, float], gain: float, braking: float = 0.0) -> Moved:
+    """By parameters as they are called in `PARAMETERS`, those of a motor at its rotor."""
+    ratio = number["gear_ratio"]
+    return Moved(
+        number["inertia"],
+        number["mgl"],
+        number["constant_torque"],
+        number["coulomb_friction"] * ratio,
+        number["viscous_friction"] * ratio**2,
+        number["gear_efficiency"],
+        number["stribeck_friction"] * ratio,
+        number["stribeck_speed"] / ratio,
+        number.get("stribeck_exponent", 2.0),
+        0.0,
+        gain,
+        braking,
+    )
+
+
 @functools.cache
 def winding() -> Callable[..., np.ndarray]:
     """The compiled (times, volts, speeds, current, resistance, inductance, constant) -> currents at the times, (n,)."""
@@ -74,7 +93,7 @@ def winding() -> Callable[..., np.ndarray]:
 
 
 @functools.cache
-def _turned() -> Any:
+def turned() -> Any:
     """The compiled shaft over one interval: (duration, input, slope, position, speed, moved) -> position, speed."""
     import numba
 
@@ -82,12 +101,13 @@ def _turned() -> Any:
     make: Any = shaft.Shaft
 
     @numba.njit(nogil=True, error_model="numpy")
-    def turned(
+    def turn(
         duration: float, given: float, slope: float, position: float, speed: float, moved: Any
     ) -> tuple[float, float]:
-        pieces = math.ceil(duration / LONGEST_SUBSTEP - 1e-6)
+        pieces = max(math.ceil(duration / LONGEST_SUBSTEP - 1e-6), 1)
         step = duration / pieces
         damped = 0.5 * step * (moved.viscous + moved.braking) / moved.inertia
+        inertia = moved.inertia * (1.0 + damped)  # as dry friction finds it, so that it ends where torques balance
         for piece in range(pieces):
             position += 0.5 * step * speed
             driving = moved.gain * (given + slope * (piece + 0.5) * step)
@@ -95,15 +115,14 @@ def _turned() -> Any:
             free = (speed * (1.0 - damped) + step * (driving + others) / moved.inertia) / (1.0 + damped)
             if moved.gear_efficiency < 1.0 or moved.stribeck_friction > 0.0:  # of the torque after back-EMF
                 torque = driving - 0.5 * moved.braking * (speed + free)
-                rest = (free - speed) / step - torque / moved.inertia
-                lost = taken(moved, step, torque, make(moved.inertia, rest, speed))
-                free -= step * lost / moved.inertia
-            most = step * moved.coulomb / moved.inertia
+                rest = (free - speed) / step - torque / inertia
+                free -= step * taken(moved, step, torque, make(inertia, rest, speed)) / inertia
+            most = step * moved.coulomb / inertia
             speed = 0.0 if abs(free) <= most else free - math.copysign(most, free)
             position += 0.5 * step * speed
         return position, speed
 
-    return turned
+    return turn
 
 
 @functools.cache
@@ -115,7 +134,7 @@ def moving() -> Callable[..., tuple[np.ndarray, np.ndarray]]:
     """
     import numba
 
-    turned = _turned()
+    turn = turned()
 
     @numba.njit(nogil=True, error_model="numpy")
     def simulate(
@@ -125,7 +144,7 @@ def moving() -> Callable[..., tuple[np.ndarray, np.ndarray]]:
         positions[0], speeds[0] = position, speed
         for row in range(len(times) - 1):
             duration = times[row + 1] - times[row]
-            position, speed = turned(duration, inputs[row], slopes[row], position, speed, moved)
+            position, speed = turn(duration, inputs[row], slopes[row], position, speed, moved)
             positions[row + 1], speeds[row + 1] = position, speed
         return positions, speeds
 
@@ -140,7 +159,7 @@ def served() -> Callable[..., np.ndarray]:
     """
     import numba
 
-    turned = _turned()
+    turn = turned()
 
     @numba.njit(nogil=True, error_model="numpy")
     def simulate(
@@ -156,7 +175,7 @@ def served() -> Callable[..., np.ndarray]:
         positions[0] = position
         for row in range(len(times) - 1):
             given = min(max(law * (targets[row] - position), -limits[row]), limits[row])
-            position, speed = turned(times[row + 1] - times[row], given, 0.0, position, speed, moved)
+            position, speed = turn(times[row + 1] - times[row], given, 0.0, position, speed, moved)
             positions[row + 1] = position
         return positions
 

@@ -2,48 +2,55 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from codrl_mj.identify import honesty
 from codrl_mj.identify.differentiation import speeds
-from codrl_mj.identify.estimate import Fit, estimate, settled
+from codrl_mj.identify.estimate import Fit, estimate, robust_cost, settled
 from codrl_mj.identify.log import Log
 from codrl_mj.identify.models import ShaftModel, shaft_model, winding_model
 from codrl_mj.identify.segments import (
     SEGMENT,
     Segment,
     halved,
-    is_locked,
-    output_of,
+    moves,
+    replaced,
     shaft_segments,
+    shifted,
     turning,
-    usable,
     winding_segments,
 )
 
 DELAYS = (-1, 1, 2, 3)
-"""Rows that the input is tried to be late by, besides 0."""
+"""Rows that the input is tried to be late by, besides 0;"""
+LONGEST = 20
+"""and on to so many, while that is better."""
 UNKNOWN = 0.5
 """A direction in which the parameters may go by so much of themselves, unnoticed, is not identified."""
 PART = 0.1
 """Share of such a direction from which a parameter belongs to it."""
 BETTER = 0.8
-"""A delay is believed where it takes the robust cost to less than this share."""
+"""A delay is believed where it takes the robust cost to less than this share, and"""
+SURE = 3.0
+"""lowers that of the segments by more, in the mean, than so many standard deviations of that mean."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Winding:
     """Voltage and speed drive the current."""
 
+    driven_by: ClassVar = "voltage"
+    output: ClassVar = "current"
+
     known: Mapping[str, float]
     shaft: "Fitted | None" = None
     """The shaft under the current, where it is known: what an encoder does not see of the speed between its rows."""
 
-    def build(self, logs: Sequence[Log], delay: int) -> tuple[list[Segment], Any, list[np.ndarray]]:
+    def build(self, logs: Sequence[Log]) -> tuple[list[Segment], Any, list[np.ndarray]]:
         """Segments, model, starts."""
-        segments = winding_segments(logs, [self._turning(log) for log in logs], delay)
+        segments = winding_segments(logs, [self._turning(log) for log in logs])
         return segments, *winding_model(segments, self.known)
 
     def _turning(self, log: Log) -> np.ndarray:
@@ -52,23 +59,18 @@ class Winding:
         A smoothed speed lags behind a light rotor, and the back-EMF that it misses would be taken for inductance.
         """
         found = turning(log)
-        if self.shaft is None or not moves(log) or not log.has("position", "current"):
-            return found
         part = self.shaft
-        segments = shaft_segments([log], "current", part.delay, part.stage.segment, 0.0)
+        if part is None or not moves(log) or not log.has("position", part.stage.driven_by):
+            return found
+        stage = part.stage
+        late = shifted(log, stage.driven_by, part.delay)
+        segments = shaft_segments([late], stage.driven_by, "position", stage.segment, 0.0)
         for segment, positions in zip(segments, settled(part.model, part.fit.values, segments), strict=True):
             left = log.signals["position"][segment.rows] - positions
             middles = 0.5 * (segment.times[1:] + segment.times[:-1])
             rest = speeds(segment.times, left, middles)
             found[segment.rows][:-1] = np.diff(positions) / np.diff(segment.times) + rest
         return found
-
-    def pretended(
-        self, logs: Sequence[Log], segments: Sequence[Segment], fit: Fit, model: Any, sign: float
-    ) -> list[Log]:
-        """The logs as the fit would have made them: the speeds as they were taken to be, positions rounded anew."""
-        made = _replaced(logs, segments, fit, model, "current", sign)
-        return [_turned(log, segments, place) for place, log in enumerate(made)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,19 +85,14 @@ class Shaft:
     segment: float = SEGMENT
     """Time [s] that is simulated at once."""
 
-    def build(self, logs: Sequence[Log], delay: int) -> tuple[list[Segment], ShaftModel, list[np.ndarray]]:
-        """Segments, model, starts."""
-        segments, output = shaft_segments(logs, self.driven_by, delay, self.segment), output_of(logs[0])
-        model, starts = shaft_model(
-            segments, self.rig, self.friction, self.driven_by, output, self.known, self.estimated
-        )
-        return segments, model, starts
+    output: str = "position"
+    """What is compared: `position` or `velocity`."""
 
-    def pretended(
-        self, logs: Sequence[Log], segments: Sequence[Segment], fit: Fit, model: Any, sign: float
-    ) -> list[Log]:
-        """The logs as the fit would have made them, segment by segment."""
-        return _replaced(logs, segments, fit, model, output_of(logs[0]), sign)
+    def build(self, logs: Sequence[Log]) -> tuple[list[Segment], ShaftModel, list[np.ndarray]]:
+        """Segments, model, starts."""
+        segments = shaft_segments(logs, self.driven_by, self.output, self.segment)
+        friction, driven_by = self.friction, self.driven_by
+        return segments, *shaft_model(segments, self.rig, friction, driven_by, self.output, self.known, self.estimated)
 
 
 Stage = Winding | Shaft
@@ -108,21 +105,22 @@ class Fitted:
     stage: Any
     """A `Winding` or a `Shaft`."""
     logs: tuple[Log, ...]
-    delay: int
+    """With the input in time."""
+    delay: float
+    """Rows by which it was late."""
     segments: tuple[Segment, ...]
     model: Any
     fit: Fit
     tried: tuple[Fit, ...]
     """What each start led to."""
 
-    def again(self, logs: Sequence[Log], delay: int | None = None) -> np.ndarray:
+    def again(self, logs: Sequence[Log]) -> np.ndarray:
         """The parameters that other logs give, from where these ended."""
-        segments, _, _ = self.stage.build(logs, self.delay if delay is None else delay)
-        return estimate(self.model, segments, [self.fit.values], most=20)[0].values
+        return estimate(self.model, self.stage.build(logs)[0], [self.fit.values], most=20)[0].values
 
     def refitted(self, stage: Stage) -> "Fitted":
         """Of the same logs with another stage, from where this ended."""
-        segments, model, _ = stage.build(self.logs, self.delay)
+        segments, model, _ = stage.build(self.logs)
         fit, _ = estimate(model, segments, [self.fit.values])
         return dataclasses.replace(self, stage=stage, segments=tuple(segments), model=model, fit=fit)
 
@@ -148,7 +146,7 @@ class Fitted:
                 step = -step
             moved = np.clip(fit.values + step / own[place] / direction[place] * direction * own, 0.2 * fit.values, None)
             other = here.holding(place, float(fit.values[place] + step), moved)
-            if _cost(other.fit, fit.scale) > fit.cost + honesty.noticed(fit, here.segments):
+            if _costs(other.fit, fit.scale).sum() > fit.cost + honesty.noticed(fit, here.segments):
                 break
             changes = np.insert(
                 (other.fit.values - np.delete(fit.values, place)) / np.delete(own, place), place, step / own[place]
@@ -172,8 +170,8 @@ class Fitted:
         return dataclasses.replace(self, model=model, fit=fit)
 
     def half_rate(self) -> np.ndarray:
-        """The parameters at half the rate, an input being late by half as many rows, rounded."""
-        return self.again([halved(log) for log in self.logs], round(self.delay / 2))
+        """The parameters at half the rate."""
+        return self.again([halved(log) for log in self.logs])
 
     def self_test(self) -> np.ndarray:
         """The parameters found in what the fit would have made of its logs: the mean of two such, of opposed residuals.
@@ -181,15 +179,39 @@ class Fitted:
         Residuals keep their order and size, stretch by stretch with a random sign, so that they belong together as they
         do in the logs; in the mean of a draw and its opposite what they do at random cancels.
         """
-        both = [
-            self.again(self.stage.pretended(self.logs, self.segments, self.fit, self.model, sign))
-            for sign in (1.0, -1.0)
-        ]
-        return np.asarray(0.5 * (both[0] + both[1]))
+        return np.asarray(0.5 * (self.again(self._pretended(1.0)) + self.again(self._pretended(-1.0))))
+
+    def _pretended(self, sign: float) -> list[Log]:
+        """The logs as the fit would have made them, rounded anew; of a winding also what it took for the motion."""
+        fit, simulate = self.fit, self.model.at(self.fit.values)
+        signals = [log.signals[self.stage.output].copy() for log in self.logs]
+        speeds = [np.zeros(len(log.time)) for log in self.logs]
+        signs = np.random.default_rng(1).choice([-1.0, 1.0], len(self.segments)) * sign
+        for place, segment in enumerate(self.segments):
+            # what is far off is an outlier of the logs, and no noise of the sensor
+            noise = np.clip(fit.residuals[place], -3.0 * fit.scale, 3.0 * fit.scale) * segment.deviation
+            signals[segment.log][segment.rows] = simulate(segment, fit.states[place]) + signs[place] * noise
+            speeds[segment.log][segment.rows] = segment.speeds
+        made = []
+        for log, values, speed in zip(self.logs, signals, speeds, strict=True):
+            made.append(_with(log, self.stage.output, values))
+            if isinstance(self.stage, Winding) and log.has("position") and moves(log):
+                turns = np.append(0.0, np.cumsum(speed[:-1] * np.diff(log.time)))
+                made[-1] = _with(made[-1], "position", log.signals["position"][0] + turns)
+        return made
+
+
+def _with(log: Log, name: str, values: np.ndarray) -> Log:
+    """A log with another signal, rounded as its sensor rounds."""
+    step = log.resolution.get(name, 0.0)
+    return replaced(log, name, np.round(values / step) * step if step > 0.0 else values)
 
 
 def fitted(stage: Stage, logs: Sequence[Log], on_step: Callable[[], None] = lambda: None, starts: int = 4) -> Fitted:
     """Fit a stage to logs: several starts, then the delays.
+
+    A voltage whose mean between two rows fits worse than itself is shown to hold from row to row: then it is also the
+    mean, which fewer rows can be given. One that fits better is that of the rows' times, and taken half a row later.
 
     Args:
         stage: what is fitted.
@@ -197,64 +219,45 @@ def fitted(stage: Stage, logs: Sequence[Log], on_step: Callable[[], None] = lamb
         on_step: called after each start and delay.
         starts: how many at most.
     """
-    segments, model, several = stage.build(logs, 0)
+    segments, model, several = stage.build(logs)
+    fit, tried = estimate(model, segments, several[: starts if model.names else 1], on_step)
     if not model.names:
-        fit, tried = estimate(model, segments, several[:1], on_step)
         return Fitted(stage, tuple(logs), 0, tuple(segments), model, fit, tried)
-    fit, tried = estimate(model, segments, several[:starts], on_step)
-    cost, costs = _cost(fit, fit.scale), {}
-    for late in DELAYS:
-        other, _, _ = stage.build(logs, late)
-        costs[late] = _cost(estimate(model, other, [fit.values], on_step, 6)[0], fit.scale)
-    delay = min(costs, key=lambda late: costs[late])
-    if not costs[delay] < BETTER * cost:
-        return Fitted(stage, tuple(logs), 0, tuple(segments), model, fit, tried)
-    segments, model, several = stage.build(logs, delay)
-    fit, tried = estimate(model, segments, [fit.values, several[0]])
-    return Fitted(stage, tuple(logs), delay, tuple(segments), model, fit, tried)
+    costs: dict[float, np.ndarray] = {0: _costs(fit, fit.scale)}
+
+    def late(delay: float) -> list[Log]:
+        return [shifted(log, stage.driven_by, delay) for log in logs]
+
+    def measure(*delays: float) -> float:
+        """Their costs; returns the best delay that is believed."""
+        for one in delays:
+            costs[one] = _costs(estimate(model, stage.build(late(one))[0], [fit.values], on_step, 6)[0], fit.scale)
+        best = min(costs, key=lambda one: costs[one].sum())
+        return best if _better(costs[best], costs[0]) else 0
+
+    delay = measure(*DELAYS)
+    while delay != 0 and delay in (min(costs), max(costs)) and abs(delay) < LONGEST:
+        delay = measure(delay + (1 if delay > 0 else -1))
+    told = late(delay)
+    if isinstance(stage, Winding) and not all(log.mean_voltage for log in logs):
+        whole = costs[delay]
+        measure(delay - 0.5, delay + 0.5)
+        half = min(delay - 0.5, delay + 0.5, key=lambda one: costs[one].sum())
+        delay = half if _better(costs[half], whole) else delay
+        if delay == half or _better(whole, costs[half]):
+            told = [dataclasses.replace(log, mean_voltage=True) for log in late(delay)]
+    if delay != 0:
+        segments, model, several = stage.build(told)
+        fit, tried = estimate(model, segments, [fit.values, several[0]])
+    return Fitted(stage, tuple(told), delay, tuple(segments), model, fit, tried)
 
 
-def _cost(fit: Fit, scale: float) -> float:
-    from codrl_mj.identify.estimate import robust_cost
-
-    return robust_cost(np.concatenate(fit.residuals), scale)
-
-
-def _replaced(
-    logs: Sequence[Log], segments: Sequence[Segment], fit: Fit, model: Any, name: str, sign: float
-) -> list[Log]:
-    signals = [log.signals[name].copy() for log in logs]
-    signs = np.random.default_rng(1).choice([-1.0, 1.0], len(segments)) * sign
-    simulate = model.at(fit.values)
-    for place, segment in enumerate(segments):
-        clean = simulate(segment, fit.states[place])
-        # what is far off is an outlier of the logs, and no noise of the sensor
-        noise = np.clip(fit.residuals[place], -3.0 * fit.scale, 3.0 * fit.scale) * segment.deviation
-        signals[segment.log][segment.rows] = clean + signs[place] * noise
-    return [
-        dataclasses.replace(log, signals={**log.signals, name: _rounded(log, name, values)})
-        for log, values in zip(logs, signals, strict=True)
-    ]
+def _costs(fit: Fit, scale: float) -> np.ndarray:
+    """Robust cost of each segment."""
+    return np.array([robust_cost(residuals, scale) for residuals in fit.residuals])
 
 
-def _rounded(log: Log, name: str, values: np.ndarray) -> np.ndarray:
-    step = log.resolution.get(name, 0.0)
-    return np.round(values / step) * step if step > 0.0 else values
-
-
-def _turned(log: Log, segments: Sequence[Segment], place: int) -> Log:
-    """A log whose positions are the integral of its segments' speeds, rounded as its sensor rounds."""
-    if not log.has("position") or is_locked(log):
-        return log
-    speed = np.zeros(len(log.time))
-    for segment in segments:
-        if segment.log == place:
-            speed[segment.rows] = segment.speeds
-    turns = np.concatenate([[0.0], np.cumsum(speed[:-1] * np.diff(log.time))])
-    moved = _rounded(log, "position", log.signals["position"][0] + turns)
-    return dataclasses.replace(log, signals={**log.signals, "position": moved})
-
-
-def moves(log: Log) -> bool:
-    """Whether it says anything of the shaft."""
-    return (log.has("position") or log.has("velocity")) and not is_locked(log) and bool(usable(log))
+def _better(these: np.ndarray, those: np.ndarray) -> bool:
+    gained = those - these
+    error = gained.std(ddof=1) / np.sqrt(len(gained)) if len(gained) > 1 else 0.0
+    return bool(these.sum() < BETTER * those.sum() and gained.mean() > SURE * error)

@@ -1,7 +1,7 @@
 """Logs that are computed: a drive of ours under a voltage, through sensors and a sampler, with faults to order.
 
 The winding is exact between the drive's samples, at the speed in their middle; the shaft moves half a sample before and
-half a sample after it (Strang's splitting, of second order), under the friction that `codrl_mj.actuators` has.
+half a sample after it (Strang's splitting, of second order).
 """
 
 import dataclasses
@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from codrl_mj.actuators import Drive, parameters_type, shaft
+from codrl_mj.actuators import Drive
 from codrl_mj.fields import check, check_names, real
+from codrl_mj.identify import simulation
 from codrl_mj.identify.excitations import Excitation
 from codrl_mj.identify.log import SIGNALS, Log, find_resolution
 from codrl_mj.runs.files import writing
@@ -113,22 +114,32 @@ class Course(NamedTuple):
     """Of the supply [V]."""
 
 
-def run(drive: Drive, excitation: Excitation, load: Load = FREE, position: float = 0.0) -> Course:
+def run(drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, position: float = 0.0) -> Course:
     """What a drive does under a voltage, from standstill.
 
     A bridge makes the voltage u of a share d = u/V of the supply, which sags by its resistance times d*i.
 
     Args:
         drive: whose motor, supply, sample rate and dead band count; its loop is left out.
-        excitation: the voltage; held over a sample, limited to the supply's.
+        excitation: the voltage, or its values [V] in each of the drive's samples, shape (n + 1,); held over a sample,
+            limited to the supply's.
         load: what it moves; held if the excitation wants that.
         position: of the output at the beginning [rad].
 
     Raises:
         ValueError: the motor moves nothing that has an inertia.
     """
-    commanded = excitation.voltage(sample_times(drive, excitation.duration))
-    return play(drive, commanded, dataclasses.replace(load, locked=load.locked or excitation.locked), position)
+    period, limit, motor = 1.0 / drive.controller.sample_rate, drive.voltage_limit, drive.motor
+    locked = load.locked
+    if isinstance(excitation, Excitation):
+        locked = locked or excitation.locked
+        excitation = excitation.voltage(sample_times(drive, excitation.duration))
+    commanded = np.clip(excitation, -limit, limit)
+    sag = 0.0 if drive.supply is None else drive.supply.resistance
+    shares = np.sign(commanded) * np.maximum(np.abs(commanded) - drive.controller.deadband, 0.0) / limit
+    winding = motor.resistance, motor.inductance, motor.back_emf_constant * motor.gear_ratio
+    states = _compiled()(period, shares, float(limit), float(sag), winding, moved(drive, load), locked, float(position))
+    return Course(period * np.arange(len(shares)), states[:, 0], commanded, *states[:, 1:].T)
 
 
 def sample_times(drive: Drive, duration: float) -> np.ndarray:
@@ -137,70 +148,21 @@ def sample_times(drive: Drive, duration: float) -> np.ndarray:
     return period * np.arange(math.ceil(duration / period - 1e-9) + 1)
 
 
-def play(drive: Drive, commanded: np.ndarray, load: Load = FREE, position: float = 0.0) -> Course:
-    """`run` under any voltages.
-
-    Args:
-        drive: see `run`.
-        commanded: voltage [V] in each of the drive's samples, shape (n + 1,).
-        load: what it moves.
-        position: of the output at the beginning [rad].
+def moved(drive: Drive, load: Load) -> simulation.Moved:
+    """The shaft under the motor's current.
 
     Raises:
-        ValueError: see `run`.
+        ValueError: it has no inertia.
     """
-    period, limit = 1.0 / drive.controller.sample_rate, drive.voltage_limit
-    time, commanded = period * np.arange(len(commanded)), np.clip(commanded, -limit, limit)
     motor = drive.motor
-    sag = 0.0 if drive.supply is None else drive.supply.resistance
-    shares = np.sign(commanded) * np.maximum(np.abs(commanded) - drive.controller.deadband, 0.0) / limit
-    states = _compiled()[0](
-        _parameters(drive),
-        period,
-        shares,
-        float(limit),
-        float(sag),
-        _moved(drive, load),
-        load.locked,
-        float(position * motor.gear_ratio),
-    )
-    voltage, current, speed, angle, bus = states.T
-    return Course(time, voltage, commanded, current, speed / motor.gear_ratio, angle / motor.gear_ratio, bus)
-
-
-def turn(drive: Drive, torque: np.ndarray, load: Load = FREE, position: float = 0.0) -> np.ndarray:
-    """Position of the output [rad] under a torque of the motor, at the drive's samples, shape (n,).
-
-    Args:
-        drive: whose shaft, gear and friction.
-        torque: at the rotor [N*m] in each sample, shape (n,).
-        load: what it moves.
-        position: at the beginning [rad].
-
-    Raises:
-        ValueError: see `run`.
-    """
-    motor, period = drive.motor, 1.0 / drive.controller.sample_rate
-    angle = float(position * motor.gear_ratio)
-    angles = _compiled()[1](_parameters(drive), period, torque, _moved(drive, load), angle)
-    return angles / motor.gear_ratio
-
-
-def _parameters(drive: Drive) -> Any:
-    family: Any = type(drive)
-    return parameters_type(family)(*drive.numbers)
-
-
-def _moved(drive: Drive, load: Load) -> tuple[float, float, float]:
-    """Inertia at the rotor [kg*m^2], gravity and constant torque at the output [N*m]."""
-    motor = drive.motor
-    inertia = motor.rotor_inertia + load.inertia / motor.gear_ratio**2
+    inertia = motor.rotor_inertia * motor.gear_ratio**2 + load.inertia
     if not inertia > 0.0 and not load.locked:
         raise ValueError(
             f"motor.rotor_inertia = {motor.rotor_inertia:g} and load.inertia = {load.inertia:g}: one must be > 0; "
             "give the load its inertia, or lock the shaft"
         )
-    return inertia, load.gravity, load.torque
+    of_load = {"inertia": inertia, "mgl": load.gravity, "constant_torque": load.torque}
+    return simulation.moved({**vars(motor), **of_load}, motor.torque_constant * motor.gear_ratio)
 
 
 def simulate(
@@ -289,67 +251,29 @@ def write_log(path: Path, log: Log) -> str:
 
 
 @functools.cache
-def _compiled() -> tuple[Callable[..., Any], Callable[..., Any]]:
+def _compiled() -> Callable[..., np.ndarray]:
     import numba
-    from numba.extending import register_jitable
 
-    for helper in (shaft.friction, _step_shaft):
-        register_jitable(helper)
-    return numba.njit(_course), numba.njit(_angles)
+    turn = simulation.turned()
 
+    @numba.njit(nogil=True, error_model="numpy")
+    def course(
+        period: float, shares: Any, limit: float, sag: float, winding: Any, moved: Any, locked: bool, position: float
+    ) -> np.ndarray:
+        """Voltage, current, speed and position of the output, and bus voltage, at each sample, shape (n, 5)."""
+        states = np.empty((len(shares), 5))
+        current, speed, (resistance, inductance, constant) = 0.0, 0.0, winding
+        decay = math.exp(-resistance * period / inductance)
+        for row in range(len(shares)):
+            bus = limit - sag * shares[row] * current
+            voltage = shares[row] * bus
+            states[row] = voltage, current, speed, position, bus
+            if not locked:
+                position, speed = turn(0.5 * period, current, 0.0, position, speed, moved)
+            reached = (voltage - constant * speed) / resistance
+            current = reached + (current - reached) * decay
+            if not locked:
+                position, speed = turn(0.5 * period, current, 0.0, position, speed, moved)
+        return states
 
-def _step_shaft(
-    parameters: Any,
-    duration: float,
-    torque: float,
-    moved: Any,
-    speed: float,
-    angle: float,
-) -> tuple[float, float]:
-    """Speed and angle of the rotor after a short time; dry friction at most stops it.
-
-    Args:
-        parameters: the drive's.
-        duration: [s].
-        torque: of the motor, at the rotor [N*m].
-        moved: inertia at the rotor [kg*m^2], gravity and constant torque at the output [N*m].
-        speed: of the rotor [rad/s].
-        angle: of the rotor [rad].
-    """
-    inertia, gravity, against = moved
-    ratio = parameters.gear_ratio
-    others = -(gravity * math.sin(angle / ratio) + against) / (ratio * inertia)
-    torque -= shaft.friction(parameters, duration, torque, shaft.Shaft(inertia, others, speed))
-    free = speed + duration * (torque / inertia + others)
-    slowed = max(abs(free) - duration * parameters.coulomb_friction / inertia, 0.0)
-    after = math.copysign(slowed, free) / (1.0 + duration * parameters.viscous_friction / inertia)
-    return after, angle + 0.5 * duration * (speed + after)
-
-
-def _course(
-    parameters: Any, period: float, shares: Any, limit: float, sag: float, moved: Any, locked: bool, angle: float
-) -> Any:
-    """Voltage, current, speed and angle of the rotor, and bus voltage, at each sample, shape (n, 5)."""
-    states = np.empty((len(shares), 5))
-    current, speed, torque_constant = 0.0, 0.0, parameters.torque_constant
-    decay = math.exp(-parameters.resistance * period / parameters.inductance)
-    for row in range(len(shares)):
-        bus = limit - sag * shares[row] * current
-        voltage = shares[row] * bus
-        states[row] = voltage, current, speed, angle, bus
-        if not locked:
-            speed, angle = _step_shaft(parameters, 0.5 * period, torque_constant * current, moved, speed, angle)
-        reached = (voltage - parameters.back_emf_constant * speed) / parameters.resistance
-        current = reached + (current - reached) * decay
-        if not locked:
-            speed, angle = _step_shaft(parameters, 0.5 * period, torque_constant * current, moved, speed, angle)
-    return states
-
-
-def _angles(parameters: Any, period: float, torques: Any, moved: Any, angle: float) -> Any:
-    """Angle of the rotor [rad] at each sample, shape (n,)."""
-    angles, speed = np.empty(len(torques)), 0.0
-    for row in range(len(torques)):
-        angles[row] = angle
-        speed, angle = _step_shaft(parameters, period, torques[row], moved, speed, angle)
-    return angles
+    return course  # type: ignore[no-any-return]

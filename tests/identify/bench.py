@@ -7,6 +7,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from codrl_mj.identify import Log, read_log
+from codrl_mj.identify.simulation import Moved, moving
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "bench_logs"
 PENDULUM = "time=time:s,position=position:rad,torque=torque:N*m"
@@ -28,7 +29,7 @@ def prbs(time, random, clock=2e-3):
     return bits[(time / clock + 1e-9).astype(int)]
 
 
-def motor_log(kind="prbs", rate=5000, duration=2.0, noise=0.01, step=0.0, seed=0, mean=True):
+def motor_log(kind="prbs", rate=5000, duration=2.0, noise=0.01, step=0.0, seed=0, mean=True, clock=2e-3):
     """A free or locked DC motor with viscous friction under a voltage that changes at 20 kHz; exact: x' = A x + B u.
 
     Args:
@@ -39,10 +40,11 @@ def motor_log(kind="prbs", rate=5000, duration=2.0, noise=0.01, step=0.0, seed=0
         step: of the encoder [rad]; 0: none.
         seed: of the PRBS and the noise.
         mean: whether rows have the mean voltage, or that of their time.
+        clock: of the PRBS [s].
     """
     random = np.random.default_rng(seed)
     time = np.arange(round(duration * LOOP)) / LOOP
-    slow, fast = 3.0 * np.sin(np.pi * time), 3.0 * prbs(time, random)
+    slow, fast = 3.0 * np.sin(np.pi * time), 3.0 * prbs(time, random, clock)
     volts = {"prbs": slow + fast, "sine": 2.0 * slow, "locked": fast}[kind]
     system = np.zeros((4, 4))
     system[0] = [-RESISTANCE / INDUCTANCE, -CONSTANT / INDUCTANCE, 0.0, 1.0 / INDUCTANCE]
@@ -61,6 +63,15 @@ def motor_log(kind="prbs", rate=5000, duration=2.0, noise=0.01, step=0.0, seed=0
     return Log(
         kind, time[::every], {"voltage": told, "current": current, "position": position}, {"position": step}, mean
     )
+
+
+def geared_pendulum(efficiency):
+    """A pendulum of 0.19 kg*m^2 and 3.6 N*m behind a gear of an efficiency, at 2 ms, and an encoder of 3 mrad."""
+    time = np.linspace(0.0, 6.0, 12001)
+    torque = np.sum([1.5 * np.sin(2.0 * np.pi * rate * time + rate) for rate in (0.25, 0.6, 0.95, 1.4)], axis=0)
+    moved = Moved(0.19, 3.6, 0.0, 0.05, 0.01, efficiency, 0.0, 1.0, 2.0, 0.0, 1.0, 0.0)
+    position = np.round(moving()(time, torque, np.zeros(12001), 0.0, 0.0, moved)[0][::4] / 3e-3) * 3e-3
+    return Log("geared", time[::4], {"position": position, "torque": torque[::4]}, {"position": 3e-3})
 
 
 def mujoco_pendulum(seed=0, duration=8.0, coulomb=0.15, viscous=0.01, step=3e-3, every=10, effort="torque"):

@@ -1,12 +1,15 @@
 """Fits of motors that are known, and what cannot be told of them."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from codrl_mj.identify import Log, identify
-from tests.identify import bench
+from codrl_mj.identify import Log, honesty, identify
+from codrl_mj.identify.estimate import Fit
+from codrl_mj.identify.segments import moves, replaced
+from tests.identify import bench, draws
 
 
 def errors(found, **truth):
@@ -57,12 +60,41 @@ def test_a_slow_sine_tells_no_inductance():
     assert "--known inductance" in found.problem()
 
 
-def test_a_late_voltage_is_found_late():
-    log = bench.motor_log("locked", duration=1.5)
-    late = np.append(log.signals["voltage"][2:], [0.0, 0.0])  # the log's voltage comes two rows early
-    found = identify([dataclasses.replace(log, signals={**log.signals, "voltage": late})])
-    assert found.delays["winding"] == 2
+@pytest.mark.parametrize("rows", [1, 6])
+def test_a_late_voltage_is_found_late(rows):
+    """And half the rate is that of the voltage in time: no cause of doubt."""
+    log = bench.motor_log("locked", duration=2.5)
+    late = np.append(log.signals["voltage"][rows:], np.zeros(rows))  # the log's voltage comes some rows early
+    found = identify([replaced(log, "voltage", late)])
+    assert found.delays["winding"] == rows
+    assert found["inductance"].status == found["resistance"].status == "identified"
     assert abs(found["inductance"].value / bench.INDUCTANCE - 1.0) < 0.02
+    assert found["resistance"].causes["half_rate"] < 1e-3 * bench.RESISTANCE
+
+
+def held_log(rows):
+    """A locked winding under a voltage that holds for some rows of 1 ms, exactly."""
+    random, decay = np.random.default_rng(0), np.exp(-bench.RESISTANCE / bench.INDUCTANCE * 1e-3)
+    volts, current = 3.0 * np.repeat(random.choice([-1.0, 1.0], 3000 // rows), rows), np.zeros(3000)
+    for row in range(2999):
+        current[row + 1] = volts[row] / bench.RESISTANCE * (1.0 - decay) + decay * current[row]
+    current += 0.02 * random.standard_normal(3000)
+    return Log("held", 1e-3 * np.arange(3000), {"voltage": volts, "current": current})
+
+
+def test_a_voltage_that_holds_until_the_next_row_is_its_mean_too():
+    """It changes at every third row, so that of every second row some have two voltages."""
+    found = identify([held_log(3)])
+    assert found.delays["winding"] == 0
+    assert found["resistance"].status == "identified"
+    assert abs(found["resistance"].value / bench.RESISTANCE - 1.0) < 0.005
+
+
+def test_a_voltage_of_the_rows_times_is_found_to_be_half_a_row_late():
+    found = identify([bench.motor_log("locked", duration=2.5, mean=False, clock=1.65e-3)])
+    assert found.delays["winding"] == -0.5
+    truth = {"resistance": bench.RESISTANCE, "inductance": bench.INDUCTANCE}
+    assert all(within(found, **truth).values())
 
 
 def test_outliers_and_dropped_rows_do_no_harm():
@@ -111,6 +143,75 @@ def test_with_a_known_mass_a_torques_gain_is_found(swings):
 
 
 @pytest.mark.matrix
+def test_a_velocity_alone_is_enough():
+    """Of a log that begins where the pendulum hangs; steps of 0.02 rad/s."""
+    log = bench.mujoco_pendulum(1, 6.0, step=1e-9)
+    velocity = np.round(np.gradient(log.signals["position"], log.time) / 0.02) * 0.02
+    found = identify([Log("b", log.time, {"velocity": velocity, "torque": log.signals["torque"]})], "pendulum")
+    assert {one.status for one in found.estimates} == {"identified"}
+    assert all(within(found, **SWUNG).values())
+    assert max(map(abs, errors(found, **SWUNG).values())) < 0.02
+
+
+def test_noise_of_a_velocity_is_no_motion(swings):
+    time, random = swings[0].time, np.random.default_rng(0)
+    assert not moves(Log("held", time, {"velocity": np.round(random.standard_normal(len(time)))}))
+    assert moves(Log("turned", time, {"velocity": np.gradient(swings[0].signals["position"], time)}))
+    assert not moves(Log("nothing", time, {"torque": swings[0].signals["torque"]}))
+
+
+@pytest.mark.matrix
+def test_a_torque_that_is_logged_too_changes_nothing_of_the_winding():
+    log = bench.motor_log(step=2.0 * np.pi / 4096)
+    found = identify([replaced(log, "torque", bench.CONSTANT * log.signals["current"])], "free")
+    assert found["torque_constant"].why == "taken as the back-EMF constant"
+    truth = {name: MOTOR[name] for name in ("resistance", "inductance", "back_emf_constant")}
+    assert all(within(found, **truth).values())
+    assert abs(errors(found, **truth)["inductance"]) < 0.01
+
+
+@pytest.mark.matrix
+def test_a_torque_constant_beside_another_back_emf_constant_is_found_with_a_known_mass():
+    """Of a current of 0.8 times what the torque is, whose voltage says 1: kT is 1.25 and kE 1."""
+    log = bench.mujoco_pendulum(0, 6.0)
+    torque, speed = log.signals["torque"], np.gradient(log.signals["position"], log.time)
+    current = torque / 1.25
+    volts = 2.0 * current + speed + 1e-3 * np.gradient(current, log.time)
+    signals = {"position": log.signals["position"], "current": current, "voltage": volts}
+    driven = Log("b", log.time, signals, log.resolution)
+    found = identify([driven], "pendulum", {"mgl": 3.6}, estimated=["torque_constant"])
+    assert found["torque_constant"].value == pytest.approx(1.25, rel=0.01)
+    assert found["back_emf_constant"].value == pytest.approx(1.0, rel=0.02)
+
+
+@pytest.mark.matrix
+def test_a_gear_that_is_worse_than_its_bound_is_refused():
+    log = bench.geared_pendulum(0.2)
+    assert identify([log], "pendulum", friction="load")["gear_efficiency"].status == "refused"
+
+
+@pytest.mark.parametrize("draw", [5, 6, 9])
+def test_a_resistance_that_a_voltage_changing_within_the_rows_spoils_is_not_believed(draw):
+    """By 3 to 5 %, at 1 kHz of an L/R of 0.3 to 1 ms, which no fit of fewer rows shows."""
+    log, truth = draws.logged(draw, "locked_prbs", 1000.0), draws.motor_of(draw).resistance
+    found = identify([log])["resistance"]
+    assert found.value > 1.02 * truth
+    assert found.low < truth
+
+
+def test_what_is_known_worst_is_not_lost_beside_what_is_known_best():
+    """Two parameters of independent rows, known to 1e-6 and to 0.05: intervals are 1.96 times that."""
+    random, rows = np.random.default_rng(0), 1000
+    jacobian = np.zeros((2 * rows, 2))
+    jacobian[:rows, 0], jacobian[rows:, 1] = 1e6 / np.sqrt(rows), 20.0 / np.sqrt(rows)
+    residuals = random.standard_normal(2 * rows)
+    fit = Fit(("a", "b"), np.ones(2), 0.0, 1e9, (residuals,), (jacobian,), (np.zeros(1),))
+    segment = SimpleNamespace(block=0, log=0)
+    found = honesty.curvature(fit, [segment], np.ones(2))
+    np.testing.assert_allclose(found, [1.96e-6, 1.96 * 0.05], rtol=0.05)
+
+
+@pytest.mark.matrix
 def test_a_voltage_alone_tells_the_constants_only_together(swings):
     """With V = torque and no back-EMF the voltage of a motor with kT = kE = k has k/R = 1 and nothing of k itself."""
     log = swings[0]
@@ -135,6 +236,15 @@ def test_bad_input_says_what_to_do(swings):
         identify([Log("empty", log.time, {"position": log.signals["position"]})], "free")
     with pytest.raises(ValueError, match="none was given"):
         identify([], "free")
+    with pytest.raises(ValueError, match=r"shaft under a torque estimated\.rotor_inertia"):
+        identify([log], "pendulum", estimated=["rotor_inertia"])
+    with pytest.raises(ValueError, match="mgl: both known and estimated"):
+        identify([log], "pendulum", {"mgl": 3.6}, estimated=["mgl"])
+    velocity = Log("b", log.time, {"velocity": log.signals["position"], "torque": log.signals["torque"]})
+    with pytest.raises(ValueError, match=r"different things \(swing0: position; b: velocity\)"):
+        identify([log, velocity], "pendulum")
+    with pytest.raises(ValueError, match=r"a row every 0.1 s, must be at most 0.05 s"):
+        identify([log.part(slice(None, None, 50))], "pendulum")
     with pytest.raises(ValueError, match=r"segment = 0.0: must be >= 0.05"):
         identify([log], "pendulum", segment=0.0)
 

@@ -11,7 +11,9 @@ from codrl_mj.actuators import Drive, identified_ranges, resolve
 from codrl_mj.cli import main
 from codrl_mj.cli.environments import environment
 from codrl_mj.cli.train import train_verb
+from codrl_mj.identify import identify
 from codrl_mj.identify.result import Estimate, Identified
+from codrl_mj.identify.segments import replaced
 from tests.identify import bench
 
 GIVEN = {"inductance": 1e-3, "rotor_inertia": 2e-5}
@@ -66,6 +68,18 @@ def test_what_the_logs_do_not_tell_is_asked_for_or_taken_from_a_motor():
         identified(friction).actuator()
     whole = identified(friction, base=Drive().as_mapping()).actuator()
     assert whole == Drive().replaced({"motor.coulomb_friction": 1e-3})
+
+
+@pytest.mark.parametrize("known", [{}, {"gear_ratio": 20.0}])
+def test_a_motor_with_a_gear_is_identified_at_its_rotor(known):
+    """A log of the output: kE of 1 V*s/rad there is 0.05 at the rotor of a gear of 20; of a wrong gear it is none."""
+    base = Drive().replaced({"motor.gear_ratio": 20.0 if not known else 1.0}).as_mapping()
+    log = bench.motor_log("sine", duration=2.0)
+    log = replaced(log, "position", log.signals["position"] / 20.0)
+    found = identify([log], "free", {**known, "load_inertia": 0.0}, base=base)
+    assert (found["gear_ratio"].value, found["gear_ratio"].status) == (20.0, "given")
+    assert found["back_emf_constant"].value == pytest.approx(bench.CONSTANT, rel=0.01)
+    assert found["rotor_inertia"].value == pytest.approx(bench.INERTIA, rel=0.05)
 
 
 def test_only_files_of_identified_actuators_have_ranges(tmp_path):

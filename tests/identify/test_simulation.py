@@ -66,6 +66,13 @@ def test_a_voltage_brakes_by_its_back_emf():
     assert speeds[-1] == pytest.approx(3.0 * (1.0 - np.exp(-2.5)), rel=1e-6)
 
 
+def test_friction_and_braking_end_where_torques_balance_however_long_the_step():
+    """0.05*6 = 0.1 + (1 + 9)*speed at the end, with a time constant of 20 steps."""
+    times = np.linspace(0.0, 1.0, 1001)
+    moved = STILL._replace(gain=0.05, braking=9.0, viscous=1.0, coulomb=0.1)
+    assert simulate(moved, times, 6.0)[1][-1] == pytest.approx(0.02, rel=1e-9)
+
+
 def test_a_servo_holds_what_its_law_says():
     times = np.linspace(0.0, 20.0, 4001)
     moved = STILL._replace(gravity=1.0, viscous=1.0)

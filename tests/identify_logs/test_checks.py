@@ -230,15 +230,17 @@ def test_a_wrapped_position_and_too_much_voltage_are_found():
     assert "times that of the supply" in found(replaced(log, bus=0.4 * log.signals["bus"]), "unit")[0].message
 
 
-def test_gravity_tells_a_zero_at_the_top():
+def test_gravity_tells_a_zero_that_is_not_where_it_hangs():
     drive, load = drive_of("geared"), Load(2e-2, gravity=0.8)
     log = simulate(
         drive, Excitation("slow_sine", 6.0, 4.0), load, {"position": Sensor(resolution=STEP)}, Sampler(500.0)
     )
     log = without(log, "voltage", "current")
-    assert found(log, "sign") == []
+    assert found(log, "sign") == found(log, "zero") == []
     turned = replaced(log, position=log.signals["position"] + math.pi)
-    assert "at the top" in found(turned, "sign")[0].message
+    assert "at the top" in found(turned, "zero")[0].message
+    (tilted,) = found(replaced(log, position=log.signals["position"] + 0.1), "zero")
+    assert float(tilted.remedy.removeprefix("write position=column").partition(":")[0]) == pytest.approx(-0.1, abs=0.02)
 
 
 def test_a_torque_that_does_not_move_it_is_found():

@@ -156,9 +156,6 @@ def test_usable_stretches_have_no_gap_and_two_rows_at_least():
     time = np.array([0.0, 1.0, 2.0, 4.0, 5.0, 20.0, 40.0, 41.0, 42.0])
     log = Log("x", time, {"current": time})
     assert usable(log) == [slice(0, 5), slice(6, 9)]
-    assert usable(log, 1.5) == [slice(0, 3), slice(3, 5), slice(6, 9)]
-    with pytest.raises(ValueError, match="longest"):
-        usable(log, 1.0)
 
 
 @pytest.mark.parametrize("step", [2.0 * np.pi / 4096, 0.0088, 3.0])
