@@ -293,7 +293,8 @@ def _evaluation(runs: Sequence[_Run]) -> Markup:
             curves.append(Curve(run.name if len(known) > 1 else "episodes", share, returns, colour=place, style="dots"))
     title = "Returns of the evaluation's episodes, in order"
     beside = page.plots([Plot(title, "share of episodes below [%]", "return", tuple(curves))] if curves else [])
-    parts = [Markup('<div class="beside">{}{}</div>').format(table, beside)]
+    layout = '<div class="beside">{}{}</div>' if len(known) == 1 else "{}{}"  # a table of several needs the width
+    parts = [Markup(layout).format(table, beside)]
     for run, one in zip(known, every, strict=True):
         parts.append(_motors(run.name, one.get("motors")))
     return page.joined((*notes, *parts))
