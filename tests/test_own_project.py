@@ -238,6 +238,7 @@ def written(tmp_path_factory):
     return folder
 
 
+@pytest.mark.matrix
 def test_the_command_certifies_the_arm_and_says_what_it_left_out(written):
     content = json.loads((written / "certificate.json").read_text())
     assert (content["subject"], content["verdict"]) == ("arm", "passed")
@@ -254,6 +255,7 @@ def test_the_command_certifies_the_arm_and_says_what_it_left_out(written):
     assert all(reason.replace("'", "&#39;") in page for reason in reasons.values())
 
 
+@pytest.mark.matrix
 def test_python_finds_what_the_command_found(written):
     found = {check.name: check.worst for check in validate("arm", quick=True, groups=["convergence", "energy"]).checks}
     content = json.loads((written / "certificate.json").read_text())

@@ -280,6 +280,7 @@ def test_many_are_judged_as_one():
     assert np.isinf(Drive.instability(np.array([good.numbers]), 0.00123)).all()
 
 
+@pytest.mark.matrix
 def test_a_vector_of_drives_is_the_drives_alone_and_their_windings_are_drawn():
     arguments = {"actuator": drive("qube"), "randomize": {"motor.resistance": Uniform(4.0, 12.0)}}
     ours = gymnasium.make_vec("codrl_mj/Acrobot-v0", 3, "vector_entry_point", **arguments)
