@@ -72,10 +72,12 @@ def report(
 
     Raises:
         FileNotFoundError: a folder is no run folder, or there is no such certificate.
-        ValueError: no run, `out` is no .html file, or the certificate that is given is damaged.
+        ValueError: no run, a seed below 0, `out` is no .html file, or the certificate that is given is damaged.
     """
     if not runs:
         raise ValueError("runs: none was given; give one run folder or more")
+    if seed < 0:
+        raise ValueError(f"seed = {seed}: must be >= 0")
     check_page(out)
     certified = _certificate(runs, certificate)
     summaries = [read_run(path) for path in runs]

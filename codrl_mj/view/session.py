@@ -214,7 +214,7 @@ class Session:
     def _made(self) -> Any:
         env: Any = self.config.make()
         if getattr(env.unwrapped, "model", None) is None:
-            raise ValueError(f"{self.config.task} has no MuJoCo model to be shown")
+            raise ValueError(f"{self.config.task} has no MuJoCo model to be shown; physics must be mujoco, its default")
         self._recorder: Any = env.get_wrapper_attr("recorder")
         return env
 

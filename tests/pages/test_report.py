@@ -209,6 +209,8 @@ def test_motors_of_somebody_elses_robot_are_filmed():
 def test_bad_input_is_refused_before_anything_is_run(tmp_path):
     with pytest.raises(ValueError, match="runs: none was given"):
         report([], tmp_path / "r.html")
+    with pytest.raises(ValueError, match="seed = -1: must be >= 0"):
+        report([RUNS / "pendulum"], tmp_path / "r.html", seed=-1)
     with pytest.raises(ValueError, match=r"must be \.html"):
         report([RUNS / "pendulum"], tmp_path / "r.pdf")
     (tmp_path / "certificate.json").write_text("{}")
