@@ -53,6 +53,7 @@ def test_the_pages_are_what_the_code_says_and_there_are_no_others():
         assert (FOLDER / name).read_text() == text, f"docs/environments/{name} is stale: run make docs"
 
 
+@pytest.mark.matrix
 def test_make_docs_writes_them(tmp_path):
     command = [sys.executable, str(ROOT / "scripts" / "environment_pages.py"), "--out", str(tmp_path)]
     subprocess.run(command, check=True, capture_output=True, timeout=120)

@@ -65,7 +65,7 @@ ALLOWED = {
     "identify": {"actuators", "catalogue", "fields", "runs.files"},
     "pages": {
         *("__init__", "actuators", "catalogue", "evaluation", "films", "foreign", "identify", "motor_design"),
-        *("pages.plots", "runs.files", "runs.layout", "runs.policies", "runs.summaries", "tasks", "training"),
+        *("pages.plots", "replay", "runs.files", "runs.layout", "runs.policies", "runs.summaries", "tasks", "training"),
         "validation",
     },
     "cli": {
@@ -74,8 +74,8 @@ ALLOWED = {
             "foreign",
             "identify",
             "motor_design",
-            "replay",
             "pages",
+            "replay",
             "runs.files",
             "runs.layout",
             "runs.policies",

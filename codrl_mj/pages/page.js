@@ -180,6 +180,7 @@ const codrl = (() => {
       this.shades = this.spec.shades.map((shade) => ({ ...shade, spans: arrays[shade.spans] }));
       this.trails = this.curves.filter((curve) => curve.style === "trail");
       this.lines = this.curves.filter((curve) => curve.style !== "trail");
+      this.curves.filter((curve) => curve.style === "reference").forEach((curve, rank) => { curve.rank = rank; });
       this.limits = this.spread();
       this.legend();
       plots.push(this);
@@ -229,7 +230,7 @@ const codrl = (() => {
       this.several = new Set(shown.filter((curve) => curve.shared != null).map((curve) => curve.tags.join())).size > 1;
       for (const curve of this.curves) {
         curve.item.hidden = !seen(curve.tags);
-        curve.swatch.className = `swatch ${this.kind(curve)} ${curve.style}${curve.dashed ? " dashed" : ""}`;
+        curve.swatch.className = `swatch ${this.kind(curve)} ${curve.style} r${(curve.rank ?? 0) % 4}${curve.dashed ? " dashed" : ""}`;
         if (curve.dot) curve.dot.className = `dot ${this.kind(curve)}`;
       }
     }
@@ -293,7 +294,7 @@ const codrl = (() => {
       const few = curve.xs.length <= 25 && curve.style !== "reference";
       const stroke = () => this.colour(curve);
       const style = { label: curve.label, stroke, width: curve.style === "reference" ? 1.4 : 1.7, points: { show: few, size: 5, fill: stroke } };
-      if (curve.style === "reference") style.dash = [5, 4];
+      if (curve.style === "reference") style.dash = [[5, 4], [2, 3], [], [10, 3, 2, 3]][curve.rank % 4];
       if (curve.dashed) Object.assign(style, { dash: [7, 4], width: 1.4 });
       if (curve.style === "step") style.paths = uPlot.paths.stepped({ align: 1 });
       if (curve.style === "dots") Object.assign(style, { paths: () => null, points: { show: true, size: curve.xs.length > 200 ? 3 : 6, fill: stroke } });

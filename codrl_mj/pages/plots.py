@@ -196,7 +196,7 @@ def still(plot: Plot, width: float = 6.4, height: float = 3.2) -> str:
         figure = Figure(figsize=(width, height))
         figure.subplots_adjust(0.13, 0.17, 0.985, 0.97)
         FigureCanvasSVG(figure)
-        axes: Any = figure.subplots()
+        axes = figure.subplots()
         for index, curve in enumerate(plot.curves[:12]):
             x, y = thinned(curve.x, _drawable(curve.y, plot.y_log), _STILL)
             colour = ink if curve.reference else _PALETTE[(index if curve.colour is None else curve.colour) % 6]
@@ -222,9 +222,10 @@ def still(plot: Plot, width: float = 6.4, height: float = 3.2) -> str:
         axes.tick_params(colors=ink, which="both")
         axes.spines[:].set_color(ink)
         axes.grid(color=ink, alpha=0.25)
-        for axis in (axes.xaxis, axes.yaxis):
-            if axis.get_scale() == "linear":
-                axis.get_major_locator().set_params(nbins=5)
+        if axes.get_xscale() == "linear":
+            axes.locator_params(axis="x", nbins=5)
+        if axes.get_yscale() == "linear":
+            axes.locator_params(axis="y", nbins=5)
         if len(plot.curves) > 1:
             axes.legend(fontsize=8, frameon=False, labelcolor=ink)
         buffer = io.StringIO()

@@ -50,6 +50,7 @@ def report(
     seed: int = 0,
     trust: bool = False,
     filmed: bool = True,
+    replayed: bool = False,
     certificate: Path | None = None,
     joined: Callable[[Sequence[Shown]], Sequence[Markup]] = lambda _: (),
     on_part: Callable[[str], None] = lambda _: None,
@@ -63,6 +64,7 @@ def report(
         seed: of the episode.
         trust: whether to import modules that a run folder names as its task, agent or actuator, which executes them.
         filmed: whether to film the episode.
+        replayed: whether to show it in three dimensions too, to be turned and zoomed.
         certificate: a `certificate.json`, or the folder of one; None: that in a run folder, if there is one.
         joined: (episodes) -> parts that follow the clock of film and plots, made by `codrl_mj.pages.page.clocked`.
         on_part: called with what is being done.
@@ -90,7 +92,7 @@ def report(
     sections = [
         page.Section("learning", "Learning", _learning(found)),
         page.Section("evaluation", "Evaluation", _evaluation(found)),
-        page.Section("episode", "An episode", _episodes(found, shown, joined)),
+        page.Section("episode", "An episode", _episodes(found, shown, joined, replayed)),
         page.Section("loop", "The loop between", _loop(found)),
         page.Section("certificate", "Certificate", certified),
         page.Section("settings", "Settings", _settings(found)),
@@ -294,7 +296,8 @@ def _evaluation(runs: Sequence[_Run]) -> Markup:
             curves.append(Curve(run.name if len(known) > 1 else "episodes", share, returns, colour=place, style="dots"))
     title = "Returns of the evaluation's episodes, in order"
     beside = page.plots([Plot(title, "share of episodes below [%]", "return", tuple(curves))] if curves else [])
-    parts = [Markup('<div class="beside">{}{}</div>').format(table, beside)]
+    layout = '<div class="beside">{}{}</div>' if len(known) == 1 else "{}{}"  # a table of several needs the width
+    parts = [Markup(layout).format(table, beside)]
     for run, one in zip(known, every, strict=True):
         parts.append(_motors(run.name, one.get("motors")))
     return page.joined((*notes, *parts))
@@ -317,11 +320,24 @@ def _motors(name: str, motors: Any) -> Markup:
 
 
 def _episodes(
-    runs: Sequence[_Run], shown: Sequence[Shown], joined: Callable[[Sequence[Shown]], Sequence[Markup]]
+    runs: Sequence[_Run],
+    shown: Sequence[Shown],
+    joined: Callable[[Sequence[Shown]], Sequence[Markup]],
+    replayed: bool,
 ) -> Markup:
     notes = [page.note(f"No episode of {run.name}: {run.problem}", bad=True) for run in runs if run.shown is None]
     notes += [page.note(f"{run.name}: the policy of its best evaluation acts.") for run in runs if run.best]
-    return page.joined((*notes, episode_section(shown, joined(shown)) if shown else ""))
+    own = _replays(shown) if replayed else []
+    return page.joined((*notes, episode_section(shown, [*own, *joined(shown)]) if shown else ""))
+
+
+def _replays(shown: Sequence[Shown]) -> list[Markup]:
+    """The episodes in three dimensions."""
+    from codrl_mj.replay import motion_of_episode, replay
+
+    made = [replay(motion_of_episode(one.episode, one.env), one.name) for one in shown]
+    named = zip(made, shown, strict=True)
+    return [page.replay(one, f"Replay: {of.name}", place == 0) for place, (one, of) in enumerate(named)]
 
 
 def _loop(runs: Sequence[_Run]) -> Markup:

@@ -34,8 +34,8 @@ def opened(chromium):
     """Opens an address; after the test nothing may have gone wrong in any page, nor been asked of another host."""
     pages, wrong = [], []
 
-    def open_page(address, width=1280, height=800, scheme="light"):
-        page = chromium.new_page(viewport={"width": width, "height": height}, color_scheme=scheme)
+    def open_page(address, width=1280, height=800, scheme="light", **options):
+        page = chromium.new_page(viewport={"width": width, "height": height}, color_scheme=scheme, **options)
         page.emulate_media(reduced_motion="reduce")
         page.on("pageerror", lambda error: wrong.append(str(error)))
         page.on("console", lambda message: message.type == "error" and wrong.append(message.text))

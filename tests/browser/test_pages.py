@@ -11,17 +11,10 @@ from codrl_mj.pages import page as builder
 from codrl_mj.pages.motor import motor_page
 from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.pages.report import report
-from tests.browser.chromium import browser, opened
 
 pytestmark = pytest.mark.browser
 RUN = Path(__file__).parents[1] / "fixtures" / "earlier" / "pendulum"
 AXE = Path(__file__).parents[2] / "node_modules" / "axe-core" / "axe.min.js"
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    with browser() as started:
-        yield started
 
 
 @pytest.fixture(scope="module")
@@ -34,10 +27,10 @@ def pages(tmp_path_factory):
         """element.querySelector("#scrub").addEventListener("click", () => seek(1.5));
         function setTime(time) { element.querySelector("#at").textContent = time.toFixed(2); }""",
     )
-    report([RUN], folder / "report.html", joined=lambda _: (joined,))
+    report([RUN], folder / "report.html", replayed=True, joined=lambda _: (joined,))
     report([RUN, RUN.parent / "cartpole"], folder / "two.html")
     motor_page("qube", find_drive("quanser-qube-servo-2"), find_entry("quanser-qube-servo-2"), folder / "motor.html")
-    evil = "<img src=http://there/x onerror=alert(1)>"
+    evil = "<img src=http://there/x onerror=alert(1)>" + "x" * 90
     plot = Plot(evil, f"{evil} [s]", evil, (Curve(evil, np.arange(9.0), np.arange(9.0)),))
     section = builder.Section("s", evil, builder.plot(plot) + builder.table(evil, (evil,), [(evil,)]))
     builder.write(folder / "evil.html", builder.page(evil, evil, Markup(), [section]))
@@ -79,122 +72,122 @@ def line(figure):
 
 @pytest.mark.parametrize("name", ["report", "two", "motor", "evil"])
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
-def test_pages_fit_laptop_and_phone_in_light_and_dark(chromium, pages, name, width, scheme):
-    with opened(chromium, pages / f"{name}.html", width, scheme) as page:
-        for figure in page.locator("figure.uplotted").all():
-            figure.scroll_into_view_if_needed()
-            figure.locator("canvas").wait_for()
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
-        light = page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
-        assert light is (scheme == "light")
-        page.click("#theme")
-        assert (page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)") is not light
+def test_pages_fit_laptop_and_phone_in_light_and_dark(opened, pages, name, width, scheme):
+    page = opened((pages / f"{name}.html").as_uri(), width, scheme=scheme)
+    for figure in page.locator("figure.uplotted").all():
+        figure.scroll_into_view_if_needed()
+        figure.locator("canvas").wait_for()
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    light = page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+    assert light is (scheme == "light")
+    page.click("#theme")
+    assert (page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)") is not light
 
 
-def test_the_plots_follow_the_film(chromium, pages):
-    with opened(chromium, pages / "report.html") as page:
-        torque = drawn(page, "Torque at the shaft")
-        page.get_by_role("button", name="Play").click()
-        until(page, "codrl.clock.time > 0.6")
-        page.get_by_role("button", name="Pause").click()
-        time = now(page)
-        assert 0.6 < time < 5.0
-        assert line(torque) == pytest.approx(time, abs=0.02)
-        video = page.evaluate("document.querySelector('video').currentTime")
-        assert video == pytest.approx(time, abs=0.15)
-        assert f"{time:.2f} /" in page.locator(".transport output").inner_text()
-        assert page.locator("#at").inner_text() == f"{time:.2f}"
+def test_the_plots_follow_the_film(opened, pages):
+    page = opened((pages / "report.html").as_uri())
+    torque = drawn(page, "Torque at the shaft")
+    page.get_by_role("button", name="Play").click()
+    until(page, "codrl.clock.time > 0.6")
+    page.get_by_role("button", name="Pause").click()
+    time = now(page)
+    assert 0.6 < time < 5.0
+    assert line(torque) == pytest.approx(time, abs=0.02)
+    video = page.evaluate("document.querySelector('video').currentTime")
+    assert video == pytest.approx(time, abs=0.15)
+    assert f"{time:.2f} /" in page.locator(".transport output").inner_text()
+    assert page.locator("#at").inner_text() == f"{time:.2f}"
 
 
-def test_dragging_in_a_plot_seeks_the_film_and_all_others(chromium, pages):
-    with opened(chromium, pages / "report.html") as page:
-        torque, reward = drawn(page, "Torque at the shaft"), drawn(page, "Reward of each step")
-        torque.scroll_into_view_if_needed()
-        box, end = torque.locator(".u-over").bounding_box(), page.evaluate("codrl.clock.end")
-        middle = box["y"] + box["height"] / 2
-        page.mouse.move(box["x"] + 0.2 * box["width"], middle)
-        page.mouse.down()
-        page.mouse.move(box["x"] + 0.6 * box["width"], middle, steps=5)
-        page.mouse.up()
-        assert now(page) == pytest.approx(0.6 * end, abs=0.02 * end)
-        assert line(reward) == pytest.approx(now(page), abs=1e-2 * end)
-        wanted = now(page)
-        until(page, f"Math.abs(document.querySelector('video').currentTime - {wanted}) < 0.06")
-        assert span(torque) == [0.0, pytest.approx(end)]
+def test_dragging_in_a_plot_seeks_the_film_and_all_others(opened, pages):
+    page = opened((pages / "report.html").as_uri())
+    torque, reward = drawn(page, "Torque at the shaft"), drawn(page, "Reward of each step")
+    torque.scroll_into_view_if_needed()
+    box, end = torque.locator(".u-over").bounding_box(), page.evaluate("codrl.clock.end")
+    middle = box["y"] + box["height"] / 2
+    page.mouse.move(box["x"] + 0.2 * box["width"], middle)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.6 * box["width"], middle, steps=5)
+    page.mouse.up()
+    assert now(page) == pytest.approx(0.6 * end, abs=0.02 * end)
+    assert line(reward) == pytest.approx(now(page), abs=1e-2 * end)
+    wanted = now(page)
+    until(page, f"Math.abs(document.querySelector('video').currentTime - {wanted}) < 0.06")
+    assert span(torque) == [0.0, pytest.approx(end)]
 
 
-def test_what_joins_the_clock_follows_it_and_may_scrub(chromium, pages):
-    with opened(chromium, pages / "report.html") as page:
-        torque = drawn(page, "Torque at the shaft")
-        page.click("#scrub")
-        assert now(page) == pytest.approx(1.5)
-        assert line(torque) == pytest.approx(1.5, abs=0.01)
-        slider = page.get_by_role("slider", name="Time")
-        slider.fill("2")
-        assert page.locator("#at").inner_text() == "2.00"
+def test_what_joins_the_clock_follows_it_and_may_scrub(opened, pages):
+    page = opened((pages / "report.html").as_uri())
+    torque = drawn(page, "Torque at the shaft")
+    page.click("#scrub")
+    assert now(page) == pytest.approx(1.5)
+    assert line(torque) == pytest.approx(1.5, abs=0.01)
+    slider = page.get_by_role("slider", name="Time")
+    slider.fill("2")
+    assert page.locator("#at").inner_text() == "2.00"
 
 
-def test_plots_zoom_pan_and_show_all_again(chromium, pages):
-    with opened(chromium, pages / "motor.html") as page:
-        figure = drawn(page, "A small step of the current")
-        low, high = whole = span(figure)
-        figure.get_by_role("button", name="Zoom in").click()
-        assert span(figure)[1] - span(figure)[0] == pytest.approx((high - low) / 2, rel=1e-3)
-        before = span(figure)
-        figure.get_by_role("button", name="Pan left").click()
-        assert span(figure)[0] < before[0]
-        figure.get_by_role("button", name="Show all").click()
-        assert span(figure) == whole
-        box = figure.locator(".u-over").bounding_box()
-        page.mouse.move(box["x"] + 0.25 * box["width"], box["y"] + 50)
-        page.mouse.down()
-        page.mouse.move(box["x"] + 0.75 * box["width"], box["y"] + 60, steps=4)
-        page.mouse.up()
-        assert span(figure) == pytest.approx([0.75 * low + 0.25 * high, 0.25 * low + 0.75 * high], rel=0.05)
-        page.mouse.dblclick(box["x"] + 0.5 * box["width"], box["y"] + 50)
-        assert span(figure) == whole
-        page.mouse.move(box["x"] + box["width"] - 2, box["y"] + 50)
-        assert figure.locator(".legend .value").first.inner_text().startswith(("1", "0.99"))
+def test_plots_zoom_pan_and_show_all_again(opened, pages):
+    page = opened((pages / "motor.html").as_uri())
+    figure = drawn(page, "A small step of the current")
+    low, high = whole = span(figure)
+    figure.get_by_role("button", name="Zoom in").click()
+    assert span(figure)[1] - span(figure)[0] == pytest.approx((high - low) / 2, rel=1e-3)
+    before = span(figure)
+    figure.get_by_role("button", name="Pan left").click()
+    assert span(figure)[0] < before[0]
+    figure.get_by_role("button", name="Show all").click()
+    assert span(figure) == whole
+    box = figure.locator(".u-over").bounding_box()
+    page.mouse.move(box["x"] + 0.25 * box["width"], box["y"] + 50)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.75 * box["width"], box["y"] + 60, steps=4)
+    page.mouse.up()
+    assert span(figure) == pytest.approx([0.75 * low + 0.25 * high, 0.25 * low + 0.75 * high], rel=0.05)
+    page.mouse.dblclick(box["x"] + 0.5 * box["width"], box["y"] + 50)
+    assert span(figure) == whole
+    page.mouse.move(box["x"] + box["width"] - 2, box["y"] + 50)
+    assert figure.locator(".legend .value").first.inner_text().startswith(("1", "0.99"))
 
 
-def test_the_keyboard_reads_zooms_and_seeks(chromium, pages):
-    with opened(chromium, pages / "report.html") as page:
-        figure = drawn(page, "Torque at the shaft")
-        figure.locator(".plot").focus()
-        page.keyboard.press("ArrowRight")
-        assert now(page) > 0.0
-        assert "desired" in figure.locator("output").inner_text()
-        page.keyboard.press("+")
-        other = span(drawn(page, "Reward of each step"))
-        assert other[1] - other[0] == pytest.approx(page.evaluate("codrl.clock.end") / 2, rel=1e-3)
-        figure.locator(".plot").focus()
-        page.keyboard.press("0")
-        assert span(figure)[1] == pytest.approx(page.evaluate("codrl.clock.end"))
+def test_the_keyboard_reads_zooms_and_seeks(opened, pages):
+    page = opened((pages / "report.html").as_uri())
+    figure = drawn(page, "Torque at the shaft")
+    figure.locator(".plot").focus()
+    page.keyboard.press("ArrowRight")
+    assert now(page) > 0.0
+    assert "desired" in figure.locator("output").inner_text()
+    page.keyboard.press("+")
+    other = span(drawn(page, "Reward of each step"))
+    assert other[1] - other[0] == pytest.approx(page.evaluate("codrl.clock.end") / 2, rel=1e-3)
+    figure.locator(".plot").focus()
+    page.keyboard.press("0")
+    assert span(figure)[1] == pytest.approx(page.evaluate("codrl.clock.end"))
 
 
-def test_runs_can_be_hidden(chromium, pages):
-    with opened(chromium, pages / "two.html") as page:
-        figure = drawn(page, "Torque at the shaft")
-        assert figure.locator(".legend button:visible").count() == 4
-        page.get_by_label("cartpole", exact=True).uncheck()
-        assert figure.locator(".legend button:visible").count() == 2
-        series = figure.locator(".plot").evaluate("box => box.plot.u.series.slice(1).map((one) => one.show)")
-        assert series == [True, True, False, False]
+def test_runs_can_be_hidden(opened, pages):
+    page = opened((pages / "two.html").as_uri())
+    figure = drawn(page, "Torque at the shaft")
+    assert figure.locator(".legend button:visible").count() == 4
+    page.get_by_label("cartpole", exact=True).uncheck()
+    assert figure.locator(".legend button:visible").count() == 2
+    series = figure.locator(".plot").evaluate("box => box.plot.u.series.slice(1).map((one) => one.show)")
+    assert series == [True, True, False, False]
 
 
-def test_without_scripts_there_are_pictures_and_the_films_own_controls(chromium, pages):
-    with opened(chromium, pages / "report.html", java_script_enabled=False) as page:
-        assert page.locator("figure.uplotted noscript img").count() == page.locator("figure.uplotted").count() > 5
-        assert page.locator("video").get_attribute("controls") is not None
+def test_without_scripts_there_are_pictures_and_the_films_own_controls(opened, pages):
+    page = opened((pages / "report.html").as_uri(), java_script_enabled=False)
+    assert page.locator("figure.uplotted noscript img").count() == page.locator("figure.uplotted").count() > 5
+    assert page.locator("video").get_attribute("controls") is not None
 
 
 @pytest.mark.parametrize("name", ["report", "two", "motor"])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_axe_finds_nothing_serious(chromium, pages, name, scheme):
+def test_axe_finds_nothing_serious(opened, pages, name, scheme):
     if not AXE.is_file():
         pytest.fail("no axe-core: npm install --no-save axe-core", pytrace=False)
-    with opened(chromium, pages / f"{name}.html", scheme=scheme, bypass_csp=True) as page:
-        page.add_script_tag(path=AXE)
-        found = page.evaluate("axe.run().then((result) => result.violations)")
-        bad = [(one["id"], [node["html"][:150] for node in one["nodes"]][:3]) for one in found]
-        assert [one["id"] for one in found if one["impact"] in ("serious", "critical")] == [], bad
+    page = opened((pages / f"{name}.html").as_uri(), scheme=scheme, bypass_csp=True)
+    page.add_script_tag(path=AXE)
+    found = page.evaluate("axe.run().then((result) => result.violations)")
+    bad = [(one["id"], [node["html"][:150] for node in one["nodes"]][:3]) for one in found]
+    assert [one["id"] for one in found if one["impact"] in ("serious", "critical")] == [], bad
