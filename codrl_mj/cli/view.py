@@ -48,7 +48,7 @@ class View:
         else:
             browser = _browser()
         policy, env = policy_and_environment(self)
-        session = Session(env, self._policies(policy), self.seed)
+        session = Session(env, self._policies(policy, env), self.seed)
         if self.native:
             run(session)
             return 0
@@ -60,7 +60,7 @@ class View:
             shown.close()
         return 0
 
-    def _policies(self: Any, given: Any) -> dict[str, Callable[[], Any]]:
+    def _policies(self: Any, given: Any, env: Any) -> dict[str, Callable[[], Any]]:
         """Name -> policy, made when it is chosen: what is watched, its other one, and other runs."""
         found: dict[str, Callable[[], Any]] = {}
         subject = Path(self.subject)
@@ -69,11 +69,13 @@ class View:
             if (subject / "best").is_dir():
                 other = "best" if self.source.which == "last" else "last"
                 found[other] = lambda: dataclasses.replace(self.source, which=other).load(subject).policy
-        found |= {run.name: functools.partial(self._policy_of, run) for run in self.policies}
+        found |= {run.name: functools.partial(self._policy_of, run, env) for run in self.policies}
         return found
 
-    def _policy_of(self: Any, run: Path) -> Any:
-        return self.source.load(run).policy
+    def _policy_of(self: Any, run: Path, env: Any) -> Any:
+        loaded = self.source.load(run)
+        loaded.check_interface(env)
+        return loaded.policy
 
 
 def _browser() -> Any:

@@ -214,8 +214,10 @@ def _lines(shown: Sequence[Shown]) -> list[_Line]:
 
 def _motor_plots(lines: Sequence[_Line]) -> list[Plot]:
     """What the motors did."""
-    force = all(isinstance(line.actuator, Ideal) for line in lines)
-    unit = "force [N] or torque [N·m]" if force else "torque [N·m]"
+    ideal = [isinstance(line.actuator, Ideal) for line in lines]
+    force, unit = all(ideal), "torque [N·m]"
+    if any(ideal):
+        unit = "force [N] or torque [N·m]" if force else "torque [N·m], of the ideal actuator force [N]"
     torque, error, current, voltage, power, warmth = ([] for _ in range(6))  # type: ignore[var-annotated]
     for line in lines:
         torque += [line.curve("actual", line.actual, 1), line.curve("desired", line.desired, 0, dashed=True)]
@@ -236,9 +238,8 @@ def _motor_plots(lines: Sequence[_Line]) -> list[Plot]:
         if line.has("temperature") and np.ptp(line.trace("temperature")) > 0.0:
             warmth.append(line.curve("winding", line.trace("temperature"), 4, held=False))
     shades = tuple(_shade(line) for line in lines if line.has("saturated"))
-    found = [
-        Plot("Torque at the shaft" if not force else "Force", _TIME, unit, tuple(torque), clock=True, shades=shades)
-    ]
+    title = "Force" if force else "Torque at the shaft"
+    found = [Plot(title, _TIME, unit, tuple(torque), clock=True, shades=shades)]
     if any(np.ptp(curve.y) > 0.0 or curve.y.any() for curve in error):
         found.append(Plot("Error: desired less actual", _TIME, unit, tuple(error), clock=True))
     if current:
@@ -286,7 +287,7 @@ def _other_signals(lines: Sequence[_Line]) -> list[Plot]:
     found = []
     for name in names:
         own = [line for line in lines if line.has(name)]
-        unit = own[0].actuator.SIGNAL_UNITS.get(name, "").replace("*", "·") if own else ""
+        unit = page.unit(own[0].actuator.SIGNAL_UNITS.get(name, "")) if own else ""
         curves = tuple(line.curve(name.replace("_", " "), line.trace(name), 3) for line in own)
         if own:
             title = name.replace("_", " ").capitalize()
@@ -316,10 +317,23 @@ def _run_plots(shown: Sequence[Shown]) -> list[Plot]:
         rewards.append(Curve(f"{before}reward", time, held, style="step", colour=5, **own))
     for unit, curves in groups.items():
         names = list(dict.fromkeys(curve.label.rpartition(": ")[2].replace("_", " ") for curve in curves))
-        title = f"State: {', '.join(names)}" if len(names) < 4 else f"States in {unit}"
+        title = (
+            f"State: {', '.join(names)}"
+            if len(names) < 4
+            else f"States {'without a unit' if unit == '1' else f'in {unit}'}"
+        )
         found.append(Plot(title, _TIME, f"state [{unit}]", tuple(curves), clock=True))
     found.append(Plot("Reward of each step", _TIME, "reward", tuple(rewards), clock=True))
     return found
+
+
+_UNITS = (
+    (("m",) * 3 + ("1",) * 4, ("m/s",) * 3 + ("rad/s",) * 3),  # free
+    (("1",) * 4, ("rad/s",) * 3),  # ball
+    (("m",), ("m/s",)),  # slide
+    (("rad",), ("rad/s",)),  # hinge
+)
+"""Of the entries of `qpos`, quaternions among them, and of `qvel`, by the kind of joint."""
 
 
 def _state_names(one: Shown) -> Sequence[str]:
@@ -333,12 +347,10 @@ def _state_names(one: Shown) -> Sequence[str]:
         model = env.unwrapped.model
         names: list[str] = []
         speeds: list[str] = []
-        counts = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # free, ball, slide, hinge: entries of qpos and of qvel
         for index, kind in enumerate(model.jnt_type.tolist()):
             joint = model.joint(index).name or f"joint {index}"
-            unit = "m" if kind in (0, 2) else "rad"
-            for count, made, own in zip(counts[kind], (names, speeds), (unit, f"{unit}/s"), strict=True):
-                made += [f"{joint}{f' {k}' if count > 1 else ''} [{own}]" for k in range(count)]
+            for made, units in zip((names, speeds), _UNITS[kind], strict=True):
+                made += [f"{joint}{f' {k}' if len(units) > 1 else ''} [{one}]" for k, one in enumerate(units)]
         return [*names, *speeds]
     finally:
         env.close()

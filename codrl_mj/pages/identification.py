@@ -98,14 +98,11 @@ def _parameters(found: Identified) -> Markup:
             *(("good", "✓") if good else ("bad", "✗")), one.status
         )
         share = f"{half:.2g} %" if interval and math.isfinite(half) else ""
-        cells = (one.name.replace("_", " "), page.number(one.value), interval, share, _unit(one.unit), status, one.why)
-        rows.append(page.Row((*cells, worst.replace("_", " ")), "" if good else "failed"))
+        unit, name = page.unit(one.unit), one.name.replace("_", " ")
+        cells = name, page.number(one.value), interval, share, unit, status, one.why, worst.replace("_", " ")
+        rows.append(page.Row(cells, "" if good else "failed"))
     columns = ("parameter", "value", "95 % interval", "half of it", "unit", "status", "why", "above all by")
     return page.table("Parameters with 95 % intervals", columns, rows, numbers=(1, 2, 3), cards=True)
-
-
-def _unit(text: str) -> str:
-    return text.replace("*", "·").replace("^2", "²").replace("ohm", "Ω")
 
 
 def _advice(found: Identified) -> Markup:

@@ -131,18 +131,16 @@ def rates_table(drive: Drive) -> Markup:
     return page.table("Other sample rates", columns, rows, numbers=range(1, 7), cards=True)
 
 
-def held_step(actuators: Mapping[str, ActuatorModel], torques: Mapping[str, float], timestep: float) -> Plot | None:
+def held_step(steps: Mapping[str, tuple[ActuatorModel, float, float]]) -> Plot | None:
     """The torque after a step of what is asked for, the shaft held; None where nothing is of interest.
 
     Args:
-        actuators: by their names.
-        torques: asked of each [N*m].
-        timestep: mechanical step [s].
+        steps: name -> actuator, torque that is asked of it [N*m], mechanical step [s].
     """
     curves = []
-    for name, actuator in actuators.items():
+    for name, (actuator, asked, timestep) in steps.items():
         kind: Any = type(actuator)
-        if not actuator.tracks or actuator.MOTION or not kind.State._fields or torques[name] == 0.0:
+        if not actuator.tracks or actuator.MOTION or not kind.State._fields or asked == 0.0:
             continue
         parameters, state, share = (
             parameters_type(kind)(*actuator.numbers),
@@ -150,19 +148,19 @@ def held_step(actuators: Mapping[str, ActuatorModel], torques: Mapping[str, floa
             [0.0],
         )
         for tick in range(100):
-            asked = Inputs(torques[name], 0.0, 0.0, tick * timestep, 0.0)
-            state, torque, _ = kind.advance(parameters, timestep, state, asked)
-            share.append(torque / torques[name])
+            inputs = Inputs(asked, 0.0, 0.0, tick * timestep, 0.0)
+            state, torque, _ = kind.advance(parameters, timestep, state, inputs)
+            share.append(torque / asked)
         time = timestep * np.arange(len(share))
         within = np.flatnonzero(np.abs(np.array(share) - share[-1]) > 0.02)
         shown = min(max(3 * (within[-1] + 1) if len(within) else 0, 20), len(share))
-        curves.append(Curve(name, time[:shown], np.array(share[:shown])))
+        label = f"{name}, at steps of {1e3 * timestep:.3g} ms"
+        curves.append(Curve(label, time[:shown], np.array(share[:shown])))
     if not curves:
         return None
-    longest = max(curves, key=lambda curve: len(curve.x)).x
+    longest = max((curve.x for curve in curves), key=lambda time: time[-1])
     curves.append(Curve("asked for", longest, np.ones(len(longest)), reference=True))
-    title = f"A step of the torque, the shaft held, at steps of {1e3 * timestep:.3g} ms"
-    return Plot(title, "time [s]", "share of what is asked for", tuple(curves))
+    return Plot("A step of the torque, the shaft held", "time [s]", "share of what is asked for", tuple(curves))
 
 
 def limits(actuator: Any, speeds: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

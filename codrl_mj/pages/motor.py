@@ -50,12 +50,8 @@ def motor_page(name: str, drive: Drive, entry: MotorEntry | None, out: Path) -> 
 
 
 def _values(caption: str, rows: Any) -> Markup:
-    made = [(row["name"].replace("_", " "), page.number(row["value"]), _unit(row["unit"])) for row in rows]
+    made = [(row["name"].replace("_", " "), page.number(row["value"]), page.unit(row["unit"])) for row in rows]
     return page.table(caption, ("number", "value", "unit"), made, numbers=(1,))
-
-
-def _unit(text: str) -> str:
-    return text.replace("*", "·").replace("^2", "²").replace("ohm", "Ω").replace("degC", "°C")
 
 
 def _abilities(known: Mapping[str, Any], drive: Drive, entry: MotorEntry | None) -> Markup:
@@ -124,7 +120,7 @@ def _numbers(known: Mapping[str, Any]) -> Markup:
         sources += [source for source in row["sources"] if source not in sources]
         places = ", ".join(str(1 + sources.index(source)) for source in row["sources"])
         how = row["how"] + (" (estimated)" if row["name"] in known["estimated"] else "")
-        cells = row["name"].replace("_", " "), page.number(row["value"]), _unit(row["unit"]), how, places
+        cells = row["name"].replace("_", " "), page.number(row["value"]), page.unit(row["unit"]), how, places
         rows.append(cells)
     columns = ("number", "value", "unit", "how it came about", "source")
     parts = [page.table("Numbers and where they are from", columns, rows, numbers=(1,), cards=True)]

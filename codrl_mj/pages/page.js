@@ -149,15 +149,12 @@ const codrl = (() => {
 
   const hiddenTags = new Set();
   function selector(box) {
-    const apply = () => {
-      if (box.type === "radio") {
-        for (const other of document.querySelectorAll(`input[name="${box.name}"]`)) toggle(other);
-      } else toggle(box);
+    const toggle = () => (box.checked ? hiddenTags.delete(box.value) : hiddenTags.add(box.value));
+    toggle();
+    box.addEventListener("change", () => {
+      toggle();
       plots.forEach((plot) => plot.select());
-    };
-    const toggle = (one) => (one.checked ? hiddenTags.delete(one.value) : hiddenTags.add(one.value));
-    toggle(box);
-    box.addEventListener("change", apply);
+    });
   }
   const seen = (tags) => !tags.some((tag) => hiddenTags.has(tag));
 

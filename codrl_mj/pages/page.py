@@ -16,7 +16,7 @@ from markupsafe import Markup
 
 from codrl_mj import __version__
 from codrl_mj.pages.plots import Plot, as_json, description, still
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import check_page, writing
 
 _HERE = Path(__file__).parent
 _POLICY = (
@@ -98,8 +98,7 @@ def write(path: Path, text: str) -> Path:
     Raises:
         ValueError: the suffix is none of a page.
     """
-    if path.suffix not in (".html", ".htm"):
-        raise ValueError(f"page {path}: the suffix is {path.suffix!r}, must be .html; write {path.stem}.html")
+    check_page(path)
     with writing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return path
@@ -180,17 +179,14 @@ def plots(several: Iterable[Plot]) -> Markup:
     return Markup('<div class="plots">{}</div>').format(joined(drawn)) if drawn else Markup("")
 
 
-def image(picture: bytes, about: str, kind: str = "jpeg") -> Markup:
+def image(picture: bytes, about: str) -> Markup:
     """A picture.
 
     Args:
-        picture: a file's content.
+        picture: a JPEG file's content.
         about: what is seen, for those who do not see it.
-        kind: the file's type.
     """
-    return Markup('<img src="data:image/{};base64,{}" alt="{}">').format(
-        kind, base64.b64encode(picture).decode(), about
-    )
+    return Markup('<img src="data:image/jpeg;base64,{}" alt="{}">').format(base64.b64encode(picture).decode(), about)
 
 
 def film(caption: str, video: bytes, rate: float, poster: bytes | None = None) -> Markup:
@@ -226,7 +222,7 @@ def selector(legend: str, kind: str, names: Sequence[str], shown: int | None = N
         shown: what alone is shown at first; None: all.
     """
     entries = [(f"{kind}:{place}", name, shown in (None, place)) for place, name in enumerate(names)]
-    return Markup(_parts().selector(legend, kind, entries, False))
+    return Markup(_parts().selector(legend, kind, entries))
 
 
 def clocked(label: str, fragment: str, script: str) -> Markup:
@@ -239,6 +235,11 @@ def clocked(label: str, fragment: str, script: str) -> Markup:
             fragment's parent, and `seek(seconds)`, to be called when the fragment itself is scrubbed.
     """
     return Markup(_parts().clocked(label, Markup(fragment), Markup(script)))
+
+
+def unit(text: str) -> str:
+    """A unit as it is printed."""
+    return text.replace("*", "·").replace("^2", "²").replace("ohm", "Ω").replace("degC", "°C")
 
 
 def replay(what: Any, label: str, first: bool) -> Markup:

@@ -183,7 +183,7 @@ def still(plot: Plot, width: float = 6.4, height: float = 3.2) -> str:
     """The plot as the text of an SVG file, without a background and small.
 
     Args:
-        plot: what to draw; of tagged curves those of the first tags.
+        plot: what to draw, its first twelve curves.
         width: of the picture [in].
         height: of the picture [in].
     """

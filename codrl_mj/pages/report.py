@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,13 +10,14 @@ import numpy as np
 from markupsafe import Markup
 
 from codrl_mj.actuators import ActuatorModel, Drive, Ideal
+from codrl_mj.evaluation import Episode
 from codrl_mj.evaluation.evaluate import MEASURES
 from codrl_mj.pages import certificate as certificates
 from codrl_mj.pages import page
 from codrl_mj.pages.episode import Shown, episode_section, show
 from codrl_mj.pages.loop import held_step, loop_section
 from codrl_mj.pages.plots import Curve, Plot
-from codrl_mj.runs.files import read_json
+from codrl_mj.runs.files import check_page, read_json
 from codrl_mj.runs.layout import PROGRESS, finished
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.runs.summaries import RunSummary, compare, read_run
@@ -38,6 +38,8 @@ class _Run:
     """Why there is none."""
     actuators: Mapping[str, ActuatorModel]
     """What it was trained through, by the names of motors or patterns."""
+    best: bool = False
+    """Whether the policy of its best evaluation acts in the episode."""
 
 
 def report(
@@ -72,12 +74,14 @@ def report(
 
     Raises:
         FileNotFoundError: a folder is no run folder, or there is no such certificate.
-        ValueError: no run, or `out` is no .html file.
+        ValueError: no run, a seed below 0, `out` is no .html file, or the certificate that is given is damaged.
     """
     if not runs:
         raise ValueError("runs: none was given; give one run folder or more")
-    if out.suffix not in (".html", ".htm"):
-        raise ValueError(f"page {out}: the suffix is {out.suffix!r}, must be .html")
+    if seed < 0:
+        raise ValueError(f"seed = {seed}: must be >= 0")
+    check_page(out)
+    certified = _certificate(runs, certificate)
     summaries = [read_run(path) for path in runs]
     found = [
         _run(one, name, which, seed, trust, filmed, on_part)
@@ -90,7 +94,7 @@ def report(
         page.Section("evaluation", "Evaluation", _evaluation(found)),
         page.Section("episode", "An episode", _episodes(found, shown, joined, replayed)),
         page.Section("loop", "The loop between", _loop(found)),
-        page.Section("certificate", "Certificate", _certificate(runs, certificate)),
+        page.Section("certificate", "Certificate", certified),
         page.Section("settings", "Settings", _settings(found)),
     ]
     kinds = "Report of a run" if len(found) == 1 else f"Report of {len(found)} runs"
@@ -117,14 +121,17 @@ def _run(
         return _Run(summary, name, None, str(error), {})
     env = config.evaluation_env
     actuators = _actuators(env)
-    policy = summary.path if which == "last" and finished(summary.path) else summary.path / BEST
+    best = which == "best" or not finished(summary.path)
+    policy = summary.path / BEST if best else summary.path
     if not (policy / "policy.json").is_file():
-        return _Run(summary, name, None, "the run has no policy yet: none was evaluated so far", actuators)
+        yet = "best policy" if finished(summary.path) else "policy yet"
+        return _Run(summary, name, None, f"the run has no {yet}: none was evaluated so far", actuators)
     try:
         on_part(f"{name}: episode")
-        return _Run(summary, name, show(name, env, load_policy(policy, trust), seed, filmed), None, actuators)
-    except (ValueError, OSError, ArithmeticError, RuntimeError, ModuleNotFoundError) as error:
+        shown = show(name, env, load_policy(policy, trust), seed, filmed)
+    except Exception as error:  # environments and actuators of others raise what they like
         return _Run(summary, name, None, f"{type(error).__name__}: {error}", actuators)
+    return _Run(summary, name, shown, None, actuators, best)
 
 
 def _actuators(env: Any) -> dict[str, ActuatorModel]:
@@ -149,15 +156,12 @@ def _top(runs: Sequence[_Run], shown: Sequence[Shown]) -> Markup:
             told.append(page.note("The training is not finished. Here is what there is so far."))
         if run.summary.state == "damaged":
             told.append(page.note(f"The run folder is damaged: {run.summary.problem}", bad=True))
-    if runs[0].summary.task:
-        told.append(page.paragraph(_about(runs[0].summary.task), "soft"))
-    still = next((one for one in shown if one.film is not None), None)
-    if still is None:
-        return page.joined(told)
-    about = f"{runs[0].summary.task}: the scene of an episode"
-    return Markup('<div class="intro"><div>{}</div>{}</div>').format(
-        page.joined(told), page.image(still.film.still, about) if still.film else ""
-    )
+    told += [page.paragraph(_about(task), "soft") for task in dict.fromkeys(run.summary.task for run in runs) if task]
+    for one in shown:
+        if one.film is not None:
+            picture = page.image(one.film.still, f"{one.env.task}: the scene of an episode")
+            return Markup('<div class="intro"><div>{}</div>{}</div>').format(page.joined(told), picture)
+    return page.joined(told)
 
 
 def _sentence(run: RunSummary) -> str:
@@ -167,7 +171,7 @@ def _sentence(run: RunSummary) -> str:
     if run.steps and run.total_steps and run.state == "unfinished":
         steps += f" of {run.total_steps:,}"
     named = {"ideal": "the ideal actuator", "custom": "an actuator of its own", "drive": "a motor behind a drive"}
-    actuator = named.get(run.actuator or "", f"the actuator {run.actuator}")
+    actuator = named.get(run.actuator or "", f"the actuator{'s' * (', ' in (run.actuator or ''))} {run.actuator}")
     text = f"{agent} on {run.task or 'an unknown task'} through {actuator}{steps}, seed {run.seed}."
     if run.evaluation is not None and run.evaluation_return is not None:
         text += (
@@ -217,7 +221,7 @@ def _learning(runs: Sequence[_Run]) -> Markup:
             stride = max(1, len(steps) // _DOTS)
             if len(runs) == 1:
                 dots = steps[::stride], values[::stride]
-                returns.append(Curve("training episodes", *dots, reference=False, style="dots", colour=5))
+                returns.append(Curve("training episodes", *dots, style="dots", colour=5))
             sums = np.cumsum(np.concatenate([[0.0], values]))
             ends = np.arange(1, len(values) + 1)
             starts = np.maximum(0, ends - WINDOW)
@@ -279,8 +283,7 @@ def _evaluation(runs: Sequence[_Run]) -> Markup:
     for name, field in MEASURES.items():
         values = [one.get(name) for one in every]
         if any(value is not None for value in values):
-            unit = field.metadata["unit"].replace("*", "·").replace("degC", "°C")
-            rows.append((field.metadata["label"], *map(_value, values), unit))
+            rows.append((field.metadata["label"], *map(_value, values), page.unit(field.metadata["unit"])))
     count = " and ".join(dict.fromkeys(str(one.get("episodes")) for one in every))
     caption = f"Last policy, {count} episodes; 95 % intervals in brackets"
     names = [run.name if len(known) > 1 else "value" for run in known]
@@ -310,7 +313,7 @@ def _motors(name: str, motors: Any) -> Markup:
         values = [one.get(measure) for one in motors.values()]
         if any(value is not None for value in values) and measure in MEASURES:
             about = MEASURES[measure].metadata
-            rows.append((about["label"], *map(_value, values), about["unit"].replace("*", "·").replace("degC", "°C")))
+            rows.append((about["label"], *map(_value, values), page.unit(about["unit"])))
     columns = ("measure", *motors, "unit")
     table = page.table(f"{name}: motor by motor", columns, rows, numbers=range(1, 1 + len(motors)))
     return page.folded(f"{name}: motor by motor", table)
@@ -323,6 +326,7 @@ def _episodes(
     replayed: bool,
 ) -> Markup:
     notes = [page.note(f"No episode of {run.name}: {run.problem}", bad=True) for run in runs if run.shown is None]
+    notes += [page.note(f"{run.name}: the policy of its best evaluation acts.") for run in runs if run.best]
     own = _replays(shown) if replayed else []
     return page.joined((*notes, episode_section(shown, [*own, *joined(shown)]) if shown else ""))
 
@@ -339,9 +343,7 @@ def _replays(shown: Sequence[Shown]) -> list[Markup]:
 def _loop(runs: Sequence[_Run]) -> Markup:
     """The loops of the drives, and steps of other actuators; each different one once."""
     drives: dict[str, Drive] = {}
-    others: dict[str, ActuatorModel] = {}
-    torques: dict[str, float] = {}
-    timestep = math.nan
+    others: dict[str, tuple[ActuatorModel, float, float]] = {}
     for run in runs:
         for motor, actuator in run.actuators.items():
             alone = len(run.actuators) == 1
@@ -353,13 +355,21 @@ def _loop(runs: Sequence[_Run]) -> Markup:
                 same = [one for one in drives.values() if _loop_of(one) == _loop_of(actuator)]
                 if not same and len(drives) < _MOST_LOOPS:
                     drives[name] = actuator
-            elif not isinstance(actuator, Ideal) and run.shown is not None and actuator not in others.values():
-                episode, timestep = run.shown.episode, run.shown.episode.timestep
-                asked = np.abs(np.asarray(episode.signals["desired_force"], dtype=float)).max() * actuator.arm_radius
-                others[name], torques[name] = actuator, float(0.5 * asked)
+            elif not isinstance(actuator, Ideal) and run.shown is not None:
+                timestep = run.shown.episode.timestep
+                if all((actuator, timestep) != (one, step) for one, _, step in others.values()):
+                    others[name] = actuator, _asked(actuator, run.shown.episode), timestep
     parts = [loop_section(drives)] if drives else []
-    plot = held_step(others, torques, timestep) if others else None
+    plot = held_step(others)
     return page.joined((*parts, page.plots([plot] if plot is not None else [])))
+
+
+def _asked(actuator: ActuatorModel, episode: Episode) -> float:
+    """Half of the largest torque that was asked of an actuator in an episode [N*m]; of all, where it was drawn anew."""
+    forces = np.atleast_2d(np.abs(np.asarray(episode.signals["desired_force"], dtype=float)).T)
+    driven = episode.actuator if isinstance(episode.actuator, tuple) else (episode.actuator,)
+    own = [one == actuator for one in driven]
+    return 0.5 * actuator.arm_radius * float(forces[own if any(own) else slice(None)].max())
 
 
 def _loop_of(drive: Drive) -> Any:
@@ -374,11 +384,13 @@ def _certificate(runs: Sequence[Path], given: Path | None) -> Markup:
     for place in places:
         if given is None and not place.is_file():
             continue
-        content = read_json(place, "certificate")
         try:
-            return certificates.summary(content)
-        except (KeyError, TypeError) as error:
-            return page.note(f"{place} is no certificate: it has no {error}", bad=True)
+            return certificates.summary(read_json(place, "certificate"))
+        except (KeyError, TypeError, ValueError) as error:
+            problem = f"{place} is no certificate: {type(error).__name__}: {error}"
+            if given is not None:
+                raise ValueError(problem) from None
+            return page.note(problem, bad=True)
     return Markup()
 
 

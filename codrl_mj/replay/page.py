@@ -13,7 +13,7 @@ import numpy as np
 from codrl_mj.replay.camera import first_view
 from codrl_mj.replay.motion import Motion
 from codrl_mj.replay.shapes import TRIANGLES, mesh, thinned
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import check_page, writing
 
 _HERE = Path(__file__).parent
 _POLICY = (
@@ -69,8 +69,7 @@ def write_replay(what: Motion, path: Path, title: str) -> Path:
     Raises:
         ValueError: the suffix is none of a page.
     """
-    if path.suffix not in (".html", ".htm"):
-        raise ValueError(f"replay {path}: the suffix is {path.suffix!r}, must be .html; write {path.stem}.html")
+    check_page(path)
     part = replay(what, title)
     entries = {
         "TITLE": html.escape(title),

@@ -79,6 +79,16 @@ def check_writable(folder: Path) -> None:
         raise PermissionError(f"cannot write to {folder}: no permission to write in {present}")
 
 
+def check_page(path: Path) -> None:
+    """Refuse a page's file by its suffix.
+
+    Raises:
+        ValueError: it is none of a page.
+    """
+    if path.suffix not in (".html", ".htm"):
+        raise ValueError(f"page {path}: the suffix is {path.suffix!r}, must be .html; write {path.stem}.html")
+
+
 def write_json(path: Path, content: Any) -> None:
     """Write `content` as indented JSON, whole or not at all."""
     with writing(path) as temporary:

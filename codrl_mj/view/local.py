@@ -26,7 +26,12 @@ class LocalServer(viser.ViserServer):
 
         Args:
             port: to listen at; where it is taken, the next free one.
+
+        Raises:
+            ValueError: there is no such port.
         """
+        if not 0 <= port < 65536:
+            raise ValueError(f"port = {port}: must be 0 to 65535; 8080 is the default, 0 any that is free")
         with _checked_requests(), contextlib.redirect_stdout(io.StringIO()):  # viser prints a table of addresses
             super().__init__(host=HOST, port=port, verbose=False)
 

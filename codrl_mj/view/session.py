@@ -126,6 +126,7 @@ class Session:
         self.ended = False
         self.signals.clear()
         self._pushes.clear()
+        self.data.xfrc_applied[:] = 0.0
         self._posed()
 
     def choose(self, name: str) -> None:
@@ -189,7 +190,6 @@ class Session:
         if self.ended and self.again:
             self.reset()
         data = self.data
-        data.xfrc_applied[:] = 0.0
         for body, (end, force) in list(self._pushes.items()):
             data.xfrc_applied[body, :3] = force
             if self.time + 1e-9 >= end:
@@ -214,7 +214,7 @@ class Session:
     def _made(self) -> Any:
         env: Any = self.config.make()
         if getattr(env.unwrapped, "model", None) is None:
-            raise ValueError(f"{self.config.task} has no MuJoCo model to be shown")
+            raise ValueError(f"{self.config.task} has no MuJoCo model to be shown; physics must be mujoco, its default")
         self._recorder: Any = env.get_wrapper_attr("recorder")
         return env
 
@@ -231,10 +231,12 @@ class Session:
             self.problem = str(error)
             return
         old[0].close()
-        if not self._diverged:
+        self.problem = None
+        if self._diverged:
+            self.reset()
+        else:
             self.data.qpos[:], self.data.qvel[:] = positions, speeds
             mujoco.mj_forward(self.model, self.data)
-        self.problem, self._diverged = None, False
 
     def _posed(self) -> None:
         """Bring the poses up to date: a step leaves those of its beginning."""

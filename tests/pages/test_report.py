@@ -6,15 +6,20 @@ import json
 import re
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 
+from codrl_mj.actuators import Lag
 from codrl_mj.cli import main
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy, run_episodes
 from codrl_mj.foreign.config import ForeignConfig
 from codrl_mj.pages import episode as episodes
 from codrl_mj.pages.episode import Shown, episode_section, show
+from codrl_mj.pages.loop import held_step
 from codrl_mj.pages.report import report
 from codrl_mj.physics.offscreen import RenderingUnavailableError
 from codrl_mj.runs.policies import load_policy
@@ -96,14 +101,27 @@ def test_an_unfinished_run_says_so_and_shows_what_there_is(tmp_path):
 
 def test_a_damaged_run_says_what_is_damaged(tmp_path):
     shutil.copytree(RUNS / "cartpole", tmp_path / "run")
-    (tmp_path / "run" / "evaluation.json").write_text("{")
+    for name in ("evaluation.json", "certificate.json"):
+        (tmp_path / "run" / name).write_text("{")
     content = json.loads((tmp_path / "run" / "config.json").read_text())
     content["train"]["agent"]["learning_rate"] = "nonsense"
     (tmp_path / "run" / "config.json").write_text(json.dumps(content))
     parsed = check_alone(report([tmp_path / "run"], tmp_path / "r.html").read_text())
     assert "The run folder is damaged" in parsed.text
     assert "evaluation.json is not a policy evaluation: it is truncated" in parsed.text
+    assert "certificate.json is no certificate" in parsed.text
     assert "No episode of run" in parsed.text
+
+
+def test_a_page_says_that_the_best_policy_acts(tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(RUNS / "pendulum", run)
+    says = "the policy of its best evaluation acts"
+    (run / "result.json").unlink()
+    (run / "best").mkdir()
+    for name in ("policy.json", "policy.safetensors"):
+        shutil.copy(run / name, run / "best")
+    assert says in check_alone(report([run], tmp_path / "r.html", filmed=False).read_text()).text
 
 
 def test_several_runs_stand_side_by_side(tmp_path, monkeypatch):
@@ -143,6 +161,40 @@ def test_several_motors_can_be_chosen():
     assert "No film of arm: none was asked for" in Parsed(section).text
 
 
+def test_an_ideal_actuator_beside_a_motor_has_a_force():
+    envs = (EnvConfig("pendulum", name, max_episode_steps=2) for name in ("weak", "ideal"))
+    shown = [show(env.actuator.family, env, RandomPolicy("pendulum"), 0, filmed=False) for env in envs]
+    labels = {one["title"]: one["y"]["label"] for one in Parsed(str(episode_section(shown))).data}
+    assert labels["Torque at the shaft"] == "torque [N·m], of the ideal actuator force [N]"
+    alone = Parsed(str(episode_section(shown[1:]))).data
+    assert "Force" in [one["title"] for one in alone]
+
+
+def test_states_of_every_kind_of_joint_have_units(monkeypatch):
+    """The oracle: three metres and a quaternion, a quaternion, a metre, a radian; and what they are in a second."""
+    bodies = "".join(f'<body><joint type="{kind}"/><geom size=".1"/></body>' for kind in ("ball", "slide", "hinge"))
+    bodies += "<body><freejoint/><geom size='.1'/></body>"
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    made = SimpleNamespace(unwrapped=SimpleNamespace(model=model), close=lambda: None)
+    monkeypatch.setattr(ForeignConfig, "make", lambda _: made)
+    names = episodes._state_names(Shown("robot", ForeignConfig("Ant-v5"), None, None, None))
+    units = [re.search(r"\[(.*)\]", name)[1] for name in names]
+    assert units[: model.nq] == ["1"] * 4 + ["m", "rad"] + ["m"] * 3 + ["1"] * 4
+    assert units[model.nq :] == ["rad/s"] * 3 + ["m/s", "rad/s"] + ["m/s"] * 3 + ["rad/s"] * 3
+
+
+def test_a_step_is_at_each_actuators_own_steps():
+    """The oracle: a lag that is exact between its steps approaches 1 as 1 - exp(-t/T)."""
+    lag = Lag(time_constant=0.05)
+    plot = held_step({"slow": (lag, 2.0, 0.02), "fast": (lag, 1.0, 0.01)})
+    slow, fast, asked = plot.curves
+    for curve, step in ((slow, 0.02), (fast, 0.01)):
+        assert f"steps of {1e3 * step:g} ms" in curve.label
+        np.testing.assert_allclose(np.diff(curve.x), step)
+        np.testing.assert_allclose(curve.y, 1.0 - np.exp(-curve.x / 0.05), atol=1e-12)
+    assert asked.x[-1] == max(slow.x[-1], fast.x[-1])
+
+
 @pytest.mark.matrix
 def test_motors_of_somebody_elses_robot_are_filmed():
     env = ForeignConfig("Reacher-v5", {"joint0": "maxon-ec45-flat-50w", "joint1": "quanser-qube-servo-2"})
@@ -157,7 +209,13 @@ def test_motors_of_somebody_elses_robot_are_filmed():
 def test_bad_input_is_refused_before_anything_is_run(tmp_path):
     with pytest.raises(ValueError, match="runs: none was given"):
         report([], tmp_path / "r.html")
+    with pytest.raises(ValueError, match="seed = -1: must be >= 0"):
+        report([RUNS / "pendulum"], tmp_path / "r.html", seed=-1)
     with pytest.raises(ValueError, match=r"must be \.html"):
         report([RUNS / "pendulum"], tmp_path / "r.pdf")
+    (tmp_path / "certificate.json").write_text("{}")
+    with pytest.raises(ValueError, match="is no certificate: KeyError: 'checks'"):
+        report([RUNS / "pendulum"], tmp_path / "r.html", certificate=tmp_path)
+    (tmp_path / "certificate.json").unlink()
     with pytest.raises(FileNotFoundError, match="no run at"):
         report([tmp_path], tmp_path / "r.html")

@@ -46,6 +46,11 @@ def test_it_listens_on_this_machine_alone(server):
             socket.create_connection((address, server.get_port()), timeout=2)
 
 
+def test_a_port_that_there_is_not_is_refused():
+    with pytest.raises(ValueError, match="port = 65536: must be 0 to 65535"):
+        LocalServer(65536)
+
+
 def test_only_its_own_pages_are_answered(server):
     port = server.get_port()
     assert status(server) == 200

@@ -97,6 +97,30 @@ def test_a_simulation_that_left_the_numbers_waits_for_a_reset():
     assert np.isfinite(made.data.qpos).all()
 
 
+def test_a_force_of_somebody_elses_stays():
+    """MuJoCo's own viewer writes the mouse's push between two steps."""
+    made = session("ideal")
+    pole = made.model.body("pole").id
+    made.data.xfrc_applied[pole, 0] = 3.0
+    made.data.qpos[:] = made.data.qvel[:] = 0.0
+    made.step()
+    assert made.data.qvel[0] > 0.0
+    assert made.data.xfrc_applied[pole, 0] == 3.0
+    made.reset()
+    assert not made.data.xfrc_applied.any()
+
+
+def test_another_setting_after_it_left_the_numbers_begins_anew():
+    made = session("ideal")
+    assert made.step()
+    made.data.qvel[:] = np.nan
+    assert not made.step()
+    made.set_disturbance(("command_delay",), 0.04)
+    assert (made.time, made.total) == (0.0, 0.0)
+    np.testing.assert_array_equal(made.observation, np.append(made.data.qpos, made.data.qvel))
+    assert made.step()
+
+
 def test_a_policy_for_another_environment_is_refused(motorised):
     class Wide:
         def predict(self, observation, **_):
@@ -138,7 +162,7 @@ def test_an_endless_voltage_ends_at_the_end_of_its_slider():
     assert nested(("supply", "voltage"), 12.0) == {"supply": {"voltage": 12.0}}
 
 
-def test_the_command_line_offers_the_runs_policy_and_those_of_others(monkeypatch):
+def test_the_command_line_offers_the_runs_policy_and_those_of_others(monkeypatch, capsys):
     seen = {}
 
     class Fake:
@@ -162,4 +186,6 @@ def test_the_command_line_offers_the_runs_policy_and_those_of_others(monkeypatch
     made.choose("cartpole")
     assert made.step()
     assert seen["title"] == "cartpole on weaker"
+    assert main(["view", "cartpole", "--policies", str(run), "--env.action", "voltage", "--env.levels", "-5", "5"]) == 2
+    assert "was trained with 'force'" in capsys.readouterr().err
     assert seen["closed"]
