@@ -118,7 +118,7 @@ def check(settings: Any) -> None:
             object.__setattr__(settings, field.name, kind(value))
 
 
-def check_names(given: Iterable[Any], known: Iterable[str], what: str, prefix: str = "") -> None:
+def check_names(given: Iterable[Any], known: Iterable[str], what: str, prefix: str = "", every: bool = False) -> None:
     """Refuse names that are not known; the nearest known one is suggested.
 
     Args:
@@ -126,6 +126,7 @@ def check_names(given: Iterable[Any], known: Iterable[str], what: str, prefix: s
         known: what they may be.
         what: what to call them, such as `actuator field`.
         prefix: stands before each of them in the message.
+        every: list the known ones beside the nearest, too: for names that somebody else has for the same.
 
     Raises:
         ValueError: one is unknown.
@@ -134,8 +135,10 @@ def check_names(given: Iterable[Any], known: Iterable[str], what: str, prefix: s
     for name in given:
         if name not in known:
             near = _nearest(name, known)
-            hint = f"did you mean {prefix}{near[0]}?" if near else f"known: {', '.join(known)}"
-            raise ValueError(f"unknown {what} {prefix}{name}; {hint}")
+            hints = [f"did you mean {prefix}{near[0]}?"] if near else []
+            if every or not near:
+                hints.append(f"known: {', '.join(known)}")
+            raise ValueError(f"unknown {what} {prefix}{name}; {' '.join(hints)}")
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:

@@ -458,7 +458,10 @@ def load_module(text: str) -> Any:
     try:
         return importlib.import_module(module)
     except (ImportError, TypeError, ValueError) as error:
-        raise ValueError(f"{text!r}: {error}; must be module:NAME, of a module that Python finds") from None
+        raise ValueError(
+            f"{text!r}: {error}; must be module:NAME, of a module that Python finds: `python -m codrl_mj` in the place "
+            "of `codrl-mj` finds those of the present folder"
+        ) from None
 
 
 def load_object(text: str) -> Any:

@@ -138,5 +138,5 @@ def from_datasheet(*, strict: bool = True, tolerance: float = 0.2, **printed: An
         ValueError: a field is unknown, is without its unit, has a wrong one or is out of bounds; the fields do not
             suffice; or two of them contradict each other. The message names field, value and remedy.
     """
-    check_names(printed, ("shaft", *KINDS), "datasheet field")
+    check_names(printed, ("shaft", *KINDS), "datasheet field", every=True)
     return Datasheet(**printed).numbers(strict, tolerance)

@@ -82,7 +82,7 @@ def _entry(name: str, content: dict[str, Any]) -> MotorEntry:
         if key in ("datasheet", "sources", "estimated") and not isinstance(content.get(key, {}), Mapping):
             raise ValueError(f"{key} = {content[key]!r}: must be a table, [{key}]")
     printed, estimated = content["datasheet"], content.get("estimated", {})
-    check_names(printed, ("shaft", *KINDS), "entry", "datasheet.")
+    check_names(printed, ("shaft", *KINDS), "entry", "datasheet.", every=True)
     check_names(estimated, printed, "entry", "estimated.")
     entry = MotorEntry(
         **{

@@ -133,10 +133,12 @@ class Train:
                 if field.name not in _OWN_FLAGS
             },
         )
-        if self.resume is not None and finished(self.resume) and config == load_config(self.resume, self.trust):
-            print(f"{self.resume} is finished already; next: codrl-mj evaluate {self.resume}")
-            return 0
         parts = config.task, config.agent.name, through(self.actuators, self.actuator_name), str(config.seed)
+        own = any(":" in part for part in parts)  # module:NAME
+        following = "next: " + ("python -m codrl_mj evaluate --trust" if own else "codrl-mj evaluate")
+        if self.resume is not None and finished(self.resume) and config == load_config(self.resume, self.trust):
+            print(f"{self.resume} is finished already; {following} {self.resume}")
+            return 0
         name = "-".join(re.sub(r"[^\w.]+", "_", part) for part in parts)
         out = self.resume or self.out or Path("runs") / name
         if isinstance(config.env, ForeignConfig):
@@ -150,7 +152,7 @@ class Train:
                 tensorboard=self.tensorboard,
                 wandb=self.wandb,
             )
-        print(f"wrote {out}: see {out / 'learning_curve.png'}; next: codrl-mj evaluate {out}")
+        print(f"wrote {out}: see {out / 'learning_curve.png'}; {following} {out}")
         return 0
 
 

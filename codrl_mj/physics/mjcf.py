@@ -101,6 +101,9 @@ def task_model(
         max_forces: limits of the desired forces [N] or torques [N*m], shape (n,); None are the task's.
         explicit: whether the positions will be moved by the old velocity.
         joint: what is added to the actuated joints, besides what the actuators add.
+
+    Raises:
+        ValueError: the model has no actuator of the name of one of the task's motors.
     """
     spec = mujoco.MjSpec.from_file(str(asset_path(task.asset)))
     spec.option.timestep = timestep
@@ -110,6 +113,9 @@ def task_model(
     limits = task.max_forces if max_forces is None else max_forces
     for name, actuator, limit in zip(task.motors, actuators, limits.tolist(), strict=True):
         motor = spec.actuator(name)
+        if motor is None:
+            there = ", ".join(repr(a.name) for a in spec.actuators) or "none"
+            raise ValueError(f"{task.asset} has no actuator {name!r}; there are {there}: rename it, or set Task.motors")
         drive(motor, actuator, limit)
         for added in (JointAdditions(joint.armature, joint.damping, joint.friction), actuator.additions):
             _add(spec, spec.joint(motor.target), added)
