@@ -566,3 +566,16 @@ print("loaded:", [name for name in heavy if name in sys.modules])
 """
     done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.splitlines()[-1] == "loaded: []"
+
+
+@pytest.mark.filterwarnings("always::UserWarning")
+def test_draws_of_the_training_over_another_actuator_are_said(capsys):
+    line = ["train", "cartpole", "--env.randomize", "motor.inductance=uniform(0.09, 0.11)", "--out", "drawn"]
+    flags = "--agent.rollout-steps 64 --agent.batch-size 64 --total-steps 64 --num-envs 1 --evaluation-episodes 1"
+    assert main([*line, *flags.split()]) == 0
+    capsys.readouterr()
+    assert main(["evaluate", "drawn", "--episodes", "1", "--actuator", "weak"]) == 0
+    assert "motor.inductance of weak are drawn as in the training" in capsys.readouterr().err
+    assert main(["evaluate", "drawn", "--episodes", "1", "--actuator", "weak", "--env.randomize", "None"]) == 0
+    assert main(["evaluate", "drawn", "--episodes", "1"]) == 0
+    assert "drawn as in" not in capsys.readouterr().err

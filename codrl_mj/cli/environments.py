@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,7 @@ def environment(verb: Any, task: str, name: str, known: Any = None) -> EnvConfig
     Raises:
         ValueError: unknown name, value out of bounds, or fields set over the ideal actuator, which has none.
     """
+    _warn_of_draws(verb, name, known)
     if is_gymnasium_id(task):
         return _foreign_environment(verb, task, name, known)
     given: dict[str, Any] = dict(vars(verb.env))
@@ -54,6 +56,19 @@ def environment(verb: Any, task: str, name: str, known: Any = None) -> EnvConfig
             actuators[index] = resolve_actuators(other, definition)[index]
     changed = [actuator_over(one, _given(verb.actuator_fields)) for one in actuators]
     return EnvConfig(task, changed, options=options, **given, **nested)
+
+
+def _warn_of_draws(verb: Any, name: str, known: Any) -> None:
+    """Say so where draws that come with a run or a file replace numbers of an actuator that was asked for by name."""
+    if known is None or not known.randomize or name in (AS_TRAINED, AS_CONFIGURED):
+        return
+    fields = [text.partition("=")[0] for text in known.randomize if not text.startswith("model.")]
+    if fields and tuple(verb.env.randomize or ()) == tuple(known.randomize):
+        warnings.warn(
+            f"{', '.join(fields)} of {name} are drawn as in the training, whatever {name} has there: for {name} as it "
+            "is add --env.randomize None",
+            stacklevel=2,
+        )
 
 
 def _foreign_environment(verb: Any, task: str, name: str, known: Any) -> ForeignConfig:
