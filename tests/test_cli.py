@@ -545,6 +545,13 @@ def test_the_program_trains_and_renders(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["film.mp4", "run"]
 
 
+def test_the_program_ends_quietly_if_its_reader_has_enough():
+    line = f"{sys.executable} -m codrl_mj train pendulum --help | head -1"
+    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout.startswith("usage: codrl-mj train")
+    assert done.stderr == ""
+
+
 def test_the_program_refuses_bad_input_with_status_2_and_one_line(tmp_path):
     done = command("train cartpole --actuator weakr", cwd=tmp_path)
     assert done.returncode == 2

@@ -193,3 +193,13 @@ def test_the_work_on_a_free_mass_is_its_kinetic_energy(force, first):
     speed = np.append(first, first + np.cumsum(force) * timestep / mass)
     kinetic = mass / 2 * (speed[-1] ** 2 - speed[0] ** 2)
     assert mechanical_work(force, speed, timestep) == pytest.approx(kinetic, rel=1e-9, abs=1e-9)
+
+
+def test_motors_whose_torques_have_means_of_their_own_lag_as_each_of_them():
+    """A mean that one motor holds says nothing of lateness, and must not hide that of the others."""
+    rng = np.random.default_rng(0)
+    desired = [offset + rng.normal(size=400) for _ in range(3) for offset in (20.0, -20.0)]  # two motors in turn
+    actual = [np.concatenate([np.full(4, signal.mean()), signal[:-4]]) for signal in desired]
+    alone = [delay(desired[motor::2], actual[motor::2], 0.01) for motor in (0, 1)]
+    assert alone == pytest.approx([0.04, 0.04], abs=1e-3)
+    assert delay(desired, actual, 0.01, motors=2) == pytest.approx(0.04, abs=1e-3)

@@ -1,6 +1,7 @@
 """The command line: parses, calls the package, prints. Nothing imports it."""
 
 import functools
+import os
 import sys
 import warnings
 from collections.abc import Callable
@@ -57,7 +58,8 @@ def main(arguments: list[str] | None = None) -> int:
         arguments: the command line without the program's name; None takes the process's.
 
     Returns:
-        Exit status: 0, 1 when a validation fails, 2 for bad input, 130 after Ctrl-C, 143 after SIGTERM.
+        Exit status: 0, 1 when a validation fails, 2 for bad input, 130 after Ctrl-C, 141 if nobody
+            reads on, 143 after SIGTERM.
     """
     given = sys.argv[1:] if arguments is None else arguments
     with warnings.catch_warnings():
@@ -74,6 +76,9 @@ def _run(arguments: list[str]) -> int:
             args=arguments,
         )
         return verb.run()
+    except BrokenPipeError:  # whoever read the output has enough of it, such as head
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left is flushed at exit
+        return 141
     except (ValueError, OSError, RuntimeError, ArithmeticError, gymnasium.error.Error) as error:
         print(f"codrl-mj: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

@@ -295,7 +295,7 @@ def _tracking(episodes: Sequence[Episode], driven: Sequence[Sequence[_Driven]]) 
         "tracking_rms": rms,
         "tracking_percent": 100 * rms / scale if scale > 0 else None,
         "tracking_max": float(np.abs(error).max()),
-        "tracking_lag": delay(desired, actual, episodes[0].timestep),
+        "tracking_lag": delay(desired, actual, episodes[0].timestep, len(driven[0])),
     }
 
 

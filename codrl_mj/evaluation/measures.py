@@ -89,18 +89,21 @@ def holds_since(condition: np.ndarray) -> int:
     return int(broken[-1]) + 1 if len(broken) else 0
 
 
-def delay(desired: Sequence[np.ndarray], actual: Sequence[np.ndarray], timestep: float) -> float | None:
+def delay(
+    desired: Sequence[np.ndarray], actual: Sequence[np.ndarray], timestep: float, motors: int = 1
+) -> float | None:
     """Time by which a signal lags behind another [s]: the delay that maximises their normalised cross-correlation.
 
     c(k) = sum of x(t)*y(t+k) / sqrt(sum of x(t)^2 * sum of y(t+k)^2), over all times t of all episodes at which both
-    exist, where x and y are the desired and the actual signal less their means over everything. Lags run from 0 to half
-    the mean length of an episode. Of peaks as high as the highest (`EQUAL_CORRELATION`) the first is taken, and refined
+    exist, where x and y are the desired and the actual signal less the means of all signals of their motor. Lags run
+    from 0 to half the mean length of an episode. Of peaks as high as the highest (`EQUAL_CORRELATION`) the first is taken, and refined
     by the parabola through it and its two neighbours.
 
     Args:
         desired: one signal for each episode, shape (n,) each.
         actual: the same for what follows it, of the same shapes.
         timestep: between samples [s].
+        motors: whose signals these are in turn, >= 1.
 
     Returns:
         The delay, >= 0; None where either signal is constant, where even the highest peak is below
@@ -114,8 +117,9 @@ def delay(desired: Sequence[np.ndarray], actual: Sequence[np.ndarray], timestep:
         return None
     lags = np.arange(-1, reach + 1)
     products, desired_squares, actual_squares = np.zeros((3, len(lags)))
-    for signal, following in zip(desired, actual, strict=True):
-        x, y = signal - every_desired.mean(), following - every_actual.mean()
+    means = [[np.concatenate(of[motor::motors]).mean() for of in (desired, actual)] for motor in range(motors)]
+    for place, (signal, following) in enumerate(zip(desired, actual, strict=True)):
+        x, y = signal - means[place % motors][0], following - means[place % motors][1]
         here = lags < len(x)
         shifts = lags[here]
         products[here] += correlate(y, x, method="fft")[shifts + len(x) - 1]
