@@ -96,8 +96,8 @@ def delay(
 
     c(k) = sum of x(t)*y(t+k) / sqrt(sum of x(t)^2 * sum of y(t+k)^2), over all times t of all episodes at which both
     exist, where x and y are the desired and the actual signal less the means of all signals of their motor. Lags run
-    from 0 to half the mean length of an episode. Of peaks as high as the highest (`EQUAL_CORRELATION`) the first is taken, and refined
-    by the parabola through it and its two neighbours.
+    from 0 to half the mean length of an episode. Of peaks as high as the highest (`EQUAL_CORRELATION`) the first is
+    taken, and refined by the parabola through it and its two neighbours.
 
     Args:
         desired: one signal for each episode, shape (n,) each.

@@ -148,6 +148,7 @@ def _car(seed_of_env=None, **arguments):
     return env
 
 
+@pytest.mark.matrix
 def test_the_same_seed_gives_the_same_weights():
     one, again, other = (_table(SARSAConfig().make_model(_car(), seed).learn(1000)) for seed in (5, 5, 6))
     np.testing.assert_array_equal(one, again)

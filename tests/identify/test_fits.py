@@ -60,6 +60,7 @@ def test_a_slow_sine_tells_no_inductance():
     assert "--known inductance" in found.problem()
 
 
+@pytest.mark.matrix
 @pytest.mark.parametrize("rows", [1, 6])
 def test_a_late_voltage_is_found_late(rows):
     """And half the rate is that of the voltage in time: no cause of doubt."""
@@ -90,6 +91,7 @@ def test_a_voltage_that_holds_until_the_next_row_is_its_mean_too():
     assert abs(found["resistance"].value / bench.RESISTANCE - 1.0) < 0.005
 
 
+@pytest.mark.matrix
 def test_a_voltage_of_the_rows_times_is_found_to_be_half_a_row_late():
     found = identify([bench.motor_log("locked", duration=2.5, mean=False, clock=1.65e-3)])
     assert found.delays["winding"] == -0.5
@@ -127,6 +129,7 @@ def test_mujocos_pendulum_is_identified(swings):
     assert found.warnings == ()
 
 
+@pytest.mark.matrix
 def test_without_a_known_mass_a_torques_gain_is_not_told_apart(swings):
     found = identify(swings[:1], "pendulum", estimated=["torque_gain"])
     assert found["torque_gain"].status == found["inertia"].status == found["mgl"].status == "ratio"

@@ -10,6 +10,7 @@ PUBLISHED = {"inertia": 0.0626, "mgl": 1.003, "viscous_friction": 0.0471, "coulo
 """Of the pendulum, by its authors."""
 
 
+@pytest.mark.matrix
 def test_the_published_pendulum_foretells_its_own_logs_badly():
     """All numbers given, so nothing is fitted; half a second is off by 0.1 rad and more."""
     logs = [bench.pendulum_log(name) for name in ("ddp", "ilqr", "sysid")]

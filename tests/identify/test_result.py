@@ -70,7 +70,7 @@ def test_what_the_logs_do_not_tell_is_asked_for_or_taken_from_a_motor():
     assert whole == Drive().replaced({"motor.coulomb_friction": 1e-3})
 
 
-@pytest.mark.parametrize("known", [{}, {"gear_ratio": 20.0}])
+@pytest.mark.parametrize("known", [pytest.param({}, marks=pytest.mark.matrix), {"gear_ratio": 20.0}])
 def test_a_motor_with_a_gear_is_identified_at_its_rotor(known):
     """A log of the output: kE of 1 V*s/rad there is 0.05 at the rotor of a gear of 20; of a wrong gear it is none."""
     base = Drive().replaced({"motor.gear_ratio": 20.0 if not known else 1.0}).as_mapping()

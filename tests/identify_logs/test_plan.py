@@ -55,6 +55,7 @@ def test_voltages_that_change_between_rows_cost_most_of_the_inductance():
     assert 10.0 * errors["together"] < errors["mean"] < errors["instantaneous"]
 
 
+@pytest.mark.matrix
 def test_errors_expected_are_those_of_fits(planned):
     """Least squares by scipy on logs that differ in their noise: R, L and kE, with delay and offset free."""
     option = of(planned, "chirp", 10e3)
