@@ -183,6 +183,8 @@ def _zero(balance: Balance | None, effort: str) -> Iterator[Finding]:
         return
     along, aside = (balance.values.get(name, 0.0) for name in names)
     zero, pull = math.atan2(-aside, along), math.hypot(along, aside)
+    if abs(balance.values.get("constant", 0.0)) > 0.5 * pull:
+        return  # over a small arc a pull and a constant load against it are as good as nothing
     if pull > 2.0 * balance.residual and abs(zero) > (2.5 if effort == "voltage" else _TILTED):
         where = ", as if 0 were at the top" if abs(zero) > 2.5 else ""
         text = f"gravity pulls towards position {zero:.3g} rad and not 0 (m*g*l about {pull:.3g}){where}"
