@@ -155,7 +155,7 @@ except TrainingStoppedError as stopped:
         line = [sys.executable, "-c", code, str(root), str(count)]
         with subprocess.Popen(line, start_new_session=True, stdout=subprocess.PIPE, text=True) as grid:
             expected = ["0/progress.csv", "short/result.json" if count == 1 else "1/progress.csv"]
-            while not all((root / file).exists() for file in expected):
+            while not all((root / file).exists() and "\n" in (root / file).read_text().strip() for file in expected):
                 assert grid.poll() is None
                 time.sleep(0.05)
             os.killpg(grid.pid, signal.SIGINT)
