@@ -35,6 +35,7 @@ check: $(STAMP)  ## the full matrices, of which make test runs a few combination
 	@$(BIN)/python -m pytest -m matrix -n 2 --dist loadfile --no-loadscope-reorder
 
 browser: $(STAMP)  ## look at pages in Chromium, which it says how to get if there is none
+	@test -d node_modules/axe-core || npm install --no-save --silent axe-core@4.14.1
 	@$(BIN)/python -m pytest -m browser
 
 lint: $(STAMP)
