@@ -2,12 +2,12 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import tyro
 
 from codrl_mj.cli.fields import AS_TRAINED, ActuatorName
-from codrl_mj.cli.subject import Source, policy_and_environment, title_of
+from codrl_mj.cli.subject import Source, SubjectWord, policy_and_environment, title_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -17,13 +17,7 @@ class Replay:
     Example: codrl-mj replay runs/cartpole-ppo-weaker-0 --out balance.html, or codrl-mj replay Ant-v5 (random actions).
     """
 
-    subject: Annotated[
-        tyro.conf.Positional[str],
-        tyro.conf.arg(
-            help="Run folder, a folder with a policy alone, or a Stable-Baselines3 zip (see --trust); or a task name "
-            "for random actions."
-        ),
-    ]
+    subject: SubjectWord
     source: tyro.conf.OmitArgPrefixes[Source] = Source()
     actuator_name: ActuatorName = AS_TRAINED
     seed: int = 0

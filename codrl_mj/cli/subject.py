@@ -11,6 +11,15 @@ from codrl_mj.cli.fields import AS_TRAINED, is_task
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.foreign.config import ForeignConfig, environment_from
 
+SubjectWord = Annotated[
+    tyro.conf.Positional[str],
+    tyro.conf.arg(
+        help="Run folder, a folder with a policy alone, or a Stable-Baselines3 zip (see --trust); or a task name or an "
+        "environment's id, for random actions."
+    ),
+]
+"""The word that says what a verb is about."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Subject:

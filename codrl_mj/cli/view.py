@@ -4,12 +4,12 @@ import dataclasses
 import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import tyro
 
 from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, field_docs, is_task
-from codrl_mj.cli.subject import Source, policy_and_environment, title_of
+from codrl_mj.cli.subject import Source, SubjectWord, policy_and_environment, title_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,13 +19,7 @@ class View:
     Example: codrl-mj view runs/cartpole-ppo-weaker-0, or codrl-mj view furuta (random actions).
     """
 
-    subject: Annotated[
-        tyro.conf.Positional[str],
-        tyro.conf.arg(
-            help="Run folder, a folder with a policy alone, or a Stable-Baselines3 zip (see --trust); or a task name "
-            "or an environment's id."
-        ),
-    ]
+    subject: SubjectWord
     source: tyro.conf.OmitArgPrefixes[Source] = Source()
     actuator_name: ActuatorName = AS_TRAINED
     seed: int = 0

@@ -11,6 +11,7 @@ from codrl_mj.pages import page as builder
 from codrl_mj.pages.motor import motor_page
 from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.pages.report import report
+from tests.browser.waiting import until
 
 pytestmark = pytest.mark.browser
 RUN = Path(__file__).parents[1] / "fixtures" / "earlier" / "pendulum"
@@ -48,15 +49,6 @@ def drawn(page, title):
 def span(figure):
     """What a plot shows of its horizontal axis."""
     return figure.locator(".plot").evaluate("box => [box.plot.u.scales.x.min, box.plot.u.scales.x.max]")
-
-
-def until(page, condition):
-    """Wait for a condition; Playwright's own way evaluates text, which the pages' policy forbids."""
-    for _ in range(100):
-        if page.evaluate(condition):
-            return
-        page.wait_for_timeout(100)
-    pytest.fail(f"not within 10 s: {condition}")
 
 
 def now(page):

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from codrl_mj.replay import motion, replay, write_replay
+from tests.browser.waiting import until
 from tests.replay.test_motion import ARM, positions
 
 pytestmark = pytest.mark.browser
@@ -49,15 +50,6 @@ def poses(page):
             [p.x, p.y, p.z, q.w, q.x, q.y, q.z])"""
         )
     )
-
-
-def until(page, condition):
-    """Wait for it; the page's own policy forbids the browser's way."""
-    for _ in range(200):
-        if page.evaluate(condition):
-            return
-        page.wait_for_timeout(50)
-    pytest.fail(f"not within 10 s: {condition}")
 
 
 def test_it_shows_the_recorded_poses_and_goes_straight_between_them(what, page_file, opened):
