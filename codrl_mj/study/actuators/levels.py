@@ -95,11 +95,13 @@ def noise(task: str, dose: float) -> EnvConfig:
     The winding's time constant is ten integration steps and half the error is gone after one, so that half of a
     sample's noise becomes torque.
     """
-    step, force = timestep(task), find_task(task).max_force
-    inductance = 10.0 * step
+    step, constant = timestep(task), motor_constant(task)
+    inductance, largest = 10.0 * step, find_task(task).max_force / constant
     kp = 0.5 * inductance / step
-    loop = CurrentLoop(kp=kp, ki=kp / inductance, max_voltage=100.0 * force, current_noise=dose * force)
-    return posed(task, Actuator(Motor(1.0, inductance), loop))
+    loop = CurrentLoop(
+        kp=kp, ki=kp / inductance, max_voltage=100.0 * needed_voltage(task), current_noise=dose * largest
+    )
+    return posed(task, Actuator(Motor(1.0, inductance, constant, constant), loop))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,18 +114,58 @@ class Axis:
     """What its doses are in."""
     doses: tuple[float, ...]
     """Six of them, the first is none."""
-    trained: float
-    """The one of them that is trained through, chosen before the study in a pilot with other seeds."""
+    trained: Mapping[str, float]
+    """Task -> the one of them that is trained through, chosen before the study in a pilot with other seeds."""
     at: Callable[[str, float], EnvConfig]
     """(task, dose) -> the environment."""
+    own_motor: bool = False
+    """Whether the first dose, too, is a motor of its own, and not ideal forces."""
 
 
 AXES: Mapping[str, Axis] = {
-    "lag": Axis("Lag", "time constant [policy steps]", (0.0, 0.25, 0.5, 1.0, 2.0, 4.0), 2.0, lag),
-    "weakness": Axis("Weakness", "missing share of the force", (0.0, 0.1, 0.25, 0.4, 0.55, 0.7), 0.4, weakness),
-    "supply": Axis("Supply", "missing share of the voltage", (0.0, 0.2, 0.35, 0.5, 0.6, 0.7), 0.5, supply),
-    "delay": Axis("Delay", "delay [policy steps]", (0.0, 0.5, 1.0, 2.0, 3.0, 4.0), 2.0, delay),
-    "friction": Axis("Friction", "Coulomb friction / largest force", (0.0, 0.02, 0.05, 0.1, 0.2, 0.3), 0.2, friction),
-    "noise": Axis("Noise", "current noise / largest current", (0.0, 0.1, 0.2, 0.4, 0.8, 1.6), 0.8, noise),
+    "lag": Axis(
+        "Lag",
+        "time constant [policy steps]",
+        (0.0, 0.25, 0.5, 1.0, 2.0, 4.0),
+        {"pendulum": 2.0, "furuta": 0.5},
+        lag,
+    ),
+    "weakness": Axis(
+        "Weakness",
+        "missing share of the force",
+        (0.0, 0.1, 0.25, 0.4, 0.55, 0.7),
+        {"pendulum": 0.25, "furuta": 0.55},
+        weakness,
+    ),
+    "supply": Axis(
+        "Supply",
+        "missing share of the voltage",
+        (0.0, 0.2, 0.35, 0.5, 0.6, 0.7),
+        {"pendulum": 0.35, "furuta": 0.6},
+        supply,
+        own_motor=True,
+    ),
+    "delay": Axis(
+        "Delay",
+        "delay [policy steps]",
+        (0.0, 0.5, 1.0, 2.0, 3.0, 4.0),
+        {"pendulum": 2.0, "furuta": 0.5},
+        delay,
+    ),
+    "friction": Axis(
+        "Friction",
+        "Coulomb friction [largest force]",
+        (0.0, 0.02, 0.05, 0.1, 0.2, 0.3),
+        {"pendulum": 0.1, "furuta": 0.2},
+        friction,
+    ),
+    "noise": Axis(
+        "Noise",
+        "current noise [largest current]",
+        (0.0, 0.1, 0.2, 0.4, 0.8, 1.6),
+        {"pendulum": 0.8, "furuta": 0.8},
+        noise,
+        own_motor=True,
+    ),
 }
 """The axes by name."""
