@@ -84,8 +84,17 @@ def bars(path: Path, scores: Scores, groups: Mapping[str, Sequence[tuple[str, Tr
             if values.size:
                 at = place + 0.8 * ((number + 0.5) / len(each) - 0.5)
                 colour = COLOURS[labels.index(label) % len(COLOURS)]
-                axes.plot(np.full(len(values), at + 0.06), np.maximum(values, _LOWEST), ".", color=colour, ms=3, alpha=0.6)
-                _bars(axes, np.array([at]), [bootstrap_mean(values)], colour, MARKERS[labels.index(label) % len(MARKERS)], label)
+                axes.plot(
+                    np.full(len(values), at + 0.06), np.maximum(values, _LOWEST), ".", color=colour, ms=3, alpha=0.6
+                )
+                _bars(
+                    axes,
+                    np.array([at]),
+                    [bootstrap_mean(values)],
+                    colour,
+                    MARKERS[labels.index(label) % len(MARKERS)],
+                    label,
+                )
     axes.set_xticks(range(len(groups)), groups)
     axes.set(ylabel="score [share of the span]", title=title, xlim=(-0.5, len(groups) - 0.5))
     axes.grid(axis="y", color="0.9")
@@ -106,5 +115,3 @@ def _bars(axes: Any, places: np.ndarray, means: Sequence[Any], colour: str, mark
     low = np.maximum(middle - np.maximum([one.low for one in means], _LOWEST), 0.0)
     high = np.maximum(np.maximum([one.high for one in means], _LOWEST) - middle, 0.0)
     axes.errorbar(places, middle, [low, high], fmt=marker, color=colour, ms=5, lw=1.2, label=label)
-
-

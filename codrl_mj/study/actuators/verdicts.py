@@ -27,7 +27,8 @@ FLOORS: Mapping[str, float] = {
 
 class Scores:
     """Scores of policies in shares of their task's span: 0 is what random actions get, 1 what policies do that were
-    trained and tested on ideal forces, on the mean."""
+    trained and tested on ideal forces, on the mean.
+    """
 
     def __init__(self, collected: Collected) -> None:
         """Read the spans.
