@@ -5,7 +5,7 @@ study of the paper's loop on unmodified Gymnasium dynamics, of 2 to 40 seeds, th
 """
 
 import dataclasses
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -136,8 +136,9 @@ def _compared(measure: Measure, how: str, by_seed: bool = False) -> Measure:
     """A measure of two arms; `by_seed`, of the seeds that both have."""
 
     def values(one: Series, other: Series) -> tuple[np.ndarray, np.ndarray]:
-        shared: Collection[int] = one.runs.keys() & other.runs.keys()
-        return tuple(measure.values(each.only(shared) if by_seed else each) for each in (one, other))  # type: ignore[return-value]
+        if by_seed:
+            one, other = one.only(other.runs), other.only(one.runs)
+        return measure.values(one), measure.values(other)
 
     return Measure(f"{measure.text}: {how}", values)
 

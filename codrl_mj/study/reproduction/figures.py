@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import IDEAL
-from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.films.strip import ACTUAL, DESIRED
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.study.figures import COLOURS, save
-from codrl_mj.study.reproduction.arms import CENTRE_RADIUS, PaperArm
+from codrl_mj.study.reproduction.arms import CENTRE_RADIUS, TEST, PaperArm
 from codrl_mj.study.reproduction.series import LAST, Series
 from codrl_mj.study.reproduction.value_iteration import Optimum
 from codrl_mj.tasks import acrobot, cartpole, find_task, mountain_car, mountain_car_continuous, pendulum
@@ -85,41 +84,50 @@ def example(series: Series) -> Episode | None:
     """The first test episode of the first seed that is finished; None if none is."""
     if not series.runs:
         return None
-    arm, run = series.arm, next(iter(series.runs.values()))
-    (episode,) = run_episodes(
-        load_policy(run.folder), EnvConfig(arm.task, arm.actuator, arm.physics).make, 1, EVALUATION_SEED
-    )
+    run = next(iter(series.runs.values()))
+    (episode,) = run_episodes(load_policy(run.folder), series.arm.trials[TEST].env.make, 1, EVALUATION_SEED)
     return episode
 
 
 def draw_learning(path: Path, arms: Sequence[Series]) -> None:
-    """Draw returns over training episodes, a panel for each settings and physics: running means, and 95 % bands.
+    """Draw trainings, a column for each settings and physics that there are runs of: means and 95 % bands over seeds.
+
+    It is the running mean of returns over episodes; of PPO, whose rollouts are the paper's epochs, mean return, mean
+    length and number of episodes over epochs.
 
     Args:
         path: SVG file.
         arms: of one task.
     """
-    rows = {f"return, mean of last {LAST}": lambda series: running_mean(series.returns_by_episode())}
-    _draw_bands(path, arms, rows, "training episode", "{settings} settings, {physics}", "medium")
-
-
-def draw_epochs(path: Path, arms: Sequence[Series]) -> None:
-    """Draw mean return, mean length and number of episodes over epochs, a column for each physics.
-
-    Args:
-        path: SVG file.
-        arms: of one task, whose agent has epochs.
-    """
 
     def over_epochs(what: str) -> Callable[[Series], np.ndarray]:
         return lambda series: np.array([_filled(getattr(one, what).astype(float)) for one in series.epochs()])
 
-    labels = {"mean return": "returns", "mean length [steps]": "lengths", _COUNTS: "counts"}
-    rows = {label: over_epochs(what) for label, what in labels.items()}
-    _draw_bands(path, arms, rows, "epoch of 4000 steps", "{physics}", "large")
-
-
-_COUNTS = "number of episodes"
+    rows = {f"return, mean of last {LAST}": lambda series: running_mean(series.returns_by_episode())}
+    along, title, size = "training episode", "{} settings, {}", "medium"
+    if arms[0].arm.config.agent.name == "ppo":
+        labels = {"mean return": "returns", "mean length [steps]": "lengths", "number of episodes": "counts"}
+        rows = {label: over_epochs(what) for label, what in labels.items()}
+        along, title, size = "epoch of 4000 steps", "{1}", "large"
+    columns: dict[tuple[str, str], list[Series]] = {}
+    for series in arms:
+        if series.runs:
+            columns.setdefault((series.arm.settings, PHYSICS[series.arm.physics]), []).append(series)
+    figure, all_axes = _panels(len(rows), len(columns))
+    for (about, members), column in zip(columns.items(), all_axes.T, strict=True):
+        for axes, (label, values_of) in zip(column, rows.items(), strict=True):
+            for series in members:
+                values = values_of(series)
+                colour, dashes = STYLES[series.arm.motor]
+                places, (mean, low, high) = np.arange(1, values.shape[1] + 1), band(values)
+                name = f"{_name(series.arm)} ({len(values)} seeds)"
+                axes.plot(places, mean, color=colour, linestyle=dashes, linewidth=1.4, label=name)
+                axes.fill_between(places, low, high, color=colour, alpha=0.2, linewidth=0)
+            axes.set(ylabel=label, yscale="log" if label == "number of episodes" else "linear")
+        column[0].set_title(title.format(*about), fontsize=size)
+        column[-1].set_xlabel(along)
+    _legend(figure, all_axes)
+    save(figure, path)
 
 
 def draw_torque(path: Path, episodes: Sequence[tuple[PaperArm, Episode]]) -> None:
@@ -210,47 +218,6 @@ def _panels(rows: int, columns: int, row_height: float = 0.0, heights: Sequence[
         each.set_axisbelow(True)
         each.spines[["top", "right"]].set_visible(False)
     return figure, axes
-
-
-def _draw_bands(
-    path: Path,
-    arms: Sequence[Series],
-    rows: Mapping[str, Callable[[Series], np.ndarray]],
-    along: str,
-    title: str,
-    size: str,
-) -> None:
-    """Draw means over seeds and their intervals, a column for each settings and physics that there are runs of.
-
-    Args:
-        path: SVG file.
-        arms: of one task.
-        rows: label -> what is drawn of a series, shape (seeds, n).
-        along: label of the other axis, counted from 1.
-        title: of a column, with `{settings}` and `{physics}`.
-        size: its font's.
-    """
-    columns: dict[tuple[str, str], list[Series]] = {}
-    for series in arms:
-        if series.runs:
-            columns.setdefault((series.arm.settings, series.arm.physics), []).append(series)
-    figure, all_axes = _panels(len(rows), len(columns))
-    for ((settings, physics), members), column in zip(columns.items(), all_axes.T, strict=True):
-        for axes, (label, values_of) in zip(column, rows.items(), strict=True):
-            for series in members:
-                values = values_of(series)
-                colour, dashes = STYLES[series.arm.motor]
-                places, (mean, low, high) = np.arange(1, values.shape[1] + 1), band(values)
-                name = f"{_name(series.arm)} ({len(values)} seeds)"
-                axes.plot(places, mean, color=colour, linestyle=dashes, linewidth=1.4, label=name)
-                axes.fill_between(places, low, high, color=colour, alpha=0.2, linewidth=0)
-            axes.set_ylabel(label)
-            if label == _COUNTS:
-                axes.set_yscale("log")
-        column[0].set_title(title.format(settings=settings, physics=PHYSICS[physics]), fontsize=size)
-        column[-1].set_xlabel(along)
-    _legend(figure, all_axes)
-    save(figure, path)
 
 
 def running_mean(values: np.ndarray, count: int = LAST) -> np.ndarray:

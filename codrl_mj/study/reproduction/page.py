@@ -171,7 +171,7 @@ def _draw(findings: Findings, task: str, folder: Path) -> dict[Path, str]:
     if any(one.runs for one in mine):
         path = folder / f"learning_{task}.svg"
         paths[path] = f"Learning, mean over seeds with its 95 % interval: {title}"
-        (figures.draw_epochs if task == "cartpole" else figures.draw_learning)(path, mine)
+        figures.draw_learning(path, mine)
     for settings in dict.fromkeys(one.arm.settings for one in mine):
         shown = [one for one in mine if one.arm.settings == settings and one.arm.physics == "mujoco"]
         episodes = [(one.arm, episode) for one in shown if (episode := figures.example(one)) is not None]

@@ -275,7 +275,7 @@ def test_the_curves_are_what_the_paper_plots():
 def test_epochs_are_drawn(tmp_path):
     arms = [arm for arm in ARMS if arm.task == "cartpole"]
     series = [Series(arm, {seed: trained(seed, epoch=35) for seed in range(3)}) for arm in arms]
-    figures.draw_epochs(tmp_path / "epochs.svg", series)
+    figures.draw_learning(tmp_path / "epochs.svg", series)
     assert ElementTree.parse(tmp_path / "epochs.svg").getroot().tag.endswith("svg")
 
 
