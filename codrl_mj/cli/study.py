@@ -1,6 +1,7 @@
 """`codrl-mj study`, and what it shares with `codrl-mj reproduce`."""
 
 import dataclasses
+import functools
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -13,10 +14,7 @@ import tyro
 class Computed:
     """A verb that trains and tests much, unless that is done already, and writes a page of it.
 
-    It has `plan()`, what is to be computed, and methods of that: `print_costs` prints every training and what the
-    unfinished ones take, and returns the core hours left; `work` returns the numbers of trainings and tests, by the
-    names that a function reports them under, and that function; `write` writes the page, and returns its files and the
-    failures by name.
+    It has `grid()`, what is to be computed, and `write()`, which writes the page, and returns its files and failures.
     """
 
     root: Path
@@ -44,25 +42,50 @@ class Computed:
         from codrl_mj.runs.files import check_writable
         from codrl_mj.study.parallel import Workers
 
-        plan, workers = self.plan(), Workers(self.jobs, self.backend, self.address)
+        grid, workers = self.grid(), Workers(self.jobs, self.backend, self.address)
         if self.dry_run:
-            left = self.print_costs(plan)
+            left = self.print_costs(grid)
             print(f"about {left:.2f} core hours are left: {left / workers.cores:.2f} hours with {workers.cores} jobs")
             return 0
         check_writable(self.out)
         if not self.only_page:
             import matplotlib  # noqa: F401 - what is missing is missed now and not in the end
 
-            counts, compute = self.work(plan)
+            counts, compute = self.work(grid)
             with progress_bar("{task.completed}/{task.total}") as bar:
                 rows = {kind: bar.add_task(f"{kind}s", total=count) for kind, count in counts.items()}
-                compute(plan, workers, self.accept_changes, lambda kind, *_: bar.advance(rows[kind]))
-        files, failures = self.write(plan)
+                compute(workers, self.accept_changes, lambda kind, *_: bar.advance(rows[kind]))
+        files, failures = self.write()
         for file in files:
             print(f"wrote {file}")
         for name, error in failures.items():
             print(f"failed: {name}: {error}", file=sys.stderr)
         return 1 if failures else 0
+
+    def print_costs(self, grid: Any) -> float:
+        """Print every arm, which of its trainings are finished, and what is left; the core hours left."""
+        from rich import box
+        from rich.table import Table
+
+        from codrl_mj.cli.terminal import console
+        from codrl_mj.study.trials import numbers_as_text
+
+        table, every = (
+            Table("arm", "seeds\nfinished", "seeds\nto do", box=box.SIMPLE_HEAD, pad_edge=False),
+            grid.costs(),
+        )
+        for header in ("s each", "tests\nto do", "core hours\nleft"):
+            table.add_column(header, justify="right")
+        for cost in every:
+            each = f"{'' if cost.finished else 'about '}{cost.seconds:.0f}"
+            seeds = numbers_as_text(cost.finished), numbers_as_text(cost.missing)
+            table.add_row(cost.arm.name, *seeds, each, str(cost.tests), f"{cost.left / 3600:.2f}")
+        console().print(table)
+        return sum(cost.left for cost in every) / 3600
+
+    def work(self, grid: Any) -> tuple[Mapping[str, int], Callable[..., None]]:
+        """The numbers of trainings and tests, by the names that a function reports them under, and that function."""
+        return {"training": len(grid.cells()), "test": len(grid.deployments())}, grid.compute
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -97,14 +120,14 @@ class Study(Computed):
     total_steps: int | None = None
     """Environment steps of every training; the default is each agent's own budget."""
 
-    def plan(self) -> Any:
+    def grid(self) -> Any:
         """The study's configuration."""
         from codrl_mj.study.mismatch import MismatchConfig
 
         names = "root", "tasks", "experiments", "conditions", "seeds", "episodes", "total_steps"
         return MismatchConfig(**{name: value for name in names if (value := getattr(self, name)) is not None})
 
-    def print_costs(self, plan: Any) -> float:
+    def print_costs(self, grid: Any) -> float:
         """Print the seeds of every training, and a row for each agent on each task."""
         from rich.table import Table
 
@@ -112,12 +135,12 @@ class Study(Computed):
         from codrl_mj.study.cost import costs, seeds_finished
 
         table = Table("training", "seeds finished", "seeds to do")
-        for kind, seeds in seeds_finished(plan).items():
+        for kind, seeds in seeds_finished(grid).items():
             table.add_row(
                 kind, *(" ".join(str(seed) for seed, done in seeds.items() if done is to) for to in (True, False))
             )
         console().print(table)
-        every = costs(plan)
+        every = costs(grid)
         title = f"Time of one core: about {sum(cost.total for cost in every) / 3600:.2f} hours in all"
         header = (
             "task",
@@ -142,16 +165,16 @@ class Study(Computed):
         console().print(table)
         return sum(cost.left for cost in every) / 3600
 
-    def work(self, plan: Any) -> tuple[Mapping[str, int], Callable[..., None]]:
+    def work(self, grid: Any) -> tuple[Mapping[str, int], Callable[..., None]]:
         """Every cell and its tests."""
         from codrl_mj.study.mismatch import cells, compute, trials
 
-        return {"training": len(cells(plan)), "test": len(trials(plan)) * plan.seeds}, compute
+        return {"training": len(cells(grid)), "test": len(trials(grid)) * grid.seeds}, functools.partial(compute, grid)
 
-    def write(self, plan: Any) -> tuple[Iterable[Path], Mapping[str, Any]]:
+    def write(self) -> tuple[Iterable[Path], Mapping[str, Any]]:
         """The page of all results that there are."""
         from codrl_mj.study.mismatch import collect
         from codrl_mj.study.page import write
 
-        results = collect(plan)
+        results = collect(self.grid())
         return write(results, self.out), results.failures

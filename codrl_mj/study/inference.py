@@ -142,7 +142,7 @@ def detectable(runs: int, level: float = 0.05, chance: float = 0.8) -> float:
 
 
 def runs_needed(difference: float, level: float = 0.05, chance: float = 0.8, most: int = 10_000) -> int | None:
-    """Runs of each kind that find a difference, in standard deviations of a run, with that chance; None beyond `most`."""
+    """Runs of each kind that find a difference, in standard deviations of a run, with that chance; None: > `most`."""
     if difference == 0 or power(most, difference, level) < chance:
         return None
     low, high = 2, most

@@ -183,7 +183,7 @@ class Grid:
             evaluations=evaluations,
             missing=tuple(missing),
             failures={name: failure.error for name, failure in failures.items() if failure is not None},
-            seconds=sum(_seconds(folder) for folder in done.values()),
+            seconds=sum(training_seconds(folder) for folder in done.values()),
             codes=collections.Counter(
                 str(read_json(folder / "config.json", "run configuration").get("code"))[:8] for folder in done.values()
             ),
@@ -202,7 +202,7 @@ class Grid:
         found = []
         for arm in self.arms:
             mine = {seed: folders[arm.name, seed] for seed in self.seeds_of(arm)}
-            took = {seed: _seconds(folder) for seed, folder in mine.items() if finished(folder)}
+            took = {seed: training_seconds(folder) for seed, folder in mine.items() if finished(folder)}
             seconds = float(np.mean(list(took.values()))) if took else arm.seconds
             waiting = sum(untested[folder] for folder in mine.values())
             found.append(Cost(arm, tuple(took), tuple(seed for seed in mine if seed not in took), seconds, waiting))
@@ -229,11 +229,9 @@ class Collected:
     """How many of them each version of the code has trained, by its digest."""
 
     def scores(self, trial: Trial, measure: str = "returns") -> dict[int, float]:
-        """A measure of every policy of a trial, by seed: means of intervals, medians of quartiles; without those
-        policies that have none."""
-        found = {seed: evaluation[measure] for seed, evaluation in self.evaluations[trial.name].items()}
-        plain = {seed: _plain(value) for seed, value in found.items()}
-        return {seed: float(value) for seed, value in plain.items() if value is not None}
+        """A measure of every policy of a trial that has one, by seed: means of intervals, medians of quartiles."""
+        found = {seed: plain(evaluation[measure]) for seed, evaluation in self.evaluations[trial.name].items()}
+        return {seed: float(value) for seed, value in found.items() if value is not None}
 
 
 def called(name: str, seed: int) -> str:
@@ -241,11 +239,17 @@ def called(name: str, seed: int) -> str:
     return f"{name}, seed {seed}"
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """A measure as one number: of an interval the mean, of quartiles the median."""
     return value.get("mean", value.get("median")) if isinstance(value, Mapping) else value
 
 
-def _seconds(folder: Path) -> float:
+def training_seconds(folder: Path) -> float:
+    """What a finished training took [s].
+
+    Raises:
+        ValueError: its result is damaged.
+    """
     return float(read_json(folder / RESULT, "result of a run")["seconds"])
 
 
