@@ -1,9 +1,8 @@
 """`codrl-mj study`, and what it shares with `codrl-mj reproduce`."""
 
 import dataclasses
-import functools
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -51,10 +50,10 @@ class Computed:
         if not self.only_page:
             import matplotlib  # noqa: F401 - what is missing is missed now and not in the end
 
-            counts, compute = self.work(grid)
+            counts = {"training": len(grid.cells()), "test": len(grid.deployments())}
             with progress_bar("{task.completed}/{task.total}") as bar:
                 rows = {kind: bar.add_task(f"{kind}s", total=count) for kind, count in counts.items()}
-                compute(workers, self.accept_changes, lambda kind, *_: bar.advance(rows[kind]))
+                grid.compute(workers, self.accept_changes, lambda kind: bar.advance(rows[kind]))
         files, failures = self.write()
         for file in files:
             print(f"wrote {file}")
@@ -83,98 +82,41 @@ class Computed:
         console().print(table)
         return sum(cost.left for cost in every) / 3600
 
-    def work(self, grid: Any) -> tuple[Mapping[str, int], Callable[..., None]]:
-        """The numbers of trainings and tests, by the names that a function reports them under, and that function."""
-        return {"training": len(grid.cells()), "test": len(grid.deployments())}, grid.compute
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Study(Computed):
-    """Run a study of many trainings, or go on with it, and write its page: docs/studies.md.
+    """Run the study of what an actuator costs, or go on with it, and write its page: docs/studies.md.
 
     What is finished is not computed again, so the same command resumes a study, adds seeds to it, and writes its page
-    anew. Example: codrl-mj study mismatch --dry-run, or codrl-mj study mismatch --tasks cartpole --seeds 3 --jobs 2
+    anew. Example: codrl-mj study actuators --dry-run, or codrl-mj study actuators --tasks pendulum --seeds 3 --jobs 2
     """
 
     study: Annotated[
-        tyro.conf.Positional[Literal["mismatch"]],
-        tyro.conf.arg(help="mismatch: train on one actuator, test on another."),
+        tyro.conf.Positional[Literal["actuators"]],
+        tyro.conf.arg(help="actuators: when an actuator matters, and what helps: docs/results/plan.md."),
     ]
-    root: Path = Path("runs/mismatch")
+    root: Path = Path("runs/actuators")
+    seeds: int = 20
+    """Training runs of each kind, with seeds from 0."""
     tasks: Annotated[
         tuple[str, ...] | None, tyro.conf.arg(metavar="NAME ...", help="Tasks; the default is all that it has.")
     ] = None
-    experiments: Annotated[
-        tuple[str, ...] | None,
-        tyro.conf.arg(
-            metavar="NAME ...",
-            help="Of matrix, ladder, action, observation, randomised, reward, agents; the default is all.",
-        ),
-    ] = None
-    conditions: Annotated[
-        tuple[str, ...] | None,
-        tyro.conf.arg(metavar="NAME ...", help="Actuators to train and test on, such as ideal weaker; default all."),
-    ] = None
-    episodes: int = 100
+    episodes: int = 50
     """Test episodes of each policy on each actuator."""
     total_steps: int | None = None
-    """Environment steps of every training; the default is each agent's own budget."""
+    """Environment steps of every training, for trying things out; the default is each agent's own budget."""
 
     def grid(self) -> Any:
-        """The study's configuration."""
-        from codrl_mj.study.mismatch import MismatchConfig
+        """Its trainings and tests."""
+        from codrl_mj.study.actuators.study import ActuatorStudy
 
-        names = "root", "tasks", "experiments", "conditions", "seeds", "episodes", "total_steps"
-        return MismatchConfig(**{name: value for name in names if (value := getattr(self, name)) is not None})
-
-    def print_costs(self, grid: Any) -> float:
-        """Print the seeds of every training, and a row for each agent on each task."""
-        from rich.table import Table
-
-        from codrl_mj.cli.terminal import console
-        from codrl_mj.study.cost import costs, seeds_finished
-
-        table = Table("training", "seeds finished", "seeds to do")
-        for kind, seeds in seeds_finished(grid).items():
-            table.add_row(
-                kind, *(" ".join(str(seed) for seed, done in seeds.items() if done is to) for to in (True, False))
-            )
-        console().print(table)
-        every = costs(grid)
-        title = f"Time of one core: about {sum(cost.total for cost in every) / 3600:.2f} hours in all"
-        header = (
-            "task",
-            "agent",
-            "steps",
-            "trainings",
-            "finished",
-            "s each",
-            "tests",
-            "finished",
-            "s each",
-            "hours left",
-        )
-        table = Table(*header, title=title, title_justify="left")
-        for cost in every:
-            estimate = "" if cost.trained else "about "
-            table.add_row(
-                *(cost.task, cost.agent, f"{cost.steps:,}", str(cost.trainings), str(cost.trained)),
-                *(f"{estimate}{cost.seconds:.0f}", str(cost.tests), str(cost.tested), f"about {cost.test_seconds:.1f}"),
-                f"{cost.left / 3600:.2f}",
-            )
-        console().print(table)
-        return sum(cost.left for cost in every) / 3600
-
-    def work(self, grid: Any) -> tuple[Mapping[str, int], Callable[..., None]]:
-        """Every cell and its tests."""
-        from codrl_mj.study.mismatch import cells, compute, trials
-
-        return {"training": len(cells(grid)), "test": len(trials(grid)) * grid.seeds}, functools.partial(compute, grid)
+        names = "root", "tasks", "seeds", "episodes", "total_steps"
+        given = {name: value for name in names if (value := getattr(self, name)) is not None}
+        return ActuatorStudy(**given).grid
 
     def write(self) -> tuple[Iterable[Path], Mapping[str, Any]]:
         """The page of all results that there are."""
-        from codrl_mj.study.mismatch import collect
-        from codrl_mj.study.page import write
+        from codrl_mj.study.actuators.page import write
 
-        results = collect(self.grid())
-        return write(results, self.out), results.failures
+        collected = self.grid().collect()
+        return write(collected, self.out), collected.failures

@@ -305,7 +305,7 @@ def _tracking(episodes: Sequence[Episode], driven: Sequence[Sequence[_Driven]]) 
     }
 
 
-def _wear(episodes: Sequence[Episode], driven: Sequence[Sequence[_Driven]]) -> dict[str, float]:
+def _wear(episodes: Sequence[Episode], driven: Sequence[Sequence[_Driven]]) -> dict[str, Any]:
     """What the delivered torques do to gears and bearings, on the mean of the motors."""
     duration = math.fsum(episode.time[-1] for episode in episodes) * len(driven[0])
     actual = [one.actual for each in driven for one in each]

@@ -4,6 +4,7 @@ A score is one trained policy's mean over its test episodes. Runs, not episodes,
 pools strata (the same question on several tasks or doses): its effect is the mean of their differences of means.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -11,8 +12,8 @@ import numpy as np
 
 from codrl_mj.evaluation.measures import Interval
 
-RELABELLINGS = 100_000
-"""Random relabellings of a permutation test: a p of 1e-5 is the smallest that it can give."""
+RELABELLINGS = 50_000
+"""Random relabellings of a permutation test: a p of 2e-5 is the smallest that it can give."""
 
 
 class Stratum(NamedTuple):
@@ -67,24 +68,34 @@ def permutation_p(strata: Sequence[Stratum], least: float = 0.0, two_sided: bool
         least: the difference that is to be exceeded: it is taken from the one's scores first.
         two_sided: whether a difference of the other sign counts as well.
     """
-    random = np.random.default_rng(0)
     totals = np.zeros(RELABELLINGS)
     seen = 0.0
-    for stratum in strata:
-        one = stratum.one - least
-        seen += float(np.mean(one) - np.mean(stratum.other))
+    for number, stratum in enumerate(strata):
+        one, other = stratum.one - least, stratum.other
+        seen += float(np.mean(one) - np.mean(other))
         if stratum.paired:
-            gains = one - stratum.other
-            signs = random.integers(0, 2, (RELABELLINGS, len(gains)), dtype=np.int8) * 2 - 1
-            totals += signs @ gains / len(gains)
+            totals += _signs(len(one), number) @ (one - other) / len(one)
             continue
-        pooled, n = np.concatenate([one, stratum.other]), len(one)
-        drawn = np.argpartition(random.random((RELABELLINGS, len(pooled)), dtype=np.float32), n - 1, axis=1)[:, :n]
-        sums = pooled[drawn].sum(axis=1)
-        totals += sums / n - (pooled.sum() - sums) / (len(pooled) - n)
-    slack = 1e-12 * max(1.0, abs(seen))  # sums in another order differ by rounding
+        pooled, n = np.concatenate([one, other]), len(one)
+        sums = _chosen(n, len(other), number) @ pooled
+        totals += sums / n - (pooled.sum() - sums) / len(other)
+    slack = 1e-9 * max(1.0, abs(seen))  # sums in another order differ by rounding
     extreme = np.abs(totals) >= abs(seen) - slack if two_sided else totals >= seen - slack
     return (1 + int(extreme.sum())) / (1 + RELABELLINGS)
+
+
+@functools.lru_cache(32)
+def _signs(n: int, stratum: int) -> np.ndarray:
+    """Random signs of n pairs, shape (relabellings, n)."""
+    random = np.random.default_rng([n, stratum])
+    return (random.integers(0, 2, (RELABELLINGS, n)) * 2 - 1).astype(np.float64)
+
+
+@functools.lru_cache(32)
+def _chosen(n: int, m: int, stratum: int) -> np.ndarray:
+    """Which n of n + m runs are labelled as the one, at random, shape (relabellings, n + m)."""
+    keys = np.random.default_rng([n, m, stratum]).random((RELABELLINGS, n + m), dtype=np.float32)
+    return (np.argsort(np.argsort(keys, axis=1), axis=1) < n).astype(np.float64)
 
 
 def equivalence_p(strata: Sequence[Stratum], margin: float) -> float:

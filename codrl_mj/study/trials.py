@@ -229,8 +229,12 @@ class Collected:
     """How many of them each version of the code has trained, by its digest."""
 
     def scores(self, trial: Trial, measure: str = "returns") -> dict[int, float]:
-        """A measure of every policy of a trial that has one, by seed: means of intervals, medians of quartiles."""
-        found = {seed: plain(evaluation[measure]) for seed, evaluation in self.evaluations[trial.name].items()}
+        """A measure of every policy of a trial that has one, by seed: means of intervals, medians of quartiles.
+
+        None of a trial that is not in the grid.
+        """
+        tested = self.evaluations.get(trial.name, {})
+        found = {seed: plain(evaluation[measure]) for seed, evaluation in tested.items()}
         return {seed: float(value) for seed, value in found.items() if value is not None}
 
 

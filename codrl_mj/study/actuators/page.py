@@ -1,5 +1,6 @@
 """The study's page: the answer to each hypothesis that was written down before, and the figures."""
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from codrl_mj.study.actuators.questions import (
     through_loop,
     through_motor,
 )
-from codrl_mj.study.actuators.verdicts import FLOORS, MARGIN, Scores, Verdict, judge, seeds_to_close
+from codrl_mj.study.actuators.verdicts import FLOORS, LEVEL, MARGIN, Scores, Verdict, judge, seeds_to_close
 from codrl_mj.study.conclusions import conclusions_section
 from codrl_mj.study.inference import detectable
 from codrl_mj.study.trials import Collected, Trial
@@ -93,18 +94,19 @@ def _draw(scores: Scores, folder: Path) -> dict[str, Path]:
 
 
 def _head(collected: Collected) -> str:
-    done, wanted = len(collected.folders), len(collected.grid.cells())
-    tested = sum(map(len, collected.evaluations.values()))
+    grid = collected.grid
+    done, wanted = len(collected.folders), len(grid.cells())
+    tested, tests = sum(map(len, collected.evaluations.values())), len(grid.deployments())
     codes = ", ".join(f"`{code}` ({count})" for code, count in sorted(collected.codes.items())) or "none"
     return f"""# What does an actuator cost?
 
-{done} of {wanted} trainings are finished ({collected.seconds / 3600:.1f} hours of one core), and {tested} of
-{len(collected.grid.deployments())} tests. [The plan](plan.md) was written before the first of them: questions, hypotheses, tests.
+{done} of {wanted} trainings are finished ({collected.seconds / 3600:.1f} hours of one core), and {tested} of {tests}
+tests. [The plan](plan.md) was written before the first of them: questions, hypotheses, tests.
 Versions of the code that trained, with the number of runs: {codes}.
 
-`codrl-mj study actuators` writes this page, its figures and its tables; do not edit it ([how to run it](../studies.md)).
-The numbers are files: [hypotheses]({FOLDER}/{tables.HYPOTHESES}), [trials]({FOLDER}/{tables.TRIALS}),
-[runs]({FOLDER}/{tables.RUNS}).
+`codrl-mj study actuators` writes this page, its figures and its tables; do not edit it
+([how to run it](../studies.md)). The numbers are files: [hypotheses]({FOLDER}/{tables.HYPOTHESES}),
+[trials]({FOLDER}/{tables.TRIALS}), [runs]({FOLDER}/{tables.RUNS}).
 """
 
 
@@ -175,18 +177,15 @@ def _missing(collected: Collected) -> str:
 
 
 def _method(collected: Collected, scores: Scores) -> str:
-    spans = (
-        "; ".join(f"{task} {FLOORS[task]:g} to {ceiling:.1f}" for task, ceiling in scores.ceilings.items())
-        or "none is known yet"
-    )
-    runs = len(collected.grid.seeds_of(collected.grid.arms[0]))
-    return f"""## How the numbers are made
-
-A policy's score is its mean return over {collected.grid.episodes} test episodes, in shares of the task's span: 0 is what random actions get
-on ideal forces, 1 what policies get there on the mean that were trained there ({spans}).
-CartPole's return is the paper's: steps within 0.1 m of the centre. Effects are differences of mean scores, pooled over
-tasks or doses where a hypothesis has several, with intervals by Student's t. p are of permutation tests of exact level,
-of equivalence by two one-sided ones with a margin of {MARGIN:g}; primary ones are corrected by Holm, the others by
-Benjamini and Hochberg. With {runs} seeds a difference of {detectable(max(runs, 2), 0.05 / 12):.2f} standard deviations of a run is found with a chance of
-80 % at the strictest of Holm's levels.
-"""
+    known = [f"{task} {FLOORS[task]:g} to {ceiling:.1f}" for task, ceiling in scores.ceilings.items()]
+    grid = collected.grid
+    runs = max(len(grid.seeds_of(grid.arms[0])), 2)
+    text = f"""A policy's score is its mean return over {grid.episodes} test episodes, in shares of the span: 0 is
+what random actions get on ideal forces, 1 what policies get there on the mean that were trained there
+({"; ".join(known) or "none is known yet"}). CartPole's return is the paper's: steps within 0.1 m of the centre.
+Effects are differences of mean scores, pooled over tasks or doses where a hypothesis has several, with intervals by
+Student's t. p are of permutation tests of exact level, of equivalence by two one-sided ones with a margin of
+{MARGIN:g}; primary ones are corrected by Holm, the others by Benjamini and Hochberg. With {runs} seeds a difference of
+{detectable(runs, LEVEL / 12):.2f} standard deviations of a run is found with a chance of 80 % at the strictest of
+Holm's levels."""
+    return f"## How the numbers are made\n\n{textwrap.fill(' '.join(text.split()), 120, break_long_words=False)}\n"

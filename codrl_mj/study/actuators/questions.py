@@ -215,7 +215,8 @@ def primary() -> list[Hypothesis]:
         Hypothesis(
             "P10",
             "wrong",
-            "Policies trained through a motor score as high where resistance, inductance or torque constant is 25 % off",
+            "Policies trained through a motor score as high where resistance, inductance or torque constant is "
+            "25 % off",
             tuple(pair for task in LOOPED for pair in _mean_wrong(task, quarter)),
             "equivalent",
         ),

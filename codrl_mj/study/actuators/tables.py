@@ -9,6 +9,7 @@ import numpy as np
 from codrl_mj.actuators import mapping_of
 from codrl_mj.evaluation.measures import bootstrap_mean
 from codrl_mj.study.actuators.verdicts import Scores, Verdict, seeds_to_close
+from codrl_mj.study.tables import write_csv
 from codrl_mj.study.trials import Collected
 
 RUNS, TRIALS, HYPOTHESES = "runs.csv", "trials.csv", "hypotheses.csv"
@@ -22,6 +23,7 @@ MEASURES = (
     "energy_drawn",
     "copper_loss",
     "mechanical_work",
+    "torque_rms",
     "reversals",
 )
 """What is tabulated besides score and return: fields of `codrl_mj.evaluation.Evaluation`."""
@@ -95,8 +97,6 @@ def hypotheses(verdicts: Sequence[Verdict]) -> Iterable[dict[str, Any]]:
 
 def write(collected: Collected, scores: Scores, verdicts: Sequence[Verdict], folder: Path) -> list[Path]:
     """Write the files into a folder."""
-    from codrl_mj.study.tables import write_csv
-
     rows = {RUNS: runs(collected, scores), TRIALS: trials(collected, scores), HYPOTHESES: hypotheses(verdicts)}
     for name, table in rows.items():
         write_csv(folder / name, list(table))

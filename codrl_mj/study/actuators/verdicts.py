@@ -26,8 +26,9 @@ FLOORS: Mapping[str, float] = {
 
 
 class Scores:
-    """Scores of policies in shares of their task's span: 0 is what random actions get, 1 what policies do that were
-    trained and tested on ideal forces, on the mean.
+    """Scores of policies in shares of their task's span.
+
+    0 is what random actions get on ideal forces, 1 what policies get there on the mean that were trained there.
     """
 
     def __init__(self, collected: Collected) -> None:
@@ -37,9 +38,11 @@ class Scores:
             collected: what there is of the study.
         """
         self._collected = collected
-        homes = {task: collected.scores(at_home(arms.ideal(task))) for task in arms.SECONDS}
-        self.ceilings = {task: float(np.mean(list(found.values()))) for task, found in homes.items() if found}
-        """Task -> upper end of its span; without those of which no ideal-trained policy is tested."""
+        homes = {task: list(collected.scores(at_home(arms.ideal(task))).values()) for task in arms.SECONDS}
+        means = {task: float(np.mean(found)) for task, found in homes.items() if found}
+        self.ceilings = {task: mean for task, mean in means.items() if mean > FLOORS[task]}
+        """Task -> upper end of its span; without those whose ideal-trained policies are not tested, or are no better than
+        random actions."""
 
     def of(self, trial: Trial) -> dict[int, float]:
         """Score of every policy of a trial by seed; none where the task's span is not known."""

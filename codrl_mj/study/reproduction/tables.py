@@ -1,17 +1,16 @@
 """The reproduction's numbers as files: every claim and every run as CSV, and all of it as JSON."""
 
-import csv
-from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from codrl_mj.runs.files import write_json, writing
+from codrl_mj.runs.files import write_json
 from codrl_mj.study.reproduction.claims import Claim
 from codrl_mj.study.reproduction.reproduce import Findings
 from codrl_mj.study.reproduction.series import LAST, Series
 from codrl_mj.study.reproduction.verdicts import Verdict
+from codrl_mj.study.tables import write_csv
 
 CLAIMS, RUNS, EVERYTHING = "claims.csv", "runs.csv", "findings.json"
 TESTED = (
@@ -25,17 +24,10 @@ RUN_COLUMNS = ("task", "settings", "motor", "gains", "physics", "seed", "run", "
 def write(findings: Findings, folder: Path) -> list[Path]:
     """Write the three files into a folder."""
     everything = as_mapping(findings)
-    _write_csv(folder / CLAIMS, list(everything["claims"][0]), everything["claims"])
-    _write_csv(folder / RUNS, RUN_COLUMNS, everything["runs"])
+    write_csv(folder / CLAIMS, everything["claims"])
+    write_csv(folder / RUNS, everything["runs"])
     write_json(folder / EVERYTHING, everything)
     return [folder / name for name in (CLAIMS, RUNS, EVERYTHING)]
-
-
-def _write_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    with writing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def claim_row(findings: Findings, claim: Claim, verdict: Verdict) -> dict[str, Any]:
