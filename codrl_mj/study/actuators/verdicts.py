@@ -41,7 +41,7 @@ class Scores:
         homes = {task: list(collected.scores(at_home(arms.ideal(task))).values()) for task in arms.SECONDS}
         means = {task: float(np.mean(found)) for task, found in homes.items() if found}
         self.ceilings = {task: mean for task, mean in means.items() if mean > FLOORS[task]}
-        """Task -> upper end of its span; without those whose ideal-trained policies are not tested, or are no better than
+        """Task -> upper end of its span; without those whose ideal-trained policies are untested, or no better than
         random actions."""
 
     def of(self, trial: Trial) -> dict[int, float]:
