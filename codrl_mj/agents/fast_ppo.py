@@ -11,7 +11,6 @@ from stable_baselines3.common.utils import explained_variance
 from codrl_mj.agents.exploration import Gaussian, exploration
 from codrl_mj.agents.twin_networks import TwinNetworks
 
-
 _LEARNT_FROM = ("actions", "log_probs", "advantages", "returns")
 
 
@@ -22,6 +21,9 @@ class FastPPO(PPO):
     takes the actor's products for each step; values and probabilities of all its actions are found in one go at its
     end. Gradients are written out and not found by automatic differentiation.
     """
+
+    _last_obs: Any
+    _last_episode_starts: Any
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -36,14 +38,14 @@ class FastPPO(PPO):
     @torch.no_grad()
     def collect_rollouts(self, env: Any, callback: Any, rollout_buffer: Any, n_rollout_steps: int) -> bool:
         """Fill the buffer, as `PPO.collect_rollouts` does."""
-        assert self._last_obs is not None
         callback.on_rollout_start()
+        seen, starts = self._last_obs, self._last_episode_starts
         rollout_buffer.reset()
         draws = self._exploration.draws(n_rollout_steps, env.num_envs, self._networks.outputs)
         box = self.action_space if isinstance(self.action_space, spaces.Box) else None
         cut: list[tuple[int, int, np.ndarray]] = []  # step, environment and last observation where time ran out
         for step in range(n_rollout_steps):
-            acted = self._networks.act(self._features(self._last_obs))
+            acted = self._networks.act(self._features(seen))
             actions = self._exploration.actions(*acted, draws[step // self._exploration.every]).numpy()
             clipped = actions if box is None else np.clip(actions, box.low, box.high)
             observations, rewards, dones, infos = env.step(clipped)
@@ -52,14 +54,14 @@ class FastPPO(PPO):
             if not callback.on_step():
                 return False
             self._update_info_buffer(infos, dones)
-            for row in np.flatnonzero(dones).tolist():
-                if infos[row].get("TimeLimit.truncated") and infos[row].get("terminal_observation") is not None:
-                    cut.append((step, row, infos[row]["terminal_observation"]))
-            rollout_buffer.observations[step] = self._last_obs.reshape(rollout_buffer.observations.shape[1:])
+            timed_out = [row for row in np.flatnonzero(dones).tolist() if infos[row].get("TimeLimit.truncated")]
+            cut += [(step, row, infos[row]["terminal_observation"]) for row in timed_out]
+            rollout_buffer.observations[step] = seen.reshape(rollout_buffer.observations.shape[1:])
             rollout_buffer.actions[step] = actions.reshape(env.num_envs, -1)
             rollout_buffer.rewards[step] = rewards
-            rollout_buffer.episode_starts[step] = self._last_episode_starts
-            self._last_obs, self._last_episode_starts = observations, dones
+            rollout_buffer.episode_starts[step] = starts
+            seen, starts = observations, dones
+        self._last_obs, self._last_episode_starts = seen, starts
         rollout_buffer.pos, rollout_buffer.full = n_rollout_steps, True
         layers = self._networks.forward(self._features(_rows(rollout_buffer.observations)))
         actions = torch.as_tensor(_rows(rollout_buffer.actions))
@@ -87,7 +89,9 @@ class FastPPO(PPO):
             self._n_updates += 1
             if not going_on:
                 break
-        self.logger.record("train/explained_variance", explained_variance(buffer.values.ravel(), buffer.returns.ravel()))
+        self.logger.record(
+            "train/explained_variance", explained_variance(buffer.values.ravel(), buffer.returns.ravel())
+        )
         if isinstance(self._exploration, Gaussian):
             self.logger.record("train/std", self._exploration.log_std.exp().mean().item())
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -121,7 +125,7 @@ class FastPPO(PPO):
         gradient[0], by_log_std = judged.backward(by_log_prob, -self.ent_coef / count)
         torch.sub(layers[-1][1, :, :1], returns, out=gradient[1, :, :1]).mul_(2 * self.vf_coef / count)
         networks.backward(layers, gradient)
-        if by_log_std is not None:
+        if networks.log_std_gradient is not None:
             networks.log_std_gradient.copy_(by_log_std)
         networks.gradient.mul_((self.max_grad_norm / (networks.gradient.norm() + 1e-6)).clamp(max=1.0))
         self.policy.optimizer.step()

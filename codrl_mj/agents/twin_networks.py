@@ -33,7 +33,9 @@ class TwinNetworks:
                 (policy.mlp_extractor.value_net, policy.value_net),
             )
         ]
-        shapes = [(max(layer.out_features for layer in pair), pair[0].in_features) for pair in zip(*towers, strict=True)]
+        shapes = [
+            (max(layer.out_features for layer in pair), pair[0].in_features) for pair in zip(*towers, strict=True)
+        ]
         self.outputs = shapes[-1][0]
         log_std = getattr(policy, "log_std", None)
         noise = 0 if log_std is None else log_std.numel()
@@ -85,7 +87,9 @@ class TwinNetworks:
 
 def _carve(vector: torch.Tensor, shapes: list[tuple[int, int]]) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
     """Weights and biases of both networks as views of a vector, layer by layer."""
-    weights, biases, start = [], [], 0
+    weights: list[torch.Tensor] = []
+    biases: list[torch.Tensor] = []
+    start = 0
     for outputs, inputs in shapes:
         for views, size in ((weights, inputs), (biases, 1)):
             count = 2 * outputs * size
