@@ -9,7 +9,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.utils import explained_variance
 
 from codrl_mj.agents.exploration import Gaussian, exploration
-from codrl_mj.agents.twin_networks import TwinNetworks
+from codrl_mj.agents.twin_networks import TwinNetworks, VectorAdam
 
 _LEARNT_FROM = ("actions", "log_probs", "advantages", "returns")
 
@@ -31,9 +31,13 @@ class FastPPO(PPO):
         self._networks = TwinNetworks(policy)
         self._exploration = exploration(policy, self.sde_sample_freq if self.sde_sample_freq > 0 else self.n_steps)
         self._networks.parameters.grad = self._networks.gradient
-        policy.optimizer = policy.optimizer_class(
-            [self._networks.parameters], lr=self.lr_schedule(1), fused=True, **policy.optimizer_kwargs
+        policy.optimizer = VectorAdam(
+            self._networks.parameters, policy.parameters(), lr=self.lr_schedule(1), **policy.optimizer_kwargs
         )
+
+    def _excluded_save_params(self) -> list[str]:
+        """What a saved model leaves out: `_setup_model` makes it anew, of the policy that is loaded."""
+        return [*super()._excluded_save_params(), "_networks", "_exploration"]
 
     @torch.no_grad()
     def collect_rollouts(self, env: Any, callback: Any, rollout_buffer: Any, n_rollout_steps: int) -> bool:

@@ -75,6 +75,9 @@ class PPOConfig(DeepAgentConfig):
         Raises:
             ValueError: the rollout is not a multiple of the environments, or of the minibatch.
         """
+        from gymnasium.spaces import Box, Discrete
+        from stable_baselines3 import PPO
+
         from codrl_mj.agents.fast_ppo import FastPPO
         from codrl_mj.agents.two_rate_ppo import TwoRatePPO
 
@@ -101,7 +104,8 @@ class PPOConfig(DeepAgentConfig):
             "device": "cpu",
         }
         if self.critic_learning_rate is None:
-            return FastPPO(self._policy_class(), env, **arguments)
+            kind = FastPPO if isinstance(env.action_space, Box | Discrete) else PPO
+            return kind(self._policy_class(), env, **arguments)
         return TwoRatePPO(
             self._policy_class(),
             env,

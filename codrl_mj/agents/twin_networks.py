@@ -7,6 +7,9 @@ graph of automatic differentiation, tensor by tensor optimisation. Here both net
 products, forwards and backwards, and all their parameters are one vector.
 """
 
+from collections.abc import Iterable
+from typing import Any
+
 import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
@@ -83,6 +86,53 @@ class TwinNetworks:
             torch.sum(gradient, 1, keepdim=True, out=self._bias_gradients[place])
             if place:
                 gradient = self._slope(torch.bmm(gradient, self.weights[place]), layers[place])
+
+
+class VectorAdam(torch.optim.Adam):
+    """Adam on one vector, whose state reads as that of the parameters that are views of it: as a plain Adam's.
+
+    So saved models are Stable-Baselines3's, which reads them, and whose own are read.
+    """
+
+    def __init__(self, vector: torch.Tensor, views: Iterable[nn.Parameter], **options: Any) -> None:
+        """Optimise the vector.
+
+        Args:
+            vector: whose gradient is in `vector.grad`.
+            views: the parameters, in the order in which a plain optimiser would have them.
+            **options: Adam's.
+        """
+        super().__init__([vector], fused=True, **options)
+        self._layout = [(view.shape, view.stride(), view.storage_offset()) for view in views]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Moments of each parameter."""
+        whole = super().state_dict()
+        moments = whole["state"].get(0, {})
+        state = {
+            number: {name: (one.as_strided(*place) if one.ndim else one).clone() for name, one in moments.items()}
+            for number, place in enumerate(self._layout)
+        }
+        group = whole["param_groups"][0] | {"params": list(state)}
+        return {"state": state if moments else {}, "param_groups": [group]}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take the moments of each parameter.
+
+        Raises:
+            ValueError: they are those of other parameters.
+        """
+        state, group = state_dict["state"], state_dict["param_groups"][0]
+        if len(group["params"]) != len(self._layout):
+            raise ValueError(f"{len(group['params'])} parameters are optimised: must be {len(self._layout)}")
+        vector = self.param_groups[0]["params"][0]
+        moments = {name: one if not one.ndim else torch.zeros_like(vector) for name, one in state.get(0, {}).items()}
+        for number, place in enumerate(self._layout if moments else ()):
+            for name, one in state[number].items():
+                if one.ndim:
+                    moments[name].as_strided(*place).copy_(one)
+        kept = {0: moments} if moments else {}
+        super().load_state_dict({"state": kept, "param_groups": [group | {"params": [0], "fused": True}]})
 
 
 def _carve(vector: torch.Tensor, shapes: list[tuple[int, int]]) -> tuple[list[torch.Tensor], list[torch.Tensor]]:

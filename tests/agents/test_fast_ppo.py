@@ -12,6 +12,7 @@ from stable_baselines3.common.logger import Logger
 
 from codrl_mj import make_sb3_vec_env
 from codrl_mj.agents import PPOConfig
+from codrl_mj.agents.fast_ppo import FastPPO
 
 CASES = {
     "discrete": ("CartPole", {"entropy_coefficient": 0.01, "target_kl": None}),
@@ -139,3 +140,31 @@ def test_state_dependent_noise_lasts_for_its_steps():
     """Drawn every four steps: the noise is one linear function of the hidden units until then."""
     explores = pair("state-dependent")[0]._exploration
     assert explores.draws(64, 4, 1).shape == (16, 4, 8, 1)
+
+
+@pytest.mark.parametrize("case", ["discrete", "state-dependent"])
+@pytest.mark.parametrize("back", [False, True], ids=["ours", "theirs"])
+def test_a_saved_model_goes_on_in_stable_baselines3_and_theirs_here(case, back, tmp_path):
+    """Weights and Adam's moments are in the file: the next update is the same."""
+    ours, theirs, envs = pair(case)
+    collect(ours)
+    theirs.rollout_buffer = copy.deepcopy(ours.rollout_buffer)
+    saved = theirs if back else ours
+    saved.set_logger(Logger(None, []))
+    saved.train()
+    saved.save(tmp_path / "model")
+    reader = FastPPO if back else PPO
+    read = reader.load(tmp_path / "model", env=envs, device="cpu")
+    read.rollout_buffer = copy.deepcopy(ours.rollout_buffer)
+    read.set_logger(Logger(None, []))
+    for model in (saved, read):
+        np.random.seed(3)
+        model.train()
+    torch.testing.assert_close(dict(read.policy.state_dict()), dict(saved.policy.state_dict()), rtol=0, atol=1e-5)
+
+
+def test_moments_of_other_networks_are_refused():
+    ours, _, _ = pair("discrete")
+    other, _, _ = pair("state-dependent")
+    with pytest.raises(ValueError, match=r"12 parameters are optimised: must be 13|13 .* must be 12"):
+        ours.policy.optimizer.load_state_dict(other.policy.optimizer.state_dict())
