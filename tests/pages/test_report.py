@@ -79,7 +79,7 @@ def test_the_plots_show_the_episode_that_the_film_shows(text):
 
 
 def test_without_opengl_there_is_no_film_and_everything_else(tmp_path, monkeypatch):
-    monkeypatch.setattr(episodes, "scene_film", no_film)
+    monkeypatch.setattr(episodes, "clip", no_film)
     text = report([RUNS / "pendulum"], tmp_path / "r.html").read_text()
     parsed = check_alone(text)
     assert "No film of pendulum: RenderingUnavailableError: cannot make an OpenGL context" in parsed.text
@@ -125,7 +125,7 @@ def test_a_page_says_that_the_best_policy_acts(tmp_path):
 
 
 def test_several_runs_stand_side_by_side(tmp_path, monkeypatch):
-    monkeypatch.setattr(episodes, "scene_film", no_film)
+    monkeypatch.setattr(episodes, "clip", no_film)
     shutil.copytree(RUNS / "pendulum", tmp_path / "other")
     certificate = {"verdict": "passed", "subject": "pendulum", "made": "then", "quick": True,
                    "checks": [{"group": "motor", "passed": True}]}  # fmt: skip
