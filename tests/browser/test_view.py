@@ -92,3 +92,12 @@ def test_another_policy_acts(browser, opened):
     page.get_by_label("policy").click()
     page.get_by_role("option", name="zero").click()
     until(page, lambda: browser.session.chosen == "zero")
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
+def test_it_is_dark_where_that_is_preferred_and_leaves_a_phone_the_scene(browser, opened, width, scheme):
+    page = opened(browser.url, width, scheme=scheme)
+    shown(browser, page)
+    assert page.evaluate("document.documentElement.dataset.mantineColorScheme") == scheme
+    top = page.get_by_role("button", name="Play or pause").bounding_box()["y"]
+    assert (top > 0.6 * 800) == (width == 390)

@@ -27,6 +27,16 @@ def motorised():
     return session()
 
 
+@pytest.mark.parametrize("again", [True, False])
+def test_at_the_time_limit_it_says_so_and_begins_anew_or_goes_on(again):
+    made = session("ideal", max_episode_steps=3)
+    made.again = again
+    said = [made.step() and made.ended for _ in range(4)]
+    assert said[:3] == ["", "", "past the time limit"]
+    assert made.time == pytest.approx((1 if again else 4) * made.step_duration)
+    assert said[3] == ("" if again else "past the time limit")
+
+
 def test_a_push_is_a_force_at_the_bodys_centre_of_mass():
     made = session("ideal")
     model, data = made.model, mujoco.MjData(made.model)
