@@ -39,6 +39,8 @@ class Shown(NamedTuple):
     """The scene; None: `problem`."""
     problem: str | None
     """Why there is no film."""
+    seed: int
+    """Of the episode."""
 
 
 def show(name: str, env: Any, policy: Any, seed: int, filmed: bool = True) -> Shown:
@@ -52,14 +54,14 @@ def show(name: str, env: Any, policy: Any, seed: int, filmed: bool = True) -> Sh
         filmed: whether to film it.
     """
     if not filmed:
-        return Shown(name, env, run_episodes(policy, env.make, 1, seed)[0], None, "none was asked for")
+        return Shown(name, env, run_episodes(policy, env.make, 1, seed)[0], None, "none was asked for", seed)
     episode = None
     try:
         episode, taken = record(policy, env, seed, *_SIZE)
-        return Shown(name, env, episode, clip(env.task, episode, taken, *_SIZE), None)
+        return Shown(name, env, episode, clip(env.task, episode, taken, *_SIZE), None, seed)
     except Exception as error:  # each renderer raises its own kind, and so do libraries that are not installed
         problem = f"{type(error).__name__}: {error}"
-    return Shown(name, env, episode or run_episodes(policy, env.make, 1, seed)[0], None, problem)
+    return Shown(name, env, episode or run_episodes(policy, env.make, 1, seed)[0], None, problem, seed)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,7 +168,7 @@ def episode_section(shown: Sequence[Shown], joined: Iterable[Markup] = ()) -> Ma
 def _caption(one: Shown, named: bool) -> str:
     episode = one.episode
     over = f"{'ended' if episode.terminated else 'time limit'} at {episode.time[-1]:.2f} s"
-    return f"{one.name + ': ' if named else ''}return {page.number(episode.total)}, {over}"
+    return f"{one.name + ': ' if named else ''}seed {one.seed}, return {page.number(episode.total)}, {over}"
 
 
 def _selectors(shown: Sequence[Shown]) -> Markup:
