@@ -49,9 +49,7 @@ def loop_section(loops: Loops) -> Markup:
     rows.append(("the voltage comes with", *late.values(), ""))
     table = page.table("Current loop", ("", *found, "unit"), rows, numbers=range(1, 1 + len(found)))
     if any(math.isnan(_right(one, field)) for one in found.values() for field, _, _ in _RIGHTS):
-        notes.append(
-            page.paragraph("–: not below half the sample rate, or not within the time that is looked at.", "soft")
-        )
+        notes.append(page.paragraph("–: not below half the sample rate, or not within sight.", "soft"))
     known = {name: loops[name] for name in found}
     return page.joined((table, *notes, page.plots((*_bode(known, found), *_small_steps(known)))))
 
