@@ -55,7 +55,7 @@ soak: $(STAMP)  ## a million steps: memory, threads, episodes
 
 results: $(STAMP)  ## docs/results/ anew: hours; what is finished in runs/ is not done again
 	@$(BIN)/codrl-mj reproduce
-	@$(BIN)/codrl-mj study mismatch
+	@$(BIN)/codrl-mj study actuators
 
 docs: $(DOCS)  ## the site in build/site, and the pages that are written from the code
 	@$(BIN)/python scripts/environment_pages.py

@@ -12,7 +12,7 @@ import pytest
 from codrl_mj import cli
 from codrl_mj.agents import PPOConfig
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.study import mismatch
+from codrl_mj.study.trials import Grid
 from codrl_mj.training import TrainConfig, train
 
 ROOT = Path(__file__).parent.parent
@@ -34,7 +34,6 @@ ELSEWHERE = {
 SHORT = {
     "80_000": "500",
     "episodes=100": "episodes=1",
-    "max_episode_steps=3000": "max_episode_steps=50",
 }
 """What takes a reader minutes -> what takes a test seconds."""
 WITH_PYTHON = [name for name, text in PAGES.items() if "```python" in text and name not in ELSEWHERE]
@@ -82,7 +81,7 @@ def folder_of_a_reader(trained, tmp_path, monkeypatch):
 )
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_the_python_of_a_page_runs(page, monkeypatch):
-    monkeypatch.setattr(mismatch, "compute", lambda *_: None)  # hours
+    monkeypatch.setattr(Grid, "compute", lambda *_: None)  # hours
     namespace = {}
     for block in re.findall(r"```python\n(.*?)```", PAGES[page], re.DOTALL):
         for long, short in SHORT.items():

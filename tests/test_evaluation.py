@@ -176,6 +176,10 @@ def test_the_tracking_error_is_that_of_every_integration_step_in_torques_at_the_
     assert summary.tracking_rms == pytest.approx(error, rel=1e-12)
     assert summary.tracking_percent == pytest.approx(100 * error / (10.0 * ARM), rel=1e-12)
     assert summary.tracking_max == pytest.approx(6.0 * ARM, rel=1e-12)
+    delivered = (8.0, 10.0, -4.0, -10.0, 9.0, 10.0)
+    assert summary.torque_rms == pytest.approx(math.sqrt(sum(f**2 for f in delivered) / 6) * ARM, rel=1e-12)
+    duration = sum(float(episode.time[-1]) for episode in episodes)
+    assert summary.reversals == pytest.approx(1 / duration, rel=1e-12)  # none between episodes
 
 
 def test_tracking_is_weighed_over_all_steps_and_not_per_episode():

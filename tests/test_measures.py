@@ -17,6 +17,7 @@ from codrl_mj.evaluation.measures import (
     interquartile_mean,
     mechanical_work,
     quartiles,
+    sign_changes,
     wilson_rate,
 )
 
@@ -203,3 +204,11 @@ def test_motors_whose_torques_have_means_of_their_own_lag_as_each_of_them():
     alone = [delay(desired[motor::2], actual[motor::2], 0.01) for motor in (0, 1)]
     assert alone == pytest.approx([0.04, 0.04], abs=1e-3)
     assert delay(desired, actual, 0.01, motors=2) == pytest.approx(0.04, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("samples", "changes"),
+    [([], 0), ([0.0, 0.0], 0), ([1, 2, 3], 0), ([1, -1, 1], 2), ([1, 0, 0, -2], 1), ([1, 0, 2], 0)],
+)
+def test_a_sign_changes_where_the_next_one_is_another(samples, changes):
+    assert sign_changes(np.array(samples, dtype=float)) == changes

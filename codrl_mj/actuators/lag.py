@@ -28,7 +28,7 @@ class State(NamedTuple):
 
 
 def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Nothing]:
-    """Tau' = (u(t - delay) - tau)/T, exactly, with the command held over a step: tau -> u + (tau - u)*exp(-dt/T).
+    """Tau' = (gain*u(t - delay) - tau)/T, exactly, with u held over a step: tau -> g*u + (tau - g*u)*exp(-dt/T).
 
     The torque is that at the end of the step, as the current loop's is. A delay that is no whole number of steps mixes
     the two neighbouring commands in proportion, which is what held commands come to on average over a step.
@@ -40,6 +40,7 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
     arrived = commands[whole]
     if fraction > 0.0:
         arrived = arrived + fraction * (commands[min(whole + 1, 8)] - arrived)
+    arrived = parameters.gain * arrived
     decay = math.exp(-timestep / parameters.time_constant) if parameters.time_constant > 0.0 else 0.0
     torque = arrived + (state.torque - arrived) * decay
     after = State(torque, inputs.desired_torque, state.c1, state.c2, state.c3, state.c4, state.c5, state.c6, state.c7)
@@ -64,6 +65,8 @@ class Lag(ActuatorModel):
     """Time constant T [s], >= 0: 63 % of a step is delivered after it. 0: nothing but the delay."""
     delay: float = real(0.0, least=0.0, unit="s")
     """Delay of the command [s], >= 0, at most eight mechanical steps."""
+    gain: float = real(1.0, above=0.0)
+    """What of the desired torque is delivered in the end, > 0: 0.9 for a torque constant that is 10 % too small."""
 
     def check(self, timestep: float) -> None:
         """Refuse a delay longer than what is remembered.

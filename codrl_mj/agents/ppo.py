@@ -75,8 +75,7 @@ class PPOConfig(DeepAgentConfig):
         Raises:
             ValueError: the rollout is not a multiple of the environments, or of the minibatch.
         """
-        from stable_baselines3 import PPO
-
+        from codrl_mj.agents.fast_ppo import FastPPO
         from codrl_mj.agents.two_rate_ppo import TwoRatePPO
 
         batch_size = self.batch_size or self.rollout_steps
@@ -102,7 +101,7 @@ class PPOConfig(DeepAgentConfig):
             "device": "cpu",
         }
         if self.critic_learning_rate is None:
-            return PPO(self._policy_class(), env, **arguments)
+            return FastPPO(self._policy_class(), env, **arguments)
         return TwoRatePPO(
             self._policy_class(),
             env,

@@ -1,7 +1,7 @@
 """`codrl-mj reproduce`."""
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -38,39 +38,19 @@ class Reproduce(Computed):
         names = "root", "seeds", "sarsa_seeds", "episodes", "test_episodes", *(["tasks"] if self.tasks else [])
         return Reproduction(**{name: getattr(self, name) for name in names})
 
-    def print_costs(self, plan: Any) -> float:
-        """Print every arm, which of its trainings are finished, and what the others would take."""
-        from rich.table import Table
+    def grid(self) -> Any:
+        """Their trainings and tests."""
+        return self.plan().grid
 
-        from codrl_mj.cli.terminal import console
-        from codrl_mj.study.reproduction.reproduce import costs
-        from codrl_mj.study.reproduction.series import interval_text
-
-        table = Table("training", "seeds finished", "seeds to do", "s each", "core hours left")
-        every = costs(plan)
-        for cost in every:
-            each = f"{'' if cost.finished else 'about '}{cost.seconds:.0f}"
-            seeds = interval_text(cost.finished), interval_text(cost.missing)
-            table.add_row(cost.arm.name, *seeds, each, f"{cost.left / 3600:.2f}")
-        console().print(table)
-        return sum(cost.left for cost in every) / 3600
-
-    def work(self, plan: Any) -> tuple[Mapping[str, int], Callable[..., None]]:
-        """Every cell and its tests."""
-        from codrl_mj.study.reproduction.reproduce import compute
-
-        return {"training": len(plan.cells()), "test": len(plan.deployments(unfinished=True))}, compute
-
-    def write(self, plan: Any) -> tuple[Iterable[Path], Mapping[str, Any]]:
+    def write(self) -> tuple[Iterable[Path], Mapping[str, Any]]:
         """The page of what there is; the verdicts are printed too."""
         from codrl_mj.study.reproduction.page import write
         from codrl_mj.study.reproduction.reproduce import gather
 
-        findings = gather(plan)
+        findings = gather(self.plan())
         files = write(findings, self.out)
         _print_verdicts(findings)
-        series = findings.evidence.series.items()
-        return files, {f"{name}, seed {seed}": error for name, one in series for seed, error in one.failures.items()}
+        return files, findings.found.failures
 
 
 def _print_verdicts(findings: Any) -> None:
@@ -80,9 +60,9 @@ def _print_verdicts(findings: Any) -> None:
     from rich.table import Table
 
     from codrl_mj.cli.terminal import console
-    from codrl_mj.study.reproduction.verdicts import CONFIRMED, NOT_CONFIRMED, number
+    from codrl_mj.study.reproduction.verdicts import COMPATIBLE, CONFIRMED, NOT_CONFIRMED, number
 
-    colours = {CONFIRMED: "green", NOT_CONFIRMED: "red"}
+    colours = {CONFIRMED: "green", COMPATIBLE: "cyan", NOT_CONFIRMED: "red"}
     for task in findings.plan.tasks:
         table = Table(title=task, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
         for header in ("said by", "what is reported", "ours [95 %]", "seeds", "verdict"):

@@ -2,7 +2,7 @@
 
 import dataclasses
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,10 +13,7 @@ import tyro
 class Computed:
     """A verb that trains and tests much, unless that is done already, and writes a page of it.
 
-    It has `plan()`, what is to be computed, and methods of that: `print_costs` prints every training and what the
-    unfinished ones take, and returns the core hours left; `work` returns the numbers of trainings and tests, by the
-    names that a function reports them under, and that function; `write` writes the page, and returns its files and the
-    failures by name.
+    It has `grid()`, what is to be computed, and `write()`, which writes the page, and returns its files and failures.
     """
 
     root: Path
@@ -44,114 +41,82 @@ class Computed:
         from codrl_mj.runs.files import check_writable
         from codrl_mj.study.parallel import Workers
 
-        plan, workers = self.plan(), Workers(self.jobs, self.backend, self.address)
+        grid, workers = self.grid(), Workers(self.jobs, self.backend, self.address)
         if self.dry_run:
-            left = self.print_costs(plan)
+            left = self.print_costs(grid)
             print(f"about {left:.2f} core hours are left: {left / workers.cores:.2f} hours with {workers.cores} jobs")
             return 0
         check_writable(self.out)
         if not self.only_page:
             import matplotlib  # noqa: F401 - what is missing is missed now and not in the end
 
-            counts, compute = self.work(plan)
+            counts = {"training": len(grid.cells()), "test": len(grid.deployments())}
             with progress_bar("{task.completed}/{task.total}") as bar:
                 rows = {kind: bar.add_task(f"{kind}s", total=count) for kind, count in counts.items()}
-                compute(plan, workers, self.accept_changes, lambda kind, *_: bar.advance(rows[kind]))
-        files, failures = self.write(plan)
+                grid.compute(workers, self.accept_changes, lambda kind: bar.advance(rows[kind]))
+        files, failures = self.write()
         for file in files:
             print(f"wrote {file}")
         for name, error in failures.items():
             print(f"failed: {name}: {error}", file=sys.stderr)
         return 1 if failures else 0
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Study(Computed):
-    """Run a study of many trainings, or go on with it, and write its page: docs/studies.md.
-
-    What is finished is not computed again, so the same command resumes a study, adds seeds to it, and writes its page
-    anew. Example: codrl-mj study mismatch --dry-run, or codrl-mj study mismatch --tasks cartpole --seeds 3 --jobs 2
-    """
-
-    study: Annotated[
-        tyro.conf.Positional[Literal["mismatch"]],
-        tyro.conf.arg(help="mismatch: train on one actuator, test on another."),
-    ]
-    root: Path = Path("runs/mismatch")
-    tasks: Annotated[
-        tuple[str, ...] | None, tyro.conf.arg(metavar="NAME ...", help="Tasks; the default is all that it has.")
-    ] = None
-    experiments: Annotated[
-        tuple[str, ...] | None,
-        tyro.conf.arg(
-            metavar="NAME ...",
-            help="Of matrix, ladder, action, observation, randomised, reward, agents; the default is all.",
-        ),
-    ] = None
-    conditions: Annotated[
-        tuple[str, ...] | None,
-        tyro.conf.arg(metavar="NAME ...", help="Actuators to train and test on, such as ideal weaker; default all."),
-    ] = None
-    episodes: int = 100
-    """Test episodes of each policy on each actuator."""
-    total_steps: int | None = None
-    """Environment steps of every training; the default is each agent's own budget."""
-
-    def plan(self) -> Any:
-        """The study's configuration."""
-        from codrl_mj.study.mismatch import MismatchConfig
-
-        names = "root", "tasks", "experiments", "conditions", "seeds", "episodes", "total_steps"
-        return MismatchConfig(**{name: value for name in names if (value := getattr(self, name)) is not None})
-
-    def print_costs(self, plan: Any) -> float:
-        """Print the seeds of every training, and a row for each agent on each task."""
+    def print_costs(self, grid: Any) -> float:
+        """Print every arm, which of its trainings are finished, and what is left; the core hours left."""
+        from rich import box
         from rich.table import Table
 
         from codrl_mj.cli.terminal import console
-        from codrl_mj.study.cost import costs, seeds_finished
+        from codrl_mj.study.trials import numbers_as_text
 
-        table = Table("training", "seeds finished", "seeds to do")
-        for kind, seeds in seeds_finished(plan).items():
-            table.add_row(
-                kind, *(" ".join(str(seed) for seed, done in seeds.items() if done is to) for to in (True, False))
-            )
-        console().print(table)
-        every = costs(plan)
-        title = f"Time of one core: about {sum(cost.total for cost in every) / 3600:.2f} hours in all"
-        header = (
-            "task",
-            "agent",
-            "steps",
-            "trainings",
-            "finished",
-            "s each",
-            "tests",
-            "finished",
-            "s each",
-            "hours left",
+        table, every = (
+            Table("arm", "seeds\nfinished", "seeds\nto do", box=box.SIMPLE_HEAD, pad_edge=False),
+            grid.costs(),
         )
-        table = Table(*header, title=title, title_justify="left")
+        for header in ("s each", "tests\nto do", "core hours\nleft"):
+            table.add_column(header, justify="right")
         for cost in every:
-            estimate = "" if cost.trained else "about "
-            table.add_row(
-                *(cost.task, cost.agent, f"{cost.steps:,}", str(cost.trainings), str(cost.trained)),
-                *(f"{estimate}{cost.seconds:.0f}", str(cost.tests), str(cost.tested), f"about {cost.test_seconds:.1f}"),
-                f"{cost.left / 3600:.2f}",
-            )
+            each = f"{'' if cost.finished else 'about '}{cost.seconds:.0f}"
+            seeds = numbers_as_text(cost.finished), numbers_as_text(cost.missing)
+            table.add_row(cost.arm.name, *seeds, each, str(cost.tests), f"{cost.left / 3600:.2f}")
         console().print(table)
         return sum(cost.left for cost in every) / 3600
 
-    def work(self, plan: Any) -> tuple[Mapping[str, int], Callable[..., None]]:
-        """Every cell and its tests."""
-        from codrl_mj.study.mismatch import cells, compute, trials
 
-        return {"training": len(cells(plan)), "test": len(trials(plan)) * plan.seeds}, compute
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Study(Computed):
+    """Run the study of what an actuator costs, or go on with it, and write its page: docs/studies.md.
 
-    def write(self, plan: Any) -> tuple[Iterable[Path], Mapping[str, Any]]:
+    What is finished is not computed again, so the same command resumes a study, adds seeds to it, and writes its page
+    anew. Example: codrl-mj study actuators --dry-run, or codrl-mj study actuators --tasks pendulum --seeds 3 --jobs 2
+    """
+
+    study: Annotated[
+        tyro.conf.Positional[Literal["actuators"]],
+        tyro.conf.arg(help="actuators: when an actuator matters, and what helps: docs/results/plan.md."),
+    ]
+    root: Path = Path("runs/actuators")
+    seeds: int = 20
+    """Training runs of each kind, with seeds from 0."""
+    tasks: Annotated[
+        tuple[str, ...] | None, tyro.conf.arg(metavar="NAME ...", help="Tasks; the default is all that it has.")
+    ] = None
+    episodes: int = 50
+    """Test episodes of each policy on each actuator."""
+    total_steps: int | None = None
+    """Environment steps of every training, for trying things out; the default is each agent's own budget."""
+
+    def grid(self) -> Any:
+        """Its trainings and tests."""
+        from codrl_mj.study.actuators.study import ActuatorStudy
+
+        names = "root", "tasks", "seeds", "episodes", "total_steps"
+        given = {name: value for name in names if (value := getattr(self, name)) is not None}
+        return ActuatorStudy(**given).grid
+
+    def write(self) -> tuple[Iterable[Path], Mapping[str, Any]]:
         """The page of all results that there are."""
-        from codrl_mj.study.mismatch import collect
-        from codrl_mj.study.page import write
+        from codrl_mj.study.actuators.page import write
 
-        results = collect(plan)
-        return write(results, self.out), results.failures
+        collected = self.grid().collect()
+        return write(collected, self.out), collected.failures

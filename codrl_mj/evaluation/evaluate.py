@@ -20,6 +20,7 @@ from codrl_mj.evaluation.measures import (
     interquartile_mean,
     mechanical_work,
     quartiles,
+    sign_changes,
     wilson_rate,
 )
 from codrl_mj.runs.policies import Policy
@@ -69,6 +70,10 @@ class Evaluation:
     """Largest absolute difference."""
     tracking_lag: float | None = _measure("shaft torque lag", "s")
     """Delay of the delivered torque behind the desired one, where they correlate best; None where they hardly do."""
+    torque_rms: float = _measure("shaft torque, rms", "N*m")
+    """Root mean square of the delivered torque: what wears gears and bearings, and heats a motor without a winding."""
+    reversals: float = _measure("reversals", "1/s")
+    """How often the delivered torque changes its sign, per second and motor: what wears gears with play."""
     saturated_percent: float | None = _measure("voltage saturated", "%")
     """Share of integration steps that ended with the voltage at its limit."""
     peak_voltage: float | None = _measure("voltage, peak", "V")
@@ -181,6 +186,7 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
         failure=None if success is None else Interval(1 - success.mean, 1 - success.high, 1 - success.low),
         time_to_goal=quartiles(reached) if definition is not None and definition.goal and len(reached) else None,
         mechanical_work=bootstrap_mean(np.array([sum(one.work for one in each) for each in driven])),
+        **_wear(episodes, driven),
         episode_returns=tuple(returns.tolist()),
         episode_times_to_goal=() if success is None else tuple(goals),
         motors={
@@ -194,7 +200,7 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
 
 def _of_motor(episodes: Sequence[Episode], driven: Sequence[Sequence["_Driven"]]) -> dict[str, float | None]:
     """What one of several motors did: measures by their names, of energies the mean."""
-    measures = _tracking(episodes, driven) | _electrical(episodes, driven)
+    measures = _tracking(episodes, driven) | _wear(episodes, driven) | _electrical(episodes, driven)
     work = float(np.mean([one.work for each in driven for one in each]))
     means = {name: value.mean if isinstance(value, Interval) else value for name, value in measures.items()}
     return means | {"mechanical_work": work}
@@ -296,6 +302,16 @@ def _tracking(episodes: Sequence[Episode], driven: Sequence[Sequence[_Driven]]) 
         "tracking_percent": 100 * rms / scale if scale > 0 else None,
         "tracking_max": float(np.abs(error).max()),
         "tracking_lag": delay(desired, actual, episodes[0].timestep, len(driven[0])),
+    }
+
+
+def _wear(episodes: Sequence[Episode], driven: Sequence[Sequence[_Driven]]) -> dict[str, Any]:
+    """What the delivered torques do to gears and bearings, on the mean of the motors."""
+    duration = math.fsum(episode.time[-1] for episode in episodes) * len(driven[0])
+    actual = [one.actual for each in driven for one in each]
+    return {
+        "torque_rms": _root_mean_square(np.concatenate(actual)),
+        "reversals": sum(map(sign_changes, actual)) / duration,
     }
 
 

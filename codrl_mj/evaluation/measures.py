@@ -192,3 +192,13 @@ def mechanical_work(force: np.ndarray, speed: np.ndarray, timestep: float) -> fl
         timestep: dt [s].
     """
     return float(np.sum(force * (speed[1:] + speed[:-1]))) * timestep / 2
+
+
+def sign_changes(samples: np.ndarray) -> int:
+    """How often a signal goes from one sign to the other; zeros in between are no sign.
+
+    Args:
+        samples: shape (n,).
+    """
+    signs = np.sign(samples[samples != 0])
+    return int(np.count_nonzero(signs[1:] != signs[:-1]))

@@ -1,1 +1,1 @@
-"""Experiments of many runs: a grid that scales, statistics over seeds, the paper's experiments, the mismatch study."""
+"""Experiments of many runs: a grid that scales, inference over seeds, the paper's experiments, what actuators cost."""

@@ -7,7 +7,7 @@ def conclusions_section(page: Path) -> str:
     """A page's section of conclusions: what its file says, or that there is none yet.
 
     Args:
-        page: the page; the file of `mismatch.md` is `mismatch_conclusions.md` beside it, which nothing here writes.
+        page: the page; the file of `actuators.md` is `actuators_conclusions.md` beside it, which nothing here writes.
     """
     file = page.with_name(f"{page.stem}_conclusions.md")
     if file.is_file():

@@ -116,7 +116,9 @@ def _make_envs(config: TrainConfig) -> Any:
         return config.env.make_sb3(config.num_envs)
     from codrl_mj.envs.sb3 import make_sb3_vec_env
 
-    return make_sb3_vec_env(config.env, config.num_envs)
+    # the engine's threads wait for each other in loops: so few simulations then take two to five times the processor
+    threads = {"num_threads": 1} if config.env.physics == "mujoco" else {}
+    return make_sb3_vec_env(config.env, config.num_envs, **threads)
 
 
 def _step_limit(config: TrainConfig) -> int:

@@ -55,6 +55,16 @@ def test_without_time_constant_and_delay_it_is_ideal():
     np.testing.assert_array_equal(_responses(Lag(time_constant=0.0), commands), commands)
 
 
+def test_a_gain_scales_what_is_delivered():
+    """The equation is linear: a gain is the commands'."""
+    commands = np.random.default_rng(5).uniform(-1, 1, 50)
+    weak = Lag(time_constant=0.03, delay=0.0125, gain=0.25)
+    scaled = _responses(Lag(time_constant=0.03, delay=0.0125), 0.25 * commands)  # a power of two: exact
+    np.testing.assert_array_equal(_responses(weak, commands), scaled)
+    with pytest.raises(ValueError, match=r"Lag\.gain = 0: must be"):
+        Lag(gain=0.0)
+
+
 def test_it_is_the_solution_of_its_differential_equation():
     commands = np.random.default_rng(3).uniform(-1, 1, 20)
     torque, expected = [0.0], []

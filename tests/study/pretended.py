@@ -3,33 +3,30 @@
 import json
 
 from codrl_mj.evaluation import MEASURES
-from codrl_mj.study.grid import cell_folder
-from codrl_mj.study.mismatch import cell_name, cells, deployments, trials
 
 INTERVALS = {"returns", "success", "energy_drawn"}
 
 
-def pretend(config, score, leaving_out=()):
+def pretend(grid, score, leaving_out=()):
     """Write finished runs and tests.
 
     Args:
-        config: of the study.
+        grid: of the study.
         score: (trial, seed) -> mean return.
-        leaving_out: names of trainings that are not to be there.
+        leaving_out: (arm, seed) of trainings that are not to be there.
     """
-    every = cells(config)
-    for name, cell in every.items():
-        if name not in leaving_out:
-            folder = cell_folder(config.root, cell)
-            folder.mkdir(parents=True)
-            (folder / "config.json").write_text(json.dumps({"train": cell.as_mapping(), "code": "c0de" * 16}))
-            (folder / "result.json").write_text(json.dumps({"steps": cell.total_steps, "seconds": 10.0}))
-    tests = deployments(config)
-    for name, trial in trials(config).items():
-        for seed, deployment in tests[name].items():
-            if cell_name(trial.arm.task, trial.arm.name, seed) not in leaving_out:
-                deployment.record.parent.mkdir(exist_ok=True)
-                deployment.record.write_text(json.dumps(evaluation(score(trial, seed), config.episodes)))
+    folders, tests = grid.folders(), grid.deployments()
+    for cell, config in grid.cells().items():
+        if cell not in leaving_out:
+            folders[cell].mkdir(parents=True)
+            (folders[cell] / "config.json").write_text(json.dumps({"train": config.as_mapping(), "code": "c0de" * 16}))
+            (folders[cell] / "result.json").write_text(json.dumps({"steps": config.total_steps, "seconds": 10.0}))
+    for trial in grid.trials:
+        for seed in grid.seeds_of(trial.arm):
+            if (trial.arm.name, seed) not in leaving_out:
+                record = tests[trial.name, seed].record
+                record.parent.mkdir(exist_ok=True)
+                record.write_text(json.dumps(evaluation(score(trial, seed), grid.episodes)))
 
 
 def evaluation(mean_return, episodes):

@@ -24,7 +24,7 @@ WITHOUT_EFFECT = {
     "ppo, state-dependent noise": FOR_THE_LOG
     | COPIED
     | ACTIONS
-    | {"_episode_num", "noise.exploration_mat"},  # of one environment
+    | {"_episode_num", "noise.exploration_mat", "noise.exploration_matrices"},  # a rollout draws its own
     "ddpg": FOR_THE_LOG | COPIED | TORCH | {"_episode_num"},
     "dqn, epsilon by episodes": FOR_THE_LOG | COPIED | DRAWN | TORCH | {"exploration_rate"},  # by _episode_num
     "dqn, epsilon by steps": FOR_THE_LOG | COPIED | TORCH | {"_episode_num", "exploration_rate"},  # by num_timesteps

@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import IDEAL
-from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.films.strip import ACTUAL, DESIRED
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.study.figures import COLOURS, save
-from codrl_mj.study.reproduction.arms import CENTRE_RADIUS, Arm
-from codrl_mj.study.reproduction.series import LAST, Series, band, running_mean
+from codrl_mj.study.reproduction.arms import CENTRE_RADIUS, TEST, PaperArm
+from codrl_mj.study.reproduction.series import LAST, Series
 from codrl_mj.study.reproduction.value_iteration import Optimum
 from codrl_mj.tasks import acrobot, cartpole, find_task, mountain_car, mountain_car_continuous, pendulum
 from codrl_mj.training import EVALUATION_SEED
@@ -85,58 +84,53 @@ def example(series: Series) -> Episode | None:
     """The first test episode of the first seed that is finished; None if none is."""
     if not series.runs:
         return None
-    arm, run = series.arm, next(iter(series.runs.values()))
-    (episode,) = run_episodes(
-        load_policy(run.folder), EnvConfig(arm.task, arm.actuator, arm.physics).make, 1, EVALUATION_SEED
-    )
+    run = next(iter(series.runs.values()))
+    (episode,) = run_episodes(load_policy(run.folder), series.arm.trials[TEST].env.make, 1, EVALUATION_SEED)
     return episode
 
 
 def draw_learning(path: Path, arms: Sequence[Series]) -> None:
-    """Draw returns over training episodes, a panel for each settings and physics: running means, and 95 % bands.
+    """Draw trainings, a column for each settings and physics that there are runs of: means and 95 % bands over seeds.
+
+    It is the running mean of returns over episodes; of PPO, whose rollouts are the paper's epochs, mean return, mean
+    length and number of episodes over epochs.
 
     Args:
         path: SVG file.
         arms: of one task.
     """
-    panels = _grouped(arms)
-    figure, all_axes = _panels(1, len(panels))
-    for axes, ((settings, physics), members) in zip(all_axes[0], panels.items(), strict=True):
-        for series in members:
-            values = running_mean(series.returns_by_episode())
-            _draw_band(axes, series, np.arange(1, values.shape[1] + 1), values)
-        title = f"{settings} settings, {PHYSICS[physics]}"
-        axes.set(xlabel="training episode", ylabel=f"return, mean of last {LAST}")
-        axes.set_title(title, fontsize="medium")
-    _legend(figure, all_axes)
-    save(figure, path)
 
+    def over_epochs(what: str) -> Callable[[Series], np.ndarray]:
+        return lambda series: np.array([_filled(getattr(one, what).astype(float)) for one in series.epochs()])
 
-def draw_epochs(path: Path, arms: Sequence[Series]) -> None:
-    """Draw mean return, mean length and number of episodes over epochs, a column for each physics.
-
-    Args:
-        path: SVG file.
-        arms: of one task, whose agent has epochs.
-    """
-    panels = _grouped(arms)
-    labels = {"returns": "mean return", "lengths": "mean length [steps]", "counts": "number of episodes"}
-    figure, all_axes = _panels(len(labels), len(panels))
-    for column, ((_, physics), members) in enumerate(panels.items()):
-        for axes, (what, label) in zip(all_axes[:, column], labels.items(), strict=True):
+    rows = {f"return, mean of last {LAST}": lambda series: running_mean(series.returns_by_episode())}
+    along, title, size = "training episode", "{} settings, {}", "medium"
+    if arms[0].arm.config.agent.name == "ppo":
+        labels = {"mean return": "returns", "mean length [steps]": "lengths", "number of episodes": "counts"}
+        rows = {label: over_epochs(what) for label, what in labels.items()}
+        along, title, size = "epoch of 4000 steps", "{1}", "large"
+    columns: dict[tuple[str, str], list[Series]] = {}
+    for series in arms:
+        if series.runs:
+            columns.setdefault((series.arm.settings, PHYSICS[series.arm.physics]), []).append(series)
+    figure, all_axes = _panels(len(rows), len(columns))
+    for (about, members), column in zip(columns.items(), all_axes.T, strict=True):
+        for axes, (label, values_of) in zip(column, rows.items(), strict=True):
             for series in members:
-                values = np.array([_filled(getattr(epochs, what).astype(float)) for epochs in series.epochs()])
-                _draw_band(axes, series, np.arange(1, values.shape[1] + 1), values)
-            axes.set_ylabel(label)
-            if what == "counts":
-                axes.set_yscale("log")
-        all_axes[0, column].set_title(PHYSICS[physics])
-        all_axes[-1, column].set_xlabel("epoch of 4000 steps")
+                values = values_of(series)
+                colour, dashes = STYLES[series.arm.motor]
+                places, (mean, low, high) = np.arange(1, values.shape[1] + 1), band(values)
+                name = f"{_name(series.arm)} ({len(values)} seeds)"
+                axes.plot(places, mean, color=colour, linestyle=dashes, linewidth=1.4, label=name)
+                axes.fill_between(places, low, high, color=colour, alpha=0.2, linewidth=0)
+            axes.set(ylabel=label, yscale="log" if label == "number of episodes" else "linear")
+        column[0].set_title(title.format(*about), fontsize=size)
+        column[-1].set_xlabel(along)
     _legend(figure, all_axes)
     save(figure, path)
 
 
-def draw_torque(path: Path, episodes: Sequence[tuple[Arm, Episode]]) -> None:
+def draw_torque(path: Path, episodes: Sequence[tuple[PaperArm, Episode]]) -> None:
     """Draw desired and actual torque at the shaft, and their difference, over an episode: a column for each arm.
 
     Args:
@@ -159,7 +153,7 @@ def draw_torque(path: Path, episodes: Sequence[tuple[Arm, Episode]]) -> None:
     save(figure, path)
 
 
-def draw_states(path: Path, task: str, episodes: Sequence[tuple[Arm, Episode]]) -> None:
+def draw_states(path: Path, task: str, episodes: Sequence[tuple[PaperArm, Episode]]) -> None:
     """Draw what there is to see of the states over an episode, a row for each curve, a line for each arm.
 
     Args:
@@ -212,15 +206,6 @@ def draw_discounts(path: Path, values: Mapping[float, float], optima: Sequence[O
     save(figure, path)
 
 
-def _grouped(arms: Sequence[Series]) -> dict[tuple[str, str], list[Series]]:
-    """Arms that have runs, by settings and physics."""
-    found: dict[tuple[str, str], list[Series]] = {}
-    for series in arms:
-        if series.runs:
-            found.setdefault((series.arm.settings, series.arm.physics), []).append(series)
-    return found
-
-
 def _panels(rows: int, columns: int, row_height: float = 0.0, heights: Sequence[float] | None = None) -> Any:
     """A figure and its axes, shape (rows, columns); rows share their time or episode axis."""
     from matplotlib.figure import Figure
@@ -235,20 +220,39 @@ def _panels(rows: int, columns: int, row_height: float = 0.0, heights: Sequence[
     return figure, axes
 
 
-def _draw_band(axes: Any, series: Series, places: np.ndarray, values: np.ndarray) -> None:
-    """Draw the mean over seeds and its interval.
+def running_mean(values: np.ndarray, count: int = LAST) -> np.ndarray:
+    """Mean of each value and those before it, at most `count` in all.
 
     Args:
-        axes: where.
-        series: whose values they are.
-        places: along the axis, shape (n,).
-        values: shape (seeds, n).
+        values: shape (..., n).
+        count: >= 1.
+
+    Returns:
+        Shape (..., n).
     """
-    colour, dashes = STYLES[series.arm.motor]
-    mean, low, high = band(values)
-    label = f"{_name(series.arm)} ({len(values)} seeds)"
-    axes.plot(places, mean, color=colour, linestyle=dashes, linewidth=1.4, label=label)
-    axes.fill_between(places, low, high, color=colour, alpha=0.2, linewidth=0)
+    sums = np.cumsum(np.concatenate([np.zeros((*values.shape[:-1], 1)), values], axis=-1), axis=-1)
+    ends = np.arange(1, values.shape[-1] + 1)
+    begins = np.maximum(0, ends - count)
+    return (sums[..., ends] - sums[..., begins]) / (ends - begins)
+
+
+def band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean over seeds with its 95 % percentile-bootstrap interval, at every place (scipy, 999 resamples, fixed seed).
+
+    Args:
+        values: shape (seeds, n), seeds >= 1.
+
+    Returns:
+        Mean, lower and upper bound, shape (n,) each; with one seed the bounds are the mean.
+    """
+    mean = values.mean(axis=0)
+    if len(values) < 2 or not values.size:
+        return mean, mean, mean
+    from scipy.stats import bootstrap
+
+    options: dict[str, Any] = {"n_resamples": 999, "batch": 50, "method": "percentile", "rng": 0}
+    interval = bootstrap((values,), np.mean, axis=0, **options).confidence_interval
+    return mean, interval.low, interval.high
 
 
 def _filled(values: np.ndarray) -> np.ndarray:
@@ -257,7 +261,7 @@ def _filled(values: np.ndarray) -> np.ndarray:
     return np.where(last >= 0, values[last], 0.0)
 
 
-def _name(arm: Arm) -> str:
+def _name(arm: PaperArm) -> str:
     return "ideal" if arm.actuator == IDEAL else arm.gains
 
 

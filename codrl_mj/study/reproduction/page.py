@@ -1,20 +1,19 @@
 """The reproduction's page: Markdown, with figures and tables beside it."""
 
 import collections
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from codrl_mj.actuators import IDEAL
 from codrl_mj.evaluation.measures import Interval
 from codrl_mj.runs.files import writing
 from codrl_mj.study.conclusions import conclusions_section
 from codrl_mj.study.reproduction import figures, tables
-from codrl_mj.study.reproduction.claims import PAPER_SAYS, PORT, STUDY_SAYS
+from codrl_mj.study.reproduction.claims import PAPER_SAYS, PORT, STUDY_SAYS, Claim
 from codrl_mj.study.reproduction.reproduce import VALUE_TASK, Findings
-from codrl_mj.study.reproduction.series import interval_text
 from codrl_mj.study.reproduction.value_iteration import Optimum
-from codrl_mj.study.reproduction.verdicts import CONFIRMED, NOT_CONFIRMED, NOT_TESTABLE, number
+from codrl_mj.study.reproduction.verdicts import NOT_CONFIRMED, NOT_TESTABLE, OUTCOMES, Verdict, number
+from codrl_mj.study.trials import numbers_as_text
 
 PAGE, FOLDER = "reproduction.md", "reproduction"
 """The page, and the folder beside it with its figures and tables."""
@@ -44,7 +43,7 @@ def write(findings: Findings, out: Path) -> list[Path]:
         _head(findings),
         conclusions_section(out / PAGE),
         _missing(findings),
-        _verdicts(findings),
+        verdicts_section(findings.claims),
         *_tasks(findings, drawn),
     ]
     with writing(out / PAGE) as temporary:
@@ -53,10 +52,8 @@ def write(findings: Findings, out: Path) -> list[Path]:
 
 
 def _head(findings: Findings) -> str:
-    plan, series = findings.plan, findings.evidence.series.values()
-    runs = [run for one in series for run in one.runs.values()]
-    wanted = sum(len(plan.seeds_of(one.arm)) for one in series)
-    hours = sum(run.seconds for run in runs) / 3600
+    plan, found = findings.plan, findings.found
+    done, wanted, hours = len(found.folders), len(found.grid.cells()), found.seconds / 3600
     trial = ""
     if plan.episodes is not None:
         trial = (
@@ -67,7 +64,7 @@ def _head(findings: Findings) -> str:
 {trial}
 *Control-Optimized Deep Reinforcement Learning* (arXiv 2507.00268) reports one run of each experiment. Here every one of
 them is trained with many seeds, and each reported number is judged by a check that was written down before.
-{len(runs)} of {wanted} trainings are finished; they took {hours:.1f} hours of one core in all. Every trained policy was
+{done} of {wanted} trainings are finished; they took {hours:.1f} hours of one core in all. Every trained policy was
 tested, without exploration, in {plan.test_episodes} episodes on the actuator that it was trained on.
 
 `codrl-mj reproduce` writes this page, its figures and its tables from run folders; do not edit it.
@@ -78,35 +75,13 @@ tested, without exploration, in {plan.test_episodes} episodes on the actuator th
 
 def _missing(findings: Findings) -> str:
     """What is not there, and what went wrong."""
-    lines = []
-    for name, series in findings.evidence.series.items():
-        if series.missing:
-            lines.append(f"- {name}: seeds {interval_text(series.missing)}")
-        lines += [f"  - seed {seed} failed: {error}" for seed, error in series.failures.items()]
+    lines = [f"- {name}: seeds {numbers_as_text(seeds)}" for name, seeds in findings.missing.items()]
+    lines += [f"- {name} failed: {error}" for name, error in findings.found.failures.items()]
     if not lines:
         return ""
     return "\n".join(
         ["## What is missing\n", "The tables are of the runs that there are, and say how many.\n", *lines, ""]
     )
-
-
-def _verdicts(findings: Findings) -> str:
-    """How many claims of whom came to what; one that is judged on both kinds of physics is one claim."""
-    outcomes = (CONFIRMED, NOT_CONFIRMED, NOT_TESTABLE)
-    rows = []
-    for source in (PAPER_SAYS, STUDY_SAYS, PORT):
-        found: dict[Any, set[str]] = {}
-        for claim, verdict in findings.claims:
-            if claim.source == source:
-                found.setdefault((claim.task, claim.statement, claim.measure), set()).add(verdict.outcome)
-        if found:
-            decisive = (NOT_CONFIRMED, CONFIRMED, NOT_TESTABLE)  # confirmed if it is wherever it could be tested
-            counts = collections.Counter(next(one for one in decisive if one in several) for several in found.values())
-            rows.append([_SOURCES[source], *(str(counts[outcome]) for outcome in outcomes)])
-    return f"## Verdicts\n\n{_ONCE}\n\n{_table(['said by', *outcomes], rows, numbers=3)}"
-
-
-_ONCE = "A claim that is judged on MuJoCo and on Gymnasium's equations counts once, as confirmed if it is on both."
 
 
 _SOURCES = {
@@ -116,7 +91,36 @@ _SOURCES = {
 }
 
 
-def _tasks(findings: Findings, drawn: dict[str, list[Path]]) -> Iterable[str]:
+def verdicts_section(claims: Sequence[tuple[Claim, Verdict]]) -> str:
+    """How many statements of whom came to what."""
+    rows = []
+    for source, who in _SOURCES.items():
+        found = [(claim, verdict.outcome) for claim, verdict in claims if claim.source == source]
+        if found:
+            each = _of_statements(found)
+            counts = collections.Counter(each.values())
+            rows.append([who, *map(str, (len(found), len(each), *(counts[outcome] for outcome in OUTCOMES)))])
+    header = ["said by", "verdicts", "statements", *OUTCOMES]
+    return f"## Verdicts\n\n{_WORDS}\n{_table(header, rows, numbers=len(header) - 1)}"
+
+
+def _of_statements(found: Iterable[tuple[Claim, str]]) -> dict[tuple[str, ...], str]:
+    """What every statement came to: where it is judged on both kinds of physics, it has to pass on both."""
+    several: dict[tuple[str, ...], set[str]] = {}
+    for claim, outcome in found:
+        several.setdefault(claim.identity, set()).add(outcome)
+    decisive = [NOT_CONFIRMED, *(one for one in OUTCOMES if one != NOT_CONFIRMED)]
+    return {identity: next(one for one in decisive if one in outcomes) for identity, outcomes in several.items()}
+
+
+_WORDS = """\
+*Confirmed* is what holds over seeds; *compatible* is what is said of one run or one episode, and could be one of ours.
+A statement that is judged on MuJoCo and on Gymnasium's equations has two verdicts and counts once, as passed if it is
+on both.
+"""
+
+
+def _tasks(findings: Findings, drawn: Mapping[str, Mapping[Path, str]]) -> Iterable[str]:
     for task in findings.plan.tasks:
         section = next(claim.section for claim, _ in findings.claims if claim.task == task)
         yield f"## {_TITLES[task]}: the paper's *{section}*\n"
@@ -124,9 +128,9 @@ def _tasks(findings: Findings, drawn: dict[str, list[Path]]) -> Iterable[str]:
         if task == VALUE_TASK:
             yield _value_iteration(findings.evidence.optima)
         if drawn[task]:
-            first, *others = drawn[task]
-            yield f"![{_caption(first)}]({FOLDER}/{first.name})\n"
-            yield ", ".join(f"[{_caption(path)}]({FOLDER}/{path.name})" for path in others) + "\n"
+            first, *others = (f"[{caption}]({FOLDER}/{path.name})" for path, caption in drawn[task].items())
+            yield f"!{first}\n"
+            yield ", ".join(others) + "\n"
 
 
 def _claims(findings: Findings, task: str) -> str:
@@ -160,39 +164,30 @@ def _value_iteration(optima: Sequence[Optimum]) -> str:
     )
 
 
-def _draw(findings: Findings, task: str, folder: Path) -> list[Path]:
-    """Draw what there is of a task."""
+def _draw(findings: Findings, task: str, folder: Path) -> dict[Path, str]:
+    """Draw what there is of a task: the files, and what they show."""
     mine = [one for one in findings.evidence.series.values() if one.arm.task == task]
-    paths = []
+    title, paths = _TITLES[task], {}
     if any(one.runs for one in mine):
-        paths.append(folder / f"learning_{task}.svg")
-        (figures.draw_epochs if task == "cartpole" else figures.draw_learning)(paths[-1], mine)
+        path = folder / f"learning_{task}.svg"
+        paths[path] = f"Learning, mean over seeds with its 95 % interval: {title}"
+        figures.draw_learning(path, mine)
     for settings in dict.fromkeys(one.arm.settings for one in mine):
         shown = [one for one in mine if one.arm.settings == settings and one.arm.physics == "mujoco"]
         episodes = [(one.arm, episode) for one in shown if (episode := figures.example(one)) is not None]
-        driven = [(arm, episode) for arm, episode in episodes if arm.actuator != IDEAL]
-        if driven:
-            paths.append(folder / f"torque_{task}_{settings}.svg")
-            figures.draw_torque(paths[-1], driven)
+        if driven := [(arm, episode) for arm, episode in episodes if arm.actuator != IDEAL]:
+            path = folder / f"torque_{task}_{settings}.svg"
+            paths[path] = f"Desired and actual torque, and error, {settings} settings: {title}"
+            figures.draw_torque(path, driven)
         if episodes:
-            paths.append(folder / f"states_{task}_{settings}.svg")
-            figures.draw_states(paths[-1], task, episodes)
+            path = folder / f"states_{task}_{settings}.svg"
+            paths[path] = f"States over a test episode, {settings} settings: {title}"
+            figures.draw_states(path, task, episodes)
     if task == VALUE_TASK:
-        paths.append(folder / "discount.svg")
-        figures.draw_discounts(paths[-1], findings.values, findings.evidence.optima)
+        path = folder / "discount.svg"
+        paths[path] = "Value of the start, and the best policies, over discount factors"
+        figures.draw_discounts(path, findings.values, findings.evidence.optima)
     return paths
-
-
-def _caption(path: Path) -> str:
-    """What a figure shows."""
-    kind, _, rest = path.stem.partition("_")
-    task, _, settings = rest.rpartition("_")
-    return {
-        "learning": f"Learning, mean over seeds with its 95 % interval: {_TITLES.get(rest, '')}",
-        "torque": f"Desired and actual torque, and error, {settings} settings: {_TITLES.get(task, '')}",
-        "states": f"States over a test episode, {settings} settings: {_TITLES.get(task, '')}",
-        "discount": "Value of the start, and the best policies, over discount factors",
-    }[kind]
 
 
 def _interval(interval: Interval) -> str:

@@ -21,7 +21,7 @@ DISCOUNTS = (0.85, 0.9, 0.95, 0.99, 0.999)
 
 
 @dataclasses.dataclass(frozen=True)
-class Grid:
+class Mesh:
     """Where values are computed; between its points they are interpolated."""
 
     positions: int = 121
@@ -39,9 +39,9 @@ class Grid:
         """
         for name in ("positions", "speeds"):
             if getattr(self, name) < 2:
-                raise ValueError(f"Grid.{name} = {getattr(self, name)}: must be >= 2")
+                raise ValueError(f"Mesh.{name} = {getattr(self, name)}: must be >= 2")
         if self.forces < 3 or self.forces % 2 == 0:
-            raise ValueError(f"Grid.forces = {self.forces}: must be an odd number >= 3")
+            raise ValueError(f"Mesh.forces = {self.forces}: must be an odd number >= 3")
 
     @property
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
@@ -59,7 +59,7 @@ class Grid:
 class Model:
     """One step of the car from every point of a grid under every force."""
 
-    def __init__(self, grid: Grid = Grid()) -> None:
+    def __init__(self, grid: Mesh = Mesh()) -> None:
         """Step Gymnasium's environment from every point: some seconds."""
         from scipy import sparse
 
@@ -81,7 +81,7 @@ class Model:
         """Weights of the points' values in what comes after, shape (A*S, S); none where the episode ends."""
 
 
-def interpolation(grid: Grid, states: np.ndarray) -> Any:
+def interpolation(grid: Mesh, states: np.ndarray) -> Any:
     """Weights with which values at the grid's points make values at states: bilinear, a sparse matrix (n, S).
 
     Args:
@@ -135,7 +135,7 @@ def iterate(rewards: np.ndarray, transitions: Any, discount: float, accuracy: fl
 class Greedy:
     """The policy that takes the best action by interpolated values."""
 
-    def __init__(self, grid: Grid, of_actions: np.ndarray) -> None:
+    def __init__(self, grid: Mesh, of_actions: np.ndarray) -> None:
         """Keep the values, shape (A, S)."""
         self._grid, self._of_actions = grid, of_actions
 

@@ -5,7 +5,6 @@ import dataclasses
 import json
 import re
 import xml.etree.ElementTree as ElementTree
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,11 +19,12 @@ from codrl_mj.study.parallel import Workers
 from codrl_mj.study.reproduction import figures, tables
 from codrl_mj.study.reproduction.arms import ARMS, TASKS
 from codrl_mj.study.reproduction.claims import CLAIMS
-from codrl_mj.study.reproduction.page import FOLDER, PAGE, _verdicts, write
-from codrl_mj.study.reproduction.reproduce import Reproduction, compute, costs, gather
+from codrl_mj.study.reproduction.page import FOLDER, PAGE, verdicts_section, write
+from codrl_mj.study.reproduction.reproduce import Reproduction, gather
 from codrl_mj.study.reproduction.series import Series
-from codrl_mj.study.reproduction.value_iteration import Grid
-from codrl_mj.study.reproduction.verdicts import CONFIRMED, NOT_CONFIRMED, NOT_TESTABLE, Verdict
+from codrl_mj.study.reproduction.value_iteration import Mesh
+from codrl_mj.study.reproduction.verdicts import COMPATIBLE, CONFIRMED, NOT_CONFIRMED, NOT_TESTABLE, Verdict
+from codrl_mj.study.trials import TEST_SECONDS
 from codrl_mj.tasks import find_task
 from codrl_mj.training import EVALUATION_SEED
 from tests.study.reproduction.worlds import trained
@@ -38,11 +38,11 @@ BLOCKED = HILL[-1]
 def done(tmp_path_factory):
     """One of two seeds of mountain cars that were trained for two episodes; one arm could not be."""
     root = tmp_path_factory.mktemp("paper")
-    plan = Reproduction(root, ("mountain_car", "mountain_car_continuous"), 1, 2, 2, 3, Grid(31, 31, 5))
+    plan = Reproduction(root, ("mountain_car", "mountain_car_continuous"), 1, 2, 2, 3, Mesh(31, 31, 5))
     hill = dataclasses.replace(plan, tasks=("mountain_car",), sarsa_seeds=1)
-    hill.folders()[BLOCKED.name, 0].write_text("a file in the way")
+    hill.grid.folders()[BLOCKED.name, 0].write_text("a file in the way")
     reported = []
-    compute(hill, Workers(jobs=1), on_cell=reported.append)
+    hill.grid.compute(Workers(jobs=1), on_cell=reported.append)
     findings = gather(plan)
     out = tmp_path_factory.mktemp("results")
     return plan, findings, out, write(findings, out), reported
@@ -54,11 +54,11 @@ def test_every_arm_is_trained_tested_and_read(done):
     assert (reported.count("training"), reported.count("test")) == (6, 5)
     for arm in HILL[:-1]:
         series = findings.evidence.series[arm.name]
-        assert (*series.runs, *series.missing) == (0, 1)
+        assert (*series.runs, *findings.missing[arm.name]) == (0, 1)
         run = series.runs[0]
-        assert run.folder == plan.folders()[arm.name, 0]
+        assert run.folder == plan.grid.folders()[arm.name, 0]
         assert len(run.episodes) == 2
-        env = arm.config(0).evaluation_env
+        env = arm.config.evaluation_env
         expected = evaluate(load_policy(run.folder), env, 3, EVALUATION_SEED)
         assert run.tests["test"]["episode_returns"] == list(expected.episode_returns)
         assert series.tested("returns") == [expected.returns.mean]
@@ -67,11 +67,11 @@ def test_every_arm_is_trained_tested_and_read(done):
 @pytest.mark.matrix
 def test_what_failed_or_was_not_tried_is_said(done):
     _, findings, out, _, _ = done
-    series = findings.evidence.series[BLOCKED.name]
-    assert series.missing == (0, 1)
-    assert "Not a directory" in series.failures[0]
+    assert findings.missing[BLOCKED.name] == [0, 1]
+    assert "Not a directory" in findings.found.failures[f"{BLOCKED.name}, seed 0"]
     page = (out / PAGE).read_text()
-    assert f"- {BLOCKED.name}: seeds 0 to 1\n  - seed 0 failed: " in page
+    assert f"- {BLOCKED.name}: seeds 0 to 1\n" in page
+    assert f"- {BLOCKED.name}, seed 0 failed: " in page
     assert "- mountain_car_continuous, repaired, ideal, mujoco: seeds 0\n" in page
     assert "5 of 16 trainings are finished" in page
     assert "A trial: every training was cut off after 2 episodes" in page
@@ -86,7 +86,7 @@ def test_the_page_has_what_the_paper_reports_and_the_table_every_claim_with_its_
     assert len(rows) == len(findings.claims)
     for claim, verdict in findings.claims:
         row = rows[claim.source, claim.physics or "", claim.statement, claim.measure]
-        assert (row["verdict"], row["why"], row["confirmed_if"]) == (
+        assert (row["verdict"], row["why"], row["criterion"]) == (
             verdict.outcome,
             verdict.reason,
             claim.check.criterion,
@@ -104,17 +104,18 @@ def test_the_page_has_what_the_paper_reports_and_the_table_every_claim_with_its_
 @pytest.mark.parametrize(
     ("mujoco", "analytic", "counted"),
     [
-        (CONFIRMED, CONFIRMED, "1 | 0 | 0"),
-        (CONFIRMED, NOT_CONFIRMED, "0 | 1 | 0"),
-        (CONFIRMED, NOT_TESTABLE, "1 | 0 | 0"),
-        (NOT_TESTABLE, NOT_TESTABLE, "0 | 0 | 1"),
+        (CONFIRMED, CONFIRMED, "1 | 0 | 0 | 0"),
+        (COMPATIBLE, COMPATIBLE, "0 | 1 | 0 | 0"),
+        (COMPATIBLE, NOT_CONFIRMED, "0 | 0 | 1 | 0"),
+        (CONFIRMED, NOT_TESTABLE, "1 | 0 | 0 | 0"),
+        (NOT_TESTABLE, NOT_TESTABLE, "0 | 0 | 0 | 1"),
     ],
 )
-def test_a_claim_about_both_kinds_of_physics_is_counted_once(mujoco, analytic, counted):
+def test_a_statement_about_both_kinds_of_physics_has_two_verdicts_and_counts_once(mujoco, analytic, counted):
     both = [claim for claim in CLAIMS if claim.statement == "ideal: goal in 160 s"]
     assert [claim.physics for claim in both] == ["mujoco", "analytic"]
     judged = zip(both, (Verdict(mujoco, ""), Verdict(analytic, "")), strict=True)
-    assert f"| the paper | {counted} |" in _verdicts(SimpleNamespace(claims=list(judged)))
+    assert f"| the paper | 2 | 1 | {counted} |" in verdicts_section(list(judged))
 
 
 @pytest.mark.matrix
@@ -179,32 +180,33 @@ def test_the_page_includes_what_a_person_wrote(done, tmp_path):
 def test_finished_runs_are_not_trained_again(done):
     plan, _, _, _, _ = done
     hill = dataclasses.replace(plan, tasks=("mountain_car",), sarsa_seeds=1)
-    results = [folder / "result.json" for folder in hill.folders().values() if (folder / "result.json").is_file()]
+    results = [folder / "result.json" for folder in hill.grid.folders().values() if (folder / "result.json").is_file()]
     assert len(results) == 5
     before = [path.stat().st_mtime_ns for path in results]
-    compute(hill, Workers(jobs=1))
+    hill.grid.compute(Workers(jobs=1))
     assert [path.stat().st_mtime_ns for path in results] == before
 
 
 @pytest.mark.matrix
 def test_costs_are_those_of_finished_runs_or_estimates(done):
     plan, findings, _, _, _ = done
-    by_arm = {cost.arm.name: cost for cost in costs(plan)}
+    by_arm = {cost.arm.name: cost for cost in plan.grid.costs()}
     half = by_arm[HILL[0].name]
     assert (half.finished, half.missing) == ((0,), (1,))
-    assert half.left == half.seconds == findings.evidence.series[HILL[0].name].runs[0].seconds
+    assert half.seconds == findings.evidence.series[HILL[0].name].runs[0].seconds
+    assert (half.tests, half.left) == (1, half.seconds + TEST_SECONDS)
     none = by_arm[BLOCKED.name]
-    assert (none.finished, none.missing, none.left) == ((), (0, 1), 2 * BLOCKED.seconds)
+    assert (none.finished, none.missing, none.left) == ((), (0, 1), 2 * (BLOCKED.seconds + TEST_SECONDS))
 
 
 def test_the_whole_is_estimated_at_less_than_four_hours_of_two_cores(tmp_path):
-    plan = Reproduction(tmp_path)
-    assert sum(cost.left for cost in costs(plan)) < 2 * 4 * 3600
-    assert len(plan.cells()) == sum(30 if arm.agent == "sarsa" else 5 for arm in ARMS)
+    grid = Reproduction(tmp_path).grid
+    assert sum(cost.left for cost in grid.costs()) < 2 * 4 * 3600
+    assert len(grid.cells()) == sum(30 if arm.task == "mountain_car" else 5 for arm in ARMS)
 
 
 def test_all_arms_first_seeds_are_trained_first_and_the_longest_before_the_others(tmp_path):
-    order = list(Reproduction(tmp_path).cells())
+    order = list(Reproduction(tmp_path).grid.cells())
     seeds = [seed for _, seed in order]
     assert seeds == sorted(seeds)
     seconds = {arm.name: arm.seconds for arm in ARMS}
@@ -273,7 +275,7 @@ def test_the_curves_are_what_the_paper_plots():
 def test_epochs_are_drawn(tmp_path):
     arms = [arm for arm in ARMS if arm.task == "cartpole"]
     series = [Series(arm, {seed: trained(seed, epoch=35) for seed in range(3)}) for arm in arms]
-    figures.draw_epochs(tmp_path / "epochs.svg", series)
+    figures.draw_learning(tmp_path / "epochs.svg", series)
     assert ElementTree.parse(tmp_path / "epochs.svg").getroot().tag.endswith("svg")
 
 
@@ -310,17 +312,18 @@ def test_failures_show_in_the_exit_status(done, tmp_path, capsys):
 @pytest.mark.matrix
 def test_a_test_that_failed_is_said(done, tmp_path):
     plan, _, _, _, _ = done
-    folder = plan.folders()[HILL[0].name, 0]
+    folder = plan.grid.folders()[HILL[0].name, 0]
     broken, content = folder / "policy.json", (folder / "policy.json").read_text()
     shorter = dataclasses.replace(plan, tasks=("mountain_car",), test_episodes=2)
     broken.write_text("{")
     try:
-        compute(shorter, Workers(jobs=1))
+        shorter.grid.compute(Workers(jobs=1))
     finally:
         broken.write_text(content)
-    series = gather(shorter).evidence.series
-    assert "policy.json" in series[HILL[0].name].failures[0]
-    assert 0 in series[HILL[1].name].runs
+    findings = gather(shorter)
+    assert "policy.json" in findings.found.failures[f"{HILL[0].name} on test, seed 0"]
+    assert findings.missing[HILL[0].name] == [0]
+    assert 0 in findings.evidence.series[HILL[1].name].runs
 
 
 def test_an_unknown_task_is_named(capsys):

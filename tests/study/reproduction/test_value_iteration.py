@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from codrl_mj.study.reproduction.value_iteration import Grid, Model, interpolation, iterate, optimum
+from codrl_mj.study.reproduction.value_iteration import Mesh, Model, interpolation, iterate, optimum
 
-COARSE = Grid(61, 61, 11)
+COARSE = Mesh(61, 61, 11)
 
 
 @pytest.fixture(scope="module")
@@ -37,12 +37,12 @@ def test_a_discount_that_does_not_converge_is_refused(discount):
 
 @pytest.mark.parametrize(("field", "value"), [("positions", 1), ("speeds", 0), ("forces", 4), ("forces", 1)])
 def test_impossible_grids_are_refused(field, value):
-    with pytest.raises(ValueError, match=f"Grid.{field} = {value}: must be"):
-        Grid(**{field: value})
+    with pytest.raises(ValueError, match=f"Mesh.{field} = {value}: must be"):
+        Mesh(**{field: value})
 
 
 def test_interpolation_is_exact_for_what_is_bilinear():
-    grid = Grid(7, 5, 3)
+    grid = Mesh(7, 5, 3)
     positions, speeds = np.meshgrid(*grid.axes, indexing="ij")
 
     def bilinear(x, v):

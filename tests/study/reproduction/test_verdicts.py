@@ -7,22 +7,21 @@ import pytest
 from scipy import stats
 
 from codrl_mj.study.reproduction.verdicts import (
+    COMPATIBLE,
     CONFIRMED,
     NOT_CONFIRMED,
     NOT_TESTABLE,
-    EverySeed,
-    Higher,
     Holds,
-    OneEpisode,
-    OneRun,
-    Same,
-    SomeSeed,
-    Within,
     central_range,
-    difference,
+    every_seed,
+    higher,
     number,
-    paired_difference,
+    one_episode,
+    one_run,
     prediction_interval,
+    same,
+    some_seed,
+    within,
 )
 
 NOTHING = np.array([])
@@ -45,22 +44,27 @@ def test_welchs_interval_is_its_formula():
     shares = values.var(ddof=1) / 4, others.var(ddof=1) / 3
     freedom = sum(shares) ** 2 / (shares[0] ** 2 / 3 + shares[1] ** 2 / 2)
     reach = stats.t.ppf(0.975, freedom) * math.sqrt(sum(shares))
-    interval, p_value = difference(values, others)
-    assert interval == pytest.approx((-2.0, -2.0 - reach, -2.0 + reach))
-    assert p_value == pytest.approx(2 * stats.t.sf(2.0 / math.sqrt(sum(shares)), freedom))
+    verdict = higher()(values, others)
+    assert verdict.measured == pytest.approx((-2.0, -2.0 - reach, -2.0 + reach))
+    p_value = 2 * stats.t.sf(2.0 / math.sqrt(sum(shares)), freedom)
+    assert verdict.reason == f"means 3 and 5, p = {p_value:.2g}: no difference can be told"
 
 
 def test_the_paired_interval_is_its_formula():
     values, others = np.array([1.0, 5.0, 9.0]), np.array([0.0, 3.0, 9.0])  # differences 1, 2, 0
     reach = stats.t.ppf(0.975, 2) * 1.0 / math.sqrt(3)
-    interval, _ = paired_difference(values, others)
-    assert interval == pytest.approx((1.0, 1.0 - reach, 1.0 + reach))
+    assert same(3.0, paired=True)(values, others).measured == pytest.approx((1.0, 1.0 - reach, 1.0 + reach))
 
 
-@pytest.mark.parametrize("compare", [difference, paired_difference])
-def test_values_without_spread_have_a_difference_without_spread(compare):
-    assert compare(np.full(3, 500.0), np.full(3, 499.0)) == ((1.0, 1.0, 1.0), 0.0)
-    assert compare(np.full(3, 500.0), np.full(3, 500.0)) == ((0.0, 0.0, 0.0), 1.0)
+@pytest.mark.parametrize(
+    ("others", "measured", "reason"),
+    [(499.0, (1.0, 1.0, 1.0), "means 500 and 499, p = 0: higher"), (500.0, (0.0, 0.0, 0.0), "p = 1: no difference")],
+)
+def test_values_without_spread_have_a_difference_without_spread(others, measured, reason):
+    verdict = higher()(np.full(3, 500.0), np.full(3, others))
+    assert verdict.measured == measured
+    assert reason in verdict.reason
+    assert same(2.0, paired=True)(np.full(3, 500.0), np.full(3, others)).measured == measured
 
 
 def test_the_central_range_leaves_out_a_fortieth_at_both_ends():
@@ -72,21 +76,21 @@ def test_the_central_range_leaves_out_a_fortieth_at_both_ends():
 @pytest.mark.parametrize(
     ("check", "values", "outcome"),
     [
-        (Within(1.0, 2.0), [1.0, 1.0], CONFIRMED),
-        (Within(1.0, 2.0), [2.0], CONFIRMED),
-        (Within(1.0, 2.0), [2.0, 2.0 + 1e-9], NOT_CONFIRMED),
-        (Within(1.0, 2.0), [0.0, 4.0], CONFIRMED),  # on average
-        (Within(low=1.0), [1e9], CONFIRMED),
-        (Within(high=1.0), [-1e9], CONFIRMED),
-        (Within(high=1.0), [1.1], NOT_CONFIRMED),
-        (EverySeed(2.0), [1.0, 2.0], CONFIRMED),
-        (EverySeed(2.0), [1.0, 2.0001], NOT_CONFIRMED),
-        (EverySeed(2.0), [1.0, math.inf], NOT_CONFIRMED),
-        (SomeSeed(0.5), [0.0, 0.5], CONFIRMED),
-        (SomeSeed(0.5), [0.0, 0.4999], NOT_CONFIRMED),
-        (OneRun(5.0), [4.9, 5.0], CONFIRMED),
-        (OneRun(5.0), [7.0, 7.001, 7.002], NOT_CONFIRMED),
-        (OneRun(5.0), [5.0], NOT_TESTABLE),
+        (within(1.0, 2.0), [1.0, 1.0], CONFIRMED),
+        (within(1.0, 2.0), [2.0], CONFIRMED),
+        (within(1.0, 2.0), [2.0, 2.0 + 1e-9], NOT_CONFIRMED),
+        (within(1.0, 2.0), [0.0, 4.0], CONFIRMED),  # on average
+        (within(low=1.0), [1e9], CONFIRMED),
+        (within(high=1.0), [-1e9], CONFIRMED),
+        (within(high=1.0), [1.1], NOT_CONFIRMED),
+        (every_seed(2.0), [1.0, 2.0], CONFIRMED),
+        (every_seed(2.0), [1.0, 2.0001], NOT_CONFIRMED),
+        (every_seed(2.0), [1.0, math.inf], NOT_CONFIRMED),
+        (some_seed(0.5), [0.0, 0.5], COMPATIBLE),
+        (some_seed(0.5), [0.0, 0.4999], NOT_CONFIRMED),
+        (one_run(5.0), [4.9, 5.0], COMPATIBLE),
+        (one_run(5.0), [7.0, 7.001, 7.002], NOT_CONFIRMED),
+        (one_run(5.0), [5.0], NOT_TESTABLE),
     ],
 )
 def test_outcomes_of_one_value_a_seed(check, values, outcome):
@@ -97,14 +101,14 @@ def test_outcomes_of_one_value_a_seed(check, values, outcome):
 
 
 @pytest.mark.parametrize(
-    "check", [Within(0.0, 1.0), EverySeed(1.0), SomeSeed(1.0), OneRun(1.0), OneEpisode(1.0), Holds("it does")]
+    "check", [within(0.0, 1.0), every_seed(1.0), some_seed(1.0), one_run(1.0), one_episode(1.0), Holds("it does")]
 )
 def test_without_runs_nothing_can_be_tested(check):
     verdict = check(None) if isinstance(check, Holds) else check(NOTHING)
     assert (verdict.outcome, verdict.measured, verdict.samples) == (NOT_TESTABLE, None, 0)
 
 
-@pytest.mark.parametrize("check", [Higher(), Same(1.0), Same(1.0, paired=True)])
+@pytest.mark.parametrize("check", [higher(), same(1.0), same(1.0, paired=True)])
 def test_a_comparison_takes_two_seeds_of_both(check):
     assert check(NOTHING, np.array([1.0, 2.0])).outcome == NOT_TESTABLE
     assert check(np.array([1.0]), np.array([1.0, 2.0])).outcome == NOT_TESTABLE
@@ -113,55 +117,55 @@ def test_a_comparison_takes_two_seeds_of_both(check):
 def test_one_runs_boundary_is_the_prediction_interval():
     values = np.array([4.0, 6.0])
     edge = 5 + math.tan(math.pi * 0.475) * math.sqrt(2) * math.sqrt(1.5)
-    assert OneRun(edge - 1e-6)(values).outcome == CONFIRMED
-    assert OneRun(edge + 1e-6)(values).outcome == NOT_CONFIRMED
+    assert one_run(edge - 1e-6)(values).outcome == COMPATIBLE
+    assert one_run(edge + 1e-6)(values).outcome == NOT_CONFIRMED
 
 
 def test_an_episode_is_like_ours_if_it_is_within_the_central_range():
     times = [np.arange(1.0, 21.0), np.arange(21.0, 41.0)]  # 1 to 40: the central 95 % are 1 to 39
-    assert OneEpisode(39.0)(times).outcome == CONFIRMED
-    assert OneEpisode(39.5)(times).outcome == NOT_CONFIRMED
-    assert OneEpisode(39.0)(times).measured.mean == (10.5 + 30.5) / 2
+    assert one_episode(39.0)(times).outcome == COMPATIBLE
+    assert one_episode(39.5)(times).outcome == NOT_CONFIRMED
+    assert one_episode(39.0)(times).measured.mean == (10.5 + 30.5) / 2
 
 
 def test_episodes_that_do_not_arrive_are_told_and_take_no_time():
     some = [np.array([1.0, math.inf, math.inf]), np.array([2.0, 3.0, 4.0]), np.array([math.inf, math.inf])]
-    assert OneEpisode(5.0)(some).outcome == NOT_CONFIRMED
-    verdict = OneEpisode(4.0)(some)
-    assert verdict.outcome == CONFIRMED
+    assert one_episode(5.0)(some).outcome == NOT_CONFIRMED
+    verdict = one_episode(4.0)(some)
+    assert verdict.outcome == COMPATIBLE
     assert (verdict.measured.mean, verdict.samples) == (2.0, 3)
     assert "50 % never arrive" in verdict.reason
-    nobody = OneEpisode(5.0)(some[2:])
+    nobody = one_episode(5.0)(some[2:])
     assert (nobody.outcome, nobody.measured) == (NOT_CONFIRMED, None)
 
 
 def test_higher_is_a_test_of_the_difference_and_not_of_the_means():
     values = np.array([1.0, 2.0, 3.0])
-    assert Higher()(values, values - 0.1).outcome == NOT_CONFIRMED
-    assert "no difference can be told" in Higher()(values, values - 0.1).reason
-    assert Higher()(values, values - 10.0).outcome == CONFIRMED
-    lower = Higher()(values - 10.0, values)
+    assert higher()(values, values - 0.1).outcome == NOT_CONFIRMED
+    assert "no difference can be told" in higher()(values, values - 0.1).reason
+    assert higher()(values, values - 10.0).outcome == CONFIRMED
+    lower = higher()(values - 10.0, values)
     assert lower.outcome == NOT_CONFIRMED
     assert lower.reason.endswith("lower")
 
 
 def test_the_same_is_shown_and_not_merely_not_refuted():
     values = np.array([1.0, 2.0, 3.0])
-    assert Same(1.0)(values, values).outcome == NOT_CONFIRMED  # the interval is wider than that
-    assert "more seeds would tell" in Same(1.0)(values, values).reason
-    assert Same(3.0)(values, values).outcome == CONFIRMED
-    assert Same(1.0, paired=True)(values, values - 0.5).outcome == CONFIRMED
-    apart = Same(1.0, paired=True)(values, values - 1.5)
+    assert same(1.0)(values, values).outcome == NOT_CONFIRMED  # the interval is wider than that
+    assert "more seeds would tell" in same(1.0)(values, values).reason
+    assert same(3.0)(values, values).outcome == CONFIRMED
+    assert same(1.0, paired=True)(values, values - 0.5).outcome == CONFIRMED
+    apart = same(1.0, paired=True)(values, values - 1.5)
     assert (apart.outcome, apart.reason) == (NOT_CONFIRMED, "they differ by more")
-    assert Same(0.0, paired=True)(values, values).reason == "no two values differ"
+    assert same(0.0, paired=True)(values, values).reason == "no two values differ"
 
 
 def test_what_is_said_of_an_interval_is_so():
     narrow, wide = np.array([1.4, 1.5, 1.6]), np.array([-5.0, 1.0, 8.5])  # means 1.5
-    assert Within(1.0, 2.0)(narrow).reason == "the whole interval is"
-    assert "reaches beyond" in Within(1.0, 2.0)(wide).reason
-    assert Within(2.0, 3.0)(narrow).reason == "the whole interval is beyond"
-    assert "reaches in" in Within(2.0, 3.0)(wide).reason
+    assert within(1.0, 2.0)(narrow).reason == "the whole interval is"
+    assert "reaches beyond" in within(1.0, 2.0)(wide).reason
+    assert within(2.0, 3.0)(narrow).reason == "the whole interval is beyond"
+    assert "reaches in" in within(2.0, 3.0)(wide).reason
 
 
 def test_numbers_as_text():

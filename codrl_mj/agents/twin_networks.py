@@ -1,0 +1,104 @@
+"""Actor and critic as one stack of networks, with its gradient written out.
+
+Imports torch: import it where an agent is made.
+
+Networks of 64 units are so small that most of a gradient step is the bookkeeping around its arithmetic: modules, the
+graph of automatic differentiation, tensor by tensor optimisation. Here both networks pass through the same few batched
+products, forwards and backwards, and all their parameters are one vector.
+"""
+
+import torch
+from stable_baselines3.common.policies import ActorCriticPolicy
+from torch import nn
+
+_SLOPES = {
+    nn.Tanh: torch.ops.aten.tanh_backward,
+    nn.ReLU: lambda gradient, output: torch.ops.aten.threshold_backward(gradient, output, 0.0),
+}
+"""Activation -> (gradient by its output, its output) -> gradient by its input."""
+
+
+class TwinNetworks:
+    """The networks of a Stable-Baselines3 `ActorCriticPolicy`, whose parameters become views of one vector.
+
+    The critic's last layer is filled up with zeros to as many outputs as the actor has; they stay zero.
+    """
+
+    def __init__(self, policy: ActorCriticPolicy) -> None:
+        """Move the policy's parameters into the vector `parameters`, whose gradient is `gradient`."""
+        towers = [
+            [layer for layer in (*hidden, last) if isinstance(layer, nn.Linear)]
+            for hidden, last in (
+                (policy.mlp_extractor.policy_net, policy.action_net),
+                (policy.mlp_extractor.value_net, policy.value_net),
+            )
+        ]
+        shapes = [
+            (max(layer.out_features for layer in pair), pair[0].in_features) for pair in zip(*towers, strict=True)
+        ]
+        self.outputs = shapes[-1][0]
+        log_std = getattr(policy, "log_std", None)
+        noise = 0 if log_std is None else log_std.numel()
+        self.parameters = torch.zeros(sum(2 * outputs * (inputs + 1) for outputs, inputs in shapes) + noise)
+        self.gradient = torch.zeros_like(self.parameters)
+        self.weights, self.biases = _carve(self.parameters, shapes)  # (2, outputs, inputs), (2, 1, outputs)
+        self._weight_gradients, self._bias_gradients = _carve(self.gradient, shapes)
+        for tower, linears in enumerate(towers):
+            for layer, weight, bias in zip(linears, self.weights, self.biases, strict=True):
+                _move(layer.weight, weight[tower, : layer.out_features])
+                _move(layer.bias, bias[tower, 0, : layer.out_features])
+        self.log_std_gradient = None
+        if log_std is not None:
+            _move(log_std, self.parameters[-noise:].view_as(log_std))
+            self.log_std_gradient = self.gradient[-noise:].view_as(log_std)
+        activation = policy.activation_fn
+        self._activation, self._slope = {nn.Tanh: torch.tanh, nn.ReLU: torch.relu}[activation], _SLOPES[activation]
+
+    def act(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The actor alone: features (N, k) -> its last hidden layer (N, h) and its outputs (N, a)."""
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            features = self._activation(torch.addmm(bias[0], features, weight[0].T))
+        return features, torch.addmm(self.biases[-1][0], features, self.weights[-1][0].T)
+
+    def forward(self, features: torch.Tensor) -> list[torch.Tensor]:
+        """Both networks: features (N, k) -> the inputs of each layer, (2, N, units), and then the outputs (2, N, a).
+
+        The critic's value is the first of its outputs.
+        """
+        layers = [features.expand(2, *features.shape)]
+        for place, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            outputs = torch.baddbmm(bias, layers[-1], weight.mT)
+            layers.append(outputs if place == len(self.weights) - 1 else self._activation(outputs))
+        return layers
+
+    def backward(self, layers: list[torch.Tensor], gradient: torch.Tensor) -> None:
+        """Fill in `gradient`, but for that of `log_std`.
+
+        Args:
+            layers: what `forward` returned.
+            gradient: of the loss by the outputs, (2, N, a).
+        """
+        for place in reversed(range(len(self.weights))):
+            torch.bmm(gradient.mT, layers[place], out=self._weight_gradients[place])
+            torch.sum(gradient, 1, keepdim=True, out=self._bias_gradients[place])
+            if place:
+                gradient = self._slope(torch.bmm(gradient, self.weights[place]), layers[place])
+
+
+def _carve(vector: torch.Tensor, shapes: list[tuple[int, int]]) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    """Weights and biases of both networks as views of a vector, layer by layer."""
+    weights: list[torch.Tensor] = []
+    biases: list[torch.Tensor] = []
+    start = 0
+    for outputs, inputs in shapes:
+        for views, size in ((weights, inputs), (biases, 1)):
+            count = 2 * outputs * size
+            piece = vector[start : start + count]
+            views.append(piece.view(2, outputs, inputs) if views is weights else piece.view(2, 1, outputs))
+            start += count
+    return weights, biases
+
+
+def _move(parameter: nn.Parameter, view: torch.Tensor) -> None:
+    view.copy_(parameter.data)
+    parameter.data = view

@@ -1,0 +1,117 @@
+"""The study's figures: dose and response, and bars of what was trained on what."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codrl_mj.evaluation.measures import bootstrap_mean
+from codrl_mj.study.actuators import arms
+from codrl_mj.study.actuators.levels import AXES
+from codrl_mj.study.actuators.questions import dosed, undosed
+from codrl_mj.study.actuators.verdicts import Scores
+from codrl_mj.study.figures import COLOURS, MARKERS, save
+from codrl_mj.study.trials import Trial
+
+TITLES: Mapping[str, str] = {
+    "pendulum": "Pendulum",
+    "cartpole": "CartPole",
+    "acrobot": "Acrobot",
+    "furuta": "Furuta pendulum",
+    "mountain_car": "Mountain Car",
+    "mountain_car_continuous": "Mountain Car, continuous",
+}
+"""What tasks are called."""
+_LOWEST = -0.1  # of the span; what is worse is as lost
+
+
+def doses(path: Path, scores: Scores) -> None:
+    """Draw what ideal-trained policies score over every axis, a panel each, a line for each task.
+
+    Where it is trained through, what policies score there that were: a star in the task's colour.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10.0, 6.4), layout="constrained")
+    panels: Any = figure.subplots(2, 3, sharey=True).ravel()
+    for panel, (name, axis) in zip(panels, AXES.items(), strict=True):
+        for number, task in enumerate(arms.SECONDS):
+            colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
+            trials = [undosed(arms.ideal(task), name), *(dosed(arms.ideal(task), name, x) for x in axis.doses[1:])]
+            there = [(place, found) for place, one in enumerate(trials) if (found := _values(scores, one)).size]
+            if there:
+                means = [bootstrap_mean(found) for _, found in there]
+                places = np.array([place for place, _ in there]) + 0.06 * (number - 2.5)
+                panel.plot(places, [max(one.mean, _LOWEST) for one in means], color=colour, lw=1.3)
+                _bars(panel, places, means, colour, marker, TITLES[task])
+            if task in axis.trained:
+                place = axis.doses.index(axis.trained[task]) + 0.06 * (number - 2.5)
+                matched = _values(scores, dosed(arms.matched(task, name), name, axis.trained[task]))
+                if matched.size:
+                    panel.plot(place, matched.mean(), "*", color=colour, markersize=13, markeredgecolor="white")
+        panel.set_xticks(range(len(axis.doses)), [f"{dose:g}" for dose in axis.doses])
+        panel.set(xlabel=axis.unit, title=axis.title, ylim=(_LOWEST - 0.04, 1.12))
+        panel.grid(axis="y", color="0.9")
+        panel.set_axisbelow(True)
+    for panel in panels[::3]:
+        panel.set_ylabel("score [share of the span]")
+    handles, labels = panels[0].get_legend_handles_labels()
+    from matplotlib.lines import Line2D
+
+    handles.append(Line2D([], [], ls="", marker="*", color="0.4", markersize=12))
+    figure.legend(handles, [*labels, "trained through it"], loc="outside lower center", ncols=4, fontsize="small")
+    save(figure, path)
+
+
+def bars(path: Path, scores: Scores, groups: Mapping[str, Sequence[tuple[str, Trial]]], title: str) -> None:
+    """Draw scores of trials in groups, every policy as a dot, and the mean with its 95 % interval.
+
+    Args:
+        path: SVG file.
+        scores: of the study.
+        groups: name -> label and trial of each of its bars; the same label has the same colour.
+        title: above it.
+    """
+    from matplotlib.figure import Figure
+
+    labels = list(dict.fromkeys(label for each in groups.values() for label, _ in each))
+    figure = Figure(figsize=(max(6.0, 1.2 + 1.5 * len(groups)), 3.9), layout="constrained")
+    axes: Any = figure.subplots()
+    for place, (_, each) in enumerate(groups.items()):
+        for number, (label, trial) in enumerate(each):
+            values = _values(scores, trial)
+            if values.size:
+                at = place + 0.8 * ((number + 0.5) / len(each) - 0.5)
+                colour = COLOURS[labels.index(label) % len(COLOURS)]
+                axes.plot(
+                    np.full(len(values), at + 0.06), np.maximum(values, _LOWEST), ".", color=colour, ms=3, alpha=0.6
+                )
+                _bars(
+                    axes,
+                    np.array([at]),
+                    [bootstrap_mean(values)],
+                    colour,
+                    MARKERS[labels.index(label) % len(MARKERS)],
+                    label,
+                )
+    axes.set_xticks(range(len(groups)), groups)
+    axes.set(ylabel="score [share of the span]", title=title, xlim=(-0.5, len(groups) - 0.5))
+    axes.grid(axis="y", color="0.9")
+    axes.set_axisbelow(True)
+    handles, names = axes.get_legend_handles_labels()
+    once = dict(zip(names, handles, strict=True))
+    figure.legend(once.values(), once.keys(), loc="outside lower center", ncols=3, fontsize="small")
+    save(figure, path)
+
+
+def _values(scores: Scores, trial: Trial) -> np.ndarray:
+    return np.array(list(scores.of(trial).values()))
+
+
+def _bars(axes: Any, places: np.ndarray, means: Sequence[Any], colour: str, marker: str, label: str) -> None:
+    """Means with their intervals; what is below the figure is drawn at its edge."""
+    middle = np.maximum([one.mean for one in means], _LOWEST)
+    low = np.maximum(middle - np.maximum([one.low for one in means], _LOWEST), 0.0)
+    high = np.maximum(np.maximum([one.high for one in means], _LOWEST) - middle, 0.0)
+    axes.errorbar(places, middle, [low, high], fmt=marker, color=colour, ms=5, lw=1.2, label=label)

@@ -1,0 +1,191 @@
+"""The study's page: the answer to each hypothesis that was written down before, and the figures."""
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from codrl_mj.runs.files import writing
+from codrl_mj.study.actuators import arms, figures, tables
+from codrl_mj.study.actuators.questions import (
+    at_home,
+    on_loop,
+    on_motor,
+    primary,
+    secondary,
+    through_loop,
+    through_motor,
+)
+from codrl_mj.study.actuators.verdicts import FLOORS, LEVEL, MARGIN, Scores, Verdict, judge, seeds_to_close
+from codrl_mj.study.conclusions import conclusions_section
+from codrl_mj.study.inference import detectable
+from codrl_mj.study.trials import Collected, Trial
+
+PAGE, FOLDER = "actuators.md", "actuators"
+"""The page, and the folder beside it with its figures and tables."""
+QUESTIONS: Mapping[str, str] = {
+    "matters": "When does an actuator matter?",
+    "tune": "Tune or train?",
+    "wrong": "A wrong model",
+    "motors": "Motors that exist",
+    "command": "What should the policy command and see?",
+}
+"""The questions by name."""
+
+
+def write(collected: Collected, out: Path) -> list[Path]:
+    """Write page, figures and tables.
+
+    Args:
+        collected: of the study; whatever is missing is named on the page.
+        out: folder for the page.
+
+    Returns:
+        The files that were written.
+    """
+    folder, scores = out / FOLDER, Scores(collected)
+    first, others = judge(scores, primary()), judge(scores, secondary())
+    drawn = _draw(scores, folder)
+    written = [*drawn.values(), *tables.write(collected, scores, [*first, *others], folder)]
+    parts = [
+        _head(collected),
+        conclusions_section(out / PAGE),
+        _verdicts(first),
+        *(_question(name, title, others, drawn) for name, title in QUESTIONS.items()),
+        _missing(collected),
+        _method(collected, scores),
+    ]
+    with writing(out / PAGE) as temporary:
+        temporary.write_text("\n".join(part for part in parts if part))
+    return [out / PAGE, *written]
+
+
+def _draw(scores: Scores, folder: Path) -> dict[str, Path]:
+    """The figures by question."""
+    found = {name: folder / f"{name}.svg" for name in ("matters", "tune", "motors")}
+    figures.doses(found["matters"], scores)
+    loops: dict[str, list[tuple[str, Trial]]] = {
+        f"{figures.TITLES[task]},\n{loop}": [
+            ("ideal-trained", on_loop(arms.ideal(task), loop)),
+            ("trained through it", on_loop(through_loop(task, loop), loop)),
+        ]
+        for task in arms.LOOPED
+        for loop in ("weaker", "paper", "designed")
+    }
+    figures.bars(found["tune"], scores, loops, "The paper's motor under three loops")
+    motors: dict[str, list[tuple[str, Trial]]] = {}
+    for task in arms.SECONDS:
+        ideal = arms.ideal(task)
+        motors[figures.TITLES[task].replace(", ", ",\n")] = [
+            ("ideal-trained, on ideal forces", at_home(ideal)),
+            ("ideal-trained, on the good motor", on_motor(ideal, "good")),
+            *(
+                [
+                    ("ideal-trained, on the marginal motor", on_motor(ideal, "marginal")),
+                    ("trained through the marginal motor", on_motor(through_motor(task), "marginal")),
+                ]
+                if task in arms.MARGINAL
+                else []
+            ),
+        ]
+    figures.bars(found["motors"], scores, motors, "Motors of the catalogue")
+    return found
+
+
+def _head(collected: Collected) -> str:
+    grid = collected.grid
+    done, wanted = len(collected.folders), len(grid.cells())
+    tested, tests = sum(map(len, collected.evaluations.values())), len(grid.deployments())
+    codes = ", ".join(f"`{code}` ({count})" for code, count in sorted(collected.codes.items())) or "none"
+    return f"""# What does an actuator cost?
+
+{done} of {wanted} trainings are finished ({collected.seconds / 3600:.1f} hours of one core), and {tested} of {tests}
+tests. [The plan](plan.md) was written before the first of them: questions, hypotheses, tests.
+Versions of the code that trained, with the number of runs: {codes}.
+
+`codrl-mj study actuators` writes this page, its figures and its tables; do not edit it
+([how to run it](../studies.md)). The numbers are files: [hypotheses]({FOLDER}/{tables.HYPOTHESES}),
+[trials]({FOLDER}/{tables.TRIALS}), [runs]({FOLDER}/{tables.RUNS}).
+"""
+
+
+def _verdicts(verdicts: Sequence[Verdict]) -> str:
+    """The primary hypotheses, one row each."""
+    lines = [
+        "## The twelve hypotheses",
+        "",
+        "| | holds | effect [95 %] | corrected p | policies | says |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    for verdict in verdicts:
+        says = verdict.hypothesis.statement
+        if verdict.outcome == "open" and (seeds := seeds_to_close(verdict)) is not None:
+            says += f" (about {seeds} seeds would tell)"
+        tested, wanted = verdict.strata
+        if tested < wanted:
+            says += f" ({tested} of {wanted} comparisons have runs)"
+        lines.append(
+            f"| {verdict.hypothesis.name} | {verdict.outcome} | {_effect(verdict)} | {_p(verdict.corrected)} | "
+            f"{min(verdict.runs)} | {says} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _effect(verdict: Verdict) -> str:
+    mean, low, high = verdict.effect
+    return "–" if np.isnan(mean) else f"{mean:+.3f} [{low:+.3f}, {high:+.3f}]"
+
+
+def _p(value: float) -> str:
+    return "< 0.001" if value < 0.001 else f"{value:.3f}"
+
+
+def _question(name: str, title: str, verdicts: Sequence[Verdict], drawn: Mapping[str, Path]) -> str:
+    """A question: its figure, and how many of its secondary comparisons were decided, with the largest effects."""
+    mine = [verdict for verdict in verdicts if verdict.hypothesis.question == name and verdict.runs != (0, 0)]
+    decided = [verdict for verdict in mine if verdict.outcome != "open"]
+    lines = [f"## {title}", ""]
+    if name in drawn:
+        lines += [f"![{title}]({FOLDER}/{drawn[name].name})", ""]
+    lines.append(
+        f"Of {len(mine)} secondary comparisons {len(decided)} differ, with a false discovery rate of 5 %. The largest:"
+        if decided
+        else f"Of {len(mine)} secondary comparisons none differs, with a false discovery rate of 5 %."
+    )
+    largest = sorted(decided, key=lambda verdict: -abs(verdict.effect.mean))[:3]
+    lines += ["", *(f"- {one.hypothesis.statement}: {_effect(one)}" for one in largest)] if largest else []
+    return "\n".join(lines) + "\n"
+
+
+def _missing(collected: Collected) -> str:
+    if not collected.missing:
+        return ""
+    shown = [f"- failed: {name}: {error}" for name, error in list(collected.failures.items())[:10]]
+    return (
+        "\n".join(
+            [
+                "## What is missing",
+                "",
+                f"{len(collected.missing)} trainings and tests, of which "
+                f"{len(collected.failures)} failed. `codrl-mj study actuators --dry-run` lists them.",
+                *shown,
+            ]
+        )
+        + "\n"
+    )
+
+
+def _method(collected: Collected, scores: Scores) -> str:
+    known = [f"{task} {FLOORS[task]:g} to {ceiling:.1f}" for task, ceiling in scores.ceilings.items()]
+    grid = collected.grid
+    runs = max(len(grid.seeds_of(grid.arms[0])), 2)
+    text = f"""A policy's score is its mean return over {grid.episodes} test episodes, in shares of the span: 0 is
+what random actions get on ideal forces, 1 what policies get there on the mean that were trained there
+({"; ".join(known) or "none is known yet"}). CartPole's return is the paper's: steps within 0.1 m of the centre.
+Effects are differences of mean scores, pooled over tasks or doses where a hypothesis has several, with intervals by
+Student's t. p are of permutation tests of exact level, of equivalence by two one-sided ones with a margin of
+{MARGIN:g}; primary ones are corrected by Holm, the others by Benjamini and Hochberg. With {runs} seeds a difference of
+{detectable(runs, LEVEL / 12):.2f} standard deviations of a run is found with a chance of 80 % at the strictest of
+Holm's levels."""
+    return f"## How the numbers are made\n\n{textwrap.fill(' '.join(text.split()), 120, break_long_words=False)}\n"

@@ -1,0 +1,268 @@
+"""What studies consist of: arms that are trained with many seeds, and trials that test their policies.
+
+A study is its trials. Every training is a run folder that is found again by its configuration, every test of a policy a
+file in it; so whatever is there is never computed again, whoever computed it.
+"""
+
+import collections
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.runs.files import read_json
+from codrl_mj.study.grid import Deployment, cell_folder, deploy_cells, read_failure, train_cells
+from codrl_mj.study.parallel import Workers
+from codrl_mj.training import EVALUATION_SEED, TrainConfig, finished
+from codrl_mj.training.folder import RESULT
+
+TEST_SECONDS = 1.0
+"""What a test takes [s of one core], about."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Arm:
+    """A way to train, to be repeated with every seed."""
+
+    name: str
+    """A name that no other arm of the study has."""
+    config: TrainConfig
+    """The training with seed 0; others differ by the seed alone."""
+    seconds: float
+    """What a training takes [s of one core], about; where some are finished, they are gone by."""
+
+    @property
+    def task(self) -> str:
+        """Task name."""
+        return self.config.task
+
+    def training(self, seed: int) -> TrainConfig:
+        """The training with a seed."""
+        return dataclasses.replace(self.config, seed=seed)
+
+    def shortened(self, steps: int) -> "Arm":
+        """The arm with another budget [environment steps], for trying things out."""
+        config = dataclasses.replace(self.config, total_steps=steps, total_episodes=None)
+        return dataclasses.replace(self, config=config)
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """The policies of an arm, tested."""
+
+    arm: Arm
+    """How they were trained."""
+    test: str
+    """What they are tested on: a name that no other test of the task has."""
+    env: EnvConfig
+    """The same, complete but for actions and observations, which are those of the training."""
+
+    @property
+    def name(self) -> str:
+        """What sets it apart from all others."""
+        return f"{self.arm.name} on {self.test}"
+
+
+class Cost(NamedTuple):
+    """What an arm takes."""
+
+    arm: Arm
+    """The arm."""
+    finished: tuple[int, ...]
+    """Seeds whose training is finished."""
+    missing: tuple[int, ...]
+    """Seeds whose training is not."""
+    seconds: float
+    """A training's computing time [s of one core]: the mean of the finished ones, or an estimate."""
+    tests: int
+    """Tests of its policies that are not there."""
+
+    @property
+    def left(self) -> float:
+        """What is missing takes [s of one core]."""
+        return len(self.missing) * self.seconds + self.tests * TEST_SECONDS
+
+
+@dataclasses.dataclass(frozen=True)
+class Grid:
+    """Arms, their seeds, and their trials.
+
+    Raises:
+        ValueError: different arms, or different tests of an arm, have the same name.
+    """
+
+    root: Path
+    """Folder of the run folders."""
+    trials: tuple[Trial, ...]
+    """Every trial once."""
+    seeds_of: Callable[[Arm], range]
+    """The seeds of an arm."""
+    episodes: int = 100
+    """Test episodes of every policy, >= 1."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        for kind, named in (
+            ("arm", {(trial.arm.name, repr(trial.arm.config)) for trial in self.trials}),
+            ("trial", {(trial.name, repr(trial.env)) for trial in self.trials}),
+        ):
+            twice = [name for name, count in collections.Counter(name for name, _ in named).items() if count > 1]
+            if twice:
+                raise ValueError(f"{kind} {twice[0]!r}: stands for several: give each a name of its own")
+
+    @property
+    def arms(self) -> tuple[Arm, ...]:
+        """Every arm once."""
+        return tuple({trial.arm.name: trial.arm for trial in self.trials}.values())
+
+    def cells(self) -> dict[tuple[str, int], TrainConfig]:
+        """The trainings by arm and seed: first seeds first, so that a part says something of all; the longest first."""
+        every = [(arm, seed) for arm in self.arms for seed in self.seeds_of(arm)]
+        every.sort(key=lambda cell: (cell[1], -cell[0].seconds))
+        return {(arm.name, seed): arm.training(seed) for arm, seed in every}
+
+    def folders(self) -> dict[tuple[str, int], Path]:
+        """The run folders by arm and seed."""
+        return {cell: cell_folder(self.root, config) for cell, config in self.cells().items()}
+
+    def deployments(self) -> dict[tuple[str, int], Deployment]:
+        """The tests by trial and seed, whether the policies are trained or not."""
+        folders = self.folders()
+        return {
+            (trial.name, seed): Deployment(folders[trial.arm.name, seed], trial.env, self.episodes, EVALUATION_SEED)
+            for trial in self.trials
+            for seed in self.seeds_of(trial.arm)
+        }
+
+    def compute(
+        self,
+        workers: Workers = Workers(),  # noqa: B008 - frozen
+        accept_changes: bool = False,
+        on_cell: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        """Train and test what is missing. What fails is recorded in `root/failures` and stops nothing else.
+
+        Args:
+            workers: what computes it.
+            accept_changes: continue begun trainings even if code or packages have changed since.
+            on_cell: called with `training` or `test` when one is finished or has failed.
+
+        Raises:
+            ValueError: Ray is asked for and not installed.
+            TrainingStoppedError: a signal asked to stop.
+        """
+        named = {called(*cell): config for cell, config in self.cells().items()}
+        train_cells(named, self.root, workers, accept_changes, lambda _: on_cell("training"))
+        tests = {called(*key): test for key, test in self.deployments().items() if finished(test.run)}
+        deploy_cells(tests, workers, lambda _: on_cell("test"))
+
+    def collect(self) -> "Collected":
+        """All that is there, without computing anything.
+
+        Raises:
+            ValueError: a file of a run is damaged.
+        """
+        folders, tests = self.folders(), self.deployments()
+        done = {cell: folder for cell, folder in folders.items() if finished(folder)}
+        evaluations: dict[str, dict[int, Mapping[str, Any]]] = {trial.name: {} for trial in self.trials}
+        missing: dict[str, Path | Deployment] = {
+            called(*cell): folder for cell, folder in folders.items() if cell not in done
+        }
+        for (trial, seed), test in tests.items():
+            if test.record.is_file():
+                evaluations[trial][seed] = read_json(test.record, "evaluation")
+            elif finished(test.run):
+                missing[called(trial, seed)] = test
+        failures = {name: read_failure(cell) for name, cell in missing.items()}
+        return Collected(
+            grid=self,
+            folders=done,
+            evaluations=evaluations,
+            missing=tuple(missing),
+            failures={name: failure.error for name, failure in failures.items() if failure is not None},
+            seconds=sum(training_seconds(folder) for folder in done.values()),
+            codes=collections.Counter(
+                str(read_json(folder / "config.json", "run configuration").get("code"))[:8] for folder in done.values()
+            ),
+        )
+
+    def costs(self) -> list[Cost]:
+        """What every arm takes.
+
+        Raises:
+            ValueError: a file of a finished run is damaged.
+        """
+        folders, tests = self.folders(), self.deployments()
+        untested: collections.Counter[Path] = collections.Counter(
+            test.run for test in tests.values() if not test.record.is_file()
+        )
+        found = []
+        for arm in self.arms:
+            mine = {seed: folders[arm.name, seed] for seed in self.seeds_of(arm)}
+            took = {seed: training_seconds(folder) for seed, folder in mine.items() if finished(folder)}
+            seconds = float(np.mean(list(took.values()))) if took else arm.seconds
+            waiting = sum(untested[folder] for folder in mine.values())
+            found.append(Cost(arm, tuple(took), tuple(seed for seed in mine if seed not in took), seconds, waiting))
+        return found
+
+
+@dataclasses.dataclass(frozen=True)
+class Collected:
+    """All that is computed so far."""
+
+    grid: Grid
+    """What was asked for."""
+    folders: Mapping[tuple[str, int], Path]
+    """Run folders of the finished trainings, by arm and seed."""
+    evaluations: Mapping[str, Mapping[int, Mapping[str, Any]]]
+    """`Evaluation.as_mapping()` by trial and seed; those that are missing are left out."""
+    missing: tuple[str, ...]
+    """Trainings that are not finished, and tests of finished ones that are not there, by name."""
+    failures: Mapping[str, str]
+    """What went wrong, by the names of those of them that were tried."""
+    seconds: float
+    """What the finished trainings took, each on one core [s]."""
+    codes: Mapping[str, int]
+    """How many of them each version of the code has trained, by its digest."""
+
+    def scores(self, trial: Trial, measure: str = "returns") -> dict[int, float]:
+        """A measure of every policy of a trial that has one, by seed: means of intervals, medians of quartiles.
+
+        None of a trial that is not in the grid.
+        """
+        tested = self.evaluations.get(trial.name, {})
+        found = {seed: plain(evaluation[measure]) for seed, evaluation in tested.items()}
+        return {seed: float(value) for seed, value in found.items() if value is not None}
+
+
+def called(name: str, seed: int) -> str:
+    """What a cell is called."""
+    return f"{name}, seed {seed}"
+
+
+def plain(value: Any) -> Any:
+    """A measure as one number: of an interval the mean, of quartiles the median."""
+    return value.get("mean", value.get("median")) if isinstance(value, Mapping) else value
+
+
+def training_seconds(folder: Path) -> float:
+    """What a finished training took [s].
+
+    Raises:
+        ValueError: its result is damaged.
+    """
+    return float(read_json(folder / RESULT, "result of a run")["seconds"])
+
+
+def numbers_as_text(numbers: Sequence[int]) -> str:
+    """Numbers as text: runs of consecutive ones by their ends."""
+    parts: list[list[int]] = []
+    for number in sorted(numbers):
+        if parts and number == parts[-1][1] + 1:
+            parts[-1][1] = number
+        else:
+            parts.append([number, number])
+    return ", ".join(str(first) if first == last else f"{first} to {last}" for first, last in parts)

@@ -1,0 +1,141 @@
+"""PPO's arithmetic written out, against Stable-Baselines3's own."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+
+from codrl_mj import make_sb3_vec_env
+from codrl_mj.agents import PPOConfig
+
+CASES = {
+    "discrete": ("CartPole", {"entropy_coefficient": 0.01, "target_kl": None}),
+    "stopped": ("CartPole", {"target_kl": 0.003, "learning_rate": 0.01}),
+    "continuous": ("Pendulum", {"entropy_coefficient": 0.01, "hidden": (16, 24), "activation": "relu"}),
+    "in units": ("Pendulum", {"unit_actions": True, "log_std_init": -0.5, "input_scale": (1.0, 1.0, 0.2)}),
+    "state-dependent": (
+        "Pendulum",
+        {"state_dependent_noise": True, "noise_steps": 4, "entropy_coefficient": 0.01, "hidden": (8, 8)},
+    ),
+}
+
+
+class Nothing(BaseCallback):
+    """Watches nothing."""
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def pair(case):
+    """A model of ours with a rollout, and Stable-Baselines3's own of the same settings and weights."""
+    task, settings = CASES[case]
+    envs = make_sb3_vec_env(f"codrl_mj/{task}-v0", 4, max_episode_steps=20)
+    config = PPOConfig(rollout_steps=256, batch_size=64, epochs=3, **settings)
+    ours = config.make_model(envs, 1)
+    theirs = PPO(
+        config._policy_class(),
+        envs,
+        n_steps=64,
+        batch_size=64,
+        n_epochs=3,
+        gae_lambda=config.gae_lambda,
+        ent_coef=config.entropy_coefficient,
+        target_kl=config.target_kl,
+        learning_rate=config.learning_rate,
+        use_sde=config.state_dependent_noise,
+        sde_sample_freq=config.noise_steps or -1,
+        policy_kwargs=config._network(),
+        seed=1,
+        device="cpu",
+    )
+    for name, tensor in theirs.policy.state_dict().items():
+        torch.testing.assert_close(ours.policy.state_dict()[name], tensor, rtol=0, atol=0)
+    return ours, theirs, envs
+
+
+def collect(model):
+    model.env.seed(1)
+    model.set_logger(Logger(None, []))
+    _, callback = model._setup_learn(0, Nothing())
+    assert model.collect_rollouts(model.env, callback, model.rollout_buffer, model.n_steps)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_learns_what_stable_baselines3_learns_from_the_same_rollout(case):
+    ours, theirs, _ = pair(case)
+    collect(ours)
+    theirs.rollout_buffer = copy.deepcopy(ours.rollout_buffer)
+    theirs.set_logger(Logger(None, []))
+    for model in (ours, theirs):
+        np.random.seed(3)
+        model.train()
+    assert ours._n_updates == theirs._n_updates
+    learnt, taught, start = (model.policy.state_dict() for model in (ours, theirs, pair(case)[0]))
+    torch.testing.assert_close(dict(learnt), dict(taught), rtol=0, atol=1e-5)
+    assert max(float((taught[name] - start[name]).abs().max()) for name in taught) > 3e-3
+
+
+class Replayed:
+    """Stands in for a policy's `forward`: acts as in a rollout, values and judges as the policy does."""
+
+    def __init__(self, policy, actions):
+        """Take the actions (steps, envs, ...)."""
+        self.policy, self.actions = policy, iter(actions)
+
+    def __call__(self, observations):
+        actions = torch.as_tensor(next(self.actions))
+        flat = actions[:, 0] if isinstance(self.policy.action_space, spaces.Discrete) else actions
+        values, log_prob, _ = self.policy.evaluate_actions(observations, flat)
+        return flat, values, log_prob
+
+
+@pytest.mark.parametrize("case", ["discrete", "in units", "state-dependent"])
+def test_fills_the_buffer_as_stable_baselines3_does_for_the_same_actions(case):
+    ours, theirs, _ = pair(case)  # their environments are the same object, and begin anew with the model's seed
+    collect(ours)
+    mine = ours.rollout_buffer
+    theirs.policy.forward = Replayed(theirs.policy, mine.actions)
+    collect(theirs)
+    for name in (
+        "observations",
+        "actions",
+        "rewards",
+        "episode_starts",
+        "values",
+        "log_probs",
+        "advantages",
+        "returns",
+    ):
+        np.testing.assert_allclose(getattr(mine, name), getattr(theirs.rollout_buffer, name), rtol=1e-5, atol=1e-5)
+    assert mine.episode_starts[1:].any()
+
+
+@pytest.mark.parametrize("case", ["discrete", "in units", "state-dependent"])
+def test_explores_with_the_probabilities_of_its_policy(case):
+    """Means and deviations of 20 000 actions in one state, against the policy's own distribution."""
+    ours, _, envs = pair(case)
+    torch.manual_seed(0)
+    count = 20_000
+    observation = envs.reset()[:1]
+    with torch.no_grad():
+        acted = ours._networks.act(ours._features(np.repeat(observation, count, axis=0)))
+        draws = ours._exploration.draws(1, count, ours._networks.outputs)
+        actions = ours._exploration.actions(*acted, draws[0]).double().numpy()
+        wanted = ours.policy.get_distribution(torch.as_tensor(observation)).distribution
+    discrete = case == "discrete"
+    mean = float(wanted.probs[0, 1] if discrete else wanted.mean)
+    deviation = (mean * (1 - mean)) ** 0.5 if discrete else float(wanted.stddev)
+    assert actions.mean() == pytest.approx(mean, abs=4 * deviation / count**0.5)
+    assert actions.std() == pytest.approx(deviation, rel=0.03)
+
+
+def test_state_dependent_noise_lasts_for_its_steps():
+    """Drawn every four steps: the noise is one linear function of the hidden units until then."""
+    explores = pair("state-dependent")[0]._exploration
+    assert explores.draws(64, 4, 1).shape == (16, 4, 8, 1)

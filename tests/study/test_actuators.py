@@ -1,0 +1,189 @@
+"""The study of what an actuator costs: what it trains, tests and concludes, on scores that a formula gives."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from codrl_mj import cli
+from codrl_mj.actuators import Lag
+from codrl_mj.study.actuators import arms
+from codrl_mj.study.actuators.levels import AXES, needed_voltage, posed
+from codrl_mj.study.actuators.page import write
+from codrl_mj.study.actuators.questions import primary, secondary, wrong_motors
+from codrl_mj.study.actuators.study import ActuatorStudy
+from codrl_mj.study.actuators.verdicts import FLOORS, Scores, judge, seeds_to_close
+from codrl_mj.tasks import find_task
+from tests.study.pretended import pretend
+
+PLAN = Path(__file__).parents[2] / "docs/results/plan.md"
+
+
+def returns(score):
+    """Mean returns of which the task's share is what a formula says: spans from the floor to a ceiling 100 above."""
+    return lambda trial, seed: FLOORS[trial.arm.task] + 100.0 * score(trial, seed)
+
+
+def noisy(level):
+    """About a level, otherwise for every seed, and with ideal-trained policies at exactly 1 on the mean at home."""
+
+    def score(trial, seed):
+        return level(trial) + 0.02 * np.cos(np.pi * (seed + 0.5))  # sums to 0 over an even number of seeds
+
+    return score
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    """Matched training is worth 0.3 everywhere; every motor costs ideal-trained policies half of the span."""
+
+    def level(trial):
+        at_home = trial.test in ("ideal", "designed", "good motor", "supply 0", "noise 0")
+        if trial.arm.name.endswith(": ideal"):
+            return 1.0 if at_home else 0.5
+        return 0.8
+
+    grid = ActuatorStudy(tmp_path_factory.mktemp("runs"), seeds=6).grid
+    pretend(grid, returns(noisy(level)))
+    return grid
+
+
+@pytest.mark.parametrize(
+    "task", [pytest.param(task, marks=[] if task == "furuta" else pytest.mark.matrix) for task in arms.SECONDS]
+)
+@pytest.mark.parametrize("axis", AXES)
+def test_every_dose_is_an_environment_that_can_be_stepped(task, axis):
+    for dose in AXES[axis].doses:
+        env = AXES[axis].at(task, dose).make()
+        env.reset(seed=0)
+        for _ in range(3):
+            observation, *_ = env.step(env.action_space.sample())
+        assert np.isfinite(observation).all()
+        env.close()
+
+
+def test_doses_are_in_steps_of_the_policy_and_shares_of_the_force():
+    for task in arms.SECONDS:
+        definition = find_task(task)
+        assert AXES["lag"].at(task, 2.0).actuator == Lag(2.0 * definition.step_duration)
+        assert AXES["delay"].at(task, 3.0).disturbances.command_delay == 3.0 * definition.step_duration
+        assert AXES["friction"].at(task, 0.1).joint.friction == pytest.approx(0.1 * definition.max_force)
+        supply = AXES["supply"].at(task, 0.35).actuator
+        assert supply.supply.voltage == pytest.approx(0.65 * needed_voltage(task))
+        stall = supply.motor.torque_constant * supply.controller.max_current
+        assert stall == pytest.approx(definition.max_force)
+
+
+def test_where_half_the_voltage_is_missing_the_stall_torque_is_just_the_largest():
+    """U = 2*sqrt(F*w) of which half is R*F/k: what the motor of 1 ohm takes to hold the largest force."""
+    for task in arms.SECONDS:
+        drive = AXES["supply"].at(task, 0.5).actuator
+        stall = drive.motor.torque_constant * drive.supply.voltage / drive.motor.resistance
+        assert stall == pytest.approx(find_task(task).max_force)
+
+
+@pytest.mark.matrix
+def test_no_dose_of_a_lag_is_ideal():
+    env, same = posed("pendulum").make(), AXES["lag"].at("pendulum", 0.0).make()
+    for one in (env, same):
+        one.reset(seed=3)
+    for _ in range(20):
+        action = env.action_space.sample()
+        np.testing.assert_array_equal(env.step(action)[0], same.step(action)[0])
+
+
+def test_the_plan_is_what_is_computed():
+    """docs/results/plan.md counts arms, trainings and tests, and names the hypotheses and doses."""
+    plan = PLAN.read_text()
+    grid = ActuatorStudy().grid
+    counts = len(grid.arms), len(grid.cells()), len(grid.deployments())
+    assert "{} arms, 20 seeds each: {} trainings, {} tests of {} episodes".format(*counts, grid.episodes) in plan
+    assert [hypothesis.name for hypothesis in primary()] == [f"P{number}" for number in range(1, 13)]
+    for name, axis in AXES.items():
+        doses = ", ".join(f"{dose:g}" for dose in axis.doses)
+        trained = ", ".join(f"{axis.trained[task]:g}" for task in arms.TRAINED)
+        assert f"| {doses} | {trained} |" in next(line for line in plan.splitlines() if line.startswith(f"| {name} |"))
+
+
+def test_wrong_motors_differ_from_the_nominal_by_what_they_are_called():
+    nominal = posed("pendulum", "weaker")
+    motors = wrong_motors("pendulum")
+    weak = motors["torque_constant -25 %"].actuator.motor
+    assert weak.torque_constant == 0.75 * nominal.actuator.motor.torque_constant
+    assert weak.back_emf_constant == 0.75 * nominal.actuator.motor.back_emf_constant
+    assert motors["friction 20 %"].joint.friction == pytest.approx(0.4)
+    assert motors["friction 20 %"].actuator == nominal.actuator
+
+
+def test_what_is_so_is_found(study):
+    verdicts = {one.hypothesis.name: one for one in judge(Scores(study.collect()), primary())}
+    for name in ("P1", "P2", "P3", "P4", "P5", "P6", "P12"):
+        assert verdicts[name].outcome == "yes"
+        assert verdicts[name].effect.mean == pytest.approx(0.3)
+        assert verdicts[name].runs == (6, 6)
+    assert verdicts["P7"].outcome == "open"  # generic training scores as high
+    assert verdicts["P8"].outcome == verdicts["P10"].outcome == verdicts["P11"].outcome == "yes"
+    assert verdicts["P9"].effect.mean == pytest.approx(0.2)
+
+
+def test_what_is_otherwise_is_said(tmp_path):
+    def level(trial):
+        matched = trial.arm.name in {f"{task}: lag" for task in arms.TRAINED}
+        return 0.2 if matched else 1.0 if trial.test != "good motor" else 0.5
+
+    grid = ActuatorStudy(tmp_path, seeds=6).grid
+    pretend(grid, returns(noisy(level)))
+    verdicts = {one.hypothesis.name: one for one in judge(Scores(grid.collect()), primary())}
+    assert verdicts["P1"].outcome == "the other way"
+    assert verdicts["P11"].outcome == "no"
+    assert seeds_to_close(verdicts["P11"]) is None
+
+
+def test_nothing_is_concluded_from_nothing(tmp_path):
+    collected = ActuatorStudy(tmp_path / "none").grid.collect()
+    assert {one.outcome for one in judge(Scores(collected), primary())} == {"open"}
+    files = write(collected, tmp_path / "out")
+    text = files[0].read_text()
+    assert "0 of 880 trainings" in text
+    assert "What is missing" in text
+
+
+def test_the_page_has_every_number_in_a_file(study, tmp_path):
+    files = {file.name: file for file in write(study.collect(), tmp_path)}
+    rows = list(csv.DictReader(files["hypotheses.csv"].open()))
+    assert len(rows) == len(primary()) + len(secondary())
+    first = rows[0]
+    page = files["actuators.md"].read_text()
+    assert f"{float(first['effect']):+.3f} [{float(first['low']):+.3f}, {float(first['high']):+.3f}]" in page
+    assert len(page.splitlines()) <= 150
+    assert len(list(csv.DictReader(files["runs.csv"].open()))) == len(study.deployments())
+    assert sum(file.stat().st_size for name, file in files.items() if name.endswith(".svg")) < 500_000
+    written = {name: file.read_bytes() for name, file in files.items()}
+    again = {file.name: file.read_bytes() for file in write(study.collect(), tmp_path)}
+    assert written == again
+
+
+@pytest.mark.matrix
+def test_from_the_command_line_a_small_study_is_computed_and_goes_on(tmp_path, monkeypatch, capsys):
+    """One training and its tests, for a few steps; the second call trains nothing."""
+    from codrl_mj.study.actuators import study as module
+
+    few = [one for one in module.trials() if one.arm.name == "mountain_car: ideal"][:2]
+    monkeypatch.setattr(module, "trials", lambda: few)
+    call = ["study", "actuators", "--root", str(tmp_path / "runs"), "--out", str(tmp_path / "out"), "--jobs", "1"]
+    call += ["--tasks", "mountain_car", "--seeds", "1", "--episodes", "2", "--total-steps", "400"]
+    assert cli.main([*call, "--dry-run"]) == 0
+    assert "mountain_car: ideal" in capsys.readouterr().out
+    assert cli.main(call) == 0
+    run = next((tmp_path / "runs").glob("mountain_car-*/result.json"))
+    before = run.stat().st_mtime_ns
+    assert cli.main(call) == 0
+    assert run.stat().st_mtime_ns == before
+    assert "1 of 1 trainings" in (tmp_path / "out" / "actuators.md").read_text()
+
+
+@pytest.mark.parametrize("wrong", [{"tasks": ("pendulm",)}, {"seeds": 0}, {"episodes": 1.5}, {"total_steps": True}])
+def test_what_cannot_be_is_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        ActuatorStudy(**wrong)
