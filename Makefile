@@ -34,8 +34,10 @@ test: $(STAMP)  ## in two processes, each with whole files: a file's tests share
 check: $(STAMP)  ## the full matrices, of which make test runs a few combinations
 	@$(BIN)/python -m pytest -m matrix -n 2 --dist loadfile --no-loadscope-reorder
 
-browser: $(STAMP)  ## look at pages in Chromium, which it says how to get if there is none
-	@test -d node_modules/axe-core || npm install --no-save --silent axe-core@4.14.1
+node_modules/axe-core:
+	@npm install --no-save --silent axe-core@4.14.1
+
+browser: $(STAMP) node_modules/axe-core  ## look at pages in Chromium, which it says how to get if there is none
 	@$(BIN)/python -m pytest -m browser
 
 lint: $(STAMP)

@@ -43,7 +43,7 @@ ALLOWED = {
     "evaluation": {
         *("actuators", "envs", "envs.config", "evaluation.measures", "physics", "runs.files", "runs.policies", "tasks"),
     },
-    "films": {"actuators", "envs", "envs.config", "evaluation", "physics", "runs.files"},
+    "films": {"actuators", "envs", "envs.config", "evaluation", "physics", "runs.files", "tasks"},
     "replay": {"envs", "envs.config", "evaluation", "runs.files"},
     "view": {"actuators", "envs.config", "evaluation", "fields", "replay"},
     "training": {

@@ -11,6 +11,7 @@ from codrl_mj import TASKS, Actuator, Motor, named_actuator
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import Episode, RandomPolicy, run_episodes
 from codrl_mj.films.film import Panel, film
+from codrl_mj.films.strip import torque_label
 from codrl_mj.physics import signal_names
 from codrl_mj.physics.offscreen import OffscreenRenderer
 
@@ -230,6 +231,25 @@ def test_filming_leaves_the_episode_alone(tmp_path):
 def test_the_ideal_actuator_can_be_filmed(monkeypatch, tmp_path):
     frames = filmed(monkeypatch, tmp_path, [played(actuator="ideal", steps=6)])
     assert len(rows_with(frames[-1], ACTUAL)) > 0
+
+
+@pytest.mark.parametrize(
+    ("task", "actuator", "label"),
+    [
+        ("cartpole", "paper", "shaft torque [N·m]"),
+        ("cartpole", "ideal", "joint force [N]"),
+        ("pendulum", "ideal", "joint torque [N·m]"),
+        ("Ant-v5", "ideal", "joint force [N, N·m]"),
+    ],
+)
+def test_the_strip_says_whose_torque_or_force_it_is(task, actuator, label):
+    assert torque_label(task, named_actuator(actuator, "cartpole"), 0) == label
+
+
+def test_the_last_time_of_the_axis_is_whole(monkeypatch, tmp_path):
+    axis = filmed(monkeypatch, tmp_path, [made_up(1.0, 0.5, steps=100)])[-1][-26:]
+    assert (axis[10:, -10:] < 100).any()  # "2 s", half of it beyond the plot
+    assert (axis[:, -2:] == 255).all()  # and white beyond that
 
 
 # -- errors -------------------------------------------------------------------------------------------------

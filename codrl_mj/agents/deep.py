@@ -19,7 +19,8 @@ class DeepAgentConfig(AgentConfig):
 
     def make_policy(self, observation_space: spaces.Box, action_space: spaces.Space[Any]) -> Any:
         """See `AgentConfig.make_policy`."""
-        return self._policy_class()(observation_space, action_space, lambda _: 0.0, **self._policy_arguments())
+        arguments = {**self._policy_arguments(), "optimizer_class": _NoOptimizer}
+        return self._policy_class()(observation_space, action_space, lambda _: 0.0, **arguments)
 
     def _policy_class(self) -> Any:
         """The class of the agent's policy."""
@@ -35,3 +36,10 @@ class DeepAgentConfig(AgentConfig):
             "features_extractor_class": ScaledObservation,
             "features_extractor_kwargs": {"factors": self.input_scale},
         }
+
+
+class _NoOptimizer:
+    """In the place of one, in policies that only act: torch's first takes almost two seconds to import a compiler."""
+
+    def __init__(self, *arguments: Any, **settings: Any) -> None:
+        """Take what an optimiser takes."""

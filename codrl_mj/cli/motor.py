@@ -148,6 +148,7 @@ class Show:
 
 def _print_explained(name: str, found: dict[str, Any]) -> None:
     from codrl_mj.cli.terminal import console
+    from codrl_mj.motor_design import unknown_in_words
 
     def say(text: str) -> None:
         console().print(text, markup=False, highlight=False)
@@ -168,7 +169,7 @@ def _print_explained(name: str, found: dict[str, Any]) -> None:
             table.add_row(row["name"], _text(row["value"]), row["unit"])
         console().print(table)
     if "numbers" in found:
-        say(f"not known: {', '.join(found['unknown']) or 'nothing'}")
+        say(unknown_in_words(found["unknown"]) or "All numbers are known.")
         for kind, texts in (
             ("source", [f"{number}: {source}" for number, source in enumerate(sources, 1)]),
             ("estimated", [f"{field}: {why}" for field, why in found["estimated"].items()]),

@@ -8,7 +8,6 @@ import tyro
 
 from codrl_mj.cli.fields import AS_TRAINED, ActuatorName
 from codrl_mj.cli.subject import Source, SubjectWord, policy_and_environment, title_of
-from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import did_you_mean
 
 
@@ -42,27 +41,16 @@ class Render:
     def run(self: Any) -> int:
         """Run the episode and film it."""
         from codrl_mj.cli.terminal import progress_bar
-        from codrl_mj.evaluation import run_episodes, save_episode
-        from codrl_mj.films.film import Filmed, Panel, film
+        from codrl_mj.evaluation import save_episode
+        from codrl_mj.films.film import Panel, film
+        from codrl_mj.films.record import record
 
         policy, env = policy_and_environment(self)
-        filmed: list[Filmed] = []
-
-        def make() -> Any:
-            if isinstance(env, EnvConfig):
-                return env.make()
-            view = env.view(self.width, self.height, None if self.camera == "fixed" else self.camera)
-            filmed.append(Filmed(env.make(**view), self.pretty))
-            return filmed[-1]
-
-        (episode,) = run_episodes(policy, make, 1, self.seed)
+        episode, frames = record(policy, env, self.seed, self.width, self.height, self.camera, self.pretty)
         title = f"{title_of(self)}: return {episode.total:.0f}"
         if episode.motors:
             title += f"; {episode.motors[self._motor(episode)]}"
-        panel = Panel(title, env.task, episode.actuator, episode, self._motor(episode))
-        for one in filmed:
-            rate = one.metadata.get("render_fps", 1.0 / float(episode.time[0]))
-            panel = dataclasses.replace(panel, frames=one.frames, rate=rate)
+        panel = Panel(title, env.task, episode.actuator, episode, self._motor(episode), frames)
         with progress_bar("{task.completed}/{task.total} frames") as bar:
             row = bar.add_task("filming", total=None)
             film(

@@ -36,7 +36,7 @@ class Report:
     def run(self) -> int:
         """Write the page."""
         from codrl_mj.cli.terminal import progress_bar
-        from codrl_mj.pages.report import report
+        from codrl_mj.pages.report import replays, report
 
         with progress_bar("") as bar:
             row = bar.add_task("reading", total=None)
@@ -47,7 +47,7 @@ class Report:
                 seed=self.seed,
                 trust=self.trust,
                 filmed=self.film,
-                replayed=self.replay,
+                joined=replays if self.replay else lambda _: (),
                 certificate=self.certificate,
                 on_part=lambda what: bar.update(row, description=what),
             )

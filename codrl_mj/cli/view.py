@@ -10,6 +10,7 @@ import tyro
 
 from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, field_docs, is_task
 from codrl_mj.cli.subject import Source, SubjectWord, policy_and_environment, title_of
+from codrl_mj.runs.layout import told_apart
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +64,9 @@ class View:
             if (subject / "best").is_dir():
                 other = "best" if self.source.which == "last" else "last"
                 found[other] = lambda: dataclasses.replace(self.source, which=other).load(subject).policy
-        found |= {run.name: functools.partial(self._policy_of, run, env) for run in self.policies}
+        taken = {*found, "random", "zero"}
+        for name, run in zip(told_apart(self.policies), self.policies, strict=True):
+            found[f"run {name}" if name in taken else name] = functools.partial(self._policy_of, run, env)
         return found
 
     def _policy_of(self: Any, run: Path, env: Any) -> Any:

@@ -24,13 +24,12 @@ from codrl_mj.engine.families import (
     parameter_count,
     size_of,
 )
-from codrl_mj.engine.inertia import INERTIA_DATA_FIELDS, INERTIA_MODEL_FIELDS, inertia
+from codrl_mj.engine.inertia import seen_from
 from codrl_mj.engine.layout import check_layout, offset
 from codrl_mj.engine.memory import array, f64, i32, i64, internal
 
 MODEL_FIELDS = (
     *COMMAND_MODEL_FIELDS,
-    *INERTIA_MODEL_FIELDS,
     "nactuator",
     "nuser_actuator",
     "opt.timestep",
@@ -41,7 +40,7 @@ MODEL_FIELDS = (
     "actuator_outadr",
     "actuator_user",
 )
-DATA_FIELDS = (*COMMAND_DATA_FIELDS, *INERTIA_DATA_FIELDS, "time", "act", "actuator_length", "actuator_velocity")
+DATA_FIELDS = (*COMMAND_DATA_FIELDS, "time", "act", "actuator_length", "actuator_velocity")
 PBASE_NEIGHBOURS = ("narena", "nbuffer", "pstack", "maxuse_stack")
 """Fields of mjData around `pbase`, which the bindings do not show."""
 
@@ -76,7 +75,7 @@ def compiled() -> Callbacks:
     act_at = data_at["act"]
     length_at, velocity_at = data_at["actuator_length"], data_at["actuator_velocity"]
     user_dynamics, user_bias = int(mujoco.mjtDyn.mjDYN_USER), int(mujoco.mjtBias.mjBIAS_USER)
-    (command, is_disabled), seen_from = commands(), inertia()
+    command, is_disabled = commands()
     first, second = SIGNATURE
 
     @internal(inline="always")

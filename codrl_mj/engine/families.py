@@ -16,6 +16,7 @@ from numba import types
 from numba.extending import register_jitable
 
 from codrl_mj.actuators import Family, Inputs, family_number, parameters_type, reference
+from codrl_mj.engine.inertia import load_inertia
 from codrl_mj.engine.memory import call_family, f64, i32, internal, read, u8, u64, write
 
 SIGNATURE = (250700.0, 268401.0)
@@ -108,6 +109,8 @@ def load_family(family: Family) -> None:
             f"family {reference(family)} has {sizes} states, signals and parameters, and {family_sizes(other)} when it "
             "was loaded before: give it another name, or start Python anew"
         )
+    if family.INERTIA:
+        load_inertia()
     function, text = _compile(family), ctypes.create_string_buffer(reference(family).encode())
     _SIZES[number], _REFERENCES[number] = sizes, ctypes.addressof(text)
     _ADDRESSES[number] = function.address

@@ -7,9 +7,10 @@ from typing import Any
 import mujoco
 import numba
 import numpy as np
+from numba import types
 
 from codrl_mj.engine.layout import check_layout, offset
-from codrl_mj.engine.memory import array, f64, i32, i64, internal, on_stack
+from codrl_mj.engine.memory import array, call_inertia, f64, i32, i64, internal, on_stack, u64
 
 INERTIA_MODEL_FIELDS = ("nv", "M_rownnz", "M_rowadr", "M_colind")
 INERTIA_DATA_FIELDS = ("qLD", "qLDiagInv", "moment_rownnz", "moment_rowadr", "moment_colind", "actuator_moment")
@@ -17,14 +18,31 @@ MOST_ON_STACK = 1024
 """Degrees of freedom up to which the work is done on the stack, which is quicker."""
 
 
+_ADDRESS = np.zeros(1, dtype=np.uintp)
+_ADDRESS_AT = _ADDRESS.ctypes.data
+
+
+@internal
+def seen_from(model: int, data: int, output: int, gear: float) -> float:
+    """The inertia [kg*m^2] at an actuator's output, through a gear; `load_inertia` must have been called.
+
+    To be compiled takes a second, which only families that ask for it are to pay.
+    """
+    return call_inertia(u64(_ADDRESS_AT)[0], model, data, output, gear)
+
+
 @functools.cache
-def inertia() -> Any:
-    """A compiled function (model, data, output, gear) -> inertia [kg*m^2] at an actuator's output, through a gear.
+def load_inertia() -> Any:
+    """Compile what `seen_from` calls, once a process; returns what owns the machine code.
 
     With its moment m, the gear times a row of `actuator_moment`, and the inertia matrix M = L^T*D*L that
     `mj_fwdPosition` has factorised, it is 1/(m*M^-1*m): how hard it is to turn with all other joints free. Infinite
-    where nothing moves. The layout of the fields above must have been checked.
+    where nothing moves.
+
+    Raises:
+        LayoutError: the installed MuJoCo's memory is not laid out as its introspection says.
     """
+    check_layout(INERTIA_MODEL_FIELDS, INERTIA_DATA_FIELDS)
     nv_at, rownnz_at, rowadr_at, colind_at = (offset("mjModel", field) for field in INERTIA_MODEL_FIELDS)
     qld_at, inverse_at, moment_nnz_at, moment_adr_at, moment_col_at, moment_at = (
         offset("mjData", field) for field in INERTIA_DATA_FIELDS
@@ -51,28 +69,17 @@ def inertia() -> Any:
                 turned[i32(array(model, colind_at))[entry]] -= f64(array(data, qld_at))[entry] * turned[row]
         return 1.0 / total if total > 0.0 else math.inf
 
-    @internal
-    def seen_from(model: int, data: int, output: int, gear: float) -> float:
+    @numba.cfunc(types.float64(types.uintp, types.uintp, types.int32, types.float64), nogil=True, error_model="numpy")
+    def through_gear(model: int, data: int, output: int, gear: float) -> float:
         count = i64(model + nv_at)[0]
         if count > MOST_ON_STACK:
             return eliminated(model, data, output, gear, np.empty(count))
         return eliminated(model, data, output, gear, on_stack(count))
 
-    return seen_from
+    _ADDRESS[0] = through_gear.address
+    return through_gear
 
 
 def shaft_inertia(model: mujoco.MjModel, data: mujoco.MjData, output: int, gear: float) -> float:
     """What `inertia` finds of a simulation whose `mj_fwdPosition` has run."""
-    return float(_from_python()(model._address, data._address, output, gear))
-
-
-@functools.cache
-def _from_python() -> Any:
-    check_layout(INERTIA_MODEL_FIELDS, INERTIA_DATA_FIELDS)
-    seen_from = inertia()
-
-    @numba.njit
-    def call(model: int, data: int, output: int, gear: float) -> float:
-        return seen_from(model, data, output, gear)
-
-    return call
+    return float(load_inertia().ctypes(model._address, data._address, output, gear))

@@ -48,15 +48,32 @@ def call_family(
     inertia: Any,  # noqa: ARG001
 ) -> Any:
     """Call a family's compiled function (see `codrl_mj.engine.families`) by its address; returns the torque [N*m]."""
-    number, address = types.float64, types.uintp
-    kinds = (address, number, address, address, address, *(number,) * 6)
+    address, number = types.uintp, types.float64
+    return _call(address, number, address, address, address, *(number,) * 6)
+
+
+@intrinsic
+def call_inertia(
+    typing_context: Any,  # noqa: ARG001 - numba fixes the arguments
+    function: Any,  # noqa: ARG001
+    model: Any,  # noqa: ARG001
+    data: Any,  # noqa: ARG001
+    output: Any,  # noqa: ARG001
+    gear: Any,  # noqa: ARG001
+) -> Any:
+    """Call the compiled function of `codrl_mj.engine.inertia` by its address; returns the inertia [kg*m^2]."""
+    return _call(types.uintp, types.uintp, types.int32, types.float64)
+
+
+def _call(*kinds: Any) -> tuple[Any, Any]:
+    """What an intrinsic returns that calls a C function of such arguments, which returns a float64, by its address."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
         llvm = [context.get_value_type(kind) for kind in kinds]
-        function_type = ir.FunctionType(context.get_value_type(number), llvm)
+        function_type = ir.FunctionType(context.get_value_type(types.float64), llvm)
         return builder.call(builder.inttoptr(arguments[0], function_type.as_pointer()), arguments[1:])
 
-    return number(address, *kinds), codegen
+    return types.float64(types.uintp, *kinds), codegen
 
 
 @intrinsic

@@ -32,7 +32,7 @@ from codrl_mj.engine.families import (
     size_of,
     slot_size,
 )
-from codrl_mj.engine.inertia import INERTIA_DATA_FIELDS, INERTIA_MODEL_FIELDS, inertia
+from codrl_mj.engine.inertia import seen_from
 from codrl_mj.engine.layout import check_layout, offset
 from codrl_mj.engine.memory import array, f64, i32, i64, internal, u8
 from codrl_mj.plugin import FAMILY, NAME, complain, library, registered
@@ -45,7 +45,6 @@ and its end, where further calls within it are stages of RK4."""
 
 MODEL_FIELDS = (
     *COMMAND_MODEL_FIELDS,
-    *INERTIA_MODEL_FIELDS,
     *("nactuator", "nuser_actuator", "opt.timestep", "opt.integrator", "plugin_stateadr", "plugin_statenum"),
     *("actuator_plugin", "actuator_user", "actuator_outadr", "actuator_actadr", "actuator_actnum", "actuator_actearly"),
     *("actuator_actlimited", "actuator_actrange", "actuator_dyntype", "actuator_dynprm", "actuator_gaintype"),
@@ -53,7 +52,6 @@ MODEL_FIELDS = (
 )
 DATA_FIELDS = (
     *COMMAND_DATA_FIELDS,
-    *INERTIA_DATA_FIELDS,
     *("time", "act", "act_dot", "actuator_length", "actuator_velocity", "actuator_force"),
 )
 STATE_NEIGHBOURS = ("qacc_warmstart", "ctrl")
@@ -111,7 +109,7 @@ def compiled() -> Functions:
     affine_gain, affine_bias = int(mujoco.mjtGain.mjGAIN_AFFINE), int(mujoco.mjtBias.mjBIAS_AFFINE)
     exact_filter, least = int(mujoco.mjtDyn.mjDYN_FILTEREXACT), mujoco.mjMINVAL
     rk4 = int(mujoco.mjtIntegrator.mjINT_RK4)
-    (command, is_disabled), seen_from = commands(), inertia()
+    command, is_disabled = commands()
     first, second = SIGNATURE
     ideal = family_number(Ideal)
 

@@ -61,16 +61,16 @@ class Evaluation:
     time_to_goal: Quartiles | None = _measure("time to goal, median", "s")
     """Time from which the goal was held until the end, in successful episodes; None if there are none, or if the goal
     is to last until the time limit."""
-    tracking_rms: float | None = _measure("torque error, rms", "N*m")
+    tracking_rms: float | None = _measure("shaft torque error, rms", "N*m")
     """Root mean square of desired less delivered torque; None where the agent commands the voltage, and none of the
     tracking measures exists."""
-    tracking_percent: float | None = _measure("torque error / desired", "%")
+    tracking_percent: float | None = _measure("shaft torque error / desired", "%")
     """The same, relative to the root mean square of the desired torque."""
-    tracking_max: float | None = _measure("torque error, largest", "N*m")
+    tracking_max: float | None = _measure("shaft torque error, largest", "N*m")
     """Largest absolute difference."""
-    tracking_lag: float | None = _measure("torque lag", "s")
+    tracking_lag: float | None = _measure("shaft torque lag", "s")
     """Delay of the delivered torque behind the desired one, where they correlate best; None where they hardly do."""
-    torque_rms: float = _measure("torque, rms", "N*m")
+    torque_rms: float = _measure("shaft torque, rms", "N*m")
     """Root mean square of the delivered torque: what wears gears and bearings, and heats a motor without a winding."""
     reversals: float = _measure("reversals", "1/s")
     """How often the delivered torque changes its sign, per second and motor: what wears gears with play."""
@@ -82,7 +82,7 @@ class Evaluation:
     """Largest absolute current."""
     rms_current: float | None = _measure("current, rms", "A")
     """Root mean square of the current, which heats the winding."""
-    peak_speed: float | None = _measure("speed, peak", "rad/s")
+    peak_speed: float | None = _measure("shaft speed, peak", "rad/s")
     """Largest absolute speed of the motor's shaft."""
     peak_temperature: float | None = _measure("winding, hottest", "degC")
     """Highest temperature of the winding; None where the motor has none."""

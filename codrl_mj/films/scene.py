@@ -1,77 +1,61 @@
-"""The scene of an episode alone, as a small film in memory, whose instants are the episode's."""
-
-import io
-import tempfile
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+"""What is seen of an episode at each of its instants."""
 
 import numpy as np
 
 from codrl_mj.envs.single import ActuatedEnv
 from codrl_mj.evaluation.episodes import Episode
+from codrl_mj.films.record import Frames
 from codrl_mj.physics.offscreen import OffscreenRenderer
 
-_MOST_FPS, _MOST_FRAMES = 30, 600
 
+class Scene:
+    """A task's, drawn from the episode's states; of an environment of others what was taken, brought to size."""
 
-class SceneFilm(NamedTuple):
-    """A film whose frame k shows the time k/rate of its episode, until the next."""
+    def __init__(
+        self,
+        task: str,
+        episode: Episode,
+        taken: Frames | None,
+        width: int,
+        height: int,
+        camera: str = "fixed",
+        pretty: bool = False,
+    ) -> None:
+        """Make the OpenGL context, where one is needed.
 
-    video: bytes
-    """H.264 in an MP4 file."""
-    rate: float
-    """Frames a second of the episode."""
-    still: bytes
-    """An image of it, a JPEG file."""
+        Args:
+            task: the task's name.
+            episode: the episode.
+            taken: as `record` returned it beside the episode.
+            width: [px].
+            height: [px].
+            camera: of the model.
+            pretty: shadows, reflections and multisampling.
 
+        Raises:
+            ValueError: unknown camera, or a size out of bounds.
+            RenderingUnavailableError: no OpenGL context can be made here; the message has the remedy.
+        """
+        self._states, self._taken, self._size = episode.state, taken, (width, height)
+        self._renderer = None
+        if taken is not None:
+            self.rate = taken.rate or 1.0 / float(episode.time[0])
+            return
+        self._env = ActuatedEnv(task, "ideal")
+        self.rate = self._env.metadata["render_fps"]
+        self._renderer = OffscreenRenderer(self._env.model, width, height, camera, pretty)
 
-def scene_film(
-    task: str, episode: Episode, width: int, height: int, frames: Sequence[np.ndarray] | None = None
-) -> SceneFilm:
-    """Film an episode.
+    def image(self, instant: int) -> np.ndarray:
+        """The scene after `instant` steps, shape (height, width, 3), uint8; a new array."""
+        if self._taken is None:
+            self._env.physics.show(self._states[instant])  # type: ignore[attr-defined]
+            return self._renderer.render(self._env.data)  # type: ignore[union-attr]
+        from PIL import Image
 
-    Args:
-        task: the task's name.
-        episode: the episode.
-        width: of the film [px], even.
-        height: of the film [px], even.
-        frames: in environments of others, the scene before the first step and after each, as `Filmed` keeps them.
+        image = Image.fromarray(self._taken[instant])
+        return np.array(image if image.size == self._size else image.resize(self._size))
 
-    Raises:
-        RenderingUnavailableError: no OpenGL context can be made here; the message has the remedy.
-    """
-    import imageio
-    from PIL import Image
-
-    steps, duration = len(episode.time), float(episode.time[0])
-    stride = max(1, round(1.0 / (duration * _MOST_FPS)), -(-steps // _MOST_FRAMES))
-    instants = [*range(0, steps, stride), steps]
-    images = _drawn(task, episode, instants, width, height) if frames is None else [frames[k] for k in instants]
-    options: Any = {"codec": "libx264", "quality": None, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-    # a key frame every half second: it is sought in; up to date players need no more than this
-    options["output_params"] = ["-preset", "veryfast", "-crf", "26", "-g", "15", "-movflags", "+faststart"]
-    rate = 1.0 / (stride * duration)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "film.mp4"
-        with imageio.get_writer(path, fps=rate, **options) as writer:
-            for one in images:
-                writer.append_data(one)
-        video = path.read_bytes()
-    buffer = io.BytesIO()
-    Image.fromarray(images[len(images) // 3]).save(buffer, "jpeg", quality=85)
-    return SceneFilm(video, rate, buffer.getvalue())
-
-
-def _drawn(task: str, episode: Episode, instants: Sequence[int], width: int, height: int) -> list[np.ndarray]:
-    """A task's scene at some instants, from the episode's states."""
-    env = ActuatedEnv(task, "ideal")
-    renderer = OffscreenRenderer(env.model, width, height)
-    try:
-        images = []
-        for instant in instants:
-            env.physics.show(episode.state[instant])  # type: ignore[attr-defined]
-            images.append(renderer.render(env.data).copy())
-        return images
-    finally:
-        renderer.close()
+    def close(self) -> None:
+        """Free the OpenGL context."""
+        if self._renderer is not None:
+            self._renderer.close()

@@ -7,11 +7,12 @@ import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, Ideal
 from codrl_mj.evaluation.episodes import Episode
+from codrl_mj.tasks import TASKS
 
 _DPI = 100
 HEADER_HEIGHT, TORQUE_HEIGHT, GAP, VOLTAGE_HEIGHT, TIME_HEIGHT = 24, 120, 8, 60, 26  # px, from top to bottom
 PLOT_HEIGHT = TORQUE_HEIGHT + GAP + VOLTAGE_HEIGHT
-AXIS_WIDTH, MARGIN = 62, 10  # px, left and right of the plots
+AXIS_WIDTH, MARGIN = 62, 16  # px, left and right of the plots; half a label of the last time has room
 DESIRED, ACTUAL, VOLTAGE, SATURATED = "#0072B2", "#D55E00", "#009E73", "#CC79A7"  # colour-blind safe (Okabe and Ito)
 
 
@@ -32,11 +33,12 @@ def pixels_per_second(width: int, window: float) -> float:
 
 
 def draw_strip(
-    episode: Episode, actuator: Any, width: int, window: float, end: float, motor: int = 0
+    task: str, episode: Episode, actuator: Any, width: int, window: float, end: float, motor: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw an episode's signals once, so that frames can be cut from them.
 
     Args:
+        task: its task's name.
         episode: the episode.
         actuator: what it ran on, a tuple with several motors; of the ideal one the strip shows forces.
         width: width of a frame [px].
@@ -46,23 +48,23 @@ def draw_strip(
 
     Returns:
         The strip's frame, `width` wide (legend and vertical axes), and its whole content below the legend, on which a
-        second is `pixels_per_second(width, window)` wide.
+        second is `pixels_per_second(width, window)` wide; `MARGIN` beyond its end.
     """
     body = PLOT_HEIGHT + TIME_HEIGHT
     frame = _figure(width, HEADER_HEIGHT + body)
-    content = _figure(round(pixels_per_second(width, window) * end), body)
+    length = round(pixels_per_second(width, window) * end)
+    content = _figure(length + MARGIN, body)
     if isinstance(actuator, tuple):
         episode = dataclasses.replace(episode, signals={name: v[:, motor] for name, v in episode.signals.items()})
         actuator = actuator[motor]
     lines = []
-    torque = "force [N]" if isinstance(actuator, Ideal) else "torque [N·m]"
     for bottom, height, plot, label in (
-        (TIME_HEIGHT + VOLTAGE_HEIGHT + GAP, TORQUE_HEIGHT, _plot_torque, torque),
+        (TIME_HEIGHT + VOLTAGE_HEIGHT + GAP, TORQUE_HEIGHT, _plot_torque, torque_label(task, actuator, motor)),
         (TIME_HEIGHT, VOLTAGE_HEIGHT, _plot_signal, _signal_label(actuator)),
     ):
         total = HEADER_HEIGHT + body
         axis = frame.add_axes((AXIS_WIDTH / width, bottom / total, 1e-6, height / total))
-        axes = content.add_axes((0, bottom / body, 1, height / body))
+        axes = content.add_axes((0, bottom / body, length / (length + MARGIN), height / body))
         lines += plot(episode, actuator, axes)
         _share_axis(axis, axes, label, end, window)
     content.axes[0].set_xticks([])
@@ -120,6 +122,16 @@ def _plot_torque(episode: Episode, actuator: ActuatorModel, axes: Any) -> list[A
         options = {"baseline": -limit, "fill": True, "color": SATURATED, "alpha": 0.3}
         lines.append(axes.stairs(band, _edges(episode), label="saturated", **options))
     return lines
+
+
+def torque_label(task: str, actuator: ActuatorModel, motor: int) -> str:
+    """What the first plot shows: torque at the motor's shaft, or, where there is no motor, what drives the joint."""
+    if not isinstance(actuator, Ideal):
+        return "shaft torque [N·m]"
+    if task not in TASKS:
+        return "joint force [N, N·m]"
+    slides = "[m/s]" in TASKS[task].state_names[TASKS[task].speeds[motor]]
+    return "joint force [N]" if slides else "joint torque [N·m]"
 
 
 def _signal(actuator: ActuatorModel) -> str | None:

@@ -4,27 +4,32 @@ from codrl_mj.motor_design.drives import Abilities, abilities, find_drive, find_
 from codrl_mj.motor_design.figures import bode_diagram, step_diagram, torque_speed_diagram
 from codrl_mj.motor_design.loop import (
     LoopDesign,
+    Looped,
     Response,
     closed_loop,
     design,
     designs,
     gains,
+    is_closed,
     open_loop,
     respond,
     small_step,
 )
-from codrl_mj.motor_design.overview import catalogue_rows, explain
+from codrl_mj.motor_design.overview import catalogue_rows, explain, unknown_in_words
 from codrl_mj.motor_design.windup import Recovery, Steps, step
 
 __all__ = [
     "catalogue_rows",
     "explain",
+    "unknown_in_words",
     "find_drive",
     "find_entry",
     "Abilities",
     "abilities",
     "torque_limits",
     "LoopDesign",
+    "Looped",
+    "is_closed",
     "design",
     "designs",
     "gains",

@@ -1,8 +1,10 @@
-"""The current loop of a drive: gains, margins, bandwidth, and its step by the drive's own equations.
+"""The current loop of a drive or an `Actuator`: gains, margins, bandwidth, and its step by their own equations.
 
 As the sampled current sees it: the winding under a zero-order hold is (1 - e)/R/(z - e) with e = exp(-R*T/L), the PI
 controller ((kp + ki*T)*z - kp)/(z - 1), the delay of a sample 1/z. Source: Franklin, Powell, Workman, *Digital Control
-of Dynamic Systems*, ch. 4; `codrl_mj.actuators.sampled` has the design.
+of Dynamic Systems*, ch. 4; `codrl_mj.actuators.sampled` has the design. An `Actuator`'s winding is stepped by Euler's
+rule, T/L/(z - 1 + R*T/L), under the PID controller of `codrl_mj.actuators.current_loop`; its sample rate is that of the
+mechanical steps, times its substeps, so that its functions take a mechanical step [s].
 """
 
 import dataclasses
@@ -11,12 +13,27 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from codrl_mj.actuators import Drive, Inputs, parameters_type
+from codrl_mj.actuators import Actuator, Drive, Inputs, parameters_type
 from codrl_mj.actuators.sampled import designed_gains
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
 
+Looped = Drive | Actuator
 RATES = (10e3, 20e3, 40e3)
 """Sample rates [Hz] that drives commonly have."""
+
+
+def sample_rate(one: Looped, timestep: float | None = None) -> float:
+    """Samples a second [Hz] of a drive, or of an `Actuator` at a mechanical step [s]."""
+    if isinstance(one, Drive):
+        return one.controller.sample_rate
+    if timestep is None:
+        raise ValueError("timestep = None: must be the mechanical step [s] of an Actuator, whose loop is closed in it")
+    return one.controller.substeps / timestep
+
+
+def is_closed(one: Looped) -> bool:
+    """Whether there is a loop: a gain on the error."""
+    return isinstance(one, Drive) or any((one.controller.kp, one.controller.ki, one.controller.kd))
 
 
 def gains(drive: Drive) -> tuple[float, float]:
@@ -33,23 +50,51 @@ def _bandwidth_asked(drive: Drive) -> float:
     return drive.controller.bandwidth or DEFAULT_BANDWIDTH * drive.controller.sample_rate
 
 
-def open_loop(drive: Drive) -> Any:
+def open_loop(one: Looped, timestep: float | None = None) -> Any:
     """The loop from error to sampled current, a `control.TransferFunction` in z."""
     import control
 
-    time, (kp, ki), (resistance, inductance) = 1.0 / drive.controller.sample_rate, gains(drive), drive.winding
-    decay = math.exp(-resistance * time / inductance)
-    effect = -math.expm1(-resistance * time / inductance) / resistance  # [A/V], of a sample
-    late = [1.0, 0.0] if drive.controller.delayed else [1.0]
-    poles = np.polymul(np.polymul([1.0, -decay], [1.0, -1.0]), late)
-    return control.TransferFunction([effect * (kp + ki * time), -effect * kp], poles, time)
+    (over, under), time = _open(one, timestep), 1.0 / sample_rate(one, timestep)
+    return control.TransferFunction(over, under, time)
 
 
-def closed_loop(drive: Drive) -> Any:
+def closed_loop(one: Looped, timestep: float | None = None) -> Any:
     """The loop from reference to sampled current, a `control.TransferFunction` in z."""
     import control
 
-    return control.feedback(open_loop(drive), 1)
+    (over, under), time = _open(one, timestep), 1.0 / sample_rate(one, timestep)
+    forward = over
+    if isinstance(one, Actuator):  # feed-forward: from the reference past the error
+        _, denominator = _pid(one, time)
+        forward = np.polyadd(over, one.controller.kff * time / one.motor.inductance * denominator)
+    return control.TransferFunction(forward, np.polyadd(under, over), time)
+
+
+def _open(one: Looped, timestep: float | None) -> tuple[np.ndarray, np.ndarray]:
+    """Numerator and denominator of the open loop."""
+    time, (resistance, inductance) = 1.0 / sample_rate(one, timestep), one.winding
+    if isinstance(one, Actuator):
+        over, under = _pid(one, time)
+        return over * time / inductance, np.polymul(under, [1.0, resistance * time / inductance - 1.0])
+    kp, ki = gains(one)
+    decay = math.exp(-resistance * time / inductance)
+    effect = -math.expm1(-resistance * time / inductance) / resistance  # [A/V], of a sample
+    late = [1.0, 0.0] if one.controller.delayed else [1.0]
+    poles = np.polymul(np.polymul([1.0, -decay], [1.0, -1.0]), late)
+    return np.array([effect * (kp + ki * time), -effect * kp]), poles
+
+
+def _pid(actuator: Actuator, time: float) -> tuple[np.ndarray, np.ndarray]:
+    """Numerator and denominator of an `Actuator`'s controller, from error [A] to voltage [V]."""
+    loop = actuator.controller
+    over, under = np.array([loop.kp]), np.array([1.0])
+    for gain, up, down in (
+        (loop.ki, [time, 0.0], [1.0 + loop.integral_leak * time, -1.0]),
+        (loop.kd, [1.0, -1.0], [time + loop.derivative_time_constant, -loop.derivative_time_constant]),
+    ):
+        if gain:
+            over, under = np.polyadd(np.polymul(over, down), gain * np.polymul(up, under)), np.polymul(under, down)
+    return over, under
 
 
 class Response(NamedTuple):
@@ -77,41 +122,56 @@ class Response(NamedTuple):
         return float(self.time[settled] - self.time[start]) if settled < len(self.time) else math.nan
 
 
-def respond(drive: Drive, references: Any, speed: float = 0.0) -> Response:
-    """Step a drive one sample at a time, through `Drive.advance`, from where it has held a current of 0 at its speed.
+def respond(one: Looped, references: Any, speed: float = 0.0, timestep: float | None = None) -> Response:
+    """Step a loop one sample at a time, through its own `advance`, from where it has held a current of 0 at its speed.
 
     Args:
-        drive: which.
+        one: a drive; or an `Actuator`, whose sensor is right here, and whose speed must be 0.
         references: current asked for in each sample [A], shape (n,).
         speed: of the rotor [rad/s], held.
+        timestep: of an `Actuator`: see the module.
     """
-    parameters, time = parameters_type(Drive)(*drive.numbers), 1.0 / drive.controller.sample_rate
-    back_emf = drive.motor.back_emf_constant * speed
-    integral = 0.0 if drive.controller.bemf_compensation else back_emf
-    kind: Any = drive.State
-    state = kind(*[0.0] * len(kind._fields))._replace(integral=integral, pending=back_emf, speed=speed)
-    rows = []
+    time = 1.0 / sample_rate(one, timestep)
+    kind: Any = one.State
+    state = kind(*[0.0] * len(kind._fields))
+    if isinstance(one, Drive):
+        back_emf = one.motor.back_emf_constant * speed
+        integral = 0.0 if one.controller.bemf_compensation else back_emf
+        state = state._replace(integral=integral, pending=back_emf, speed=speed)
+    else:
+        right = dataclasses.replace(one.controller, substeps=1, current_bias=0.0, current_noise=0.0)
+        one = dataclasses.replace(one, controller=right)
+    family: Any = type(one)
+    parameters, rows = parameters_type(family)(*one.numbers), []
     for reference in references:
         before = state.current
-        torque = drive.motor.torque_constant * float(reference)
-        state, _, signals = drive.advance(parameters, time, state, Inputs(torque, 0.0, speed, 0.0, 0.0))
+        torque = one.motor.torque_constant * float(reference)
+        state, _, signals = one.advance(parameters, time, state, Inputs(torque, 0.0, speed, 0.0, 0.0))
         rows.append((signals.reference_current, before, signals.voltage))
     return Response(time * np.arange(len(rows)), *np.array(rows).T)
 
 
-def small_step(drive: Drive) -> Response:
+def small_step(one: Looped, timestep: float | None = None) -> Response:
     """The step from rest to a current that does not saturate.
 
-    It is a tenth of V/R, or what half the voltage makes at once, or `max_current`, whichever is smallest. It lasts 20
-    time constants of the designed loop, or of the winding under given gains, and 100 to 20000 samples.
+    It is a tenth of V/R, or what half the voltage makes at once, or `max_current`, whichever is smallest; 1 A where the
+    voltage has no limit. It lasts 20 time constants of the designed loop, or of the winding under given gains, and 100
+    to 20000 samples.
     """
-    (kp, ki), loop = gains(drive), drive.controller
-    at_once = 0.5 * drive.voltage_limit / (kp + ki / loop.sample_rate)
-    amplitude = min(0.1 * drive.voltage_limit / drive.motor.resistance, at_once, loop.max_current)
-    designed = loop.kp == 0.0 and loop.ki == 0.0
-    constant = 1.0 / (2.0 * math.pi * _bandwidth_asked(drive)) if designed else drive.motor.electrical_time_constant
-    samples = min(max(math.ceil(20.0 * constant * loop.sample_rate), 100), 20_000)
-    return respond(drive, np.full(samples, amplitude))
+    (resistance, inductance), rate = one.winding, sample_rate(one, timestep)
+    constant, most = inductance / resistance, math.inf
+    if isinstance(one, Drive):
+        (kp, ki), most = gains(one), one.controller.max_current
+        at_once = kp + ki / rate
+        if one.controller.kp == 0.0 and one.controller.ki == 0.0:
+            constant = 1.0 / (2.0 * math.pi * _bandwidth_asked(one))
+    else:
+        over, under = _pid(one, 1.0 / rate)
+        at_once = over[0] / under[0] + one.controller.kff
+    limit = one.voltage_limit
+    amplitude = min(0.1 * limit / resistance, 0.5 * limit / at_once, most)
+    samples = min(max(math.ceil(20.0 * constant * rate), 100), 20_000)
+    return respond(one, np.full(samples, amplitude if math.isfinite(amplitude) else 1.0), timestep=timestep)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,20 +202,22 @@ class LoopDesign:
     """Of a small step, as a share of it."""
 
 
-def design(drive: Drive) -> LoopDesign:
-    """Judge a drive's current loop: margins of its transfer function, a step of the drive itself.
+def design(one: Looped, timestep: float | None = None) -> LoopDesign:
+    """Judge a current loop: margins of its transfer function, a step of its own.
 
     Raises:
         ValueError: the loop is unstable; the message has the spectral radius and a remedy.
     """
-    loop = drive.controller
-    drive.check(1.0 / loop.sample_rate)
-    step = small_step(drive)
+    rate, own = sample_rate(one, timestep), (one.controller.kp, one.controller.ki)
+    one.check(1.0 / rate if timestep is None else timestep)
+    step, delayed = small_step(one, timestep), False
+    if isinstance(one, Drive):
+        own, delayed = gains(one), one.controller.delayed
     return LoopDesign(
-        loop.sample_rate,
-        loop.delayed,
-        *gains(drive),
-        *_margins(drive),
+        rate,
+        delayed,
+        *own,
+        *_margins(open_loop(one, timestep), closed_loop(one, timestep), rate),
         step.settling_time(),
         step.overshoot,
     )
@@ -179,14 +241,13 @@ def designs(drive: Drive, rates: Any = None) -> dict[tuple[float, bool], LoopDes
     return found
 
 
-def _margins(drive: Drive) -> tuple[float, float, float, float, float]:
+def _margins(opened: Any, closed: Any, rate: float) -> tuple[float, float, float, float, float]:
     """Gain margin, phase margin [deg], phase crossover, crossover and bandwidth [Hz].
 
     They are searched for on the unit circle, which slow loops and the pole at z = 1 leave exact; python-control's
     margins, by the roots of polynomials, are not. At half the sample rate, z = -1, the loop is real: without a
     crossing before, the gain margin is read there.
     """
-    rate, opened, closed = drive.controller.sample_rate, open_loop(drive), closed_loop(drive)
     turned = _first_below(lambda z: -opened(z).imag, rate)
     turned = 0.5 * rate if math.isnan(turned) else turned
     crossover = _first_below(lambda z: abs(opened(z)) - 1.0, rate)

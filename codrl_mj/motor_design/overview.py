@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import re
+from collections.abc import Sequence
 from typing import Any
 
 from codrl_mj.actuators import Drive
@@ -80,6 +81,12 @@ def explain(drive: Drive, entry: MotorEntry | None = None) -> dict[str, Any]:
         "estimated": dict(entry.estimated),
         "notes": entry.notes,
     }
+
+
+def unknown_in_words(names: Sequence[str]) -> str:
+    """What is said of a motor's unknown numbers; empty where all are known."""
+    words = ", ".join(name.replace("max_", "highest ").replace("_", " ") for name in names)
+    return f"Not known, for no source has it and it follows from nothing that one has: {words}." if words else ""
 
 
 def _value(name: str, value: Any, unit: str) -> dict[str, Any]:

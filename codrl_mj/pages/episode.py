@@ -10,8 +10,8 @@ from markupsafe import Markup
 
 from codrl_mj.actuators import Drive, Ideal
 from codrl_mj.evaluation import Episode, run_episodes
-from codrl_mj.films.film import Filmed
-from codrl_mj.films.scene import SceneFilm, scene_film
+from codrl_mj.films.clip import Clip, clip
+from codrl_mj.films.record import record
 from codrl_mj.foreign.config import ForeignConfig
 from codrl_mj.pages import page
 from codrl_mj.pages.loop import limits, no_load_speed
@@ -35,10 +35,12 @@ class Shown(NamedTuple):
     """What it ran in."""
     episode: Episode
     """What happened."""
-    film: SceneFilm | None
+    film: Clip | None
     """The scene; None: `problem`."""
     problem: str | None
     """Why there is no film."""
+    seed: int
+    """Of the episode."""
 
 
 def show(name: str, env: Any, policy: Any, seed: int, filmed: bool = True) -> Shown:
@@ -51,28 +53,15 @@ def show(name: str, env: Any, policy: Any, seed: int, filmed: bool = True) -> Sh
         seed: of the episode.
         filmed: whether to film it.
     """
-    problem = None if filmed else "none was asked for"
-    made: list[Filmed] = []
-
-    def make() -> Any:
-        made.append(Filmed(env.make(**env.view(*_SIZE))))
-        return made[-1]
-
-    foreign = isinstance(env, ForeignConfig)
-    if foreign and filmed:
-        try:
-            (episode,) = run_episodes(policy, make, 1, seed)
-            return Shown(name, env, episode, scene_film(env.task, episode, *_SIZE, made[0].frames), None)
-        except Exception as error:  # each renderer raises its own kind
-            problem = f"{type(error).__name__}: {error}"
-    (episode,) = run_episodes(policy, env.make, 1, seed)
-    film = None
-    if filmed and not foreign:
-        try:
-            film = scene_film(env.task, episode, *_SIZE)
-        except Exception as error:  # as above, and libraries that are not installed
-            problem = f"{type(error).__name__}: {error}"
-    return Shown(name, env, episode, film, problem)
+    if not filmed:
+        return Shown(name, env, run_episodes(policy, env.make, 1, seed)[0], None, "none was asked for", seed)
+    episode = None
+    try:
+        episode, taken = record(policy, env, seed, *_SIZE)
+        return Shown(name, env, episode, clip(env.task, episode, taken, *_SIZE), None, seed)
+    except Exception as error:  # each renderer raises its own kind, and so do libraries that are not installed
+        problem = f"{type(error).__name__}: {error}"
+    return Shown(name, env, episode or run_episodes(policy, env.make, 1, seed)[0], None, problem, seed)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,7 +168,7 @@ def episode_section(shown: Sequence[Shown], joined: Iterable[Markup] = ()) -> Ma
 def _caption(one: Shown, named: bool) -> str:
     episode = one.episode
     over = f"{'ended' if episode.terminated else 'time limit'} at {episode.time[-1]:.2f} s"
-    return f"{one.name + ': ' if named else ''}return {page.number(episode.total)}, {over}"
+    return f"{one.name + ': ' if named else ''}seed {one.seed}, return {page.number(episode.total)}, {over}"
 
 
 def _selectors(shown: Sequence[Shown]) -> Markup:

@@ -8,7 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from codrl_mj.actuators import Actuator, ActuatorModel, Drive, Inputs, TorqueSpeed, parameters_type
-from codrl_mj.motor_design import LoopDesign, closed_loop, design, designs, open_loop, small_step, torque_limits
+from codrl_mj.motor_design import LoopDesign, Looped, closed_loop, design, designs, open_loop, small_step, torque_limits
 from codrl_mj.motor_design import step as all_steps
 from codrl_mj.pages import page
 from codrl_mj.pages.plots import Curve, Plot
@@ -27,13 +27,17 @@ _RIGHTS = (
 _SCALES = {"settling_time": 1e3, "overshoot": 100.0}
 
 
-def loop_section(drives: Mapping[str, Drive]) -> Markup:
-    """Margins, Bode's diagram and a small step of the current loops of some drives, by their names."""
+Loops = Mapping[str, tuple[Looped, float | None]]
+"""By their names, with the mechanical step [s] of those that are no drives."""
+
+
+def loop_section(loops: Loops) -> Markup:
+    """Margins, Bode's diagram and a small step of some current loops."""
     found: dict[str, LoopDesign] = {}
     notes = []
-    for name, drive in drives.items():
+    for name, (one, timestep) in loops.items():
         try:
-            found[name] = design(drive)
+            found[name] = design(one, timestep)
         except ValueError as error:
             notes.append(page.note(f"{name}: {error}", bad=True))
     if not found:
@@ -44,8 +48,10 @@ def loop_section(drives: Mapping[str, Drive]) -> Markup:
     late = {name: "a sample of delay" if one.delayed else "no delay" for name, one in found.items()}
     rows.append(("the voltage comes with", *late.values(), ""))
     table = page.table("Current loop", ("", *found, "unit"), rows, numbers=range(1, 1 + len(found)))
-    known = {name: drives[name] for name in found}
-    return page.joined((*notes, table, page.plots((*_bode(known, found), *_small_steps(known)))))
+    if any(math.isnan(_right(one, field)) for one in found.values() for field, _, _ in _RIGHTS):
+        notes.append(page.paragraph("–: not below half the sample rate, or not within sight.", "soft"))
+    known = {name: loops[name] for name in found}
+    return page.joined((table, *notes, page.plots((*_bode(known, found), *_small_steps(known)))))
 
 
 def _right(one: LoopDesign, field: str) -> float:
@@ -53,19 +59,20 @@ def _right(one: LoopDesign, field: str) -> float:
     return 20.0 * math.log10(value) if field == "gain_margin" else value * _SCALES.get(field, 1.0)
 
 
-def _bode(drives: Mapping[str, Drive], designed: Mapping[str, LoopDesign]) -> list[Plot]:
+def _bode(loops: Loops, designed: Mapping[str, LoopDesign]) -> list[Plot]:
     gains, phases = [], []
-    for place, (name, drive) in enumerate(drives.items()):
-        rate, one = drive.controller.sample_rate, designed[name]
+    for place, (name, loop) in enumerate(loops.items()):
+        one = designed[name]
+        rate = one.sample_rate
         frequencies = np.geomspace(np.nanmin([1e-3 * rate, 0.02 * one.crossover]), 0.49999 * rate, 500)
-        before = f"{name}: " if len(drives) > 1 else ""
-        for label, loop, dashed in (("open loop", open_loop(drive), True), ("closed loop", closed_loop(drive), False)):
-            values = loop(np.exp(2j * math.pi * frequencies / rate))
-            more: dict[str, Any] = {"colour": place if len(drives) > 1 else int(not dashed), "dashed": dashed}
+        before = f"{name}: " if len(loops) > 1 else ""
+        for label, function, dashed in (("open loop", open_loop, True), ("closed loop", closed_loop, False)):
+            values = function(*loop)(np.exp(2j * math.pi * frequencies / rate))
+            more: dict[str, Any] = {"colour": place if len(loops) > 1 else int(not dashed), "dashed": dashed}
             decibels, degrees = 20.0 * np.log10(np.abs(values)), np.degrees(np.unwrap(np.angle(values)))
             gains.append(Curve(before + label, frequencies, decibels, **more))
             phases.append(Curve(before + label, frequencies, degrees, **more))
-        if len(drives) == 1:
+        if len(loops) == 1:
             margin = 20.0 * math.log10(one.gain_margin)
             gains.append(_upright(f"gain margin {margin:.1f} dB", one.phase_crossover, -margin, 0.0))
             if math.isfinite(one.phase_margin):
@@ -81,14 +88,14 @@ def _upright(label: str, x: float, low: float, high: float) -> Curve:
     return Curve(label, np.array([x, x * (1.0 + 1e-6)]), np.array([low, high]), colour=3)
 
 
-def _small_steps(drives: Mapping[str, Drive]) -> list[Plot]:
+def _small_steps(loops: Loops) -> list[Plot]:
     curves = []
-    for place, (name, drive) in enumerate(drives.items()):
-        step, before = small_step(drive), f"{name}: " if len(drives) > 1 else ""
+    for place, (name, loop) in enumerate(loops.items()):
+        step, before = small_step(*loop), f"{name}: " if len(loops) > 1 else ""
         shown = slice(0, max(int(3.0 * np.searchsorted(step.time, step.settling_time())), 20))
         time, asked = 1e3 * step.time[shown], step.reference[-1]
         curves.append(
-            Curve(f"{before}current", time, step.current[shown] / asked, colour=place if len(drives) > 1 else 1)
+            Curve(f"{before}current", time, step.current[shown] / asked, colour=place if len(loops) > 1 else 1)
         )
     curves.append(Curve("asked for", time, np.ones(len(time)), reference=True))
     return [

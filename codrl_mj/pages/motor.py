@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from codrl_mj.actuators import Drive
 from codrl_mj.catalogue import MotorEntry
-from codrl_mj.motor_design import abilities, explain, torque_limits
+from codrl_mj.motor_design import abilities, explain, torque_limits, unknown_in_words
 from codrl_mj.pages import page
 from codrl_mj.pages.loop import loop_section, rates_table, step_plots
 from codrl_mj.pages.plots import Curve, Plot
@@ -102,7 +102,7 @@ def torque_speed(drive: Drive, entry: MotorEntry | None = None) -> Plot:
 
 
 def _loop(name: str, drive: Drive) -> Markup:
-    parts = [loop_section({name: drive})]
+    parts = [loop_section({name: (drive, None)})]
     try:
         parts += [page.heading("Out of saturation, by kind of anti-windup"), page.plots(step_plots(drive))]
     except ValueError as error:
@@ -128,5 +128,5 @@ def _numbers(known: Mapping[str, Any]) -> Markup:
     if known["estimated"]:
         parts += [page.heading("Estimated"), page.definitions(known["estimated"].items())]
     if known["unknown"]:
-        parts.append(page.paragraph(f"Not known: {', '.join(known['unknown']).replace('_', ' ')}.", "soft"))
+        parts.append(page.paragraph(unknown_in_words(known["unknown"]), "soft"))
     return page.joined(parts)

@@ -9,16 +9,17 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from codrl_mj.actuators import ActuatorModel, Drive, Ideal
+from codrl_mj.actuators import Actuator, ActuatorModel, Drive, Ideal
 from codrl_mj.evaluation import Episode
 from codrl_mj.evaluation.evaluate import MEASURES
+from codrl_mj.motor_design import Looped, is_closed
 from codrl_mj.pages import certificate as certificates
 from codrl_mj.pages import page
 from codrl_mj.pages.episode import Shown, episode_section, show
 from codrl_mj.pages.loop import held_step, loop_section
 from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.runs.files import check_page, read_json
-from codrl_mj.runs.layout import PROGRESS, finished
+from codrl_mj.runs.layout import PROGRESS, finished, told_apart
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.runs.summaries import RunSummary, compare, read_run
 from codrl_mj.training.folder import BEST, EPISODES, load_config
@@ -50,7 +51,6 @@ def report(
     seed: int = 0,
     trust: bool = False,
     filmed: bool = True,
-    replayed: bool = False,
     certificate: Path | None = None,
     joined: Callable[[Sequence[Shown]], Sequence[Markup]] = lambda _: (),
     on_part: Callable[[str], None] = lambda _: None,
@@ -64,9 +64,9 @@ def report(
         seed: of the episode.
         trust: whether to import modules that a run folder names as its task, agent or actuator, which executes them.
         filmed: whether to film the episode.
-        replayed: whether to show it in three dimensions too, to be turned and zoomed.
         certificate: a `certificate.json`, or the folder of one; None: that in a run folder, if there is one.
-        joined: (episodes) -> parts that follow the clock of film and plots, made by `codrl_mj.pages.page.clocked`.
+        joined: (episodes) -> parts that follow the clock of film and plots, made by `codrl_mj.pages.page.clocked`;
+            `replays` shows them in three dimensions.
         on_part: called with what is being done.
 
     Returns:
@@ -85,14 +85,14 @@ def report(
     summaries = [read_run(path) for path in runs]
     found = [
         _run(one, name, which, seed, trust, filmed, on_part)
-        for one, name in zip(summaries, _names(summaries), strict=True)
+        for one, name in zip(summaries, told_apart([one.path for one in summaries]), strict=True)
     ]
     on_part("page")
     shown = [run.shown for run in found if run.shown is not None]
     sections = [
         page.Section("learning", "Learning", _learning(found)),
         page.Section("evaluation", "Evaluation", _evaluation(found)),
-        page.Section("episode", "An episode", _episodes(found, shown, joined, replayed)),
+        page.Section("episode", "An episode", _episodes(found, shown, joined)),
         page.Section("loop", "The loop between", _loop(found)),
         page.Section("certificate", "Certificate", certified),
         page.Section("settings", "Settings", _settings(found)),
@@ -100,15 +100,6 @@ def report(
     kinds = "Report of a run" if len(found) == 1 else f"Report of {len(found)} runs"
     title = ", ".join(run.name for run in found)
     return page.write(out, page.page(title, kinds, _top(found, shown), sections))
-
-
-def _names(summaries: Sequence[RunSummary]) -> list[str]:
-    """Names of the folders, with as much of their paths as tells them apart."""
-    for length in range(1, 4):
-        names = ["/".join(one.path.resolve().parts[-length:]) for one in summaries]
-        if len(set(names)) == len(names):
-            return names
-    return [f"{name} ({place})" for place, name in enumerate(names, 1)]
 
 
 def _run(
@@ -320,19 +311,15 @@ def _motors(name: str, motors: Any) -> Markup:
 
 
 def _episodes(
-    runs: Sequence[_Run],
-    shown: Sequence[Shown],
-    joined: Callable[[Sequence[Shown]], Sequence[Markup]],
-    replayed: bool,
+    runs: Sequence[_Run], shown: Sequence[Shown], joined: Callable[[Sequence[Shown]], Sequence[Markup]]
 ) -> Markup:
     notes = [page.note(f"No episode of {run.name}: {run.problem}", bad=True) for run in runs if run.shown is None]
     notes += [page.note(f"{run.name}: the policy of its best evaluation acts.") for run in runs if run.best]
-    own = _replays(shown) if replayed else []
-    return page.joined((*notes, episode_section(shown, [*own, *joined(shown)]) if shown else ""))
+    return page.joined((*notes, episode_section(shown, joined(shown)) if shown else ""))
 
 
-def _replays(shown: Sequence[Shown]) -> list[Markup]:
-    """The episodes in three dimensions."""
+def replays(shown: Sequence[Shown]) -> list[Markup]:
+    """The episodes in three dimensions, to be turned and zoomed: what `joined` of a report may return."""
     from codrl_mj.replay import motion_of_episode, replay
 
     made = [replay(motion_of_episode(one.episode, one.env), one.name) for one in shown]
@@ -341,9 +328,10 @@ def _replays(shown: Sequence[Shown]) -> list[Markup]:
 
 
 def _loop(runs: Sequence[_Run]) -> Markup:
-    """The loops of the drives, and steps of other actuators; each different one once."""
-    drives: dict[str, Drive] = {}
+    """Current loops, and steps of actuators without one; each different one once."""
+    loops: dict[str, tuple[Looped, float | None]] = {}
     others: dict[str, tuple[ActuatorModel, float, float]] = {}
+    without: dict[str, None] = {}
     for run in runs:
         for motor, actuator in run.actuators.items():
             alone = len(run.actuators) == 1
@@ -351,17 +339,36 @@ def _loop(runs: Sequence[_Run]) -> Markup:
                 (motor if len(runs) == 1 else run.name) if alone else f"{run.name}, {motor}" if len(runs) > 1 else motor
             )
             name = "motor" if name in (".*", "motor") else name
-            if isinstance(actuator, Drive):
-                same = [one for one in drives.values() if _loop_of(one) == _loop_of(actuator)]
-                if not same and len(drives) < _MOST_LOOPS:
-                    drives[name] = actuator
-            elif not isinstance(actuator, Ideal) and run.shown is not None:
-                timestep = run.shown.episode.timestep
-                if all((actuator, timestep) != (one, step) for one, _, step in others.values()):
-                    others[name] = actuator, _asked(actuator, run.shown.episode), timestep
-    parts = [loop_section(drives)] if drives else []
+            timestep = run.shown.episode.timestep if run.shown is not None else None
+            if isinstance(actuator, Drive | Actuator) and is_closed(actuator):
+                loop = actuator, None if isinstance(actuator, Drive) else timestep
+                known = isinstance(actuator, Drive) or timestep is not None
+                if known and all(_loop_of(*loop) != _loop_of(*one) for one in loops.values()):
+                    loops[name] = loop
+                continue
+            without[_without_loop(name, actuator)] = None
+            if run.shown is None or timestep is None or isinstance(actuator, Ideal):
+                continue
+            if all((actuator, timestep) != (one, step) for one, _, step in others.values()):
+                others[name] = actuator, _asked(actuator, run.shown.episode), timestep
+    parts = [page.paragraph(text, "soft") for text in without]
+    if len(loops) > _MOST_LOOPS:
+        left = ", ".join(list(loops)[_MOST_LOOPS:])
+        parts.append(
+            page.note(f"The first {_MOST_LOOPS} of {len(loops)} different loops are shown; not those of {left}")
+        )
+    if loops:
+        parts.append(loop_section(dict(list(loops.items())[:_MOST_LOOPS])))
     plot = held_step(others)
     return page.joined((*parts, page.plots([plot] if plot is not None else [])))
+
+
+def _without_loop(name: str, actuator: ActuatorModel) -> str:
+    """Why there is no current loop to be judged."""
+    if isinstance(actuator, Actuator):
+        return f"{name}: no gain on the error of the current, feed-forward alone: there is no loop to be judged."
+    about = (type(actuator).__doc__ or type(actuator).__name__).strip().partition("\n")[0]
+    return f"{name}: {about} There is no current loop in it."
 
 
 def _asked(actuator: ActuatorModel, episode: Episode) -> float:
@@ -372,8 +379,8 @@ def _asked(actuator: ActuatorModel, episode: Episode) -> float:
     return 0.5 * actuator.arm_radius * float(forces[own if any(own) else slice(None)].max())
 
 
-def _loop_of(drive: Drive) -> Any:
-    return drive.winding, drive.controller, drive.voltage_limit
+def _loop_of(one: Looped, timestep: float | None) -> Any:
+    return one.winding, one.controller, one.voltage_limit, timestep
 
 
 def _certificate(runs: Sequence[Path], given: Path | None) -> Markup:

@@ -139,8 +139,7 @@ class OffscreenRenderer:
         flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = False
         image = self._renderer.render()
         flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = True
-        red, green, blue = np.moveaxis(image, 2, 0)
-        image += sky * ((red | green | blue) == 0)[..., None]
+        np.copyto(image, sky, where=image == 0)
         return image
 
     def _drawn_sky(self, renderer: mujoco.Renderer) -> np.ndarray:
@@ -165,7 +164,7 @@ class OffscreenRenderer:
 
 
 def _only_sky_is_black(model: mujoco.MjModel) -> bool:
-    """Whether of a picture without sky only the sky's pixels are black.
+    """Whether of a picture without sky only the sky's pixels have a colour of 0.
 
     All else is lit by the headlight's ambient part, opaque, and has no picture on it.
     """
@@ -175,7 +174,7 @@ def _only_sky_is_black(model: mujoco.MjModel) -> bool:
         light.active
         and (model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).all()
         and (colours[:, 3] == 1).all()
-        and colours[:, :3].max(axis=1, initial=0).min(initial=1) * light.ambient.min() > 2 / 255
+        and colours[:, :3].min(initial=1) * light.ambient.min() > 2 / 255
     )
 
 

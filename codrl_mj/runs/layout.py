@@ -1,5 +1,6 @@
 """What a run folder holds under which name, and what marks it as finished."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 CONFIG, RESULT, EVALUATION = "config.json", "result.json", "evaluation.json"
@@ -10,3 +11,12 @@ POLICY_FILES = WEIGHTS, DESCRIPTION = "policy.safetensors", "policy.json"
 def finished(run: Path) -> bool:
     """Whether the training of a run folder is finished: its result, which is written last, is there."""
     return (run / RESULT).is_file()
+
+
+def told_apart(folders: Sequence[Path]) -> list[str]:
+    """Names of some folders, with as much of their paths as tells them apart."""
+    for length in range(1, 4):
+        names = ["/".join(one.resolve().parts[-length:]) for one in folders]
+        if len(set(names)) == len(names):
+            return names
+    return [f"{name} ({place})" for place, name in enumerate(names, 1)]

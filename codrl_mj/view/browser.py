@@ -112,7 +112,7 @@ class Browser:
     def _say(self) -> None:
         session = self.session
         state = "waits" if session.waits else "plays" if self.playing else "paused"
-        ended = ", ended" if session.ended else ""
+        ended = f", {session.ended}" if session.ended else ""
         text = f"**{session.time:.2f} s** · return {session.total:.1f}{ended} · {state}, {self._real:.2f} × real time"
         if self._status.content != text:
             self._status.content = text
@@ -150,7 +150,7 @@ class Browser:
         policy.on_update(lambda _: self._ask("policy", lambda: session.choose(policy.value)))
         speed = gui.add_slider("speed", 0.05, 4.0, 0.05, 1.0)
         speed.on_update(lambda _: setattr(self, "_speed", speed.value))
-        again = gui.add_checkbox("begin anew at the end", True)
+        again = gui.add_checkbox("begin anew at the end", True, hint="also at the time limit; otherwise it goes on")
         again.on_update(lambda _: setattr(session, "again", again.value))
         self._pushes()
         self._signals()

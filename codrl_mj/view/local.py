@@ -18,6 +18,15 @@ _NAMES = (HOST, "localhost")
 """As which a browser may ask for it: a page of somebody else's, or a name that was made to lead here, may not."""
 
 
+_HEAD = b"""
+<script>window.__VISER_EMBED_CONFIG__ = {darkMode: matchMedia("(prefers-color-scheme: dark)").matches};</script>
+<style>@media (max-width: 36em) {
+[style*="max-height: 60%"] { max-height: 38% !important }
+[style*="max-height: 60%"], [style*="max-height: 60%"] [style*="width: 20em"] { width: 100% !important }
+}</style>"""
+"""Dark where the browser prefers it; on a phone the panel, at the bottom, leaves the scene in sight."""
+
+
 class LocalServer(viser.ViserServer):
     """Listens on the loopback interface, answers pages of its own origin, and shares nothing through other hosts."""
 
@@ -42,7 +51,10 @@ class LocalServer(viser.ViserServer):
 
 @contextlib.contextmanager
 def _checked_requests() -> Iterator[None]:
-    """Let servers that begin in the block refuse requests of other origins; viser has no setting for it."""
+    """Let servers that begin in the block refuse requests of other origins, and give the page our head.
+
+    viser has no setting for either.
+    """
     plain = websockets.asyncio.server.serve
 
     @functools.wraps(plain)
@@ -50,7 +62,15 @@ def _checked_requests() -> Iterator[None]:
         def checked(connection: Any, request: Request) -> Response | None:
             if not allowed(request.headers):
                 return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", Headers({"Content-Length": "0"}), b"")
-            return process_request(connection, request)
+            if request.path.partition("?")[0] != "/":
+                return process_request(connection, request)
+            request.headers.pop("Accept-Encoding", None)  # text is to be put into the page
+            response = process_request(connection, request)
+            if response is not None:  # no upgrade to a web socket
+                response.body = response.body.replace(b"<head>", b"<head>" + _HEAD, 1)
+                del response.headers["Content-Length"]
+                response.headers["Content-Length"] = str(len(response.body))
+            return response
 
         return plain(handler, *arguments, process_request=checked, **options)
 

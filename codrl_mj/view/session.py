@@ -55,9 +55,10 @@ class Session:
             ValueError: it cannot be built, or has no MuJoCo model.
         """
         self.config = dataclasses.replace(config, max_episode_steps=_FOREVER)
+        self._limit = config.time_limit or _FOREVER
         self.problem: str | None = None
         self.again = True
-        """Whether an episode that ended begins anew by itself."""
+        """Whether an episode that ended, or reached the time limit, begins anew by itself; otherwise it goes on."""
         self.signals: deque[tuple[float, np.ndarray]] = deque()
         """Time [s], and a row of `trace_names` for each motor."""
         self._seed, self._diverged, self._pushes = seed, False, {}  # type: ignore[var-annotated]
@@ -123,7 +124,7 @@ class Session:
         self.observation, _ = self.env.reset(seed=self._seed)
         self._seed += 1
         self.time = self.total = 0.0
-        self.ended = False
+        self._steps, self.ended = 0, ""
         self.signals.clear()
         self._pushes.clear()
         self.data.xfrc_applied[:] = 0.0
@@ -205,7 +206,8 @@ class Session:
             return False
         self._remember()
         self.total += float(reward)
-        self.ended = bool(terminated or truncated)
+        self._steps += 1
+        self.ended = "ended" if terminated or truncated else "past the time limit" * (self._steps >= self._limit)
         self._posed()
         return True
 

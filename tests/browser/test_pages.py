@@ -10,7 +10,7 @@ from codrl_mj.motor_design import find_drive, find_entry
 from codrl_mj.pages import page as builder
 from codrl_mj.pages.motor import motor_page
 from codrl_mj.pages.plots import Curve, Plot
-from codrl_mj.pages.report import report
+from codrl_mj.pages.report import replays, report
 from tests.browser.waiting import until
 
 pytestmark = pytest.mark.browser
@@ -28,7 +28,7 @@ def pages(tmp_path_factory):
         """element.querySelector("#scrub").addEventListener("click", () => seek(1.5));
         function setTime(time) { element.querySelector("#at").textContent = time.toFixed(2); }""",
     )
-    report([RUN], folder / "report.html", replayed=True, joined=lambda _: (joined,))
+    report([RUN], folder / "report.html", joined=lambda shown: (*replays(shown), joined))
     report([RUN, RUN.parent / "cartpole"], folder / "two.html")
     motor_page("qube", find_drive("quanser-qube-servo-2"), find_entry("quanser-qube-servo-2"), folder / "motor.html")
     evil = "<img src=http://there/x onerror=alert(1)>" + "x" * 90

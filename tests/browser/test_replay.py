@@ -65,12 +65,16 @@ def test_it_shows_the_recorded_poses_and_goes_straight_between_them(what, page_f
 def test_it_plays_at_a_speed_and_stops_at_the_end(page_file, opened):
     page = opened(page_file.as_uri())
     page.select_option("#speed", "4")
+    page.clock.install()
     page.click("#play")
-    until(page, "replay.now() > 0.5 && replay.playing()")
-    until(page, "replay.now() >= 59 / 30 - 1e-3 && !replay.playing()")
+    page.clock.run_for(250)  # ms
+    assert page.evaluate("replay.now()") == pytest.approx(4 * 0.25, abs=4 * 2 / 60)  # its first frame begins to count
+    page.clock.run_for(500)
+    assert page.evaluate("replay.now()") == pytest.approx(59 / 30, abs=1e-3)
     assert page.inner_text("#play") == "Play"
     page.click("#play")
-    until(page, "replay.playing() && replay.now() < 1.5")  # from the beginning
+    page.clock.run_for(100)
+    assert page.evaluate("replay.playing() && replay.now() < 0.5")  # from the beginning
 
 
 def test_the_picture_moves_with_the_time_and_with_the_mouse(page_file, opened):

@@ -7,6 +7,7 @@ import pytest
 from codrl_mj.foreign.config import environment_from
 from codrl_mj.view.browser import Browser
 from codrl_mj.view.session import Session
+from tests.browser.waiting import until
 
 pytestmark = pytest.mark.browser
 
@@ -37,14 +38,12 @@ def shown(browser, page):
 def test_it_simulates_in_real_time_and_is_paused_stepped_and_reset(browser, opened):
     page = opened(browser.url)
     shown(browser, page)
-    page.wait_for_timeout(2500)
-    assert browser._real == pytest.approx(1.0, abs=0.2)
+    until(page, lambda: browser._real == pytest.approx(1.0, abs=0.2) and browser.session.time > 0)
     page.get_by_role("button", name="Play or pause").click()
     page.wait_for_selector("text=paused")
     time = browser.session.time
     page.get_by_role("button", name="Step").click()
-    page.wait_for_timeout(500)
-    assert browser.session.time == pytest.approx(time + browser.session.step_duration)
+    until(page, lambda: browser.session.time == pytest.approx(time + browser.session.step_duration))
     page.get_by_role("button", name="Reset").click()
     page.wait_for_selector("text=0.00 s")
     page.get_by_role("button", name="Play or pause").click()
@@ -58,7 +57,7 @@ def test_a_push_moves_the_pole(browser, opened):
     plain = browser.session.push
     browser.session.push = lambda *given: pushed.append(given) or plain(*given)
     page.get_by_role("button", name="Push forth").click()
-    page.wait_for_timeout(500)
+    until(page, lambda: pushed)
     del browser.session.push
     ((body, force, axis),) = pushed
     assert (body, axis) == ("pole", 0)
@@ -79,14 +78,12 @@ def test_settings_change_the_simulation_and_unstable_ones_are_said(browser, open
     assert browser.session.time == time
     gain.fill("0")
     gain.press("Enter")
-    page.wait_for_timeout(500)
-    assert browser.session.time != time
+    until(page, lambda: browser.session.time != time)
     page.get_by_text("supply", exact=True).click()
     voltage = field(page, "voltage [V]")
     voltage.fill("7")
     voltage.press("Enter")
-    page.wait_for_timeout(1500)
-    assert browser.session.patterns[".*"].supply.voltage == pytest.approx(7.0)
+    until(page, lambda: browser.session.patterns[".*"].supply.voltage == pytest.approx(7.0))
 
 
 def test_another_policy_acts(browser, opened):
@@ -94,5 +91,13 @@ def test_another_policy_acts(browser, opened):
     shown(browser, page)
     page.get_by_label("policy").click()
     page.get_by_role("option", name="zero").click()
-    page.wait_for_timeout(500)
-    assert browser.session.chosen == "zero"
+    until(page, lambda: browser.session.chosen == "zero")
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
+def test_it_is_dark_where_that_is_preferred_and_leaves_a_phone_the_scene(browser, opened, width, scheme):
+    page = opened(browser.url, width, scheme=scheme)
+    shown(browser, page)
+    assert page.evaluate("document.documentElement.dataset.mantineColorScheme") == scheme
+    top = page.get_by_role("button", name="Play or pause").bounding_box()["y"]
+    assert (top > 0.6 * 800) == (width == 390)

@@ -7,9 +7,22 @@ import control
 import numpy as np
 import pytest
 
+from codrl_mj import Actuator, CurrentLoop
 from codrl_mj.actuators import Drive, SampledLoop
-from codrl_mj.motor_design import closed_loop, design, designs, find_drive, gains, open_loop, respond, small_step, step
+from codrl_mj.motor_design import (
+    closed_loop,
+    design,
+    designs,
+    find_drive,
+    gains,
+    is_closed,
+    open_loop,
+    respond,
+    small_step,
+    step,
+)
 from codrl_mj.motor_design.windup import ANTI_WINDUPS
+from codrl_mj.validation import motor_sampled
 
 MOTORS = ("quanser-qube-servo-2", "maxon-dcx22l", "heinzmann-pmg-132", "lego-ev3-large")
 every_motor = pytest.mark.parametrize("name", MOTORS)
@@ -90,6 +103,34 @@ def test_the_margins_are_those_that_python_control_finds(own, delayed):
     if delayed:  # without, the crossing is where it does not look
         expected = pytest.approx((gain_margin, gain_at / 2 / math.pi), rel=1e-6)
         assert (found.gain_margin, found.phase_crossover) == expected
+
+
+@pytest.mark.parametrize(
+    "loop",
+    [
+        CurrentLoop(kp=1.0, ki=20.0, kd=1e-6),
+        CurrentLoop(kp=4.0, ki=300.0, integral_leak=3.0, kff=0.5),
+        CurrentLoop(kp=2.0, kd=1e-3, derivative_time_constant=0.004, current_bias=0.1, substeps=2),
+    ],
+    ids=["paper's", "leak and feed-forward", "filtered derivative"],
+)
+def test_an_actuators_loop_is_the_one_that_python_control_joins(loop):
+    actuator, timestep = Actuator(controller=loop), 0.02
+    dt = timestep / loop.substeps
+    other = motor_sampled.closed_loop(actuator, dt)
+    at = np.exp(1j * np.linspace(0.01, 3.1, 40))
+    np.testing.assert_allclose(closed_loop(actuator, timestep)(at), other(at), rtol=1e-9)
+    response = respond(actuator, np.full(200, 0.01), timestep=timestep)
+    np.testing.assert_allclose(response.current, 0.01 * control.step_response(other, response.time)[1], atol=1e-9)
+    found, (_, phase_margin, _, phase_at) = design(actuator, timestep), control.margin(open_loop(actuator, timestep))
+    assert (found.phase_margin, found.crossover) == pytest.approx((phase_margin, phase_at / 2 / math.pi), rel=1e-6)
+    assert found.sample_rate == loop.substeps / timestep
+
+
+def test_an_actuators_loop_needs_its_step_and_a_gain():
+    assert not is_closed(Actuator(controller=CurrentLoop(kp=0.0, kff=1.0)))
+    with pytest.raises(ValueError, match="timestep = None: must be the mechanical step"):
+        design(Actuator())
 
 
 def test_other_rates_are_designed_where_they_allow_the_bandwidth():

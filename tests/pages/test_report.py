@@ -17,7 +17,9 @@ from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy, run_episodes
 from codrl_mj.foreign.config import ForeignConfig
+from codrl_mj.motor_design import find_drive
 from codrl_mj.pages import episode as episodes
+from codrl_mj.pages import report as reports
 from codrl_mj.pages.episode import Shown, episode_section, show
 from codrl_mj.pages.loop import held_step
 from codrl_mj.pages.report import report
@@ -78,8 +80,27 @@ def test_the_plots_show_the_episode_that_the_film_shows(text):
     assert float(transport) == pytest.approx(episode.time[-1])
 
 
+def test_the_papers_current_loop_has_its_margins_and_its_step(text):
+    parsed = check_alone(text)
+    titles = {data["title"] for data in parsed.data}
+    assert {"Bode: gain", "Bode: phase", "A small step of the current, the shaft held"} <= titles
+    assert "phase margin" in parsed.text
+    assert "seed 0" in parsed.text.partition("An episode")[2]
+
+
+def test_it_says_which_loops_it_leaves_out_and_why_there_is_none():
+    def run(actuators):
+        return reports._Run(None, "run", None, None, actuators)
+
+    drives = {f"m{place}": find_drive("maxon-dcx22l", bandwidth=300.0 + place) for place in range(6)}
+    assert "The first 4 of 6 different loops are shown; not those of m4, m5" in str(reports._loop([run(drives)]))
+    said = str(reports._loop([run({"lag": Lag(time_constant=0.1)})]))
+    assert "lag: The delivered torque follows the desired one with a time constant" in said
+    assert "There is no current loop in it." in said
+
+
 def test_without_opengl_there_is_no_film_and_everything_else(tmp_path, monkeypatch):
-    monkeypatch.setattr(episodes, "scene_film", no_film)
+    monkeypatch.setattr(episodes, "clip", no_film)
     text = report([RUNS / "pendulum"], tmp_path / "r.html").read_text()
     parsed = check_alone(text)
     assert "No film of pendulum: RenderingUnavailableError: cannot make an OpenGL context" in parsed.text
@@ -125,7 +146,7 @@ def test_a_page_says_that_the_best_policy_acts(tmp_path):
 
 
 def test_several_runs_stand_side_by_side(tmp_path, monkeypatch):
-    monkeypatch.setattr(episodes, "scene_film", no_film)
+    monkeypatch.setattr(episodes, "clip", no_film)
     shutil.copytree(RUNS / "pendulum", tmp_path / "other")
     certificate = {"verdict": "passed", "subject": "pendulum", "made": "then", "quick": True,
                    "checks": [{"group": "motor", "passed": True}]}  # fmt: skip
@@ -152,7 +173,7 @@ def test_several_motors_can_be_chosen():
         for field in ("trace", "signals")
     }
     two = dataclasses.replace(one, **arrays, actuator=(one.actuator,) * 2, motors=("left", "right"))
-    section = str(episode_section([Shown("arm", env, two, None, "none was asked for")]))
+    section = str(episode_section([Shown("arm", env, two, None, "none was asked for", 0)]))
     expected = [
         (f"{side}: {what}", f"motor:{place}") for place, side in enumerate(two.motors) for what in ("actual", "desired")
     ]
@@ -177,7 +198,7 @@ def test_states_of_every_kind_of_joint_have_units(monkeypatch):
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
     made = SimpleNamespace(unwrapped=SimpleNamespace(model=model), close=lambda: None)
     monkeypatch.setattr(ForeignConfig, "make", lambda _: made)
-    names = episodes._state_names(Shown("robot", ForeignConfig("Ant-v5"), None, None, None))
+    names = episodes._state_names(Shown("robot", ForeignConfig("Ant-v5"), None, None, None, 0))
     units = [re.search(r"\[(.*)\]", name)[1] for name in names]
     assert units[: model.nq] == ["1"] * 4 + ["m", "rad"] + ["m"] * 3 + ["1"] * 4
     assert units[model.nq :] == ["rad/s"] * 3 + ["m/s", "rad/s"] + ["m/s"] * 3 + ["rad/s"] * 3

@@ -1,6 +1,7 @@
 """A session does what MuJoCo does, and what cannot be simulated is not."""
 
 import dataclasses
+import shutil
 from pathlib import Path
 
 import mujoco
@@ -25,6 +26,16 @@ def session(motor=MOTOR, policies=(), **arguments):
 @pytest.fixture(scope="module")
 def motorised():
     return session()
+
+
+@pytest.mark.parametrize("again", [True, False])
+def test_at_the_time_limit_it_says_so_and_begins_anew_or_goes_on(again):
+    made = session("ideal", max_episode_steps=3)
+    made.again = again
+    said = [made.step() and made.ended for _ in range(4)]
+    assert said[:3] == ["", "", "past the time limit"]
+    assert made.time == pytest.approx((1 if again else 4) * made.step_duration)
+    assert said[3] == ("" if again else "past the time limit")
 
 
 def test_a_push_is_a_force_at_the_bodys_centre_of_mass():
@@ -162,7 +173,7 @@ def test_an_endless_voltage_ends_at_the_end_of_its_slider():
     assert nested(("supply", "voltage"), 12.0) == {"supply": {"voltage": 12.0}}
 
 
-def test_the_command_line_offers_the_runs_policy_and_those_of_others(monkeypatch, capsys):
+def test_the_command_line_offers_the_runs_policy_and_those_of_others(monkeypatch, capsys, tmp_path):
     seen = {}
 
     class Fake:
@@ -179,11 +190,13 @@ def test_the_command_line_offers_the_runs_policy_and_those_of_others(monkeypatch
 
     monkeypatch.setattr("codrl_mj.cli.view._browser", lambda: Fake)
     run = Path(__file__).parents[1] / "fixtures" / "earlier" / "cartpole"
-    assert main(["view", str(run), "--policies", str(run), "--actuator", "weaker"]) == 0
+    other = shutil.copytree(run, tmp_path / "other" / "cartpole")
+    assert main(["view", str(run), "--policies", str(run), str(other), "--actuator", "weaker"]) == 0
     made = seen["session"]
-    assert list(made.policies) == ["last", "cartpole", "random"]  # none of its actions does nothing
+    names = ["last", "earlier/cartpole", "other/cartpole", "random"]  # none of its actions does nothing
+    assert list(made.policies) == names
     assert made.chosen == "last"
-    made.choose("cartpole")
+    made.choose("other/cartpole")
     assert made.step()
     assert seen["title"] == "cartpole on weaker"
     assert main(["view", "cartpole", "--policies", str(run), "--env.action", "voltage", "--env.levels", "-5", "5"]) == 2
