@@ -6,7 +6,7 @@ handful of unknowns however many segments there are.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -18,7 +18,7 @@ DIFFERENCE = 1e-4
 """Step of finite differences, in the parameters' scales: dry friction makes smaller ones rough."""
 FAR = 1e30
 SCREENING = 12
-"""Evaluations from each start; the two that get farthest go on."""
+"""Evaluations from each of several starts."""
 Simulate = Callable[[Segment, np.ndarray], np.ndarray]
 
 
@@ -97,6 +97,8 @@ def _settle(
         root = (1.0 + (residuals / scale) ** 2) ** -0.25
         columns = _state_columns(simulate, segment, state, steps, residuals)
         step = np.linalg.lstsq(root[:, None] * columns, -root * residuals, rcond=1e-9)[0]
+        if np.sum((root * (columns @ step)) ** 2) < 1e-6 * cost:  # all that it could gain
+            break
         for share in (1.0, 0.25):
             tried = _residuals(simulate, segment, state + share * step)
             lower = robust_cost(tried, scale)
@@ -104,9 +106,7 @@ def _settle(
                 break
         else:
             break
-        state, residuals, gained, cost = state + share * step, tried, cost - lower, lower
-        if gained < 1e-6 * cost:
-            break
+        state, residuals, cost = state + share * step, tried, lower
     return state, residuals
 
 
@@ -137,17 +137,23 @@ def settled(model: Model, values: np.ndarray, segments: Sequence[Segment]) -> li
 class _Problem:
     """The outer problem, as scipy takes it; remembers the states of the point that it last took a Jacobian at."""
 
-    def __init__(self, model: Model, segments: Sequence[Segment], scale: float) -> None:
+    def __init__(self, model: Model, segments: Sequence[Segment], states: Sequence[np.ndarray], scale: float) -> None:
         self.model, self.segments, self.scale = model, segments, scale
-        self.known = [segment.state for segment in segments]
+        self.known = list(states)
+        self.slopes: list[np.ndarray] = []  # of the states by the parameters, at
+        self.origin = np.zeros(0)
         self.at: tuple[bytes, list[np.ndarray], list[np.ndarray]] | None = None
 
     def solve(self, values: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
         if self.at is None or self.at[0] != values.tobytes():
             simulate, steps = self.model.at(values), self.model.steps
+            states = self.known
+            if self.slopes:
+                moved = values - self.origin
+                states = [one + slope @ moved for one, slope in zip(self.known, self.slopes, strict=True)]
             pairs = [
                 _settle(simulate, segment, state, steps, self.scale)
-                for segment, state in zip(self.segments, self.known, strict=True)
+                for segment, state in zip(self.segments, states, strict=True)
             ]
             self.at = values.tobytes(), [state for state, _ in pairs], [residuals for _, residuals in pairs]
         return self.at[1], self.at[2]
@@ -160,14 +166,14 @@ class _Problem:
                 _settle(simulate, segment, state, steps, self.scale) for state in (self.known[place], segment.state)
             ]
             self.known[place] = min(pairs, key=lambda pair: robust_cost(pair[1], self.scale))[0]
-        self.at = None
+        self.at, self.slopes = None, []
 
     def residuals(self, values: np.ndarray) -> np.ndarray:
         return np.concatenate(self.solve(values)[1])
 
     def jacobians(self, values: np.ndarray) -> list[np.ndarray]:
         states, residuals = self.solve(values)
-        self.known = states
+        self.known, self.slopes, self.origin = states, [], values.copy()
         model, made = self.model, []
         inward = np.where(values + DIFFERENCE * model.scales > model.upper, -1.0, 1.0)
         moves = np.diag(inward * DIFFERENCE * model.scales)
@@ -178,8 +184,8 @@ class _Problem:
                 columns[:, place] = (_residuals(simulate, segment, state) - found) / move.sum()
             own = _state_columns(here, segment, state, model.steps, found)
             root = ((1.0 + (found / self.scale) ** 2) ** -0.25)[:, None]
-            shares = np.linalg.lstsq(root * own, root * columns, rcond=1e-9)[0]
-            made.append(columns - own @ shares)
+            self.slopes.append(-np.linalg.lstsq(root * own, root * columns, rcond=1e-9)[0])
+            made.append(columns + own @ self.slopes[-1])
         return made
 
     def jacobian(self, values: np.ndarray) -> np.ndarray:
@@ -217,30 +223,38 @@ def robust_scale(residuals: np.ndarray) -> float:
 def estimate(
     model: Model,
     segments: Sequence[Segment],
-    starts: Iterable[np.ndarray],
+    starts: Sequence[np.ndarray],
     on_start: Callable[[], None] = lambda: None,
     most: int = 40,
+    scale: float | None = None,
 ) -> tuple[Fit, tuple[Fit, ...]]:
     """Fit a model to segments.
 
     Args:
         model: the model.
         segments: at least one.
-        starts: of the parameters, each (p,).
+        starts: of the parameters, each (p,). Several are screened, and the two that get farthest go on; a single one
+            is taken to be near, and its states and scale begin as it has them.
         on_start: called after each start.
         most: evaluations for each start.
+        scale: of a single start: residuals beyond this count less, in standard deviations of the sensor.
 
     Returns:
         The best fit, and what each start led to.
     """
+    if len(starts) == 1:
+        states = [settled_state(model, starts[0], one) for one in segments]
+        best = _refined(model, segments, starts[0], states, most, scale)
+        on_start()
+        return best, (best,)
     found = []
     for start in starts:
-        found.append(_refined(model, segments, start, [segment.state for segment in segments], min(SCREENING, most)))
+        found.append(_refined(model, segments, start, [segment.state for segment in segments], SCREENING))
         on_start()
-    scale = min(one.scale for one in found)
-    found.sort(key=lambda one: robust_cost(np.concatenate(one.residuals), scale))
+    least = min(one.scale for one in found)
+    found.sort(key=lambda one: robust_cost(np.concatenate(one.residuals), least))
     polished = [_refined(model, segments, one.values, one.states, most, one.scale) for one in found[:2]]
-    best = min(polished, key=lambda one: robust_cost(np.concatenate(one.residuals), scale))
+    best = min(polished, key=lambda one: robust_cost(np.concatenate(one.residuals), least))
     return best, tuple(found)
 
 
@@ -252,19 +266,17 @@ def _refined(
     most: int,
     scale: float | None = None,
 ) -> Fit:
-    """A fit from a start; the states begin from what is known of them, or from the segments' own where that is better.
+    """A fit from a start and states; without a scale that of what they leave.
 
-    Dry friction gives a segment several minima: the one that it was in under other parameters need not be the best.
+    In the end each state is also looked for from the segment's own guess: dry friction gives a segment several minima,
+    and the one that it was in under other parameters need not be the best.
     """
     values = np.clip(start, model.lower, model.upper)
-    problem = _Problem(model, segments, scale or 1.0)
-    problem.known = list(states)
     if scale is None:
         simulate = model.at(values)
-        raw = [_residuals(simulate, one, state) for one, state in zip(segments, states, strict=True)]
-        problem.scale = robust_scale(np.concatenate(raw))
-    else:
-        problem.reconsider(values)
+        left = [_residuals(simulate, one, state) for one, state in zip(segments, states, strict=True)]
+        scale = robust_scale(np.concatenate(left))
+    problem = _Problem(model, segments, states, scale)
     values = _minimise(problem, values, most)
     problem.scale = robust_scale(problem.residuals(values))
     problem.reconsider(values)
