@@ -7,7 +7,7 @@ handful of unknowns however many segments there are.
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -87,27 +87,36 @@ def _residuals(simulate: Simulate, segment: Segment, state: np.ndarray) -> np.nd
     return found if found @ found < FAR else np.clip(np.nan_to_num(found, nan=1e9), -1e9, 1e9)
 
 
+class _Settled(NamedTuple):
+    """A segment from the state from which it fits best."""
+
+    state: np.ndarray
+    residuals: np.ndarray
+    columns: np.ndarray
+    """How these change with the state, shape (m, s)."""
+
+    def cost(self, scale: float) -> float:
+        return robust_cost(self.residuals, scale)
+
+
 def _settle(
     simulate: Simulate, segment: Segment, state: np.ndarray, steps: np.ndarray, scale: float, most: int = 4
-) -> tuple[np.ndarray, np.ndarray]:
-    """The state from which a segment fits best, and its residuals."""
-    residuals = _residuals(simulate, segment, state)
-    cost = robust_cost(residuals, scale)
+) -> _Settled:
+    here = _residuals(simulate, segment, state)
     for _ in range(most):
-        root = (1.0 + (residuals / scale) ** 2) ** -0.25
-        columns = _state_columns(simulate, segment, state, steps, residuals)
-        step = np.linalg.lstsq(root[:, None] * columns, -root * residuals, rcond=1e-9)[0]
+        columns = _state_columns(simulate, segment, state, steps, here)
+        root, cost = (1.0 + (here / scale) ** 2) ** -0.25, robust_cost(here, scale)
+        step = np.linalg.lstsq(root[:, None] * columns, -root * here, rcond=1e-9)[0]
         if np.sum((root * (columns @ step)) ** 2) < 1e-6 * cost:  # all that it could gain
             break
         for share in (1.0, 0.25):
             tried = _residuals(simulate, segment, state + share * step)
-            lower = robust_cost(tried, scale)
-            if lower < cost:
+            if robust_cost(tried, scale) < cost:
                 break
         else:
             break
-        state, residuals, cost = state + share * step, tried, lower
-    return state, residuals
+        state, here = state + share * step, tried
+    return _Settled(state, here, columns)
 
 
 def _state_columns(
@@ -125,7 +134,7 @@ def settled_state(model: Model, values: np.ndarray, segment: Segment) -> np.ndar
     """The state from which a segment fits best, by the parameters (p,)."""
     simulate = model.at(values)
     scale = robust_scale(_residuals(simulate, segment, segment.state))
-    return _settle(simulate, segment, segment.state, model.steps, scale)[0]
+    return _settle(simulate, segment, segment.state, model.steps, scale).state
 
 
 def settled(model: Model, values: np.ndarray, segments: Sequence[Segment]) -> list[np.ndarray]:
@@ -140,50 +149,41 @@ class _Problem:
     def __init__(self, model: Model, segments: Sequence[Segment], states: Sequence[np.ndarray], scale: float) -> None:
         self.model, self.segments, self.scale = model, segments, scale
         self.known = list(states)
-        self.slopes: list[np.ndarray] = []  # of the states by the parameters, at
-        self.origin = np.zeros(0)
-        self.at: tuple[bytes, list[np.ndarray], list[np.ndarray]] | None = None
+        self.slopes = [np.zeros((len(one), len(model.names))) for one in states]  # of the states by the parameters, at
+        self.origin = np.zeros(len(model.names))
+        self.at: tuple[bytes, list[_Settled]] = b"", []
 
-    def solve(self, values: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        if self.at is None or self.at[0] != values.tobytes():
-            simulate, steps = self.model.at(values), self.model.steps
-            states = self.known
-            if self.slopes:
-                moved = values - self.origin
-                states = [one + slope @ moved for one, slope in zip(self.known, self.slopes, strict=True)]
-            pairs = [
-                _settle(simulate, segment, state, steps, self.scale)
-                for segment, state in zip(self.segments, states, strict=True)
-            ]
-            self.at = values.tobytes(), [state for state, _ in pairs], [residuals for _, residuals in pairs]
-        return self.at[1], self.at[2]
+    def settle(self, values: np.ndarray, states: Sequence[np.ndarray]) -> list[_Settled]:
+        simulate, steps = self.model.at(values), self.model.steps
+        return [_settle(simulate, *pair, steps, self.scale) for pair in zip(self.segments, states, strict=True)]
+
+    def solve(self, values: np.ndarray) -> list[_Settled]:
+        if self.at[0] != values.tobytes():
+            moved = values - self.origin
+            states = [one + slope @ moved for one, slope in zip(self.known, self.slopes, strict=True)]
+            self.at = values.tobytes(), self.settle(values, states)
+        return self.at[1]
 
     def reconsider(self, values: np.ndarray) -> None:
         """Begin each segment from where it fits best: what is known, or its own guess."""
-        simulate, steps = self.model.at(values), self.model.steps
-        for place, segment in enumerate(self.segments):
-            pairs = [
-                _settle(simulate, segment, state, steps, self.scale) for state in (self.known[place], segment.state)
-            ]
-            self.known[place] = min(pairs, key=lambda pair: robust_cost(pair[1], self.scale))[0]
-        self.at, self.slopes = None, []
+        both = zip(self.solve(values), self.settle(values, [one.state for one in self.segments]), strict=True)
+        self.at = values.tobytes(), [min(pair, key=lambda one: one.cost(self.scale)) for pair in both]
 
     def residuals(self, values: np.ndarray) -> np.ndarray:
-        return np.concatenate(self.solve(values)[1])
+        return np.concatenate([one.residuals for one in self.solve(values)])
 
     def jacobians(self, values: np.ndarray) -> list[np.ndarray]:
-        states, residuals = self.solve(values)
-        self.known, self.slopes, self.origin = states, [], values.copy()
+        found = self.solve(values)
+        self.known, self.slopes, self.origin = [one.state for one in found], [], values.copy()
         model, made = self.model, []
         inward = np.where(values + DIFFERENCE * model.scales > model.upper, -1.0, 1.0)
         moves = np.diag(inward * DIFFERENCE * model.scales)
-        here, moved = model.at(values), [model.at(values + move) for move in moves]
-        for segment, state, found in zip(self.segments, states, residuals, strict=True):
-            columns = np.empty((len(found), len(values)))
+        moved = [model.at(values + move) for move in moves]
+        for segment, (state, residuals, own) in zip(self.segments, found, strict=True):
+            columns = np.empty((len(residuals), len(values)))
             for place, (simulate, move) in enumerate(zip(moved, moves, strict=True)):
-                columns[:, place] = (_residuals(simulate, segment, state) - found) / move.sum()
-            own = _state_columns(here, segment, state, model.steps, found)
-            root = ((1.0 + (found / self.scale) ** 2) ** -0.25)[:, None]
+                columns[:, place] = (_residuals(simulate, segment, state) - residuals) / move.sum()
+            root = ((1.0 + (residuals / self.scale) ** 2) ** -0.25)[:, None]
             self.slopes.append(-np.linalg.lstsq(root * own, root * columns, rcond=1e-9)[0])
             made.append(columns + own @ self.slopes[-1])
         return made
@@ -281,6 +281,6 @@ def _refined(
     problem.scale = robust_scale(problem.residuals(values))
     problem.reconsider(values)
     jacobians = problem.jacobians(values)
-    at, residuals = problem.solve(values)
+    states, residuals, _ = zip(*problem.solve(values), strict=True)
     cost = robust_cost(np.concatenate(residuals), problem.scale)
-    return Fit(model.names, values, cost, problem.scale, tuple(residuals), tuple(jacobians), tuple(at))
+    return Fit(model.names, values, cost, problem.scale, residuals, tuple(jacobians), states)
