@@ -26,7 +26,7 @@ SLACK = 1e-3
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Spread:
-    """Half-widths of 95 % intervals by cause, each of shape (p,)."""
+    """Half-widths of 95 % intervals by cause, each of shape (q,), of `of` @ parameters with `of` of shape (q, p)."""
 
     curvature: np.ndarray
     resampling: np.ndarray
@@ -72,8 +72,8 @@ def _inverse(matrix: np.ndarray, scales: np.ndarray) -> np.ndarray:
     return np.asarray((vectors / np.maximum(values, FLAT)) @ vectors.T * np.outer(units, units))
 
 
-def resampling(fit: Fit, segments: Sequence[Segment], scales: np.ndarray, seed: int) -> np.ndarray:
-    """Half-widths, shape (p,), by refits of stretches drawn with replacement, each a Gauss-Newton step from the fit.
+def resampling(fit: Fit, segments: Sequence[Segment], scales: np.ndarray, of: np.ndarray, seed: int) -> np.ndarray:
+    """Half-widths, shape (q,), by refits of stretches drawn with replacement, each a Gauss-Newton step from the fit.
 
     Few stretches tell little of how they differ: percentiles are stretched to Student's.
     """
@@ -84,28 +84,28 @@ def resampling(fit: Fit, segments: Sequence[Segment], scales: np.ndarray, seed: 
     gradients, matrices = _sums(fit, groups)
     count = len(gradients)
     if count < 2:
-        return np.full(len(fit.values), np.inf)
+        return np.full(len(of), np.inf)
     drawn = np.random.default_rng(seed).multinomial(count, np.full(count, 1.0 / count), DRAWS)
-    moved = [-_inverse(np.tensordot(times, matrices, 1), scales) @ (times @ gradients) for times in drawn]
-    low, high = np.percentile(moved, [2.5, 97.5], axis=0)
+    moved = np.array([_inverse(np.tensordot(times, matrices, 1), scales) @ (times @ -gradients) for times in drawn])
+    low, high = np.percentile(moved @ of.T, [2.5, 97.5], axis=0)
     few = t.ppf(0.975, count - 1) / t.ppf(0.975, 1e6) * np.sqrt(count / (count - 1.0))
     return np.asarray(np.maximum(-low, high) * few)
 
 
-def curvature(fit: Fit, segments: Sequence[Segment], scales: np.ndarray) -> np.ndarray:
-    """Half-widths, shape (p,), were the model exact and each residual by itself: never less, however few the blocks."""
+def curvature(fit: Fit, segments: Sequence[Segment], scales: np.ndarray, of: np.ndarray) -> np.ndarray:
+    """Half-widths, shape (q,), were the model exact and each residual by itself: never less, however few the blocks."""
     _, matrices = _sums(fit, [segment.block for segment in segments])
     noise = float(np.mean(np.concatenate([fit.weights(i) * r**2 for i, r in enumerate(fit.residuals)])))
-    return np.asarray(1.96 * np.sqrt(noise * np.diag(_inverse(matrices.sum(axis=0), scales))))
+    return np.asarray(1.96 * np.sqrt(noise * np.diag(of @ _inverse(matrices.sum(axis=0), scales) @ of.T)))
 
 
-def between_logs(fit: Fit, segments: Sequence[Segment], scales: np.ndarray) -> np.ndarray:
-    """Half-widths, shape (p,), by how the logs pull: two standard deviations of their mean; 0 for a single log."""
+def between_logs(fit: Fit, segments: Sequence[Segment], scales: np.ndarray, of: np.ndarray) -> np.ndarray:
+    """Half-widths, shape (q,), by how the logs pull: two standard deviations of their mean; 0 for a single log."""
     gradients, matrices = _sums(fit, [segment.log for segment in segments])
     count = len(gradients)
     if count < 2:
-        return np.zeros(len(fit.values))
-    pulls = count * gradients @ _inverse(matrices.sum(axis=0), scales)
+        return np.zeros(len(of))
+    pulls = count * gradients @ _inverse(matrices.sum(axis=0), scales) @ of.T
     return np.asarray(2.0 * pulls.std(axis=0, ddof=1) / np.sqrt(count))
 
 
