@@ -195,7 +195,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=100)
     parser.add_argument("--faults", action="store_true")
-    parser.add_argument("--only", nargs="*", help="rows whose names begin so")
+    parser.add_argument("--only", nargs="*", help="rows, by their whole names")
     parser.add_argument("--log", type=Path, help="file with a line for each draw, from which a run goes on")
     options = parser.parse_args()
     rows = FAULTS if options.faults else {name: lambda draw, row=row: logged(draw, **row) for name, row in ROWS.items()}
@@ -204,7 +204,7 @@ def main():
     print(f"of {options.draws} draws: identified, of these within the interval, largest error; rough: the same")
     print(f"| | {' | '.join(NAMES)} | beyond the goal | said |\n| --- | {'--- | ' * (len(NAMES) + 1)}--- |")
     for name, make in rows.items():
-        if options.only and not name.startswith(tuple(options.only)):
+        if options.only and name not in options.only:
             continue
         for draw in range(options.draws):
             if (name, draw) not in known:
