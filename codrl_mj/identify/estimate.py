@@ -196,7 +196,7 @@ def _minimise(problem: _Problem, start: np.ndarray, most: int) -> np.ndarray:
     from scipy.optimize import least_squares
 
     model = problem.model
-    if not model.names:
+    if not model.names or not most:
         return start
     inside = np.clip(start, model.lower + 1e-9 * model.scales, model.upper - 1e-9 * model.scales)
     found = least_squares(
@@ -236,7 +236,7 @@ def estimate(
         starts: of the parameters, each (p,). Several are screened, and the two that get farthest go on; a single one
             is taken to be near, and its states and scale begin as it has them.
         on_start: called after each start.
-        most: evaluations for each start.
+        most: evaluations for each start; 0: the fit is the start.
         scale: of a single start: residuals beyond this count less, in standard deviations of the sensor.
 
     Returns:
@@ -281,6 +281,13 @@ def _refined(
     problem.scale = robust_scale(problem.residuals(values))
     problem.reconsider(values)
     jacobians = problem.jacobians(values)
-    states, residuals, _ = zip(*problem.solve(values), strict=True)
-    cost = robust_cost(np.concatenate(residuals), problem.scale)
-    return Fit(model.names, values, cost, problem.scale, residuals, tuple(jacobians), states)
+    found = problem.solve(values)
+    return Fit(
+        model.names,
+        values,
+        robust_cost(np.concatenate([one.residuals for one in found]), problem.scale),
+        problem.scale,
+        tuple(one.residuals for one in found),
+        tuple(jacobians),
+        tuple(one.state for one in found),
+    )

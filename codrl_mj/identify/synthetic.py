@@ -167,7 +167,7 @@ def moved(drive: Drive, load: Load) -> simulation.Moved:
 
 def simulate(
     drive: Drive,
-    excitation: Excitation,
+    excitation: Excitation | np.ndarray,
     load: Load = FREE,
     sensors: Mapping[str, Sensor] | None = None,
     sampler: Sampler = Sampler(),
@@ -179,7 +179,7 @@ def simulate(
 
     Args:
         drive: see `run`.
-        excitation: the voltage.
+        excitation: the voltage, see `run`.
         load: what the output moves.
         sensors: by signal; those that are not named show what is. The voltage is the one asked for, without the
             supply's sag, and the torque n*kT*i.
