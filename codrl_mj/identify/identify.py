@@ -15,7 +15,7 @@ from codrl_mj.identify.parameters import DEFAULTS, ESTIMABLE, FRICTION, OF_RIG, 
 from codrl_mj.identify.prediction import Prediction, predict
 from codrl_mj.identify.result import Estimate, Identified, Status
 from codrl_mj.identify.segments import BLOCK, SEGMENT, moves, shifted
-from codrl_mj.identify.stages import Fitted, Shaft, Winding, fitted
+from codrl_mj.identify.stages import PART, Fitted, Shaft, Winding, fitted
 from codrl_mj.identify.traces import correlations, fitted_traces
 
 WIDEST = 0.3
@@ -27,7 +27,7 @@ NARROWEST = 0.002
 NARROWEST_OF = {"inductance": 0.02}
 """What comes of a fifth of a row's time: neither stamps nor a held back-EMF are better."""
 NARROW = 0.1
-"""Friction whose interval is at most this share of itself, and not only of all friction, is no rough number."""
+"""Friction whose interval is a larger share of itself is a rough number: what is sure is how much of all it may be."""
 BIASED = 0.5
 """The self-test fails where it is off by more than this share of the widest interval."""
 STEPS_OF_A_STAGE = 8 + 4
@@ -245,7 +245,7 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
         for name, value in zip(fit.names, fit.values, strict=True)
     ]
     scales = np.maximum(scales, 1e-6 * model.scales)
-    slopes = [friction.slopes.get(name, 0.0) for name in fit.names]
+    slopes = np.array([friction.slopes.get(name, 0.0) for name in fit.names])
     names, of = fit.names, np.eye(len(fit.names))
     values, sizes, units = fit.values, scales, model.scales
     if any(slopes):
@@ -265,10 +265,17 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
     spread = honesty.Spread(curved, resampled, logs, np.abs(tested - values), rate, lost * np.abs(values))
     directions = part.unknown_directions(scales)
     on_step()
+    for direction in directions if any(slopes) else ():
+        changes = np.array([direction.get(name, 0.0) for name in fit.names]) * scales
+        if abs(share := float(slopes @ changes / sizes[-1])) > PART:
+            direction["friction_torque"] = share
     made = []
-    for place, (name, value) in enumerate(zip(names, map(float, values), strict=True)):
-        half = math.hypot(float(spread.total[place]), NARROWEST_OF.get(name, NARROWEST) * value)
+    halves = np.hypot(spread.total, [NARROWEST_OF.get(name, NARROWEST) for name in names] * values)
+    summed = any(slopes) and bool(halves[-1] <= NARROW * values[-1])
+    for place, (name, value, half) in enumerate(zip(names, map(float, values), map(float, halves), strict=True)):
         widest = WIDEST_OF.get(name, WIDEST) if isinstance(part.stage, Winding) else WIDEST
+        if name in FRICTION and summed:  # what one takes too little of, the other takes
+            widest = 1.0
         least, most = PARAMETERS[name].least, PARAMETERS[name].most
         causes = {field: float(getattr(spread, field)[place]) for field in vars(spread)}
         share = half / sizes[place]
@@ -295,10 +302,8 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
             whole = "all friction" if name in FRICTION else "it"
             why = f"its interval is {100.0 * share:.3g} % of {whole} to either side, above all by {worst}"
         elif name in FRICTION and not half <= NARROW * abs(value - none):
-            status, why = (
-                "rough",
-                f"its interval is {100.0 * share:.3g} % of all friction to either side, not of itself",
-            )
+            status = "rough"
+            why = f"its interval is {100.0 * share:.3g} % of all friction to either side, and more of itself"
         made.append(Estimate(name, value, max(value - half, least), min(value + half, most), status, why, causes))
     return made
 
