@@ -151,7 +151,7 @@ class _Problem:
         self.known = list(states)
         self.slopes = [np.zeros((len(one), len(model.names))) for one in states]  # of the states by the parameters, at
         self.origin = np.zeros(len(model.names))
-        self.at: tuple[bytes, list[_Settled]] = b"", []
+        self.at: tuple[bytes | None, list[_Settled]] = None, []
 
     def settle(self, values: np.ndarray, states: Sequence[np.ndarray]) -> list[_Settled]:
         simulate, steps = self.model.at(values), self.model.steps
