@@ -252,17 +252,16 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
         names, of = (*names, "friction_torque"), np.vstack([of, slopes])
         values = np.append(values, friction.torque)
         sizes, units = (np.append(one, friction.all_of("friction_torque")) for one in (sizes, units))
-    resampled = honesty.resampling(fit, part.segments, scales, of, seed)
-    logs = honesty.between_logs(fit, part.segments, scales, of)
+    causes = honesty.half_widths(fit, part.segments, scales, of, seed)
     on_step()
     tested = values + of @ (part.self_test() - fit.values)
     on_step()
     # an error that goes with a row's time is half as large at the rate of the logs, one with its root more than that
-    rate = (2.0 if isinstance(part.stage, Winding) else 1.0) * np.abs(of @ (part.half_rate() - fit.values))
+    electrical = isinstance(part.stage, Winding)
+    causes["half_rate"] = (2.0 if electrical else 1.0) * np.abs(of @ (part.half_rate() - fit.values))
     on_step()
-    curved = honesty.curvature(fit, part.segments, scales, of)
-    lost = honesty.unexplained(fit, part.segments) if isinstance(part.stage, Winding) else 0.0
-    spread = honesty.Spread(curved, resampled, logs, np.abs(tested - values), rate, lost * np.abs(values))
+    causes["self_test"] = np.abs(tested - values)
+    causes["unexplained"] = np.abs(values) * (honesty.unexplained(fit, part.segments) if electrical else 0.0)
     directions = part.unknown_directions(scales)
     on_step()
     for direction in directions if any(slopes) else ():
@@ -270,20 +269,20 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
         if abs(share := float(slopes @ changes / sizes[-1])) > PART:
             direction["friction_torque"] = share
     made = []
-    halves = np.hypot(spread.total, [NARROWEST_OF.get(name, NARROWEST) for name in names] * values)
+    halves = np.hypot(honesty.total(causes), [NARROWEST_OF.get(name, NARROWEST) for name in names] * values)
     summed = any(slopes) and bool(halves[-1] <= NARROW * values[-1])
     for place, (name, value, half) in enumerate(zip(names, map(float, values), map(float, halves), strict=True)):
-        widest = WIDEST_OF.get(name, WIDEST) if isinstance(part.stage, Winding) else WIDEST
+        widest = WIDEST_OF.get(name, WIDEST) if electrical else WIDEST
         if name in FRICTION and summed:  # what one takes too little of, the other takes
             widest = 1.0
         least, most = PARAMETERS[name].least, PARAMETERS[name].most
-        causes = {field: float(getattr(spread, field)[place]) for field in vars(spread)}
+        by_cause = {cause: float(several[place]) for cause, several in causes.items()}
         share = half / sizes[place]
         own = [direction for direction in directions if name in direction]
         none = most if name == "gear_efficiency" else least
         nothing = name in FRICTION and abs(value - none) <= AT_BOUND * units[place]
         at_bound = min(value - least, most - value) <= AT_BOUND * units[place]
-        worst = max(causes, key=lambda cause: causes[cause]).replace("_", " ")
+        worst = max(by_cause, key=lambda cause: by_cause[cause]).replace("_", " ")
         status: Status = "identified"
         why = ""
         if own and (len(own[0]) > 1):
@@ -292,9 +291,9 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
             status, why = "unidentifiable", "the logs are as likely whatever it is"
         elif at_bound and not nothing:
             status, why = "refused", f"it ended at its bound, {value:g} {PARAMETERS[name].unit}".strip()
-        elif math.isinf(causes["resampling"]):
+        elif math.isinf(by_cause["resampling"]):
             status, why = "refused", f"there are no two stretches of {BLOCK:g} s to resample: give a longer log"
-        elif not causes["self_test"] <= BIASED * widest * sizes[place]:
+        elif not by_cause["self_test"] <= BIASED * widest * sizes[place]:
             status = "refused"
             why = f"the self-test finds {tested[place]:.4g} where the fit that it simulates has {value:.4g}"
         elif not share <= widest:
@@ -304,7 +303,7 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
         elif name in FRICTION and not half <= NARROW * abs(value - none):
             status = "rough"
             why = f"its interval is {100.0 * share:.3g} % of all friction to either side, and more of itself"
-        made.append(Estimate(name, value, max(value - half, least), min(value + half, most), status, why, causes))
+        made.append(Estimate(name, value, max(value - half, least), min(value + half, most), status, why, by_cause))
     return made
 
 

@@ -224,7 +224,7 @@ def test_what_is_known_worst_is_not_lost_beside_what_is_known_best():
     residuals = random.standard_normal(2 * rows)
     fit = Fit(("a", "b"), np.ones(2), 0.0, 1e9, (residuals,), (jacobian,), (np.zeros(1),))
     segment = SimpleNamespace(block=0, log=0)
-    found = honesty.curvature(fit, [segment], np.ones(2), np.eye(2))
+    found = honesty.half_widths(fit, [segment], np.ones(2), np.eye(2), 0)["curvature"]
     np.testing.assert_allclose(found, [1.96e-6, 1.96 * 0.05], rtol=0.05)
 
 
