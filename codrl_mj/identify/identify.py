@@ -264,10 +264,11 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
     causes["unexplained"] = np.abs(values) * (honesty.unexplained(fit, part.segments) if electrical else 0.0)
     directions = part.unknown_directions(scales)
     on_step()
-    for direction in directions if any(slopes) else ():
-        changes = np.array([direction.get(name, 0.0) for name in fit.names]) * scales
-        if abs(share := float(slopes @ changes / sizes[-1])) > PART:
-            direction["friction_torque"] = share
+    together = [
+        {**one, "friction_torque": change}
+        for one in directions
+        if abs(change := float(slopes * scales @ [one.get(name, 0.0) for name in fit.names] / sizes[-1])) > PART
+    ]
     made = []
     halves = np.hypot(honesty.total(causes), [NARROWEST_OF.get(name, NARROWEST) for name in names] * values)
     summed = any(slopes) and bool(halves[-1] <= NARROW * values[-1])
@@ -278,7 +279,7 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
         least, most = PARAMETERS[name].least, PARAMETERS[name].most
         by_cause = {cause: float(several[place]) for cause, several in causes.items()}
         share = half / sizes[place]
-        own = [direction for direction in directions if name in direction]
+        own = together if name == "friction_torque" else [one for one in directions if name in one]
         none = most if name == "gear_efficiency" else least
         nothing = name in FRICTION and abs(value - none) <= AT_BOUND * units[place]
         at_bound = min(value - least, most - value) <= AT_BOUND * units[place]
@@ -302,7 +303,8 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
             why = f"its interval is {100.0 * share:.3g} % of {whole} to either side, above all by {worst}"
         elif name in FRICTION and not half <= NARROW * abs(value - none):
             status = "rough"
-            why = f"its interval is {100.0 * share:.3g} % of all friction to either side, and more of itself"
+            why = f"its interval is {100.0 * share:.3g} % of all friction to either side"
+            why += ", and more of itself" if name != "friction_torque" else ""
         made.append(Estimate(name, value, max(value - half, least), min(value + half, most), status, why, by_cause))
     return made
 
