@@ -102,6 +102,7 @@ class _Settled(NamedTuple):
 def _settle(
     simulate: Simulate, segment: Segment, state: np.ndarray, steps: np.ndarray, scale: float, most: int = 4
 ) -> _Settled:
+    """The segment from the best state near one, by Gauss-Newton steps that are cut where they are too long."""
     here = _residuals(simulate, segment, state)
     for _ in range(most):
         columns = _state_columns(simulate, segment, state, steps, here)
@@ -144,7 +145,7 @@ def settled(model: Model, values: np.ndarray, segments: Sequence[Segment]) -> li
 
 
 class _Problem:
-    """The outer problem, as scipy takes it; remembers the states of the point that it last took a Jacobian at."""
+    """The outer problem, as scipy takes it; begins from the states at the last Jacobian, moved as that says."""
 
     def __init__(self, model: Model, segments: Sequence[Segment], states: Sequence[np.ndarray], scale: float) -> None:
         self.model, self.segments, self.scale = model, segments, scale
