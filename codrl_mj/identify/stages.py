@@ -232,7 +232,7 @@ def fitted(stage: Stage, logs: Sequence[Log], on_step: Callable[[], None] = lamb
         """Their costs; returns the best delay that is believed."""
         for one in delays:
             segments = stage.build(late(one))[0]
-            costs[one] = _costs(estimate(model, segments, [fit.values], on_step, 6, fit.scale)[0], fit.scale)
+            costs[one] = _costs(estimate(model, segments, [fit.values], on_step, 20, fit.scale)[0], fit.scale)
         best = min(costs, key=lambda one: costs[one].sum())
         return best if _better(costs[best], costs[0]) else 0
 
