@@ -159,6 +159,7 @@ def print_identified(found: Any) -> None:
 
     from codrl_mj.cli.look import titled_table
     from codrl_mj.cli.terminal import console
+    from codrl_mj.identify.result import USABLE
 
     table = titled_table(f"Identified from {', '.join(found.logs)}")
     for name in ("parameter", "value", "95 % interval", "unit", "status", "why"):
@@ -166,7 +167,7 @@ def print_identified(found: Any) -> None:
     for one in found.estimates:
         interval = "" if one.status == "given" else f"{one.low:.4g} to {one.high:.4g}"
         texts = one.name, f"{one.value:.4g}", interval, one.unit, one.status, one.why
-        table.add_row(*map(escape, texts), style="" if one.status in ("identified", "given") else "yellow")
+        table.add_row(*map(escape, texts), style="" if one.status in USABLE else "yellow")
     console().print(table)
     if found.fitted or found.held_out:
         units = {"position": "rad", "velocity": "rad/s"}

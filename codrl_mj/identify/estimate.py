@@ -6,8 +6,8 @@ handful of unknowns however many segments there are.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Callable, Mapping, Sequence
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,7 @@ DIFFERENCE = 1e-4
 """Step of finite differences, in the parameters' scales: dry friction makes smaller ones rough."""
 FAR = 1e30
 SCREENING = 12
-"""Evaluations from each start; the two that get farthest go on."""
+"""Evaluations from each of several starts."""
 Simulate = Callable[[Segment, np.ndarray], np.ndarray]
 
 
@@ -87,27 +87,37 @@ def _residuals(simulate: Simulate, segment: Segment, state: np.ndarray) -> np.nd
     return found if found @ found < FAR else np.clip(np.nan_to_num(found, nan=1e9), -1e9, 1e9)
 
 
+class _Settled(NamedTuple):
+    """A segment from the state from which it fits best."""
+
+    state: np.ndarray
+    residuals: np.ndarray
+    columns: np.ndarray
+    """How these change with the state, shape (m, s)."""
+
+    def cost(self, scale: float) -> float:
+        return robust_cost(self.residuals, scale)
+
+
 def _settle(
     simulate: Simulate, segment: Segment, state: np.ndarray, steps: np.ndarray, scale: float, most: int = 4
-) -> tuple[np.ndarray, np.ndarray]:
-    """The state from which a segment fits best, and its residuals."""
-    residuals = _residuals(simulate, segment, state)
-    cost = robust_cost(residuals, scale)
+) -> _Settled:
+    """The segment from the best state near one, by Gauss-Newton steps that are cut where they are too long."""
+    here = _residuals(simulate, segment, state)
     for _ in range(most):
-        root = (1.0 + (residuals / scale) ** 2) ** -0.25
-        columns = _state_columns(simulate, segment, state, steps, residuals)
-        step = np.linalg.lstsq(root[:, None] * columns, -root * residuals, rcond=1e-9)[0]
+        columns = _state_columns(simulate, segment, state, steps, here)
+        root, cost = (1.0 + (here / scale) ** 2) ** -0.25, robust_cost(here, scale)
+        step = np.linalg.lstsq(root[:, None] * columns, -root * here, rcond=1e-9)[0]
+        if np.sum((root * (columns @ step)) ** 2) < 1e-6 * cost:  # all that it could gain
+            break
         for share in (1.0, 0.25):
             tried = _residuals(simulate, segment, state + share * step)
-            lower = robust_cost(tried, scale)
-            if lower < cost:
+            if robust_cost(tried, scale) < cost:
                 break
         else:
             break
-        state, residuals, gained, cost = state + share * step, tried, cost - lower, lower
-        if gained < 1e-6 * cost:
-            break
-    return state, residuals
+        state, here = state + share * step, tried
+    return _Settled(state, here, columns)
 
 
 def _state_columns(
@@ -125,7 +135,7 @@ def settled_state(model: Model, values: np.ndarray, segment: Segment) -> np.ndar
     """The state from which a segment fits best, by the parameters (p,)."""
     simulate = model.at(values)
     scale = robust_scale(_residuals(simulate, segment, segment.state))
-    return _settle(simulate, segment, segment.state, model.steps, scale)[0]
+    return _settle(simulate, segment, segment.state, model.steps, scale).state
 
 
 def settled(model: Model, values: np.ndarray, segments: Sequence[Segment]) -> list[np.ndarray]:
@@ -135,51 +145,48 @@ def settled(model: Model, values: np.ndarray, segments: Sequence[Segment]) -> li
 
 
 class _Problem:
-    """The outer problem, as scipy takes it; remembers the states of the point that it last took a Jacobian at."""
+    """The outer problem, as scipy takes it; begins from the states at the last Jacobian, moved as that says."""
 
-    def __init__(self, model: Model, segments: Sequence[Segment], scale: float) -> None:
+    def __init__(self, model: Model, segments: Sequence[Segment], states: Sequence[np.ndarray], scale: float) -> None:
         self.model, self.segments, self.scale = model, segments, scale
-        self.known = [segment.state for segment in segments]
-        self.at: tuple[bytes, list[np.ndarray], list[np.ndarray]] | None = None
+        self.known = list(states)
+        self.slopes = [np.zeros((len(one), len(model.names))) for one in states]  # of the states by the parameters, at
+        self.origin = np.zeros(len(model.names))
+        self.at: tuple[bytes | None, list[_Settled]] = None, []
 
-    def solve(self, values: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        if self.at is None or self.at[0] != values.tobytes():
-            simulate, steps = self.model.at(values), self.model.steps
-            pairs = [
-                _settle(simulate, segment, state, steps, self.scale)
-                for segment, state in zip(self.segments, self.known, strict=True)
-            ]
-            self.at = values.tobytes(), [state for state, _ in pairs], [residuals for _, residuals in pairs]
-        return self.at[1], self.at[2]
+    def settle(self, values: np.ndarray, states: Sequence[np.ndarray]) -> list[_Settled]:
+        simulate, steps = self.model.at(values), self.model.steps
+        return [_settle(simulate, *pair, steps, self.scale) for pair in zip(self.segments, states, strict=True)]
+
+    def solve(self, values: np.ndarray) -> list[_Settled]:
+        if self.at[0] != values.tobytes():
+            moved = values - self.origin
+            states = [one + slope @ moved for one, slope in zip(self.known, self.slopes, strict=True)]
+            self.at = values.tobytes(), self.settle(values, states)
+        return self.at[1]
 
     def reconsider(self, values: np.ndarray) -> None:
         """Begin each segment from where it fits best: what is known, or its own guess."""
-        simulate, steps = self.model.at(values), self.model.steps
-        for place, segment in enumerate(self.segments):
-            pairs = [
-                _settle(simulate, segment, state, steps, self.scale) for state in (self.known[place], segment.state)
-            ]
-            self.known[place] = min(pairs, key=lambda pair: robust_cost(pair[1], self.scale))[0]
-        self.at = None
+        both = zip(self.solve(values), self.settle(values, [one.state for one in self.segments]), strict=True)
+        self.at = values.tobytes(), [min(pair, key=lambda one: one.cost(self.scale)) for pair in both]
 
     def residuals(self, values: np.ndarray) -> np.ndarray:
-        return np.concatenate(self.solve(values)[1])
+        return np.concatenate([one.residuals for one in self.solve(values)])
 
     def jacobians(self, values: np.ndarray) -> list[np.ndarray]:
-        states, residuals = self.solve(values)
-        self.known = states
+        found = self.solve(values)
+        self.known, self.slopes, self.origin = [one.state for one in found], [], values.copy()
         model, made = self.model, []
         inward = np.where(values + DIFFERENCE * model.scales > model.upper, -1.0, 1.0)
         moves = np.diag(inward * DIFFERENCE * model.scales)
-        here, moved = model.at(values), [model.at(values + move) for move in moves]
-        for segment, state, found in zip(self.segments, states, residuals, strict=True):
-            columns = np.empty((len(found), len(values)))
+        moved = [model.at(values + move) for move in moves]
+        for segment, (state, residuals, own) in zip(self.segments, found, strict=True):
+            columns = np.empty((len(residuals), len(values)))
             for place, (simulate, move) in enumerate(zip(moved, moves, strict=True)):
-                columns[:, place] = (_residuals(simulate, segment, state) - found) / move.sum()
-            own = _state_columns(here, segment, state, model.steps, found)
-            root = ((1.0 + (found / self.scale) ** 2) ** -0.25)[:, None]
-            shares = np.linalg.lstsq(root * own, root * columns, rcond=1e-9)[0]
-            made.append(columns - own @ shares)
+                columns[:, place] = (_residuals(simulate, segment, state) - residuals) / move.sum()
+            root = ((1.0 + (residuals / self.scale) ** 2) ** -0.25)[:, None]
+            self.slopes.append(-np.linalg.lstsq(root * own, root * columns, rcond=1e-9)[0])
+            made.append(columns + own @ self.slopes[-1])
         return made
 
     def jacobian(self, values: np.ndarray) -> np.ndarray:
@@ -190,7 +197,7 @@ def _minimise(problem: _Problem, start: np.ndarray, most: int) -> np.ndarray:
     from scipy.optimize import least_squares
 
     model = problem.model
-    if not model.names:
+    if not model.names or not most:
         return start
     inside = np.clip(start, model.lower + 1e-9 * model.scales, model.upper - 1e-9 * model.scales)
     found = least_squares(
@@ -217,30 +224,38 @@ def robust_scale(residuals: np.ndarray) -> float:
 def estimate(
     model: Model,
     segments: Sequence[Segment],
-    starts: Iterable[np.ndarray],
+    starts: Sequence[np.ndarray],
     on_start: Callable[[], None] = lambda: None,
     most: int = 40,
+    scale: float | None = None,
 ) -> tuple[Fit, tuple[Fit, ...]]:
     """Fit a model to segments.
 
     Args:
         model: the model.
         segments: at least one.
-        starts: of the parameters, each (p,).
+        starts: of the parameters, each (p,). Several are screened, and the two that get farthest go on; a single one
+            is taken to be near, and its states and scale begin as it has them.
         on_start: called after each start.
-        most: evaluations for each start.
+        most: evaluations for each start; 0: the fit is the start.
+        scale: of a single start: residuals beyond this count less, in standard deviations of the sensor.
 
     Returns:
         The best fit, and what each start led to.
     """
+    if len(starts) == 1:
+        states = [settled_state(model, starts[0], one) for one in segments]
+        best = _refined(model, segments, starts[0], states, most, scale)
+        on_start()
+        return best, (best,)
     found = []
     for start in starts:
-        found.append(_refined(model, segments, start, [segment.state for segment in segments], min(SCREENING, most)))
+        found.append(_refined(model, segments, start, [segment.state for segment in segments], SCREENING))
         on_start()
-    scale = min(one.scale for one in found)
-    found.sort(key=lambda one: robust_cost(np.concatenate(one.residuals), scale))
+    least = min(one.scale for one in found)
+    found.sort(key=lambda one: robust_cost(np.concatenate(one.residuals), least))
     polished = [_refined(model, segments, one.values, one.states, most, one.scale) for one in found[:2]]
-    best = min(polished, key=lambda one: robust_cost(np.concatenate(one.residuals), scale))
+    best = min(polished, key=lambda one: robust_cost(np.concatenate(one.residuals), least))
     return best, tuple(found)
 
 
@@ -252,23 +267,28 @@ def _refined(
     most: int,
     scale: float | None = None,
 ) -> Fit:
-    """A fit from a start; the states begin from what is known of them, or from the segments' own where that is better.
+    """A fit from a start and states; without a scale that of what they leave.
 
-    Dry friction gives a segment several minima: the one that it was in under other parameters need not be the best.
+    In the end each state is also looked for from the segment's own guess: dry friction gives a segment several minima,
+    and the one that it was in under other parameters need not be the best.
     """
     values = np.clip(start, model.lower, model.upper)
-    problem = _Problem(model, segments, scale or 1.0)
-    problem.known = list(states)
     if scale is None:
         simulate = model.at(values)
-        raw = [_residuals(simulate, one, state) for one, state in zip(segments, states, strict=True)]
-        problem.scale = robust_scale(np.concatenate(raw))
-    else:
-        problem.reconsider(values)
+        left = [_residuals(simulate, one, state) for one, state in zip(segments, states, strict=True)]
+        scale = robust_scale(np.concatenate(left))
+    problem = _Problem(model, segments, states, scale)
     values = _minimise(problem, values, most)
     problem.scale = robust_scale(problem.residuals(values))
     problem.reconsider(values)
     jacobians = problem.jacobians(values)
-    at, residuals = problem.solve(values)
-    cost = robust_cost(np.concatenate(residuals), problem.scale)
-    return Fit(model.names, values, cost, problem.scale, tuple(residuals), tuple(jacobians), tuple(at))
+    found = problem.solve(values)
+    return Fit(
+        model.names,
+        values,
+        robust_cost(np.concatenate([one.residuals for one in found]), problem.scale),
+        problem.scale,
+        tuple(one.residuals for one in found),
+        tuple(jacobians),
+        tuple(one.state for one in found),
+    )

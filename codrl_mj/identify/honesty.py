@@ -5,8 +5,7 @@ of the logs are resampled, and the interval is widened by what differs between l
 simulated and fitted again, and by what is found at half the rate.
 """
 
-import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -24,22 +23,10 @@ SLACK = 1e-3
 """Share of the cost that a fit may be better by luck: dry friction has many minima."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Spread:
-    """Half-widths of 95 % intervals by cause, each of shape (p,)."""
-
-    curvature: np.ndarray
-    resampling: np.ndarray
-    logs: np.ndarray
-    self_test: np.ndarray
-    half_rate: np.ndarray
-    unexplained: np.ndarray
-
-    @property
-    def total(self) -> np.ndarray:
-        """The largest of the first three, and what the rate does, as what is independent adds up; then the biases."""
-        wide = np.maximum(np.maximum(self.curvature, self.resampling), self.logs)
-        return np.asarray(np.sqrt(wide**2 + self.half_rate**2) + self.self_test + self.unexplained)
+def total(causes: Mapping[str, np.ndarray]) -> np.ndarray:
+    """The largest of three half-widths, and what the rate does, as what is independent adds up; then the biases."""
+    wide = np.max([causes["curvature"], causes["resampling"], causes["logs"]], axis=0)
+    return np.asarray(np.hypot(wide, causes["half_rate"]) + causes["self_test"] + causes["unexplained"])
 
 
 def unexplained(fit: Fit, segments: Sequence[Segment]) -> float:
@@ -64,6 +51,11 @@ def _sums(fit: Fit, groups: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     return gradients, matrices
 
 
+def _noise(fit: Fit) -> float:
+    """Mean square of the residuals, as much as they count."""
+    return float(np.mean(np.concatenate([fit.weights(i) * r**2 for i, r in enumerate(fit.residuals)])))
+
+
 def _inverse(matrix: np.ndarray, scales: np.ndarray) -> np.ndarray:
     """The inverse, large and never 0 along what is not known; none of it is lost beside what is known far better."""
     known = np.diag(matrix) * scales**2
@@ -72,41 +64,41 @@ def _inverse(matrix: np.ndarray, scales: np.ndarray) -> np.ndarray:
     return np.asarray((vectors / np.maximum(values, FLAT)) @ vectors.T * np.outer(units, units))
 
 
-def resampling(fit: Fit, segments: Sequence[Segment], scales: np.ndarray, seed: int) -> np.ndarray:
-    """Half-widths, shape (p,), by refits of stretches drawn with replacement, each a Gauss-Newton step from the fit.
+def half_widths(
+    fit: Fit, segments: Sequence[Segment], scales: np.ndarray, of: np.ndarray, seed: int
+) -> dict[str, np.ndarray]:
+    """Half-widths of 95 % intervals by cause, each of shape (q,), of `of` @ the parameters with `of` of shape (q, p).
 
-    Few stretches tell little of how they differ: percentiles are stretched to Student's.
+    `curvature`: were the model exact and each residual by itself: never less, however few the stretches. `resampling`:
+    by refits of stretches drawn with replacement, each a Gauss-Newton step from the fit; few stretches tell little of
+    how they differ, and percentiles are stretched to Student's. `logs`: two standard deviations of the mean of how logs
+    pull; 0 for a single log.
     """
     from scipy.stats import t
 
-    logs = {segment.log for segment in segments}
-    groups = [segment.log if len(logs) >= LEAST_LOGS else segment.block for segment in segments]
-    gradients, matrices = _sums(fit, groups)
-    count = len(gradients)
-    if count < 2:
-        return np.full(len(fit.values), np.inf)
-    drawn = np.random.default_rng(seed).multinomial(count, np.full(count, 1.0 / count), DRAWS)
-    moved = [-_inverse(np.tensordot(times, matrices, 1), scales) @ (times @ gradients) for times in drawn]
-    low, high = np.percentile(moved, [2.5, 97.5], axis=0)
-    few = t.ppf(0.975, count - 1) / t.ppf(0.975, 1e6) * np.sqrt(count / (count - 1.0))
-    return np.asarray(np.maximum(-low, high) * few)
+    by_log, by_block = _sums(fit, [one.log for one in segments]), _sums(fit, [one.block for one in segments])
+    inverse = _inverse(by_block[1].sum(axis=0), scales)
+    curvature = 1.96 * np.sqrt(_noise(fit) * np.diag(of @ inverse @ of.T))
+    logs, count = np.zeros(len(of)), len(by_log[0])
+    if count > 1:
+        logs = 2.0 * (count * by_log[0] @ inverse @ of.T).std(axis=0, ddof=1) / np.sqrt(count)
+    gradients, matrices = by_log if count >= LEAST_LOGS else by_block
+    resampling, count = np.full(len(of), np.inf), len(gradients)
+    if count > 1:
+        drawn = np.random.default_rng(seed).multinomial(count, np.full(count, 1.0 / count), DRAWS)
+        moved = [-_inverse(np.tensordot(times, matrices, 1), scales) @ (times @ gradients) for times in drawn]
+        low, high = np.percentile(np.array(moved) @ of.T, [2.5, 97.5], axis=0)
+        few = t.ppf(0.975, count - 1) / t.ppf(0.975, 1e6) * np.sqrt(count / (count - 1.0))
+        resampling = np.maximum(-low, high) * few
+    return {"curvature": curvature, "resampling": resampling, "logs": logs}
 
 
-def curvature(fit: Fit, segments: Sequence[Segment], scales: np.ndarray) -> np.ndarray:
-    """Half-widths, shape (p,), were the model exact and each residual by itself: never less, however few the blocks."""
-    _, matrices = _sums(fit, [segment.block for segment in segments])
-    noise = float(np.mean(np.concatenate([fit.weights(i) * r**2 for i, r in enumerate(fit.residuals)])))
-    return np.asarray(1.96 * np.sqrt(noise * np.diag(_inverse(matrices.sum(axis=0), scales))))
-
-
-def between_logs(fit: Fit, segments: Sequence[Segment], scales: np.ndarray) -> np.ndarray:
-    """Half-widths, shape (p,), by how the logs pull: two standard deviations of their mean; 0 for a single log."""
-    gradients, matrices = _sums(fit, [segment.log for segment in segments])
-    count = len(gradients)
-    if count < 2:
-        return np.zeros(len(fit.values))
-    pulls = count * gradients @ _inverse(matrices.sum(axis=0), scales)
-    return np.asarray(2.0 * pulls.std(axis=0, ddof=1) / np.sqrt(count))
+def correlations(fit: Fit) -> np.ndarray:
+    """Of the parameters, shape (p, p), by the Jacobian: near 1 or -1, one may stand for the other."""
+    _, matrices = _sums(fit, [0] * len(fit.residuals))
+    covariance = _inverse(matrices[0], np.ones(len(fit.values)))
+    spread = np.sqrt(np.diag(covariance))
+    return np.asarray(np.clip(covariance / np.outer(spread, spread), -1.0, 1.0))
 
 
 def weakest_direction(fit: Fit, segments: Sequence[Segment], scales: np.ndarray) -> np.ndarray:
@@ -126,6 +118,6 @@ def noticed(fit: Fit, segments: Sequence[Segment]) -> float:
     root = np.sqrt(np.maximum(np.diag(whole), 1e-300))
     strengths, vectors = np.linalg.eigh(whole / root / root[:, None])
     pulls = gradients / root @ vectors[:, -1]
-    noise = float(np.mean(np.concatenate([fit.weights(i) * r**2 for i, r in enumerate(fit.residuals)])))
+    noise = _noise(fit)
     together = max(float(pulls @ pulls) / max(strengths[-1] * noise, 1e-30), 1.0)
     return 3.84 * noise * together + SLACK * fit.cost

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from codrl_mj.identify.parameters import DEFAULTS, ESTIMABLE, FRICTION, OF_RIG, 
 from codrl_mj.identify.prediction import Prediction, predict
 from codrl_mj.identify.result import Estimate, Identified, Status
 from codrl_mj.identify.segments import BLOCK, SEGMENT, moves, shifted
-from codrl_mj.identify.stages import Fitted, Shaft, Winding, fitted
+from codrl_mj.identify.stages import PART, Fitted, Shaft, Winding, fitted
 from codrl_mj.identify.traces import correlations, fitted_traces
 
 WIDEST = 0.3
@@ -26,6 +26,8 @@ NARROWEST = 0.002
 """No interval is narrower than this share of the value to either side: nobody's sensors are better calibrated."""
 NARROWEST_OF = {"inductance": 0.02}
 """What comes of a fifth of a row's time: neither stamps nor a held back-EMF are better."""
+NARROW = 0.1
+"""Friction whose interval is a larger share of itself is a rough number: what is sure is how much of all it may be."""
 BIASED = 0.5
 """The self-test fails where it is off by more than this share of the widest interval."""
 STEPS_OF_A_STAGE = 8 + 4
@@ -130,7 +132,7 @@ def _checked(
 ) -> dict[str, float]:
     if not logs:
         raise ValueError("logs: none was given; give one or more")
-    check_names(known, PARAMETERS, "parameter", "known.")
+    check_names(known, [name for name in PARAMETERS if name != "friction_torque"], "parameter", "known.")
     if rig is not None:
         check_names([rig], OF_RIG, "rig")
     check_names([friction], ("auto", "coulomb", "stribeck", "load", "both"), "friction")
@@ -224,7 +226,7 @@ def _with_constant(found: list[Estimate], constant: Estimate | None, stage: Shaf
         own = one.value * relative if one.name not in ("gear_efficiency", "stribeck_speed") and not anchored else 0.0
         low, high = one.value - math.hypot(one.value - one.low, own), one.value + math.hypot(one.high - one.value, own)
         status, why = one.status, one.why
-        if status == "identified" and constant.status not in ("identified", "given"):
+        if status in ("identified", "rough") and constant.status not in ("identified", "given"):
             status, why = "refused", f"the torque constant that it is in proportion to is {constant.status}"
         ends = max(low, PARAMETERS[one.name].least), min(high, PARAMETERS[one.name].most)
         made.append(Estimate(one.name, one.value, *ends, status, why, {**one.causes, "torque_constant": own}))
@@ -232,40 +234,56 @@ def _with_constant(found: list[Estimate], constant: Estimate | None, stage: Shaf
 
 
 def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estimate]:
-    """Every free parameter of a stage with its interval and status."""
+    """Every free parameter of a stage with its interval and status, and their sum where they are friction."""
     fit, model = part.fit, part.model
     if not fit.names:
         return []
-    weights = _weights(part)
+    friction = _Friction.of(part)
     # what a change is measured by: the value itself or, of friction, what would be all of it
-    scales = np.array([weights.get(name, abs(value)) for name, value in zip(fit.names, fit.values, strict=True)])
+    scales = [
+        friction.all_of(name) if name in FRICTION else abs(value)
+        for name, value in zip(fit.names, fit.values, strict=True)
+    ]
     scales = np.maximum(scales, 1e-6 * model.scales)
-    resampled = honesty.resampling(fit, part.segments, scales, seed)
-    logs = honesty.between_logs(fit, part.segments, scales)
+    slopes = np.array([friction.slopes.get(name, 0.0) for name in fit.names])
+    names, of = fit.names, np.eye(len(fit.names))
+    values, sizes, units = fit.values, scales, model.scales
+    if any(slopes):
+        names, of = (*names, "friction_torque"), np.vstack([of, slopes])
+        values = np.append(values, friction.torque)
+        sizes, units = (np.append(one, friction.all_of("friction_torque")) for one in (sizes, units))
+    causes = honesty.half_widths(fit, part.segments, scales, of, seed)
     on_step()
-    tested = part.self_test()
-    on_step()
-    halved = part.half_rate()
+    tested = values + of @ (part.self_test() - fit.values)
     on_step()
     # an error that goes with a row's time is half as large at the rate of the logs, one with its root more than that
-    rate = (2.0 if isinstance(part.stage, Winding) else 1.0) * np.abs(halved - fit.values)
-    curved = honesty.curvature(fit, part.segments, scales)
-    lost = honesty.unexplained(fit, part.segments) if isinstance(part.stage, Winding) else 0.0
-    spread = honesty.Spread(curved, resampled, logs, np.abs(tested - fit.values), rate, lost * np.abs(fit.values))
+    electrical = isinstance(part.stage, Winding)
+    causes["half_rate"] = (2.0 if electrical else 1.0) * np.abs(of @ (part.half_rate() - fit.values))
+    on_step()
+    causes["self_test"] = np.abs(tested - values)
+    causes["unexplained"] = np.abs(values) * (honesty.unexplained(fit, part.segments) if electrical else 0.0)
     directions = part.unknown_directions(scales)
     on_step()
+    together = [
+        {**one, "friction_torque": change}
+        for one in directions
+        if abs(change := float(slopes * scales @ [one.get(name, 0.0) for name in fit.names] / sizes[-1])) > PART
+    ]
     made = []
-    for place, name in enumerate(fit.names):
-        value = float(fit.values[place])
-        half = math.hypot(float(spread.total[place]), NARROWEST_OF.get(name, NARROWEST) * value)
-        widest = WIDEST_OF.get(name, WIDEST) if isinstance(part.stage, Winding) else WIDEST
+    halves = np.hypot(honesty.total(causes), [NARROWEST_OF.get(name, NARROWEST) for name in names] * values)
+    summed = any(slopes) and bool(halves[-1] <= NARROW * values[-1])
+    for place, (name, value, half) in enumerate(zip(names, map(float, values), map(float, halves), strict=True)):
+        widest = WIDEST_OF.get(name, WIDEST) if electrical else WIDEST
+        if name in FRICTION and summed:  # what one takes too little of, the other takes
+            widest = 1.0
         least, most = PARAMETERS[name].least, PARAMETERS[name].most
-        causes = {field: float(getattr(spread, field)[place]) for field in vars(spread)}
-        share = half / scales[place]
-        own = [direction for direction in directions if name in direction]
+        by_cause = {cause: float(several[place]) for cause, several in causes.items()}
+        share = half / sizes[place]
+        own = together if name == "friction_torque" else [one for one in directions if name in one]
         none = most if name == "gear_efficiency" else least
-        nothing = name in FRICTION and abs(value - none) <= AT_BOUND * model.scales[place]
-        at_bound = min(value - least, most - value) <= AT_BOUND * model.scales[place]
+        nothing = name in FRICTION and abs(value - none) <= AT_BOUND * units[place]
+        at_bound = min(value - least, most - value) <= AT_BOUND * units[place]
+        worst = max(by_cause, key=lambda cause: by_cause[cause]).replace("_", " ")
         status: Status = "identified"
         why = ""
         if own and (len(own[0]) > 1):
@@ -274,44 +292,57 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
             status, why = "unidentifiable", "the logs are as likely whatever it is"
         elif at_bound and not nothing:
             status, why = "refused", f"it ended at its bound, {value:g} {PARAMETERS[name].unit}".strip()
-        elif math.isinf(causes["resampling"]):
+        elif math.isinf(by_cause["resampling"]):
             status, why = "refused", f"there are no two stretches of {BLOCK:g} s to resample: give a longer log"
-        elif not causes["self_test"] <= BIASED * widest * scales[place]:
+        elif not by_cause["self_test"] <= BIASED * widest * sizes[place]:
             status = "refused"
             why = f"the self-test finds {tested[place]:.4g} where the fit that it simulates has {value:.4g}"
         elif not share <= widest:
             status = "refused"
-            worst = max(causes, key=lambda cause: causes[cause]).replace("_", " ")
             whole = "all friction" if name in FRICTION else "it"
             why = f"its interval is {100.0 * share:.3g} % of {whole} to either side, above all by {worst}"
-        made.append(Estimate(name, value, max(value - half, least), min(value + half, most), status, why, causes))
+        elif name in FRICTION and not half <= NARROW * abs(value - none):
+            status = "rough"
+            why = f"its interval is {100.0 * share:.3g} % of all friction to either side"
+            why += ", and more of itself" if name != "friction_torque" else ""
+        made.append(Estimate(name, value, max(value - half, least), min(value + half, most), status, why, by_cause))
     return made
 
 
-def _weights(part: Fitted) -> dict[str, float]:
-    """Of each kind of friction, how much of it would be all friction that there is."""
-    if isinstance(part.stage, Winding):
-        return {}
-    model, number = part.model, part.model.all_values(part.fit.values)
-    moved = model.moved(part.fit.values)
-    every = [slice(None, None, max(len(one.times) // 20, 1)) for one in part.segments]
-    speeds = np.concatenate(
-        [
-            one.measured if model.output == "velocity" else np.diff(one.measured[rows]) / np.diff(one.times[rows])
-            for one, rows in zip(part.segments, every, strict=True)
-        ]
-    )
-    speed = max(float(np.sqrt(np.mean(speeds**2))), 1e-9) * number["gear_ratio"]
-    inputs = np.concatenate([one.inputs for one in part.segments])
-    torque = float(np.sqrt(np.mean(inputs**2))) * moved.gain / number["gear_ratio"]
-    lost = (1.0 - number["gear_efficiency"]) * torque
-    whole = number["coulomb_friction"] + number["viscous_friction"] * speed + lost + 1e-2 * torque
-    return {
-        "coulomb_friction": whole,
-        "viscous_friction": whole / speed,
-        "stribeck_friction": whole,
-        "gear_efficiency": min(whole / torque, 1.0),
-    }
+class _Friction(NamedTuple):
+    """All friction at the root mean square of a shaft's speeds and torques, at the rotor."""
+
+    torque: float
+    """[N*m]"""
+    slopes: Mapping[str, float]
+    """How it changes with each kind of friction."""
+    least: float
+    """Torque [N*m] that is little beside what drives: less friction is as good as none."""
+
+    def all_of(self, name: str) -> float:
+        """How much of one kind would be all of it."""
+        found = (self.torque + self.least) / abs(self.slopes.get(name, 1.0))
+        return min(found, 1.0) if name == "gear_efficiency" else found
+
+    @classmethod
+    def of(cls, part: Fitted) -> "_Friction":
+        """That of what was fitted; of a winding none."""
+        if isinstance(part.stage, Winding):
+            return cls(0.0, {}, 0.0)
+        model, number = part.model, part.model.all_values(part.fit.values)
+        every = [slice(None, None, max(len(one.times) // 20, 1)) for one in part.segments]
+        speeds = np.concatenate(
+            [
+                one.measured if model.output == "velocity" else np.diff(one.measured[rows]) / np.diff(one.times[rows])
+                for one, rows in zip(part.segments, every, strict=True)
+            ]
+        )
+        speed = max(float(np.sqrt(np.mean(speeds**2))), 1e-9) * number["gear_ratio"]
+        inputs = np.concatenate([one.inputs for one in part.segments])
+        torque = float(np.sqrt(np.mean(inputs**2))) * model.moved(part.fit.values).gain / number["gear_ratio"]
+        slopes = {"coulomb_friction": 1.0, "viscous_friction": speed, "gear_efficiency": -torque}
+        lost = slopes["gear_efficiency"] * (number["gear_efficiency"] - 1.0)
+        return cls(number["coulomb_friction"] + number["viscous_friction"] * speed + lost, slopes, 1e-2 * torque)
 
 
 def _text(direction: Mapping[str, float]) -> str:

@@ -28,6 +28,7 @@ PARAMETERS = {
     "constant_torque": Parameter("N*m", -1e4, 1e4, "held load against positive speeds, at the output"),
     "coulomb_friction": Parameter("N*m", 0.0, 1e3, "Coulomb friction at the rotor"),
     "viscous_friction": Parameter("N*m*s/rad", 0.0, 1e3, "viscous friction at the rotor"),
+    "friction_torque": Parameter("N*m", 0.0, 1e3, "what all friction takes at the speed of the logs, at the rotor"),
     "gear_efficiency": Parameter("", 0.3, 1.0, "share of the torque that the gear passes on"),
     "stribeck_friction": Parameter("N*m", 0.0, 1e3, "what standstill adds to Coulomb friction, at the rotor"),
     "stribeck_speed": Parameter("rad/s", 1e-3, 1e4, "rotor speed at which 1/e of that is left"),
@@ -35,9 +36,9 @@ PARAMETERS = {
     "load_inertia": Parameter("kg*m^2", 0.0, 1e4, "inertia of what the output moves besides the motor"),
     "gear_ratio": Parameter("", 1e-3, 1e5, "turns of the rotor for one of the output"),
 }
-"""Everything that can be identified or given as known."""
+"""Everything that can be identified; all but `friction_torque`, which is a sum, can be given as known."""
 ELECTRICAL = ("resistance", "inductance", "back_emf_constant")
-FRICTION = ("coulomb_friction", "viscous_friction", "stribeck_friction", "gear_efficiency")
+FRICTION = ("coulomb_friction", "viscous_friction", "stribeck_friction", "gear_efficiency", "friction_torque")
 """What may well be nothing at all (an efficiency: 1): judged by how much of the torque it takes."""
 OF_FRICTION: dict[str, tuple[str, ...]] = {
     "coulomb": ("coulomb_friction", "viscous_friction"),

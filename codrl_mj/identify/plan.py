@@ -1,15 +1,14 @@
 """Which excitation, sample rate and amplitude a motor needs: what each would tell, before anything is measured.
 
-The errors expected are those of the best unbiased estimate, by the Fisher information, and of the voltage that is taken
-as held from row to row where it changes in between. Winding and shaft stand each for itself: the current under voltage
-and measured speed, the position under the measured torque; so nothing depends on how well the other is modelled. A
-delay and an offset of the current, and position and speed at the beginning of segments of 0.25 s, are free. Source:
+The errors expected are those of a fit to a log without noise, at the truth: by the noise that will be and by the fit's
+own Jacobian (Fisher information), and those of a winding by a voltage that is taken as held where it changes. Winding
+and shaft stand each for itself: the current under voltage and speed, the position under the measured current. Source:
 Ljung, *System Identification* (2nd ed. 1999), sec. 7.4 and 13.2.
 """
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -17,10 +16,13 @@ import numpy as np
 
 from codrl_mj.actuators import Drive
 from codrl_mj.fields import check, check_names, real
-from codrl_mj.identify import simulation
+from codrl_mj.identify.estimate import Model, estimate
 from codrl_mj.identify.excitations import KINDS, Excitation
-from codrl_mj.identify.parameters import ELECTRICAL
-from codrl_mj.identify.synthetic import FREE, Course, Load, moved, run, sample_times
+from codrl_mj.identify.log import Log
+from codrl_mj.identify.models import shaft_model, winding_model
+from codrl_mj.identify.parameters import ELECTRICAL, PARAMETERS
+from codrl_mj.identify.segments import Segment, shaft_segments, winding_segments
+from codrl_mj.identify.synthetic import FREE, Load, Sampler, run, sample_times, simulate
 from codrl_mj.runs.files import writing
 
 GOALS = {
@@ -159,9 +161,10 @@ def _options(
             clock=2 * max(round(2.0 * constant * rate), 1) / rate if together else 4.0 * constant,
         )
         held = dataclasses.replace(load, locked=load.locked or excitation.locked)
-        time = sample_times(drive, duration)
-        shape = excitation.voltage(np.floor(time * rate + 1e-6) / rate if together else time) / excitation.amplitude
-        amplitude = excitation.amplitude
+        time, amplitude = sample_times(drive, duration), excitation.amplitude
+        shape = (
+            excitation.voltage(np.floor(time * rate + 1e-6) / rate if together else time + _PHASE / rate) / amplitude
+        )
         for _ in range(8):  # the response is nearly in proportion to the voltage
             course = run(drive, amplitude * shape, held)
             peak, rms = float(np.abs(course.current).max()), float(np.sqrt(np.mean(course.current**2)))
@@ -169,108 +172,45 @@ def _options(
             if excess <= 1.0:
                 break
             amplitude *= 0.98 / excess
-        told = _told(drive, amplitude * shape, rate, sensing)
-        errors = _electrical(drive, course, told, rate, sensing)
+        log = simulate(drive, amplitude * shape, held, sampler=Sampler(rate, mean_voltage=sensing.voltage == "mean"))
+        errors = _electrical(drive, log, sensing.current_noise)
         if not held.locked:
             constant_error = errors.get("back_emf_constant", 0.0)  # which the torque is known by
-            by_position = _mechanical(drive, course, held, rate, sensing)
+            by_position = _mechanical(drive, log, held, sensing.encoder)
             errors |= {name: math.hypot(error, constant_error) for name, error in by_position.items()}
         options.append(Option(dataclasses.replace(excitation, amplitude=amplitude), rate, peak, rms, errors))
     return options
 
 
-_MECHANICAL = ("inertia", "coulomb_friction", "viscous_friction")
-_STEP = 1e-3  # of a parameter, relative, by which it is changed
+def _electrical(drive: Drive, log: Log, noise: float) -> dict[str, float]:
+    """Relative errors of a winding by the current, at the speed that is: see `Winding` for how it is found."""
+    turned = np.append(np.diff(log.signals["position"]) / np.diff(log.time), 0.0)
+    segments = winding_segments([log], [turned])
+    model, _ = winding_model(segments, {"gear_ratio": drive.motor.gear_ratio})
+    return _errors(drive, FREE, model, segments, noise * float(np.abs(log.signals["current"]).max()), True)
 
 
-def _electrical(drive: Drive, course: Course, told: np.ndarray, rate: float, sensing: Sensing) -> dict[str, float]:
-    """Relative errors by the current."""
-    from scipy.signal import lfilter
-
-    middle = 0.5 * (course.speed + np.append(course.speed[1:], course.speed[-1])) * drive.motor.gear_ratio
-
-    def current(voltage: np.ndarray, resistance: float, inductance: float, back_emf_constant: float) -> np.ndarray:
-        decay = math.exp(-resistance / (inductance * drive.controller.sample_rate))
-        gain = (1.0 - decay) / resistance
-        found: np.ndarray = lfilter([0.0, gain], [1.0, -decay], voltage - back_emf_constant * middle)
-        return found
-
-    given = {name: _value(drive, FREE, name) for name in ELECTRICAL}
-    base = current(course.voltage, **given)
-    time = _row_times(course, rate, sensing).ravel()
-    noise = sensing.current_noise * max(float(np.abs(base).max()), 1e-300)
-
-    def see(values: np.ndarray) -> np.ndarray:
-        seen: np.ndarray = np.interp(time, course.time, values) / noise
-        return seen
-
-    slopes = [
-        _slope(lambda value, name=name: see(current(course.voltage, **{**given, name: value})), given[name])  # type: ignore[misc]
-        for name in ELECTRICAL
-    ]
-    later = see(np.concatenate([base[:1], base[:-1]])) - see(base)
-    wrong = see(current(told, **given)) - see(base)
-    return _errors(ELECTRICAL, np.column_stack([*slopes, later, np.ones(len(time))]), wrong)
+def _mechanical(drive: Drive, log: Log, load: Load, encoder: float) -> dict[str, float]:
+    """Relative errors of a shaft by the position; what the datasheet leaves at 0 is left out."""
+    segments = shaft_segments([log], "current", "position", _SEGMENT)
+    known = {name: value for name, value in vars(drive.motor).items() if name in PARAMETERS and name != "rotor_inertia"}
+    known |= {"mgl": load.gravity, "constant_torque": load.torque}
+    known = {name: value for name, value in known.items() if name not in GOALS or value == 0.0}
+    model, _ = shaft_model(segments, "free", "coulomb", "current", "position", known)
+    return _errors(drive, load, model, segments, 2.0 * math.pi / encoder / math.sqrt(12.0), False)
 
 
-def _mechanical(drive: Drive, course: Course, load: Load, rate: float, sensing: Sensing) -> dict[str, float]:
-    """Relative errors by the position; those that the datasheet leaves at 0 are left out."""
-    ratio, shaft = drive.motor.gear_ratio, moved(drive, load)
-    # by the names of a motor, at the rotor
-    fields = {"inertia": ratio**2, "coulomb_friction": ratio, "viscous_friction": ratio**2}
-    time = _row_times(course, rate, sensing)
-    free = np.linalg.qr(np.column_stack([np.ones(time.shape[1]), np.arange(time.shape[1])]))[0]
-    noise = 2.0 * math.pi / sensing.encoder / math.sqrt(12.0)
-    names = [name for name in _MECHANICAL if _value(drive, load, name) > 0.0]
-    still = np.zeros(len(course.time))
-
-    def see(name: str, value: float) -> np.ndarray:
-        changed = shaft._replace(**{name.removesuffix("_friction"): value * fields[name]})
-        angle = simulation.moving()(course.time, course.current, still, 0.0, 0.0, changed)[0]
-        seen = np.interp(time, course.time, angle) / noise
-        return (seen - seen @ free @ free.T).ravel()
-
-    slopes = [_slope(lambda value, name=name: see(name, value), _value(drive, load, name)) for name in names]  # type: ignore[misc]
-    return _errors(names, np.column_stack(slopes), np.zeros(time.size))
-
-
-def _row_times(course: Course, rate: float, sensing: Sensing) -> np.ndarray:
-    """Times of the rows [s], shape (segments, rows)."""
-    count = max(round(_SEGMENT * rate), 8)
-    total = int((course.time[-1] - 1.0 / rate) * rate) // count * count
-    phase = 0.0 if sensing.voltage == "together" else _PHASE
-    return ((np.arange(total) + phase) / rate).reshape(-1, count)
-
-
-def _slope(seen: Callable[[float], np.ndarray], value: float) -> np.ndarray:
-    """How the rows change with a parameter, for a relative change of 1."""
-    return (seen(value * (1.0 + _STEP)) - seen(value * (1.0 - _STEP))) / (2.0 * _STEP)
-
-
-def _errors(names: Sequence[str], slopes: np.ndarray, wrong: np.ndarray) -> dict[str, float]:
-    """Relative errors by variance and bias; those that the data do not determine are left out."""
-    scales = np.linalg.norm(slopes, axis=0)
-    used = scales > 0.0
-    unit = slopes[:, used] / scales[used]
-    values, vectors = np.linalg.eigh(unit.T @ unit)
-    inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T
-    spread = np.sqrt(np.diag(inverse)) / scales[used]
-    shift = inverse @ (unit.T @ wrong) / scales[used]
-    seen = [name for name, one in zip(names, used, strict=False) if one]
-    found = dict(zip(seen, map(float, np.hypot(spread, shift)), strict=False))
-    return {name: error for name, error in found.items() if error < 1.0}
-
-
-def _told(drive: Drive, voltage: np.ndarray, rate: float, sensing: Sensing) -> np.ndarray:
-    """The voltage in each of the drive's samples that the rows tell."""
-    if sensing.voltage == "together":
-        return voltage
-    time, period = np.arange(len(voltage)) / drive.controller.sample_rate, 1.0 / drive.controller.sample_rate
-    begin = (np.maximum(np.floor(time * rate - _PHASE + 1e-9), 0.0) + _PHASE) / rate
-    if sensing.voltage == "instantaneous":
-        return voltage[np.clip(np.floor(begin / period + 1e-9).astype(int), 0, len(voltage) - 1)]
-    flux = np.concatenate([[0.0], np.cumsum(period * voltage[:-1])])
-    return (np.interp(begin + 1.0 / rate, time, flux) - np.interp(begin, time, flux)) * rate
+def _errors(
+    drive: Drive, load: Load, model: Model, segments: Sequence[Segment], deviation: float, biased: bool
+) -> dict[str, float]:
+    """Relative errors of a fit by noise of a deviation, and by what it cannot explain; those above 1 are left out."""
+    truth = np.array([_value(drive, load, name) for name in model.names])
+    fit, _ = estimate(model, [one._replace(deviation=deviation) for one in segments], [truth], most=0)
+    inverse = np.linalg.pinv(np.concatenate(fit.jacobians) * truth)
+    found = np.linalg.norm(inverse, axis=1)
+    if biased:
+        found = np.hypot(found, inverse @ np.concatenate(fit.residuals))
+    return {name: float(error) for name, error in zip(model.names, found, strict=True) if 0.0 < error < 1.0}
 
 
 def _value(drive: Drive, load: Load, name: str) -> float:

@@ -10,8 +10,8 @@ from codrl_mj.identify.prediction import Prediction
 from codrl_mj.identify.traces import Trace
 from codrl_mj.runs.files import write_json, writing
 
-Status = Literal["identified", "given", "ratio", "unidentifiable", "refused"]
-USABLE = ("identified", "given")
+Status = Literal["identified", "rough", "given", "ratio", "unidentifiable", "refused"]
+USABLE = ("identified", "rough", "given")
 OF_MOTOR = (
     *("resistance", "inductance", "torque_constant", "back_emf_constant", "rotor_inertia", "gear_ratio"),
     *("gear_efficiency", "coulomb_friction", "viscous_friction", "stribeck_friction", "stribeck_speed"),
@@ -92,11 +92,11 @@ class Identified:
         return None
 
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """Field of a drive -> interval, of what was identified and is not a point."""
+        """Field of a drive -> interval, of what is used and is not a point."""
         return {
             f"motor.{one.name}": (one.low, one.high)
             for one in self.estimates
-            if one.name in OF_MOTOR and one.status == "identified" and one.low < one.high
+            if one.name in OF_MOTOR and one.status in USABLE and one.low < one.high
         }
 
     def actuator(self) -> Any:

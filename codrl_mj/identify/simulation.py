@@ -111,7 +111,9 @@ def turned() -> Any:
         for piece in range(pieces):
             position += 0.5 * step * speed
             driving = moved.gain * (given + slope * (piece + 0.5) * step)
-            others = -moved.gravity * math.sin(position) - moved.constant_torque
+            others = -moved.constant_torque
+            if moved.gravity != 0.0:  # a sine takes as long as all the rest
+                others -= moved.gravity * math.sin(position)
             free = (speed * (1.0 - damped) + step * (driving + others) / moved.inertia) / (1.0 + damped)
             if moved.gear_efficiency < 1.0 or moved.stribeck_friction > 0.0:  # of the torque after back-EMF
                 torque = driving - 0.5 * moved.braking * (speed + free)

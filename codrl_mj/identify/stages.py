@@ -166,7 +166,7 @@ class Fitted:
             known={**self.model.known, self.fit.names[place]: value},
             scales=np.delete(self.model.scales, place),
         )
-        fit, _ = estimate(model, self.segments, [np.delete(start, place)], most=20)
+        fit, _ = estimate(model, self.segments, [np.delete(start, place)], most=20, scale=self.fit.scale)
         return dataclasses.replace(self, model=model, fit=fit)
 
     def half_rate(self) -> np.ndarray:
@@ -231,7 +231,8 @@ def fitted(stage: Stage, logs: Sequence[Log], on_step: Callable[[], None] = lamb
     def measure(*delays: float) -> float:
         """Their costs; returns the best delay that is believed."""
         for one in delays:
-            costs[one] = _costs(estimate(model, stage.build(late(one))[0], [fit.values], on_step, 6)[0], fit.scale)
+            segments = stage.build(late(one))[0]
+            costs[one] = _costs(estimate(model, segments, [fit.values], on_step, 20, fit.scale)[0], fit.scale)
         best = min(costs, key=lambda one: costs[one].sum())
         return best if _better(costs[best], costs[0]) else 0
 

@@ -17,7 +17,7 @@ from codrl_mj.actuators import Drive
 from codrl_mj.fields import check, check_names, real
 from codrl_mj.identify import simulation
 from codrl_mj.identify.excitations import Excitation
-from codrl_mj.identify.log import SIGNALS, Log, find_resolution
+from codrl_mj.identify.log import SIGNALS, Log
 from codrl_mj.runs.files import writing
 
 
@@ -167,7 +167,7 @@ def moved(drive: Drive, load: Load) -> simulation.Moved:
 
 def simulate(
     drive: Drive,
-    excitation: Excitation,
+    excitation: Excitation | np.ndarray,
     load: Load = FREE,
     sensors: Mapping[str, Sensor] | None = None,
     sampler: Sampler = Sampler(),
@@ -179,7 +179,7 @@ def simulate(
 
     Args:
         drive: see `run`.
-        excitation: the voltage.
+        excitation: the voltage, see `run`.
         load: what the output moves.
         sensors: by signal; those that are not named show what is. The voltage is the one asked for, without the
             supply's sag, and the torque n*kT*i.
@@ -212,7 +212,7 @@ def simulate(
     kept = random.random(len(time)) >= sampler.dropped
     kept[[0, -1]] = True
     found = {signal: values[kept] for signal, values in found.items()}
-    resolution = {signal: find_resolution(values) for signal, values in found.items()}
+    resolution = {signal: sensors.get(signal, Sensor()).resolution for signal in found}
     return Log(name, time[kept], found, resolution, sampler.mean_voltage, rows=np.flatnonzero(kept) + 1)
 
 

@@ -4,6 +4,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from codrl_mj.identify import honesty
+
 
 class Trace(NamedTuple):
     """A simulation beside what was measured, in pieces that each begin from a state of their own."""
@@ -55,11 +57,6 @@ def correlations(part: Any) -> dict[str, dict[str, float]]:
     """
     if part is None or not part.fit.names:
         return {}
-    fit = part.fit
-    rows = np.concatenate([np.sqrt(fit.weights(i))[:, None] * one for i, one in enumerate(fit.jacobians)])
-    size = np.linalg.norm(rows, axis=0)
-    scaled = rows / np.where(size > 0.0, size, 1.0)
-    covariance = np.linalg.pinv(scaled.T @ scaled)
-    spread = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    found = np.clip(covariance / np.outer(spread, spread), -1.0, 1.0)
-    return {name: dict(zip(fit.names, row.tolist(), strict=True)) for name, row in zip(fit.names, found, strict=True)}
+    names = part.fit.names
+    table = honesty.correlations(part.fit)
+    return {name: dict(zip(names, row.tolist(), strict=True)) for name, row in zip(names, table, strict=True)}

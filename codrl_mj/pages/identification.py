@@ -27,6 +27,7 @@ _ADVICE = {
     "constant_torque": "move the load up and down, several times",
     "coulomb_friction": "pass standstill often: a slow sine, in both directions",
     "viscous_friction": "hold several speeds up to the highest, in both directions",
+    "friction_torque": "log longer, and several speeds in both directions",
     "gear_efficiency": "repeat the motion with two loads at least, driving and braking",
     "stribeck_friction": "creep: log very slow motion out of standstill",
     "stribeck_speed": "creep: log speeds from standstill to where friction is least",
@@ -109,7 +110,7 @@ def _advice(found: Identified) -> Markup:
     texts = [
         Markup("<b>{}</b> is {}: {}.").format(one.name.replace("_", " "), one.status, _ADVICE[one.name])
         for one in found.estimates
-        if one.status not in USABLE and one.name in _ADVICE
+        if one.status not in ("identified", "given") and one.name in _ADVICE
     ]
     told = Markup(
         "<b>{}</b> and <b>{}</b> stand for each other (correlation {:+.2f}): give one of them with --known, or excite "

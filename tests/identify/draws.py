@@ -6,7 +6,10 @@
 import argparse
 import collections
 import dataclasses
+import json
 import math
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,8 +27,9 @@ NAMES = {
     "J": "inertia",
     "Coulomb": "coulomb_friction",
     "viscous": "viscous_friction",
+    "friction": "friction_torque",
 }
-GOALS = {"R": 0.02, "L": 0.1, "kE": 0.02, "J": 0.05, "Coulomb": 0.05, "viscous": 0.05}
+GOALS = {"R": 0.02, "L": 0.1, "kE": 0.02, "J": 0.05, "Coulomb": 0.05, "viscous": 0.05, "friction": 0.05}
 """Relative errors within which what is identified is asked to be."""
 ROWS = {
     f"{kind} {rate // 1000} kHz{', ' + voltage if voltage != 'mean' else ''}": {
@@ -142,50 +146,81 @@ FAULTS = {
 }
 
 
-def measured(make, draws):
-    """Of each parameter: how often identified, how often of these within the interval, and their relative errors."""
-    counts, errors = {name: [0, 0, 0] for name in NAMES}, {name: [] for name in NAMES}
-    said = collections.Counter()
-    for draw in range(draws):
-        motor, log = motor_of(draw), make(draw)
-        said.update({f"{one.check} ({one.severity})" for one in check(log) if one.severity != "info"})
-        try:
-            found = identify([log], "free" if log.has("position") else None, seed=draw)
-        except ValueError as error:
-            said[str(error)[:40]] += 1
-            continue
-        said.update({"residuals" for text in found.warnings if "residuals" in text})
-        said.update(f"{part} {rows:+g} rows" for part, rows in found.delays.items() if rows)
-        for short, name in NAMES.items():
-            one = next((one for one in found.estimates if one.name == name), None)
-            if one is None:
-                continue
-            truth = motor.rotor_inertia if name == "inertia" else getattr(motor, name)
-            error = one.value / truth - 1.0
-            if one.status == "identified":
-                counts[short][0] += 1
-                counts[short][1] += one.low <= truth <= one.high
-                counts[short][2] += abs(error) > GOALS[short]
-                errors[short].append(error)
-    return counts, errors, said
+class Found(NamedTuple):
+    """What one draw gave."""
+
+    numbers: dict[str, tuple[str, float, bool]]
+    """Short name -> status, relative error, whether the truth is within the interval."""
+    said: list[str]
+    """By the checks and the fit."""
+
+
+def tried(make, draw):
+    """One draw."""
+    motor, log = motor_of(draw), make(draw)
+    said = [f"{one.check} ({one.severity})" for one in check(log) if one.severity != "info"]
+    try:
+        found = identify([log], "free" if log.has("position") else None, seed=draw)
+    except ValueError as error:
+        return Found({}, [*said, str(error)[:40]])
+    said += ["residuals" for text in found.warnings if "residuals" in text][:1]
+    said += [f"{part} {rows:+g} rows" for part, rows in found.delays.items() if rows]
+    named, numbers = {one.name: one for one in found.estimates}, {}
+    for short, name in NAMES.items():
+        if name in named:
+            one, truth = named[name], _truth(motor, named, name)
+            numbers[short] = one.status, one.value / truth - 1.0, one.low <= truth <= one.high
+    return Found(numbers, sorted(set(said)))
+
+
+def _truth(motor, named, name):
+    if name == "friction_torque":  # at the speed at which the sum of both was taken
+        coulomb, viscous = named["coulomb_friction"].value, named["viscous_friction"].value
+        return motor.coulomb_friction + motor.viscous_friction * (named[name].value - coulomb) / viscous
+    return motor.rotor_inertia if name == "inertia" else getattr(motor, name)
+
+
+def cell(several):
+    """Of a parameter in all draws: how many identified, of these within the interval and beyond the goal; the rough."""
+    texts = []
+    for status in ("identified", "rough"):
+        errors = [(error, inside) for one, error, inside in several if one == status]
+        if errors or status == "identified":
+            worst = f", {100.0 * max(abs(error) for error, _ in errors):.2g} %" if errors else ""
+            texts.append(f"{len(errors)}, {sum(inside for _, inside in errors)}{worst}")
+    return "; rough ".join(texts)
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=100)
     parser.add_argument("--faults", action="store_true")
-    parser.add_argument("--only", nargs="*", help="rows whose names begin so")
+    parser.add_argument("--only", nargs="*", help="rows, by their whole names")
+    parser.add_argument("--log", type=Path, help="file with a line for each draw, from which a run goes on")
     options = parser.parse_args()
     rows = FAULTS if options.faults else {name: lambda draw, row=row: logged(draw, **row) for name, row in ROWS.items()}
-    print(f"of {options.draws} draws: identified, of these within the interval, largest error, beyond the goal")
-    print(f"| | {' | '.join(NAMES)} | said |\n| --- | {'--- | ' * len(NAMES)}--- |")
+    lines = options.log.read_text().splitlines() if options.log and options.log.exists() else []
+    known = {(row, draw): Found(*found) for row, draw, found in map(json.loads, lines)}
+    print(f"of {options.draws} draws: identified, of these within the interval, largest error; rough: the same")
+    print(f"| | {' | '.join(NAMES)} | beyond the goal | said |\n| --- | {'--- | ' * (len(NAMES) + 1)}--- |")
     for name, make in rows.items():
-        if options.only and not name.startswith(tuple(options.only)):
+        if options.only and name not in options.only:
             continue
-        counts, errors, said = measured(make, options.draws)
-        worst = {one: f", {100.0 * max(several, key=abs):.2g} %" if several else "" for one, several in errors.items()}
-        cells = [f"{n}, {inside}{worst[one]}, {off} off" for one, (n, inside, off) in counts.items()]
-        print(f"| {name} | {' | '.join(cells)} | {dict(said)} |", flush=True)
+        for draw in range(options.draws):
+            if (name, draw) not in known:
+                known[name, draw] = tried(make, draw)
+                if options.log:
+                    with options.log.open("a") as file:
+                        file.write(json.dumps([name, draw, known[name, draw]], default=bool) + "\n")
+        found = [known[name, draw] for draw in range(options.draws)]
+        by_name = {short: [one.numbers[short] for one in found if short in one.numbers] for short in NAMES}
+        off = {
+            short: count
+            for short, several in by_name.items()
+            if (count := sum(one == "identified" and abs(error) > GOALS[short] for one, error, _ in several))
+        }
+        said = dict(collections.Counter(text for one in found for text in one.said))
+        print(f"| {name} | {' | '.join(map(cell, by_name.values()))} | {off or ''} | {said} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -58,7 +58,8 @@ def test_files_have_no_traces(found):
 
 def test_the_page_has_fits_statuses_and_advice(found, tmp_path):
     refused = Estimate("coulomb_friction", 0.1, 0.0, 0.9, "refused", "too wide, <b>", {"logs": 0.4})
-    bad = dataclasses.replace(found, estimates=(*found.estimates, refused), warnings=("beware & see",))
+    rough = Estimate("viscous_friction", 0.1, 0.0, 0.2, "rough", "its interval is 20 % of all friction")
+    bad = dataclasses.replace(found, estimates=(*found.estimates, refused, rough), warnings=("beware & see",))
     parsed = check_alone(identification_page(bad, tmp_path / "r.html").read_text())
     titles = [data["title"] for data in parsed.data]
     assert "<one>: current" in titles
@@ -68,4 +69,5 @@ def test_the_page_has_fits_statuses_and_advice(found, tmp_path):
     assert "too wide, <b>" in parsed.text
     assert "coulomb friction is refused: pass standstill often" in parsed.text
     assert "beware & see" in parsed.text
-    assert "2 of 3 numbers can be relied on" in parsed.text
+    assert "viscous friction is rough: hold several speeds" in parsed.text
+    assert "3 of 4 numbers can be relied on" in parsed.text
