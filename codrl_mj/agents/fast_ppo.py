@@ -93,7 +93,13 @@ class FastPPO(PPO):
 
     @torch.no_grad()
     def train(self) -> None:
-        """Learn from the rollout."""
+        """Learn from the rollout.
+
+        Raises:
+            RuntimeError: the policy was replaced or copied since the model was made, and would not learn.
+        """
+        if not self._networks.holds(self.policy):
+            raise RuntimeError("the policy is another than the model was made with: copy a model by save and load")
         optimizer, buffer = self.policy.optimizer, self.rollout_buffer
         self._update_learning_rate(optimizer)
         features = self._features(buffer.swap_and_flatten(buffer.observations))

@@ -73,6 +73,10 @@ class TwinNetworks:
         activation = policy.activation_fn
         self._activation, self._slope = {nn.Tanh: torch.tanh, nn.ReLU: torch.relu}[activation], _SLOPES[activation]
 
+    def holds(self, policy: ActorCriticPolicy) -> bool:
+        """Whether the policy's parameters are views of `parameters` still: a copy of a policy has its own."""
+        return policy.action_net.weight.data_ptr() == self.weights[-1].data_ptr()
+
     def act(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """The actor alone: features (N, k) -> its last hidden layer (N, h) and its outputs (N, a)."""
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):

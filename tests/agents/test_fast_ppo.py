@@ -205,6 +205,12 @@ def test_a_file_of_stable_baselines3_s_goes_on_where_it_was():
     torch.testing.assert_close(loaded.policy.state_dict(), model.policy.state_dict(), rtol=0, atol=0)
 
 
+def test_a_copy_that_would_not_learn_says_so():
+    model = copy.deepcopy(small(box(3), box(1)))
+    with pytest.raises(RuntimeError, match="save and load"):
+        model.learn(64)
+
+
 @pytest.mark.parametrize(
     ("name", "observations", "settings"),
     [
