@@ -320,7 +320,7 @@ def test_fields_of_a_family_are_set_by_its_flags(tmp_path):
     for line in (["evaluate", str(run), "--episodes", "1", "--out", "e.json"], ["render", str(run), *SHORT_FILM]):
         assert main([*line, "--actuator.delay", "0.04"]) == 0
     described = json.loads(Path("e.json").read_text())["conditions"]["env"]["actuator"]
-    assert described == {"family": "lag", "time_constant": 0.1, "delay": 0.04}
+    assert described == {"family": "lag", "time_constant": 0.1, "delay": 0.04, "gain": 1.0}
 
 
 def test_an_actuator_of_a_file_is_its_family_s(tmp_path):

@@ -20,12 +20,23 @@ class FastPPO(PPO):
     Only the order in which floating-point numbers are added and the way in which noise is drawn differ. A rollout
     takes the actor's products for each step; values and probabilities of all its actions are found in one go at its
     end. Gradients are written out and not found by automatic differentiation.
+
+    Raises:
+        ValueError: observations of several parts, a clipped value loss, or a policy with other parameters than those of
+            its two networks, such as a features extractor that learns: those are Stable-Baselines3's own `PPO`'s.
     """
 
     _last_obs: Any
     _last_episode_starts: Any
 
     def _setup_model(self) -> None:
+        if isinstance(self.observation_space, spaces.Dict):
+            raise ValueError(
+                f"observation_space = {self.observation_space}: must be a single space; flatten it, as gymnasium's "
+                "FlattenObservation does"
+            )
+        if self.clip_range_vf is not None:
+            raise ValueError(f"clip_range_vf = {self.clip_range_vf!r}: must be None; use Stable-Baselines3's PPO")
         super()._setup_model()
         policy = self.policy
         self._networks = TwinNetworks(policy)
@@ -51,11 +62,12 @@ class FastPPO(PPO):
         for step in range(n_rollout_steps):
             acted = self._networks.act(self._features(seen))
             actions = self._exploration.actions(*acted, draws[step // self._exploration.every]).numpy()
-            clipped = actions if box is None else np.clip(actions, box.low, box.high)
+            clipped = actions if box is None else np.clip(actions.reshape(-1, *box.shape), box.low, box.high)
             observations, rewards, dones, infos = env.step(clipped)
             self.num_timesteps += env.num_envs
             callback.update_locals(locals())
             if not callback.on_step():
+                self._last_obs, self._last_episode_starts = seen, starts
                 return False
             self._update_info_buffer(infos, dones)
             timed_out = [row for row in np.flatnonzero(dones).tolist() if infos[row].get("TimeLimit.truncated")]
@@ -68,7 +80,7 @@ class FastPPO(PPO):
         self._last_obs, self._last_episode_starts = seen, starts
         rollout_buffer.pos, rollout_buffer.full = n_rollout_steps, True
         layers = self._networks.forward(self._features(_rows(rollout_buffer.observations)))
-        actions = torch.as_tensor(_rows(rollout_buffer.actions))
+        actions = torch.as_tensor(_rows(rollout_buffer.actions)).float()
         judged = self._exploration.judge(layers[-2][0], layers[-1][0], actions)
         rollout_buffer.log_probs[:] = judged.log_prob.view(rollout_buffer.log_probs.shape)
         rollout_buffer.values[:] = layers[-1][1, :, 0].view(rollout_buffer.values.shape)
@@ -81,11 +93,17 @@ class FastPPO(PPO):
 
     @torch.no_grad()
     def train(self) -> None:
-        """Learn from the rollout."""
+        """Learn from the rollout.
+
+        Raises:
+            RuntimeError: the policy was replaced or copied since the model was made, and would not learn.
+        """
+        if not self._networks.holds(self.policy):
+            raise RuntimeError("the policy is another than the model was made with: copy a model by save and load")
         optimizer, buffer = self.policy.optimizer, self.rollout_buffer
         self._update_learning_rate(optimizer)
         features = self._features(buffer.swap_and_flatten(buffer.observations))
-        rest = [torch.as_tensor(buffer.swap_and_flatten(getattr(buffer, name))) for name in _LEARNT_FROM]
+        rest = [torch.as_tensor(buffer.swap_and_flatten(getattr(buffer, name))).float() for name in _LEARNT_FROM]
         for _ in range(self.n_epochs):
             order = torch.as_tensor(np.random.permutation(len(features)))  # as Stable-Baselines3 draws it
             shuffled = [one[order].split(self.batch_size) for one in (features, *rest)]
@@ -93,6 +111,10 @@ class FastPPO(PPO):
             self._n_updates += 1
             if not going_on:
                 break
+        layers, (actions, _, _, returns) = self._networks.forward(features), rest  # as they are now
+        entropy = self._exploration.judge(layers[-2][0], layers[-1][0], actions).entropy
+        self.logger.record("train/value_loss", (layers[-1][1, :, :1] - returns).square().mean().item())
+        self.logger.record("train/entropy_loss", -entropy.mean().item())
         self.logger.record(
             "train/explained_variance", explained_variance(buffer.values.ravel(), buffer.returns.ravel())
         )

@@ -28,7 +28,12 @@ class TwinNetworks:
     """
 
     def __init__(self, policy: ActorCriticPolicy) -> None:
-        """Move the policy's parameters into the vector `parameters`, whose gradient is `gradient`."""
+        """Move the policy's parameters into the vector `parameters`, whose gradient is `gradient`.
+
+        Raises:
+            ValueError: the networks differ in their hidden layers or have another activation, or the policy has other
+                parameters.
+        """
         towers = [
             [layer for layer in (*hidden, last) if isinstance(layer, nn.Linear)]
             for hidden, last in (
@@ -36,11 +41,25 @@ class TwinNetworks:
                 (policy.mlp_extractor.value_net, policy.value_net),
             )
         ]
+        log_std = getattr(policy, "log_std", None)
+        sizes = [[(layer.in_features, layer.out_features) for layer in tower] for tower in towers]
+        inputs = [[size[0] for size in tower] for tower in sizes]
+        if inputs[0] != inputs[1] or policy.activation_fn not in _SLOPES:
+            raise ValueError(
+                f"actor and critic of {policy.net_arch} with {policy.activation_fn.__name__}: must have the same "
+                f"hidden layers, with {' or '.join(one.__name__ for one in _SLOPES)}; use Stable-Baselines3's PPO"
+            )
+        ours = sum((inputs + 1) * outputs for tower in sizes for inputs, outputs in tower)
+        theirs = sum(one.numel() for one in policy.parameters() if one is not log_std)
+        if ours != theirs:
+            raise ValueError(
+                f"the policy has {theirs} weights and biases, of which {ours} are those of its two networks: a "
+                "features extractor must not learn; use Stable-Baselines3's PPO for one that does"
+            )
         shapes = [
             (max(layer.out_features for layer in pair), pair[0].in_features) for pair in zip(*towers, strict=True)
         ]
         self.outputs = shapes[-1][0]
-        log_std = getattr(policy, "log_std", None)
         noise = 0 if log_std is None else log_std.numel()
         self.parameters = torch.zeros(sum(2 * outputs * (inputs + 1) for outputs, inputs in shapes) + noise)
         self.gradient = torch.zeros_like(self.parameters)
@@ -56,6 +75,10 @@ class TwinNetworks:
             self.log_std_gradient = self.gradient[-noise:].view_as(log_std)
         activation = policy.activation_fn
         self._activation, self._slope = {nn.Tanh: torch.tanh, nn.ReLU: torch.relu}[activation], _SLOPES[activation]
+
+    def holds(self, policy: ActorCriticPolicy) -> bool:
+        """Whether the policy's parameters are views of `parameters` still: a copy of a policy has its own."""
+        return policy.action_net.weight.data_ptr() == self.weights[-1].data_ptr()
 
     def act(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """The actor alone: features (N, k) -> its last hidden layer (N, h) and its outputs (N, a)."""

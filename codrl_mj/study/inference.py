@@ -1,4 +1,4 @@
-"""What may be concluded from scores of training runs: exact tests, corrections for their number, equivalence, power.
+"""What may be concluded from scores of training runs: tests, corrections for their number, equivalence, power.
 
 A score is one trained policy's mean over its test episodes. Runs, not episodes, are what training repeats. A contrast
 pools strata (the same question on several tasks or doses): its effect is the mean of their differences of means.
@@ -36,7 +36,7 @@ def effect(strata: Sequence[Stratum], confidence: float = 0.95) -> Interval:
     """Mean difference over the strata, with its interval by Student's t, variances unequal (Welch, Satterthwaite).
 
     Args:
-        strata: at least one.
+        strata: at least one, of which none shares runs with another.
         confidence: of the interval, in (0, 1).
     """
     from scipy.stats import t
@@ -60,11 +60,13 @@ def _variances(stratum: Stratum) -> list[tuple[float, int]]:
 def permutation_p(strata: Sequence[Stratum], least: float = 0.0, two_sided: bool = True) -> float:
     """How often labels given at random make a mean difference as large as the one seen: the p of no difference.
 
-    Labels are exchanged within each stratum: among its runs, or, where it is paired, within every pair. The test is of
-    exact level, whatever the scores' distribution; the labels seen count as one of the relabellings.
+    Labels are exchanged within each stratum: among its runs, or, where it is paired, within every pair. The labels seen
+    count as one of the relabellings. Where both kinds have the same distribution (of pairs: where differences are as
+    likely with either sign) the level is exact; where their means alone are equal it is so approximately, for about
+    equal numbers of runs.
 
     Args:
-        strata: at least one.
+        strata: at least one, of which none shares runs with another.
         least: the difference that is to be exceeded: it is taken from the one's scores first.
         two_sided: whether a difference of the other sign counts as well.
     """

@@ -61,7 +61,7 @@ def test_a_gain_scales_what_is_delivered():
     weak = Lag(time_constant=0.03, delay=0.0125, gain=0.25)
     scaled = _responses(Lag(time_constant=0.03, delay=0.0125), 0.25 * commands)  # a power of two: exact
     np.testing.assert_array_equal(_responses(weak, commands), scaled)
-    with pytest.raises(ValueError, match=r"Lag\.gain = 0: must be"):
+    with pytest.raises(ValueError, match=r"Lag\.gain = 0\.0: must be"):
         Lag(gain=0.0)
 
 

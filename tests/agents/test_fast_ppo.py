@@ -1,7 +1,9 @@
 """PPO's arithmetic written out, against Stable-Baselines3's own."""
 
 import copy
+import io
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,9 @@ from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import NatureCNN
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from codrl_mj import make_sb3_vec_env
 from codrl_mj.agents import PPOConfig
@@ -168,3 +173,86 @@ def test_moments_of_other_networks_are_refused():
     other, _, _ = pair("state-dependent")
     with pytest.raises(ValueError, match=r"12 parameters are optimised: must be 13|13 .* must be 12"):
         ours.policy.optimizer.load_state_dict(other.policy.optimizer.state_dict())
+
+
+class Sampled(gymnasium.Env):
+    """Observations at random from a space; takes none but its own actions."""
+
+    def __init__(self, observation_space, action_space):
+        """Take the spaces."""
+        self.observation_space, self.action_space = observation_space, action_space
+        observation_space.seed(0)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed, options=options)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        return self.observation_space.sample(), float(np.sum(action)), False, self.np_random.random() < 0.1, {}
+
+
+def box(*shape, dtype=np.float32):
+    return spaces.Box(-1, 1, shape, dtype)
+
+
+def small(observations, actions, model=PPOConfig, **settings):
+    envs = DummyVecEnv([lambda: Sampled(observations, actions)] * 2)
+    if model is PPOConfig:
+        return PPOConfig(rollout_steps=32, batch_size=16, epochs=2, hidden=(8,)).make_model(envs, 0)
+    return model(ActorCriticPolicy, envs, n_steps=16, batch_size=16, device="cpu", **settings)
+
+
+@pytest.mark.parametrize(
+    "spaced",
+    [
+        (box(3, dtype=np.float64), box(2, dtype=np.float64)),
+        (box(2, 3), box(2, 3)),
+        (spaces.Discrete(4), spaces.Discrete(3)),
+    ],
+    ids=["float64", "of several dimensions", "discrete"],
+)
+def test_learns_in_spaces_that_stable_baselines3_learns_in(spaced):
+    model = small(*spaced)
+    before = copy.deepcopy(model.policy.state_dict())
+    model.learn(64)
+    assert all((tensor != before[name]).any() for name, tensor in model.policy.state_dict().items())
+
+
+def test_a_file_of_stable_baselines3_s_goes_on_where_it_was():
+    model, file = small(box(3), box(1)), io.BytesIO()
+    model.learn(64)
+    model.save(file)
+    file.seek(0)
+    loaded = FastPPO.load(file, env=model.env, device="cpu")
+    loaded.set_logger(Logger(None, []))
+    loaded.rollout_buffer = copy.deepcopy(model.rollout_buffer)
+    for one in (model, loaded):
+        np.random.seed(3)
+        one.train()
+    torch.testing.assert_close(loaded.policy.state_dict(), model.policy.state_dict(), rtol=0, atol=0)
+
+
+def test_a_copy_that_would_not_learn_says_so():
+    model = copy.deepcopy(small(box(3), box(1)))
+    with pytest.raises(RuntimeError, match="save and load"):
+        model.learn(64)
+
+
+@pytest.mark.parametrize(
+    ("name", "observations", "settings"),
+    [
+        ("observation_space", spaces.Dict(a=box(3)), {}),
+        ("clip_range_vf", box(3), {"clip_range_vf": 0.2}),
+        ("hidden layers", box(3), {"policy_kwargs": {"net_arch": {"pi": [8], "vf": [4]}}}),
+        ("hidden layers", box(3), {"policy_kwargs": {"activation_fn": torch.nn.ELU}}),
+        (
+            "extractor must not learn",
+            spaces.Box(0, 255, (36, 36, 3), np.uint8),
+            {"policy_kwargs": {"features_extractor_class": NatureCNN}},
+        ),
+    ],
+)
+def test_what_it_would_learn_wrongly_is_refused(name, observations, settings):
+    with pytest.raises(ValueError, match=name):
+        small(observations, box(1), FastPPO, **settings)

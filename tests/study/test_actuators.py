@@ -5,15 +5,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from codrl_mj import cli
 from codrl_mj.actuators import Lag
+from codrl_mj.evaluation.measures import Interval
 from codrl_mj.study.actuators import arms
 from codrl_mj.study.actuators.levels import AXES, needed_voltage, posed
 from codrl_mj.study.actuators.page import write
 from codrl_mj.study.actuators.questions import primary, secondary, wrong_motors
 from codrl_mj.study.actuators.study import ActuatorStudy
-from codrl_mj.study.actuators.verdicts import FLOORS, Scores, judge, seeds_to_close
+from codrl_mj.study.actuators.verdicts import FLOORS, Scores, Verdict, judge, seeds_to_close
 from codrl_mj.tasks import find_task
 from tests.study.pretended import pretend
 
@@ -138,6 +140,49 @@ def test_what_is_otherwise_is_said(tmp_path):
     assert verdicts["P1"].outcome == "the other way"
     assert verdicts["P11"].outcome == "no"
     assert seeds_to_close(verdicts["P11"]) is None
+
+
+@pytest.mark.parametrize(("kind", "mean", "seeds"), [("better", 0.05, 30), ("equivalent", 0.0, 27)])
+def test_seeds_that_would_tell_find_it_as_often_as_power_says(kind, mean, seeds):
+    """A run's standard deviation of 0.05, tested at the strictest of Holm's levels."""
+    half = 0.05 * np.sqrt(2 / 20) * stats.t.ppf(0.975, 38)
+    hypothesis = next(one for one in primary() if one.kind == kind)
+    interval = Interval(mean, mean - half, mean + half)
+    verdict = Verdict(hypothesis, (20, 20), (1, 1), interval, 0.2, 1.0)
+    assert seeds_to_close(verdict) == seeds
+    random = np.random.default_rng(0)
+    one, other = random.normal(mean, 0.05, (20_000, seeds)), random.normal(0.0, 0.05, (20_000, seeds))
+    if kind == "better":
+        found = stats.ttest_ind(one, other, axis=1).pvalue < 0.05 / 12
+    else:
+        found = stats.ttest_ind(one + 0.05, other, axis=1, alternative="greater").pvalue < 0.05 / 12
+    assert found.mean() == pytest.approx(0.8, abs=0.02)
+
+
+def test_policies_that_are_tested_in_several_contrasts_count_once(tmp_path):
+    """P7 holds the same generic policies against six arms: its runs are policies' means over the six axes.
+
+    And P10 the same policies on six motors: its pairs are means of their differences.
+    """
+    random = np.random.default_rng(0)
+    own = random.normal(0.0, 0.1, 6)  # what a seed is better by, wherever it is tested
+
+    def score(trial, seed):
+        if trial.arm.name.endswith(("generic", "weaker")) and trial.test != "weaker":
+            return 0.5 + own[seed]
+        return 1.0 + 0.01 * (-1) ** seed
+
+    grid = ActuatorStudy(tmp_path, tasks=("pendulum",), seeds=6).grid
+    pretend(grid, returns(score))
+    verdicts = {one.hypothesis.name: one for one in judge(Scores(grid.collect()), primary())}
+    matched = 1.0 + 0.01 * (-1.0) ** np.arange(6)
+    for name, test in (
+        ("P7", stats.ttest_ind(matched, 0.5 + own, equal_var=False)),
+        ("P10", stats.ttest_rel(0.5 + own, matched)),
+    ):
+        assert verdicts[name].strata == (6, 12)
+        assert verdicts[name].runs == (6, 6)
+        assert verdicts[name].effect[1:] == pytest.approx(test.confidence_interval(), rel=1e-9)
 
 
 def test_nothing_is_concluded_from_nothing(tmp_path):

@@ -183,8 +183,9 @@ def _method(collected: Collected, scores: Scores) -> str:
     text = f"""A policy's score is its mean return over {grid.episodes} test episodes, in shares of the span: 0 is
 what random actions get on ideal forces, 1 what policies get there on the mean that were trained there
 ({"; ".join(known) or "none is known yet"}). CartPole's return is the paper's: steps within 0.1 m of the centre.
-Effects are differences of mean scores, pooled over tasks or doses where a hypothesis has several, with intervals by
-Student's t. p are of permutation tests of exact level, of equivalence by two one-sided ones with a margin of
+Effects are differences of mean scores, pooled over tasks or doses where a hypothesis has several: policies count once
+on every task, by their mean over its comparisons. Intervals are by Student's t. p are of permutation tests, of
+equivalence by two one-sided ones with a margin of
 {MARGIN:g}; primary ones are corrected by Holm, the others by Benjamini and Hochberg. With {runs} seeds a difference of
 {detectable(runs, LEVEL / 12):.2f} standard deviations of a run is found with a chance of 80 % at the strictest of
 Holm's levels."""

@@ -52,14 +52,24 @@ class Scores:
         span = self.ceilings[task] - FLOORS[task]
         return {seed: (value - FLOORS[task]) / span for seed, value in self._collected.scores(trial).items()}
 
-    def stratum(self, contrast: Contrast) -> Stratum | None:
-        """A contrast's scores; None with fewer than two policies of either."""
-        one, other = self.of(contrast.one), self.of(contrast.other)
-        if contrast.paired:
-            both = sorted(one.keys() & other.keys())
-            one, other = ({seed: found[seed] for seed in both} for found in (one, other))
-        values = [np.array(list(found.values())) for found in (one, other)]
-        return Stratum(values[0], values[1], contrast.paired) if min(map(len, values)) >= 2 else None
+    def stratum(self, contrasts: Sequence[Contrast]) -> Stratum | None:
+        """Every policy's mean over contrasts of one task; None with fewer than two policies of either kind.
+
+        Several contrasts may share policies, whose scores then are no independent samples: seeds are. A seed counts
+        where it was tested in all of the contrasts.
+        """
+        paired = all(contrast.paired for contrast in contrasts)
+        sides = [
+            [self.of(one) for one in trials] for trials in zip(*((c.one, c.other) for c in contrasts), strict=True)
+        ]
+        seeds = [set.intersection(*map(set, side)) for side in sides]
+        if paired:
+            seeds = [seeds[0] & seeds[1]] * 2
+        one, other = (
+            np.array([np.mean([found[seed] for found in side]) for seed in sorted(common)])
+            for side, common in zip(sides, seeds, strict=True)
+        )
+        return Stratum(one, other, paired) if min(len(one), len(other)) >= 2 else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,8 +122,13 @@ def judge(scores: Scores, hypotheses: Sequence[Hypothesis]) -> list[Verdict]:
 
 
 def _test(scores: Scores, hypothesis: Hypothesis) -> _Tested:
-    strata = [found for pair in hypothesis.contrasts if (found := scores.stratum(pair)) is not None]
-    counts = len(strata), len(hypothesis.contrasts)
+    by_task: dict[str, list[Contrast]] = {}
+    for pair in hypothesis.contrasts:
+        if scores.stratum([pair]) is not None:
+            by_task.setdefault(pair.one.arm.task, []).append(pair)
+    found = {task: scores.stratum(pairs) for task, pairs in by_task.items()}
+    strata = [stratum for stratum in found.values() if stratum is not None]
+    counts = sum(len(by_task[task]) for task in found if found[task] is not None), len(hypothesis.contrasts)
     if not strata:
         return _Tested((0, 0), counts, Interval(np.nan, np.nan, np.nan), 1.0)
     fewest = min(len(stratum.one) for stratum in strata), min(len(stratum.other) for stratum in strata)
@@ -124,14 +139,15 @@ def _test(scores: Scores, hypothesis: Hypothesis) -> _Tested:
 def seeds_to_close(verdict: Verdict) -> int | None:
     """Seeds of each kind that would tell, if the difference and its spread are what they seem; None if too many.
 
-    Of a hypothesis of a difference, those that find the difference seen with a chance of 80 % at the corrected level;
-    of one of equivalence, those that bring the interval's half width below what is left of the margin.
+    They find it with a chance of 80 % at the strictest of Holm's levels: the difference seen, or, of equivalence, what
+    is left of the margin, in one of the two one-sided tests.
     """
+    from scipy.stats import t
+
     runs, half = min(verdict.runs), (verdict.effect.high - verdict.effect.low) / 2
     if runs < 2 or not half > 0:
         return None
-    if verdict.hypothesis.kind == "equivalent":
-        room = MARGIN - abs(verdict.effect.mean)
-        return None if room <= 0 else int(np.ceil(runs * max(half / room, 1.0) ** 2))
-    spread = half / 2.02 / np.sqrt(2.0 / runs)  # of one run, as if all were of two kinds: t at 38 degrees of freedom
-    return runs_needed(abs(verdict.effect.mean) / spread, LEVEL / 12)
+    equivalent, seen = verdict.hypothesis.kind == "equivalent", abs(verdict.effect.mean)
+    spread = half / t.ppf(0.975, 2 * runs - 2) / np.sqrt(2.0 / runs)  # of one run, as if all were of two kinds
+    least = MARGIN - seen if equivalent else seen
+    return runs_needed(least / spread, (2 if equivalent else 1) * LEVEL / 12) if least > 0 else None
