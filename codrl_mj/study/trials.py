@@ -154,10 +154,12 @@ class Grid:
             ValueError: Ray is asked for and not installed.
             TrainingStoppedError: a signal asked to stop.
         """
-        named = {called(*cell): config for cell, config in self.cells().items()}
-        train_cells(named, self.root, workers, accept_changes, lambda _: on_cell("training"))
-        tests = {called(*key): test for key, test in self.deployments().items() if finished(test.run)}
-        deploy_cells(tests, workers, lambda _: on_cell("test"))
+        cells, tests = self.cells(), self.deployments()
+        for seed in sorted({seed for _, seed in cells}):  # trained and tested, so that a part says something of all
+            named = {called(*cell): config for cell, config in cells.items() if cell[1] == seed}
+            train_cells(named, self.root, workers, accept_changes, lambda _: on_cell("training"))
+            ready = {called(*key): test for key, test in tests.items() if key[1] == seed and finished(test.run)}
+            deploy_cells(ready, workers, lambda _: on_cell("test"))
 
     def collect(self) -> "Collected":
         """All that is there, without computing anything.

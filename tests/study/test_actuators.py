@@ -1,6 +1,7 @@
 """The study of what an actuator costs: what it trains, tests and concludes, on scores that a formula gives."""
 
 import csv
+import operator
 from pathlib import Path
 
 import numpy as np
@@ -111,11 +112,22 @@ def test_the_plan_is_what_is_computed():
 def test_wrong_motors_differ_from_the_nominal_by_what_they_are_called():
     nominal = posed("pendulum", "weaker")
     motors = wrong_motors("pendulum")
-    weak = motors["torque_constant -25 %"].actuator.motor
-    assert weak.torque_constant == 0.75 * nominal.actuator.motor.torque_constant
-    assert weak.back_emf_constant == 0.75 * nominal.actuator.motor.back_emf_constant
+    assert motors["resistance -25 %"].actuator.motor.resistance == 0.75 * nominal.actuator.motor.resistance
+    assert motors["resistance -25 %"].actuator.controller == nominal.actuator.controller
     assert motors["friction 20 %"].joint.friction == pytest.approx(0.4)
     assert motors["friction 20 %"].actuator == nominal.actuator
+
+
+@pytest.mark.parametrize("task", arms.TRAINED)
+@pytest.mark.parametrize("axis", arms.DRAWN)
+def test_drawn_doses_end_at_the_dose_that_they_are_said_to(task, axis):
+    """The distribution's ends are the fields of the environments of these doses."""
+    (name, distribution), *rest = arms.drawn(task, axis).config.env.distributions.items()
+    assert not rest
+    of = operator.attrgetter(name)
+    ends = [of(AXES[axis].at(task, dose).actuator) for dose in (0.0, arms.drawn_up_to(task, axis))]
+    assert [distribution.low, distribution.high] == pytest.approx(sorted(ends), rel=1e-5)
+    assert AXES[axis].trained[task] < arms.drawn_up_to(task, axis) <= AXES[axis].doses[-1]
 
 
 def test_what_is_so_is_found(study):
@@ -180,7 +192,7 @@ def test_policies_that_are_tested_in_several_contrasts_count_once(tmp_path):
         ("P7", stats.ttest_ind(matched, 0.5 + own, equal_var=False)),
         ("P10", stats.ttest_rel(0.5 + own, matched)),
     ):
-        assert verdicts[name].strata == (6, 12)
+        assert verdicts[name].strata == (4, 8)
         assert verdicts[name].runs == (6, 6)
         assert verdicts[name].effect[1:] == pytest.approx(test.confidence_interval(), rel=1e-9)
 
@@ -190,7 +202,7 @@ def test_nothing_is_concluded_from_nothing(tmp_path):
     assert {one.outcome for one in judge(Scores(collected), primary())} == {"open"}
     files = write(collected, tmp_path / "out")
     text = files[0].read_text()
-    assert "0 of 880 trainings" in text
+    assert "0 of 860 trainings" in text
     assert "What is missing" in text
 
 

@@ -58,18 +58,21 @@ def matched(task: str, axis: str) -> Arm:
 
 
 def drawn(task: str, axis: str) -> Arm:
-    """Trained on doses that are drawn anew for every episode, evenly over all that are tested."""
-    most, step = AXES[axis].doses[-1], find_task(task).step_duration
-    env = AXES[axis].at(task, AXES[axis].trained[task])
-    least = 1.0 - most
+    """Trained on doses that are drawn anew for every episode, evenly from none to `drawn_up_to`."""
+    most = AXES[axis].at(task, drawn_up_to(task, axis))
+    none, actuator = AXES[axis].at(task, 0.0).actuator, most.actuator
     text = {
-        "lag": f"time_constant=uniform(0, {most * step:g})",
-        "weakness": f"gain=uniform({least:g}, 1)",
-        "supply": f"supply.voltage=uniform({least * AXES['supply'].at(task, 0.0).actuator.supply.voltage:g}, "
-        f"{AXES['supply'].at(task, 0.0).actuator.supply.voltage:g})",
-        "noise": f"controller.current_noise=uniform(0, {most * find_task(task).max_force:g})",
-    }[axis]
-    return arm(task, f"{axis}, drawn", dataclasses.replace(env, randomize=(text,)))
+        "lag": lambda: f"time_constant=uniform(0, {actuator.time_constant:g})",
+        "weakness": lambda: f"gain=uniform({actuator.gain:g}, 1)",
+        "supply": lambda: f"supply.voltage=uniform({actuator.supply.voltage:g}, {none.supply.voltage:g})",
+        "noise": lambda: f"controller.current_noise=uniform(0, {actuator.controller.current_noise:g})",
+    }[axis]()
+    return arm(task, f"{axis}, drawn", dataclasses.replace(most, randomize=(text,)))
+
+
+def drawn_up_to(task: str, axis: str) -> float:
+    """The largest dose that is drawn: twice the one that others are trained through, or the largest that is tested."""
+    return min(2.0 * AXES[axis].trained[task], AXES[axis].doses[-1])
 
 
 def generic(task: str) -> Arm:
@@ -86,7 +89,7 @@ def generic(task: str) -> Arm:
             randomize=(
                 f"time_constant=uniform(0, {2 * step:g})",
                 f"delay=uniform(0, {8 * timestep(task):g})",
-                "gain=uniform(0.75, 1.25)",
+                "gain=uniform(0.5, 1.25)",
             ),
             disturbances=Disturbances(pulse_force=pulse, pulse_duration=step, pulse_interval=10 * step),
         ),

@@ -96,18 +96,19 @@ def on_motor(arm: Arm, kind: str) -> Trial:
     return _on(arm, f"{kind} motor", arms.motor(arm.task, chosen[arm.task]))
 
 
-def through_motor(task: str, **changes: Any) -> Arm:
-    """Trained through the marginal motor of the catalogue."""
-    named = ", ".join(["marginal motor", *(f"{value}" for value in changes.values())])
+def through_motor(task: str, otherwise: str = "", **changes: Any) -> Arm:
+    """Trained through the marginal motor of the catalogue, with changes that have a name."""
+    named = ", ".join(filter(None, ["marginal motor", otherwise]))
     return arms.arm(task, named, dataclasses.replace(arms.motor(task, MARGINAL[task]), **changes))
 
 
 WRONG: dict[str, dict[str, float]] = {
     f"{name} {100 * (factor - 1):+.0f} %": {name: factor}
-    for name in ("resistance", "inductance", "torque_constant")
+    for name in ("resistance", "inductance")
     for factor in (0.5, 0.75, 0.9, 1.1, 1.25, 1.5)
 }
-"""What of the motor is otherwise than in training, by what factor; the torque constant with the back-EMF's."""
+"""What of the motor is otherwise than in training, by what factor. A torque constant that the loop does not know of is
+an axis of its own, `weakness`."""
 PERTURBED: dict[str, dict[str, Any]] = {
     "friction 5 %": {"joint": ("friction", 0.05)},
     "friction 20 %": {"joint": ("friction", 0.2)},
@@ -125,8 +126,6 @@ def wrong_motors(task: str) -> dict[str, EnvConfig]:
     found = {}
     for name, factors in WRONG.items():
         changed = {field: getattr(motor, field) * factor for field, factor in factors.items()}
-        if "torque_constant" in changed:
-            changed["back_emf_constant"] = motor.back_emf_constant * factors["torque_constant"]
         actuator = dataclasses.replace(nominal.actuator, motor=dataclasses.replace(motor, **changed))
         found[name] = dataclasses.replace(nominal, actuator=actuator)
     for name, perturbed in PERTURBED.items():
@@ -144,7 +143,7 @@ def wrong_motors(task: str) -> dict[str, EnvConfig]:
 
 
 def identified(task: str) -> Arm:
-    """Trained on what an identification leaves open: R and kT within 2 %, L within 10 %, for every episode anew."""
+    """Trained on what an identification leaves open: R within 2 %, L within 10 %, for every episode anew."""
     nominal = posed(task, "weaker")
     motor = nominal.actuator.motor
 
@@ -152,7 +151,7 @@ def identified(task: str) -> Arm:
         value = getattr(motor, name)
         return f"motor.{name}=uniform({value * (1 - share):g}, {value * (1 + share):g})"
 
-    text = around("resistance", 0.02), around("inductance", 0.1), around("torque_constant", 0.02)
+    text = around("resistance", 0.02), around("inductance", 0.1)
     return arms.arm(task, "weaker, drawn", dataclasses.replace(nominal, randomize=text))
 
 
@@ -180,7 +179,8 @@ def primary() -> list[Hypothesis]:
         Hypothesis(
             "P7",
             "matters",
-            "Over all six: training through the very actuator scores higher than generic robustification",
+            "Over all six: training through the very actuator scores higher than generic robustification as the plan "
+            "has it",
             tuple(
                 pair
                 for axis in AXES
@@ -215,8 +215,7 @@ def primary() -> list[Hypothesis]:
         Hypothesis(
             "P10",
             "wrong",
-            "Policies trained through a motor score as high where resistance, inductance or torque constant is "
-            "25 % off",
+            "Policies trained through a motor score as high where its resistance or inductance is 25 % off",
             tuple(pair for task in LOOPED for pair in _mean_wrong(task, quarter)),
             "equivalent",
         ),
@@ -309,18 +308,18 @@ def secondary() -> list[Hypothesis]:
                 Contrast(on_motor(through, "marginal"), on_motor(ideal, "marginal")),
             ),
         ]
-    for task in TRAINED:
-        through = through_motor(task)
-        volts = through_motor(task, action="voltage")
-        sees = through_motor(task, observe_actuator=True)
-        found += [
-            (
-                "command",
-                f"{task}, marginal motor: {name} over torque",
-                Contrast(on_motor(arm, "marginal"), on_motor(through, "marginal")),
-            )
-            for name, arm in (("voltage", volts), ("current observed", sees))
-        ]
+    told = {task: [through_motor(task, "current and reference observed", observe_actuator=True)] for task in TRAINED}
+    # on Pendulum the marginal drive's current limit would bind the torque arm alone
+    told["furuta"].append(through_motor("furuta", "voltage", action="voltage"))
+    found += [
+        (
+            "command",
+            f"{arm.name}, over torque and no more",
+            Contrast(on_motor(arm, "marginal"), on_motor(through_motor(task), "marginal")),
+        )
+        for task, several in told.items()
+        for arm in several
+    ]
     return [Hypothesis(f"S{k}", where, says, (pair,)) for k, (where, says, pair) in enumerate(found, start=1)]
 
 
