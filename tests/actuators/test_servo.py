@@ -12,6 +12,7 @@ from scipy import signal
 import codrl_mj
 from codrl_mj import Servo, ServoLoop, Uniform
 from codrl_mj.actuators import GearMotor, SampledLoop, Supply
+from tests.matrix import but
 
 INERTIA, RATIO = 0.02, 10.0
 MOTOR = GearMotor(gear_ratio=RATIO, rotor_inertia=1e-6)
@@ -40,7 +41,9 @@ def turned(one, targets, timestep, load=0.0):
     return np.array(rows).T
 
 
-@pytest.mark.parametrize(("timestep", "rate"), [(0.0005, 2000.0), (0.001, 2000.0), (0.0005, 500.0)])
+@pytest.mark.parametrize(
+    ("timestep", "rate"), but([(0.001, 2000.0)], [(0.0005, 2000.0), (0.001, 2000.0), (0.0005, 500.0)])
+)
 def test_a_position_loop_is_the_linear_system_that_it_looks_like(timestep, rate):
     """Torque g*(K*(q* - q) - w), held over a sample, on an inertia; the loop's rate may be that of the steps or not."""
     one = servo(velocity_gain=1.5, position_gain=15.0, servo_rate=rate)

@@ -257,9 +257,13 @@ DISTURBED = {
 @pytest.mark.parametrize(
     ("settings", "arguments"),
     [
-        ({}, {"actuator": "paper"}),
+        pytest.param({}, {"actuator": "paper"}, marks=pytest.mark.matrix),
         ({"trace_decay": 0.8, "gamma": 0.9}, {}),
-        ({}, {"actuator": "paper", "observe_actuator": True, "action": "current", "levels": (-1, -0.5, 0.5, 1)}),
+        pytest.param(
+            {},
+            {"actuator": "paper", "observe_actuator": True, "action": "current", "levels": (-1, -0.5, 0.5, 1)},
+            marks=pytest.mark.matrix,
+        ),
         ({}, {"actuator": NOISY, "disturbances": DISTURBED, "max_episode_steps": 77}),
     ],
     ids=["motor", "with traces", "currents", "disturbed"],

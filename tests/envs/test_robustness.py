@@ -126,7 +126,7 @@ _loops = st.builds(
 )
 
 
-@pytest.mark.parametrize("task", but(["pendulum", "mountain_car"], [*REBUILT]))
+@pytest.mark.parametrize("task", but(["pendulum"], [*REBUILT]))
 @settings(max_examples=40)
 @given(motor=_motors, loop=_loops, seed=st.integers(0, 2**31), command=st.sampled_from(["force", "current", "voltage"]))
 def test_both_physics_agree_on_any_actuator_from_any_start(task, motor, loop, seed, command):

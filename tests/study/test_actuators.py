@@ -206,6 +206,7 @@ def test_nothing_is_concluded_from_nothing(tmp_path):
     assert "What is missing" in text
 
 
+@pytest.mark.matrix
 def test_the_page_has_every_number_in_a_file(study, tmp_path):
     files = {file.name: file for file in write(study.collect(), tmp_path)}
     rows = list(csv.DictReader(files["hypotheses.csv"].open()))
