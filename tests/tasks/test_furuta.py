@@ -165,7 +165,7 @@ def test_the_analytic_physics_refuses_the_rotor():
 
 
 @pytest.mark.parametrize(
-    ("command", "unit"), but(["force"], [("force", 1.0), ("current", 0.042), ("voltage", 0.042 / 8.4)])
+    ("command", "unit"), but([("force", 1.0)], [("force", 1.0), ("current", 0.042), ("voltage", 0.042 / 8.4)])
 )
 def test_a_command_is_delivered_or_what_its_winding_makes_of_it(command, unit):
     """The arm is as good as locked, so that the current of a voltage is u/R after a few L/R = 0.14 ms."""
