@@ -69,10 +69,8 @@ class Computed:
         from codrl_mj.cli.terminal import console
         from codrl_mj.study.trials import numbers_as_text
 
-        table, every = (
-            Table("arm", "seeds\nfinished", "seeds\nto do", box=box.SIMPLE_HEAD, pad_edge=False),
-            grid.costs(),
-        )
+        every = grid.costs()
+        table = Table("arm", "seeds\nfinished", "seeds\nto do", box=box.SIMPLE_HEAD, pad_edge=False)
         for header in ("s each", "tests\nto do", "core hours\nleft"):
             table.add_column(header, justify="right")
         for cost in every:

@@ -11,18 +11,9 @@ from codrl_mj.study.actuators import arms
 from codrl_mj.study.actuators.levels import AXES
 from codrl_mj.study.actuators.questions import dosed, undosed
 from codrl_mj.study.actuators.verdicts import Scores
-from codrl_mj.study.figures import COLOURS, MARKERS, save
+from codrl_mj.study.figures import COLOURS, MARKERS, TITLES, save
 from codrl_mj.study.trials import Trial
 
-TITLES: Mapping[str, str] = {
-    "pendulum": "Pendulum",
-    "cartpole": "CartPole",
-    "acrobot": "Acrobot",
-    "furuta": "Furuta pendulum",
-    "mountain_car": "Mountain Car",
-    "mountain_car_continuous": "Mountain Car, continuous",
-}
-"""What tasks are called."""
 _LOWEST = -0.1  # of the span; what is worse is as lost
 
 
@@ -78,23 +69,16 @@ def bars(path: Path, scores: Scores, groups: Mapping[str, Sequence[tuple[str, Tr
     labels = list(dict.fromkeys(label for each in groups.values() for label, _ in each))
     figure = Figure(figsize=(max(6.0, 1.2 + 1.5 * len(groups)), 3.9), layout="constrained")
     axes: Any = figure.subplots()
-    for place, (_, each) in enumerate(groups.items()):
+    for place, each in enumerate(groups.values()):
         for number, (label, trial) in enumerate(each):
             values = _values(scores, trial)
             if values.size:
                 at = place + 0.8 * ((number + 0.5) / len(each) - 0.5)
-                colour = COLOURS[labels.index(label) % len(COLOURS)]
-                axes.plot(
-                    np.full(len(values), at + 0.06), np.maximum(values, _LOWEST), ".", color=colour, ms=3, alpha=0.6
-                )
-                _bars(
-                    axes,
-                    np.array([at]),
-                    [bootstrap_mean(values)],
-                    colour,
-                    MARKERS[labels.index(label) % len(MARKERS)],
-                    label,
-                )
+                kind = labels.index(label)
+                colour, marker = COLOURS[kind % len(COLOURS)], MARKERS[kind % len(MARKERS)]
+                dots = np.maximum(values, _LOWEST)
+                axes.plot(np.full(len(dots), at + 0.06), dots, ".", color=colour, markersize=3, alpha=0.6)
+                _bars(axes, np.array([at]), [bootstrap_mean(values)], colour, marker, label)
     axes.set_xticks(range(len(groups)), groups)
     axes.set(ylabel="score [share of the span]", title=title, xlim=(-0.5, len(groups) - 0.5))
     axes.grid(axis="y", color="0.9")

@@ -12,11 +12,9 @@ from typing import Any
 from codrl_mj.actuators import IDEAL, Actuator, CurrentLoop, Drive, GearMotor, Lag, Motor, SampledLoop, Supply
 from codrl_mj.disturbances import Disturbances, Joint
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.study.reproduction.arms import CENTRE_RADIUS
 from codrl_mj.tasks import find_task
 
-PAPER_RADIUS = 0.1
-"""CartPole: distance from the centre [m] beyond which the paper's reward is 0. The score that is measured, too: with
-Gymnasium's reward nearly every policy is at the ceiling of 500, and nothing could be told apart."""
 REFERENCE_SPEEDS: Mapping[str, float] = {
     "pendulum": 6.0,
     "cartpole": 1.0,
@@ -33,7 +31,8 @@ def posed(task: str, actuator: Any = IDEAL, **fields: Any) -> EnvConfig:
 
     Ideal and real actuators are integrated alike, so that the actuator alone makes the difference.
     """
-    options = {"center_radius": PAPER_RADIUS} if task == "cartpole" else {}
+    # CartPole by the paper's reward: by Gymnasium's nearly every policy is at the ceiling, and nothing told apart
+    options = {"center_radius": CENTRE_RADIUS} if task == "cartpole" else {}
     return EnvConfig(task, actuator, timestep=timestep(task), options=options, **fields)
 
 
@@ -75,13 +74,13 @@ def needed_voltage(task: str) -> float:
     return 2.0 * math.sqrt(find_task(task).max_force * REFERENCE_SPEEDS[task])
 
 
-def supplied(task: str, volts: float, **loop: Any) -> Drive:
+def supplied(task: str, volts: float) -> Drive:
     """A motor of 1 ohm whose loop settles in a fraction of an integration step, on a supply."""
     step = timestep(task)
     constant = motor_constant(task)
     motor = GearMotor(1.0, step / 20.0, constant, constant, rotor_inertia=0.0)
-    controls = {"sample_rate": 20.0 / step, "max_current": find_task(task).max_force / constant, **loop}
-    return Drive(motor, SampledLoop(**controls), Supply(volts))
+    loop = SampledLoop(sample_rate=20.0 / step, max_current=find_task(task).max_force / constant)
+    return Drive(motor, loop, Supply(volts))
 
 
 def supply(task: str, dose: float) -> EnvConfig:

@@ -19,6 +19,7 @@ from codrl_mj.study.actuators.questions import (
 )
 from codrl_mj.study.actuators.verdicts import FLOORS, LEVEL, MARGIN, Scores, Verdict, judge, seeds_to_close
 from codrl_mj.study.conclusions import conclusions_section
+from codrl_mj.study.figures import TITLES
 from codrl_mj.study.inference import detectable
 from codrl_mj.study.trials import Collected, Trial
 
@@ -66,7 +67,7 @@ def _draw(scores: Scores, folder: Path) -> dict[str, Path]:
     found = {name: folder / f"{name}.svg" for name in ("matters", "tune", "motors")}
     figures.doses(found["matters"], scores)
     loops: dict[str, list[tuple[str, Trial]]] = {
-        f"{figures.TITLES[task]},\n{loop}": [
+        f"{TITLES[task]},\n{loop}": [
             ("ideal-trained", on_loop(arms.ideal(task), loop)),
             ("trained through it", on_loop(through_loop(task, loop), loop)),
         ]
@@ -77,7 +78,7 @@ def _draw(scores: Scores, folder: Path) -> dict[str, Path]:
     motors: dict[str, list[tuple[str, Trial]]] = {}
     for task in arms.SECONDS:
         ideal = arms.ideal(task)
-        motors[figures.TITLES[task].replace(", ", ",\n")] = [
+        motors[TITLES[task].replace("Continuous ", "Continuous\n")] = [
             ("ideal-trained, on ideal forces", at_home(ideal)),
             ("ideal-trained, on the good motor", on_motor(ideal, "good")),
             *(

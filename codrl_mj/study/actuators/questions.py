@@ -52,18 +52,14 @@ class Hypothesis:
         return self.name.startswith("P")
 
 
-def _on(arm: Arm, test: str, env: EnvConfig) -> Trial:
-    return Trial(arm, test, env)
-
-
 def dosed(arm: Arm, axis: str, dose: float) -> Trial:
     """Policies tested on a dose."""
-    return _on(arm, f"{axis} {dose:g}", AXES[axis].at(arm.task, dose))
+    return Trial(arm, f"{axis} {dose:g}", AXES[axis].at(arm.task, dose))
 
 
 def at_home(arm: Arm) -> Trial:
     """Policies tested on ideal forces."""
-    return _on(arm, "ideal", posed(arm.task))
+    return Trial(arm, "ideal", posed(arm.task))
 
 
 def undosed(arm: Arm, axis: str) -> Trial:
@@ -82,7 +78,7 @@ def _contrasts(axis: str, one: Any, other: Any) -> tuple[Contrast, ...]:
 
 def on_loop(arm: Arm, loop: str) -> Trial:
     """Policies tested on the paper's motor under a loop."""
-    return _on(arm, loop, posed(arm.task, arms.designed(arm.task) if loop == "designed" else loop))
+    return Trial(arm, loop, posed(arm.task, arms.designed(arm.task) if loop == "designed" else loop))
 
 
 def through_loop(task: str, loop: str) -> Arm:
@@ -93,7 +89,7 @@ def through_loop(task: str, loop: str) -> Arm:
 def on_motor(arm: Arm, kind: str) -> Trial:
     """Policies tested on a motor of the catalogue."""
     chosen = {"good": GOOD, "marginal": MARGINAL}[kind]
-    return _on(arm, f"{kind} motor", arms.motor(arm.task, chosen[arm.task]))
+    return Trial(arm, f"{kind} motor", arms.motor(arm.task, chosen[arm.task]))
 
 
 def through_motor(task: str, otherwise: str = "", **changes: Any) -> Arm:
@@ -102,44 +98,41 @@ def through_motor(task: str, otherwise: str = "", **changes: Any) -> Arm:
     return arms.arm(task, named, dataclasses.replace(arms.motor(task, MARGINAL[task]), **changes))
 
 
-WRONG: dict[str, dict[str, float]] = {
-    f"{name} {100 * (factor - 1):+.0f} %": {name: factor}
+WRONG: dict[str, tuple[str, float]] = {
+    f"{name} {100 * (factor - 1):+.0f} %": (name, factor)
     for name in ("resistance", "inductance")
     for factor in (0.5, 0.75, 0.9, 1.1, 1.25, 1.5)
 }
 """What of the motor is otherwise than in training, by what factor. A torque constant that the loop does not know of is
 an axis of its own, `weakness`."""
-PERTURBED: dict[str, dict[str, Any]] = {
-    "friction 5 %": {"joint": ("friction", 0.05)},
-    "friction 20 %": {"joint": ("friction", 0.2)},
-    "current noise 20 %": {"controller": ("current_noise", 0.2)},
-    "pulses 25 %": {"disturbances": ("pulse_force", 0.25)},
-    "pulses 50 %": {"disturbances": ("pulse_force", 0.5)},
-}
-"""What comes to it, in shares of the largest force."""
 
 
 def wrong_motors(task: str) -> dict[str, EnvConfig]:
-    """The actuator `weaker` of the paper's family with another motor than the one trained through, by name."""
-    nominal = posed(task, "weaker")
-    motor, force = nominal.actuator.motor, find_task(task).max_force
-    found = {}
-    for name, factors in WRONG.items():
-        changed = {field: getattr(motor, field) * factor for field, factor in factors.items()}
-        actuator = dataclasses.replace(nominal.actuator, motor=dataclasses.replace(motor, **changed))
-        found[name] = dataclasses.replace(nominal, actuator=actuator)
-    for name, perturbed in PERTURBED.items():
-        (where, (field, share)), step = next(iter(perturbed.items())), find_task(task).step_duration
-        if where == "joint":
-            found[name] = dataclasses.replace(nominal, joint=Joint(friction=share * force))
-        elif where == "disturbances":
-            pulses = Disturbances(pulse_force=share * force, pulse_duration=step, pulse_interval=10 * step)
-            found[name] = dataclasses.replace(nominal, disturbances=pulses)
-        else:
-            amperes = share * motor.arm_radius * force / motor.torque_constant
-            loop = dataclasses.replace(nominal.actuator.controller, **{field: amperes})
-            found[name] = dataclasses.replace(nominal, actuator=dataclasses.replace(nominal.actuator, controller=loop))
-    return found
+    """The actuator `weaker`, otherwise than trained through, by name: `WRONG`, and shares of the largest force."""
+    nominal, step, force = posed(task, "weaker"), find_task(task).step_duration, find_task(task).max_force
+    motor, loop = nominal.actuator.motor, nominal.actuator.controller
+
+    def driven(**parts: Any) -> EnvConfig:
+        return dataclasses.replace(nominal, actuator=dataclasses.replace(nominal.actuator, **parts))
+
+    def pushed(share: float) -> EnvConfig:
+        pulses = Disturbances(pulse_force=share * force, pulse_duration=step, pulse_interval=10 * step)
+        return dataclasses.replace(nominal, disturbances=pulses)
+
+    def rubbed(share: float) -> EnvConfig:
+        return dataclasses.replace(nominal, joint=Joint(friction=share * force))
+
+    noise = 0.2 * motor.arm_radius * force / motor.torque_constant  # A
+    return {
+        name: driven(motor=dataclasses.replace(motor, **{field: getattr(motor, field) * factor}))
+        for name, (field, factor) in WRONG.items()
+    } | {
+        "friction 5 %": rubbed(0.05),
+        "friction 20 %": rubbed(0.2),
+        "current noise 20 %": driven(controller=dataclasses.replace(loop, current_noise=noise)),
+        "pulses 25 %": pushed(0.25),
+        "pulses 50 %": pushed(0.5),
+    }
 
 
 def identified(task: str) -> Arm:
@@ -158,7 +151,7 @@ def identified(task: str) -> Arm:
 def _mean_wrong(task: str, names: Iterable[str]) -> list[Contrast]:
     nominal = through_loop(task, "weaker")
     motors = wrong_motors(task)
-    return [Contrast(_on(nominal, name, motors[name]), on_loop(nominal, "weaker")) for name in names]
+    return [Contrast(Trial(nominal, name, motors[name]), on_loop(nominal, "weaker")) for name in names]
 
 
 def primary() -> list[Hypothesis]:
@@ -287,12 +280,12 @@ def secondary() -> list[Hypothesis]:
                 (
                     "wrong",
                     f"{task}, {name} over nominal",
-                    Contrast(_on(nominal, name, env), on_loop(nominal, "weaker")),
+                    Contrast(Trial(nominal, name, env), on_loop(nominal, "weaker")),
                 ),
                 (
                     "wrong",
                     f"{task}, {name}: drawn over nominal",
-                    Contrast(_on(open_, name, env), _on(nominal, name, env)),
+                    Contrast(Trial(open_, name, env), Trial(nominal, name, env)),
                 ),
             ]
     for task in SECONDS:

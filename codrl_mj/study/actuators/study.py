@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+from codrl_mj.fields import check, integer
 from codrl_mj.study.actuators import arms
 from codrl_mj.study.actuators.questions import trials
 from codrl_mj.study.grid import check_chosen
@@ -21,21 +22,17 @@ class ActuatorStudy:
     """Folder of the run folders."""
     tasks: tuple[str, ...] = tuple(arms.SECONDS)
     """Tasks."""
-    seeds: int = 20
+    seeds: int = integer(20, least=1)
     """Training runs of every arm, >= 1, with seeds from 0."""
-    episodes: int = 50
+    episodes: int = integer(50, least=1)
     """Test episodes of every policy, >= 1."""
-    total_steps: int | None = None
+    total_steps: int | None = integer(None, least=1)
     """Environment steps of every training, >= 1, for trying things out; None: the agents' own budgets."""
 
     def __post_init__(self) -> None:
         """Validate."""
         check_chosen("tasks", self.tasks, arms.SECONDS)
-        for name in ("seeds", "episodes", "total_steps"):
-            value = getattr(self, name)
-            whole = isinstance(value, int) and not isinstance(value, bool)
-            if (not whole or value < 1) and not (name == "total_steps" and value is None):
-                raise ValueError(f"{name} = {value!r}: must be an integer >= 1")
+        check(self)
 
     @property
     def grid(self) -> Grid:

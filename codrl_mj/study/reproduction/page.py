@@ -8,6 +8,7 @@ from codrl_mj.actuators import IDEAL
 from codrl_mj.evaluation.measures import Interval
 from codrl_mj.runs.files import writing
 from codrl_mj.study.conclusions import conclusions_section
+from codrl_mj.study.figures import TITLES
 from codrl_mj.study.reproduction import figures, tables
 from codrl_mj.study.reproduction.claims import PAPER_SAYS, PORT, STUDY_SAYS, Claim
 from codrl_mj.study.reproduction.reproduce import VALUE_TASK, Findings
@@ -17,13 +18,6 @@ from codrl_mj.study.trials import numbers_as_text
 
 PAGE, FOLDER = "reproduction.md", "reproduction"
 """The page, and the folder beside it with its figures and tables."""
-_TITLES = {
-    "pendulum": "Pendulum",
-    "mountain_car": "Mountain Car",
-    "mountain_car_continuous": "Continuous Mountain Car",
-    "acrobot": "Acrobot",
-    "cartpole": "CartPole",
-}
 
 
 def write(findings: Findings, out: Path) -> list[Path]:
@@ -123,7 +117,7 @@ on both.
 def _tasks(findings: Findings, drawn: Mapping[str, Mapping[Path, str]]) -> Iterable[str]:
     for task in findings.plan.tasks:
         section = next(claim.section for claim, _ in findings.claims if claim.task == task)
-        yield f"## {_TITLES[task]}: the paper's *{section}*\n"
+        yield f"## {TITLES[task]}: the paper's *{section}*\n"
         yield _claims(findings, task)
         if task == VALUE_TASK:
             yield _value_iteration(findings.evidence.optima)
@@ -167,7 +161,7 @@ def _value_iteration(optima: Sequence[Optimum]) -> str:
 def _draw(findings: Findings, task: str, folder: Path) -> dict[Path, str]:
     """Draw what there is of a task: the files, and what they show."""
     mine = [one for one in findings.evidence.series.values() if one.arm.task == task]
-    title, paths = _TITLES[task], {}
+    title, paths = TITLES[task], {}
     if any(one.runs for one in mine):
         path = folder / f"learning_{task}.svg"
         paths[path] = f"Learning, mean over seeds with its 95 % interval: {title}"

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from codrl_mj.fields import check, integer
 from codrl_mj.study.grid import check_chosen
 from codrl_mj.study.reproduction.arms import ARMS, TASKS
 from codrl_mj.study.reproduction.claims import CLAIMS, Claim, Evidence
@@ -29,13 +30,13 @@ class Reproduction:
     """Folder of the run folders."""
     tasks: tuple[str, ...] = TASKS
     """Tasks."""
-    seeds: int = 5
+    seeds: int = integer(5, least=1)
     """Runs of every arm, >= 1, with seeds from 0."""
-    sarsa_seeds: int = 30
+    sarsa_seeds: int = integer(30, least=1)
     """Runs of every arm of SARSA, >= 1, which takes seconds."""
-    episodes: int | None = None
+    episodes: int | None = integer(None, least=1)
     """Training episodes, >= 1, for trying things out; None: the paper's budgets."""
-    test_episodes: int = 100
+    test_episodes: int = integer(100, least=1)
     """Test episodes of every policy, >= 1."""
     mesh: Mesh = Mesh()
     """Of value iteration."""
@@ -43,11 +44,7 @@ class Reproduction:
     def __post_init__(self) -> None:
         """Validate."""
         check_chosen("tasks", self.tasks, TASKS)
-        for name in ("seeds", "sarsa_seeds", "test_episodes", "episodes"):
-            value = getattr(self, name)
-            whole = isinstance(value, int) and not isinstance(value, bool)
-            if (not whole or value < 1) and not (name == "episodes" and value is None):
-                raise ValueError(f"{name} = {value!r}: must be an integer >= 1")
+        check(self)
 
     @property
     def grid(self) -> Grid:
