@@ -20,6 +20,7 @@ _POINTS = 400
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")  # colour-blind safe (Okabe and Ito)
 _AXES = {"x": 0, "y": 1, "z": 2}
 _WANTED = ("desired", "reference")  # signals that are drawn first
+_HUGE = 1e30  # what is beyond it has diverged
 _DELAY_STEPS = 5  # environment steps, where the slider of the delay ends
 Docs = Callable[[type], Mapping[str, str]]
 
@@ -133,7 +134,7 @@ class Browser:
         times = np.array([when for when, _ in kept])
         values = np.array([row[motor] for _, row in kept])
         for columns, handle in self._plots:
-            handle.data = (times, *(values[:, column] for column in columns))
+            handle.data = (times, *drawable(values[:, columns]).T)
 
     # -- what is on the panel ------------------------------------------------------------------------------------
 
@@ -278,6 +279,16 @@ class Browser:
         if self.playing:
             self._toggle()
         self.session.step()
+
+
+def drawable(values: np.ndarray) -> np.ndarray:
+    """Values of a plot, of any shape, as uPlot can draw them: finite, and equal or apart by 1e-6 of the largest.
+
+    Where all differ by rounding errors alone, its search for ticks does not end before the memory does.
+    """
+    values = np.nan_to_num(values, posinf=_HUGE, neginf=-_HUGE).clip(-_HUGE, _HUGE)
+    step = 1e-6 * np.abs(values).max(initial=0.0)
+    return np.round(values / step) * step if step > np.finfo(float).tiny else np.zeros_like(values)
 
 
 def _round(value: float) -> float:

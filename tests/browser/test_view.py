@@ -1,7 +1,9 @@
 """The live view in Chromium."""
 
+import collections
 import threading
 
+import numpy as np
 import pytest
 
 from codrl_mj.foreign.config import environment_from
@@ -84,6 +86,20 @@ def test_settings_change_the_simulation_and_unstable_ones_are_said(browser, open
     voltage.fill("7")
     voltage.press("Enter")
     until(page, lambda: browser.session.patterns[".*"].supply.voltage == pytest.approx(7.0))
+
+
+def test_signals_that_differ_by_rounding_alone_are_drawn(browser, opened):
+    page = opened(browser.url)
+    shown(browser, page)
+    kept, browser.playing = browser.session.signals, False
+    count = len(browser.session.trace_names)
+    browser.session.signals = collections.deque(
+        (0.01 * index, np.full((1, count), -24.0) * (1 + 1e-10 * (index % 2))) for index in range(50)
+    )
+    until(page, lambda: page.evaluate("document.querySelectorAll('.u-wrap').length") > 0)
+    page.wait_for_timeout(1500)
+    assert page.evaluate("1 + 1") == 2
+    browser.session.signals, browser.playing = kept, True
 
 
 def test_another_policy_acts(browser, opened):
