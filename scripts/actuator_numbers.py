@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
-import numpy as np
 
 import codrl_mj
 from codrl_mj.actuators import NAMED, Drive
 from codrl_mj.catalogue import motor_entry, motor_names
 from codrl_mj.motor_design import design, find_drive, torque_limits
 from codrl_mj.runs.files import writing
+from codrl_mj.sizing.bench import BLOCKED, Bench, free_run, settled
 from codrl_mj.tasks import OURS, named_actuator
 from codrl_mj.validation.drives import COLD
 
@@ -31,74 +31,8 @@ PAGE = "actuators_in_numbers.md"
 TABLES = {"tasks": "actuators_in_numbers_tasks.csv", "motors": "actuators_in_numbers_motors.csv"}
 TASKS = {task.name: task for task in OURS}
 """Those that have the paper's actuators."""
-BLOCKED = 1e12
-"""Inertia [kg*m^2] that nothing here turns."""
 LONG = 200.0
 """Time [s] after which the slowest of the tasks' loops has settled."""
-
-
-class Bench:
-    """One hinge that an actuator drives.
-
-    Args:
-        actuator: any family's.
-        timestep: integration step [s].
-        inertia: of the load [kg*m^2].
-    """
-
-    def __init__(self, actuator: Any, timestep: float, inertia: float) -> None:
-        """Build it."""
-        spec = mujoco.MjSpec()
-        spec.option.timestep, spec.compiler.boundmass = timestep, 0.0
-        body = spec.worldbody.add_body(explicitinertial=True, mass=1.0, inertia=[inertia] * 3)
-        body.add_joint(name="hinge", axis=[0.0, 0.0, 1.0])
-        spec.add_actuator(target="hinge", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
-        self._model = codrl_mj.motorise(spec, {"hinge": actuator}).compile()
-        self._data = mujoco.MjData(self._model)
-        self._inertia = inertia + actuator.additions.armature
-
-    def run(self, torque: float, duration: float, speed: float = 0.0) -> np.ndarray:
-        """Ask for a torque from rest of the actuator.
-
-        Args:
-            torque: desired, at the joint [N*m].
-            duration: [s].
-            speed: of the joint at the start [rad/s].
-
-        Returns:
-            Shape (steps, 3): the actuator's torque [N*m] in each step, that which accelerates the hinge [N*m], and its
-            speed [rad/s] after the step.
-        """
-        model, data = self._model, self._data
-        mujoco.mj_resetData(model, data)
-        data.ctrl[:], data.qvel[:] = torque, speed
-        rows = np.empty((max(round(duration / model.opt.timestep), 1), 3))
-        for row in rows:
-            mujoco.mj_step(model, data)
-            row[:] = data.qfrc_actuator[0], data.qacc[0] * self._inertia, data.qvel[0]
-        return rows
-
-
-def settled(torques: np.ndarray, band: float) -> int:
-    """The first step from which on the torque, shape (steps,), stays within a share of its last."""
-    wrong = np.flatnonzero(np.abs(torques / torques[-1] - 1.0) > band)
-    return int(wrong[-1]) + 1 if len(wrong) else 0
-
-
-def free_run(actuator: Any, timestep: float, inertia: float, time_constant: float) -> tuple[float, float]:
-    """No-load speed [rad/s] of the joint and the time constant [s] in which it is reached.
-
-    That is the area between speed and no-load speed over the latter: the sum of all time constants less none of the
-    winding's, whatever its inductance; torque and back-EMF are of the speed at a step's start, and so is the sum.
-
-    Args:
-        actuator: whose.
-        timestep: [s].
-        inertia: of the load [kg*m^2].
-        time_constant: about the one to be found [s], for how long to look.
-    """
-    speeds = Bench(actuator, timestep, inertia).run(1e6, 20.0 * time_constant)[:, 2]
-    return float(speeds[-1]), float(timestep * (1.0 + np.sum(1.0 - speeds / speeds[-1])))
 
 
 def task_row(task: str, name: str) -> dict[str, Any]:

@@ -58,7 +58,7 @@ ALLOWED = {
     "validation": {"actuators", "catalogue", "engine", "pages.plots", "physics", "runs.files", "tasks", "tasks.assets"},
     "study": {
         *("actuators", "disturbances", "envs.config", "evaluation", "evaluation.measures", "fields", "films"),
-        *("runs.files", "runs.policies", "tasks", "training"),
+        *("runs.files", "runs.policies", "sizing", "tasks", "training"),
     },
     "rl_zoo3": set(),
     "motor_design": {"actuators", "catalogue", "fields", "runs.files"},

@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium
 import tyro
 
+from codrl_mj.cli.advise import Advise
 from codrl_mj.cli.evaluate import Evaluate
 from codrl_mj.cli.fields import with_environment
 from codrl_mj.cli.identify import Identify, identify_verb
@@ -34,6 +35,7 @@ VERBS: dict[str, Any] = {
     "view": View,
     "report": Report,
     "motor": Motor,
+    "advise": Advise,
     "identify": Identify,
     "validate": Validate,
     "study": Study,

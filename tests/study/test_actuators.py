@@ -12,8 +12,9 @@ from codrl_mj import cli
 from codrl_mj.actuators import Lag
 from codrl_mj.evaluation.measures import Interval
 from codrl_mj.study.actuators import arms
+from codrl_mj.study.actuators.evidence import Evidence
 from codrl_mj.study.actuators.levels import AXES, needed_voltage, posed
-from codrl_mj.study.actuators.page import write
+from codrl_mj.study.actuators.page import FOLDER, write
 from codrl_mj.study.actuators.questions import primary, secondary, wrong_motors
 from codrl_mj.study.actuators.study import ActuatorStudy
 from codrl_mj.study.actuators.verdicts import FLOORS, Scores, Verdict, judge, seeds_to_close
@@ -217,6 +218,13 @@ def test_the_page_has_every_number_in_a_file(study, tmp_path):
     assert len(page.splitlines()) <= 150
     assert len(list(csv.DictReader(files["runs.csv"].open()))) == len(study.deployments())
     assert sum(file.stat().st_size for name, file in files.items() if name.endswith(".svg")) < 500_000
+    assert f"({FOLDER}/chart.svg)" in page
+    evidence = Evidence.read(files["hypotheses.csv"])
+    for task in arms.SECONDS:
+        for axis, described in AXES.items():
+            loss = evidence.loss(task, axis, described.doses[3])
+            assert loss.loss.mean == pytest.approx(0.5)
+            assert loss.kept == (pytest.approx(0.2) if task in arms.TRAINED else None)
     written = {name: file.read_bytes() for name, file in files.items()}
     again = {file.name: file.read_bytes() for file in write(study.collect(), tmp_path)}
     assert written == again

@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Any
 
-from codrl_mj.actuators import Drive, GearMotor, Lag, SampledLoop, Supply
+from codrl_mj.actuators import Actuator, Drive, GearMotor, Lag, SampledLoop, Supply
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.study.actuators.levels import AXES, posed, timestep
@@ -97,9 +97,13 @@ def generic(task: str) -> Arm:
 
 
 def designed(task: str) -> Drive:
-    """The paper's motor and supply under a designed loop: pole-zero cancellation, anti-windup, a current limit."""
-    paper = named_actuator("paper", task)
-    motor, supply = paper.motor, paper.controller.max_voltage
+    """The paper's motor and supply under a designed loop."""
+    return redesigned(named_actuator("paper", task), task)
+
+
+def redesigned(actuator: Actuator, task: str) -> Drive:
+    """The motor and supply of a current loop under a designed one: pole-zero cancellation, anti-windup, a limit."""
+    motor, supply = actuator.motor, actuator.controller.max_voltage
     limit = motor.arm_radius * find_task(task).max_force / motor.torque_constant
     return Drive(
         GearMotor(

@@ -1,4 +1,4 @@
-"""The study's figures: dose and response, and bars of what was trained on what."""
+"""The study's figures: dose and response, bars of what was trained on what, and what to do about an actuator."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,13 +8,16 @@ import numpy as np
 
 from codrl_mj.evaluation.measures import bootstrap_mean
 from codrl_mj.study.actuators import arms
+from codrl_mj.study.actuators.advice import BUY, IDEAL, LOOP, THROUGH, advise, decide
+from codrl_mj.study.actuators.evidence import Evidence
 from codrl_mj.study.actuators.levels import AXES
-from codrl_mj.study.actuators.questions import dosed, undosed
+from codrl_mj.study.actuators.questions import at_home, dosed, on_loop, on_motor, undosed
 from codrl_mj.study.actuators.verdicts import Scores
 from codrl_mj.study.figures import COLOURS, MARKERS, TITLES, save
 from codrl_mj.study.trials import Trial
 
 _LOWEST = -0.1  # of the span; what is worse is as lost
+_REGIONS = {IDEAL: "#d9f0e3", LOOP: "#dbe9f6", THROUGH: "#fdebc8", BUY: "#f6d5cc"}
 
 
 def doses(path: Path, scores: Scores) -> None:
@@ -82,6 +85,84 @@ def bars(path: Path, scores: Scores, groups: Mapping[str, Sequence[tuple[str, Tr
     axes.set_xticks(range(len(groups)), groups)
     axes.set(ylabel="score [share of the span]", title=title, xlim=(-0.5, len(groups) - 0.5))
     axes.grid(axis="y", color="0.9")
+    axes.set_axisbelow(True)
+    handles, names = axes.get_legend_handles_labels()
+    once = dict(zip(names, handles, strict=True))
+    figure.legend(once.values(), once.keys(), loc="outside lower center", ncols=3, fontsize="small")
+    save(figure, path)
+
+
+def chart(path: Path, evidence: Evidence) -> bool:
+    """Draw what to do about an actuator that is late or short of voltage and nothing else, a panel for each task.
+
+    Returns:
+        Whether anything could be drawn: the results of a task are all there.
+    """
+    from matplotlib.colors import ListedColormap
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
+    from scipy.ndimage import distance_transform_edt
+
+    lags, lacks = np.geomspace(0.05, 8.0, 120), np.linspace(0.0, 0.8, 81)
+    tasks = [task for task in arms.SECONDS if all(evidence.loss(task, axis, 0.0) for axis in ("lag", "supply"))]
+    if not tasks:
+        return False
+    figure = Figure(figsize=(10.0, 6.4), layout="constrained")
+    panels: Any = figure.subplots(2, 3, sharex=True, sharey=True).ravel()
+    for panel, task in zip(panels, tasks, strict=False):
+        late, short = (
+            [found for dose in doses if (found := evidence.loss(task, axis, dose))]
+            for axis, doses in (("lag", lags), ("supply", lacks))
+        )
+        regions = np.array([[list(_REGIONS).index(decide([one, other], [other])) for one in late] for other in short])
+        colours = ListedColormap(list(_REGIONS.values()))
+        panel.pcolormesh(lags, 1.0 - lacks, regions, cmap=colours, vmin=-0.5, vmax=3.5, rasterized=True)
+        for number, name in enumerate(_REGIONS):  # in words too, for print without colours
+            room = distance_transform_edt(np.pad(regions == number, 1))[1:-1, 1:-1]
+            row, column = np.unravel_index(np.argmax(room), room.shape)
+            if room[row, column] > 5:
+                words = {"ha": "center", "va": "center", "fontsize": 7, "color": "0.25"}
+                panel.text(lags[column], 1.0 - lacks[row], name.replace(" ", "\n", 1), **words)
+        panel.set(title=TITLES[task], xscale="log")
+        panel.set_xticks([0.1, 0.3, 1.0, 3.0], ["0.1", "0.3", "1", "3"])
+        panel.minorticks_off()
+    for panel in panels[3:]:
+        panel.set_xlabel("time constant of the loop, or a third of its\nsettling time to 5 % [policy steps]")
+    for panel in panels[::3]:
+        panel.set_ylabel("voltage there is [needed voltage]")
+    handles = [Patch(facecolor=colour, edgecolor="0.6", label=name) for name, colour in _REGIONS.items()]
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize="small")
+    save(figure, path)
+    return True
+
+
+def foretold(path: Path, scores: Scores, evidence: Evidence) -> None:
+    """Draw what the bench and the doses foretell that ideal-trained policies lose, over what they lost in tests."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.4, 4.6), layout="constrained")
+    axes: Any = figure.subplots()
+    for number, task in enumerate(arms.SECONDS):
+        ideal = arms.ideal(task)
+        home = _values(scores, at_home(ideal))
+        tested = [on_motor(ideal, "good"), *([on_motor(ideal, "marginal")] if task in arms.MARGINAL else [])]
+        tested += [on_loop(ideal, loop) for loop in ("weaker", "paper", "designed") if task in arms.LOOPED]
+        for trial in tested:
+            values, advice = _values(scores, trial), advise(trial.env.actuator, task, evidence)
+            if values.size and advice.losses:
+                at = min(float(np.mean(home) - np.mean(values)), 1.0)
+                colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
+                axes.plot(at, advice.lost.mean, marker, color=colour, label=TITLES[task])
+                axes.annotate(
+                    trial.test.removesuffix(" motor"),
+                    (at, advice.lost.mean),
+                    (4, 4),
+                    fontsize=7,
+                    textcoords="offset points",
+                )
+    axes.plot([-0.1, 1.05], [-0.1, 1.05], color="0.7", lw=1, zorder=0)
+    axes.set(xlabel="lost in tests [share of the span]", ylabel="foretold by bench and doses")
+    axes.grid(color="0.92")
     axes.set_axisbelow(True)
     handles, names = axes.get_legend_handles_labels()
     once = dict(zip(names, handles, strict=True))

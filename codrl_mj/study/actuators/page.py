@@ -8,6 +8,7 @@ import numpy as np
 
 from codrl_mj.runs.files import writing
 from codrl_mj.study.actuators import arms, figures, tables
+from codrl_mj.study.actuators.evidence import Evidence
 from codrl_mj.study.actuators.questions import (
     at_home,
     on_loop,
@@ -49,17 +50,19 @@ def write(collected: Collected, out: Path) -> list[Path]:
     first, others = judge(scores, primary()), judge(scores, secondary())
     drawn = _draw(scores, folder)
     written = [*drawn.values(), *tables.write(collected, scores, [*first, *others], folder)]
+    advice = _advice(folder, scores)
     parts = [
         _head(collected),
         conclusions_section(out / PAGE),
         _verdicts(first),
         *(_question(name, title, others, drawn) for name, title in QUESTIONS.items()),
+        _yours(advice),
         _missing(collected),
         _method(collected, scores),
     ]
     with writing(out / PAGE) as temporary:
         temporary.write_text("\n".join(part for part in parts if part))
-    return [out / PAGE, *written]
+    return [out / PAGE, *written, *advice]
 
 
 def _draw(scores: Scores, folder: Path) -> dict[str, Path]:
@@ -92,6 +95,33 @@ def _draw(scores: Scores, folder: Path) -> dict[str, Path]:
         ]
     figures.bars(found["motors"], scores, motors, "Motors of the catalogue")
     return found
+
+
+def _advice(folder: Path, scores: Scores) -> list[Path]:
+    """Draw what is advised, and how well it was foretold; nothing where results are missing."""
+    evidence, files = Evidence.read(folder / tables.HYPOTHESES), [folder / "chart.svg", folder / "foretold.svg"]
+    if not figures.chart(files[0], evidence):
+        return []
+    figures.foretold(files[1], scores, evidence)
+    return files
+
+
+def _yours(drawn: Sequence[Path]) -> str:
+    if not drawn:
+        return ""
+    chart, foretold = (path.name for path in drawn)
+    return f"""## What to do about yours
+
+`codrl-mj advise ACTUATOR TASK` measures an actuator on a bench and says it for yours ([how](../advise.md)). By the same
+rules, of one that is late or short of voltage and nothing else:
+
+![Train on ideal, design the loop, train through it, or buy another]({FOLDER}/{chart})
+
+Losses of several things at once are added up there. How well that foretells what ideal-trained policies lose on the
+motors and loops of this study, none of which the doses were taken from:
+
+![Foretold and measured losses]({FOLDER}/{foretold})
+"""
 
 
 def _head(collected: Collected) -> str:

@@ -1,0 +1,147 @@
+"""`codrl-mj advise`."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+_DELIVERED = {
+    # field of Delivery: what it is, unit, digits
+    "lag": ("lag, as of a first-order one that settles alike", "policy steps", ".3g"),
+    "dead_time": ("dead time", "policy steps", ".3g"),
+    "at_rest": ("delivered of the largest force, at rest", "", ".0%"),
+    "at_speed": ("delivered of it at the reference speed", "", ".0%"),
+    "friction": ("friction", "largest force", ".3g"),
+    "noise": ("noise of the force", "largest force", ".3g"),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Advise:
+    """Say whether to train on ideal forces, design the loop, train through an actuator, or buy another: docs/advise.md.
+
+    A bench measures how late, how much and how noisily the actuator delivers the task's largest force; the study's
+    results say what policies that were trained on ideal forces lose by that. --measure trains some, on ideal forces
+    and through it, and tests them on it, which takes minutes and assumes nothing; killed, it goes on where it was.
+
+    Example: codrl-mj advise maxon-ec45-flat-50w pendulum --gear-ratio 20, or codrl-mj advise paper cartpole --measure 5
+    """
+
+    actuator: Annotated[
+        tyro.conf.Positional[str],
+        tyro.conf.arg(
+            metavar="ACTUATOR",
+            help="A motor of the catalogue (codrl-mj motor list), a variation of the paper's (paper, weak "
+            "...), a file with the fields of an actuator or a datasheet, or module:NAME of your own.",
+        ),
+    ]
+    task: Annotated[
+        tyro.conf.Positional[str],
+        tyro.conf.arg(metavar="TASK", help="One of the study's tasks, such as pendulum."),
+    ]
+    gear_ratio: float | None = None
+    """Turns of the rotor for a turn of the joint, or radians for a metre; the motor's own unless given."""
+    voltage: float | None = None
+    """Voltage of the supply [V]; the motor's nominal one unless given."""
+    measure: int | None = None
+    """Train so many policies of either kind, at least 2, and test them on it."""
+    root: Path = Path("runs/advise")
+    """Folder of the run folders of --measure."""
+    jobs: int = -1
+    """Trainings at once; -1 for one on each CPU."""
+    evidence: Path | None = None
+    """The study's hypotheses.csv, unless that of the installation is meant."""
+    as_json: Annotated[
+        bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(name="json", help="Print JSON instead of tables.")
+    ] = False
+
+    def run(self) -> int:
+        """Print the doses, what they cost, and the verdict last."""
+        from codrl_mj.study.actuators.advice import advise
+        from codrl_mj.study.actuators.evidence import Evidence
+        from codrl_mj.study.actuators.levels import REFERENCE_SPEEDS, posed
+        from codrl_mj.study.grid import check_chosen
+
+        check_chosen("TASK", [self.task], REFERENCE_SPEEDS)
+        if self.measure is not None and self.measure < 2:
+            raise ValueError(f"--measure {self.measure}: must be >= 2, or there is no interval")
+        actuator = posed(self.task, self._named()).actuator
+        found = advise(actuator, self.task, Evidence.read(self.evidence))
+        if not self.as_json:
+            _print(self.actuator, found)
+        measured = None if self.measure is None else self._measured(actuator, self.measure)
+        if self.as_json:
+            print(json.dumps({"advice": _plain(found), "measured": measured and _plain(measured)}, indent=2))
+        return 0
+
+    def _named(self) -> Any:
+        changed: dict[str, Any] = {}
+        if self.gear_ratio is not None:
+            changed["motor"] = {"gear_ratio": self.gear_ratio}
+        if self.voltage is not None:
+            changed["supply"] = {"voltage": self.voltage}
+        return {"name": self.actuator, **changed} if changed else self.actuator
+
+    def _measured(self, actuator: Any, seeds: int) -> Any:
+        from codrl_mj.cli.look import titled_table
+        from codrl_mj.cli.terminal import console, progress_bar
+        from codrl_mj.study.actuators.measured import measured, measured_grid
+        from codrl_mj.study.parallel import Workers
+
+        grid = measured_grid(actuator, self.task, seeds, self.root)
+        with progress_bar("{task.completed}/{task.total}") as bar:
+            counts = {"training": len(grid.cells()), "test": len(grid.deployments())}
+            rows = {kind: bar.add_task(f"{kind}s", total=count) for kind, count in counts.items()}
+            grid.compute(Workers(self.jobs), on_cell=lambda kind: bar.advance(rows[kind]))
+        found = measured(actuator, self.task, grid.collect())
+        if not self.as_json:
+            table = titled_table(f"Measured: {seeds} policies of either kind, 50 episodes each")
+            for head in ("what is done", "score on it", "95 %"):
+                table.add_column(head)
+            for name, (mean, low, high) in found.scores.items():
+                table.add_row(name, f"{mean:.2f}", f"{low:.2f} to {high:.2f}")
+            console().print(table)
+            console().print(f"measured: {found.verdict}", markup=False, highlight=False)
+        return found
+
+
+def _print(name: str, found: Any) -> None:
+    from codrl_mj.cli.look import titled_table
+    from codrl_mj.cli.terminal import console
+    from codrl_mj.study.actuators.levels import AXES
+
+    table = titled_table(f"{name} on {found.task}, on the bench")
+    table.add_column("what it does to the largest force")
+    table.add_column("value", justify="right")
+    table.add_column("unit")
+    for field, (title, unit, digits) in _DELIVERED.items():
+        table.add_row(title, format(getattr(found.found, field), digits), unit)
+    console().print(table)
+    if found.losses:
+        table = titled_table("What policies lose by it that were trained on ideal forces [shares of the task's span]")
+        for head in ("by", "dose", "unit", "loss", "95 %", "rows"):
+            table.add_column(head, justify="right" if head in ("dose", "loss") else "left")
+        for loss in found.losses:
+            least = "at least " if loss.beyond else ""
+            bounds = f"{loss.loss.low:.2f} to {loss.loss.high:.2f}"
+            row = (f"{loss.dose:.3g}", AXES[loss.axis].unit, f"{least}{loss.loss.mean:.2f}", bounds)
+            table.add_row(loss.axis, *row, ", ".join(loss.rows))
+        console().print(table)
+    if found.redesigned is not None and found.redesigned.verdict is not None:
+        better = found.redesigned
+        line = f"the same motor under a designed loop: {better.verdict}, {better.reason}"
+        console().print(line, markup=False, highlight=False)
+    verdict = f"{found.verdict}: {found.reason}" if found.verdict else f"no verdict: {found.reason} (--measure 5)"
+    console().print(verdict, markup=False, highlight=False)
+
+
+def _plain(value: Any) -> Any:
+    """Named tuples as mappings, recursively."""
+    if hasattr(value, "_asdict"):
+        extra = {"lost": _plain(value.lost)} if getattr(value, "losses", ()) else {}
+        return {name: _plain(part) for name, part in value._asdict().items()} | extra
+    if isinstance(value, dict):
+        return {name: _plain(part) for name, part in value.items()}
+    return [_plain(part) for part in value] if isinstance(value, tuple) else value

@@ -1,0 +1,139 @@
+"""One hinge that an actuator drives, in the engine: how fast its torque comes, how exact, and how much there is."""
+
+import math
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from codrl_mj.specs import motorise
+
+BLOCKED = 1e12
+"""Inertia [kg*m^2] that nothing here turns."""
+HORIZON = 20.0
+"""Steps of the policy after which a force counts as not there."""
+
+
+class Bench:
+    """One hinge that an actuator drives.
+
+    Args:
+        actuator: any family's.
+        timestep: integration step [s].
+        inertia: of the load [kg*m^2].
+    """
+
+    def __init__(self, actuator: Any, timestep: float, inertia: float) -> None:
+        """Build it."""
+        spec = mujoco.MjSpec()
+        spec.option.timestep, spec.compiler.boundmass = timestep, 0.0
+        body = spec.worldbody.add_body(explicitinertial=True, mass=1.0, inertia=[inertia] * 3)
+        body.add_joint(name="hinge", axis=[0.0, 0.0, 1.0])
+        spec.add_actuator(target="hinge", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
+        self._model = motorise(spec, {"hinge": actuator}).compile()
+        self._data = mujoco.MjData(self._model)
+        self._inertia = inertia + actuator.additions.armature
+
+    def run(self, torque: float, duration: float, speed: float = 0.0) -> np.ndarray:
+        """Ask for a torque from rest of the actuator.
+
+        Args:
+            torque: desired, at the joint [N*m].
+            duration: [s].
+            speed: of the joint at the start [rad/s].
+
+        Returns:
+            Shape (steps, 3): the actuator's torque [N*m] in each step, that which accelerates the hinge [N*m], and its
+            speed [rad/s] after the step.
+        """
+        model, data = self._model, self._data
+        mujoco.mj_resetData(model, data)
+        data.ctrl[:], data.qvel[:] = torque, speed
+        rows = np.empty((max(round(duration / model.opt.timestep), 1), 3))
+        for row in rows:
+            mujoco.mj_step(model, data)
+            row[:] = data.qfrc_actuator[0], data.qacc[0] * self._inertia, data.qvel[0]
+        return rows
+
+
+def settled(torques: np.ndarray, band: float) -> int:
+    """The first step from which on the torque, shape (steps,), stays within a share of its last."""
+    wrong = np.flatnonzero(np.abs(torques / torques[-1] - 1.0) > band)
+    return int(wrong[-1]) + 1 if len(wrong) else 0
+
+
+def free_run(actuator: Any, timestep: float, inertia: float, time_constant: float) -> tuple[float, float]:
+    """No-load speed [rad/s] of the joint and the time constant [s] in which it is reached.
+
+    That is the area between speed and no-load speed over the latter: the sum of all time constants less none of the
+    winding's, whatever its inductance; torque and back-EMF are of the speed at a step's start, and so is the sum.
+
+    Args:
+        actuator: whose.
+        timestep: [s].
+        inertia: of the load [kg*m^2].
+        time_constant: about the one to be found [s], for how long to look.
+    """
+    speeds = Bench(actuator, timestep, inertia).run(1e6, 20.0 * time_constant)[:, 2]
+    return float(speeds[-1]), float(timestep * (1.0 + np.sum(1.0 - speeds / speeds[-1])))
+
+
+class Delivery(NamedTuple):
+    """What an actuator makes of a command within `HORIZON`, in steps of the policy and shares of the largest force.
+
+    A loop that is quick at first and creeps to its end much later is thus called quick and weak: that is what a policy
+    meets, whose commands change long before.
+    """
+
+    dead_time: float
+    """Until a thousandth of what comes in the end is there [steps]."""
+    lag: float
+    """Time constant [steps] of the first-order lag that comes within 5 % in the same time, dead time aside."""
+    at_rest: float
+    """What is there in the end, while the joint is blocked."""
+    at_speed: float
+    """The same at the reference speed, while it drives."""
+    friction: float
+    """Friction and other losses [largest force] of the actuator at a twentieth of the reference speed."""
+    noise: float
+    """Standard deviation of the force [largest force] from one integration step to the next."""
+
+
+def delivery(actuator: Any, timestep: float, step: float, force: float, speed: float) -> Delivery:
+    """Measure what an actuator makes of commands, on the bench.
+
+    Args:
+        actuator: any family's.
+        timestep: integration step [s].
+        step: of the policy [s].
+        force: the largest that is asked for [N*m; N on a slide].
+        speed: the reference speed [rad/s; m/s on a slide].
+    """
+    duration = HORIZON * step
+    blocked = Bench(actuator, timestep, BLOCKED)
+    unasked = blocked.run(0.0, duration)[:, 0]  # its noise is every run's, and thus taken from them
+
+    def asked(at: float) -> np.ndarray:
+        return (blocked.run(force, duration, at)[:, 0] - unasked) / force
+
+    torques = asked(0.0)
+    last = float(np.mean(_end(torques)))
+    begun = np.flatnonzero(np.abs(torques) > 1e-3 * abs(last))
+    late = np.flatnonzero(np.abs(torques - last) > 0.05 * abs(last))
+    dead = int(begun[0]) if len(begun) else 0
+    lag = max(int(late[-1]) + 1 - dead, 0) / math.log(20.0) if len(late) else 0.0
+    slow = 0.05 * speed
+    turned = _end(Bench(actuator, timestep, 1e4 * force * duration / slow).run(0.0, duration, slow))
+    return Delivery(
+        dead * timestep / step,
+        lag * timestep / step,
+        last,
+        float(np.mean(_end(asked(speed)))),
+        max(float(np.mean(turned[:, 0] - turned[:, 1])), 0.0) / force,
+        float(np.std(unasked[len(unasked) // 2 :])) / force,
+    )
+
+
+def _end(rows: np.ndarray) -> np.ndarray:
+    """The last step of the policy."""
+    return rows[-max(round(len(rows) / HORIZON), 1) :]

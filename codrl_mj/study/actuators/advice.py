@@ -1,0 +1,156 @@
+"""What to do about an actuator on a task: its numbers on a bench, held against what the study measured.
+
+The bench gives one dose of everything that the study has an axis for; what ideal-trained policies lose at a dose is
+interpolated between those that were tested, and losses are added up. `measured.py` needs no such assumption.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from codrl_mj.actuators import Actuator, Drive
+from codrl_mj.evaluation.measures import Interval
+from codrl_mj.sizing.bench import Delivery, delivery
+from codrl_mj.study.actuators import arms
+from codrl_mj.study.actuators.evidence import Evidence, Loss
+from codrl_mj.study.actuators.levels import AXES, REFERENCE_SPEEDS, noise, timestep
+from codrl_mj.study.actuators.questions import MARGIN
+from codrl_mj.study.grid import check_chosen
+from codrl_mj.tasks import find_task
+
+IDEAL, LOOP, THROUGH, BUY = "train on ideal", "design the loop", "train through it", "buy another"
+"""What there is to be advised."""
+
+
+def delivered(actuator: Any, task: str) -> Delivery:
+    """What an actuator makes of the commands of a task, on the bench.
+
+    Raises:
+        ValueError: the study has no such task.
+    """
+    check_chosen("task", [task], REFERENCE_SPEEDS)
+    known = find_task(task)
+    return delivery(actuator, timestep(task), known.step_duration, known.max_force, REFERENCE_SPEEDS[task])
+
+
+def doses(found: Delivery, task: str) -> dict[str, float]:
+    """The dose of every axis that does to a command what the actuator does, by axis.
+
+    Weakness g and a supply that lacks a share d leave g*min(1, 2*(1 - d)) of the largest force at rest, and
+    g*(1 - 2*d) at the reference speed (`levels.supply`): solved for both, with g at most 1.
+
+    Args:
+        found: of the actuator, on the task.
+        task: task name.
+    """
+    rest, speed = max(found.at_rest, 0.0), min(found.at_speed, found.at_rest)
+    strength = rest if speed >= 0.0 else rest - speed
+    if rest == 0.0:
+        lacks = 1.0
+    elif speed >= 0.0:
+        lacks = (1.0 - speed / rest) / 2.0
+    else:
+        lacks = 1.0 - rest / (2.0 * strength)
+    loud = found.noise and found.noise / delivered(noise(task, 1.0).actuator, task).noise
+    return {
+        "lag": found.lag,
+        "weakness": max(1.0 - strength, 0.0),
+        "supply": lacks,
+        "delay": found.dead_time,
+        "friction": found.friction,
+        "noise": loud,
+    }
+
+
+class Advice(NamedTuple):
+    """What to do about an actuator on a task."""
+
+    task: str
+    """Task name."""
+    found: Delivery
+    """What the bench measured."""
+    losses: tuple[Loss, ...]
+    """By axis; empty where the study has no results."""
+    redesigned: "Advice | None"
+    """The same with a designed loop, where there is one to design."""
+    verdict: str | None
+    """One of `IDEAL`, `LOOP`, `THROUGH` and `BUY`; None without evidence."""
+    reason: str
+    """Why, in a sentence."""
+
+    @property
+    def lost(self) -> Interval:
+        """All losses, as if they added up, and no more than everything."""
+        return Interval(*(min(sum(part), 1.0) for part in zip(*(one.loss for one in self.losses), strict=True)))
+
+
+def redesign(actuator: Any, task: str) -> Drive | None:
+    """The same motor and supply under a designed loop; None if it has one, or no loop that could be designed.
+
+    Raises:
+        ValueError: the motor does not allow one.
+    """
+    if isinstance(actuator, Actuator):
+        return arms.redesigned(actuator, task)
+    if isinstance(actuator, Drive):
+        loop = dataclasses.replace(actuator.controller, bandwidth=0.0, kp=0.0, ki=0.0, anti_windup="back_calculation")
+        return None if loop == actuator.controller else dataclasses.replace(actuator, controller=loop)
+    return None
+
+
+def advise(actuator: Any, task: str, evidence: Evidence) -> Advice:
+    """What to do about an actuator on a task, by the study's results.
+
+    Args:
+        actuator: any family's.
+        task: task name.
+        evidence: the results.
+
+    Raises:
+        ValueError: the study has no such task.
+    """
+    found = delivered(actuator, task)
+    known = [evidence.loss(task, axis, dose) for axis, dose in doses(found, task).items()]
+    losses = tuple(one for one in known if one is not None)
+    better = redesign(actuator, task)
+    other = advise(better, task, evidence) if better is not None else None
+    if len(losses) < len(AXES):
+        return Advice(task, found, (), other, None, "the study has no results of this task here: measure it")
+    verdict = decide(losses, other and other.losses)
+    plain = Advice(task, found, losses, other, verdict, "")
+    return plain._replace(reason=_reason(verdict, plain))
+
+
+def decide(losses: Sequence[Loss], redesigned: Sequence[Loss] | None) -> str:
+    """The verdict: one of `IDEAL`, `LOOP`, `THROUGH` and `BUY`.
+
+    Args:
+        losses: of the actuator, at least one.
+        redesigned: with a designed loop; None where there is none to design.
+    """
+    if _within(losses):
+        return IDEAL
+    if redesigned is not None and _within(redesigned):
+        return LOOP
+    return BUY if _worst(losses).lasting else THROUGH
+
+
+def _within(losses: Sequence[Loss]) -> bool:
+    return sum(one.loss.mean for one in losses) <= MARGIN and not any(one.beyond for one in losses)
+
+
+def _worst(losses: Sequence[Loss]) -> Loss:
+    return max(losses, key=lambda one: (one.lasting, one.loss.mean))
+
+
+def _reason(verdict: str, advice: Advice) -> str:
+    if verdict == IDEAL:
+        return f"policies that never met it lose {advice.lost.mean:.2f} of the span, which is within {MARGIN:g}"
+    if verdict == LOOP and advice.redesigned is not None:
+        return f"the same motor under a designed loop loses {advice.redesigned.lost.mean:.2f} of the span"
+    worst = _worst(advice.losses)
+    known = "" if worst.kept is None else f"; trained through {worst.trained:g} they lose {worst.kept:.2f}"
+    if worst.beyond:
+        known = ", and no dose as large was tested"
+    least = "at least " if worst.beyond else ""
+    return f"{worst.axis} {worst.dose:.3g} costs {least}{worst.loss.mean:.2f} of the span{known}"

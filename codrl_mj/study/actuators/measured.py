@@ -1,0 +1,78 @@
+"""What to do about an actuator on a task, measured: policies trained on ideal forces and through it, tested on it."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from codrl_mj.evaluation.measures import Interval, bootstrap_mean
+from codrl_mj.study.actuators import arms
+from codrl_mj.study.actuators.advice import BUY, IDEAL, LOOP, THROUGH, redesign
+from codrl_mj.study.actuators.levels import REFERENCE_SPEEDS, posed
+from codrl_mj.study.actuators.questions import MARGIN, at_home
+from codrl_mj.study.actuators.verdicts import FLOORS
+from codrl_mj.study.grid import check_chosen
+from codrl_mj.study.trials import Collected, Grid, Trial
+
+
+def measured_grid(actuator: Any, task: str, seeds: int, root: Path, episodes: int = 50) -> Grid:
+    """The trainings and tests that show what an actuator costs on a task, and what training through it buys.
+
+    Args:
+        actuator: any family's.
+        task: task name.
+        seeds: training runs of either kind, >= 2.
+        root: folder of the run folders.
+        episodes: test episodes of every policy.
+
+    Raises:
+        ValueError: the study has no such task, or fewer than two seeds are asked for.
+    """
+    check_chosen("task", [task], REFERENCE_SPEEDS)
+    if seeds < 2:
+        raise ValueError(f"seeds = {seeds}: an interval needs at least 2")
+    return Grid(root, tuple(_measured(actuator, task).values()), lambda _: range(seeds), episodes)
+
+
+def _measured(actuator: Any, task: str) -> dict[str, Trial]:
+    here, ideal = posed(task, actuator), arms.ideal(task)
+    through = arms.arm(task, "through it", here)
+    found = {"home": at_home(ideal), IDEAL: Trial(ideal, "it", here), THROUGH: Trial(through, "it", here)}
+    better = redesign(actuator, task)
+    return found if better is None else found | {LOOP: Trial(ideal, "designed", posed(task, better))}
+
+
+class Measured(NamedTuple):
+    """What trainings and tests showed."""
+
+    scores: Mapping[str, Interval]
+    """Mean score with its 95 % interval [shares of the span], by what is done: `IDEAL`, `LOOP`, `THROUGH`."""
+    verdict: str
+    """The first of them, in this order, that loses no more than `MARGIN`; `BUY` if none does, and training wins
+    nothing, `THROUGH` if it wins something."""
+
+
+def measured(actuator: Any, task: str, collected: Collected) -> Measured:
+    """The verdict of what `measured_grid` found.
+
+    Args:
+        actuator: the same.
+        task: the same.
+        collected: of the grid, without anything missing.
+
+    Raises:
+        ValueError: the ideal-trained policies are no better than random actions, or something is missing.
+    """
+    trials = _measured(actuator, task)
+    home = np.array(list(collected.scores(trials.pop("home")).values()))
+    found = {name: np.array(list(collected.scores(trial).values())) for name, trial in trials.items()}
+    if collected.missing or not len(home):
+        raise ValueError(f"{len(collected.missing)} of its trainings and tests are missing: run it again")
+    span = float(np.mean(home)) - FLOORS[task]
+    if span <= 0.0:
+        raise ValueError(f"{task}: ideal-trained policies are no better than random actions: train more seeds")
+    scores = {name: bootstrap_mean((values - FLOORS[task]) / span) for name, values in found.items()}
+    good = [name for name in (IDEAL, LOOP, THROUGH) if name in scores and scores[name].mean >= 1.0 - MARGIN]
+    wins = scores[THROUGH].mean - scores[IDEAL].mean > MARGIN
+    return Measured(scores, good[0] if good else THROUGH if wins else BUY)

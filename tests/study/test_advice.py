@@ -1,0 +1,251 @@
+"""What is advised about an actuator: the bench against closed forms, and verdicts on results that a formula gives."""
+
+import csv
+import dataclasses
+import json
+import math
+
+import pytest
+
+from codrl_mj import cli
+from codrl_mj.actuators import Actuator, CurrentLoop, Lag, Motor
+from codrl_mj.motor_design import find_drive, torque_limits
+from codrl_mj.study.actuators.advice import BUY, IDEAL, LOOP, THROUGH, advise, delivered, doses
+from codrl_mj.study.actuators.evidence import Evidence
+from codrl_mj.study.actuators.levels import AXES, REFERENCE_SPEEDS, supplied, timestep
+from codrl_mj.study.actuators.measured import measured, measured_grid
+from codrl_mj.study.actuators.questions import secondary
+from codrl_mj.study.actuators.verdicts import FLOORS
+from codrl_mj.tasks import find_task, named_actuator
+from tests.matrix import but
+from tests.study.pretended import pretend
+
+OWN_STEPS = {"supply": 1, "noise": 4}
+"""Integration steps in which the loops of the axes' own motors come to within 5 %: at once, and half way each."""
+FINENESS = 0.04  # policy steps: an integration step over ln 20
+
+
+@pytest.mark.parametrize("task", but(["furuta"], REFERENCE_SPEEDS))
+@pytest.mark.parametrize("axis", ["lag", "weakness", "supply", "noise"])
+def test_the_bench_finds_every_dose_of_the_study_and_nothing_else(task, axis):
+    for dose in AXES[axis].doses:
+        found = doses(delivered(AXES[axis].at(task, dose).actuator, task), task)
+        own = OWN_STEPS.get(axis, 0) * timestep(task) / find_task(task).step_duration / math.log(20.0)
+        expected = dict.fromkeys(AXES, 0.0) | {"lag": own} | {axis: dose}
+        if axis == "lag":
+            # within the horizon of 20 steps a lag of 4 comes to 1 - e^-5
+            assert found.pop("weakness") == pytest.approx(math.exp(-20.0 / dose) if dose else 0.0, abs=2e-3)
+            assert found.pop("lag") == pytest.approx(dose, abs=2 * FINENESS, rel=0.05)
+        else:
+            assert found.pop("lag") == pytest.approx(expected["lag"], abs=0.1 * FINENESS)
+        for name, value in found.items():
+            assert value == pytest.approx(expected[name], abs=2e-3, rel=2e-3), name
+
+
+def test_a_delay_is_found_beside_a_lag():
+    step = find_task("pendulum").step_duration
+    found = doses(delivered(Lag(step, delay=0.6 * step), "pendulum"), "pendulum")
+    assert found["delay"] == pytest.approx(0.6)
+    assert found["lag"] == pytest.approx(1.0, abs=2 * FINENESS)
+
+
+def test_friction_is_the_gearmotor_s_at_the_output_and_a_current_limit_is_weakness():
+    drive = supplied("pendulum", 100.0)
+    limited = dataclasses.replace(drive.controller, max_current=0.25 * drive.controller.max_current)
+    rubbed = dataclasses.replace(drive.motor, coulomb_friction=0.02, arm_radius=0.1, rotor_inertia=0.0)
+    force = find_task("pendulum").max_force
+    assert doses(delivered(dataclasses.replace(drive, motor=rubbed), "pendulum"), "pendulum")["friction"] == (
+        pytest.approx(0.02 / 0.1 / force, rel=1e-3)
+    )
+    found = doses(delivered(dataclasses.replace(drive, controller=limited), "pendulum"), "pendulum")
+    assert found["weakness"] == pytest.approx(0.75, abs=1e-3)
+    assert found["supply"] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_what_creeps_to_its_end_counts_as_missing():
+    """A PI loop that is at kp/(kp + R) with (L/R)/(1 + kp/R), and at the rest with (1 + kp)/ki."""
+    step, dt = find_task("pendulum").step_duration, timestep("pendulum")
+    loop = CurrentLoop(kp=1.0, ki=2.0 / (1000 * step), max_voltage=1e3)
+    found = delivered(Actuator(Motor(1.0, 10 * dt, 1.0, 1.0), loop), "pendulum")
+    assert found.at_rest == pytest.approx(1.0 - 0.5 * math.exp(-0.02), abs=2e-3)
+    assert found.lag == pytest.approx(0.5, abs=0.1)
+
+
+# evidence
+
+
+def results(loss, matched=0.2):
+    """Rows of hypotheses.csv: ideal-trained policies lose `loss(axis, dose)` on every task, within 0.01."""
+
+    def effect(contrast):
+        ideal = contrast.one.arm.name.endswith(": ideal")
+        axis, _, dose = contrast.one.test.rpartition(" ")
+        return -loss(axis, float(dose)) if ideal else loss(axis, float(dose)) - matched
+
+    for hypothesis in secondary():
+        (pair,) = hypothesis.contrasts
+        if pair.one.test.rpartition(" ")[0] in AXES:
+            mean = effect(pair)
+            yield {
+                "name": hypothesis.name,
+                "compared": f"{pair.one.name} over {pair.other.name}",
+                **{name: str(mean + by) for name, by in (("effect", 0.0), ("low", -0.01), ("high", 0.01))},
+            }
+
+
+def proportional(axis, dose):
+    """Half of the span at the largest dose."""
+    return 0.5 * dose / AXES[axis].doses[-1]
+
+
+@pytest.fixture(scope="module")
+def evidence():
+    return Evidence(list(results(proportional)))
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_a_loss_is_interpolated_and_has_the_rows_that_it_is_between(evidence, axis):
+    tested, named = AXES[axis].doses, {one.statement: one.name for one in secondary()}
+    middle = (tested[1] + tested[2]) / 2
+    loss = evidence.loss("acrobot", axis, middle)
+    assert loss.loss == pytest.approx([proportional(axis, middle) + by for by in (0.0, -0.01, 0.01)])
+    assert loss.rows == tuple(named[f"acrobot, ideal-trained: {axis} {at:g} over none"] for at in tested[1:3])
+    assert evidence.loss("acrobot", axis, 0.0)[2:5] == ((0.0, 0.0, 0.0), False, ())
+    beyond = evidence.loss("acrobot", axis, 2 * tested[-1])
+    assert beyond.beyond
+    assert beyond.loss.mean == pytest.approx(0.5)
+
+
+def test_what_training_keeps_is_known_where_it_was_tried(evidence):
+    assert evidence.loss("furuta", "lag", 0.5).kept == pytest.approx(0.2)
+    assert evidence.loss("acrobot", "lag", 0.5).kept is None
+
+
+def test_verdicts(evidence):
+    step = find_task("pendulum").step_duration
+    assert advise(Lag(0.0), "pendulum", evidence).verdict == IDEAL
+    assert advise(Lag(step), "pendulum", evidence).verdict == THROUGH
+    assert advise(Lag(10 * step), "pendulum", evidence).verdict == BUY
+    weak = advise(Lag(0.0, gain=0.6), "pendulum", evidence)
+    assert (weak.verdict, weak.lost.mean) == (BUY, pytest.approx(0.5 * 0.4 / 0.7))
+    late = advise(named_actuator("weaker", "pendulum"), "pendulum", evidence)
+    assert late.verdict == LOOP
+    assert late.redesigned.found.lag < 0.1
+    assert "designed loop" in late.reason
+
+
+def test_a_detuned_drive_is_told_to_design_its_loop(evidence):
+    drive = supplied("pendulum", 100.0)
+    slow = dataclasses.replace(drive.controller, bandwidth=0.3)
+    assert advise(dataclasses.replace(drive, controller=slow), "pendulum", evidence).verdict == LOOP
+    assert advise(drive, "pendulum", evidence)[3:5] == (None, IDEAL)
+
+
+def test_without_results_there_is_no_verdict():
+    found = advise(Lag(1.0), "cartpole", Evidence([]))
+    assert found.verdict is None
+    assert "measure" in found.reason
+
+
+# measured
+
+
+@pytest.mark.parametrize(
+    ("ideal", "designed", "through", "verdict"),
+    [
+        (0.97, 1.0, 1.0, IDEAL),
+        (0.5, 0.96, 1.0, LOOP),
+        (0.5, 0.6, 0.96, THROUGH),
+        (0.5, 0.6, 0.7, THROUGH),
+        (0.5, 0.6, 0.52, BUY),
+    ],
+)
+def test_the_verdict_of_a_measurement(tmp_path, ideal, designed, through, verdict):
+    actuator = named_actuator("weaker", "cartpole")
+    grid = measured_grid(actuator, "cartpole", 4, tmp_path)
+
+    def score(trial, seed):
+        level = through if trial.arm.name.endswith("through it") else {"ideal": 1.0, "designed": designed}
+        level = level if isinstance(level, float) else level.get(trial.test, ideal)
+        return FLOORS["cartpole"] + 200.0 * (level + 0.001 * (-1) ** seed)
+
+    pretend(grid, score)
+    found = measured(actuator, "cartpole", grid.collect())
+    assert found.verdict == verdict
+    assert [found.scores[name].mean for name in (IDEAL, LOOP, THROUGH)] == pytest.approx([ideal, designed, through])
+
+
+def test_a_measurement_that_is_not_finished_says_so(tmp_path):
+    actuator = named_actuator("weaker", "cartpole")
+    grid = measured_grid(actuator, "cartpole", 2, tmp_path)
+    pretend(grid, lambda *_: 100.0, leaving_out=[("cartpole: through it", 1)])
+    with pytest.raises(ValueError, match=r"1 of its trainings and tests are missing"):
+        measured(actuator, "cartpole", grid.collect())
+
+
+# the command line
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "hypotheses.csv"
+    rows = list(results(proportional))
+    with path.open("w", newline="") as opened:
+        writer = csv.DictWriter(opened, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    return path
+
+
+def test_on_the_command_line_with_results_and_runs(tmp_path, file, capsys):
+    actuator = named_actuator("weaker", "cartpole")
+    pretend(measured_grid(actuator, "cartpole", 2, tmp_path / "runs"), lambda _, seed: 100.0 + seed)
+    words = [
+        "advise",
+        "weaker",
+        "cartpole",
+        "--evidence",
+        str(file),
+        "--measure",
+        "2",
+        "--root",
+        str(tmp_path / "runs"),
+    ]
+    assert cli.main(words) == 0
+    shown = capsys.readouterr().out
+    assert f"{LOOP}: the same motor under a designed loop loses 0.0" in shown
+    assert f"measured: {IDEAL}" in shown
+    assert cli.main([*words, "--json"]) == 0
+    printed = capsys.readouterr().out
+    found = json.loads(printed[printed.index("{\n") :])
+    assert found["advice"]["verdict"] == LOOP
+    assert found["advice"]["losses"][0]["axis"] == "lag"
+    assert found["measured"]["scores"][IDEAL]["mean"] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["papr", "cartpole"], "did you mean 'paper'"),
+        (["paper", "cartpol"], "did you mean 'cartpole'"),
+        (["paper", "cartpole", "--measure", "1"], "must be >= 2"),
+        (["paper", "cartpole", "--evidence", "nowhere.csv"], "nowhere.csv"),
+        (["maxon-dcx22l", "pendulum", "--gear-ratio", "0"], "gear_ratio = 0.0"),
+    ],
+)
+def test_bad_input_is_told(words, said, capsys):
+    assert cli.main(["advise", *words]) == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("gear", "volts"), [(59.0, 9.0), (59.0, 3.0), (2.0, 9.0)])
+def test_a_motor_s_gear_and_supply_are_the_command_line_s(gear, volts, file, capsys):
+    words = ["advise", "maxon-dcx22l", "pendulum", "--evidence", str(file), "--json"]
+    assert cli.main([*words, "--gear-ratio", str(gear), "--voltage", str(volts)]) == 0
+    found = json.loads(capsys.readouterr().out)["advice"]["found"]
+    drive, force = find_drive("maxon-dcx22l", gear_ratio=gear, voltage=volts), find_task("pendulum").max_force
+    frictionless = dataclasses.replace(drive, motor=dataclasses.replace(drive.motor, coulomb_friction=0.0))
+    for name, speed in (("at_rest", 0.0), ("at_speed", REFERENCE_SPEEDS["pendulum"])):
+        expected = min(float(torque_limits(frictionless, speed, drive.controller.max_current)[1]) / force, 1.0)
+        assert found[name] == pytest.approx(expected, rel=2e-3), name
+    assert found["friction"] == pytest.approx(gear * drive.motor.coulomb_friction / force, rel=1e-3)
