@@ -1,6 +1,7 @@
 """The study of what an actuator costs: what it trains, tests and concludes, on scores that a formula gives."""
 
 import csv
+import dataclasses
 import operator
 from pathlib import Path
 
@@ -13,9 +14,10 @@ from codrl_mj.actuators import Lag
 from codrl_mj.evaluation.measures import Interval
 from codrl_mj.study.actuators import arms
 from codrl_mj.study.actuators.evidence import Evidence
+from codrl_mj.study.actuators.exploration import paper_loops, windup
 from codrl_mj.study.actuators.levels import AXES, needed_voltage, posed
 from codrl_mj.study.actuators.page import FOLDER, write
-from codrl_mj.study.actuators.questions import primary, secondary, wrong_motors
+from codrl_mj.study.actuators.questions import primary, secondary, trials, wrong_motors
 from codrl_mj.study.actuators.study import ActuatorStudy
 from codrl_mj.study.actuators.verdicts import FLOORS, Scores, Verdict, judge, seeds_to_close
 from codrl_mj.tasks import find_task
@@ -98,10 +100,14 @@ def test_no_dose_of_a_lag_is_ideal():
 
 
 def test_the_plan_is_what_is_computed():
-    """docs/results/plan.md counts arms, trainings and tests, and names the hypotheses and doses."""
-    plan = PLAN.read_text()
+    """docs/results/plan.md counts arms, trainings and tests, and names the hypotheses and doses.
+
+    What is explored beyond it tests more, and trains nothing else.
+    """
+    plan, planned = PLAN.read_text(), trials()
     grid = ActuatorStudy().grid
-    counts = len(grid.arms), len(grid.cells()), len(grid.deployments())
+    assert set(planned) <= set(grid.trials)
+    counts = len(grid.arms), len(grid.cells()), len(planned) * 20
     assert "{} arms, 20 seeds each: {} trainings, {} tests of {} episodes".format(*counts, grid.episodes) in plan
     assert [hypothesis.name for hypothesis in primary()] == [f"P{number}" for number in range(1, 13)]
     for name, axis in AXES.items():
@@ -129,6 +135,34 @@ def test_drawn_doses_end_at_the_dose_that_they_are_said_to(task, axis):
     ends = [of(AXES[axis].at(task, dose).actuator) for dose in (0.0, arms.drawn_up_to(task, axis))]
     assert [distribution.low, distribution.high] == pytest.approx(sorted(ends), rel=1e-5)
     assert AXES[axis].trained[task] < arms.drawn_up_to(task, axis) <= AXES[axis].doses[-1]
+
+
+def test_what_is_explored_is_one_thing_otherwise():
+    """Nothing but anti-windup, or one number of the paper's actuator, or the integration step."""
+    for task, pairs in windup().items():
+        for planned, wound in pairs:
+            drive = wound.env.actuator
+            tracking = dataclasses.replace(drive.controller, anti_windup="back_calculation")
+            assert dataclasses.replace(drive, controller=tracking) == planned.env.actuator
+            assert (wound.arm.name, planned.env.timestep) == (f"{task}: ideal", wound.env.timestep)
+    for task in arms.LOOPED:
+        nominal = posed(task, "paper")
+        flat = {name: flattened(env.as_mapping()) for name, env in paper_loops(task).items()}
+        changed = {
+            name: {key for key, value in flattened(nominal.as_mapping()).items() if found[key] != value}
+            for name, found in flat.items()
+        }
+        assert {len(keys) for name, keys in changed.items() if name != "feed-forward 0"} == {1}
+        assert changed["feed-forward 0"] == ({"actuator.controller.kff"} if task == "cartpole" else set())
+
+
+def flattened(mapping, prefix=""):
+    """Leaves of nested mappings by their path."""
+    found = {}
+    for name, value in mapping.items():
+        path = f"{prefix}{name}"
+        found |= flattened(value, f"{path}.") if isinstance(value, dict) else {path: value}
+    return found
 
 
 def test_what_is_so_is_found(study):
@@ -219,6 +253,7 @@ def test_the_page_has_every_number_in_a_file(study, tmp_path):
     assert len(list(csv.DictReader(files["runs.csv"].open()))) == len(study.deployments())
     assert sum(file.stat().st_size for name, file in files.items() if name.endswith(".svg")) < 500_000
     assert f"({FOLDER}/chart.svg)" in page
+    assert "| Pendulum | 0.50 / 0.50 |" in page
     evidence = Evidence.read(files["hypotheses.csv"])
     for task in arms.SECONDS:
         for axis, described in AXES.items():

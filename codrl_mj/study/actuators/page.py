@@ -9,6 +9,8 @@ import numpy as np
 from codrl_mj.runs.files import writing
 from codrl_mj.study.actuators import arms, figures, tables
 from codrl_mj.study.actuators.evidence import Evidence
+from codrl_mj.study.actuators.exploration import around_the_paper, paper_loops, windup
+from codrl_mj.study.actuators.levels import AXES
 from codrl_mj.study.actuators.questions import (
     at_home,
     on_loop,
@@ -57,6 +59,7 @@ def write(collected: Collected, out: Path) -> list[Path]:
         _verdicts(first),
         *(_question(name, title, others, drawn) for name, title in QUESTIONS.items()),
         _yours(advice),
+        _explored(scores),
         _missing(collected),
         _method(collected, scores),
     ]
@@ -122,6 +125,42 @@ motors and loops of this study, none of which the doses were taken from:
 
 ![Foretold and measured losses]({FOLDER}/{foretold})
 """
+
+
+def _explored(scores: Scores) -> str:
+    """Tables of what was not planned: mean scores."""
+    doses = AXES["supply"].doses[1:]
+    lines = [
+        "## Exploration",
+        "",
+        f"Not planned, and without p: mean scores of the same policies, rows of [trials]({FOLDER}/{tables.TRIALS}). A "
+        "supply that lacks a share of what is needed, under ideal-trained policies, with anti-windup / with an "
+        "integrator that goes on while the voltage saturates:",
+        "",
+        f"| supply lacks | {' | '.join(f'{dose:g}' for dose in doses)} |",
+        f"| --- |{' --- |' * len(doses)}",
+    ]
+    for task, pairs in windup().items():
+        lines.append(
+            f"| {TITLES[task]} | {' | '.join(' / '.join(_mean(scores, one) for one in pair) for pair in pairs)} |"
+        )
+    columns = around_the_paper()
+    names = ["the paper's", *paper_loops(arms.LOOPED[0])]
+    lines += [
+        "",
+        "The paper's motor and loop, and otherwise, under policies that were trained on ideal forces and on it:",
+        "",
+        f"| loop | {' | '.join(columns)} |",
+        f"| --- |{' --- |' * len(columns)}",
+    ]
+    for row, name in enumerate(names):
+        lines.append(f"| {name} | {' | '.join(_mean(scores, column[row]) for column in columns.values())} |")
+    return "\n".join(lines) + "\n"
+
+
+def _mean(scores: Scores, trial: Trial) -> str:
+    found = list(scores.of(trial).values())
+    return f"{np.mean(found):.2f}" if found else "–"
 
 
 def _head(collected: Collected) -> str:

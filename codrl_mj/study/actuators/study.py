@@ -5,6 +5,7 @@ from pathlib import Path
 
 from codrl_mj.fields import check, integer
 from codrl_mj.study.actuators import arms
+from codrl_mj.study.actuators.exploration import explored
 from codrl_mj.study.actuators.questions import trials
 from codrl_mj.study.grid import check_chosen
 from codrl_mj.study.trials import Grid
@@ -37,7 +38,8 @@ class ActuatorStudy:
     @property
     def grid(self) -> Grid:
         """Its trainings and tests."""
-        chosen = [trial for trial in trials() if trial.arm.task in self.tasks]
+        every = {trial.name: trial for trial in trials()} | explored()
+        chosen = [trial for trial in every.values() if trial.arm.task in self.tasks]
         if self.total_steps is not None:
             chosen = [dataclasses.replace(trial, arm=trial.arm.shortened(self.total_steps)) for trial in chosen]
         return Grid(self.root, tuple(chosen), lambda _: range(self.seeds), self.episodes)

@@ -1,0 +1,76 @@
+"""What was looked at beyond the plan: more tests of the study's policies, tabulated and concluded from with care."""
+
+import dataclasses
+from typing import Any
+
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.study.actuators import arms
+from codrl_mj.study.actuators.levels import AXES, posed, supply, timestep
+from codrl_mj.study.actuators.questions import dosed, on_loop, through_loop
+from codrl_mj.study.trials import Trial
+from codrl_mj.tasks import find_task
+
+
+def wound_up(task: str, dose: float) -> EnvConfig:
+    """A supply that comes short, under a loop whose integrator goes on while the voltage saturates."""
+    env = supply(task, dose)
+    loop = dataclasses.replace(env.actuator.controller, anti_windup="none")
+    return dataclasses.replace(env, actuator=dataclasses.replace(env.actuator, controller=loop))
+
+
+def windup() -> dict[str, list[tuple[Trial, Trial]]]:
+    """Task -> ideal-trained policies on every dose of the supply, with anti-windup and without."""
+    return {
+        task: [
+            (
+                dosed(arms.ideal(task), "supply", dose),
+                Trial(arms.ideal(task), f"supply {dose:g}, winding up", wound_up(task, dose)),
+            )
+            for dose in AXES["supply"].doses[1:]
+        ]
+        for task in arms.SECONDS
+    }
+
+
+def paper_loops(task: str) -> dict[str, EnvConfig]:
+    """The paper's motor and loop otherwise than the paper has them, by name.
+
+    The integration step is varied for motor and mechanics alike. The study's is a tenth of the policy's step, the
+    paper's the whole of it.
+    """
+    nominal, step = posed(task, "paper"), find_task(task).step_duration
+    motor, loop = nominal.actuator.motor, nominal.actuator.controller
+
+    def driven(**parts: Any) -> EnvConfig:
+        return dataclasses.replace(nominal, actuator=dataclasses.replace(nominal.actuator, **parts))
+
+    return {
+        "feed-forward 0": driven(controller=dataclasses.replace(loop, kff=0.0)),
+        "feed-forward R": driven(controller=dataclasses.replace(loop, kff=motor.resistance)),
+        "half the arm": driven(motor=dataclasses.replace(motor, arm_radius=0.5 * motor.arm_radius)),
+        "twice the arm": driven(motor=dataclasses.replace(motor, arm_radius=2.0 * motor.arm_radius)),
+        "step of the policy": dataclasses.replace(nominal, timestep=step),
+        "step of a hundredth": dataclasses.replace(nominal, timestep=timestep(task) / 10.0),
+    }
+
+
+def around_the_paper() -> dict[str, list[Trial]]:
+    """Column of a table -> policies on the paper's loop, and on what is otherwise; ideal-trained and trained on it."""
+    return {
+        f"{task}, {name}": [
+            on_loop(arm, "paper"),
+            *(Trial(arm, f"paper, {otherwise}", env) for otherwise, env in paper_loops(task).items()),
+        ]
+        for task in arms.LOOPED
+        for name, arm in (("ideal-trained", arms.ideal(task)), ("trained on it", through_loop(task, "paper")))
+    }
+
+
+def explored() -> dict[str, Trial]:
+    """Every trial of the exploration once, by name; some are the plan's."""
+    pairs = [pair for rows in windup().values() for pair in rows]
+    found = [
+        *(trial for pair in pairs for trial in pair),
+        *(t for column in around_the_paper().values() for t in column),
+    ]
+    return {trial.name: trial for trial in found}
