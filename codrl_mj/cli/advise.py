@@ -9,7 +9,7 @@ import tyro
 
 _DELIVERED = {
     # field of Delivery: what it is, unit, digits
-    "lag": ("lag, as of a first-order one that settles alike", "policy steps", ".3g"),
+    "lag": ("lag: time constant of a first-order one that is as late", "policy steps", ".3g"),
     "dead_time": ("dead time", "policy steps", ".3g"),
     "at_rest": ("delivered of the largest force, at rest", "", ".0%"),
     "at_speed": ("delivered of it at the reference speed", "", ".0%"),
@@ -110,6 +110,7 @@ class Advise:
 def _print(name: str, found: Any) -> None:
     from codrl_mj.cli.look import titled_table
     from codrl_mj.cli.terminal import console
+    from codrl_mj.study.actuators.advice import LOOP
     from codrl_mj.study.actuators.levels import AXES
 
     table = titled_table(f"{name} on {found.task}, on the bench")
@@ -129,7 +130,7 @@ def _print(name: str, found: Any) -> None:
             row = (f"{loss.dose:.3g}", AXES[loss.axis].unit, f"{least}{loss.loss.mean:.2f}", bounds)
             table.add_row(loss.axis, *row, ", ".join(loss.rows))
         console().print(table)
-    if found.redesigned is not None and found.redesigned.verdict is not None:
+    if found.redesigned is not None and found.redesigned.verdict is not None and found.verdict != LOOP:
         better = found.redesigned
         line = f"the same motor under a designed loop: {better.verdict}, {better.reason}"
         console().print(line, markup=False, highlight=False)

@@ -11,7 +11,7 @@ from codrl_mj.study.actuators import arms
 from codrl_mj.study.actuators.advice import BUY, IDEAL, LOOP, THROUGH, advise, decide
 from codrl_mj.study.actuators.evidence import Evidence
 from codrl_mj.study.actuators.levels import AXES
-from codrl_mj.study.actuators.questions import at_home, dosed, on_loop, on_motor, undosed
+from codrl_mj.study.actuators.questions import MARGIN, at_home, dosed, on_loop, on_motor, undosed
 from codrl_mj.study.actuators.verdicts import Scores
 from codrl_mj.study.figures import COLOURS, MARKERS, TITLES, save
 from codrl_mj.study.trials import Trial
@@ -127,7 +127,7 @@ def chart(path: Path, evidence: Evidence) -> bool:
         panel.set_xticks([0.1, 0.3, 1.0, 3.0], ["0.1", "0.3", "1", "3"])
         panel.minorticks_off()
     for panel in panels[3:]:
-        panel.set_xlabel("time constant of the loop, or a third of its\nsettling time to 5 % [policy steps]")
+        panel.set_xlabel("time constant of the loop, a third of\nits settling time to 5 % [policy steps]")
     for panel in panels[::3]:
         panel.set_ylabel("voltage there is [needed voltage]")
     handles = [Patch(facecolor=colour, edgecolor="0.6", label=name) for name, colour in _REGIONS.items()]
@@ -153,13 +153,10 @@ def foretold(path: Path, scores: Scores, evidence: Evidence) -> None:
                 at = min(float(np.mean(home) - np.mean(values)), 1.0)
                 colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
                 axes.plot(at, advice.lost.mean, marker, color=colour, label=TITLES[task])
-                axes.annotate(
-                    trial.test.removesuffix(" motor"),
-                    (at, advice.lost.mean),
-                    (4, 4),
-                    fontsize=7,
-                    textcoords="offset points",
-                )
+                if max(at, advice.lost.mean) > MARGIN:
+                    name = trial.test.removesuffix(" motor")
+                    where = {"xytext": (4, 4), "textcoords": "offset points", "fontsize": 7}
+                    axes.annotate(name, (at, advice.lost.mean), **where)
     axes.plot([-0.1, 1.05], [-0.1, 1.05], color="0.7", lw=1, zorder=0)
     axes.set(xlabel="lost in tests [share of the span]", ylabel="foretold by bench and doses")
     axes.grid(color="0.92")
