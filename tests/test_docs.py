@@ -1,6 +1,7 @@
 """What the pages tell a reader to type works as it stands: Python, commands, links."""
 
 import contextlib
+import csv
 import re
 import shlex
 import sys
@@ -107,3 +108,10 @@ def test_a_page_links_to_what_exists(page):
     for link in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", PAGES[page]):
         if not link.startswith("http"):
             assert ((ROOT / page).parent / link).exists(), link
+
+
+def test_the_table_of_upright_tolerances_is_the_file():
+    with (ROOT / "docs/upright_tolerances.csv").open(newline="") as file:
+        rows = list(csv.reader(file))
+    page = (ROOT / "docs/evaluation.md").read_text()
+    assert all(f"| {' | '.join(row)} |" in page for row in rows)

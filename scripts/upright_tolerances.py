@@ -1,0 +1,70 @@
+"""How strict is 'upright and still'? Pendulum's success under other tolerances, of policies that the study trained.
+
+In the episodes that the study tests by. Writes docs/upright_tolerances.csv, and prints it as the table of
+docs/evaluation.md. The study's run folders have to be there: codrl-mj study actuators.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from codrl_mj.evaluation.episodes import run_episodes
+from codrl_mj.runs.policies import load_policy
+from codrl_mj.study.actuators.study import ActuatorStudy
+from codrl_mj.study.tables import write_csv
+from codrl_mj.tasks import find_task
+from codrl_mj.tasks.pendulum import GOAL_HOLD, upright_angle
+from codrl_mj.training import finished
+
+TOLERANCES = ((0.05, 0.05), (0.1, 0.1), (0.2, 0.1), (0.1, 0.2), (0.2, 0.5), (0.5, 1.0))
+"""Angle [rad] and speed [rad/s]."""
+TRIALS = (
+    *("ideal on ideal", "ideal on paper", "paper on paper", "ideal on designed", "ideal on noise 0.8"),
+    *("noise on noise 0.8", "ideal on friction 0.1", "friction on friction 0.1", "ideal on lag 2", "lag on lag 2"),
+    *("weakness on weakness 0.25", "marginal motor on marginal motor", "weaker on weaker"),
+)
+"""Trained on, and tested on."""
+
+
+def row(name: str, study: ActuatorStudy) -> dict[str, object]:
+    """Share of episodes of all finished policies of a trial that end upright and still, by tolerance."""
+    step = find_task("pendulum").step_duration
+    held = round(GOAL_HOLD / step) + 1
+    worst: list[np.ndarray] = []
+    tests = study.grid.deployments()
+    policies = [tests[f"pendulum: {name}", seed] for seed in range(study.seeds)]
+    policies = [test for test in policies if finished(test.run)]
+    for test in policies:
+        for episode in run_episodes(load_policy(test.run), test.env.make, test.episodes, test.seed):
+            end = episode.state[-held:]
+            worst.append(np.array([np.abs(upright_angle(end.T)).max(), np.abs(end[:, 1]).max()]))
+    reached = np.array(worst).reshape(-1, 2)
+    shares = {
+        f"{angle:g} rad, {speed:g} rad/s": round(float(np.mean((reached < (angle, speed)).all(axis=1))), 3)
+        for angle, speed in TOLERANCES
+    }
+    return {"policies": name, "seeds": len(policies), **shares}
+
+
+def main() -> int:
+    """Write the file and print it."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--root", type=Path, default=Path("runs/actuators"), help="folder of the study's run folders")
+    parser.add_argument("--out", type=Path, default=Path("docs/upright_tolerances.csv"), help="file of the table")
+    options = parser.parse_args()
+    study = ActuatorStudy(options.root, tasks=("pendulum",))
+    rows = [found for name in TRIALS if (found := row(name, study))["seeds"]]
+    if not rows:
+        print(f"no finished training in {options.root}: run codrl-mj study actuators first", file=sys.stderr)
+        return 1
+    write_csv(options.out, rows)
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *(found.values() for found in rows)]
+    print("\n".join(f"| {' | '.join(map(str, line))} |" for line in lines))
+    print(f"wrote {options.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
