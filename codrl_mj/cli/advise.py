@@ -91,10 +91,13 @@ class Advise:
         from codrl_mj.study.parallel import Workers
 
         grid = measured_grid(actuator, self.task, seeds, self.root)
-        with progress_bar("{task.completed}/{task.total}") as bar:
-            counts = {"training": len(grid.cells()), "test": len(grid.deployments())}
-            rows = {kind: bar.add_task(f"{kind}s", total=count) for kind, count in counts.items()}
-            grid.compute(Workers(self.jobs), on_cell=lambda kind: bar.advance(rows[kind]))
+        if self.as_json:
+            grid.compute(Workers(self.jobs))
+        else:
+            with progress_bar("{task.completed}/{task.total}") as bar:
+                counts = {"training": len(grid.cells()), "test": len(grid.deployments())}
+                rows = {kind: bar.add_task(f"{kind}s", total=count) for kind, count in counts.items()}
+                grid.compute(Workers(self.jobs), on_cell=lambda kind: bar.advance(rows[kind]))
         found = measured(actuator, self.task, grid.collect())
         if not self.as_json:
             table = titled_table(f"Measured: {seeds} policies of either kind, 50 episodes each")

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from codrl_mj import cli
-from codrl_mj.actuators import Actuator, CurrentLoop, Lag, Motor
+from codrl_mj.actuators import Actuator, CurrentLoop, Lag, Motor, Supply
 from codrl_mj.motor_design import find_drive, torque_limits
-from codrl_mj.study.actuators.advice import BUY, IDEAL, LOOP, THROUGH, advise, delivered, doses
+from codrl_mj.study.actuators.advice import BUY, IDEAL, LOOP, THROUGH, advise, delivered, doses, redesign
 from codrl_mj.study.actuators.evidence import Evidence
 from codrl_mj.study.actuators.levels import AXES, REFERENCE_SPEEDS, supplied, timestep
 from codrl_mj.study.actuators.measured import measured, measured_grid
@@ -145,6 +145,15 @@ def test_a_detuned_drive_is_told_to_design_its_loop(evidence):
     assert advise(drive, "pendulum", evidence)[3:5] == (None, IDEAL)
 
 
+def test_a_designed_loop_keeps_the_supply_and_does_not_cure_a_sensor(evidence):
+    paper = named_actuator("paper", "pendulum")
+    sagging = dataclasses.replace(paper, supply=Supply(5.0, 0.3))
+    assert redesign(sagging, "pendulum").supply == Supply(5.0, 0.3)
+    noisy = dataclasses.replace(paper, controller=dataclasses.replace(paper.controller, current_noise=0.1))
+    assert redesign(noisy, "pendulum") is None
+    assert advise(noisy, "pendulum", evidence).redesigned is None
+
+
 def test_without_results_there_is_no_verdict():
     found = advise(Lag(1.0), "cartpole", Evidence([]))
     assert found.verdict is None
@@ -220,8 +229,7 @@ def test_on_the_command_line_with_results_and_runs(tmp_path, file, capsys):
     assert f"{LOOP}: the same motor under a designed loop loses 0.0" in shown
     assert f"measured: {IDEAL}" in shown
     assert cli.main([*words, "--json"]) == 0
-    printed = capsys.readouterr().out
-    found = json.loads(printed[printed.index("{\n") :])
+    found = json.loads(capsys.readouterr().out)
     assert found["advice"]["verdict"] == LOOP
     assert found["advice"]["losses"][0]["axis"] == "lag"
     assert found["measured"]["scores"][IDEAL]["mean"] == pytest.approx(1.0)
@@ -234,6 +242,8 @@ def test_on_the_command_line_with_results_and_runs(tmp_path, file, capsys):
         (["paper", "cartpol"], "did you mean 'cartpole'"),
         (["paper", "cartpole", "--measure", "1"], "must be >= 2"),
         (["paper", "cartpole", "--evidence", "nowhere.csv"], "nowhere.csv"),
+        (["paper", "cartpole", "--evidence", "docs/upright_tolerances.csv"], "has no column 'name'"),
+        (["ideal", "cartpole", "--measure", "2"], "actuator = 'ideal'"),
         (["maxon-dcx22l", "pendulum", "--gear-ratio", "0"], "gear_ratio = 0.0"),
     ],
 )

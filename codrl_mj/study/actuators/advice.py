@@ -90,8 +90,9 @@ def redesign(actuator: Any, task: str) -> Drive | None:
     Raises:
         ValueError: the motor does not allow one.
     """
-    if isinstance(actuator, Actuator):
-        return arms.redesigned(actuator, task)
+    if isinstance(actuator, Actuator):  # what a sensor gets wrong no loop makes right
+        wrong = actuator.controller.current_noise or actuator.controller.current_bias
+        return None if wrong else arms.redesigned(actuator, task)
     if isinstance(actuator, Drive):
         loop = dataclasses.replace(actuator.controller, bandwidth=0.0, kp=0.0, ki=0.0, anti_windup="back_calculation")
         return None if loop == actuator.controller else dataclasses.replace(actuator, controller=loop)

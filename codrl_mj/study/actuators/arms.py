@@ -103,7 +103,9 @@ def designed(task: str) -> Drive:
 
 def redesigned(actuator: Actuator, task: str) -> Drive:
     """The motor and supply of a current loop under a designed one: pole-zero cancellation, anti-windup, a limit."""
-    motor, supply = actuator.motor, actuator.controller.max_voltage
+    motor, voltage = actuator.motor, actuator.controller.max_voltage
+    if actuator.supply is not None:
+        voltage = min(voltage, actuator.supply.voltage)
     limit = motor.arm_radius * find_task(task).max_force / motor.torque_constant
     return Drive(
         GearMotor(
@@ -115,7 +117,7 @@ def redesigned(actuator: Actuator, task: str) -> Drive:
             arm_radius=motor.arm_radius,
         ),
         SampledLoop(sample_rate=20.0 / timestep(task), max_current=limit),
-        Supply(supply),
+        Supply(voltage) if actuator.supply is None else dataclasses.replace(actuator.supply, voltage=voltage),
     )
 
 

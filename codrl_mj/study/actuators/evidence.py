@@ -17,6 +17,7 @@ from codrl_mj.study.actuators.tables import HYPOTHESES
 _PACKAGE = Path(__file__).parents[2]
 EVIDENCE = (_PACKAGE / "_assets" / "study", _PACKAGE.parent / "docs" / "results" / "actuators")
 """Where the study's results lie: in a wheel, in a checkout."""
+_COLUMNS = ("name", "compared", "effect", "low", "high")
 
 
 class Loss(NamedTuple):
@@ -61,12 +62,22 @@ class Evidence:
 
     @classmethod
     def read(cls, file: Path | None = None) -> "Evidence":
-        """Read a file; that of the checkout or the wheel unless one is given, and none if there is none."""
+        """Read a file; that of the checkout or the wheel unless one is given, and none if there is none.
+
+        Raises:
+            FileNotFoundError: the file that is given is not there.
+            ValueError: a file is none of the study's.
+        """
         there = [file] if file is not None else [folder / HYPOTHESES for folder in EVIDENCE]
         for path in there:
             if path.is_file() or file is not None:
                 with path.open(newline="", encoding="utf-8") as opened:
-                    return cls(list(csv.DictReader(opened)))
+                    rows = list(csv.DictReader(opened))
+                if lacking := [name for name in _COLUMNS if rows and name not in rows[0]]:
+                    raise ValueError(
+                        f"{path}: has no column {lacking[0]!r}: give the {HYPOTHESES} of codrl-mj study actuators"
+                    )
+                return cls(rows)
         return cls([])
 
     def effect(self, contrast: Contrast) -> tuple[str, Interval] | None:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from codrl_mj.actuators import IDEAL as IDEAL_ACTUATOR
 from codrl_mj.evaluation.measures import Interval, bootstrap_mean
 from codrl_mj.study.actuators import arms
 from codrl_mj.study.actuators.advice import BUY, IDEAL, LOOP, THROUGH, redesign
@@ -27,9 +28,11 @@ def measured_grid(actuator: Any, task: str, seeds: int, root: Path, episodes: in
         episodes: test episodes of every policy.
 
     Raises:
-        ValueError: the study has no such task, or fewer than two seeds are asked for.
+        ValueError: the study has no such task, the actuator is ideal, or fewer than two seeds are asked for.
     """
     check_chosen("task", [task], REFERENCE_SPEEDS)
+    if actuator == IDEAL_ACTUATOR:
+        raise ValueError("actuator = 'ideal': training through it is training on ideal forces: name another")
     if seeds < 2:
         raise ValueError(f"seeds = {seeds}: an interval needs at least 2")
     return Grid(root, tuple(_measured(actuator, task).values()), lambda _: range(seeds), episodes)
@@ -68,7 +71,8 @@ def measured(actuator: Any, task: str, collected: Collected) -> Measured:
     home = np.array(list(collected.scores(trials.pop("home")).values()))
     found = {name: np.array(list(collected.scores(trial).values())) for name, trial in trials.items()}
     if collected.missing or not len(home):
-        raise ValueError(f"{len(collected.missing)} of its trainings and tests are missing: run it again")
+        why = next((f": {name}: {error}" for name, error in collected.failures.items()), "")
+        raise ValueError(f"{len(collected.missing)} of its trainings and tests are missing{why}: run it again")
     span = float(np.mean(home)) - FLOORS[task]
     if span <= 0.0:
         raise ValueError(f"{task}: ideal-trained policies are no better than random actions: train more seeds")
