@@ -11,7 +11,7 @@ import pytest
 from codrl_mj import cli
 from codrl_mj.actuators import Actuator, CurrentLoop, Lag, Motor, Supply
 from codrl_mj.motor_design import find_drive, torque_limits
-from codrl_mj.study.actuators.advice import BUY, IDEAL, LOOP, THROUGH, advise, delivered, doses, redesign
+from codrl_mj.study.actuators.advice import BUY, IDEAL, LOOP, MEASURE, THROUGH, advise, delivered, doses, redesign
 from codrl_mj.study.actuators.evidence import Evidence
 from codrl_mj.study.actuators.levels import AXES, REFERENCE_SPEEDS, supplied, timestep
 from codrl_mj.study.actuators.measured import measured, measured_grid
@@ -136,6 +136,13 @@ def test_verdicts(evidence):
     assert late.verdict == LOOP
     assert late.redesigned.found.lag < 0.1
     assert "designed loop" in late.reason
+
+
+def test_more_than_was_tested_is_no_reason_to_buy_where_it_cost_nothing():
+    harmless = Evidence(list(results(lambda axis, dose: 0.0 if axis == "weakness" else proportional(axis, dose))))
+    found = advise(Lag(0.0, gain=0.1), "acrobot", harmless)
+    assert (found.verdict, found.lost.mean) == (MEASURE, 0.0)
+    assert "no dose as large" in found.reason
 
 
 def test_a_detuned_drive_is_told_to_design_its_loop(evidence):

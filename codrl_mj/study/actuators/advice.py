@@ -19,6 +19,7 @@ from codrl_mj.study.grid import check_chosen
 from codrl_mj.tasks import find_task
 
 IDEAL, LOOP, THROUGH, BUY = "train on ideal", "design the loop", "train through it", "buy another"
+MEASURE = "measure it"
 """What there is to be advised."""
 
 
@@ -74,7 +75,7 @@ class Advice(NamedTuple):
     redesigned: "Advice | None"
     """The same with a designed loop, where there is one to design."""
     verdict: str | None
-    """One of `IDEAL`, `LOOP`, `THROUGH` and `BUY`; None without evidence."""
+    """One of `IDEAL`, `LOOP`, `THROUGH`, `BUY` and `MEASURE`; None without evidence."""
     reason: str
     """Why, in a sentence."""
 
@@ -123,7 +124,7 @@ def advise(actuator: Any, task: str, evidence: Evidence) -> Advice:
 
 
 def decide(losses: Sequence[Loss], redesigned: Sequence[Loss] | None) -> str:
-    """The verdict: one of `IDEAL`, `LOOP`, `THROUGH` and `BUY`.
+    """The verdict: one of `IDEAL`, `LOOP`, `THROUGH` and `BUY`, or `MEASURE`: more than was tested, which cost little.
 
     Args:
         losses: of the actuator, at least one.
@@ -133,6 +134,8 @@ def decide(losses: Sequence[Loss], redesigned: Sequence[Loss] | None) -> str:
         return IDEAL
     if redesigned is not None and _within(redesigned):
         return LOOP
+    if sum(one.loss.mean for one in losses) <= MARGIN:
+        return MEASURE
     return BUY if _worst(losses).lasting else THROUGH
 
 
@@ -149,7 +152,7 @@ def _reason(verdict: str, advice: Advice) -> str:
         return f"policies that never met it lose {advice.lost.mean:.2f} of the span, which is within {MARGIN:g}"
     if verdict == LOOP and advice.redesigned is not None:
         return f"the same motor under a designed loop loses {advice.redesigned.lost.mean:.2f} of the span"
-    worst = _worst(advice.losses)
+    worst = _worst([one for one in advice.losses if one.beyond or verdict != MEASURE])
     known = "" if worst.kept is None else f"; trained through {worst.trained:g} they lose {worst.kept:.2f}"
     if worst.beyond:
         known = ", and no dose as large was tested"

@@ -42,9 +42,11 @@ class Loss(NamedTuple):
     def lasting(self) -> bool:
         """Whether training through it buys it back, as far as is known, is to be denied.
 
-        So it is where no dose as large was tested, and where policies that were trained through no more of it still
-        lose more than `MARGIN`.
+        So it is where it costs more than `MARGIN`, and no dose as large was tested, or policies that were trained
+        through no more of it still lose as much.
         """
+        if self.loss.mean <= MARGIN:
+            return False
         return self.beyond or (self.dose >= self.trained and self.kept is not None and self.kept > MARGIN)
 
 

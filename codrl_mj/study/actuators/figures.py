@@ -8,7 +8,7 @@ import numpy as np
 
 from codrl_mj.evaluation.measures import bootstrap_mean
 from codrl_mj.study.actuators import arms
-from codrl_mj.study.actuators.advice import BUY, IDEAL, LOOP, THROUGH, advise, decide
+from codrl_mj.study.actuators.advice import BUY, IDEAL, LOOP, MEASURE, THROUGH, advise, decide
 from codrl_mj.study.actuators.evidence import Evidence
 from codrl_mj.study.actuators.levels import AXES
 from codrl_mj.study.actuators.questions import MARGIN, at_home, dosed, on_loop, on_motor, undosed
@@ -17,7 +17,7 @@ from codrl_mj.study.figures import COLOURS, MARKERS, TITLES, save
 from codrl_mj.study.trials import Trial
 
 _LOWEST = -0.1  # of the span; what is worse is as lost
-_REGIONS = {IDEAL: "#d9f0e3", LOOP: "#dbe9f6", THROUGH: "#fdebc8", BUY: "#f6d5cc"}
+_REGIONS = {IDEAL: "#d9f0e3", LOOP: "#dbe9f6", THROUGH: "#fdebc8", BUY: "#f6d5cc", MEASURE: "#eeeeee"}
 
 
 def doses(path: Path, scores: Scores) -> None:
@@ -116,7 +116,7 @@ def chart(path: Path, evidence: Evidence) -> bool:
         )
         regions = np.array([[list(_REGIONS).index(decide([one, other], [other])) for one in late] for other in short])
         colours = ListedColormap(list(_REGIONS.values()))
-        panel.pcolormesh(lags, 1.0 - lacks, regions, cmap=colours, vmin=-0.5, vmax=3.5, rasterized=True)
+        panel.pcolormesh(lags, 1.0 - lacks, regions, cmap=colours, vmin=-0.5, vmax=4.5, rasterized=True)
         for number, name in enumerate(_REGIONS):  # in words too, for print without colours
             room = distance_transform_edt(np.pad(regions == number, 1))[1:-1, 1:-1]
             row, column = np.unravel_index(np.argmax(room), room.shape)
@@ -131,7 +131,7 @@ def chart(path: Path, evidence: Evidence) -> bool:
     for panel in panels[::3]:
         panel.set_ylabel("voltage there is [needed voltage]")
     handles = [Patch(facecolor=colour, edgecolor="0.6", label=name) for name, colour in _REGIONS.items()]
-    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize="small")
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize="small")
     save(figure, path)
     return True
 
