@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -148,4 +149,6 @@ def _plain(value: Any) -> Any:
         return {name: _plain(part) for name, part in value._asdict().items()} | extra
     if isinstance(value, dict):
         return {name: _plain(part) for name, part in value.items()}
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
     return [_plain(part) for part in value] if isinstance(value, tuple) else value

@@ -87,8 +87,8 @@ class Delivery(NamedTuple):
     dead_time: float
     """Until a thousandth of what comes in the end is there [steps]."""
     lag: float
-    """Average residence time less the dead time [steps]: the time constant of the first-order lag that delivers as much
-    impulse. Source: Astrom, Hagglund, *PID Controllers*, 2nd ed., section 2.4 (area methods)."""
+    """Average residence time less the dead time [steps]: the time constant of the first-order lag that comes as late;
+    ringing counts as lateness. Source: Astrom, Hagglund, *PID Controllers*, 2nd ed., section 2.4 (area methods)."""
     at_rest: float
     """What is there in the end, while the joint is blocked."""
     at_speed: float
@@ -120,7 +120,7 @@ def delivery(actuator: Any, timestep: float, step: float, force: float, speed: f
     last = float(np.mean(_end(torques)))
     begun = np.flatnonzero(np.abs(torques) > 1e-3 * abs(last))
     dead = int(begun[0]) if len(begun) else 0
-    lag = max(float(np.sum(1.0 - torques / last)) - dead, 0.0) if last else 0.0
+    lag = max(float(np.sum(np.abs(1.0 - torques / last))) - dead, 0.0) if last else 0.0
     slow = 0.05 * speed
     turned = _end(Bench(actuator, timestep, 1e4 * force * duration / slow).run(0.0, duration, slow))
     return Delivery(

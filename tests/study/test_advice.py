@@ -145,6 +145,24 @@ def test_more_than_was_tested_is_no_reason_to_buy_where_it_cost_nothing():
     assert "no dose as large" in found.reason
 
 
+def test_more_than_is_asked_for_is_not_called_harmless(evidence):
+    assert advise(Lag(0.0, gain=3.0), "pendulum", evidence).verdict == MEASURE
+
+
+def test_the_largest_dose_is_not_beyond_it(evidence):
+    found = advise(AXES["supply"].at("acrobot", AXES["supply"].doses[-1]).actuator, "acrobot", evidence)
+    assert not any(loss.beyond for loss in found.losses)
+
+
+def test_a_ringing_loop_is_late(evidence):
+    """Poles of 0.9 rad a step with a damping ratio of 0.1: an overshoot of exp(-pi*0.1/sqrt(0.99)) = 73 %."""
+    speed = 0.9 / find_task("pendulum").step_duration
+    loop = CurrentLoop(kp=0.0, ki=speed**2, max_voltage=1e6, substeps=100)
+    found = advise(Actuator(Motor(0.2 * speed, 1.0, 1.0, 1.0), loop), "pendulum", evidence)
+    assert found.found.lag > 1.0
+    assert found.verdict != IDEAL
+
+
 def test_a_detuned_drive_is_told_to_design_its_loop(evidence):
     drive = supplied("pendulum", 100.0)
     slow = dataclasses.replace(drive.controller, bandwidth=0.3)
@@ -236,7 +254,7 @@ def test_on_the_command_line_with_results_and_runs(tmp_path, file, capsys):
     assert f"{LOOP}: the same motor under a designed loop loses 0.0" in shown
     assert f"measured: {IDEAL}" in shown
     assert cli.main([*words, "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    found = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert found["advice"]["verdict"] == LOOP
     assert found["advice"]["losses"][0]["axis"] == "lag"
     assert found["measured"]["scores"][IDEAL]["mean"] == pytest.approx(1.0)

@@ -27,9 +27,13 @@ def delivered(actuator: Any, task: str) -> Delivery:
     """What an actuator makes of the commands of a task, on the bench.
 
     Raises:
-        ValueError: the study has no such task.
+        ValueError: the study has no such task, or the actuator is not asked for forces.
     """
     check_chosen("task", [task], REFERENCE_SPEEDS)
+    if actuator.MOTION:
+        raise ValueError(
+            f"actuator: a {actuator.family} is asked for motion, not for forces: name one of another family"
+        )
     known = find_task(task)
     return delivery(actuator, timestep(task), known.step_duration, known.max_force, REFERENCE_SPEEDS[task])
 
@@ -118,6 +122,8 @@ def advise(actuator: Any, task: str, evidence: Evidence) -> Advice:
     other = advise(better, task, evidence) if better is not None else None
     if len(losses) < len(AXES):
         return Advice(task, found, (), other, None, "the study has no results of this task here: measure it")
+    if max(found.at_rest, found.at_speed) > 1.05:
+        return Advice(task, found, losses, other, MEASURE, "it delivers more than is asked for, which was not tested")
     verdict = decide(losses, other and other.losses)
     plain = Advice(task, found, losses, other, verdict, "")
     return plain._replace(reason=_reason(verdict, plain))
@@ -136,7 +142,9 @@ def decide(losses: Sequence[Loss], redesigned: Sequence[Loss] | None) -> str:
         return LOOP
     if sum(one.loss.mean for one in losses) <= MARGIN:
         return MEASURE
-    return BUY if _worst(losses).lasting else THROUGH
+    if not _worst(losses).lasting:
+        return THROUGH
+    return BUY if redesigned is None or _worst(redesigned).lasting else LOOP
 
 
 def _within(losses: Sequence[Loss]) -> bool:

@@ -105,7 +105,7 @@ class Evidence:
         between = Interval(*(float(np.interp(dose, tested, values)) for values in zip(*curve.lost, strict=True)))
         index = min(int(np.searchsorted(tested, dose)), len(tested) - 1)
         rows = tuple(curve.rows[place - 1] for place in (index - 1, index) if place >= 1) if dose else ()
-        return Loss(axis, dose, between, dose > tested[-1], rows, curve.kept, curve.trained)
+        return Loss(axis, dose, between, dose > 1.005 * tested[-1], rows, curve.kept, curve.trained)
 
     def _curve(self, task: str, axis: str) -> "_Curve | None":
         ideal, tested = arms.ideal(task), AXES[axis].doses
