@@ -87,7 +87,8 @@ class Advise:
 
     def _measured(self, actuator: Any, seeds: int) -> Any:
         from codrl_mj.cli.look import titled_table
-        from codrl_mj.cli.terminal import console, progress_bar
+        from codrl_mj.cli.study import compute
+        from codrl_mj.cli.terminal import console
         from codrl_mj.study.actuators.measured import measured, measured_grid
         from codrl_mj.study.parallel import Workers
 
@@ -95,10 +96,7 @@ class Advise:
         if self.as_json:
             grid.compute(Workers(self.jobs))
         else:
-            with progress_bar("{task.completed}/{task.total}") as bar:
-                counts = {"training": len(grid.cells()), "test": len(grid.deployments())}
-                rows = {kind: bar.add_task(f"{kind}s", total=count) for kind, count in counts.items()}
-                grid.compute(Workers(self.jobs), on_cell=lambda kind: bar.advance(rows[kind]))
+            compute(grid, Workers(self.jobs))
         found = measured(actuator, self.task, grid.collect())
         if not self.as_json:
             table = titled_table(f"Measured: {seeds} policies of either kind, 50 episodes each")

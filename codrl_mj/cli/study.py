@@ -9,6 +9,16 @@ from typing import Annotated, Any, Literal
 import tyro
 
 
+def compute(grid: Any, workers: Any, accept_changes: bool = False) -> None:
+    """Compute what of a grid is missing, with a progress bar each for its trainings and its tests."""
+    from codrl_mj.cli.terminal import progress_bar
+
+    counts = {"training": len(grid.cells()), "test": len(grid.deployments())}
+    with progress_bar("{task.completed}/{task.total}") as bar:
+        rows = {kind: bar.add_task(f"{kind}s", total=count) for kind, count in counts.items()}
+        grid.compute(workers, accept_changes, lambda kind: bar.advance(rows[kind]))
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Computed:
     """A verb that trains and tests much, unless that is done already, and writes a page of it.
@@ -37,7 +47,6 @@ class Computed:
 
     def run(self: Any) -> int:
         """Compute what is missing and write the page; 1 if something failed."""
-        from codrl_mj.cli.terminal import progress_bar
         from codrl_mj.runs.files import check_writable
         from codrl_mj.study.parallel import Workers
 
@@ -50,10 +59,7 @@ class Computed:
         if not self.only_page:
             import matplotlib  # noqa: F401 - what is missing is missed now and not in the end
 
-            counts = {"training": len(grid.cells()), "test": len(grid.deployments())}
-            with progress_bar("{task.completed}/{task.total}") as bar:
-                rows = {kind: bar.add_task(f"{kind}s", total=count) for kind, count in counts.items()}
-                grid.compute(workers, self.accept_changes, lambda kind: bar.advance(rows[kind]))
+            compute(grid, workers, self.accept_changes)
         files, failures = self.write()
         for file in files:
             print(f"wrote {file}")

@@ -55,28 +55,6 @@ class Bench:
         return rows
 
 
-def settled(torques: np.ndarray, band: float) -> int:
-    """The first step from which on the torque, shape (steps,), stays within a share of its last."""
-    wrong = np.flatnonzero(np.abs(torques / torques[-1] - 1.0) > band)
-    return int(wrong[-1]) + 1 if len(wrong) else 0
-
-
-def free_run(actuator: Any, timestep: float, inertia: float, time_constant: float) -> tuple[float, float]:
-    """No-load speed [rad/s] of the joint and the time constant [s] in which it is reached.
-
-    That is the area between speed and no-load speed over the latter: the sum of all time constants less none of the
-    winding's, whatever its inductance; torque and back-EMF are of the speed at a step's start, and so is the sum.
-
-    Args:
-        actuator: whose.
-        timestep: [s].
-        inertia: of the load [kg*m^2].
-        time_constant: about the one to be found [s], for how long to look.
-    """
-    speeds = Bench(actuator, timestep, inertia).run(1e6, 20.0 * time_constant)[:, 2]
-    return float(speeds[-1]), float(timestep * (1.0 + np.sum(1.0 - speeds / speeds[-1])))
-
-
 class Delivery(NamedTuple):
     """What an actuator makes of a command within `HORIZON`, in steps of the policy and shares of the largest force.
 
