@@ -16,6 +16,7 @@ _DELIVERED = {
     "at_speed": ("delivered of it at the reference speed", "", ".0%"),
     "friction": ("friction", "largest force", ".3g"),
     "noise": ("noise of the force", "largest force", ".3g"),
+    "unasked": ("force while nothing is asked for", "largest force", ".3g"),
 }
 
 
@@ -25,7 +26,7 @@ class Advise:
 
     A bench measures how late, how much and how noisily the actuator delivers the task's largest force; the study's
     results say what policies that were trained on ideal forces lose by that. --measure trains some, on ideal forces
-    and through it, and tests them on it, which takes minutes and assumes nothing; killed, it goes on where it was.
+    and through it, and tests them on it, which takes minutes; killed, it goes on where it was.
 
     Example: codrl-mj advise maxon-ec45-flat-50w pendulum --gear-ratio 20, or codrl-mj advise paper cartpole --measure 5
     """
@@ -68,7 +69,12 @@ class Advise:
         check_chosen("TASK", [self.task], REFERENCE_SPEEDS)
         if self.measure is not None and self.measure < 2:
             raise ValueError(f"--measure {self.measure}: must be >= 2, or there is no interval")
-        actuator = posed(self.task, self._named()).actuator
+        try:
+            actuator = posed(self.task, self._named()).actuator
+        except ValueError as error:
+            given = {"--gear-ratio": self.gear_ratio, "--voltage": self.voltage}
+            about = ", ".join(flag for flag, value in given.items() if value is not None)
+            raise ValueError(f"{about}: {error}" if about else str(error)) from error
         found = advise(actuator, self.task, Evidence.read(self.evidence))
         if not self.as_json:
             _print(self.actuator, found)
@@ -128,8 +134,8 @@ def _print(name: str, found: Any) -> None:
             table.add_column(head, justify="right" if head in ("dose", "loss") else "left")
         for loss in found.losses:
             least = "at least " if loss.beyond else ""
-            bounds = f"{loss.loss.low:.2f} to {loss.loss.high:.2f}"
-            row = (f"{loss.dose:.3g}", AXES[loss.axis].unit, f"{least}{loss.loss.mean:.2f}", bounds)
+            bounds = f"{loss.loss.low:z.2f} to {loss.loss.high:z.2f}"
+            row = (f"{loss.dose:.3g}", AXES[loss.axis].unit, f"{least}{loss.loss.mean:z.2f}", bounds)
             table.add_row(loss.axis, *row, ", ".join(loss.rows))
         console().print(table)
     if found.redesigned is not None and found.redesigned.verdict is not None and found.verdict != LOOP:

@@ -26,6 +26,7 @@ class Bench:
         """Build it."""
         spec = mujoco.MjSpec()
         spec.option.timestep, spec.compiler.boundmass = timestep, 0.0
+        spec.option.tolerance = 0.0  # it is relative to the inertia, beside which friction would count as none
         body = spec.worldbody.add_body(explicitinertial=True, mass=1.0, inertia=[inertia] * 3)
         body.add_joint(name="hinge", axis=[0.0, 0.0, 1.0])
         spec.add_actuator(target="hinge", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
@@ -72,9 +73,12 @@ class Delivery(NamedTuple):
     at_speed: float
     """The same at the reference speed, while it drives."""
     friction: float
-    """Friction and other losses [largest force] of the actuator at a twentieth of the reference speed."""
+    """What brakes the joint while nothing is asked for [largest force]: the larger of all of it at a twentieth of the
+    reference speed, and of what the actuator rubs away itself at that speed, where its back-EMF is no friction."""
     noise: float
     """Standard deviation of the force [largest force] from one integration step to the next."""
+    unasked: float
+    """Mean force [largest force] at rest while nothing is asked for, either sign."""
 
 
 def delivery(actuator: Any, timestep: float, step: float, force: float, speed: float) -> Delivery:
@@ -94,20 +98,25 @@ def delivery(actuator: Any, timestep: float, step: float, force: float, speed: f
     def asked(at: float) -> np.ndarray:
         return (blocked.run(force, duration, at)[:, 0] - unasked) / force
 
+    def braked(at: float) -> tuple[float, float]:
+        turned = _end(Bench(actuator, timestep, 1e4 * force * duration / at).run(0.0, duration, at))
+        driven, moved, _ = np.mean(turned, axis=0)
+        return float(np.mean(_end(unasked)) - moved) / force, float(driven - moved) / force
+
     torques = asked(0.0)
     last = float(np.mean(_end(torques)))
     begun = np.flatnonzero(np.abs(torques) > 1e-3 * abs(last))
     dead = int(begun[0]) if len(begun) else 0
     lag = max(float(np.sum(np.abs(1.0 - torques / last))) - dead, 0.0) if last else 0.0
-    slow = 0.05 * speed
-    turned = _end(Bench(actuator, timestep, 1e4 * force * duration / slow).run(0.0, duration, slow))
+    settled = unasked[len(unasked) // 2 :] / force
     return Delivery(
-        dead * timestep / step,
-        lag * timestep / step,
-        last,
-        float(np.mean(_end(asked(speed)))),
-        max(float(np.mean(turned[:, 0] - turned[:, 1])), 0.0) / force,
-        float(np.std(unasked[len(unasked) // 2 :])) / force,
+        dead_time=dead * timestep / step,
+        lag=lag * timestep / step,
+        at_rest=last,
+        at_speed=float(np.mean(_end(asked(speed)))),
+        friction=max(braked(0.05 * speed)[0], braked(speed)[1], 0.0),
+        noise=float(np.std(settled)),
+        unasked=abs(float(np.mean(settled))),
     )
 
 

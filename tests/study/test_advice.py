@@ -11,7 +11,18 @@ import pytest
 from codrl_mj import cli
 from codrl_mj.actuators import Actuator, CurrentLoop, Lag, Motor, Supply
 from codrl_mj.motor_design import find_drive, torque_limits
-from codrl_mj.study.actuators.advice import BUY, IDEAL, LOOP, MEASURE, THROUGH, advise, delivered, doses, redesign
+from codrl_mj.study.actuators.advice import (
+    BUY,
+    IDEAL,
+    LOOP,
+    MEASURE,
+    THROUGH,
+    advise,
+    decide,
+    delivered,
+    doses,
+    redesign,
+)
 from codrl_mj.study.actuators.evidence import Evidence
 from codrl_mj.study.actuators.levels import AXES, REFERENCE_SPEEDS, supplied, timestep
 from codrl_mj.study.actuators.measured import measured, measured_grid
@@ -51,14 +62,27 @@ def test_a_delay_is_found_beside_a_lag():
     assert found["lag"] == pytest.approx(0.95, abs=0.01)  # half an integration step less
 
 
-def test_friction_is_the_gearmotor_s_at_the_output_and_a_current_limit_is_weakness():
+@pytest.mark.parametrize("task", ["pendulum", "mountain_car"])
+@pytest.mark.parametrize(
+    ("kinds", "expected"),
+    [
+        ({"coulomb_friction": 0.02}, lambda _: 0.02),
+        ({"viscous_friction": 1e-3}, lambda speed: 1e-3 * speed),
+        ({"stribeck_friction": 0.02, "stribeck_speed": 1e6}, lambda _: 0.02),
+        ({"coulomb_friction": 0.02, "viscous_friction": 1e-3}, lambda speed: 0.02 + 1e-3 * speed),
+    ],
+)
+def test_friction_is_the_gearmotor_s_at_the_output(task, kinds, expected):
+    drive = supplied(task, 100.0)
+    rubbed = dataclasses.replace(drive.motor, arm_radius=0.1, rotor_inertia=0.0, **kinds)
+    found = doses(delivered(dataclasses.replace(drive, motor=rubbed), task), task)["friction"]
+    at_the_rotor = expected(REFERENCE_SPEEDS[task] / 0.1)
+    assert found == pytest.approx(at_the_rotor / 0.1 / find_task(task).max_force, rel=1e-3)
+
+
+def test_a_current_limit_is_weakness():
     drive = supplied("pendulum", 100.0)
     limited = dataclasses.replace(drive.controller, max_current=0.25 * drive.controller.max_current)
-    rubbed = dataclasses.replace(drive.motor, coulomb_friction=0.02, arm_radius=0.1, rotor_inertia=0.0)
-    force = find_task("pendulum").max_force
-    assert doses(delivered(dataclasses.replace(drive, motor=rubbed), "pendulum"), "pendulum")["friction"] == (
-        pytest.approx(0.02 / 0.1 / force, rel=1e-3)
-    )
     found = doses(delivered(dataclasses.replace(drive, controller=limited), "pendulum"), "pendulum")
     assert found["weakness"] == pytest.approx(0.75, abs=1e-3)
     assert found["supply"] == pytest.approx(0.0, abs=1e-3)
@@ -103,8 +127,13 @@ def proportional(axis, dose):
 
 
 @pytest.fixture(scope="module")
-def evidence():
-    return Evidence(list(results(proportional)))
+def rows():
+    return list(results(proportional))
+
+
+@pytest.fixture(scope="module")
+def evidence(rows):
+    return Evidence(rows)
 
 
 @pytest.mark.parametrize("axis", AXES)
@@ -115,6 +144,9 @@ def test_a_loss_is_interpolated_and_has_the_rows_that_it_is_between(evidence, ax
     assert loss.loss == pytest.approx([proportional(axis, middle) + by for by in (0.0, -0.01, 0.01)])
     assert loss.rows == tuple(named[f"acrobot, ideal-trained: {axis} {at:g} over none"] for at in tested[1:3])
     assert evidence.loss("acrobot", axis, 0.0)[2:5] == ((0.0, 0.0, 0.0), False, ())
+    assert evidence.loss("acrobot", axis, tested[1]).rows == (
+        named[f"acrobot, ideal-trained: {axis} {tested[1]:g} over none"],
+    )
     beyond = evidence.loss("acrobot", axis, 2 * tested[-1])
     assert beyond.beyond
     assert beyond.loss.mean == pytest.approx(0.5)
@@ -147,6 +179,23 @@ def test_more_than_was_tested_is_no_reason_to_buy_where_it_cost_nothing():
 
 def test_more_than_is_asked_for_is_not_called_harmless(evidence):
     assert advise(Lag(0.0, gain=3.0), "pendulum", evidence).verdict == MEASURE
+
+
+def test_more_than_was_tested_which_cost_nothing_is_measured_beside_a_loss():
+    """Four times the largest noise, whose tested doses are harmless, beside a lag that would be trained through."""
+    harmless = Evidence(list(results(lambda axis, dose: 0.0 if axis == "noise" else proportional(axis, dose))))
+    lag, noise = (harmless.loss("pendulum", axis, dose) for axis, dose in (("lag", 1.0), ("noise", 6.4)))
+    assert [decide([lag], None), decide([lag, noise], None)] == [THROUGH, MEASURE]
+
+
+def test_a_force_that_nobody_asked_for_is_not_called_harmless(evidence):
+    """A sensor that reads 0.1 A too much: a loop with an integrator takes -0.1 A for none."""
+    paper = named_actuator("paper", "pendulum")
+    wrong = dataclasses.replace(paper, controller=dataclasses.replace(paper.controller, current_bias=0.1))
+    found = advise(wrong, "pendulum", evidence)
+    assert (found.verdict, "nothing is asked for" in found.reason) == (MEASURE, True)
+    share = 0.1 * paper.motor.torque_constant / paper.motor.arm_radius / find_task("pendulum").max_force
+    assert found.found.unasked == pytest.approx(share, rel=0.05)
 
 
 def test_the_largest_dose_is_not_beyond_it(evidence):
@@ -195,7 +244,8 @@ def test_without_results_there_is_no_verdict():
         (0.5, 0.96, 1.0, LOOP),
         (0.5, 0.6, 0.96, THROUGH),
         (0.5, 0.6, 0.7, THROUGH),
-        (0.5, 0.6, 0.52, BUY),
+        (0.5, 0.6, 0.52, LOOP),
+        (0.5, 0.54, 0.52, BUY),
     ],
 )
 def test_the_verdict_of_a_measurement(tmp_path, ideal, designed, through, verdict):
@@ -211,6 +261,8 @@ def test_the_verdict_of_a_measurement(tmp_path, ideal, designed, through, verdic
     found = measured(actuator, "cartpole", grid.collect())
     assert found.verdict == verdict
     assert [found.scores[name].mean for name in (IDEAL, LOOP, THROUGH)] == pytest.approx([ideal, designed, through])
+    # of four policies +-0.001 around the mean: Student's t of three degrees of freedom
+    assert found.scores[LOOP].high - designed == pytest.approx(3.18245 * 0.001 * math.sqrt(4 / 3) / 2, rel=1e-4)
 
 
 def test_a_measurement_that_is_not_finished_says_so(tmp_path):
@@ -225,9 +277,8 @@ def test_a_measurement_that_is_not_finished_says_so(tmp_path):
 
 
 @pytest.fixture
-def file(tmp_path):
+def file(tmp_path, rows):
     path = tmp_path / "hypotheses.csv"
-    rows = list(results(proportional))
     with path.open("w", newline="") as opened:
         writer = csv.DictWriter(opened, rows[0])
         writer.writeheader()
@@ -260,6 +311,17 @@ def test_on_the_command_line_with_results_and_runs(tmp_path, file, capsys):
     assert found["measured"]["scores"][IDEAL]["mean"] == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("value", ["nan", "inf", "much", ""])
+def test_evidence_that_is_no_number_is_refused(tmp_path, file, value):
+    lines = file.read_text().splitlines()
+    cells = lines[2].split(",")
+    cells[lines[0].split(",").index("low")] = value
+    wrong = tmp_path / "wrong.csv"
+    wrong.write_text("\n".join([lines[0], lines[1], ",".join(cells), *lines[3:]]) + "\n")
+    with pytest.raises(ValueError, match=rf"wrong.csv, line 3: low = '{value}': must be a finite number"):
+        Evidence.read(wrong)
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -270,6 +332,7 @@ def test_on_the_command_line_with_results_and_runs(tmp_path, file, capsys):
         (["paper", "cartpole", "--evidence", "docs/upright_tolerances.csv"], "has no column 'name'"),
         (["ideal", "cartpole", "--measure", "2"], "actuator = 'ideal'"),
         (["maxon-dcx22l", "pendulum", "--gear-ratio", "0"], "gear_ratio = 0.0"),
+        (["lag", "pendulum", "--voltage", "3"], "--voltage: "),
     ],
 )
 def test_bad_input_is_told(words, said, capsys):

@@ -79,6 +79,10 @@ class Evidence:
                     raise ValueError(
                         f"{path}: has no column {lacking[0]!r}: give the {HYPOTHESES} of codrl-mj study actuators"
                     )
+                for number, row in enumerate(rows, start=2):
+                    for key in _COLUMNS[2:]:
+                        if row["effect"] and not _finite(row[key]):
+                            raise ValueError(f"{path}, line {number}: {key} = {row[key]!r}: must be a finite number")
                 return cls(rows)
         return cls([])
 
@@ -104,7 +108,8 @@ class Evidence:
             return None
         between = Interval(*(float(np.interp(dose, tested, values)) for values in zip(*curve.lost, strict=True)))
         index = min(int(np.searchsorted(tested, dose)), len(tested) - 1)
-        rows = tuple(curve.rows[place - 1] for place in (index - 1, index) if place >= 1) if dose else ()
+        places = (index,) if tested[index] == dose else (index - 1, index)
+        rows = tuple(curve.rows[place - 1] for place in places if place >= 1)
         return Loss(axis, dose, between, dose > 1.005 * tested[-1], rows, curve.kept, curve.trained)
 
     def _curve(self, task: str, axis: str) -> "_Curve | None":
@@ -121,6 +126,13 @@ class Evidence:
         at = AXES[axis].trained[task]
         won = self.effect(Contrast(dosed(arms.matched(task, axis), axis, at), dosed(ideal, axis, at)))
         return _Curve(lost, rows, None if won is None else lost[tested.index(at)].mean - won[1].mean, at)
+
+
+def _finite(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except (TypeError, ValueError):  # None where a row is too short
+        return False
 
 
 class _Curve(NamedTuple):

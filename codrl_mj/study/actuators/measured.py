@@ -7,13 +7,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from codrl_mj.actuators import IDEAL as IDEAL_ACTUATOR
-from codrl_mj.evaluation.measures import Interval, bootstrap_mean
+from codrl_mj.evaluation.measures import Interval
 from codrl_mj.study.actuators import arms
 from codrl_mj.study.actuators.advice import BUY, IDEAL, LOOP, THROUGH, redesign
 from codrl_mj.study.actuators.levels import REFERENCE_SPEEDS, posed
 from codrl_mj.study.actuators.questions import MARGIN, at_home
 from codrl_mj.study.actuators.verdicts import FLOORS
 from codrl_mj.study.grid import check_chosen
+from codrl_mj.study.inference import Stratum, effect
 from codrl_mj.study.trials import Collected, Grid, Trial
 
 
@@ -50,10 +51,11 @@ class Measured(NamedTuple):
     """What trainings and tests showed."""
 
     scores: Mapping[str, Interval]
-    """Mean score with its 95 % interval [shares of the span], by what is done: `IDEAL`, `LOOP`, `THROUGH`."""
+    """Mean score [shares of the span], by what is done: `IDEAL`, `LOOP`, `THROUGH`. Its 95 % interval is Student's t
+    over policies, as if the span were exact."""
     verdict: str
-    """The first of them, in this order, that loses no more than `MARGIN`; `BUY` if none does, and training wins
-    nothing, `THROUGH` if it wins something."""
+    """The first of them, in this order, that loses no more than `MARGIN`; if none does, the better of loop and
+    training, where it wins more than that, and else `BUY`."""
 
 
 def measured(actuator: Any, task: str, collected: Collected) -> Measured:
@@ -76,7 +78,9 @@ def measured(actuator: Any, task: str, collected: Collected) -> Measured:
     span = float(np.mean(home)) - FLOORS[task]
     if span <= 0.0:
         raise ValueError(f"{task}: ideal-trained policies are no better than random actions: train more seeds")
-    scores = {name: bootstrap_mean((values - FLOORS[task]) / span) for name, values in found.items()}
+    shares = {name: (values - FLOORS[task]) / span for name, values in found.items()}
+    scores = {name: effect([Stratum(share, np.zeros_like(share), paired=True)]) for name, share in shares.items()}
     good = [name for name in (IDEAL, LOOP, THROUGH) if name in scores and scores[name].mean >= 1.0 - MARGIN]
-    wins = scores[THROUGH].mean - scores[IDEAL].mean > MARGIN
-    return Measured(scores, good[0] if good else THROUGH if wins else BUY)
+    best = max(scores, key=lambda name: scores[name].mean)
+    wins = scores[best].mean - scores[IDEAL].mean > MARGIN
+    return Measured(scores, good[0] if good else best if wins else BUY)
