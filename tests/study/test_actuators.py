@@ -242,6 +242,21 @@ def test_nothing_is_concluded_from_nothing(tmp_path):
 
 
 @pytest.mark.matrix
+def test_the_page_says_which_doses_are_borne(tmp_path):
+    """Up to half a step of lag costs 0.02, more of it 0.2, and nothing else anything."""
+
+    def level(trial):
+        axis, _, dose = trial.test.rpartition(" ")
+        return 1.0 if axis != "lag" else 0.98 if float(dose) <= 0.5 else 0.8
+
+    grid = ActuatorStudy(tmp_path / "runs", tasks=("pendulum",), seeds=4).grid
+    pretend(grid, returns(noisy(level)))
+    page = write(grid.collect(), tmp_path)[0].read_text()
+    assert "| Pendulum | 0.5, 1 | 0.7, – | 0.7, – | 4, – | 0.3, – | 1.6, – |" in page
+    assert "| CartPole | 0, – |" in page  # of which nothing is known
+
+
+@pytest.mark.matrix
 def test_the_page_has_every_number_in_a_file(study, tmp_path):
     files = {file.name: file for file in write(study.collect(), tmp_path)}
     rows = list(csv.DictReader(files["hypotheses.csv"].open()))
