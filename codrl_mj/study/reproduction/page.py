@@ -10,7 +10,7 @@ from codrl_mj.runs.files import writing
 from codrl_mj.study.conclusions import conclusions_section
 from codrl_mj.study.figures import TITLES
 from codrl_mj.study.reproduction import figures, tables
-from codrl_mj.study.reproduction.claims import PAPER_SAYS, PORT, STUDY_SAYS, Claim
+from codrl_mj.study.reproduction.claims import PAPER_SAYS, PORT, Claim
 from codrl_mj.study.reproduction.reproduce import VALUE_TASK, Findings
 from codrl_mj.study.reproduction.value_iteration import Optimum
 from codrl_mj.study.reproduction.verdicts import NOT_CONFIRMED, NOT_TESTABLE, OUTCOMES, Verdict, number
@@ -78,11 +78,7 @@ def _missing(findings: Findings) -> str:
     )
 
 
-_SOURCES = {
-    PAPER_SAYS: "the paper",
-    STUDY_SAYS: "a quick study of the paper's loop on Gymnasium's dynamics, before this port",
-    PORT: "this port: MuJoCo against Gymnasium's equations",
-}
+_SOURCES = {PAPER_SAYS: "the paper", PORT: "this port: MuJoCo against Gymnasium's equations"}
 
 
 def verdicts_section(claims: Sequence[tuple[Claim, Verdict]]) -> str:
@@ -120,7 +116,7 @@ def _tasks(findings: Findings, drawn: Mapping[str, Mapping[Path, str]]) -> Itera
         yield f"## {TITLES[task]}: the paper's *{section}*\n"
         yield _claims(findings, task)
         if task == VALUE_TASK:
-            yield _value_iteration(findings.evidence.optima)
+            yield _value_iteration(findings.optima)
         if drawn[task]:
             first, *others = (f"[{caption}]({FOLDER}/{path.name})" for path, caption in drawn[task].items())
             yield f"!{first}\n"
@@ -134,7 +130,7 @@ def _claims(findings: Findings, task: str) -> str:
         if (claim.task, claim.source) == (task, PAPER_SAYS) and claim.physics != "analytic":
             outcome = verdict.outcome if verdict.outcome == NOT_TESTABLE else f"**{verdict.outcome}**"
             ours = "–" if verdict.measured is None else _interval(verdict.measured)
-            rows.append([outcome, claim.statement, claim.measure, ours, str(verdict.samples or "–")])
+            rows.append([outcome, claim.statement, claim.measure.text, ours, str(verdict.samples or "–")])
     return _table(["verdict", "the paper reports", "measure", "ours [95 %]", "seeds"], rows)
 
 
@@ -160,7 +156,7 @@ def _value_iteration(optima: Sequence[Optimum]) -> str:
 
 def _draw(findings: Findings, task: str, folder: Path) -> dict[Path, str]:
     """Draw what there is of a task: the files, and what they show."""
-    mine = [one for one in findings.evidence.series.values() if one.arm.task == task]
+    mine = [one for one in findings.series.values() if one.arm.task == task]
     title, paths = TITLES[task], {}
     if any(one.runs for one in mine):
         path = folder / f"learning_{task}.svg"
@@ -180,7 +176,7 @@ def _draw(findings: Findings, task: str, folder: Path) -> dict[Path, str]:
     if task == VALUE_TASK:
         path = folder / "discount.svg"
         paths[path] = "Value of the start, and the best policies, over discount factors"
-        figures.draw_discounts(path, findings.values, findings.evidence.optima)
+        figures.draw_discounts(path, findings.values, findings.optima)
     return paths
 
 

@@ -33,10 +33,10 @@ def write(findings: Findings, folder: Path) -> list[Path]:
 def claim_row(findings: Findings, claim: Claim, verdict: Verdict) -> dict[str, Any]:
     """A claim and its verdict: ours over seeds, and the mean wall-clock time of a training that it is about [s]."""
     mean, low, high = verdict.measured or (None, None, None)
-    series = [findings.evidence.series[name] for name in claim.arms]
-    took = [run.seconds for one in series for run in one.runs.values()]
-    names = ("task", "physics", "source", "section", "statement", "measure")
+    took = [run.seconds for name in claim.arms for run in findings.series[name].runs.values()]
+    names = ("task", "physics", "source", "section", "statement")
     return {name: getattr(claim, name) for name in names} | {
+        "measure": claim.measure.text,
         "criterion": claim.check.criterion,
         "mean": mean,
         "low": low,
@@ -64,14 +64,14 @@ def run_rows(series: Series) -> list[dict[str, Any]]:
 
 def as_mapping(findings: Findings) -> dict[str, Any]:
     """Everything as JSON-serialisable values."""
-    plan, evidence = findings.plan, findings.evidence
+    plan = findings.plan
     return {
         "plan": {name: getattr(plan, name) for name in ("seeds", "sarsa_seeds", "episodes", "test_episodes")}
         | {"tasks": list(plan.tasks)},
         "claims": [claim_row(findings, *one) for one in findings.claims],
         "missing": findings.missing,
         "failures": dict(findings.found.failures),
-        "runs": [row for series in evidence.series.values() for row in run_rows(series)],
-        "value_iteration": [optimum.as_mapping() for optimum in evidence.optima],
+        "runs": [row for series in findings.series.values() for row in run_rows(series)],
+        "value_iteration": [optimum.as_mapping() for optimum in findings.optima],
         "values_of_start": [{"discount": discount, "value": value} for discount, value in findings.values.items()],
     }
