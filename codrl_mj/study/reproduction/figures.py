@@ -11,7 +11,7 @@ from codrl_mj.actuators import IDEAL
 from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.films.strip import ACTUAL, DESIRED
 from codrl_mj.runs.policies import load_policy
-from codrl_mj.study.figures import COLOURS, save
+from codrl_mj.study.figures import COLOURS, legend, save
 from codrl_mj.study.reproduction.arms import CENTRE_RADIUS, TEST, PaperArm
 from codrl_mj.study.reproduction.series import LAST, Series
 from codrl_mj.study.reproduction.value_iteration import Optimum
@@ -126,7 +126,7 @@ def draw_learning(path: Path, arms: Sequence[Series]) -> None:
             axes.set(ylabel=label, yscale="log" if label == "number of episodes" else "linear")
         column[0].set_title(title.format(*about), fontsize=size)
         column[-1].set_xlabel(along)
-    _legend(figure, all_axes)
+    legend(figure, 2)
     save(figure, path)
 
 
@@ -149,7 +149,7 @@ def draw_torque(path: Path, episodes: Sequence[tuple[PaperArm, Episode]]) -> Non
         below.stairs(desired - actual, edges, color=_ERROR, label="error: desired - actual", **options)
         above.set(ylabel="torque [N·m]", title=arm.gains)
         below.set(ylabel="error [N·m]", xlabel="time [s]")
-    _legend(figure, all_axes)
+    legend(figure, 2)
     save(figure, path)
 
 
@@ -172,7 +172,7 @@ def draw_states(path: Path, task: str, episodes: Sequence[tuple[PaperArm, Episod
             axes.plot(times, curve.values(episode.state.T), color=colour, linestyle=dashes, label=_name(arm))
         axes.set_ylabel(curve.label.replace("_dot", "'"), fontsize="small")
     all_axes[-1, 0].set_xlabel("time [s]")
-    _legend(figure, all_axes)
+    legend(figure, 2)
     save(figure, path)
 
 
@@ -217,6 +217,7 @@ def _panels(rows: int, columns: int, row_height: float = 0.0, heights: Sequence[
         each.grid(color="0.9")
         each.set_axisbelow(True)
         each.spines[["top", "right"]].set_visible(False)
+    figure.align_ylabels()
     return figure, axes
 
 
@@ -263,12 +264,3 @@ def _filled(values: np.ndarray) -> np.ndarray:
 
 def _name(arm: PaperArm) -> str:
     return "ideal" if arm.actuator == IDEAL else arm.gains
-
-
-def _legend(figure: Any, axes: Any) -> None:
-    """One legend below all panels, each label once."""
-    figure.align_ylabels()
-    entries: dict[str, Any] = {}
-    for each in axes.flat:
-        entries |= dict(zip(*reversed(each.get_legend_handles_labels()), strict=True))
-    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=2, fontsize="small")
