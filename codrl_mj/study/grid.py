@@ -47,13 +47,10 @@ class Deployment:
     """Seed of the first episode."""
 
     @property
-    def _identity(self) -> dict[str, Any]:
-        return {**vars(self), "env": self.env.as_mapping(), "run": None}
-
-    @property
     def record(self) -> Path:
         """The JSON file of the result, in the run folder."""
-        return self.run / _DEPLOYMENTS / f"{_digest(self._identity)}.json"
+        identity = {**vars(self), "env": self.env.as_mapping(), "run": None}
+        return self.run / _DEPLOYMENTS / f"{_digest(identity)}.json"
 
 
 def check_chosen(field: str, given: Sequence[str], known: Iterable[str]) -> None:
@@ -107,49 +104,6 @@ def _note(cell: Path | Deployment, error: Exception | None, about: dict[str, Any
     return Failure(line, record)
 
 
-def train_cells(
-    cells: Mapping[str, TrainConfig],
-    root: Path,
-    workers: Workers = Workers(),  # noqa: B008 - frozen
-    accept_changes: bool = False,
-    on_cell: Callable[[str], None] | None = None,
-) -> tuple[dict[str, Path], dict[str, Failure]]:
-    """Train every cell that is not finished; one that fails does not stop the others.
-
-    Args:
-        cells: configurations by name; equal configurations are one cell.
-        root: folder of the run folders.
-        workers: what computes them.
-        accept_changes: continue begun cells even if code or packages have changed since.
-        on_cell: called with a cell's name when it is finished or has failed; those finished before come first, those of
-            a Ray cluster when all are done.
-
-    Returns:
-        The run folders of the finished cells, and the failures; both by name. A failure's record stays in
-        `root/failures` until the cell is finished.
-
-    Raises:
-        ValueError: Ray is asked for and not installed.
-        TrainingStoppedError: a signal asked to stop.
-    """
-    folders = {name: cell_folder(root, config) for name, config in cells.items()}
-    called: dict[Path, list[str]] = {}
-    for name, folder in folders.items():
-        called.setdefault(folder, []).append(name)
-    report = on_cell or (lambda _: None)
-
-    def ended(folder: Path) -> None:
-        for name in called[folder]:
-            report(name)
-
-    runs = {folder: cells[names[0]] for folder, names in called.items()}
-    failures = train_runs(runs, workers, ended, accept_changes=accept_changes, tensorboard=False)
-    return (
-        {name: folder for name, folder in folders.items() if folder not in failures},
-        {name: failures[folder] for name, folder in folders.items() if folder in failures},
-    )
-
-
 def train_runs(
     runs: Mapping[Path, TrainConfig],
     workers: Workers = Workers(),  # noqa: B008 - frozen
@@ -186,37 +140,27 @@ def train_runs(
 def deploy_cells(
     deployments: Mapping[str, Deployment],
     workers: Workers = Workers(),  # noqa: B008 - frozen
-    on_cell: Callable[[str], None] | None = None,
-) -> tuple[dict[str, dict[str, Any]], dict[str, Failure]]:
+    on_cell: Callable[[str], None] = lambda _: None,
+) -> None:
     """Evaluate policies; what was evaluated before is not evaluated again, and one that fails does not stop the others.
+
+    The record of a result has `Evaluation.as_mapping()`; a failure's stays in `failures` beside the run folders until
+    the evaluation succeeds.
 
     Args:
         deployments: by name.
         workers: what computes them.
         on_cell: called with a deployment's name when it is evaluated or has failed; those evaluated before come first.
 
-    Returns:
-        `Evaluation.as_mapping()` of those that succeeded, and the failures; both by name. A failure's record stays in
-        `failures` beside the run folders until the evaluation succeeds.
-
     Raises:
-        ValueError: Ray is asked for and not installed, or a record of a result is damaged.
+        ValueError: Ray is asked for and not installed.
     """
-    report = on_cell or (lambda _: None)
     waiting = {name: deployment for name, deployment in deployments.items() if not deployment.record.is_file()}
     for name in deployments:
         if name not in waiting:
-            report(name)
-    failures = {}
-    for name, failure in compute(_deploy_cell, list(waiting.items()), workers):
-        if failure is not None:
-            failures[name] = failure
-        report(name)
-    return {
-        name: read_json(deployment.record, "evaluation")
-        for name, deployment in deployments.items()
-        if name not in failures
-    }, failures
+            on_cell(name)
+    for name in compute(_deploy_cell, waiting.items(), workers):
+        on_cell(name)
 
 
 def _train_run(config: TrainConfig, folder: Path, options: Mapping[str, Any]) -> tuple[Path, Failure | None]:
@@ -241,27 +185,21 @@ def _try_to_train(config: TrainConfig, folder: Path, options: Mapping[str, Any])
             return error
 
 
-def _deploy_cell(name: str, deployment: Deployment) -> tuple[str, Failure | None]:
-    """Evaluate one policy: its name, and what went wrong, of which a record is kept."""
-    try:
-        _deploy(deployment)
-    except Exception as error:
-        return name, _note(deployment, error, {"test": name, "run": deployment.run.name})
-    return name, _note(deployment, None, {})
-
-
-def _deploy(deployment: Deployment) -> None:
+def _deploy_cell(name: str, deployment: Deployment) -> str:
+    """Evaluate one policy: its name. Of what goes wrong a record is kept."""
     from codrl_mj.evaluation import evaluate
     from codrl_mj.runs.policies import load_policy
 
-    config = load_config(deployment.run, trust=True)  # ours: found by its configuration
-    result = evaluate(
-        load_policy(deployment.run),
-        deployment.env.seen_as(config.env),
-        deployment.episodes,
-        deployment.seed,
-    )
-    write_json(deployment.record, result.as_mapping())
+    error = None
+    try:
+        config = load_config(deployment.run, trust=True)  # ours: found by its configuration
+        env = deployment.env.seen_as(config.env)
+        result = evaluate(load_policy(deployment.run), env, deployment.episodes, deployment.seed)
+        write_json(deployment.record, result.as_mapping())
+    except Exception as caught:
+        error = caught
+    _note(deployment, error, {"test": name, "run": deployment.run.name})
+    return name
 
 
 def _digest(content: Any) -> str:
