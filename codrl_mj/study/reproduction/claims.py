@@ -60,11 +60,6 @@ class Claim:
         return " and ".join(dict.fromkeys(name.rpartition(", ")[2] for name in self.arms))
 
     @property
-    def identity(self) -> tuple[str, str, str, str]:
-        """What it has in common with the same claim on the other kind of physics alone."""
-        return self.task, self.source, self.statement, self.measure.text
-
-    @property
     def section(self) -> str:
         """Where in the paper the experiment is described."""
         name = {VALUE_TASK: "Mountain Car"}.get(self.task, self.task.replace("_", " ").title())

@@ -80,24 +80,22 @@ def _unbroken(angle: np.ndarray) -> np.ndarray:
     return np.where(jumps, np.nan, angle)
 
 
-def example(series: Series) -> Episode | None:
-    """The first test episode of the first seed that is finished; None if none is."""
-    if not series.runs:
-        return None
+def example(series: Series) -> Episode:
+    """The first test episode of the first seed that is finished, of which there must be one."""
     run = next(iter(series.runs.values()))
     (episode,) = run_episodes(load_policy(run.folder), series.arm.trials[TEST].env.make, 1, EVALUATION_SEED)
     return episode
 
 
 def draw_learning(path: Path, arms: Sequence[Series]) -> None:
-    """Draw trainings, a column for each settings and physics that there are runs of: means and 95 % bands over seeds.
+    """Draw trainings, a column for each settings and physics: means and 95 % bands over seeds.
 
     It is the running mean of returns over episodes; of PPO, whose rollouts are the paper's epochs, mean return, mean
     length and number of episodes over epochs.
 
     Args:
         path: SVG file.
-        arms: of one task.
+        arms: of one task, at least one, each with a run.
     """
 
     def over_epochs(what: str) -> Callable[[Series], np.ndarray]:
@@ -111,8 +109,7 @@ def draw_learning(path: Path, arms: Sequence[Series]) -> None:
         along, title, size = "epoch of 4000 steps", "{1}", "large"
     columns: dict[tuple[str, str], list[Series]] = {}
     for series in arms:
-        if series.runs:
-            columns.setdefault((series.arm.settings, PHYSICS[series.arm.physics]), []).append(series)
+        columns.setdefault((series.arm.settings, PHYSICS[series.arm.physics]), []).append(series)
     figure, all_axes = _panels(len(rows), len(columns))
     for (about, members), column in zip(columns.items(), all_axes.T, strict=True):
         for axes, (label, values_of) in zip(column, rows.items(), strict=True):

@@ -95,12 +95,11 @@ def verdicts_section(claims: Sequence[tuple[Claim, Verdict]]) -> str:
 
 
 def _of_statements(found: Iterable[tuple[Claim, str]]) -> dict[tuple[str, ...], str]:
-    """What every statement came to: where it is judged on both kinds of physics, it has to pass on both."""
+    """What every statement of somebody came to: judged on both kinds of physics, it has to pass on both."""
     several: dict[tuple[str, ...], set[str]] = {}
     for claim, outcome in found:
-        several.setdefault(claim.identity, set()).add(outcome)
-    decisive = [NOT_CONFIRMED, *(one for one in OUTCOMES if one != NOT_CONFIRMED)]
-    return {identity: next(one for one in decisive if one in outcomes) for identity, outcomes in several.items()}
+        several.setdefault((claim.task, claim.statement, claim.measure.text), set()).add(outcome)
+    return {statement: min(outcomes, key=[NOT_CONFIRMED, *OUTCOMES].index) for statement, outcomes in several.items()}
 
 
 _WORDS = """\
@@ -156,15 +155,15 @@ def _value_iteration(optima: Sequence[Optimum]) -> str:
 
 def _draw(findings: Findings, task: str, folder: Path) -> dict[Path, str]:
     """Draw what there is of a task: the files, and what they show."""
-    mine = [one for one in findings.series.values() if one.arm.task == task]
+    mine = [one for one in findings.series.values() if one.arm.task == task and one.runs]
     title, paths = TITLES[task], {}
-    if any(one.runs for one in mine):
+    if mine:
         path = folder / f"learning_{task}.svg"
         paths[path] = f"Learning, mean over seeds with its 95 % interval: {title}"
         figures.draw_learning(path, mine)
     for settings in dict.fromkeys(one.arm.settings for one in mine):
         shown = [one for one in mine if one.arm.settings == settings and one.arm.physics == "mujoco"]
-        episodes = [(one.arm, episode) for one in shown if (episode := figures.example(one)) is not None]
+        episodes = [(one.arm, figures.example(one)) for one in shown]
         if driven := [(arm, episode) for arm, episode in episodes if arm.actuator != IDEAL]:
             path = folder / f"torque_{task}_{settings}.svg"
             paths[path] = f"Desired and actual torque, and error, {settings} settings: {title}"

@@ -18,7 +18,6 @@ TESTED = (
     *("saturated_percent", "peak_voltage"),
 )
 """Measures of the test in `RUNS`, as docs/evaluation.md has them: means, and the median time to the goal."""
-RUN_COLUMNS = ("task", "settings", "motor", "gains", "physics", "seed", "run", "seconds", f"last_{LAST}", *TESTED)
 
 
 def write(findings: Findings, folder: Path) -> list[Path]:
@@ -49,16 +48,14 @@ def claim_row(findings: Findings, claim: Claim, verdict: Verdict) -> dict[str, A
 
 
 def run_rows(series: Series) -> list[dict[str, Any]]:
-    """The finished runs of an arm, by `RUN_COLUMNS`."""
-    rows, arm = [], series.arm
+    """The finished runs of an arm."""
+    rows = []
     for seed, run in series.runs.items():
         alone = series.only({seed})
-        measured = [alone.last_returns(), *(alone.tested(name) for name in TESTED)]
-        values = (
-            *(arm.task, arm.settings, arm.motor, arm.gains, arm.physics, seed, run.folder.name, run.seconds),
-            *(float(one[0]) if len(one) else None for one in measured),
-        )
-        rows.append(dict(zip(RUN_COLUMNS, values, strict=True)))
+        measured = {f"last_{LAST}": alone.last_returns()} | {name: alone.tested(name) for name in TESTED}
+        row = {name: getattr(series.arm, name) for name in ("task", "settings", "motor", "gains", "physics")}
+        row |= {"seed": seed, "run": run.folder.name, "seconds": run.seconds}
+        rows.append(row | {name: float(one[0]) if len(one) else None for name, one in measured.items()})
     return rows
 
 

@@ -208,4 +208,4 @@ def start_value(model: Model, of_actions: np.ndarray) -> float:
 
 def values_over(model: Model, discounts: Sequence[float]) -> dict[float, float]:
     """Values of x = -0.5 m at rest by discount factor."""
-    return {one: start_value(model, iterate(model.rewards, model.transitions, one)) for one in discounts}
+    return {discount: start_value(model, iterate(model.rewards, model.transitions, discount)) for discount in discounts}
