@@ -24,16 +24,6 @@ _PATIENCE = 120.0  # s to wait for a run folder that a dying process of a killed
 
 
 @dataclasses.dataclass(frozen=True)
-class Failure:
-    """A cell that could not be computed."""
-
-    error: str
-    """What went wrong, in a line."""
-    record: Path
-    """JSON file with the traceback and the configuration."""
-
-
-@dataclasses.dataclass(frozen=True)
 class Deployment:
     """The last policy of a run, put to work on an actuator."""
 
@@ -77,31 +67,32 @@ def cell_folder(root: Path, config: TrainConfig) -> Path:
     return root / f"{config.task}-{config.agent.name}-s{config.seed}-{_digest(config.as_mapping())}"
 
 
-def read_failure(cell: Path | Deployment) -> Failure | None:
-    """Why a cell was not finished when it was tried last; None if it did not fail.
+def read_failure(cell: Path | Deployment) -> str | None:
+    """Why a cell was not finished when it was tried last, in a line; None if it did not fail.
 
     Args:
         cell: run folder of a training, or a test.
     """
-    record = _failure_record(cell)
-    return Failure(read_json(record, "record of a failure")["error"], record) if record.is_file() else None
+    record = failure_record(cell)
+    return str(read_json(record, "record of a failure")["error"]) if record.is_file() else None
 
 
-def _failure_record(cell: Path | Deployment) -> Path:
+def failure_record(cell: Path | Deployment) -> Path:
+    """The JSON file of what went wrong with a cell: the error, its traceback and the configuration."""
     if isinstance(cell, Deployment):
         return cell.run.parent / _FAILURES / f"{cell.run.name}-{cell.record.stem}.json"
     return cell.parent / _FAILURES / f"{cell.name}.json"
 
 
-def _note(cell: Path | Deployment, error: Exception | None, about: dict[str, Any]) -> Failure | None:
-    """Keep a record of what went wrong with a cell; forget the last one if nothing did."""
-    record = _failure_record(cell)
+def _note(cell: Path | Deployment, error: Exception | None, about: dict[str, Any]) -> str | None:
+    """Keep a record of what went wrong with a cell, and say it; forget the last one if nothing did."""
+    record = failure_record(cell)
     if error is None:
         record.unlink(missing_ok=True)
         return None
     line = " ".join(str(error).split()) or type(error).__name__
     write_json(record, {"error": line, "traceback": "".join(traceback.format_exception(error)), **about})
-    return Failure(line, record)
+    return line
 
 
 def train_runs(
@@ -109,7 +100,7 @@ def train_runs(
     workers: Workers = Workers(),  # noqa: B008 - frozen
     on_run: Callable[[Path], None] = lambda _: None,
     **options: Any,
-) -> dict[Path, Failure]:
+) -> dict[Path, str]:
     """Train every run that is not finished; one that fails does not stop the others.
 
     Args:
@@ -119,7 +110,7 @@ def train_runs(
         **options: `accept_changes` and `tensorboard`, as for `codrl_mj.training.train`.
 
     Returns:
-        The failures. A failure's record stays in `failures` beside the run folder until the run is finished.
+        What went wrong, by run folder. A failure's record stays in `failures` beside it until the run is finished.
 
     Raises:
         ValueError: Ray is asked for and not installed.
@@ -163,7 +154,7 @@ def deploy_cells(
         on_cell(name)
 
 
-def _train_run(config: TrainConfig, folder: Path, options: Mapping[str, Any]) -> tuple[Path, Failure | None]:
+def _train_run(config: TrainConfig, folder: Path, options: Mapping[str, Any]) -> tuple[Path, str | None]:
     """Train one run: its folder, and what went wrong, of which a record is kept."""
     return folder, _note(folder, _try_to_train(config, folder, options), {"train": config.as_mapping()})
 

@@ -184,7 +184,7 @@ class Grid:
             folders=done,
             evaluations=evaluations,
             missing=tuple(missing),
-            failures={name: failure.error for name, failure in failures.items() if failure is not None},
+            failures={name: failure for name, failure in failures.items() if failure is not None},
             seconds=sum(training_seconds(folder) for folder in done.values()),
             codes=collections.Counter(
                 str(read_json(folder / "config.json", "run configuration").get("code"))[:8] for folder in done.values()
@@ -198,9 +198,7 @@ class Grid:
             ValueError: a file of a finished run is damaged.
         """
         folders, tests = self.folders(), self.deployments()
-        untested: collections.Counter[Path] = collections.Counter(
-            test.run for test in tests.values() if not test.record.is_file()
-        )
+        untested = collections.Counter(test.run for test in tests.values() if not test.record.is_file())
         found = []
         for arm in self.arms:
             mine = {seed: folders[arm.name, seed] for seed in self.seeds_of(arm)}

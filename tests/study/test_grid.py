@@ -15,7 +15,7 @@ from codrl_mj.agents import PPOConfig
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import evaluate
 from codrl_mj.runs.policies import load_policy
-from codrl_mj.study.grid import Deployment, cell_folder, deploy_cells, read_failure, train_runs
+from codrl_mj.study.grid import Deployment, cell_folder, deploy_cells, failure_record, read_failure, train_runs
 from codrl_mj.study.parallel import Workers, compute
 from codrl_mj.training import TrainConfig, finished, load_config
 
@@ -56,14 +56,13 @@ def test_a_cell_that_fails_is_recorded_and_does_not_stop_the_others(computed):
     assert [name for name, run in runs.items() if finished(run)] == [*CELLS]
     assert sorted(reported) == sorted(runs.values())
     assert [*failures] == [runs["unstable"]]
-    (failure,) = failures.values()
-    assert "spectral radius" in failure.error
-    record = json.loads(failure.record.read_text())
-    assert record["error"] == failure.error
+    assert "spectral radius" in failures[runs["unstable"]]
+    (file,) = (root / "failures").iterdir()
+    assert file == failure_record(runs["unstable"])
+    record = json.loads(file.read_text())
+    assert record["error"] == failures[runs["unstable"]] == read_failure(runs["unstable"])
     assert "Traceback" in record["traceback"]
     assert record["train"]["env"]["actuator"]["controller"]["kp"] == 100.0
-    assert failure.record.parent == root / "failures"
-    assert read_failure(runs["unstable"]) == failure
     assert read_failure(runs["seed 0"]) is None
 
 
@@ -95,7 +94,8 @@ def test_finished_cells_are_left_alone(computed):
 def test_a_failure_is_forgotten_when_the_cell_succeeds(tmp_path):
     folder = cell_folder(tmp_path, TINY)
     folder.write_text("a file in the way")
-    assert train_runs({folder: TINY}, ONE)[folder].record.is_file()
+    assert "Not a directory" in train_runs({folder: TINY}, ONE)[folder]
+    assert failure_record(folder).is_file()
     folder.unlink()
     assert train_runs({folder: TINY}, ONE) == {}
     assert finished(folder)
@@ -201,13 +201,12 @@ def test_a_deployment_that_fails_is_recorded_and_does_not_stop_the_others(comput
     deploy_cells({"bad": bad, "good": good}, ONE, reported.append)
     assert (bad.record.is_file(), good.record.is_file()) == (False, True)
     assert sorted(reported) == ["bad", "good"]
-    failure = read_failure(bad)
-    assert "spectral radius" in failure.error
-    record = json.loads(failure.record.read_text())
-    assert record["error"] == failure.error
+    assert failure_record(bad).parent == root / "failures"
+    record = json.loads(failure_record(bad).read_text())
+    assert "spectral radius" in record["error"]
+    assert read_failure(bad) == record["error"]
     assert "Traceback" in record["traceback"]
     assert (record["test"], record["run"]) == ("bad", runs["seed 1"].name)
-    assert failure.record.parent == root / "failures"
     assert read_failure(good) is None
     assert read_failure(runs["seed 1"]) is None
 
@@ -222,7 +221,7 @@ def test_a_failure_of_a_deployment_is_forgotten_when_it_succeeds(computed):
         deploy_cells({"cell": deployment}, ONE)
     finally:
         policy.write_text(content)
-    assert read_failure(deployment).record.is_file()
+    assert "policy.json" in read_failure(deployment)
     deploy_cells({"cell": deployment}, ONE)
     assert deployment.record.is_file()
     assert read_failure(deployment) is None

@@ -228,10 +228,9 @@ def running_mean(values: np.ndarray, count: int = LAST) -> np.ndarray:
     Returns:
         Shape (..., n).
     """
-    sums = np.cumsum(np.concatenate([np.zeros((*values.shape[:-1], 1)), values], axis=-1), axis=-1)
-    ends = np.arange(1, values.shape[-1] + 1)
-    begins = np.maximum(0, ends - count)
-    return (sums[..., ends] - sums[..., begins]) / (ends - begins)
+    sums = np.cumsum(values, axis=-1)
+    sums[..., count:] = sums[..., count:] - sums[..., :-count]
+    return sums / np.minimum(np.arange(1, values.shape[-1] + 1), count)
 
 
 def band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
