@@ -13,7 +13,7 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes, summarize
 from codrl_mj.films.film import Panel, film
 from codrl_mj.runs.policies import load_policy
-from codrl_mj.study.grid import train_runs
+from codrl_mj.study.grid import failure_record, train_runs
 from codrl_mj.tasks import named_actuator
 from codrl_mj.training import TrainConfig, TrainingStoppedError, finished, load_config
 from codrl_mj.validation import validate
@@ -61,8 +61,8 @@ def main() -> int:
     if waiting:
         with training_bars(waiting):
             failures = train_runs({out: config for config, out in waiting.values()}, accept_changes=True)
-        for out, failure in failures.items():
-            print(f"demo: {out}: {failure.error} (see {failure.record})", file=sys.stderr)
+        for out, error in failures.items():
+            print(f"demo: {out}: {error} (see {failure_record(out)})", file=sys.stderr)
         if failures:
             return 1
 

@@ -70,7 +70,7 @@ def _print_verdicts(findings: Any) -> None:
         for claim, verdict in findings.claims:
             if claim.task == task:
                 found = "–" if verdict.measured is None else "{} [{}, {}]".format(*map(number, verdict.measured))
-                words = claim.source, f"{claim.statement} ({claim.physics or 'value iteration'})", found
+                words = claim.source, f"{claim.statement} ({claim.physics})", found
                 colour = colours.get(verdict.outcome, "yellow")
                 table.add_row(*map(escape, words), str(verdict.samples), f"[{colour}]{verdict.outcome}")
         console().print(table)

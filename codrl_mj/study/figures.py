@@ -22,6 +22,14 @@ _SVG = {"svg.hashsalt": "codrl_mj", "svg.fonttype": "none", "font.sans-serif": [
 """The same bytes for the same figure; text as text, which a reader can search and edit."""
 
 
+def legend(figure: Any, columns: int) -> None:
+    """One legend below all of a figure's panels, each label once."""
+    entries: dict[str, Any] = {}
+    for axes in figure.axes:
+        entries |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=columns, fontsize="small")
+
+
 def save(figure: Any, path: Path) -> None:
     """Write a figure on white as SVG; the same bytes for the same figure."""
     import matplotlib

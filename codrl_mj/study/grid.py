@@ -24,16 +24,6 @@ _PATIENCE = 120.0  # s to wait for a run folder that a dying process of a killed
 
 
 @dataclasses.dataclass(frozen=True)
-class Failure:
-    """A cell that could not be computed."""
-
-    error: str
-    """What went wrong, in a line."""
-    record: Path
-    """JSON file with the traceback and the configuration."""
-
-
-@dataclasses.dataclass(frozen=True)
 class Deployment:
     """The last policy of a run, put to work on an actuator."""
 
@@ -47,13 +37,10 @@ class Deployment:
     """Seed of the first episode."""
 
     @property
-    def _identity(self) -> dict[str, Any]:
-        return {**vars(self), "env": self.env.as_mapping(), "run": None}
-
-    @property
     def record(self) -> Path:
         """The JSON file of the result, in the run folder."""
-        return self.run / _DEPLOYMENTS / f"{_digest(self._identity)}.json"
+        identity = {**vars(self), "env": self.env.as_mapping(), "run": None}
+        return self.run / _DEPLOYMENTS / f"{_digest(identity)}.json"
 
 
 def check_chosen(field: str, given: Sequence[str], known: Iterable[str]) -> None:
@@ -80,74 +67,32 @@ def cell_folder(root: Path, config: TrainConfig) -> Path:
     return root / f"{config.task}-{config.agent.name}-s{config.seed}-{_digest(config.as_mapping())}"
 
 
-def read_failure(cell: Path | Deployment) -> Failure | None:
-    """Why a cell was not finished when it was tried last; None if it did not fail.
+def read_failure(cell: Path | Deployment) -> str | None:
+    """Why a cell was not finished when it was tried last, in a line; None if it did not fail.
 
     Args:
         cell: run folder of a training, or a test.
     """
-    record = _failure_record(cell)
-    return Failure(read_json(record, "record of a failure")["error"], record) if record.is_file() else None
+    record = failure_record(cell)
+    return str(read_json(record, "record of a failure")["error"]) if record.is_file() else None
 
 
-def _failure_record(cell: Path | Deployment) -> Path:
+def failure_record(cell: Path | Deployment) -> Path:
+    """The JSON file of what went wrong with a cell: the error, its traceback and the configuration."""
     if isinstance(cell, Deployment):
         return cell.run.parent / _FAILURES / f"{cell.run.name}-{cell.record.stem}.json"
     return cell.parent / _FAILURES / f"{cell.name}.json"
 
 
-def _note(cell: Path | Deployment, error: Exception | None, about: dict[str, Any]) -> Failure | None:
-    """Keep a record of what went wrong with a cell; forget the last one if nothing did."""
-    record = _failure_record(cell)
+def _note(cell: Path | Deployment, error: Exception | None, about: dict[str, Any]) -> str | None:
+    """Keep a record of what went wrong with a cell, and say it; forget the last one if nothing did."""
+    record = failure_record(cell)
     if error is None:
         record.unlink(missing_ok=True)
         return None
     line = " ".join(str(error).split()) or type(error).__name__
     write_json(record, {"error": line, "traceback": "".join(traceback.format_exception(error)), **about})
-    return Failure(line, record)
-
-
-def train_cells(
-    cells: Mapping[str, TrainConfig],
-    root: Path,
-    workers: Workers = Workers(),  # noqa: B008 - frozen
-    accept_changes: bool = False,
-    on_cell: Callable[[str], None] | None = None,
-) -> tuple[dict[str, Path], dict[str, Failure]]:
-    """Train every cell that is not finished; one that fails does not stop the others.
-
-    Args:
-        cells: configurations by name; equal configurations are one cell.
-        root: folder of the run folders.
-        workers: what computes them.
-        accept_changes: continue begun cells even if code or packages have changed since.
-        on_cell: called with a cell's name when it is finished or has failed; those finished before come first, those of
-            a Ray cluster when all are done.
-
-    Returns:
-        The run folders of the finished cells, and the failures; both by name. A failure's record stays in
-        `root/failures` until the cell is finished.
-
-    Raises:
-        ValueError: Ray is asked for and not installed.
-        TrainingStoppedError: a signal asked to stop.
-    """
-    folders = {name: cell_folder(root, config) for name, config in cells.items()}
-    called: dict[Path, list[str]] = {}
-    for name, folder in folders.items():
-        called.setdefault(folder, []).append(name)
-    report = on_cell or (lambda _: None)
-
-    def ended(folder: Path) -> None:
-        for name in called[folder]:
-            report(name)
-
-    runs = {folder: cells[names[0]] for folder, names in called.items()}
-    failures = train_runs(runs, workers, ended, accept_changes=accept_changes, tensorboard=False)
-    return (
-        {name: folder for name, folder in folders.items() if folder not in failures},
-        {name: failures[folder] for name, folder in folders.items() if folder in failures},
-    )
+    return line
 
 
 def train_runs(
@@ -155,7 +100,7 @@ def train_runs(
     workers: Workers = Workers(),  # noqa: B008 - frozen
     on_run: Callable[[Path], None] = lambda _: None,
     **options: Any,
-) -> dict[Path, Failure]:
+) -> dict[Path, str]:
     """Train every run that is not finished; one that fails does not stop the others.
 
     Args:
@@ -165,7 +110,7 @@ def train_runs(
         **options: `accept_changes` and `tensorboard`, as for `codrl_mj.training.train`.
 
     Returns:
-        The failures. A failure's record stays in `failures` beside the run folder until the run is finished.
+        What went wrong, by run folder. A failure's record stays in `failures` beside it until the run is finished.
 
     Raises:
         ValueError: Ray is asked for and not installed.
@@ -186,40 +131,30 @@ def train_runs(
 def deploy_cells(
     deployments: Mapping[str, Deployment],
     workers: Workers = Workers(),  # noqa: B008 - frozen
-    on_cell: Callable[[str], None] | None = None,
-) -> tuple[dict[str, dict[str, Any]], dict[str, Failure]]:
+    on_cell: Callable[[str], None] = lambda _: None,
+) -> None:
     """Evaluate policies; what was evaluated before is not evaluated again, and one that fails does not stop the others.
+
+    The record of a result has `Evaluation.as_mapping()`; a failure's stays in `failures` beside the run folders until
+    the evaluation succeeds.
 
     Args:
         deployments: by name.
         workers: what computes them.
         on_cell: called with a deployment's name when it is evaluated or has failed; those evaluated before come first.
 
-    Returns:
-        `Evaluation.as_mapping()` of those that succeeded, and the failures; both by name. A failure's record stays in
-        `failures` beside the run folders until the evaluation succeeds.
-
     Raises:
-        ValueError: Ray is asked for and not installed, or a record of a result is damaged.
+        ValueError: Ray is asked for and not installed.
     """
-    report = on_cell or (lambda _: None)
     waiting = {name: deployment for name, deployment in deployments.items() if not deployment.record.is_file()}
     for name in deployments:
         if name not in waiting:
-            report(name)
-    failures = {}
-    for name, failure in compute(_deploy_cell, list(waiting.items()), workers):
-        if failure is not None:
-            failures[name] = failure
-        report(name)
-    return {
-        name: read_json(deployment.record, "evaluation")
-        for name, deployment in deployments.items()
-        if name not in failures
-    }, failures
+            on_cell(name)
+    for name in compute(_deploy_cell, waiting.items(), workers):
+        on_cell(name)
 
 
-def _train_run(config: TrainConfig, folder: Path, options: Mapping[str, Any]) -> tuple[Path, Failure | None]:
+def _train_run(config: TrainConfig, folder: Path, options: Mapping[str, Any]) -> tuple[Path, str | None]:
     """Train one run: its folder, and what went wrong, of which a record is kept."""
     return folder, _note(folder, _try_to_train(config, folder, options), {"train": config.as_mapping()})
 
@@ -241,27 +176,21 @@ def _try_to_train(config: TrainConfig, folder: Path, options: Mapping[str, Any])
             return error
 
 
-def _deploy_cell(name: str, deployment: Deployment) -> tuple[str, Failure | None]:
-    """Evaluate one policy: its name, and what went wrong, of which a record is kept."""
-    try:
-        _deploy(deployment)
-    except Exception as error:
-        return name, _note(deployment, error, {"test": name, "run": deployment.run.name})
-    return name, _note(deployment, None, {})
-
-
-def _deploy(deployment: Deployment) -> None:
+def _deploy_cell(name: str, deployment: Deployment) -> str:
+    """Evaluate one policy: its name. Of what goes wrong a record is kept."""
     from codrl_mj.evaluation import evaluate
     from codrl_mj.runs.policies import load_policy
 
-    config = load_config(deployment.run, trust=True)  # ours: found by its configuration
-    result = evaluate(
-        load_policy(deployment.run),
-        deployment.env.seen_as(config.env),
-        deployment.episodes,
-        deployment.seed,
-    )
-    write_json(deployment.record, result.as_mapping())
+    error = None
+    try:
+        config = load_config(deployment.run, trust=True)  # ours: found by its configuration
+        env = deployment.env.seen_as(config.env)
+        result = evaluate(load_policy(deployment.run), env, deployment.episodes, deployment.seed)
+        write_json(deployment.record, result.as_mapping())
+    except Exception as caught:
+        error = caught
+    _note(deployment, error, {"test": name, "run": deployment.run.name})
+    return name
 
 
 def _digest(content: Any) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.runs.files import read_json
-from codrl_mj.study.grid import Deployment, cell_folder, deploy_cells, read_failure, train_cells
+from codrl_mj.study.grid import Deployment, cell_folder, deploy_cells, read_failure, train_runs
 from codrl_mj.study.parallel import Workers
 from codrl_mj.training import EVALUATION_SEED, TrainConfig, finished
 from codrl_mj.training.folder import RESULT
@@ -154,10 +154,10 @@ class Grid:
             ValueError: Ray is asked for and not installed.
             TrainingStoppedError: a signal asked to stop.
         """
-        cells, tests = self.cells(), self.deployments()
+        cells, folders, tests = self.cells(), self.folders(), self.deployments()
         for seed in sorted({seed for _, seed in cells}):  # trained and tested, so that a part says something of all
-            named = {called(*cell): config for cell, config in cells.items() if cell[1] == seed}
-            train_cells(named, self.root, workers, accept_changes, lambda _: on_cell("training"))
+            runs = {folders[cell]: config for cell, config in cells.items() if cell[1] == seed}
+            train_runs(runs, workers, lambda _: on_cell("training"), accept_changes=accept_changes, tensorboard=False)
             ready = {called(*key): test for key, test in tests.items() if key[1] == seed and finished(test.run)}
             deploy_cells(ready, workers, lambda _: on_cell("test"))
 
@@ -184,7 +184,7 @@ class Grid:
             folders=done,
             evaluations=evaluations,
             missing=tuple(missing),
-            failures={name: failure.error for name, failure in failures.items() if failure is not None},
+            failures={name: failure for name, failure in failures.items() if failure is not None},
             seconds=sum(training_seconds(folder) for folder in done.values()),
             codes=collections.Counter(
                 str(read_json(folder / "config.json", "run configuration").get("code"))[:8] for folder in done.values()
@@ -198,9 +198,7 @@ class Grid:
             ValueError: a file of a finished run is damaged.
         """
         folders, tests = self.folders(), self.deployments()
-        untested: collections.Counter[Path] = collections.Counter(
-            test.run for test in tests.values() if not test.record.is_file()
-        )
+        untested = collections.Counter(test.run for test in tests.values() if not test.record.is_file())
         found = []
         for arm in self.arms:
             mine = {seed: folders[arm.name, seed] for seed in self.seeds_of(arm)}

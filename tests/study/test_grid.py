@@ -15,7 +15,7 @@ from codrl_mj.agents import PPOConfig
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import evaluate
 from codrl_mj.runs.policies import load_policy
-from codrl_mj.study.grid import Deployment, cell_folder, deploy_cells, read_failure, train_cells
+from codrl_mj.study.grid import Deployment, cell_folder, deploy_cells, failure_record, read_failure, train_runs
 from codrl_mj.study.parallel import Workers, compute
 from codrl_mj.training import TrainConfig, finished, load_config
 
@@ -28,6 +28,14 @@ CELLS = {f"seed {seed}": dataclasses.replace(TINY, seed=seed) for seed in range(
 ONE = Workers(jobs=1)
 
 
+def train_cells(cells, root, workers=ONE, on_run=lambda _: None):
+    """Run folders by name, and what failed by its run folder."""
+    folders = {name: cell_folder(root, config) for name, config in cells.items()}
+    return folders, train_runs(
+        dict(zip(folders.values(), cells.values(), strict=True)), workers, on_run, tensorboard=False
+    )
+
+
 def weights(folder):
     return (folder / "policy.safetensors").read_bytes()
 
@@ -37,25 +45,24 @@ def computed(tmp_path_factory):
     """A grid in two processes, one of whose cells cannot be trained."""
     root = tmp_path_factory.mktemp("grid")
     reported = []
-    cells = CELLS | {"unstable": dataclasses.replace(TINY, env=UNSTABLE), "again": CELLS["seed 0"]}
-    runs, failures = train_cells(cells, root, Workers(jobs=2), on_cell=reported.append)
+    cells = CELLS | {"unstable": dataclasses.replace(TINY, env=UNSTABLE)}
+    runs, failures = train_cells(cells, root, Workers(jobs=2), reported.append)
     return root, runs, failures, reported
 
 
 @pytest.mark.matrix
 def test_a_cell_that_fails_is_recorded_and_does_not_stop_the_others(computed):
     root, runs, failures, reported = computed
-    assert set(runs) == {*CELLS, "again"}
-    assert all(finished(run) for run in runs.values())
-    assert sorted(reported) == sorted([*CELLS, "again", "unstable"])
-    (failure,) = failures.values()
-    assert "spectral radius" in failure.error
-    record = json.loads(failure.record.read_text())
-    assert record["error"] == failure.error
+    assert [name for name, run in runs.items() if finished(run)] == [*CELLS]
+    assert sorted(reported) == sorted(runs.values())
+    assert [*failures] == [runs["unstable"]]
+    assert "spectral radius" in failures[runs["unstable"]]
+    (file,) = (root / "failures").iterdir()
+    assert file == failure_record(runs["unstable"])
+    record = json.loads(file.read_text())
+    assert record["error"] == failures[runs["unstable"]] == read_failure(runs["unstable"])
     assert "Traceback" in record["traceback"]
     assert record["train"]["env"]["actuator"]["controller"]["kp"] == 100.0
-    assert failure.record.parent == root / "failures"
-    assert read_failure(cell_folder(root, dataclasses.replace(TINY, env=UNSTABLE))) == failure
     assert read_failure(runs["seed 0"]) is None
 
 
@@ -65,7 +72,6 @@ def test_a_cell_is_an_ordinary_run_folder_keyed_by_its_configuration(computed):
     for name, config in CELLS.items():
         assert runs[name] == cell_folder(root, config)
         assert load_config(runs[name]) == config
-    assert runs["again"] == runs["seed 0"]
     changed = [
         dataclasses.replace(TINY, total_steps=513),
         dataclasses.replace(TINY, env=dataclasses.replace(ENV, options={"center_radius": 0.1})),
@@ -80,22 +86,19 @@ def test_finished_cells_are_left_alone(computed):
     root, runs, _, _ = computed
     before = {path: path.stat().st_mtime_ns for run in runs.values() for path in run.rglob("*")}
     reported = []
-    again, failures = train_cells(CELLS, root, ONE, on_cell=reported.append)
-    assert again == {name: runs[name] for name in CELLS}
-    assert failures == {}
-    assert reported == [*CELLS]
+    assert train_cells(CELLS, root, on_run=reported.append)[1] == {}
+    assert reported == [runs[name] for name in CELLS]
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
 def test_a_failure_is_forgotten_when_the_cell_succeeds(tmp_path):
-    blocked = cell_folder(tmp_path, TINY)
-    blocked.write_text("a file in the way")
-    _, failures = train_cells({"cell": TINY}, tmp_path, ONE)
-    assert failures["cell"].record.is_file()
-    blocked.unlink()
-    runs, failures = train_cells({"cell": TINY}, tmp_path, ONE)
-    assert failures == {}
-    assert finished(runs["cell"])
+    folder = cell_folder(tmp_path, TINY)
+    folder.write_text("a file in the way")
+    assert "Not a directory" in train_runs({folder: TINY}, ONE)[folder]
+    assert failure_record(folder).is_file()
+    folder.unlink()
+    assert train_runs({folder: TINY}, ONE) == {}
+    assert finished(folder)
     assert list((tmp_path / "failures").iterdir()) == []
 
 
@@ -105,7 +108,7 @@ def test_ray_computes_the_same(computed, tmp_path):
     ray_runs, failures = train_cells(
         CELLS | {"unstable": dataclasses.replace(TINY, env=UNSTABLE)}, tmp_path, Workers(jobs=2, backend="ray")
     )
-    assert set(failures) == {"unstable"}
+    assert set(failures) == {ray_runs["unstable"]}
     for name in CELLS:
         assert weights(ray_runs[name]) == weights(runs[name])
 
@@ -126,7 +129,7 @@ train_cells(CELLS, Path(sys.argv[1]), Workers(jobs=2))
             time.sleep(0.02)
         grid.send_signal(signal.SIGKILL)
     assert not all(finished(cell_folder(tmp_path, config)) for config in CELLS.values())
-    resumed, failures = train_cells(CELLS, tmp_path, ONE)
+    resumed, failures = train_cells(CELLS, tmp_path)
     assert failures == {}
     for name in CELLS:
         assert weights(resumed[name]) == weights(runs[name])
@@ -177,17 +180,17 @@ def test_deployments_are_evaluations_that_are_made_once(computed):
     deployments = {
         name: Deployment(runs["seed 0"], EnvConfig("cartpole", name), episodes=3, seed=7) for name in ("paper", "ideal")
     }
-    results, failures = deploy_cells(deployments, ONE)
-    assert failures == {}
-    for name, deployment in deployments.items():
+    deploy_cells(deployments, ONE)
+    for deployment in deployments.values():
         expected = evaluate(load_policy(runs["seed 0"]), deployment.env, episodes=3, seed=7)
-        assert results[name]["returns"] == expected.returns._asdict()
+        assert json.loads(deployment.record.read_text())["returns"] == expected.returns._asdict()
     before = {deployment.record: deployment.record.stat().st_mtime_ns for deployment in deployments.values()}
     assert len(before) == 2
-    assert deploy_cells(deployments, ONE) == (results, {})
+    deploy_cells(deployments, ONE)
     assert {record: record.stat().st_mtime_ns for record in before} == before
     other = Deployment(runs["seed 0"], EnvConfig("cartpole", max_episode_steps=5), episodes=3, seed=7)
-    assert deploy_cells({"short": other}, ONE)[0]["short"]["length"]["mean"] == 5.0
+    deploy_cells({"short": other}, ONE)
+    assert json.loads(other.record.read_text())["length"]["mean"] == 5.0
 
 
 @pytest.mark.matrix
@@ -195,17 +198,15 @@ def test_a_deployment_that_fails_is_recorded_and_does_not_stop_the_others(comput
     root, runs, _, _ = computed
     good, bad = (Deployment(runs["seed 1"], env, episodes=2, seed=3) for env in (IDEAL, UNSTABLE))
     reported = []
-    results, failures = deploy_cells({"bad": bad, "good": good}, ONE, reported.append)
-    assert set(results) == {"good"}
+    deploy_cells({"bad": bad, "good": good}, ONE, reported.append)
+    assert (bad.record.is_file(), good.record.is_file()) == (False, True)
     assert sorted(reported) == ["bad", "good"]
-    failure = failures["bad"]
-    assert "spectral radius" in failure.error
-    record = json.loads(failure.record.read_text())
-    assert record["error"] == failure.error
+    assert failure_record(bad).parent == root / "failures"
+    record = json.loads(failure_record(bad).read_text())
+    assert "spectral radius" in record["error"]
+    assert read_failure(bad) == record["error"]
     assert "Traceback" in record["traceback"]
     assert (record["test"], record["run"]) == ("bad", runs["seed 1"].name)
-    assert failure.record.parent == root / "failures"
-    assert read_failure(bad) == failure
     assert read_failure(good) is None
     assert read_failure(runs["seed 1"]) is None
 
@@ -217,12 +218,12 @@ def test_a_failure_of_a_deployment_is_forgotten_when_it_succeeds(computed):
     content = policy.read_text()
     policy.write_text("{")
     try:
-        _, failures = deploy_cells({"cell": deployment}, ONE)
+        deploy_cells({"cell": deployment}, ONE)
     finally:
         policy.write_text(content)
-    assert failures["cell"].record.is_file()
-    results, failures = deploy_cells({"cell": deployment}, ONE)
-    assert (set(results), failures) == ({"cell"}, {})
+    assert "policy.json" in read_failure(deployment)
+    deploy_cells({"cell": deployment}, ONE)
+    assert deployment.record.is_file()
     assert read_failure(deployment) is None
 
 
@@ -240,4 +241,4 @@ def test_impossible_workers_are_refused(field, value, expected):
 def test_ray_that_is_not_installed_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ValueError, match=r"pip install 'codrl-mj\[ray\]'"):
-        train_cells({"cell": TINY}, tmp_path, Workers(backend="ray"))
+        train_runs({tmp_path: TINY}, Workers(backend="ray"))

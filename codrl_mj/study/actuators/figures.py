@@ -13,7 +13,7 @@ from codrl_mj.study.actuators.evidence import Evidence
 from codrl_mj.study.actuators.levels import AXES
 from codrl_mj.study.actuators.questions import MARGIN, at_home, dosed, on_loop, on_motor, undosed
 from codrl_mj.study.actuators.verdicts import Scores
-from codrl_mj.study.figures import COLOURS, MARKERS, TITLES, save
+from codrl_mj.study.figures import COLOURS, MARKERS, TITLES, legend, save
 from codrl_mj.study.trials import Trial
 
 _LOWEST = -0.1  # of the span; what is worse is as lost
@@ -50,11 +50,8 @@ def doses(path: Path, scores: Scores) -> None:
         panel.set_axisbelow(True)
     for panel in panels[::3]:
         panel.set_ylabel("score [share of the span]")
-    handles, labels = panels[0].get_legend_handles_labels()
-    from matplotlib.lines import Line2D
-
-    handles.append(Line2D([], [], ls="", marker="*", color="0.4", markersize=12))
-    figure.legend(handles, [*labels, "trained through it"], loc="outside lower center", ncols=4, fontsize="small")
+    panels[-1].plot([], [], "*", color="0.4", markersize=12, label="trained through it")
+    legend(figure, 4)
     save(figure, path)
 
 
@@ -86,9 +83,7 @@ def bars(path: Path, scores: Scores, groups: Mapping[str, Sequence[tuple[str, Tr
     axes.set(ylabel="score [share of the span]", title=title, xlim=(-0.5, len(groups) - 0.5))
     axes.grid(axis="y", color="0.9")
     axes.set_axisbelow(True)
-    handles, names = axes.get_legend_handles_labels()
-    once = dict(zip(names, handles, strict=True))
-    figure.legend(once.values(), once.keys(), loc="outside lower center", ncols=3, fontsize="small")
+    legend(figure, 3)
     save(figure, path)
 
 
@@ -161,9 +156,7 @@ def foretold(path: Path, scores: Scores, evidence: Evidence) -> None:
     axes.set(xlabel="lost in tests [share of the span]", ylabel="foretold by bench and doses")
     axes.grid(color="0.92")
     axes.set_axisbelow(True)
-    handles, names = axes.get_legend_handles_labels()
-    once = dict(zip(names, handles, strict=True))
-    figure.legend(once.values(), once.keys(), loc="outside lower center", ncols=3, fontsize="small")
+    legend(figure, 3)
     save(figure, path)
 
 

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from codrl_mj.actuators import IDEAL, Actuator
+from codrl_mj.actuators import IDEAL, Actuator, CurrentLoop
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import find_task
@@ -58,8 +58,7 @@ class PaperArm(Arm):
 
 
 FAST: Actuator = dataclasses.replace(
-    find_task("mountain_car").paper[0],
-    controller=dataclasses.replace(find_task("mountain_car").paper[0].controller, kp=2.0, ki=10.0, kd=1e-6),
+    find_task("mountain_car").paper[0], controller=CurrentLoop(kp=2.0, ki=10.0, kd=1e-6)
 )
 """The mountain car's second set of gains (Solving the Mountain Car Environment)."""
 

@@ -11,7 +11,7 @@ from codrl_mj.actuators import IDEAL
 from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.films.strip import ACTUAL, DESIRED
 from codrl_mj.runs.policies import load_policy
-from codrl_mj.study.figures import COLOURS, save
+from codrl_mj.study.figures import COLOURS, legend, save
 from codrl_mj.study.reproduction.arms import CENTRE_RADIUS, TEST, PaperArm
 from codrl_mj.study.reproduction.series import LAST, Series
 from codrl_mj.study.reproduction.value_iteration import Optimum
@@ -80,24 +80,22 @@ def _unbroken(angle: np.ndarray) -> np.ndarray:
     return np.where(jumps, np.nan, angle)
 
 
-def example(series: Series) -> Episode | None:
-    """The first test episode of the first seed that is finished; None if none is."""
-    if not series.runs:
-        return None
+def example(series: Series) -> Episode:
+    """The first test episode of the first seed that is finished, of which there must be one."""
     run = next(iter(series.runs.values()))
     (episode,) = run_episodes(load_policy(run.folder), series.arm.trials[TEST].env.make, 1, EVALUATION_SEED)
     return episode
 
 
 def draw_learning(path: Path, arms: Sequence[Series]) -> None:
-    """Draw trainings, a column for each settings and physics that there are runs of: means and 95 % bands over seeds.
+    """Draw trainings, a column for each settings and physics: means and 95 % bands over seeds.
 
     It is the running mean of returns over episodes; of PPO, whose rollouts are the paper's epochs, mean return, mean
     length and number of episodes over epochs.
 
     Args:
         path: SVG file.
-        arms: of one task.
+        arms: of one task, at least one, each with a run.
     """
 
     def over_epochs(what: str) -> Callable[[Series], np.ndarray]:
@@ -111,8 +109,7 @@ def draw_learning(path: Path, arms: Sequence[Series]) -> None:
         along, title, size = "epoch of 4000 steps", "{1}", "large"
     columns: dict[tuple[str, str], list[Series]] = {}
     for series in arms:
-        if series.runs:
-            columns.setdefault((series.arm.settings, PHYSICS[series.arm.physics]), []).append(series)
+        columns.setdefault((series.arm.settings, PHYSICS[series.arm.physics]), []).append(series)
     figure, all_axes = _panels(len(rows), len(columns))
     for (about, members), column in zip(columns.items(), all_axes.T, strict=True):
         for axes, (label, values_of) in zip(column, rows.items(), strict=True):
@@ -126,7 +123,7 @@ def draw_learning(path: Path, arms: Sequence[Series]) -> None:
             axes.set(ylabel=label, yscale="log" if label == "number of episodes" else "linear")
         column[0].set_title(title.format(*about), fontsize=size)
         column[-1].set_xlabel(along)
-    _legend(figure, all_axes)
+    legend(figure, 2)
     save(figure, path)
 
 
@@ -149,7 +146,7 @@ def draw_torque(path: Path, episodes: Sequence[tuple[PaperArm, Episode]]) -> Non
         below.stairs(desired - actual, edges, color=_ERROR, label="error: desired - actual", **options)
         above.set(ylabel="torque [N·m]", title=arm.gains)
         below.set(ylabel="error [N·m]", xlabel="time [s]")
-    _legend(figure, all_axes)
+    legend(figure, 2)
     save(figure, path)
 
 
@@ -172,7 +169,7 @@ def draw_states(path: Path, task: str, episodes: Sequence[tuple[PaperArm, Episod
             axes.plot(times, curve.values(episode.state.T), color=colour, linestyle=dashes, label=_name(arm))
         axes.set_ylabel(curve.label.replace("_dot", "'"), fontsize="small")
     all_axes[-1, 0].set_xlabel("time [s]")
-    _legend(figure, all_axes)
+    legend(figure, 2)
     save(figure, path)
 
 
@@ -217,6 +214,7 @@ def _panels(rows: int, columns: int, row_height: float = 0.0, heights: Sequence[
         each.grid(color="0.9")
         each.set_axisbelow(True)
         each.spines[["top", "right"]].set_visible(False)
+    figure.align_ylabels()
     return figure, axes
 
 
@@ -230,10 +228,9 @@ def running_mean(values: np.ndarray, count: int = LAST) -> np.ndarray:
     Returns:
         Shape (..., n).
     """
-    sums = np.cumsum(np.concatenate([np.zeros((*values.shape[:-1], 1)), values], axis=-1), axis=-1)
-    ends = np.arange(1, values.shape[-1] + 1)
-    begins = np.maximum(0, ends - count)
-    return (sums[..., ends] - sums[..., begins]) / (ends - begins)
+    sums = np.cumsum(values, axis=-1)
+    sums[..., count:] = sums[..., count:] - sums[..., :-count]
+    return sums / np.minimum(np.arange(1, values.shape[-1] + 1), count)
 
 
 def band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -263,12 +260,3 @@ def _filled(values: np.ndarray) -> np.ndarray:
 
 def _name(arm: PaperArm) -> str:
     return "ideal" if arm.actuator == IDEAL else arm.gains
-
-
-def _legend(figure: Any, axes: Any) -> None:
-    """One legend below all panels, each label once."""
-    figure.align_ylabels()
-    entries: dict[str, Any] = {}
-    for each in axes.flat:
-        entries |= dict(zip(*reversed(each.get_legend_handles_labels()), strict=True))
-    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=2, fontsize="small")

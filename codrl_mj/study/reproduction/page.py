@@ -10,7 +10,7 @@ from codrl_mj.runs.files import writing
 from codrl_mj.study.conclusions import conclusions_section
 from codrl_mj.study.figures import TITLES
 from codrl_mj.study.reproduction import figures, tables
-from codrl_mj.study.reproduction.claims import PAPER_SAYS, PORT, STUDY_SAYS, Claim
+from codrl_mj.study.reproduction.claims import PAPER_SAYS, PORT, Claim
 from codrl_mj.study.reproduction.reproduce import VALUE_TASK, Findings
 from codrl_mj.study.reproduction.value_iteration import Optimum
 from codrl_mj.study.reproduction.verdicts import NOT_CONFIRMED, NOT_TESTABLE, OUTCOMES, Verdict, number
@@ -78,11 +78,7 @@ def _missing(findings: Findings) -> str:
     )
 
 
-_SOURCES = {
-    PAPER_SAYS: "the paper",
-    STUDY_SAYS: "a quick study of the paper's loop on Gymnasium's dynamics, before this port",
-    PORT: "this port: MuJoCo against Gymnasium's equations",
-}
+_SOURCES = {PAPER_SAYS: "the paper", PORT: "this port: MuJoCo against Gymnasium's equations"}
 
 
 def verdicts_section(claims: Sequence[tuple[Claim, Verdict]]) -> str:
@@ -99,12 +95,11 @@ def verdicts_section(claims: Sequence[tuple[Claim, Verdict]]) -> str:
 
 
 def _of_statements(found: Iterable[tuple[Claim, str]]) -> dict[tuple[str, ...], str]:
-    """What every statement came to: where it is judged on both kinds of physics, it has to pass on both."""
+    """What every statement of somebody came to: judged on both kinds of physics, it has to pass on both."""
     several: dict[tuple[str, ...], set[str]] = {}
     for claim, outcome in found:
-        several.setdefault(claim.identity, set()).add(outcome)
-    decisive = [NOT_CONFIRMED, *(one for one in OUTCOMES if one != NOT_CONFIRMED)]
-    return {identity: next(one for one in decisive if one in outcomes) for identity, outcomes in several.items()}
+        several.setdefault((claim.task, claim.statement, claim.measure.text), set()).add(outcome)
+    return {statement: min(outcomes, key=[NOT_CONFIRMED, *OUTCOMES].index) for statement, outcomes in several.items()}
 
 
 _WORDS = """\
@@ -120,7 +115,7 @@ def _tasks(findings: Findings, drawn: Mapping[str, Mapping[Path, str]]) -> Itera
         yield f"## {TITLES[task]}: the paper's *{section}*\n"
         yield _claims(findings, task)
         if task == VALUE_TASK:
-            yield _value_iteration(findings.evidence.optima)
+            yield _value_iteration(findings.optima)
         if drawn[task]:
             first, *others = (f"[{caption}]({FOLDER}/{path.name})" for path, caption in drawn[task].items())
             yield f"!{first}\n"
@@ -134,7 +129,7 @@ def _claims(findings: Findings, task: str) -> str:
         if (claim.task, claim.source) == (task, PAPER_SAYS) and claim.physics != "analytic":
             outcome = verdict.outcome if verdict.outcome == NOT_TESTABLE else f"**{verdict.outcome}**"
             ours = "–" if verdict.measured is None else _interval(verdict.measured)
-            rows.append([outcome, claim.statement, claim.measure, ours, str(verdict.samples or "–")])
+            rows.append([outcome, claim.statement, claim.measure.text, ours, str(verdict.samples or "–")])
     return _table(["verdict", "the paper reports", "measure", "ours [95 %]", "seeds"], rows)
 
 
@@ -160,15 +155,15 @@ def _value_iteration(optima: Sequence[Optimum]) -> str:
 
 def _draw(findings: Findings, task: str, folder: Path) -> dict[Path, str]:
     """Draw what there is of a task: the files, and what they show."""
-    mine = [one for one in findings.evidence.series.values() if one.arm.task == task]
+    mine = [one for one in findings.series.values() if one.arm.task == task and one.runs]
     title, paths = TITLES[task], {}
-    if any(one.runs for one in mine):
+    if mine:
         path = folder / f"learning_{task}.svg"
         paths[path] = f"Learning, mean over seeds with its 95 % interval: {title}"
         figures.draw_learning(path, mine)
     for settings in dict.fromkeys(one.arm.settings for one in mine):
         shown = [one for one in mine if one.arm.settings == settings and one.arm.physics == "mujoco"]
-        episodes = [(one.arm, episode) for one in shown if (episode := figures.example(one)) is not None]
+        episodes = [(one.arm, figures.example(one)) for one in shown]
         if driven := [(arm, episode) for arm, episode in episodes if arm.actuator != IDEAL]:
             path = folder / f"torque_{task}_{settings}.svg"
             paths[path] = f"Desired and actual torque, and error, {settings} settings: {title}"
@@ -180,7 +175,7 @@ def _draw(findings: Findings, task: str, folder: Path) -> dict[Path, str]:
     if task == VALUE_TASK:
         path = folder / "discount.svg"
         paths[path] = "Value of the start, and the best policies, over discount factors"
-        figures.draw_discounts(path, findings.values, findings.evidence.optima)
+        figures.draw_discounts(path, findings.values, findings.optima)
     return paths
 
 

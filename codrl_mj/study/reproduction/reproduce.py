@@ -7,9 +7,9 @@ from pathlib import Path
 from codrl_mj.fields import check, integer
 from codrl_mj.study.grid import check_chosen
 from codrl_mj.study.reproduction.arms import ARMS, TASKS
-from codrl_mj.study.reproduction.claims import CLAIMS, Claim, Evidence
-from codrl_mj.study.reproduction.series import read_series
-from codrl_mj.study.reproduction.value_iteration import DISCOUNTS, Mesh, Model, optimum, values_over
+from codrl_mj.study.reproduction.claims import CLAIMS, Claim
+from codrl_mj.study.reproduction.series import Series, read_series
+from codrl_mj.study.reproduction.value_iteration import DISCOUNTS, Mesh, Model, Optimum, optimum, values_over
 from codrl_mj.study.reproduction.value_iteration import TASK as VALUE_TASK
 from codrl_mj.study.reproduction.verdicts import Verdict
 from codrl_mj.study.trials import Collected, Grid
@@ -68,19 +68,21 @@ class Findings:
     """What was to be done."""
     found: Collected
     """What is computed."""
-    evidence: Evidence
-    """All that is judged by."""
+    series: Mapping[str, Series]
+    """The runs of every arm, by its name."""
     claims: Sequence[tuple[Claim, Verdict]]
     """Every claim and its verdict."""
+    optima: Sequence[Optimum]
+    """The continuous mountain car's best policies at `DISCOUNTS`; none without that task."""
     values: Mapping[float, float]
-    """Discount factor -> value of the start of the continuous mountain car; empty without that task."""
+    """Discount factor -> value of its start; empty without that task."""
 
     @property
     def missing(self) -> dict[str, list[int]]:
         """Arm -> seeds that are wanted and not finished and tested."""
-        wanted = {arm.name: self.found.grid.seeds_of(arm) for arm in self.found.grid.arms}
+        seeds_of = self.found.grid.seeds_of
         missing = {
-            name: [seed for seed in wanted[name] if seed not in one.runs] for name, one in self.evidence.series.items()
+            name: [seed for seed in seeds_of(one.arm) if seed not in one.runs] for name, one in self.series.items()
         }
         return {name: seeds for name, seeds in missing.items() if seeds}
 
@@ -92,10 +94,10 @@ def gather(plan: Reproduction) -> Findings:
         ValueError: a file of a finished run is damaged.
     """
     found = plan.grid.collect()
-    names = {arm.name for arm in found.grid.arms}
-    series = {arm.name: read_series(arm, found) for arm in ARMS if arm.name in names}
-    model = Model(plan.mesh) if VALUE_TASK in plan.tasks else None
-    evidence = Evidence(series, [optimum(model, discount) for discount in DISCOUNTS] if model else [])
-    values = dict(zip(VALUE_DISCOUNTS, values_over(model, VALUE_DISCOUNTS), strict=True)) if model else {}
-    judged = [(claim, claim.judge(evidence)) for claim in CLAIMS if claim.task in plan.tasks]
-    return Findings(plan, found, evidence, judged, values)
+    series = {arm.name: read_series(arm, found) for arm in ARMS if arm.task in plan.tasks}
+    judged = [(claim, claim.judge(series)) for claim in CLAIMS if claim.task in plan.tasks]
+    if VALUE_TASK not in plan.tasks:
+        return Findings(plan, found, series, judged, [], {})
+    model = Model(plan.mesh)
+    optima = [optimum(model, discount) for discount in DISCOUNTS]
+    return Findings(plan, found, series, judged, optima, values_over(model, VALUE_DISCOUNTS))

@@ -75,10 +75,10 @@ class Series:
         return [np.array([np.inf if time is None else time for time in of_run]) for of_run in times]
 
     def returns_by_episode(self) -> np.ndarray:
-        """Returns of the training, shape (seeds, episodes), as far as all seeds have them."""
+        """Returns of the training, shape (seeds, episodes), as far as all seeds have them; there must be one."""
         returns = [run.column("return") for run in self.runs.values()]
-        shortest = min(map(len, returns), default=0)
-        return np.array([of_run[:shortest] for of_run in returns]).reshape(len(returns), shortest)
+        shortest = min(map(len, returns))
+        return np.array([of_run[:shortest] for of_run in returns])
 
     def epochs(self) -> list[Epochs]:
         """The training by its epochs, which are the agent's rollouts; for each seed."""

@@ -18,7 +18,6 @@ TESTED = (
     *("saturated_percent", "peak_voltage"),
 )
 """Measures of the test in `RUNS`, as docs/evaluation.md has them: means, and the median time to the goal."""
-RUN_COLUMNS = ("task", "settings", "motor", "gains", "physics", "seed", "run", "seconds", f"last_{LAST}", *TESTED)
 
 
 def write(findings: Findings, folder: Path) -> list[Path]:
@@ -33,10 +32,10 @@ def write(findings: Findings, folder: Path) -> list[Path]:
 def claim_row(findings: Findings, claim: Claim, verdict: Verdict) -> dict[str, Any]:
     """A claim and its verdict: ours over seeds, and the mean wall-clock time of a training that it is about [s]."""
     mean, low, high = verdict.measured or (None, None, None)
-    series = [findings.evidence.series[name] for name in claim.arms]
-    took = [run.seconds for one in series for run in one.runs.values()]
-    names = ("task", "physics", "source", "section", "statement", "measure")
+    took = [run.seconds for name in claim.arms for run in findings.series[name].runs.values()]
+    names = ("task", "physics", "source", "section", "statement")
     return {name: getattr(claim, name) for name in names} | {
+        "measure": claim.measure.text,
         "criterion": claim.check.criterion,
         "mean": mean,
         "low": low,
@@ -49,29 +48,27 @@ def claim_row(findings: Findings, claim: Claim, verdict: Verdict) -> dict[str, A
 
 
 def run_rows(series: Series) -> list[dict[str, Any]]:
-    """The finished runs of an arm, by `RUN_COLUMNS`."""
-    rows, arm = [], series.arm
+    """The finished runs of an arm."""
+    rows = []
     for seed, run in series.runs.items():
         alone = series.only({seed})
-        measured = [alone.last_returns(), *(alone.tested(name) for name in TESTED)]
-        values = (
-            *(arm.task, arm.settings, arm.motor, arm.gains, arm.physics, seed, run.folder.name, run.seconds),
-            *(float(one[0]) if len(one) else None for one in measured),
-        )
-        rows.append(dict(zip(RUN_COLUMNS, values, strict=True)))
+        measured = {f"last_{LAST}": alone.last_returns()} | {name: alone.tested(name) for name in TESTED}
+        row = {name: getattr(series.arm, name) for name in ("task", "settings", "motor", "gains", "physics")}
+        row |= {"seed": seed, "run": run.folder.name, "seconds": run.seconds}
+        rows.append(row | {name: float(one[0]) if len(one) else None for name, one in measured.items()})
     return rows
 
 
 def as_mapping(findings: Findings) -> dict[str, Any]:
     """Everything as JSON-serialisable values."""
-    plan, evidence = findings.plan, findings.evidence
+    plan = findings.plan
     return {
         "plan": {name: getattr(plan, name) for name in ("seeds", "sarsa_seeds", "episodes", "test_episodes")}
         | {"tasks": list(plan.tasks)},
         "claims": [claim_row(findings, *one) for one in findings.claims],
         "missing": findings.missing,
         "failures": dict(findings.found.failures),
-        "runs": [row for series in evidence.series.values() for row in run_rows(series)],
-        "value_iteration": [optimum.as_mapping() for optimum in evidence.optima],
+        "runs": [row for series in findings.series.values() for row in run_rows(series)],
+        "value_iteration": [optimum.as_mapping() for optimum in findings.optima],
         "values_of_start": [{"discount": discount, "value": value} for discount, value in findings.values.items()],
     }

@@ -13,6 +13,7 @@ import numpy as np
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.evaluation.measures import Interval, Quartiles, bootstrap_mean, quartiles
+from codrl_mj.fields import check, integer
 from codrl_mj.tasks import TASKS
 
 TASK = "mountain_car_continuous"
@@ -24,12 +25,12 @@ DISCOUNTS = (0.85, 0.9, 0.95, 0.99, 0.999)
 class Mesh:
     """Where values are computed; between its points they are interpolated."""
 
-    positions: int = 121
+    positions: int = integer(121, least=2)
     """Points from wall to wall, >= 2."""
-    speeds: int = 121
+    speeds: int = integer(121, least=2)
     """Points between the speed limits, >= 2."""
-    forces: int = 21
-    """Forces to choose from, evenly from -1 N to 1 N; an odd number, so that there is one of 0."""
+    forces: int = integer(21, least=3)
+    """Forces to choose from, evenly from -1 N to 1 N, >= 3; an odd number, so that there is one of 0."""
 
     def __post_init__(self) -> None:
         """Validate.
@@ -37,11 +38,9 @@ class Mesh:
         Raises:
             ValueError: a number is out of bounds.
         """
-        for name in ("positions", "speeds"):
-            if getattr(self, name) < 2:
-                raise ValueError(f"Mesh.{name} = {getattr(self, name)}: must be >= 2")
-        if self.forces < 3 or self.forces % 2 == 0:
-            raise ValueError(f"Mesh.forces = {self.forces}: must be an odd number >= 3")
+        check(self)
+        if self.forces % 2 == 0:
+            raise ValueError(f"Mesh.forces = {self.forces}: must be an odd number")
 
     @property
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
@@ -207,6 +206,6 @@ def start_value(model: Model, of_actions: np.ndarray) -> float:
     return float((interpolation(model.grid, np.array([[-0.5, 0.0]])) @ of_actions.max(axis=0))[0])
 
 
-def values_over(model: Model, discounts: Sequence[float]) -> list[float]:
-    """Values of x = -0.5 m at rest at many discount factors."""
-    return [start_value(model, iterate(model.rewards, model.transitions, discount)) for discount in discounts]
+def values_over(model: Model, discounts: Sequence[float]) -> dict[float, float]:
+    """Values of x = -0.5 m at rest by discount factor."""
+    return {discount: start_value(model, iterate(model.rewards, model.transitions, discount)) for discount in discounts}

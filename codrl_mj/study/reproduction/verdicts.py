@@ -44,6 +44,8 @@ class Check:
     """What it then comes to."""
     least: int = 1
     """Seeds that it takes."""
+    paired: bool = False
+    """Whether the n-th values of all arms are to be of one seed."""
 
     def __call__(self, *values: Any) -> Verdict:
         """Judge one value for each seed of every arm, shape (n,)."""
@@ -55,20 +57,6 @@ class Check:
             return Verdict(NOT_TESTABLE, "one seed: it takes two to say how runs differ", measured, samples)
         holds, reason, measured = self.judge(*values)
         return Verdict(self.passed if holds else NOT_CONFIRMED, reason, measured, samples)
-
-
-@dataclasses.dataclass(frozen=True)
-class Holds:
-    """A statement about what was computed without chance holds."""
-
-    criterion: str
-    """The statement."""
-
-    def __call__(self, holds: bool | None, found: str = "") -> Verdict:
-        """Judge whether it holds (None: it was not computed), and say what was found."""
-        if holds is None:
-            return Verdict(NOT_TESTABLE, "not computed")
-        return Verdict(CONFIRMED if holds else NOT_CONFIRMED, found)
 
 
 def within(low: float = -math.inf, high: float = math.inf) -> Check:
@@ -130,25 +118,12 @@ def one_episode(figure: float) -> Check:
 def every_seed(limit: float) -> Check:
     """The value of every seed is at most a limit."""
 
-    def judge(values: np.ndarray) -> tuple[bool, str, Interval | None]:
-        beyond, largest = int(np.sum(values > limit)), float(np.max(values))
-        return (
-            not beyond,
-            f"{beyond} of {len(values)} seeds are beyond; the largest has {number(largest)}",
-            _mean(values),
-        )
+    def judge(values: np.ndarray) -> tuple[bool, str, Interval]:
+        beyond = int(np.sum(values > limit))
+        reason = f"{beyond} of {len(values)} seeds are beyond; the largest has {number(float(np.max(values)))}"
+        return not beyond, reason, bootstrap_mean(values)
 
     return Check(f"at most {number(limit)} in every seed", judge)
-
-
-def some_seed(limit: float) -> Check:
-    """The value of some seed is at least a limit."""
-
-    def judge(values: np.ndarray) -> tuple[bool, str, Interval | None]:
-        there, largest = int(np.sum(values >= limit)), float(np.max(values))
-        return there > 0, f"so in {there} of {len(values)} seeds; the largest has {number(largest)}", _mean(values)
-
-    return Check(f"at least {number(limit)} in some seed", judge, COMPATIBLE)
 
 
 def higher() -> Check:
@@ -186,15 +161,11 @@ def same(margin: float, paired: bool = False) -> Check:
         return inside, reason, measured
 
     kind = "paired t" if paired else "Welch"
-    return Check(f"the 95 % interval of the difference ({kind}) is within ±{number(margin)}", judge, least=2)
+    criterion = f"the 95 % interval of the difference ({kind}) is within ±{number(margin)}"
+    return Check(criterion, judge, least=2, paired=paired)
 
 
 _MORE = "more seeds would tell"
-
-
-def _mean(values: np.ndarray) -> Interval | None:
-    """Mean over seeds with its interval; None if one of them is infinite."""
-    return bootstrap_mean(values) if np.isfinite(values).all() else None
 
 
 def prediction_interval(values: np.ndarray) -> tuple[float, float]:
@@ -224,6 +195,4 @@ def central_range(values: np.ndarray) -> tuple[float, float]:
 
 def number(value: float) -> str:
     """A number as text: four digits, or all before the point."""
-    if math.isinf(value):
-        return "∞" if value > 0 else "-∞"
     return f"{value:.4g}" if abs(value) < 1000 else f"{value:.0f}"

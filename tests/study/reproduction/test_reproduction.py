@@ -53,7 +53,7 @@ def test_every_arm_is_trained_tested_and_read(done):
     plan, findings, _, _, reported = done
     assert (reported.count("training"), reported.count("test")) == (6, 5)
     for arm in HILL[:-1]:
-        series = findings.evidence.series[arm.name]
+        series = findings.series[arm.name]
         assert (*series.runs, *findings.missing[arm.name]) == (0, 1)
         run = series.runs[0]
         assert run.folder == plan.grid.folders()[arm.name, 0]
@@ -85,14 +85,14 @@ def test_the_page_has_what_the_paper_reports_and_the_table_every_claim_with_its_
         rows = {(row["source"], row["physics"], row["statement"], row["measure"]): row for row in csv.DictReader(file)}
     assert len(rows) == len(findings.claims)
     for claim, verdict in findings.claims:
-        row = rows[claim.source, claim.physics or "", claim.statement, claim.measure]
+        row = rows[claim.source, claim.physics, claim.statement, claim.measure.text]
         assert (row["verdict"], row["why"], row["criterion"]) == (
             verdict.outcome,
             verdict.reason,
             claim.check.criterion,
         )
         of_the_paper = claim.source == "paper" and claim.physics != "analytic"
-        found = [line for line in page.splitlines() if f"| {claim.statement} | {claim.measure} |" in line]
+        found = [line for line in page.splitlines() if f"| {claim.statement} | {claim.measure.text} |" in line]
         assert len(found) == of_the_paper or claim.source == "paper"
         if of_the_paper:
             assert verdict.outcome in found[0]
@@ -144,7 +144,7 @@ def test_the_tables_are_the_findings(done):
     assert len(runs) == 5
     for row in runs:
         name = f"{row['task']}, {row['settings']}, {row['motor']}, {row['physics']}"
-        run = findings.evidence.series[name].runs[int(row["seed"])]
+        run = findings.series[name].runs[int(row["seed"])]
         assert float(row["returns"]) == run.tests["test"]["returns"]["mean"]
         assert float(row["last_50"]) == run.column("return").mean()
         assert row["time_to_goal"] == ""  # nobody arrives after two episodes
@@ -193,7 +193,7 @@ def test_costs_are_those_of_finished_runs_or_estimates(done):
     by_arm = {cost.arm.name: cost for cost in plan.grid.costs()}
     half = by_arm[HILL[0].name]
     assert (half.finished, half.missing) == ((0,), (1,))
-    assert half.seconds == findings.evidence.series[HILL[0].name].runs[0].seconds
+    assert half.seconds == findings.series[HILL[0].name].runs[0].seconds
     assert (half.tests, half.left) == (1, half.seconds + TEST_SECONDS)
     none = by_arm[BLOCKED.name]
     assert (none.finished, none.missing, none.left) == ((), (0, 1), 2 * (BLOCKED.seconds + TEST_SECONDS))
@@ -323,7 +323,7 @@ def test_a_test_that_failed_is_said(done, tmp_path):
     findings = gather(shorter)
     assert "policy.json" in findings.found.failures[f"{HILL[0].name} on test, seed 0"]
     assert findings.missing[HILL[0].name] == [0]
-    assert 0 in findings.evidence.series[HILL[1].name].runs
+    assert 0 in findings.series[HILL[1].name].runs
 
 
 def test_an_unknown_task_is_named(capsys):

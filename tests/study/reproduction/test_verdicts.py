@@ -11,7 +11,6 @@ from codrl_mj.study.reproduction.verdicts import (
     CONFIRMED,
     NOT_CONFIRMED,
     NOT_TESTABLE,
-    Holds,
     central_range,
     every_seed,
     higher,
@@ -20,7 +19,6 @@ from codrl_mj.study.reproduction.verdicts import (
     one_run,
     prediction_interval,
     same,
-    some_seed,
     within,
 )
 
@@ -85,9 +83,6 @@ def test_the_central_range_leaves_out_a_fortieth_at_both_ends():
         (within(high=1.0), [1.1], NOT_CONFIRMED),
         (every_seed(2.0), [1.0, 2.0], CONFIRMED),
         (every_seed(2.0), [1.0, 2.0001], NOT_CONFIRMED),
-        (every_seed(2.0), [1.0, math.inf], NOT_CONFIRMED),
-        (some_seed(0.5), [0.0, 0.5], COMPATIBLE),
-        (some_seed(0.5), [0.0, 0.4999], NOT_CONFIRMED),
         (one_run(5.0), [4.9, 5.0], COMPATIBLE),
         (one_run(5.0), [7.0, 7.001, 7.002], NOT_CONFIRMED),
         (one_run(5.0), [5.0], NOT_TESTABLE),
@@ -100,11 +95,9 @@ def test_outcomes_of_one_value_a_seed(check, values, outcome):
     assert verdict.reason
 
 
-@pytest.mark.parametrize(
-    "check", [within(0.0, 1.0), every_seed(1.0), some_seed(1.0), one_run(1.0), one_episode(1.0), Holds("it does")]
-)
+@pytest.mark.parametrize("check", [within(0.0, 1.0), every_seed(1.0), one_run(1.0), one_episode(1.0)])
 def test_without_runs_nothing_can_be_tested(check):
-    verdict = check(None) if isinstance(check, Holds) else check(NOTHING)
+    verdict = check(NOTHING)
     assert (verdict.outcome, verdict.measured, verdict.samples) == (NOT_TESTABLE, None, 0)
 
 
@@ -169,6 +162,4 @@ def test_what_is_said_of_an_interval_is_so():
 
 
 def test_numbers_as_text():
-    assert [number(value) for value in (-122.54, 4000.4, 0.11859, math.inf, -math.inf)] == [
-        *("-122.5", "4000", "0.1186", "∞", "-∞")
-    ]
+    assert [number(value) for value in (-122.54, 4000.4, 0.11859)] == ["-122.5", "4000", "0.1186"]

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 
 from codrl_mj.study.reproduction.arms import ARMS, CENTRE, TEST
-from codrl_mj.study.reproduction.claims import Evidence
 from codrl_mj.study.reproduction.series import Series, Trained
 
 SPREAD = np.array([-1.0, 0.0, 1.0, 0.5, -0.5])
@@ -39,7 +38,6 @@ def trained(seed=0, last=0.0, test=0.0, success=1.0, tracking=1.0, largest=0.05,
     evaluation = {
         "returns": {"mean": test + 0.5 * shift if test != 500 else 500.0, "low": 0.0, "high": 0.0},
         "success": {"mean": success, "low": 0.0, "high": 1.0},
-        "failure": {"mean": 1 - success, "low": 0.0, "high": 1.0},
         "tracking_percent": tracking,
         "tracking_max": largest,
         "episode_times_to_goal": [*times[:arrived].tolist(), *[None] * (len(times) - arrived)],
@@ -48,19 +46,18 @@ def trained(seed=0, last=0.0, test=0.0, success=1.0, tracking=1.0, largest=0.05,
     return Trained(Path("nowhere"), episodes, tests, 60.0)
 
 
-def world(values, seeds=range(5), optima=()):
-    """Evidence from runs.
+def world(values, seeds=range(5)):
+    """The series of every arm, by its name.
 
     Args:
         values: (task, settings, motor) -> arguments of `trained`; each arm takes those of its task, settings and motor.
         seeds: of every arm.
-        optima: value iteration's.
     """
     series = {}
     for arm in ARMS:
         given = values[arm.task, arm.settings, arm.motor]
         series[arm.name] = Series(arm, {seed: trained(seed, **given) for seed in seeds})
-    return Evidence(series, optima)
+    return series
 
 
 PAPERS = {
@@ -85,7 +82,7 @@ PAPERS = {
 }
 """What the paper reports."""
 
-STUDYS = PAPERS | {
+OTHERS = PAPERS | {
     ("pendulum", "paper", "paper gains"): {"last": -1400, "test": -1413, "success": 0.0},
     ("pendulum", "paper", "ideal"): {"last": -1400, "test": -1413, "success": 0.0},
     ("pendulum", "repaired", "paper gains"): {"last": -160, "test": -150, "time": 1.7},
@@ -100,4 +97,4 @@ STUDYS = PAPERS | {
     ("acrobot", "paper", "ideal"): {"last": -90, "test": -81, "time": 16.0},
     ("cartpole", "paper", "paper gains"): {"test": 500, "epoch": 40, "largest": 0.119},
 }
-"""What the quick study found."""
+"""Much of which is not so."""
