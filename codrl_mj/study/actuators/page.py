@@ -26,6 +26,7 @@ from codrl_mj.study.actuators.verdicts import FLOORS, LEVEL, MARGIN, Scores, Ver
 from codrl_mj.study.conclusions import conclusions_section
 from codrl_mj.study.figures import TITLES
 from codrl_mj.study.inference import detectable
+from codrl_mj.study.tables import markdown_table
 from codrl_mj.study.trials import Collected, Trial
 
 PAGE, FOLDER = "actuators.md", "actuators"
@@ -133,32 +134,23 @@ taken from:
 def _explored(scores: Scores) -> str:
     """Tables of what was not planned: mean scores."""
     doses = AXES["supply"].doses[1:]
-    lines = [
-        "## Exploration",
-        "",
-        f"Not planned, and without p: mean scores of the same policies, rows of [trials]({FOLDER}/{tables.TRIALS}). A "
-        "supply that lacks a share of what is needed, under ideal-trained policies, with anti-windup / with an "
-        "integrator that goes on while the voltage saturates:",
-        "",
-        f"| supply lacks | {' | '.join(f'{dose:g}' for dose in doses)} |",
-        f"| --- |{' --- |' * len(doses)}",
+    wound = [
+        [TITLES[task], *(" / ".join(_mean(scores, one) for one in pair) for pair in pairs)]
+        for task, pairs in windup().items()
     ]
-    for task, pairs in windup().items():
-        lines.append(
-            f"| {TITLES[task]} | {' | '.join(' / '.join(_mean(scores, one) for one in pair) for pair in pairs)} |"
-        )
     columns = around_the_paper()
     names = ["the paper's", *paper_loops(arms.LOOPED[0])]
-    lines += [
-        "",
-        "The paper's motor and loop, and otherwise, under policies that were trained on ideal forces and on it:",
-        "",
-        f"| loop | {' | '.join(columns)} |",
-        f"| --- |{' --- |' * len(columns)}",
-    ]
-    for row, name in enumerate(names):
-        lines.append(f"| {name} | {' | '.join(_mean(scores, column[row]) for column in columns.values())} |")
-    return "\n".join(lines) + "\n"
+    around = [[name, *(_mean(scores, column[row]) for column in columns.values())] for row, name in enumerate(names)]
+    return f"""## Exploration
+
+Not planned, and without p: mean scores of the same policies, rows of [trials]({FOLDER}/{tables.TRIALS}). A supply that
+lacks a share of what is needed, under ideal-trained policies, with anti-windup / with an integrator that goes on while
+the voltage saturates:
+
+{markdown_table(["supply lacks", *(f"{dose:g}" for dose in doses)], wound)}
+The paper's motor and loop, and otherwise, under policies that were trained on ideal forces and on it:
+
+{markdown_table(["loop", *columns], around)}"""
 
 
 def _mean(scores: Scores, trial: Trial) -> str:
@@ -185,12 +177,7 @@ Versions of the code that trained, with the number of runs: {codes}.
 
 def _verdicts(verdicts: Sequence[Verdict]) -> str:
     """The primary hypotheses, one row each."""
-    lines = [
-        "## The twelve hypotheses",
-        "",
-        "| | holds | effect [95 %] | corrected p | policies | says |",
-        "| --- | --- | --- | --- | --- | --- |",
-    ]
+    rows = []
     for verdict in verdicts:
         says = verdict.hypothesis.statement
         if verdict.outcome == "open" and (seeds := seeds_to_close(verdict)) is not None:
@@ -198,11 +185,11 @@ def _verdicts(verdicts: Sequence[Verdict]) -> str:
         tested, wanted = verdict.strata
         if tested < wanted:
             says += f" ({tested} of {wanted} comparisons have runs)"
-        lines.append(
-            f"| {verdict.hypothesis.name} | {verdict.outcome} | {_effect(verdict)} | {_p(verdict.corrected)} | "
-            f"{min(verdict.runs)} | {says} |"
-        )
-    return "\n".join(lines) + "\n"
+        policies = str(min(verdict.runs))
+        name = verdict.hypothesis.name
+        rows.append([name, verdict.outcome, _effect(verdict), _p(verdict.corrected), policies, says])
+    header = ["", "holds", "effect [95 %]", "corrected p", "policies", "says"]
+    return f"## The twelve hypotheses\n\n{markdown_table(header, rows)}"
 
 
 def _effect(verdict: Verdict) -> str:
@@ -222,7 +209,7 @@ def _question(name: str, title: str, verdicts: Sequence[Verdict], drawn: Mapping
     if name in drawn:
         lines += [f"![{title}]({FOLDER}/{drawn[name].name})", ""]
     if name == "matters":
-        lines += _harm(mine)
+        lines.append(_harm(mine))
     lines.append(
         f"Of {len(mine)} secondary comparisons {len(decided)} differ, with a false discovery rate of 5 %. The largest:"
         if decided
@@ -233,25 +220,22 @@ def _question(name: str, title: str, verdicts: Sequence[Verdict], drawn: Mapping
     return "\n".join(lines) + "\n"
 
 
-def _harm(verdicts: Sequence[Verdict]) -> list[str]:
+def _harm(verdicts: Sequence[Verdict]) -> str:
     """A table of the doses that do no harm, and of those that do, to ideal-trained policies."""
     effects = {pair.one.name: one.effect for one in verdicts for pair in one.hypothesis.contrasts}
-    lines = [
-        "What policies bear that were trained on ideal forces: the largest dose up to which the 95 % intervals of what",
-        f"they lose lie within {MARGIN:g} of the span, and the smallest whose interval lies beyond it.",
-        "",
-        f"| | {' | '.join(f'{axis.title}: {axis.unit}' for axis in AXES.values())} |",
-        f"| --- |{' --- |' * len(AXES)}",
-    ]
+    rows = []
     for task in arms.SECONDS:
-        cells = []
+        rows.append([TITLES[task]])
         for name, axis in AXES.items():
             known = [effects.get(dosed(arms.ideal(task), name, dose).name) for dose in axis.doses[1:]]
             borne = list(itertools.takewhile(lambda one: one is not None and one.low > -MARGIN, known))
             beyond = [dose for dose, one in zip(axis.doses[1:], known, strict=True) if one and one.high < -MARGIN]
-            cells.append(f"{axis.doses[len(borne)]:g}, {format(beyond[0], 'g') if beyond else '–'}")
-        lines.append(f"| {TITLES[task]} | {' | '.join(cells)} |")
-    return [*lines, ""]
+            rows[-1].append(f"{axis.doses[len(borne)]:g}, {format(beyond[0], 'g') if beyond else '–'}")
+    return f"""\
+What policies bear that were trained on ideal forces: the largest dose up to which the 95 % intervals of what they lose
+lie within {MARGIN:g} of the span, and the smallest whose interval lies beyond it.
+
+{markdown_table(["", *(f"{axis.title}: {axis.unit}" for axis in AXES.values())], rows)}"""
 
 
 def _missing(collected: Collected) -> str:

@@ -14,6 +14,7 @@ from codrl_mj.study.reproduction.claims import PAPER_SAYS, PORT, Claim
 from codrl_mj.study.reproduction.reproduce import VALUE_TASK, Findings
 from codrl_mj.study.reproduction.value_iteration import Optimum
 from codrl_mj.study.reproduction.verdicts import NOT_CONFIRMED, NOT_TESTABLE, OUTCOMES, Verdict, number
+from codrl_mj.study.tables import markdown_table
 from codrl_mj.study.trials import numbers_as_text
 
 PAGE, FOLDER = "reproduction.md", "reproduction"
@@ -91,7 +92,7 @@ def verdicts_section(claims: Sequence[tuple[Claim, Verdict]]) -> str:
             counts = collections.Counter(each.values())
             rows.append([who, *map(str, (len(found), len(each), *(counts[outcome] for outcome in OUTCOMES)))])
     header = ["said by", "verdicts", "statements", *OUTCOMES]
-    return f"## Verdicts\n\n{_WORDS}\n{_table(header, rows, numbers=len(header) - 1)}"
+    return f"## Verdicts\n\n{_WORDS}\n{markdown_table(header, rows, numbers=len(header) - 1)}"
 
 
 def _of_statements(found: Iterable[tuple[Claim, str]]) -> dict[tuple[str, ...], str]:
@@ -130,7 +131,7 @@ def _claims(findings: Findings, task: str) -> str:
             outcome = verdict.outcome if verdict.outcome == NOT_TESTABLE else f"**{verdict.outcome}**"
             ours = "–" if verdict.measured is None else _interval(verdict.measured)
             rows.append([outcome, claim.statement, claim.measure.text, ours, str(verdict.samples or "–")])
-    return _table(["verdict", "the paper reports", "measure", "ours [95 %]", "seeds"], rows)
+    return markdown_table(["verdict", "the paper reports", "measure", "ours [95 %]", "seeds"], rows)
 
 
 def _value_iteration(optima: Sequence[Optimum]) -> str:
@@ -149,7 +150,7 @@ def _value_iteration(optima: Sequence[Optimum]) -> str:
     return (
         "Why the printed settings fail: value iteration of Gymnasium's own dynamics, on a grid with interpolation,\n"
         "and its policy at work in Gymnasium's environment, without a motor. Returns are not discounted.\n\n"
-        + _table(header, rows)
+        + markdown_table(header, rows)
     )
 
 
@@ -182,10 +183,3 @@ def _draw(findings: Findings, task: str, folder: Path) -> dict[Path, str]:
 def _interval(interval: Interval) -> str:
     mean, low, high = map(number, interval)
     return mean if low == high else f"{mean} [{low}, {high}]"
-
-
-def _table(header: Sequence[str], rows: Iterable[Sequence[str]], numbers: int = 0) -> str:
-    """A Markdown table; the last columns, as many as are `numbers`, are aligned to the right."""
-    marks = ["---"] * (len(header) - numbers) + ["---:"] * numbers
-    lines = [header, marks, *([cell.replace("|", "\\|") for cell in row] for row in rows)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
