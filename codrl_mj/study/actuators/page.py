@@ -210,10 +210,10 @@ def _question(name: str, title: str, verdicts: Sequence[Verdict], drawn: Mapping
         lines += [f"![{title}]({FOLDER}/{drawn[name].name})", ""]
     if name == "matters":
         lines.append(_harm(mine))
+    beyond = sum(one.effect.low > MARGIN or one.effect.high < -MARGIN for one in decided)
     lines.append(
-        f"Of {len(mine)} secondary comparisons {len(decided)} differ, with a false discovery rate of 5 %. The largest:"
-        if decided
-        else f"Of {len(mine)} secondary comparisons none differs, with a false discovery rate of 5 %."
+        f"Of {len(mine)} secondary comparisons {len(decided) or 'none'} differ with a false discovery rate of 5 %, "
+        f"{beyond or 'none'} by more than {MARGIN:g} of the span (its 95 % interval)." + " The largest:" * bool(decided)
     )
     largest = sorted(decided, key=lambda verdict: -abs(verdict.effect.mean))[:3]
     lines += ["", *(f"- {one.hypothesis.statement}: {_effect(one)}" for one in largest)] if largest else []
