@@ -14,7 +14,9 @@ USE = """
 import gymnasium as gym
 import numpy as np
 import codrl_mj
+from codrl_mj.study.actuators.evidence import Evidence
 print(codrl_mj.__file__)
+print(Evidence.read().loss("pendulum", "lag", 1.0) is not None)
 for env_id in sorted(name for name in gym.registry if name.startswith("codrl_mj/")):
     env = gym.make(env_id, render_mode="rgb_array", width=64, height=48)
     env.reset(seed=0)
@@ -52,7 +54,8 @@ def test_the_wheel_has_every_module_model_and_the_type_marker(wheel):
     assert len(models) >= 5
     replay = {f"codrl_mj/replay/{name}" for name in ("page.html", "replay.css", "replay.js")}
     three = {f"codrl_mj/replay/three/{name}" for name in ("three.min.js", "LICENSE", "README.md")}
-    assert names >= modules | models | settings | replay | three | pages | {"codrl_mj/py.typed"}
+    others = {"codrl_mj/py.typed", "codrl_mj/_assets/study/hypotheses.csv"}
+    assert names >= modules | models | settings | replay | three | pages | others
     assert not [name for name in names if name.startswith(("tests", "scripts", "assets", "docs"))]
 
 
@@ -82,7 +85,8 @@ def test_the_unpacked_wheel_steps_and_draws_every_task_from_another_folder(wheel
     options = {"cwd": elsewhere, "env": environment, "capture_output": True, "text": True, "timeout": 120}
     done = subprocess.run([sys.executable, "-c", USE], check=False, **options)
     assert done.returncode == 0, done.stderr
-    first, *tasks = done.stdout.splitlines()
+    first, has_evidence, *tasks = done.stdout.splitlines()
     assert Path(first).is_relative_to(site)
+    assert has_evidence == "True"
     assert len(tasks) == 6
     assert all(line.endswith("(48, 64, 3) True True") for line in tasks), tasks
