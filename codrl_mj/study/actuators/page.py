@@ -140,7 +140,16 @@ def _explored(scores: Scores) -> str:
     ]
     columns = around_the_paper()
     names = ["the paper's", *paper_loops(arms.LOOPED[0])]
-    around = [[name, *(_mean(scores, column[row]) for column in columns.values())] for row, name in enumerate(names)]
+    around = [
+        [
+            name,
+            *(
+                "the same" if row and column[row].env == column[0].env else _mean(scores, column[row])
+                for column in columns.values()
+            ),
+        ]
+        for row, name in enumerate(names)
+    ]
     return f"""## Exploration
 
 Not planned, and without p: mean scores of the same policies, rows of [trials]({FOLDER}/{tables.TRIALS}). A supply that
