@@ -1,13 +1,16 @@
 """Digests of what a change of the code's structure must leave as it is, to the last bit.
 
 Written on two commits and compared by `--compare`: trajectories of every task through every actuator, command and
-disturbance; the weights that short trainings of every agent end with; and what every check of the quick certificate
-found at worst, as the number itself. They may depend on the machine and on the versions of the packages.
+disturbance, and through motors that one can buy; of environments of others; the weights that short trainings of every
+agent end with; what is identified from logs that are made here; every preset's configuration; and what every check of
+the quick certificate found at worst, as the number itself. They may depend on the machine and on the versions of the
+packages.
 """
 
 import argparse
 import dataclasses
 import hashlib
+import json
 import sys
 import tempfile
 import time
@@ -20,8 +23,16 @@ import numpy as np
 from gymnasium.spaces import Discrete
 from safetensors.numpy import load_file
 
+import codrl_mj
 from codrl_mj import Actuator, CurrentLoop, Ideal, Motor, Supply, Uniform, named_actuator
+from codrl_mj.agents import AGENTS
+from codrl_mj.agents.presets import SETTINGS
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.foreign.config import ForeignConfig
+from codrl_mj.identify import identify
+from codrl_mj.identify.excitations import Excitation
+from codrl_mj.identify.synthetic import Load, Sampler, Sensor, simulate
+from codrl_mj.motor_design import find_drive
 from codrl_mj.runs.files import read_json, write_json
 from codrl_mj.tasks import OURS
 from codrl_mj.training import TrainConfig, train
@@ -91,13 +102,17 @@ def digest(arrays: list[np.ndarray]) -> str:
     return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()[:16]
 
 
-def trajectory(task: str, num_envs: int | None, arguments: dict[str, Any]) -> str:
+def trajectory(
+    task: str, num_envs: int | None, arguments: dict[str, Any], told: tuple[str, ...] = SIGNALS, steps: int = STEPS
+) -> str:
     """The digest of what an environment returns under random actions.
 
     Args:
         task: the task's name.
         num_envs: environments of the vector environment; None for a single one.
         arguments: of the environment.
+        told: signals of the info.
+        steps: how many.
     """
     size: tuple[int, ...] = () if num_envs is None else (num_envs,)
     env: Any
@@ -111,13 +126,13 @@ def trajectory(task: str, num_envs: int | None, arguments: dict[str, Any]) -> st
     generator, options = np.random.default_rng(1), STARTS.get(task)
     observation, _ = env.reset(seed=2, options=options)
     seen = [observation, env.unwrapped.state]
-    for step in range(STEPS):
+    for step in range(steps):
         if step % HOLD == 0 and isinstance(space, Discrete):
             action = generator.integers(space.n, size=size)
         elif step % HOLD == 0:
             action = generator.uniform(space.low, space.high, (*size, *space.shape)).astype(np.float32)
         observation, reward, terminated, truncated, info = env.step(action)
-        signals = [info.get(name, np.zeros(size)) for name in SIGNALS]  # none where every environment was reset
+        signals = [info.get(name, np.zeros(size)) for name in told]  # none where every environment was reset
         seen += [observation, reward, terminated, env.unwrapped.state, *signals]
         if num_envs is None and (terminated or truncated):
             observation, _ = env.reset(options=options)
@@ -223,7 +238,123 @@ def certificate() -> Entries:
         yield f"certificate/{check.group}/{check.task or 'no task'}/{check.name}", repr(float(check.worst))
 
 
-PARTS = {"trajectory": trajectories, "weights": trainings, "certificate": certificate}
+MOTORS = {
+    "geared": {"name": "maxon-ec45-flat-50w", "motor": {"gear_ratio": 20}},
+    "warm": {"family": "drive", "motor": {"max_temperature": 60.0}, "supply": {"voltage": 6.0, "resistance": 0.5}},
+    "lag": "lag",
+    "torque_speed": "torque_speed",
+    "servo": "servo",
+}
+"""Name -> actuator of a family that is not the paper's."""
+FAMILIES = ("HalfCheetah-v5", "Hopper-v5", "InvertedPendulum-v5")
+"""Environments of others."""
+
+
+def behind_motors() -> Entries:
+    """Names and digests of our tasks' trajectories behind other families; of those that are refused, the word."""
+    for task in TASKS:
+        for name, actuator in MOTORS.items():
+            for num_envs in (None, 4):
+                arguments = {"actuator": actuator, "allow_unstable": True}
+                try:
+                    digested = trajectory(task, num_envs, arguments, SIGNALS[:5], 60)
+                except ValueError:
+                    digested = "refused"
+                yield f"motors/{task}/{'single' if num_envs is None else 'vector'}/{name}", digested
+
+
+def rolled_out(env: Any, steps: int = 60) -> str:
+    """The digest of what somebody else's environment and the motors in it do under random actions."""
+    generator, space = np.random.default_rng(1), env.action_space
+    seen = [env.reset(seed=2)[0]]
+    for _ in range(steps):
+        action = generator.uniform(space.low, space.high).astype(space.dtype)
+        observation, reward, terminated, truncated, info = env.step(action)
+        seen += [observation, reward, terminated, *(info.get(name, 0.0) for name in SIGNALS[:5])]
+        if terminated or truncated:
+            seen.append(env.reset()[0])
+    env.close()
+    return digest([np.asarray(array, dtype=np.float64) for array in seen])
+
+
+def environments_of_others() -> Entries:
+    """Names and digests of trajectories of environments of others, Gymnasium's and dm_control's."""
+    drive = {"name": "maxon-ec45-flat-50w", "motor": {"gear_ratio": 5}}
+    ways: dict[str, dict[str, Any]] = {
+        "ideal": {"actuators": {".*": "ideal"}},
+        "lag": {"actuators": {".*": "lag"}},
+        "drive": {"actuators": {".*": drive}, "observe_actuator": True},
+        "current": {"actuators": {".*": drive}, "action": "current"},
+        "delayed": {"actuators": {".*": drive}, "disturbances": {"command_delay": 0.1, "command_quantum": 0.1}},
+        "pulses": {"actuators": {".*": "lag"}, "disturbances": _PULSE},
+        "drawn": {
+            "actuators": {".*": drive},
+            "randomize": {".*": {"motor.resistance": "uniform(0.5, 2.0)"}, "model.gravity": "uniform(0.8, 1.2)"},
+        },
+    }
+    for env_id in FAMILIES:
+        for name, arguments in ways.items():
+            made = codrl_mj.make(env_id, allow_unstable=True, **arguments)
+            yield f"others/{env_id}/{name}", rolled_out(made)
+    for name in ("ideal", "drive", "drawn"):
+        arguments = {"randomize": None} | {key: ways[name][key] for key in ways[name] if key != "observe_actuator"}
+        made_by = {"task_kwargs": {"random": 1}, "noise_seed": 3, "allow_unstable": True}
+        env = codrl_mj.make_dm_control("cheetah/run", **made_by, **arguments)
+        generator, seen = np.random.default_rng(1), []
+        env.reset()
+        for _ in range(60):
+            step = env.step(generator.uniform(-1.0, 1.0, 6))
+            seen += [*step.observation.values(), step.reward]
+        yield f"others/cheetah-run/{name}", digest([np.asarray(array, dtype=np.float64) for array in seen])
+    vector = ForeignConfig("Hopper-v5", {".*": "lag"}).make_sb3(2)
+    vector.seed(3)
+    seen = [vector.reset()]
+    for _ in range(60):
+        seen += vector.step(np.full((2, 3), 0.1, dtype=np.float32))[:2]
+    yield "others/Hopper-v5/vector", digest([np.asarray(array, dtype=np.float64) for array in seen])
+
+
+def identified() -> Entries:
+    """What is identified from logs that are simulated, as the numbers themselves."""
+    drive = find_drive("maxon-ec45-flat-50w")
+    prbs = Excitation("prbs", amplitude=4.0, duration=2.0)
+    sensors = {"current": Sensor(noise=0.02), "position": Sensor(resolution=0.0015)}
+    rigs: dict[str, tuple[Load, dict[str, float]]] = {
+        "free": (Load(inertia=1e-4), {"load_inertia": 1e-4}),
+        "pendulum": (Load(inertia=1e-3, gravity=0.05), {"mgl": 0.05}),
+    }
+    for rig, (load, known) in rigs.items():
+        made = [simulate(drive, prbs, load, sensors, Sampler(mean_voltage=True), seed) for seed in (1, 2)]
+        logs = [dataclasses.replace(log, signals={name: log.signals[name] for name in USED}) for log in made]
+        for one in identify(logs, rig, {"gear_ratio": 1.0, **known}).estimates:
+            yield f"identified/{rig}/{one.name}", f"{one.value!r} {one.low!r} {one.high!r} {one.status}"
+
+
+USED = ("voltage", "current", "position")
+
+
+def configurations() -> Entries:
+    """Every preset as its mapping, whose hash names a run."""
+    for task in TASKS:
+        for agent in AGENTS:
+            for settings in SETTINGS:
+                try:
+                    mapping = TrainConfig.preset(task, agent, settings).as_mapping()
+                except ValueError:
+                    continue
+                text = json.dumps(mapping, sort_keys=True).encode()
+                yield f"configuration/{task}/{agent}/{settings}", hashlib.sha256(text).hexdigest()[:16]
+
+
+PARTS = {
+    "trajectory": trajectories,
+    "weights": trainings,
+    "certificate": certificate,
+    "motors": behind_motors,
+    "others": environments_of_others,
+    "identified": identified,
+    "configuration": configurations,
+}
 
 
 def compare(first: dict[str, str], second: dict[str, str]) -> int:
