@@ -1,0 +1,110 @@
+"""Whatever a user hands over is refused in a sentence, and costs nobody a file."""
+
+import importlib.util
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+SCRIPT = Path(__file__).parents[1] / "scripts" / "corrupt.py"
+
+
+@pytest.fixture(scope="module")
+def corrupt():
+    spec = importlib.util.spec_from_file_location("corrupt", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.matrix
+def test_thirty_of_each_kind_end_with_a_word(tmp_path):
+    command = [sys.executable, str(SCRIPT), "--count", "30", "--log", str(tmp_path / "log")]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=900, check=False)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    assert "0 of 90 failed" in ended.stdout
+
+
+def _succeeds():
+    return 0
+
+
+def _refuses():
+    print("codrl-mj: error: there is no such thing", file=sys.stderr)
+    return 2
+
+
+def _refuses_without_a_word():
+    return 2
+
+
+def _crashes():
+    raise KeyError("x")
+
+
+def _ends_by_a_signal():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _overwrites():
+    Path("mine").write_text("theirs")
+    return 0
+
+
+def _deletes():
+    Path("mine").unlink()
+    return 0
+
+
+def _leaves_a_half():
+    Path(".out-abcd1234.html").touch()
+    return 0
+
+
+def _dies_of_ctrl_c():
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    time.sleep(60)
+
+
+def _ends_at_ctrl_c():
+    try:
+        time.sleep(60)
+    except KeyboardInterrupt:
+        print("codrl-mj: stopped", file=sys.stderr)
+        return 130
+
+
+@pytest.mark.parametrize(
+    ("program", "failures"),
+    [
+        (_succeeds, []),
+        (_refuses, []),
+        (_ends_at_ctrl_c, []),
+        (_refuses_without_a_word, ["no word on it"]),
+        (_crashes, ["exit status 99", "traceback"]),
+        (_ends_by_a_signal, ["exit status -9"]),
+        (_overwrites, ["lost: mine"]),
+        (_deletes, ["lost: mine"]),
+        (_leaves_a_half, ["lost: .out-abcd1234.html"]),
+        (_dies_of_ctrl_c, ["exit status -2"]),
+    ],
+)
+def test_every_kind_of_failure_is_seen(corrupt, tmp_path, monkeypatch, program, failures):
+    folder = tmp_path / "case"
+    folder.mkdir()
+    (folder / "mine").write_text("mine")
+    monkeypatch.setattr(corrupt, "codrl_mj", lambda _: program())
+    outcome = corrupt.attempt(corrupt.Case("files", ["runs"], ""), folder, patience=0.5)
+    assert outcome.failures == failures, outcome
+
+
+def test_a_case_is_drawn_from_its_name_alone(corrupt):
+    drawn = [corrupt.change_text(corrupt.MOTOR, random.Random(f"files/{seed}")) for seed in (0, 0, *range(1, 20))]
+    assert drawn[0] == drawn[1]
+    assert len(set(drawn)) > 15
