@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NoReturn
 
 import mujoco
@@ -47,9 +48,12 @@ def motorise(spec: mujoco.MjSpec, actuators: Mapping[str, Any], allow_unstable: 
         A new spec, to be compiled.
 
     Raises:
-        ValueError: a pattern matches nothing, or two match the same actuator; an actuator of the model cannot be driven
-            like this; or one of ours is not valid, or not stable at the model's step.
+        ValueError: `spec` is none; a pattern matches nothing, or two match the same actuator; an actuator of the model
+            cannot be driven like this; or one of ours is not valid, or not stable at the model's step.
     """
+    if not isinstance(spec, mujoco.MjSpec):
+        given = repr(str(spec)) if isinstance(spec, str | Path) else "FILE"
+        raise ValueError(f"spec = {spec!r}: must be a mujoco.MjSpec, such as mujoco.MjSpec.from_file({given})")
     new, model = spec.copy(), spec.copy().compile()
     # MuJoCo 3.17 copies default classes without their numbers, and forgets those that are added then; this numbers them
     new.delete(new.add_default(NAME, new.default))

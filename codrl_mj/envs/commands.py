@@ -135,7 +135,7 @@ class Commands:
         """Forces [N or N*m] of the discrete actions, in order, shape (k,) or (k, n); None where the space is a box."""
         if self.levels is not None:
             return self.levels * self.scales[0]
-        return None if self.task.forces is None else np.array(self.task.forces)
+        return None if self.task.forces is None else np.array(self.task.forces, dtype=np.float64)
 
     @functools.cached_property
     def _box(self) -> tuple[Any, Any, int]:

@@ -24,15 +24,15 @@ is a wrapper's, and the loop's to keep. The environment must outlive the calls.
 """
 
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from numba import types
 
 from codrl_mj.actuators.noise import LARGEST_KEY
-from codrl_mj.engine.families import jitable
-from codrl_mj.engine.memory import internal
+from codrl_mj.engine.families import compiled_function, jitable
+from codrl_mj.engine.memory import floats, internal
 from codrl_mj.envs.outcomes import Outcomes, compiled_outcomes
 from codrl_mj.envs.setup import Setup
 from codrl_mj.physics.constrain import Compiled
@@ -61,7 +61,7 @@ class Kernels(NamedTuple):
     the arguments; columns as in `codrl_mj.physics.trace_names`."""
     reset: Compiled
     """(generator, low, high, observation, *arguments) -> nothing: starts an episode from a state that the numpy
-    `Generator` draws between `low` and `high` (see `Task.initial_bounds`), and fills the observation."""
+    `Generator` draws between `low` and `high` (see `Task.bounds`), and fills the observation."""
 
 
 class CompiledEnv(NamedTuple):
@@ -95,33 +95,28 @@ def compiled_env(env: Any) -> CompiledEnv | None:
     if physics.compiled is None or setup.randomization is not None:
         return None
     kernels = compiled_kernels(setup, physics)
-    low, high = setup.task.initial_bounds(None)
+    low, high = setup.initial_bounds
     return CompiledEnv(kernels.step, kernels.reset, arguments(setup, physics), setup.commands.action_forces, low, high)
 
 
 def arguments(setup: Setup, physics: Any) -> tuple[Any, ...]:
-    """The last arguments of an environment's kernels.
-
-    Args:
-        setup: the environment's.
-        physics: its simulation, one whose steps are compiled.
-    """
+    """The last arguments of an environment's kernels, of a simulation whose steps are compiled."""
     kind = Interface(bool(setup.view.sensors), setup.random)
     return (np.array([*kind, *setup.view.options], dtype=np.float64), *physics.compiled.arguments)
 
 
 def compiled_kernels(setup: Setup, physics: Any) -> Kernels:
-    """The functions for environments of one kind; compiled as they are used, once a process.
+    """The functions for environments of one kind, whose simulation's steps are compiled; compiled once a process.
 
-    Args:
-        setup: the environment's.
-        physics: its simulation, one whose steps are compiled.
+    Raises:
+        ValueError: a function of the task's is not what numba compiles.
     """
     task = setup.task
     jitable(task)
     sensors = len(setup.family.OBSERVED) if setup.view.sensors else 0
     single, size = len(task.motors) == 1, len(task.state_names)
-    return _kernels(physics.compiled.stepping, compiled_outcomes(task), task.initial_state, size, single, sensors)
+    initial_entries = compiled_function(task.initial_state, task.state_names, "Task.state_names", types.float64[::1])
+    return _kernels(physics.compiled.stepping, compiled_outcomes(task), initial_entries, size, single, sensors)
 
 
 @internal
@@ -138,7 +133,7 @@ def _each(delivered: np.ndarray) -> np.ndarray:
 def _kernels(
     stepping: Stepping,
     outcomes: Outcomes,
-    initial_state: Callable[..., Any],
+    initial_entries: Compiled,
     size: int,
     single: bool,
     sensors: int,
@@ -146,7 +141,6 @@ def _kernels(
     advance, start, read, observed = stepping
     observe, rewarded, ended = outcomes.observe, outcomes.reward, outcomes.terminated
     compiled = numba.njit(nogil=True, error_model="numpy")
-    initial_entries = internal(initial_state)
     delivered = _only if single else _each
 
     @internal
@@ -204,7 +198,7 @@ def _kernels(
         draws, state = np.empty(len(low)), np.empty(size)
         for entry in range(len(low)):
             draws[entry] = low[entry] + (high[entry] - low[entry]) * generator.random()
-        entries = initial_entries(draws)
+        entries = floats(initial_entries(draws))
         for entry in range(size):
             state[entry] = entries[entry]
         key = generator.random() * LARGEST_KEY if interface[RANDOM] != 0.0 else 0.0

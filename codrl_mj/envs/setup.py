@@ -172,8 +172,8 @@ class Setup:
 
     @functools.cached_property
     def initial_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """`Task.initial_bounds` without reset options."""
-        return self.task.initial_bounds(None)
+        """`Task.bounds` without reset options."""
+        return self.task.bounds(None)
 
     @functools.cached_property
     def random(self) -> bool:

@@ -11,6 +11,7 @@ from codrl_mj.engine.families import SIGNATURE, slot_size, user_head
 from codrl_mj.engine.reading import motors
 from codrl_mj.tasks import Task
 from codrl_mj.tasks.assets import asset_path
+from codrl_mj.tasks.base import INTEGRATORS
 
 
 def drive(target: mujoco.MjsActuator, actuator: ActuatorModel, max_force: float | None) -> None:
@@ -103,9 +104,18 @@ def task_model(
         joint: what is added to the actuated joints, besides what the actuators add.
 
     Raises:
-        ValueError: the model has no actuator of the name of one of the task's motors.
+        ValueError: it is no model, has no actuator of the name of one of the task's motors, or other joints than the
+            task's state has entries, or another integrator.
     """
-    spec = mujoco.MjSpec.from_file(str(asset_path(task.asset)))
+    try:
+        spec = mujoco.MjSpec.from_file(str(asset_path(task.asset)))
+    except ValueError as error:
+        raise ValueError(f"{task.asset}: {error}") from error
+    if other := [name for name in task.integrators if INTEGRATORS[name] != spec.option.integrator]:
+        kind = mujoco.mjtIntegrator(spec.option.integrator).name.removeprefix("mjINT_")
+        raise ValueError(
+            f"{task.asset}: its <option> has integrator {kind}, so Task.integrators cannot have {', '.join(other)}"
+        )
     spec.option.timestep = timestep
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     if explicit:
@@ -116,10 +126,22 @@ def task_model(
         if motor is None:
             there = ", ".join(repr(a.name) for a in spec.actuators) or "none"
             raise ValueError(f"{task.asset} has no actuator {name!r}; there are {there}: rename it, or set Task.motors")
+        joint_driven = spec.joint(motor.target) if motor.trntype == mujoco.mjtTrn.mjTRN_JOINT else None
+        if joint_driven is None or joint_driven.type not in _ALONG:
+            raise ValueError(f"{task.asset}: actuator {name!r} must drive a hinge or a slide joint")
         drive(motor, actuator, limit)
         for added in (JointAdditions(joint.armature, joint.damping, joint.friction), actuator.additions):
-            _add(spec, spec.joint(motor.target), added)
-    return spec.compile()
+            _add(spec, joint_driven, added)
+    model = spec.compile()
+    if (model.nq, model.nv) != (len(task.qpos), len(task.qvel)):
+        raise ValueError(
+            f"{task.asset} has {model.nq} positions and {model.nv} velocities, and {task.name}'s state_names have "
+            f"{len(task.qpos)} and {len(task.qvel)} of them: {', '.join(task.state_names)}"
+        )
+    return model
+
+
+_ALONG = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 def _add(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, added: JointAdditions) -> None:
