@@ -80,11 +80,7 @@ def _call(target: mujoco.MjsActuator, index: int) -> str:
 
 
 def resolve_patterns(actuators: Mapping[str, Any], whose: str) -> dict[str, ActuatorModel]:
-    """Pattern -> actuator, of whatever a user may write for either.
-
-    Args:
-        actuators: as for `motorise`.
-        whose: whose they are, for messages.
+    """Pattern -> actuator, of whatever a user may write for either; messages call the model `whose`.
 
     Raises:
         ValueError: it is no mapping, a pattern is no regular expression, or an actuator is none.
@@ -189,11 +185,7 @@ def _refusal(model: mujoco.MjModel, target: mujoco.MjsActuator, index: int, actu
 def _drive(spec: mujoco.MjSpec, model: mujoco.MjModel, index: int, actuator: ActuatorModel) -> None:
     """Make an actuator of a spec one of ours.
 
-    Args:
-        spec: the new model.
-        model: the old one, compiled: it has what defaults, `inheritrange` and automatic limits come to.
-        index: the actuator's.
-        actuator: what drives it.
+    The old `model` is compiled: it has what defaults, `inheritrange` and automatic limits come to.
     """
     target, name = spec.actuators[index], f"{NAME}.{index}"
     if actuator.MOTION:  # its own loops take the place of the model's

@@ -128,12 +128,7 @@ def family_sizes(family: Family) -> tuple[int, ...]:
 
 @contextlib.contextmanager
 def replaced(family: Family, other: Family) -> Iterator[None]:
-    """Run another's `advance` in place of a family's, in all models, for the length of a `with` block.
-
-    Args:
-        family: the family.
-        other: has the same parameters, states and signals.
-    """
+    """Run another's `advance` in place of a family's in a `with` block; both have the same states and signals."""
     load_family(family)
     number, function = family_number(family), _compile(other)
     right = _ADDRESSES[number]

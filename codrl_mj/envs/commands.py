@@ -35,13 +35,7 @@ class Commands:
     def build(
         cls, task: Task, actuators: tuple[ActuatorModel, ...], name: str, levels: Sequence[float] | None
     ) -> "Commands":
-        """Resolve a command.
-
-        Args:
-            task: the task.
-            actuators: one for each of its motors, of one family.
-            name: the command.
-            levels: for discrete tasks and other commands than `force`.
+        """Resolve a command by its name; `levels` are for discrete tasks and other commands than `force`.
 
         Raises:
             ValueError: an unknown command, one that the actuator or the task cannot take, or a missing or invalid

@@ -17,11 +17,7 @@ from codrl_mj.tasks.base import INTEGRATORS
 def drive(target: mujoco.MjsActuator, actuator: ActuatorModel, max_force: float | None) -> None:
     """Make an actuator of an `MjSpec` one of ours, at the control callback's door; an ideal one is a plain `<motor>`.
 
-    Args:
-        target: the actuator, with its joint transmission set; its gear, dynamics, gain, bias, range and user data are
-            overwritten.
-        actuator: what drives the joint.
-        max_force: limit of the desired force [N] or torque [N*m] at the joint; None for no limit.
+    All but its transmission is overwritten. `max_force` limits the desired force [N] or torque [N*m] at the joint.
     """
     ideal, family, arm = isinstance(actuator, Ideal), type(actuator), actuator.arm_radius
     target.gear = [1.0 / arm, 0, 0, 0, 0, 0]
@@ -93,15 +89,8 @@ def task_model(
     """Compile a task's model.
 
     A diverging simulation is left to diverge, so that it can be reported, instead of being reset by the engine. Where
-    the Euler integrator is made `explicit`, joint damping is explicit too.
-
-    Args:
-        task: the task.
-        actuators: one for each of the task's motors.
-        timestep: integration step [s].
-        max_forces: limits of the desired forces [N] or torques [N*m], shape (n,); None are the task's.
-        explicit: whether the positions will be moved by the old velocity.
-        joint: what is added to the actuated joints, besides what the actuators add.
+    the Euler integrator is made `explicit`, joint damping is explicit too. The integration step is in [s]; `max_forces`
+    [N or N*m], shape (n,), limit the desired forces in place of the task's; `joint` is added to the actuated joints.
 
     Raises:
         ValueError: it is no model, has no actuator of the name of one of the task's motors, or other joints than the

@@ -129,13 +129,7 @@ class MujocoBatchPhysics:
         self.set_parameters(rows, numbers, np.array([[one.arm_radius for one in each] for each in actuators]))
 
     def set_parameters(self, rows: np.ndarray, numbers: np.ndarray, arms: np.ndarray) -> None:
-        """Do what `set_actuators` does, with actuators as arrays.
-
-        Args:
-            rows: indices of simulations, shape (m,).
-            numbers: as `ActuatorModel.numbers`, shape (m, n, p).
-            arms: [m], shape (m, n).
-        """
+        """Do what `set_actuators` does, with their `numbers` as an array (m, n, p) and their arms [m] as one (m, n)."""
         if not self.motorised:
             return
         user, gear, limits = map(self.field, ("actuator_user", "actuator_gear", "actuator_ctrlrange"))

@@ -210,13 +210,7 @@ class MujocoPhysics:
 
 
 def wiring(model: mujoco.MjModel, name: str, actuator: ActuatorModel) -> Wiring:
-    """Where the numbers of a model's actuator are.
-
-    Args:
-        model: a task's.
-        name: of the actuator.
-        actuator: what drives it.
-    """
+    """Where the numbers are of the actuator of a task's model that has a name."""
     index = model.actuator(name).id
     dof = model.jnt_dofadr[model.actuator_trnid[index, 0]]
     address = max(int(model.actuator_actadr[index]), 0)
