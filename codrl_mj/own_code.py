@@ -38,14 +38,7 @@ def place(function: Callable[..., Any], line: int | None = None) -> str:
 
 
 def check_form(function: Callable[..., Any], value: Any, form: Form, declared: str) -> Any:
-    """Refuse what a function returns unless it is numbers of a form; returns it.
-
-    Args:
-        function: the function.
-        value: what it returns; where numba says so, types that are no numbers stand for themselves.
-        form: what it is to return.
-        declared: what says so, for the message.
-    """
+    """What a function returns (or numba says that it does), which has to be of a form; `declared` says where."""
     if not _fits(value, form):
         raise ValueError(f"{place(function)}: returns {_said(value)}, must return {_wanted(form)}: see {declared}")
     return value
@@ -58,20 +51,18 @@ def _fits(value: Any, form: Form) -> bool:
 
 
 def _said(value: Any) -> str:
-    """What was returned, in words; what numba says it to be has a name."""
-    if _fits(value, ""):
-        return "a number"
-    if not isinstance(value, tuple):
-        return str(getattr(value, "name", type(value).__name__))
-    return f"a tuple of {len(value)}" if _fits(value, ("",) * len(value)) else f"({', '.join(map(_said, value))})"
+    """What was returned, in words; numba's types have names."""
+    if isinstance(value, tuple):
+        flat = _fits(value, ("",) * len(value))
+        return f"a tuple of {len(value)}" if flat else f"({', '.join(map(_said, value))})"
+    return "a number" if _fits(value, "") else str(getattr(value, "name", type(value).__name__))
 
 
 def _wanted(form: Form) -> str:
-    """A form in words."""
     if isinstance(form, str):
         return "a number"
-    names = all(isinstance(one, str) for one in form)
-    return f"a tuple of {len(form)} ({', '.join(form)})" if names else f"({', '.join(map(_wanted, form))})"
+    flat = all(isinstance(one, str) for one in form)
+    return f"a tuple of {len(form)} ({', '.join(form)})" if flat else f"({', '.join(map(_wanted, form))})"
 
 
 def not_compiled(function: Callable[..., Any], error: Exception) -> str:

@@ -142,8 +142,7 @@ class Commands:
     def force(self, action: Any) -> Any:
         """The force [N] or torque [N*m] that the physics is to ask the actuator for; with several motors an array (n,).
 
-        Args:
-            action: an element of the action space; a box's saturates.
+        An action of a box saturates.
 
         Raises:
             ValueError: the action is no element, or not a number.
@@ -167,13 +166,7 @@ class Commands:
         return np.clip(array.astype(np.float64), -limit, limit) * scale
 
     def forces(self, actions: Any) -> np.ndarray:
-        """What `force` does, for a batch.
-
-        Args:
-            actions: a batch of elements of the action space, shape (N, ...).
-
-        Returns:
-            Shape (N,), or with several motors (N, n), float64.
+        """What `force` does, for a batch (N, ...): forces (N,), or with several motors (N, n), float64.
 
         Raises:
             ValueError: wrong shape or type, or a row that is no element; the message has its index.

@@ -24,6 +24,7 @@ is a wrapper's, and the loop's to keep. The environment must outlive the calls.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numba
@@ -90,11 +91,15 @@ def compiled_env(env: Any) -> CompiledEnv | None:
     Returns:
         None where they would not be the whole of it: on physics that are Python, such as the analytic one, and where
         actuator or model are drawn at resets, which is Python too.
+
+    Raises:
+        ValueError: a function of the task's is not what numba compiles.
     """
     setup, physics = env.setup, env.physics
     if physics.compiled is None or setup.randomization is not None:
         return None
-    kernels = compiled_kernels(setup, physics)
+    kernels, task = compiled_kernels(setup, physics), setup.task
+    compiled_function(task.initial_state, task.state_names, "Task.state_names", types.float64[::1])
     low, high = setup.initial_bounds
     return CompiledEnv(kernels.step, kernels.reset, arguments(setup, physics), setup.commands.action_forces, low, high)
 
@@ -106,17 +111,12 @@ def arguments(setup: Setup, physics: Any) -> tuple[Any, ...]:
 
 
 def compiled_kernels(setup: Setup, physics: Any) -> Kernels:
-    """The functions for environments of one kind, whose simulation's steps are compiled; compiled once a process.
-
-    Raises:
-        ValueError: a function of the task's is not what numba compiles.
-    """
+    """The functions for environments of one kind, whose simulation's steps are compiled; compiled once a process."""
     task = setup.task
     jitable(task)
     sensors = len(setup.family.OBSERVED) if setup.view.sensors else 0
     single, size = len(task.motors) == 1, len(task.state_names)
-    initial_entries = compiled_function(task.initial_state, task.state_names, "Task.state_names", types.float64[::1])
-    return _kernels(physics.compiled.stepping, compiled_outcomes(task), initial_entries, size, single, sensors)
+    return _kernels(physics.compiled.stepping, compiled_outcomes(task), task.initial_state, size, single, sensors)
 
 
 @internal
@@ -133,7 +133,7 @@ def _each(delivered: np.ndarray) -> np.ndarray:
 def _kernels(
     stepping: Stepping,
     outcomes: Outcomes,
-    initial_entries: Compiled,
+    initial_state: Callable[..., Any],
     size: int,
     single: bool,
     sensors: int,
@@ -141,6 +141,7 @@ def _kernels(
     advance, start, read, observed = stepping
     observe, rewarded, ended = outcomes.observe, outcomes.reward, outcomes.terminated
     compiled = numba.njit(nogil=True, error_model="numpy")
+    initial_entries = internal(initial_state)
     delivered = _only if single else _each
 
     @internal

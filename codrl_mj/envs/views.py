@@ -67,14 +67,9 @@ class View:
         return (*self.task.observation_names, *self.sensors)
 
     def observation(self, state: np.ndarray, seen: np.ndarray | None) -> np.ndarray:
-        """What the agent sees.
+        """What the agent sees in a mechanical state (n,), or in N (N, n): shape (k,), or (N, k), float32.
 
-        Args:
-            state: the mechanical state, shape (n,); or a batch of them, (N, n).
-            seen: what the sensors say, as many numbers for each state as there are `sensors`; None if there are none.
-
-        Returns:
-            Shape (k,), or (N, k), float32.
+        `seen` is what the sensors say, as many numbers for each state as there are `sensors`; None if there are none.
         """
         size = len(self.task.observation_names)
         rows = np.empty((*state.shape[:-1], size + len(self.sensors)), np.float32)

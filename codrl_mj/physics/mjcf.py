@@ -99,7 +99,7 @@ def task_model(
     try:
         spec = mujoco.MjSpec.from_file(str(asset_path(task.asset)))
     except ValueError as error:
-        raise ValueError(f"{task.asset}: {error}") from error
+        raise ValueError(f"{task.asset}: {' '.join(str(error).split())}") from error
     if other := [name for name in task.integrators if INTEGRATORS[name] != spec.option.integrator]:
         kind = mujoco.mjtIntegrator(spec.option.integrator).name.removeprefix("mjINT_")
         raise ValueError(

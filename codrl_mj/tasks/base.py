@@ -27,13 +27,14 @@ Options = Any
 """A task's options: a `NamedTuple` of floats and flags whose fields have defaults."""
 Entries = Any
 """A sequence of numbers, or of arrays with one number for each of N states."""
-INTEGRATORS = {
-    "euler": mujoco.mjtIntegrator.mjINT_EULER,
-    "semi-implicit": mujoco.mjtIntegrator.mjINT_EULER,
-    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
-    "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
-    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+_KINDS = {
+    "euler": "EULER",
+    "semi-implicit": "EULER",
+    "rk4": "RK4",
+    "implicit": "IMPLICIT",
+    "implicitfast": "IMPLICITFAST",
 }
+INTEGRATORS = {name: getattr(mujoco.mjtIntegrator, f"mjINT_{kind}") for name, kind in _KINDS.items()}
 """Integrators by name, and what a model has to have for them; with `euler` positions are moved by the old velocity."""
 
 
@@ -191,7 +192,7 @@ class Task:
         asked = None if options is None else _Asked(options)
         low, high = self.initial_bounds(asked)  # type: ignore[arg-type]
         if asked is not None:
-            fields.check_names(asked.data, asked.names, "reset option", every=True)
+            fields.check_names(asked.data, sorted(map(str, asked.names)), "reset option", every=True)
         return np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
 
     def initial(self, generator: np.random.Generator, options: dict[str, Any] | None) -> np.ndarray:
@@ -208,13 +209,12 @@ class _Asked(UserDict[str, Any]):
     """Reset options that remember which names they were asked for."""
 
     def __init__(self, options: Mapping[str, Any]) -> None:
-        self.names: dict[str, None] = {}
+        self.names: set[Any] = set()
         super().__init__(options)
 
-    def __getitem__(self, name: str) -> Any:
-        self.names[name] = None
-        return super().__getitem__(name)
-
     def __contains__(self, name: object) -> bool:
-        self.names[str(name)] = None
+        self.names.add(name)
         return super().__contains__(name)
+
+    def __getitem__(self, name: str) -> Any:
+        return self.data[name] if name in self else super().__getitem__(name)
