@@ -214,5 +214,5 @@ class Watcher(BaseCallback):
         for name in ("episodes", "reports"):
             if hasattr(self, name):
                 getattr(self, name).close()
-        if hasattr(getattr(self, "model", None), "_logger"):  # it has none before its environments were reset
+        if hasattr(getattr(self, "model", None), "_logger"):  # learning may not have begun
             self.logger.close()
