@@ -115,7 +115,7 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
     found = look_up(given, NAMED | FAMILIES | dict.fromkeys(motor_names()), "actuator")
     made = found
     if isinstance(found, type) and issubclass(found, ActuatorModel):
-        check_family(found)
+        check_family(found)  # type: ignore[arg-type]
         made = found()
     if isinstance(made, ActuatorModel):
         return made
@@ -192,6 +192,6 @@ def check_same_family(actuators: Sequence[ActuatorModel]) -> Family:
     if len(kinds) > 1:
         names = ", ".join(sorted(kind.__name__ for kind in kinds))
         raise ValueError(f"actuators of several families ({names}): the actuators of one environment must be of one")
-    (family,) = kinds
+    family: Family = kinds.pop()
     check_family(family)
     return family

@@ -54,7 +54,7 @@ def compiled_outcomes(task: Task) -> Outcomes:
     jitable(task)
     size, several = len(task.state_names), len(task.motors) > 1
     functions = task.observation, task.reward, task.terminated
-    return _compiled(*functions, task.options, size, task.observation_names, several)
+    return _compiled(*functions, task.options, size, task.observation_names, several)  # type: ignore[arg-type]
 
 
 @functools.cache

@@ -3,7 +3,7 @@
 import functools
 from collections import UserDict
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import mujoco
@@ -56,13 +56,13 @@ class Task:
     """Name on the command line, such as `cartpole`."""
     env_id: str
     """Its id in Gymnasium's registry, such as `codrl_mj/CartPole-v0`."""
-    max_episode_steps: int | None = fields.integer(MISSING, least=1, optional=True)
+    max_episode_steps: int | None = field(metadata=fields.integer(None, least=1).metadata)
     """Time limit [environment steps]; None for none."""
     asset: str
     """MJCF file: a name among ours, or a path."""
-    step_duration: float = fields.real(MISSING, above=0.0, unit="s")
+    step_duration: float = field(metadata=fields.real(1.0, above=0.0, unit="s").metadata)
     """Duration of one environment step [s]."""
-    motor_inner_steps: int = fields.integer(MISSING, least=1)
+    motor_inner_steps: int = field(metadata=fields.integer(1, least=1).metadata)
     """Integration steps per environment step when a motor is in the loop."""
     max_force: Any
     """Largest desired force [N] or torque [N*m] of any action; where the action is the force, it saturates here. One
