@@ -15,6 +15,7 @@ from gymnasium import spaces
 
 import codrl_mj
 from codrl_mj.fields import real
+from codrl_mj.tasks.trials import Trials
 
 ROOT, _NUMBERS = Path(__file__).parent, itertools.count()
 STATE = "state[0], state[1], state[2], state[3]"
@@ -134,6 +135,7 @@ TASKS = [
     *itertools.product(("options",), (Undefaulted, Worded, dict, 3)),
     *itertools.product(("helpers",), (3, (3,), max)),
     *itertools.product(("paper", "name", "env_id"), (3,)),
+    *itertools.product(("trials",), (Trials((1.0,) * 4, ((0.0,),) * 4, (0.0,) * 3, 2, 1),)),
     *itertools.product(("goal_hold",), (-1.0, np.nan, "1")),
 ]
 """(field, what is wrong with it): refused when the task is made."""

@@ -202,7 +202,10 @@ class Task:
 
     def initial_states(self, draws: np.ndarray) -> np.ndarray:
         """Initial states, shape (N, n), from numbers drawn within the bounds, (N, k)."""
-        return np.stack([np.broadcast_to(entry, len(draws)) for entry in self.initial_state(draws.T)], axis=-1)
+        states = np.empty((len(draws), len(self.state_names)))
+        for column, entry in zip(states.T, self.initial_state(draws.T), strict=True):
+            column[:] = entry
+        return states
 
 
 class _Asked(UserDict[str, Any]):

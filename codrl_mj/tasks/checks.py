@@ -42,6 +42,8 @@ def check_layout(task: Any) -> None:
     what = f"with qvel = {task.qvel!r} each index of the {states} state_names once, both evenly spaced and ascending"
     _require(task, "qpos", fine, what)
     _require(task, "wrapped", all(one in range(states) for one in task.wrapped), f"indices below {states}")
+    of_trials = task.trials and {len(task.trials.bounds), len(task.trials.edges), len(task.trials.start)}
+    _require(task, "trials", of_trials in (None, {states}), f"of {states} bounds, edges and numbers of start")
     wanted: Any = spaces.Box(-np.inf, np.inf, (len(task.observation_names),), np.float32)
     fine = isinstance(box, spaces.Box) and (box.shape, box.dtype) == (wanted.shape, wanted.dtype)
     _require(task, "observation_space", fine, f"such as {wanted}, by observation_names")
