@@ -354,6 +354,7 @@ def test_the_source_of_a_family_is_part_of_what_a_run_was_made_with(own_family, 
 
 def test_so_is_the_file_of_a_model_of_somebody_s_own(tmp_path):
     arm, path = find_task("tests.own_project.arm:TASK"), tmp_path / "arm.xml"
+    path.touch()
     register(dataclasses.replace(arm, name="copied_arm", env_id="tests/CopiedArm-v0", asset=str(path)))
     own, foreign = EnvConfig("copied_arm", "lag"), ForeignConfig("HalfCheetah-v5", options={"xml_file": str(path)})
     digests = []

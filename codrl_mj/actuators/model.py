@@ -19,6 +19,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from codrl_mj import fields
+from codrl_mj.own_code import Form, call, check_form, place
 
 
 class Inputs(NamedTuple):
@@ -386,7 +387,7 @@ def parameter_paths(cls: type) -> Mapping[str, str]:
     A parameter is called as its field is, and in a part that may be None by the part's name and the field's.
 
     Raises:
-        TypeError: two of them have the same name.
+        ValueError: two of them have the same name.
     """
     optional = {field.name for field in dataclasses.fields(cls) if "absent" in field.metadata}
     paths = [path for path in field_paths(cls) if not _is_arm(path)]
@@ -394,7 +395,8 @@ def parameter_paths(cls: type) -> Mapping[str, str]:
         path.replace(".", "_") if path.split(".")[0] in optional else path.rpartition(".")[2]: path for path in paths
     }
     if len(named) < len(paths):
-        raise TypeError(f"{cls.__name__}: two parameters have the same name: {', '.join(paths)}")
+        twice = [path for path in paths if path not in named.values()]
+        raise ValueError(f"{cls.__name__}: another parameter has the same name as {', '.join(twice)}: rename one")
     return named
 
 
@@ -409,6 +411,49 @@ def parameters_type(cls: type) -> Any:
 
 def _parameters(cls: type, *numbers: float) -> Any:
     return parameters_type(cls)(*numbers)
+
+
+def advance_form(cls: Family) -> tuple[Form, str]:
+    """What `advance` is to return, and what says so."""
+    return (cls.State._fields, "torque", cls.Signals._fields), f"{cls.__name__}.State and {cls.__name__}.Signals"
+
+
+@functools.cache
+def check_family(cls: Family) -> None:
+    """Refuse a family whose functions do not return what it declares: each is called once on plain numbers.
+
+    Raises:
+        ValueError: as it says; the message has the place, or the name of what is declared.
+    """
+    for name in ("State", "Signals"):
+        if not hasattr(kind := getattr(cls, name), "_fields"):
+            raise ValueError(f"{cls.__name__}.{name} = {kind!r}: must be a typing.NamedTuple of floats")
+    if any(isinstance(value, dataclasses.Field) for value in vars(cls).values()):
+        raise ValueError(f"{cls.__name__}: must be decorated with @dataclasses.dataclass(frozen=True)")
+    if reserved := {"desired_force", "actual_force", "speed"} & {*cls.Signals._fields}:
+        raise ValueError(f"{cls.__name__}.Signals: {', '.join(reserved)}: every family has that: choose another name")
+    fields.check_names(cls.SIGNAL_UNITS, cls.Signals._fields, "signal", "SIGNAL_UNITS.")
+    fields.check_names(cls.RANDOM, field_paths(cls), "field", "RANDOM: ")
+    if missing := [one.name for one in dataclasses.fields(cls) if one.default is dataclasses.MISSING]:
+        raise ValueError(f"{cls.__name__}.{missing[0]}: must have a default")
+    actuator = cls()
+    for path in field_paths(cls):
+        if not isinstance(value := _get(actuator, path), int | float):
+            raise ValueError(f"{cls.__name__}.{path} = {value!r}: must be a number; see `codrl_mj.fields`")
+    parameters, step = parameters_type(cls)(*actuator.numbers), np.float64(1e-3)
+    inputs = Inputs(*map(np.float64, (0.1, 0.2, 0.3, 0.0, 0.0, 1.0)))
+    state, signals = (kind(*map(np.float64, [0.0] * len(kind._fields))) for kind in (cls.State, cls.Signals))
+    if cls.advance is ActuatorModel.advance:
+        raise ValueError(f"{cls.__name__}: has no `advance`")
+    result = call(f"{cls.__name__}.advance", cls.advance, parameters, step, state, inputs)
+    after, torque, _ = check_form(cls.advance, result, *advance_form(cls))
+    if not np.isfinite([*after, torque]).all():
+        raise ValueError(
+            f"{place(cls.advance)}: returns the state {(*map(float, after),)} and the torque {torque}: must be finite"
+        )
+    if cls.OBSERVED:
+        seen = call(f"{cls.__name__}.observe", cls.observe, parameters, step, signals, inputs)
+        check_form(cls.observe, seen, cls.OBSERVED, f"{cls.__name__}.OBSERVED")
 
 
 def reference(cls: type) -> str:

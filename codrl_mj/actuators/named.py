@@ -10,7 +10,7 @@ from codrl_mj.actuators.drive import Drive, VoltageDrive
 from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.identified import usable_fields
 from codrl_mj.actuators.lag import Lag
-from codrl_mj.actuators.model import ActuatorModel, Family, family_name, look_up
+from codrl_mj.actuators.model import ActuatorModel, Family, check_family, family_name, look_up
 from codrl_mj.actuators.servo import Servo
 from codrl_mj.actuators.torque_speed import TorqueSpeed
 
@@ -50,6 +50,7 @@ def find_family(name: str) -> Family:
         ValueError: there is none; the nearest known name is suggested.
     """
     family: Family = look_up(name, FAMILIES, "family", of=ActuatorModel)
+    check_family(family)
     return family
 
 
@@ -112,7 +113,10 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
     if given in motor_names() or Path(given).suffix == ".toml":
         return Drive.of(motor_entry(given).numbers)
     found = look_up(given, NAMED | FAMILIES | dict.fromkeys(motor_names()), "actuator")
-    made = found() if isinstance(found, type) and issubclass(found, ActuatorModel) else found
+    made = found
+    if isinstance(found, type) and issubclass(found, ActuatorModel):
+        check_family(found)  # type: ignore[arg-type]
+        made = found()
     if isinstance(made, ActuatorModel):
         return made
     raise ValueError(f"actuator = {given!r}: {found!r} is neither an actuator nor a family of them")
@@ -188,4 +192,6 @@ def check_same_family(actuators: Sequence[ActuatorModel]) -> Family:
     if len(kinds) > 1:
         names = ", ".join(sorted(kind.__name__ for kind in kinds))
         raise ValueError(f"actuators of several families ({names}): the actuators of one environment must be of one")
-    return kinds.pop()
+    family: Family = kinds.pop()
+    check_family(family)
+    return family

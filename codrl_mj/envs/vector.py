@@ -243,7 +243,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         Returns:
             The infos of the reset: what was drawn.
         """
-        low, high = self.setup.task.initial_bounds(options) if options else self.setup.initial_bounds
+        low, high = self.setup.task.bounds(options) if options else self.setup.initial_bounds
         draws = low + (high - low) * self._streams.random(rows, len(low))
         states = self.setup.task.initial_states(draws)
         infos = {} if self._draws is None else self._draws.draw(self._streams, rows)

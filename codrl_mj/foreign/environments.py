@@ -71,6 +71,8 @@ def make(
             actuators or the environment.
     """
     entry = gymnasium.spec(env_id)
+    if str(entry.entry_point).startswith("codrl_mj.envs:"):
+        raise ValueError(f"{env_id}: its actuators are its own: gymnasium.make({env_id!r}, actuator=...)")
     resolved = resolve_patterns(actuators, f"the environment {env_id}")
     spec = copy.copy(entry)
     spec.entry_point = Motorised(entry.entry_point, resolved, action, allow_unstable)

@@ -136,13 +136,7 @@ def check_finite(task: Task, state: np.ndarray, time: float) -> None:
 
 
 def inner_step_count(task: Task, actuator: ActuatorModel, inner_steps: int | None, timestep: float | None) -> int:
-    """Integration steps in one environment step.
-
-    Args:
-        task: the task, whose `step_duration` they divide.
-        actuator: whether it is ideal decides on the task's default.
-        inner_steps: their number, or None.
-        timestep: the integration step [s], or None; give at most one of the two.
+    """Integration steps in one environment step: their number, by the step [s], or the task's default for an actuator.
 
     Raises:
         ValueError: both were given, the number is below 1, or the timestep does not divide the environment step.

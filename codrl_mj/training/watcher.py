@@ -214,5 +214,5 @@ class Watcher(BaseCallback):
         for name in ("episodes", "reports"):
             if hasattr(self, name):
                 getattr(self, name).close()
-        if self.model is not None and hasattr(self.model, "_logger"):
+        if hasattr(getattr(self, "model", None), "_logger"):  # learning may not have begun
             self.logger.close()

@@ -41,6 +41,10 @@ class Mine(ActuatorModel):
     family = "mine"
     strength: float = real(2.0, above=0.0)
 
+    @staticmethod
+    def advance(parameters, timestep, state, inputs):  # noqa: ARG004
+        return state, parameters.strength * inputs.desired_torque, state
+
 
 MINE = Mine(3.0)
 
@@ -135,6 +139,7 @@ PAIR = dataclasses.replace(
     CARTPOLE,
     name="pair",
     motors=("left", "right"),
+    forces=((-10.0, -10.0), (10.0, 10.0)),
     paper=(Actuator(Motor(inductance=0.2)), Actuator(Motor(inductance=0.3))),
 )
 
