@@ -38,6 +38,11 @@ class MotorEntry:
     tolerance: float
     """Up to where its values may contradict each other; see `from_datasheet`."""
 
+    @property
+    def title(self) -> str:
+        """Maker, product and kind, as far as the file says."""
+        return ", ".join(filter(None, (f"{self.manufacturer} {self.product}".strip(), self.kind)))
+
     @functools.cached_property
     def numbers(self) -> MotorNumbers:
         """What follows from the datasheet, in SI."""
@@ -61,12 +66,11 @@ def motor_entry(name: str) -> MotorEntry:
             unknown; or its datasheet is refused, see `from_datasheet`.
     """
     path = Path(name)
-    own = path.suffix == ".toml"
-    if not own:
+    if path.suffix != ".toml":
         check_names([name], motor_names(), "motor")
         path = asset_folder() / "motors" / f"{name}.toml"
     try:
-        return _entry(path.stem, tomllib.loads(path.read_text(encoding="utf-8")), own)
+        return _entry(path.stem, tomllib.loads(path.read_text(encoding="utf-8")), name.endswith(".toml"))
     except FileNotFoundError as error:
         raise ValueError(f"motor {name!r}: there is no such file; codrl-mj motor new {name} writes one") from error
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
