@@ -32,11 +32,8 @@ class Disagreement(NamedTuple):
 
     def __str__(self) -> str:
         """In a sentence."""
-        by = (
-            f"{100.0 * self.difference:+.3g}%"
-            if abs(self.difference) < 1.0
-            else f"{self.difference + 1.0:.3g} times that"
-        )
+        share = self.difference
+        by = f"{100.0 * share:+.3g}%" if abs(share) < 1.0 else f"{share + 1.0:.3g} times that"
         return (
             f"{self.quantity} = {self.printed:.4g} {self.unit}, but {self.formula} = {self.computed:.4g} {self.unit}, "
             f"{by}: {self.reading}"

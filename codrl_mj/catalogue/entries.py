@@ -54,6 +54,17 @@ def motor_names() -> list[str]:
     return sorted(path.stem for path in (asset_folder() / "motors").glob("*.toml"))
 
 
+def new_motor(path: Path) -> None:
+    """Write a file for a motor, to be filled in with what its datasheet prints.
+
+    Raises:
+        ValueError: its name does not end in .toml, or it is there already.
+    """
+    if path.suffix != ".toml" or path.exists():
+        raise ValueError(f"{path}: {'is there already' if path.exists() else 'must end in .toml'}: give another name")
+    path.write_bytes((asset_folder() / "motor_template.toml").read_bytes())
+
+
 def motor_entry(name: str) -> MotorEntry:
     """A motor of the catalogue.
 
@@ -81,7 +92,7 @@ def motor_entry(name: str) -> MotorEntry:
 
 def _entry(name: str, content: dict[str, Any], own: bool) -> MotorEntry:
     """What a file says, its numbers first; one's `own` need not say who makes it and who says so."""
-    optional = {"estimated": {}, "notes": "", "tolerance": 0.2}
+    optional: dict[str, Any] = {"estimated": {}, "notes": "", "tolerance": 0.2}
     if own:
         optional |= {"manufacturer": "", "product": name, "kind": "", "sources": {}}
     known = [f.name for f in dataclasses.fields(MotorEntry) if f.name != "name"]

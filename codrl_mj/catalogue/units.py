@@ -86,7 +86,7 @@ def _si(name: str, printed: str, number: float, unit: str, kind: Kind, remedy: s
     except Exception as error:  # of any kind: what pint's parser stumbles over
         raise ValueError(f"datasheet.{name} = {printed!r}: its unit {unit!r} is not known; {remedy}") from error
     wanted = registry.Quantity(1.0, kind.unit).dimensionality
-    if quantity.dimensionality == wanted / registry.standard_gravity.dimensionality and "m" in kind.unit:
+    if quantity.dimensionality == wanted / registry.standard_gravity.dimensionality:
         quantity = quantity * registry.standard_gravity  # kg*cm, oz*in: the weight of a kilogram, of an ounce
     if quantity.dimensionality != wanted:
         raise ValueError(

@@ -291,11 +291,9 @@ class New:
 
     def run(self) -> int:
         """Write it."""
-        from codrl_mj.tasks.assets import asset_folder
+        from codrl_mj.catalogue import new_motor
 
-        if self.file.suffix != ".toml" or self.file.exists():
-            raise ValueError(f"{self.file}: {'is there already' if self.file.exists() else 'must end in .toml'}")
-        self.file.write_text((asset_folder() / "motor_template.toml").read_text(encoding="utf-8"), encoding="utf-8")
+        new_motor(self.file)
         print(f"wrote {self.file}: fill it in; next: codrl-mj motor show {self.file}")
         return 0
 

@@ -1,8 +1,7 @@
 """`codrl-mj motor feasible` and `codrl-mj motor choose`."""
 
 import dataclasses
-import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -62,14 +61,8 @@ class Feasible:
             table.add_column(header, justify="right" if header in ("needs", "has") else "left")
         for bound in found.bounds:
             numbers = f"{bound.needed:.4g}", f"{bound.available:.4g}"
-            table.add_row(
-                bound.name,
-                bound.formula,
-                *numbers,
-                bound.unit,
-                "[green]holds" if bound.holds else "[red]fails",
-                bound.verdict,
-            )
+            mark = "[green]holds" if bound.holds else "[red]fails"
+            table.add_row(bound.name, bound.formula, *numbers, bound.unit, mark, bound.verdict)
         console().print(table)
         asked, best = found.operation, geared(drive, demand, continuous)
         at_best = feasibility(best, demand, continuous)
@@ -128,10 +121,8 @@ class Choose:
         if self.top < 1:
             raise ValueError(f"--top {self.top}: must be >= 1")
         asked, motors = _told_apart(self.words)
-        if self.motor is None:
-            demands = demands_of(asked, trust=self.trust)
-        else:
-            demands = {self.motor: demand_of(asked, trust=self.trust, motor=self.motor)}
+        one = self.motor is not None and {self.motor: demand_of(asked, trust=self.trust, motor=self.motor)}
+        demands = one or demands_of(asked, trust=self.trust)
         ranked = {name: choose(demand, motors or None, self.voltage, self.margin) for name, demand in demands.items()}
         alone = next(iter(demands.values())) if len(demands) == 1 else None
         if alone is not None and alone.model_gear != 1.0:
@@ -140,18 +131,17 @@ class Choose:
         told = [(name, choice) for name, found in ranked.items() for choice in (found if alone else found[:1])]
         shown = told[: self.top] if alone else told
         title = f"smallest that does it with {self.margin:.0%} left first: {alone.source if alone else asked}"
-        console().print(_ranking([choice for _, choice in shown], title, [] if alone else list(ranked)))
+        console().print(_ranking(shown, demands, title))
         for place, (name, choice) in enumerate(told):
             at = f"{choice.name} at {_gear(choice.drive, demands[name])}"
-            unknown = choice.unknown and f"not known, and not counted: {', '.join(choice.unknown)}"
+            unknown = f"not known, and not counted: {', '.join(choice.unknown)}" if choice.unknown else ""
             about = "; ".join(filter(None, (choice.lacks, unknown, choice.drive.assumed)))
             if about and (choice.lacks or place < len(shown)):
                 say(f"{at}: {about}" if alone else f"{name}: {at}: {about}")
         for name, choice in shown if self.out is not None else ():
             assert self.out is not None
-            _draw(
-                choice.drive, demands[name], choice.name, self.out / f"{Path(choice.name).stem if alone else name}.png"
-            )
+            picture = Path(choice.name).stem if alone else name
+            _draw(choice.drive, demands[name], choice.name, self.out / f"{picture}.png")
         self._write({name: (found[0], demands[name]) for name, found in ranked.items()})
         return 0
 
@@ -174,9 +164,9 @@ def _told_apart(words: Sequence[str]) -> tuple[str, list[str]]:
     from codrl_mj.catalogue import motor_names
     from codrl_mj.tasks import TASKS
 
-    files = {".toml", ".yaml", ".yml", ".json"}
     asked = [word for word in words if word in TASKS or Path(word).suffix == ".npz" or Path(word).is_dir()]
-    asked = asked or [word for word in words if Path(word).suffix not in files and word not in motor_names()]
+    files = ".toml", ".yaml", ".yml", ".json"
+    asked = asked or [word for word in words if not word.endswith(files) and word not in motor_names()]
     if len(asked) != 1:
         raise ValueError(
             f"motor choose: {' and '.join(asked) or 'nothing'} to choose for: name one task, run folder or .npz file, "
@@ -195,28 +185,25 @@ def _share(drive: Any, asked: Any) -> str:
     return f"{asked.own_share:.0%}" if drive.motor.rotor_inertia > 0.0 else "unknown"
 
 
-def _ranking(choices: Iterable[Any], title: str, driven: Sequence[str] = ()) -> Any:
+def _ranking(choices: Sequence[tuple[str, Any]], demands: Mapping[str, Any], title: str) -> Any:
     """A row for each choice; of several motors, each with what it drives."""
     from codrl_mj.cli.look import titled_table
 
     table = titled_table(title)
-    if driven:
+    several = len(demands) > 1
+    if several:
         table.add_column("drives", overflow="fold")
     columns = ("motor", "gear", "supply\n[V]", "power\n[W]", "does\nit", "margin", "rotor's\nshare", "peak\n[A]")
     for header in (*columns, "rms\n[A]", "drawn\n[J]", "heat\n[J]"):
         table.add_column(header, justify="left" if header in ("motor", "does\nit") else "right", no_wrap=True)
-    for choice, name in itertools.zip_longest(choices, driven):
+    for name, choice in choices:
         asked = choice.feasibility.operation
         numbers = abs(asked.current).max(), asked.rms_current, asked.energy_drawn, asked.copper_loss
+        gear, does = _gear(choice.drive, demands[name]), "[red]no" if choice.lacks else "[green]yes"
         table.add_row(
-            *((name,) if driven else ()),
-            *(choice.name, f"{choice.ratio:.4g}", f"{choice.drive.voltage_limit:g}", f"{choice.power:,.0f}"),
-            "[red]no" if choice.lacks else "[green]yes",
-            *(
-                f"{choice.feasibility.margin:.0%}",
-                _share(choice.drive, asked),
-                *(f"{number:.3g}" for number in numbers),
-            ),
+            *((name, choice.name) if several else (choice.name,)),
+            *(gear.removeprefix("gear "), f"{choice.drive.voltage_limit:g}", f"{choice.power:,.0f}", does),
+            *(f"{choice.feasibility.margin:.0%}", _share(choice.drive, asked), *(f"{one:.3g}" for one in numbers)),
         )
     return table
 

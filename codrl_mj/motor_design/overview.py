@@ -71,8 +71,8 @@ def explain(drive: Drive, entry: MotorEntry | None = None) -> dict[str, Any]:
     }
     if entry is None:
         return found
-    for_ever = continuous_torque(drive, entry.numbers.continuous_current)
-    found["abilities"].insert(2, _value("continuous_torque", for_ever, "N*m"))
+    torque = continuous_torque(drive, entry.numbers.continuous_current)
+    found["abilities"].insert(2, _value("continuous_torque", torque, "N*m"))
     names = [field.name for field in dataclasses.fields(MotorNumbers) if field.name not in ("derived", "disagreements")]
     derived = entry.numbers.derived
     return found | {

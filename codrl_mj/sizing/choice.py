@@ -123,8 +123,8 @@ def choose(
     choices = []
     for name in motor_names() if motors is None else motors:
         drive, continuous, unknown = catalogued(name, None, voltage)
-        has_its_own = drive.motor.gear_ratio != 1.0 and not demand.linear
-        best = drive if has_its_own else geared(drive, demand, continuous)
+        fixed = drive.motor.gear_ratio != 1.0 and not demand.linear
+        best = drive if fixed else geared(drive, demand, continuous)
         found = feasibility(best, demand, continuous)
         choices.append(Choice(name, best, unknown, found, _lacks(found, demand, continuous, least_margin)))
 
