@@ -27,10 +27,9 @@ Trust = Annotated[
 
 @dataclasses.dataclass(frozen=True)
 class Feasible:
-    """Ask whether a motor can do a task, before anything is trained: surely, try it, hopeless, surely not.
+    """Ask whether a motor can do a task, before training: surely, try it, hopeless, surely not; docs/motors.md.
 
-    Hopeless is short by a factor of ten, see docs/motors.md. Exit status 1 for the latter two. Example:
-    codrl-mj motor feasible maxon-ec45-flat-50w pendulum --gear-ratio 20
+    Exit status 1 for the last two. Example: codrl-mj motor feasible maxon-ec45-flat-50w pendulum --gear-ratio 20
     """
 
     name: Annotated[
@@ -134,7 +133,8 @@ class Choose:
         console().print(_ranking(shown, demands, title))
         for place, (name, choice) in enumerate(told):
             at = f"{choice.name} at {_gear(choice.drive, demands[name])}"
-            unknown = f"not known, and not counted: {', '.join(choice.unknown)}" if choice.unknown else ""
+            rest = ", ".join(one for one in choice.unknown if one not in choice.lacks)
+            unknown = f"not known, and not counted: {rest}" if rest else ""
             about = "; ".join(filter(None, (choice.lacks, unknown, choice.drive.assumed)))
             if about and (choice.lacks or place < len(shown)):
                 say(f"{at}: {about}" if alone else f"{name}: {at}: {about}")
