@@ -69,8 +69,7 @@ def motor_entry(name: str) -> MotorEntry:
     """A motor of the catalogue.
 
     Args:
-        name: one of `motor_names()`, or the path of a TOML file of your own, which may leave out who makes it, and from
-            where its values are.
+        name: one of `motor_names()`, or the path of a TOML file of your own, of which [datasheet] is enough.
 
     Raises:
         ValueError: there is no such motor (the nearest is suggested); the file lacks something or has something
@@ -100,9 +99,10 @@ def _entry(name: str, content: dict[str, Any], own: bool) -> MotorEntry:
     content = optional | {key: value for key, value in content.items() if value != ""}
     if missing := [key for key in known if key not in content]:
         raise ValueError(f"{', '.join(missing)} missing; write [datasheet] with what is printed")
-    for key in ("datasheet", "sources", "estimated"):
-        if not isinstance(content[key], Mapping):
-            raise ValueError(f"{key} = {content[key]!r}: must be a table, [{key}]")
+    for key, value in content.items():
+        table = key in ("datasheet", "sources", "estimated")
+        if key != "tolerance" and not isinstance(value, Mapping if table else str):
+            raise ValueError(f"{key} = {value!r}: must be {f'a table, [{key}]' if table else 'text'}")
     printed = {key: value for key, value in named(content["datasheet"]).items() if value != ""}
     content |= {"name": name, "datasheet": Datasheet(**printed), "estimated": named(content["estimated"])}
     _ = MotorEntry(**content).numbers  # refused here, not at first use
@@ -117,7 +117,7 @@ def _sources(sources: Mapping[str, Any], printed: list[str]) -> dict[str, str]:
     """The source of each printed value, from the values of each source."""
     found: dict[str, str] = {}
     for source, values in sources.items():
-        if values != _THE_REST and not isinstance(values, list):
+        if values != _THE_REST and not (isinstance(values, list) and all(isinstance(one, str) for one in values)):
             raise ValueError(f'sources.{source!r} = {values!r}: must be a list of entries, or "{_THE_REST}"')
         if values != _THE_REST:
             values = named(dict.fromkeys(values, source))
