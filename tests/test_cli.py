@@ -587,3 +587,13 @@ def test_draws_of_the_training_over_another_actuator_are_said(capsys):
     assert main(["evaluate", "drawn", "--episodes", "1", "--actuator", "weak", "--env.randomize", "None"]) == 0
     assert main(["evaluate", "drawn", "--episodes", "1"]) == 0
     assert "drawn as in" not in capsys.readouterr().err
+
+
+def test_training_says_first_what_is_assumed_of_the_motor(capsys, monkeypatch):
+    monkeypatch.setattr("codrl_mj.training.train", lambda *_, **__: None)
+    assert main(["train", "pendulum", "--actuator", "maxon-ec45-flat-339285", "--out", "assumed"]) == 0
+    assumed = "assumed, for none is given: supply.voltage = 24 V, controller.max_current = inf"
+    assert capsys.readouterr().out.splitlines()[0] == assumed
+    flags = "--actuator.supply.voltage", "12", "--actuator.controller.max-current", "5"
+    assert main(["train", "pendulum", "--actuator", "maxon-ec45-flat-339285", "--out", "assumed", *flags]) == 0
+    assert "assumed, for" not in capsys.readouterr().out

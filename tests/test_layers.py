@@ -70,7 +70,8 @@ ALLOWED = {
         "validation",
     },
     "cli": {
-        *("actuators", "agents", "disturbances", "envs.config", "evaluation", "evaluation.measures", "fields", "films"),
+        *("actuators", "agents", "catalogue", "disturbances", "envs.config", "evaluation", "evaluation.measures"),
+        *("fields", "films"),
         *(
             "foreign",
             "identify",

@@ -211,17 +211,20 @@ class Drive(ActuatorModel):
         """The supply's voltage [V]."""
         return 24.0 if self.supply is None else self.supply.voltage
 
+    @property
+    def assumed(self) -> str:
+        """As `ActuatorModel.assumed`: the supply, the largest current, the inertia of the rotor."""
+        missing = {
+            f"supply.voltage = {self.voltage_limit:g} V": self.supply is None,
+            "controller.max_current = inf": math.isinf(self.controller.max_current),
+            "motor.rotor_inertia = 0": self.motor.rotor_inertia == 0.0,
+        }
+        told = ", ".join(text for text, is_missing in missing.items() if is_missing)
+        return f"assumed, for none is given: {told}" if told else ""
+
     @classmethod
     def from_numbers(cls, numbers: Any, arm_radius: float = 1.0) -> Any:
-        """As `ActuatorModel.from_numbers`: the arm is that between rotor and load, the gear's ratio among the numbers.
-
-        Args:
-            numbers: shape (p,).
-            arm_radius: [m].
-
-        Raises:
-            ValueError: a number is out of its field's bounds.
-        """
+        """As `ActuatorModel.from_numbers`: the arm is that between rotor and load, the gear among the numbers."""
         family: Any = cls
         return super().from_numbers(numbers, arm_radius * parameters_type(family)(*numbers).gear_ratio)
 
@@ -299,10 +302,6 @@ class Drive(ActuatorModel):
         """The spectral radius of the loop over a sample; infinite where a step holds no whole number of samples.
 
         And where two fields are together what their class refuses.
-
-        Args:
-            numbers: shape (m, p), rows as `numbers` returns them.
-            timestep: mechanical step [s].
         """
         columns = stability.columns(cls, numbers)
         samples = timestep * columns.sample_rate

@@ -168,6 +168,11 @@ class ActuatorModel:
         """The largest voltage [V], to be drawn in figures of the signal `voltage`."""
         return None
 
+    @property
+    def assumed(self) -> str:
+        """A sentence on what is taken for numbers that nobody gave, for whoever uses it; empty where all are given."""
+        return ""
+
     def commands(self) -> Mapping[str, Command]:
         """What an agent can command besides the force, by name.
 

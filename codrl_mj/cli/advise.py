@@ -61,6 +61,7 @@ class Advise:
 
     def run(self) -> int:
         """Print the doses, what they cost, and the verdict last."""
+        from codrl_mj.cli.terminal import say
         from codrl_mj.study.actuators.advice import advise
         from codrl_mj.study.actuators.evidence import Evidence
         from codrl_mj.study.actuators.levels import REFERENCE_SPEEDS, posed
@@ -78,6 +79,7 @@ class Advise:
         found = advise(actuator, self.task, Evidence.read(self.evidence))
         if not self.as_json:
             _print(self.actuator, found)
+            say(actuator.assumed)
         measured = None if self.measure is None else self._measured(actuator, self.measure)
         if self.as_json:
             print(json.dumps({"advice": _plain(found), "measured": measured and _plain(measured)}, indent=2))

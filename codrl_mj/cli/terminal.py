@@ -27,6 +27,12 @@ def console() -> Console:
     return Console() if sys.stdout.isatty() else Console(width=110)
 
 
+def say(*texts: str) -> None:
+    """Print each text that is not empty, as wide as the terminal."""
+    for text in filter(None, texts):
+        console().print(text, markup=False, highlight=False)
+
+
 def progress_bar(*columns: str) -> Progress:
     """A progress display with the given text columns, the time elapsed and the time left."""
     return Progress(

@@ -116,7 +116,7 @@ class Train:
 
     def run(self: Any) -> int:
         """Train, with a progress bar."""
-        from codrl_mj.cli.terminal import training_bars
+        from codrl_mj.cli.terminal import say, training_bars
         from codrl_mj.training import train
 
         if _task(self.task) != _task(self.base.task) and self.resume is None:
@@ -143,6 +143,8 @@ class Train:
         out = self.resume or self.out or Path("runs") / name
         if isinstance(config.env, ForeignConfig):
             config.env.make().close()  # what is wrong with it is said before there is a bar
+        driven = config.env.actuator if isinstance(config.env.actuator, tuple) else (config.env.actuator,)
+        say(*dict.fromkeys(one.assumed for one in driven))
         with training_bars({f"{config.agent.name.upper()} on {config.task}": (config, out)}):
             train(
                 config,

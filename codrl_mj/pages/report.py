@@ -340,6 +340,8 @@ def _loop(runs: Sequence[_Run]) -> Markup:
             )
             name = "motor" if name in (".*", "motor") else name
             timestep = run.shown.episode.timestep if run.shown is not None else None
+            if actuator.assumed:
+                without[f"{name}: {actuator.assumed}."] = None
             if isinstance(actuator, Drive | Actuator) and is_closed(actuator):
                 loop = actuator, None if isinstance(actuator, Drive) else timestep
                 known = isinstance(actuator, Drive) or timestep is not None

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from codrl_mj.actuators import Lag
+from codrl_mj.actuators import Drive, Lag
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy, run_episodes
@@ -97,6 +97,7 @@ def test_it_says_which_loops_it_leaves_out_and_why_there_is_none():
     said = str(reports._loop([run({"lag": Lag(time_constant=0.1)})]))
     assert "lag: The delivered torque follows the desired one with a time constant" in said
     assert "There is no current loop in it." in said
+    assert "m: assumed, for none is given: supply.voltage = 24 V" in str(reports._loop([run({"m": Drive()})]))
 
 
 def test_without_opengl_there_is_no_film_and_everything_else(tmp_path, monkeypatch):
