@@ -1,13 +1,14 @@
 """Films: the right format, size and length, the right content, and no file when something fails."""
 
 import contextlib
+import dataclasses
 
 import imageio
 import numpy as np
 import pytest
 from PIL import Image
 
-from codrl_mj import TASKS, Actuator, Motor, named_actuator
+from codrl_mj import TASKS, Actuator, Drive, Motor, named_actuator
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import Episode, RandomPolicy, run_episodes
 from codrl_mj.films.film import Panel, film
@@ -19,6 +20,7 @@ WIDTH, HEIGHT = 200, 120
 FRAME_HEIGHT = 40 + HEIGHT + 24 + 120 + 8 + 60 + 26  # title, scene, and the strip's legend, plots and time axis
 PLOT_TOP = 40 + HEIGHT + 24
 DESIRED, ACTUAL, SATURATED, VOLTAGE = (0, 114, 178), (213, 94, 0), (204, 121, 167), (0, 158, 115)
+LIMITS = {"voltage": SATURATED, "current": (230, 159, 0), "temperature": (86, 180, 233)}
 SIGNALS = signal_names(Actuator)
 
 
@@ -186,12 +188,21 @@ def test_a_long_episodes_strip_slides(monkeypatch, tmp_path):
     assert late > 70  # below it: the first half has left the window
 
 
-@pytest.mark.parametrize("saturated", [True, False])
-def test_saturation_is_marked(monkeypatch, tmp_path, saturated):
-    frame = filmed(monkeypatch, tmp_path, [made_up(8.0, -4.0, saturated=saturated)])[-1]
-    pale = 0.3 * np.array(SATURATED) + 0.7 * 255
-    marked = (np.abs(frame[PLOT_TOP : PLOT_TOP + 120] - pale).max(axis=-1) < 12).mean()
-    assert (marked > 0.3) if saturated else (marked == 0.0)
+@pytest.mark.parametrize("limit", ["voltage", "current", "temperature", "", None])
+def test_saturation_is_marked_in_the_colour_of_its_limit(monkeypatch, tmp_path, limit):
+    """Of a drive the limit that is met, or none; of a current loop its only one."""
+    panel = made_up(8.0, -4.0, saturated=limit != "")
+    if limit is not None:
+        signals = panel.episode.signals | {f"{one}_saturated": np.full(40, float(one == limit)) for one in LIMITS}
+        panel = dataclasses.replace(
+            panel, actuator=Drive(), episode=dataclasses.replace(panel.episode, signals=signals)
+        )
+    frame = filmed(monkeypatch, tmp_path, [panel])[-1]
+    for one, colour in LIMITS.items():
+        pale = 0.3 * np.array(colour) + 0.7 * 255
+        marked = (np.abs(frame[PLOT_TOP : PLOT_TOP + 120] - pale).max(axis=-1) < 12).mean()
+        met = limit != "" and one == (limit or "voltage")
+        assert (marked > 0.3) if met else (marked < 0.1), one  # the edges of lines are pale too
 
 
 def test_the_scene_shows_the_states(monkeypatch, tmp_path):
