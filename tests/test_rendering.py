@@ -2,19 +2,24 @@
 
 import contextlib
 import dataclasses
+import re
 
 import imageio
+import mujoco
 import numpy as np
 import pytest
 from PIL import Image
 
 from codrl_mj import TASKS, Actuator, Drive, Motor, named_actuator
+from codrl_mj.actuators import IDEAL
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import Episode, RandomPolicy, run_episodes
 from codrl_mj.films.film import Panel, film
 from codrl_mj.films.strip import torque_label
 from codrl_mj.physics import signal_names
+from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.offscreen import OffscreenRenderer
+from codrl_mj.tasks.assets import asset_path
 
 WIDTH, HEIGHT = 200, 120
 FRAME_HEIGHT = 40 + HEIGHT + 24 + 120 + 8 + 60 + 26  # title, scene, and the strip's legend, plots and time axis
@@ -203,6 +208,19 @@ def test_saturation_is_marked_in_the_colour_of_its_limit(monkeypatch, tmp_path, 
         marked = (np.abs(frame[PLOT_TOP : PLOT_TOP + 120] - pale).max(axis=-1) < 12).mean()
         met = limit != "" and one == (limit or "voltage")
         assert (marked > 0.3) if met else (marked < 0.1), one  # the edges of lines are pale too
+
+
+def test_a_model_without_a_sky_is_drawn_on_ours(tmp_path):
+    """Pendulum's own, its sky taken out."""
+    bare = tmp_path / "bare.xml"
+    bare.write_text(re.sub(r'<texture name="sky".*?/>', "", asset_path("pendulum.xml").read_text()))
+    images = []
+    for task in (TASKS["pendulum"], dataclasses.replace(TASKS["pendulum"], asset=str(bare))):
+        model = task_model(task, (IDEAL,), 0.01)
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        images.append(OffscreenRenderer(model, WIDTH, HEIGHT).render(data))
+    np.testing.assert_array_equal(*images)
 
 
 def test_the_scene_shows_the_states(monkeypatch, tmp_path):

@@ -146,14 +146,7 @@ def _advance(
 
 
 def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Signals]:
-    """Advance winding, loop and shaft by one mechanical step.
-
-    Args:
-        parameters: named as the fields of `Drive` and its parts.
-        timestep: mechanical step [s].
-        state: as the step before left it.
-        inputs: desired torque [N*m], speed [rad/s] and inertia [kg*m^2] at the rotor.
-    """
+    """Advance winding, loop and shaft by one mechanical step [s]; speed and inertia of the inputs are the rotor's."""
     return _advance(parameters, timestep, state, inputs, True)
 
 

@@ -47,22 +47,10 @@ def jump(
     y: float,
     lost: float,
 ) -> tuple[float, float, float, float, int]:
-    """A designed loop over many samples in closed form; all in amperes, as the module's docstring has it.
+    """A designed loop over n samples in closed form; all in amperes, with x = R*T/L, y = wc*T and `lost` = 1 - e.
 
-    Args:
-        current: i [A].
-        integral: c [A].
-        reference: i_ref [A].
-        low: the lowest (u - b)/R [A].
-        high: the highest.
-        samples: n.
-        x: R*T/L.
-        y: wc*T.
-        lost: 1 - exp(-x).
-
-    Returns:
-        i, c, the sum of i over the samples' starts [A], that of v times the mean current of each sample [A^2], and how
-        many samples were saturated.
+    v lies from `low` to `high`. Found are i, c, the sum of i over the samples' starts [A], that of v times the mean
+    current of each sample [A^2], and how many samples were saturated.
     """
     step = -math.expm1(-y)  # P
     gain, apart = step / lost, lost - step
@@ -138,29 +126,12 @@ def run_samples(
     anti_windup: float,
     delayed: float,
 ) -> tuple[float, float, float, float, float, int]:
-    """Any PI loop, sample by sample.
+    """Any PI loop, sample by sample: i [A], the integral [V], the pending voltage, and then what `jump` finds.
 
-    Args:
-        current: i [A].
-        integral: of the controller [V].
-        pending: the voltage [V] computed in the sample before, which a delayed loop applies now.
-        reference: i_ref [A].
-        back_emf: b [V].
-        compensated: the part of it [V] that is added to the voltage.
-        voltage: the supply's [V].
-        sag: its resistance [ohm].
-        deadband: voltage [V] that the bridge loses.
-        samples: n.
-        resistance: R [ohm].
-        decay: exp(-R*T/L).
-        lasting: the mean of exp(-R*t/L) over a sample.
-        kp: proportional gain [V/A].
-        ki: integral gain per sample [V/A].
-        anti_windup: 0 back-calculation with the tracking time kp/ki, 1 clamping, 2 none.
-        delayed: 1 if a sample's voltage is applied in the next one.
-
-    Returns:
-        i, integral, pending voltage, and as of `jump` both sums and how many samples were saturated.
+    `ki` is the integral gain per sample [V/A], `compensated` the part of the back-EMF [V] that is added to the voltage,
+    `sag` the supply's resistance [ohm], `deadband` what the bridge loses [V], `decay` e, and `lasting` m. A `delayed`
+    loop applies the voltage of the sample before, `pending`. `anti_windup` is 0 for back-calculation with the tracking
+    time kp/ki, 1 for clamping, 2 for none.
     """
     total, drawn, saturated, gain = 0.0, 0.0, 0, kp + ki
     tracking = ki / gain if gain > 0.0 else 0.0

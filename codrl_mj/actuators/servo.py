@@ -129,11 +129,7 @@ def demand(
 def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Signals]:
     """Advance all loops by one mechanical step; between its samples the outer loops see the speed as it is predicted.
 
-    Args:
-        parameters: named as the fields of `Servo` and its parts.
-        timestep: mechanical step [s].
-        state: as the step before left it.
-        inputs: in place of the desired torque, position [rad] or speed [rad/s] of the rotor; and as for a drive.
+    In place of a desired torque the inputs have a position [rad] or a speed [rad/s] of the rotor.
     """
     winding, heat, moving = drive.begin(parameters, timestep, state, inputs)
     resistance = shaft.resistance_at(parameters, shaft.temperature_of(parameters, heat))

@@ -37,20 +37,11 @@ def pixels_per_second(width: int, window: float) -> float:
 def draw_strip(
     task: str, episode: Episode, actuator: Any, width: int, window: float, end: float, motor: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw an episode's signals once, so that frames can be cut from them.
+    """Draw an episode's signals once, so that frames `width` px wide that show `window` seconds can be cut from them.
 
-    Args:
-        task: its task's name.
-        episode: the episode.
-        actuator: what it ran on, a tuple with several motors; of the ideal one the strip shows forces.
-        width: width of a frame [px].
-        window: the span of time that a frame shows [s].
-        end: time at the right end of the whole strip [s].
-        motor: which of several motors.
-
-    Returns:
-        The strip's frame, `width` wide (legend and vertical axes), and its whole content below the legend, on which a
-        second is `pixels_per_second(width, window)` wide; `MARGIN` beyond its end.
+    The whole strip ends at the time `end` [s]; of several motors, where the actuator is a tuple, it is of one. Found
+    are the strip's frame (legend and vertical axes), and its whole content below the legend, which is `MARGIN` px wider
+    than the time that it shows.
     """
     body = PLOT_HEIGHT + TIME_HEIGHT
     frame = _figure(width, HEADER_HEIGHT + body)
