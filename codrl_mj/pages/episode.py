@@ -125,12 +125,7 @@ class _Line:
 
 
 def episode_section(shown: Sequence[Shown], joined: Iterable[Markup] = ()) -> Markup:
-    """Films, controls and plots of some episodes side by side.
-
-    Args:
-        shown: the episodes.
-        joined: what else follows the clock: see `codrl_mj.pages.page.clocked`.
-    """
+    """Films, controls and plots of some episodes side by side, and what else follows the clock (`page.clocked`)."""
     lines = _lines(shown)
     end = max(float(one.episode.time[-1]) for one in shown)
     films = [page.film(_caption(one, len(shown) > 1), one.film.video, one.film.rate, one.film.still)
