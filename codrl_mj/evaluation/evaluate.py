@@ -369,7 +369,8 @@ def _energies(one: _Driven) -> tuple[float, float, float, float, float]:
     stored = inductance * one.current[-1] ** 2 / 2
     if isinstance(one.actuator, Drive):  # whose steps are long beside its winding
         heat = one.signals["copper_loss"] * one.timestep
-        warm = shaft.resistance_at(one.actuator.motor, one.signals["temperature"])
+        temperature: Any = one.signals["temperature"]
+        warm = shaft.resistance_at(one.actuator.motor, temperature)
         drawn, returned = drawn_and_returned(one.signals["electrical_power"] * one.timestep)
         return drawn, returned, float(heat.sum()), stored, float((heat / warm).sum())
     drawn, returned = electrical_energy(one.signals["voltage"], one.current, one.timestep)
