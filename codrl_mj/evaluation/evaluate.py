@@ -328,7 +328,8 @@ def _root_mean_square(values: np.ndarray) -> float:
 
 def _electrical(episodes: Sequence[Episode], driven: Sequence[Sequence[_Driven]]) -> dict[str, Any]:
     """What was asked of the actuators: of any but the ideal one, and of windings, as far as the family shows it."""
-    limits = {f"{name}_percent": name for name in ("saturated", *(f"{one}_saturated" for one in _LIMITS))}
+    each = (f"{limit}_saturated" for limit in ("voltage", "current", "temperature"))
+    limits = {f"{name}_percent": name for name in ("saturated", *each)}
     names = ("peak_voltage", "peak_current", "rms_current", "peak_speed", "peak_temperature", "energy_drawn")
     found: dict[str, Any] = dict.fromkeys((*limits, *names, "energy_returned", "copper_loss", "magnetic_energy"))
     every = [one for each in driven for one in each if not isinstance(one.actuator, Ideal)]
@@ -357,9 +358,6 @@ def _electrical(episodes: Sequence[Episode], driven: Sequence[Sequence[_Driven]]
         "copper_loss": bootstrap_mean(copper),
         "magnetic_energy": bootstrap_mean(magnetic),
     }
-
-
-_LIMITS = ("voltage", "current", "temperature")
 
 
 def _energies(one: _Driven) -> tuple[float, float, float, float, float]:
