@@ -180,7 +180,31 @@ def test_evaluation_is_that_of_the_package(capsys, trained, tmp_path):
     assert result["episodes"] == 7
     text = capsys.readouterr().out
     assert f"{np.mean(totals):.1f}" in text
-    assert f"{result['tracking_rms']:.3f} N·m" in text
+    assert f"{result['tracking_rms']:.3g} N·m" in text
+
+
+def test_several_policies_have_a_row_each_in_the_environment_of_their_own_training(capsys, trained, tmp_path):
+    shutil.copytree(trained, tmp_path / "other" / trained.name)
+    config = tmp_path / "other" / trained.name / "config.json"
+    content = json.loads(config.read_text())
+    content["train"]["env"]["actuator"] = "paper"
+    content.pop("sha256", None)
+    config.write_text(json.dumps(content))
+    both = [str(trained), str(config.parent)]
+    assert main(["evaluate", *both, "--episodes", "3", "--out", "both.json"]) == 0
+    found = json.loads((tmp_path / "both.json").read_text())
+    assert list(found) == [f"{Path(one).parent.name}/{trained.name} on as-trained" for one in both]
+    for path, result in zip(both, found.values(), strict=True):
+        assert main(["evaluate", path, "--episodes", "3", "--out", "one.json"]) == 0
+        assert json.loads((tmp_path / "one.json").read_text()) == result
+    assert len({json.dumps(one["conditions"]) for one in found.values()}) == 2
+    assert "POLICY: none was given" in refused(capsys, "evaluate")
+
+
+def test_what_the_study_does_not_know_is_advised_to_be_compared(capsys):
+    said = refused(capsys, "advise", "re25", "Hopper-v5")
+    assert "knows pendulum, cartpole" in said
+    assert "codrl-mj evaluate RUN RUN --actuator re25" in said
 
 
 def test_a_policy_is_evaluated_on_any_actuator(trained, tmp_path):

@@ -95,8 +95,8 @@ class ActuatorModel:
     """What it remembers: a `NamedTuple` of floats, all 0 at the start of an episode."""
     Signals: ClassVar[type] = Nothing
     """What can be seen of it after a step: a `NamedTuple` of floats. A signal called `saturated` is 1 where the
-    actuator is at its limit. Signals called `current` [A] and `voltage` [V] make the electrical measures of an
-    evaluation."""
+    actuator is at its limit; `voltage_saturated`, `current_saturated` and `temperature_saturated` may say at which.
+    Signals called `current` [A] and `voltage` [V] make the electrical measures of an evaluation."""
     SIGNAL_UNITS: ClassVar[Mapping[str, str]] = {}
     """Units of the signals, for tables and figures."""
     OBSERVED: ClassVar[tuple[str, ...]] = ()

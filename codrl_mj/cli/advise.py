@@ -8,6 +8,8 @@ from typing import Annotated, Any
 
 import tyro
 
+from codrl_mj.fields import did_you_mean
+
 _DELIVERED = {
     # field of Delivery: what it is, unit, digits
     "lag": ("lag: time constant of a first-order one that is as late", "policy steps", ".3g"),
@@ -65,9 +67,13 @@ class Advise:
         from codrl_mj.study.actuators.advice import advise
         from codrl_mj.study.actuators.evidence import Evidence
         from codrl_mj.study.actuators.levels import REFERENCE_SPEEDS, posed
-        from codrl_mj.study.grid import check_chosen
 
-        check_chosen("TASK", [self.task], REFERENCE_SPEEDS)
+        if self.task not in REFERENCE_SPEEDS:
+            raise ValueError(
+                f"TASK = {self.task!r}: {did_you_mean(self.task, REFERENCE_SPEEDS)}The study, and so --measure, knows "
+                f"{', '.join(REFERENCE_SPEEDS)}; for any other train a policy on ideal forces and one through the "
+                f"actuator, and compare them on it: codrl-mj evaluate RUN RUN --actuator {self.actuator}"
+            )
         if self.measure is not None and self.measure < 2:
             raise ValueError(f"--measure {self.measure}: must be >= 2, or there is no interval")
         try:

@@ -217,6 +217,6 @@ def with_environment(verb: Any, arguments: Sequence[str]) -> Any:
             with contextlib.suppress(ValueError, OSError):  # the verb says so better
                 known = load_config(run, chosen.trust).evaluation_env
     fields = environment_fields(known, chosen.actuator, known.task if isinstance(known, ForeignConfig) else task)
-    made = dataclasses.make_dataclass(verb.__name__, fields, bases=(verb,), frozen=True)
-    made.__doc__ = verb.__doc__
+    made: Any = dataclasses.make_dataclass(verb.__name__, fields, bases=(verb,), frozen=True)
+    made.__doc__, made.line = verb.__doc__, tuple(arguments)
     return made

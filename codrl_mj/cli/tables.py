@@ -35,7 +35,7 @@ _TELLING: dict[str, tuple[str, Callable[[Any], str]]] = {
     "success": ("success", lambda value: f"{100 * value.mean:.0f} %"),
     "returns": ("return", lambda value: "{:.1f} [{:.1f}, {:.1f}]".format(*value)),
     "time_to_goal": ("time to\ngoal", lambda value: f"{value.median:.1f} s"),
-    "tracking_rms": ("shaft torque\nerror", lambda value: f"{value:.3f} N·m"),
+    "tracking_rms": ("shaft torque\nerror", lambda value: f"{_text(value)} N·m"),
     "saturated_percent": ("saturated", lambda value: f"{value:.1f} %"),
     "peak_voltage": ("peak\n|u|", lambda value: f"{value:.1f} V"),
     "energy_drawn": ("energy\ndrawn", lambda value: f"{_text(value.mean)} J"),

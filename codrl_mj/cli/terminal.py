@@ -57,7 +57,7 @@ def training_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> Iterator[None
         "{task.completed:,}/{task.total:,} {task.fields[unit]}",
         "return {task.fields[mean_return]:.1f}",
         "length {task.fields[mean_length]:.0f}",
-        "torque err {task.fields[torque_error]:.2g} N·m",
+        "end torque err {task.fields[torque_error]:.2g} N·m",
         "{task.fields[steps_per_second]:.0f}/s",
     )
     with progress_bar(*columns) as bar:

@@ -121,6 +121,8 @@ def task_model(
         drive(motor, actuator, limit)
         for added in (JointAdditions(joint.armature, joint.damping, joint.friction), actuator.additions):
             _add(spec, joint_driven, added)
+    if all(texture.type != mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
+        _add_sky(spec)
     model = spec.compile()
     if (model.nq, model.nv) != (len(task.qpos), len(task.qvel)):
         raise ValueError(
@@ -131,6 +133,13 @@ def task_model(
 
 
 _ALONG = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+def _add_sky(spec: mujoco.MjSpec) -> None:
+    """Give a model without a sky that of our own models: it would be drawn on black."""
+    kind, gradient = mujoco.mjtTexture.mjTEXTURE_SKYBOX, mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
+    sky = spec.add_texture(type=kind, builtin=gradient, width=64, height=64)
+    sky.rgb1, sky.rgb2 = [0.93, 0.95, 0.97], [0.76, 0.82, 0.88]
 
 
 def _add(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, added: JointAdditions) -> None:

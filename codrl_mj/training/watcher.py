@@ -22,7 +22,7 @@ from codrl_mj.training.state import State, capture, restore
 
 REPORT_INTERVAL = 1000
 """Environment steps between two reports; the next end of a rollout counts."""
-_REMEMBERED = ("marks", "squares", "samples", "best", "evaluation_return")
+_REMEMBERED = ("marks", "squares", "samples", "best")
 
 
 class LearningEnded(Exception):  # noqa: N818 - no error
@@ -55,7 +55,6 @@ class Watcher(BaseCallback):
         self._marks = {"report": 0, "evaluation": 0, "checkpoint": 0}
         self._squares, self._samples = 0.0, 0  # of the torque error since the last report
         self._best = {"return": -math.inf, "steps": 0}
-        self._evaluation_return = math.nan
         self._seconds_before, self._steps_before, self._start = 0.0, 0, time.perf_counter()
         self._identity = json.dumps(config.as_mapping(), sort_keys=True)
         self._resumed: State | None = None
@@ -137,10 +136,11 @@ class Watcher(BaseCallback):
         """
         if self.model.num_timesteps == 0:
             return
-        if self._due("evaluation", self._config.evaluation_interval) or last:
+        evaluated = self._due("evaluation", self._config.evaluation_interval) or last
+        if evaluated:
             self._evaluate()
-        if self._due("report", REPORT_INTERVAL) or last:
-            self._report()
+        if self._due("report", REPORT_INTERVAL) or evaluated:
+            self._report(evaluated)
         if self._due("checkpoint", self._config.checkpoint_interval) or last or stopping:
             self._save()
 
@@ -158,14 +158,13 @@ class Watcher(BaseCallback):
             config.evaluation_episodes,
             EVALUATION_SEED,
         )
-        self._evaluation_return = self.evaluation.returns.mean
-        if self._evaluation_return > self._best["return"]:
-            self._best = {"return": self._evaluation_return, "steps": self.model.num_timesteps}
+        if self.evaluation.returns.mean > self._best["return"]:
+            self._best = {"return": self.evaluation.returns.mean, "steps": self.model.num_timesteps}
             best = self._out / folder.BEST
             save_policy(self.model.policy, config.agent, best)
             write_json(best / folder.EVALUATION, sealed(self.evaluation.as_mapping()))
 
-    def _report(self) -> None:
+    def _report(self, evaluated: bool) -> None:
         if self.reports.last("steps") == self.model.num_timesteps:
             return  # killed after the last report, before the run was marked as finished
         elapsed = time.perf_counter() - self._start
@@ -175,7 +174,7 @@ class Watcher(BaseCallback):
             mean_return=self.episodes.last_mean("return"),
             mean_length=self.episodes.last_mean("length"),
             torque_error=math.sqrt(self._squares / self._samples) if self._samples else math.nan,
-            evaluation_return=self._evaluation_return,
+            evaluation_return=self.evaluation.returns.mean if self.evaluation and evaluated else math.nan,
             steps_per_second=(self.model.num_timesteps - self._steps_before) / elapsed,
             seconds=self._seconds_before + elapsed,
         )
@@ -184,7 +183,8 @@ class Watcher(BaseCallback):
         self.reports.flush()
         self.episodes.flush()
         for name in REPORT_COLUMNS[1:]:
-            self.logger.record(f"run/{name}", getattr(progress, name))
+            if not math.isnan(value := getattr(progress, name)):
+                self.logger.record(f"run/{name}", value)
         self.logger.dump(self.model.num_timesteps)
         if self._on_progress is not None:
             self._on_progress(progress)
@@ -204,7 +204,7 @@ class Watcher(BaseCallback):
             "steps": self.model.num_timesteps,
             "episodes": len(self.episodes),
             "mean_return": self.episodes.last_mean("return"),
-            "evaluation_return": self._evaluation_return,
+            "evaluation_return": self.evaluation.returns.mean if self.evaluation else math.nan,
             "best": self._best,
             "seconds": self._seconds_before + time.perf_counter() - self._start,
         }

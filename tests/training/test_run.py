@@ -4,6 +4,7 @@ import contextlib
 import csv
 import dataclasses
 import json
+import math
 import platform
 import sys
 from importlib.machinery import ModuleSpec
@@ -21,7 +22,7 @@ from codrl_mj.agents.sarsa_episodes import CompiledEpisodes
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy, evaluate, run_episodes
 from codrl_mj.runs.policies import load_policy
-from codrl_mj.training import EVALUATION_SEED, TrainConfig, load_config, train
+from codrl_mj.training import EVALUATION_SEED, TrainConfig, curve, load_config, train, watcher
 
 TINY_PPO = PPOConfig(rollout_steps=256, batch_size=64, epochs=2, hidden=(8, 8))
 ENV = EnvConfig("cartpole", "weaker", options={"center_radius": 0.1})
@@ -155,6 +156,15 @@ def test_the_result_and_the_evaluation_agree_with_an_evaluation_of_the_saved_pol
     assert result["steps"] == report.steps
     assert result["episodes"] == report.episodes
     assert result["best"] == {"return": anew.returns.mean, "steps": 1024}  # the only evaluation
+
+
+def test_a_report_has_the_evaluation_that_took_place_then_and_no_other(tmp_path, monkeypatch):
+    monkeypatch.setattr(watcher, "REPORT_INTERVAL", 2500)
+    monkeypatch.setattr(curve, "draw_learning_curve", lambda *_: None)
+    config = dataclasses.replace(TINY, total_steps=5000, evaluation_interval=2000, evaluation_episodes=2)
+    rows = read_csv(train(config, tmp_path / "run") / "progress.csv")
+    found = {int(row["steps"]): math.isfinite(float(row["evaluation_return"])) for row in rows}
+    assert found == {2048: True, 2560: False, 4096: True, 5120: True}  # 2560: the report alone; 5120: the end
 
 
 def test_the_best_policy_is_kept_though_a_worse_one_comes_last(tmp_path):
