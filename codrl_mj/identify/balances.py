@@ -20,6 +20,10 @@ _POWER = 5
 """Of s - s^2 in phi: so high that the trapezoidal rule is good for phi'' too."""
 
 
+BODY = "inertia", "viscous", "coulomb"
+"""Terms of a torque balance that no body and no friction has negative."""
+
+
 class Balance(NamedTuple):
     """A regression over the windows of a log."""
 
@@ -104,22 +108,28 @@ def _polynomials() -> dict[int, np.polynomial.Polynomial]:
     return {-1: phi.integ(), 0: phi, 1: phi.deriv(), 2: phi.deriv(2)}
 
 
-def regress(target: np.ndarray, terms: Mapping[str, np.ndarray]) -> Balance | None:
+def regress(target: np.ndarray, terms: Mapping[str, np.ndarray], least: float = -np.inf) -> Balance | None:
     """Least squares that outliers do not move; None where there are too few windows, or terms say the same.
 
     Args:
         target: shape (windows,).
         terms: each of that shape; those that are 0 throughout are left out.
+        least: of the coefficients of `BODY`.
     """
+    from scipy.optimize import lsq_linear
+
     terms = {name: values for name, values in terms.items() if np.any(values)}
     if len(target) < 3 * len(terms) or not terms or not np.any(target):
         return None
     matrix = np.column_stack(list(terms.values()))
     scales = np.sqrt(np.mean(matrix**2, axis=0))
     matrix = matrix / scales
+    bounds = [least if name in BODY else -np.inf for name in terms], np.inf
     weights = np.ones(len(target))
-    for _ in range(8):  # Huber's weights, reweighted
+    for _ in range(8 if least == -np.inf else 1):  # Huber's weights, reweighted
         solution, _, rank, _ = np.linalg.lstsq(matrix * weights[:, None], target * weights, rcond=1e-9)
+        if least > -np.inf:
+            solution = lsq_linear(matrix * weights[:, None], target * weights, bounds).x
         residual = target - matrix @ solution
         scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-12 * float(np.abs(target).max())
         weights = np.sqrt(np.minimum(1.0, 2.0 * scale / np.maximum(np.abs(residual), 1e-300)))
@@ -127,8 +137,8 @@ def regress(target: np.ndarray, terms: Mapping[str, np.ndarray]) -> Balance | No
         return None
     error = math.sqrt(float(np.mean((weights * residual) ** 2)))
     # phi is about half as wide as its window, and so overlaps by half with the next one: they count for half
-    covariance = 2.0 * error**2 * np.linalg.inv((matrix * weights[:, None]).T @ (matrix * weights[:, None]))
-    certain = solution / np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    variance = 2.0 * error**2 * np.sum(np.linalg.pinv(matrix * weights[:, None]) ** 2, axis=1)
+    certain = solution / np.sqrt(np.maximum(variance, 1e-300))
     return Balance(
         dict(zip(terms, map(float, solution / scales), strict=True)),
         dict(zip(terms, map(float, certain), strict=True)),
@@ -169,31 +179,47 @@ def voltage_balance(log: Log, duration: float = 0.0, sag: bool = False) -> Balan
     return regress(windows.mean_held("voltage"), voltage_terms(log, windows, sag)) if len(windows) else None
 
 
-def torque_terms(log: Log, windows: Windows, aside: bool = False) -> dict[str, np.ndarray] | None:
+def torque_terms(
+    log: Log, windows: Windows, aside: bool = False, rig: str | None = None
+) -> dict[str, np.ndarray] | None:
     """The terms of `torque_balance`; None without a motion."""
+    from scipy.integrate import cumulative_trapezoid
+
     speed, acceleration = speed_terms(log, windows), speed_terms(log, windows, 1)
     if speed is None or acceleration is None:
         return None
     one = windows.mean(np.ones(len(log.time)))
     terms = {"inertia": acceleration, "viscous": speed, "coulomb": np.sign(speed) * one, "constant": one}
-    if log.has("position"):
-        terms["gravity"] = windows.mean(np.sin(log.signals["position"]))
+    if rig in (None, "pendulum"):
+        known = log.has("position")
+        angle = log.signals["position"] if known else cumulative_trapezoid(log.signals["velocity"], log.time, initial=0)
+        terms["gravity"] = windows.mean(np.sin(angle))
         if aside:
-            terms["gravity_aside"] = windows.mean(np.cos(log.signals["position"]))
+            terms["gravity_aside"] = windows.mean(np.cos(angle))
     return terms
 
 
-def torque_balance(log: Log, effort: str = "torque", duration: float = 0.3, aside: bool = False) -> Balance | None:
+def torque_balance(
+    log: Log,
+    effort: str = "torque",
+    duration: float = 0.3,
+    aside: bool = False,
+    rig: str | None = None,
+    sign: float = 0.0,
+) -> Balance | None:
     """Fits `inertia`*alpha + `gravity`*sin(q) + `viscous`*omega + `coulomb`*sign(omega) + `constant` to the effort.
 
     Args:
-        log: with the effort and a position or a velocity; gravity, and `gravity_aside`*cos(q), only with a position.
+        log: with the effort and a position, or a velocity: then from where it hangs.
         effort: `torque`, `current` or `voltage`.
         duration: of a window [s].
-        aside: whether to regress on cos(q) too.
+        aside: whether to regress on cos(q) too, by `gravity_aside`.
+        rig: what moves; gravity pulls at a pendulum, or where that is not known (None).
+        sign: 1 or -1: of the effort, with which inertia and friction are not to be negative; 0: they may be.
     """
     windows = Windows(log, duration)
-    terms = torque_terms(log, windows, aside) if len(windows) else None
+    terms = torque_terms(log, windows, aside, rig) if len(windows) else None
     if terms is None:
         return None
-    return regress(windows.mean_held(effort) if effort == "voltage" else windows.mean(effort), terms)
+    given = windows.mean_held(effort) if effort == "voltage" else windows.mean(effort)
+    return regress(sign * given, terms, 0.0) if sign else regress(given, terms)

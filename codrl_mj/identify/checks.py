@@ -12,19 +12,20 @@ _MOST_LISTED = 10
 _SAW = ("current", "torque", "velocity")  # signals that a sensor may clip or spoil; others rest where they like
 
 
-def check(log: Log, motor: Any = None) -> list[Finding]:
+def check(log: Log, motor: Any = None, rig: str | None = None) -> list[Finding]:
     """What is noteworthy about a log, errors first.
 
     Args:
         log: the log.
         motor: what its datasheet says, a `GearMotor`, to be compared with; None: nothing is known.
+        rig: what the output moves, as `identify` takes it; None: it may be a pendulum.
     """
     findings = [*log.findings, *_times(log)]
     for signal in log.signals:
         findings += _resolution(log, signal)
         if signal in _SAW:
             findings += [*_saturation(log, signal), *_outliers(log, signal)]
-    findings += [*_wrapped(log), *_beyond_supply(log), *contradictions(log, motor)]
+    findings += [*_wrapped(log), *_beyond_supply(log), *contradictions(log, motor, rig)]
     order = ("error", "warning", "info")
     return sorted(findings, key=lambda one: order.index(one.severity))
 

@@ -23,6 +23,8 @@ FACTORS = {
 }
 """What a factor between two numbers that should be equal tells."""
 _CERTAIN = 10.0  # coefficient over its standard error
+_TURNED = 2.0 / 3.0  # of the residual, that a sign must leave at most to be the right one
+_DROWNED = 0.1  # noise over the motion, beyond which speeds are not compared
 _TILTED = 0.03  # rad, by which a pendulum hangs beside position 0
 
 
@@ -35,12 +37,13 @@ def name_of_factor(ratio: float) -> str:
     return "a wrong scale, or two sides of a gear"
 
 
-def contradictions(log: Log, motor: Any = None) -> list[Finding]:
+def contradictions(log: Log, motor: Any = None, rig: str | None = None) -> list[Finding]:
     """What contradicts what.
 
     Args:
         log: the log.
         motor: what its datasheet says, a `GearMotor`; None: nothing is known.
+        rig: what moves, as `identify` takes it; None: it may be a pendulum.
     """
     found: list[Finding] = [*_degrees(log)]
     turns = moves(log)
@@ -54,7 +57,7 @@ def contradictions(log: Log, motor: Any = None) -> list[Finding]:
         found.append(Finding("info", "excitation", None, text, "leave position and velocity out if it is"))
     effort = next((name for name in ("torque", "current", "voltage") if log.has(name)), None)
     if turns and effort is not None:
-        found += [*_mechanical(log, effort), *_motion(log)]
+        found += [*_mechanical(log, effort, rig), *_motion(log)]
     if electrical is not None:
         found += [*_two_constants(log, electrical), *_datasheet(electrical, motor)]
     return found
@@ -73,7 +76,7 @@ def _degrees(log: Log) -> Iterator[Finding]:
 def _velocity(log: Log) -> Iterator[Finding]:
     """The velocity against the differentiated position."""
     found = velocity_lag(log)
-    if found is None:
+    if found is None or found.noise > _DROWNED:
         return
     if found.unexplained > 0.5:
         text = f"velocity and differentiated position have nothing in common ({found.unexplained:.0%} is left over)"
@@ -82,7 +85,9 @@ def _velocity(log: Log) -> Iterator[Finding]:
     if found.gain < 0.0:
         text = "the velocity falls where the position grows"
         yield Finding("error", "sign", None, text, "give one of them a minus: velocity=-column:unit")
-    if abs(math.log(abs(found.gain))) > 0.1:
+    # noise of the one takes from its factor, of the other it adds to it: the true one is between both regressions
+    ends = [math.log(abs(found.gain)), math.log(abs(found.gain) / (1.0 - found.unexplained**2))]
+    if min(ends) > 0.1 or max(ends) < -0.1:
         text = f"the velocity is {abs(found.gain):.4g} times what the position says: {name_of_factor(found.gain)}"
         yield Finding("error", "unit", None, text, "correct the unit of velocity, position or time")
     rows = abs(found.lag) / log.step
@@ -151,20 +156,19 @@ def _sag(log: Log, balance: Balance | None) -> Iterator[Finding]:
         yield Finding("warning", "sag", None, text, remedy)
 
 
-def _mechanical(log: Log, effort: str) -> Iterator[Finding]:
+def _mechanical(log: Log, effort: str, rig: str | None) -> Iterator[Finding]:
     """Signs of inertia and gravity; whether the motion follows from the torque."""
-    quick = torque_balance(log, effort, 0.03)  # where it shakes, shorter windows show more of the inertia
-    balance = torque_balance(log, effort) or quick
-    if balance is None:
+    # where it shakes, shorter windows show more of the inertia
+    balances = [one for seconds in (0.3, 0.03) if (one := torque_balance(log, effort, seconds, rig=rig)) is not None]
+    if not balances:
         return
-    certain = balance.certainty
-    both = [one.certainty.get("inertia", 0.0) for one in (balance, quick) if one is not None]
-    heavy, hangs = max(both, key=abs), certain.get("gravity", 0.0)
-    if heavy < -_CERTAIN or (hangs < -_CERTAIN and heavy < -3.0):
-        text = f"the {effort} accelerates the wrong way: the inertia would be negative, by {-heavy:.0f} standard errors"
+    balance, certain = balances[0], balances[0].certainty
+    heavy = max((one.certainty.get("inertia", 0.0) for one in balances), key=abs)
+    wrong = heavy < -_CERTAIN or (certain.get("gravity", 0.0) < -_CERTAIN and heavy < -3.0)
+    if wrong and (told := _told_sign(log, effort, rig)):
         remedy = f"give the {effort}, or position and velocity, a minus"
-        yield Finding("error", "sign", None, text, remedy)
-    elif log.has("position"):
+        yield Finding("error", "sign", None, f"the {effort} accelerates the wrong way: {told}", remedy)
+    elif log.has("position") and rig in (None, "pendulum"):
         yield from _zero(torque_balance(log, effort, aside=True), effort)
     large = 0.08 * float(np.std(log.signals[effort]))  # else it is what fast changes leave of rounding
     if effort == "torque" and balance.unexplained > 0.25 and balance.residual > large:
@@ -174,6 +178,20 @@ def _mechanical(log: Log, effort: str) -> Iterator[Finding]:
             text += f"; {lag.unexplained:.0%} if the motion came {1e3 * lag.lag:.3g} ms later"
         remedy = "something else moves it, or the columns are not of one time: trust this log less than others"
         yield Finding("warning", "torque", None, text, remedy)
+
+
+def _told_sign(log: Log, effort: str, rig: str | None) -> str:
+    """How much better a body with friction explains the effort with a minus; empty where it does not.
+
+    The other check, by standard errors, is fooled where friction that holds, or a controller, makes what it sees.
+    """
+    for seconds in (0.3, 0.03):
+        now, turned = (torque_balance(log, effort, seconds, rig=rig, sign=sign) for sign in (1.0, -1.0))
+        if now is None or turned is None or now.unexplained < 0.03:
+            continue  # as it is nothing is amiss
+        if turned.residual < _TURNED * now.residual:
+            return f"inertia and friction leave {now.unexplained:.0%} of it, with a minus {turned.unexplained:.2g}"
+    return ""
 
 
 def _zero(balance: Balance | None, effort: str) -> Iterator[Finding]:
@@ -202,6 +220,8 @@ def _motion(log: Log) -> Iterator[Finding]:
 
 def _two_constants(log: Log, electrical: Balance) -> Iterator[Finding]:
     """The torque constant against the back-EMF constant, which in SI are equal but for losses and star or delta."""
+    slow = voltage_balance(log, 0.1)  # the steps of an encoder take less from the speed of longer windows
+    electrical = electrical if slow is None else slow
     back_emf = electrical.values.get("back_emf_constant", 0.0)
     if not log.has("torque", "current") or electrical.certainty.get("back_emf_constant", 0.0) < _CERTAIN:
         return
