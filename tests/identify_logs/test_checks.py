@@ -122,6 +122,40 @@ def test_a_wrong_unit_is_found(name):
     assert found(UNITS[name](logged()), "unit")
 
 
+@pytest.mark.parametrize("amplitude", [6.0, 2.0])
+@pytest.mark.parametrize("signal", ["torque", "current"])
+def test_degrees_for_radians_are_an_error_by_the_encoder_and_by_gravity(amplitude, signal):
+    clean = simulate(drive_of("geared"), Excitation("slow_sine", amplitude, 4.0), Load(2e-2, gravity=0.8), {},
+                     Sampler(500.0))  # fmt: skip
+    clean = without(clean, "velocity", *{"torque", "current", "voltage"} - {signal})
+    (one,) = found(scaled(clean, position=180.0 / math.pi), "unit")
+    assert (one.severity, "gravity" in one.message, one.remedy) == ("error", True, "write position=column:deg")
+    assert found(clean, "unit") == []
+    encoder = without(logged(), "torque", "velocity")
+    (one,) = found(scaled(encoder, position=180.0 / math.pi), "unit")
+    assert (one.severity, "1/4096 of 360" in one.message) == ("error", True)
+    rounded = replaced(encoder, position=np.round(encoder.signals["position"], 2))
+    rounded = dataclasses.replace(rounded, resolution={**rounded.resolution, "position": 0.01})
+    assert [one.severity for one in found(rounded, "unit")] == ["warning"]  # decimals of a file may be of radians too
+
+
+@pytest.mark.parametrize(
+    ("make", "says", "severity"),
+    [
+        (lambda log: scaled(log, current=1000.0, voltage=3.0), "the resistance would be 0.00", "error"),
+        (lambda log: scaled(log, current=1000.0), "the current is up to ", "error"),
+        (lambda log: scaled(log, voltage=1000.0), "the voltage is up to ", "error"),
+        (lambda log: scaled(log, current=1e-5), "outside 0.005 to 1e4 ohm", "error"),
+        (lambda log: scaled(log, voltage=1 / 12.0), "is it a duty?", "warning"),
+    ],
+)
+def test_what_no_bench_has_is_found_without_a_datasheet(make, says, severity):
+    clean = without(logged(), "torque", "bus")
+    told = [one for one in found(make(clean), "unit") if says in one.message]
+    assert [one.severity for one in told] == [severity]
+    assert found(clean, "unit") == []
+
+
 @pytest.mark.matrix
 @pytest.mark.parametrize(("motor", "kind"), CLEAN)
 def test_wrong_signs_and_units_are_found_by_every_excitation(motor, kind):
@@ -131,14 +165,20 @@ def test_wrong_signs_and_units_are_found_by_every_excitation(motor, kind):
 
 
 def test_the_current_alone_needs_a_datasheet_for_its_unit():
-    log = without(scaled(logged(), current=1000.0), "torque")
+    log = without(scaled(logged(), current=100.0), "torque")
     assert found(log, "unit") == []
-    assert "thousandths" in found(log, "unit", MOTORS["small"])[0].message
+    assert "hundredths" in found(log, "unit", MOTORS["small"])[0].message
 
 
 @pytest.mark.parametrize("name", FACTORS)
 def test_factors_have_names(name):
-    assert name_of_factor(1.02 * FACTORS[name]) == name == name_of_factor(-0.98 / FACTORS[name])
+    assert name in name_of_factor(1.02 * FACTORS[name])
+    assert name in name_of_factor(-0.98 / FACTORS[name])
+
+
+def test_a_factor_that_may_be_several_things_is_said_to_be_any_of_them():
+    assert "rpm for rad/s (9.549) or kgf*cm for N*m (10.2) or a wrong scale" in name_of_factor(9.8)
+    assert "rpm" not in name_of_factor(9.43, angle=False)  # resistances have no angle
 
 
 def test_factors_without_a_name_may_be_gears():
