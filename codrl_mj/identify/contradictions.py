@@ -218,7 +218,7 @@ def _told_sign(log: Log, effort: str, rig: str | None) -> str:
         if now is None or turned is None or now.unexplained < 0.03:
             continue  # as it is nothing is amiss
         if turned.residual < _TURNED * now.residual:
-            return f"inertia and friction leave {now.unexplained:.0%} of it, with a minus {turned.unexplained:.2g}"
+            return f"inertia and friction leave {now.unexplained:.1%} of it unexplained, with a minus {turned.unexplained:.2%}"
     return ""
 
 

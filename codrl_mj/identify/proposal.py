@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from codrl_mj.identify.columns import Column
-from codrl_mj.identify.log import SIGNALS
+from codrl_mj.identify.log import SIGNALS, find_resolution
 from codrl_mj.identify.reading import Table, number, read_table
 
 _WORDS = {
@@ -94,8 +94,8 @@ def _guessed(signal: str, name: str, table: Table) -> tuple[str, str]:
     step = float(np.median(np.diff(found))) if found.size > 1 else 0.0
     if signal == "time" and step > 0.5:
         unit = "us" if step > 50.0 else "ms"
-    elif signal == "position" and largest > 40.0:
-        unit = "deg"
+    elif signal == "position" and largest > 40.0 and (grid := find_resolution(found)) > 0.0:
+        unit = "deg" if abs(360.0 / grid - round(360.0 / grid)) < 1e-3 else unit  # else it may turn on
     elif signal == "velocity" and largest > 1000.0:
         unit = "rpm"
     elif signal == "current" and largest > 200.0:

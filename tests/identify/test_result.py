@@ -132,9 +132,13 @@ def test_the_command_line_identifies_and_draws_within_the_intervals(tmp_path, ca
     columns = "time=t:s,voltage=mean(voltage):V,current=current:A,position=position:rad"
     out = tmp_path / "motor"
     known = ["--known", "torque_constant=0.05", "back_emf_constant=0.05", "rotor_inertia=2e-5"]
-    given = ["identify", log, "--columns", columns, *known, "--out", str(out)]
+    wrong = bench.motor_log("locked", duration=1.0)
+    wrong = write_csv(tmp_path / "wrong.csv", replaced(wrong, "current", -wrong.signals["current"]))
+    given = ["identify", log, "--columns", columns, *known, "--out", str(out), "--holdout", wrong]
     assert main(given) == 0
     shown = capsys.readouterr().out
+    assert "wrong, which is held out, has errors, and is left out" in shown
+    assert "supply 3 V: the largest of the logs" in shown
     assert "resistance" in shown
     assert "identified" in shown
     actuator = str(out / "actuator.yaml")

@@ -111,7 +111,7 @@ def test_a_column_that_is_not_there_is_named():
             "spare: not known",
         ),
         (
-            "t,motorCurrent,angle\n0,900,0\n2,-800,90",
+            "t,motorCurrent,angle\n0,900,0\n2,-800,90\n4,1,45",
             "time=t:ms,current=motorCurrent:mA,position=angle:deg",
             "deg is a",
         ),
