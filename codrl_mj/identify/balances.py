@@ -38,13 +38,7 @@ class Balance(NamedTuple):
 
 
 class Windows:
-    """A log cut into overlapping windows, in each of which signals are weighted by phi ~ (s - s^2)^5, s in [0, 1].
-
-    Args:
-        log: the log.
-        duration: of a window [s]; at least a dozen rows, at most a tenth of the log.
-        most: of the windows, evenly spread, that are looked at.
-    """
+    """A log cut into overlapping windows, in each of which signals are weighted by phi ~ (s - s^2)^5, s in [0, 1]."""
 
     def __init__(self, log: Log, duration: float = 0.0, most: int = 20_000) -> None:
         """Cut it."""
@@ -67,12 +61,7 @@ class Windows:
         return len(self.rows)
 
     def mean(self, signal: str | np.ndarray, order: int = 0) -> np.ndarray:
-        """The weighted mean of a signal's derivative of some order, shape (windows,).
-
-        Args:
-            signal: its name, or values of shape (n,).
-            order: 0, 1 or 2.
-        """
+        """The weighted mean of a signal's derivative of some order, shape (windows,)."""
         values = (self._log.signals[signal] if isinstance(signal, str) else signal)[self.rows]
         if order > 0:  # what is constant counts for nothing, and would only be rounded
             values = values - values.mean(axis=1, keepdims=True)
@@ -82,12 +71,7 @@ class Windows:
         return np.sum(0.5 * self._steps * (weighted[:, 1:] + weighted[:, :-1]), axis=1) / self.length[:, 0]
 
     def mean_held(self, signal: str, lag: float = 0.0) -> np.ndarray:
-        """The weighted mean of a signal that is held from a row to the next, shape (windows,).
-
-        Args:
-            signal: its name.
-            lag: how much later than its stamps it is in force [s].
-        """
+        """The weighted mean of a signal that is held from a row to the next, shape (windows,)."""
         values, time = self._log.signals[signal], self._log.time
         reach = 0 if lag == 0.0 else math.ceil(abs(lag) / self._log.step) + 1
         rows = np.arange(-reach, self.rows.shape[1] - 1 + reach) + self.rows[:, :1]
@@ -111,10 +95,7 @@ def _polynomials() -> dict[int, np.polynomial.Polynomial]:
 def regress(target: np.ndarray, terms: Mapping[str, np.ndarray], least: float = -np.inf) -> Balance | None:
     """Least squares that outliers do not move; None where there are too few windows, or terms say the same.
 
-    Args:
-        target: shape (windows,).
-        terms: each of that shape; those that are 0 throughout are left out.
-        least: of the coefficients of `BODY`.
+    Inertia and friction (`BODY`) get coefficients of at least `least`; terms that are 0 throughout are left out.
     """
     from scipy.optimize import lsq_linear
 
@@ -170,10 +151,7 @@ def voltage_terms(log: Log, windows: Windows, sag: bool = False) -> dict[str, np
 def voltage_balance(log: Log, duration: float = 0.0, sag: bool = False) -> Balance | None:
     """Fits `resistance`*i + `inductance`*di/dt + `back_emf_constant`*omega, of the output, to the voltage; all SI.
 
-    Args:
-        log: with voltage and current; without a motion the shaft counts as locked.
-        duration: of a window [s].
-        sag: whether to regress on (u/max u)^2*i too, which a supply takes whose resistance is `supply_resistance`.
+    Without a motion the shaft counts as locked. `sag`: on (u/max u)^2*i too, which a `supply_resistance` takes.
     """
     windows = Windows(log, duration)
     return regress(windows.mean_held("voltage"), voltage_terms(log, windows, sag)) if len(windows) else None
@@ -209,13 +187,8 @@ def torque_balance(
 ) -> Balance | None:
     """Fits `inertia`*alpha + `gravity`*sin(q) + `viscous`*omega + `coulomb`*sign(omega) + `constant` to the effort.
 
-    Args:
-        log: with the effort and a position, or a velocity: then from where it hangs.
-        effort: `torque`, `current` or `voltage`.
-        duration: of a window [s].
-        aside: whether to regress on cos(q) too, by `gravity_aside`.
-        rig: what moves; gravity pulls at a pendulum, or where that is not known (None).
-        sign: 1 or -1: of the effort, with which inertia and friction are not to be negative; 0: they may be.
+    A velocity alone counts from where the pendulum hangs; a `rig` without gravity has no term of it. A `sign` is that
+    of the effort, with which inertia and friction must not be negative; 0: they may be. Windows have a `duration` [s].
     """
     windows = Windows(log, duration)
     terms = torque_terms(log, windows, aside, rig) if len(windows) else None

@@ -32,12 +32,7 @@ _TILTED = 0.03  # rad, by which a pendulum hangs beside position 0
 
 
 def name_of_factor(ratio: float, angle: bool = True) -> str:
-    """What a ratio, or its inverse, could be: all confusions within 8 %, else a scale or a gear.
-
-    Args:
-        ratio: of two numbers that should be equal.
-        angle: whether angles are in them.
-    """
+    """What a ratio, or its inverse, could be: all confusions within 8 %, else a scale or a gear."""
     size = abs(math.log(abs(ratio)))
     near = [
         f"{name} ({factor:.4g})"
@@ -48,13 +43,7 @@ def name_of_factor(ratio: float, angle: bool = True) -> str:
 
 
 def contradictions(log: Log, motor: Any = None, rig: str | None = None) -> list[Finding]:
-    """What contradicts what.
-
-    Args:
-        log: the log.
-        motor: what its datasheet says, a `GearMotor`; None: nothing is known.
-        rig: what moves, as `identify` takes it; None: it may be a pendulum.
-    """
+    """What contradicts what."""
     turns = moves(log)
     effort = next((name for name in ("torque", "current", "voltage") if log.has(name)), None)
     found: list[Finding] = [*_degrees(log, effort if turns else None, rig)]
@@ -218,7 +207,8 @@ def _told_sign(log: Log, effort: str, rig: str | None) -> str:
         if now is None or turned is None or now.unexplained < 0.03:
             continue  # as it is nothing is amiss
         if turned.residual < _TURNED * now.residual:
-            return f"inertia and friction leave {now.unexplained:.1%} of it unexplained, with a minus {turned.unexplained:.2%}"
+            shares = f"{now.unexplained:.1%} of it unexplained, with a minus {turned.unexplained:.2%}"
+            return f"inertia and friction leave {shares}"
     return ""
 
 

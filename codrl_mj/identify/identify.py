@@ -105,7 +105,8 @@ def identify(
         stage = Shaft(rig, "coulomb", driven_by, known, tuple(estimated), segment, _output(moving) or "")
         stage = chosen_friction(stage, moving, friction, step("friction"))
         shaft = fitted(stage, moving, step("shaft"))
-    estimates, warnings, unlike = [], [], {}
+    estimates, warnings = [], []
+    unlike: dict[str, float] = {}
     if winding is not None:
         if shaft is not None and driven_by != "voltage":
             winding = winding.refitted(Winding(given, shaft))
@@ -193,8 +194,8 @@ def checked(
         )
     if rig is None and "mgl" not in known and _driven_by(logs) is not None:
         raise ValueError(
-            "rig is not given (--rig on the command line): what the output moves decides what is fitted, must be one "
-            "of pendulum, free (nothing but inertia) and load; such as --rig pendulum, in Python rig='pendulum'"
+            "rig is not given (--rig on the command line, rig= in Python): what the output moves decides what is "
+            "fitted, must be pendulum, free or load; a motor on its own is free, with load_inertia=0 known"
         )
     return dict(known)
 

@@ -105,7 +105,7 @@ def test_the_supply_is_that_of_the_logs_and_is_said(tmp_path):
 
 def test_a_rig_that_is_not_said_and_what_will_be_missing_are_told_before_the_fit():
     log = bench.motor_log("sine", duration=0.5)
-    with pytest.raises(ValueError, match=r"--rig on the command line.*rig='pendulum'"):
+    with pytest.raises(ValueError, match=r"--rig on the command line, rig= in Python.*pendulum, free or load"):
         checked([log])
     assert "rotor_inertia" in foreseen([log], {}, None)
     assert "0 for a motor alone" in foreseen([log], {}, None)

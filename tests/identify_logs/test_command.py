@@ -60,8 +60,8 @@ def test_columns_are_proposed_with_the_line_to_type_next(capsys):
     assert line.endswith("--rig free --known load_inertia=0 --out motor")
     said(capsys, f"check {line.partition(' --rig')[0]} --rig free")
     columns = json.loads(said(capsys, "columns log.csv --json"))["columns"]
-    assert columns.startswith("time=time:s,voltage=voltage:V")
-    assert "rig is not given (--rig on the command line)" in said(capsys, f"log.csv --columns {columns}", 2)
+    assert columns.startswith("time=time:s,current=current:A")
+    assert "rig is not given (--rig on the command line" in said(capsys, f"log.csv --columns {columns}", 2)
 
 
 def test_a_plan_is_printed_and_its_excitation_written(capsys, tmp_path):
