@@ -1,5 +1,7 @@
 """A mapping of columns to signals, guessed from names, units and values: a person is to read it before it is used."""
 
+import json
+import keyword
 import re
 from pathlib import Path
 from typing import NamedTuple
@@ -58,7 +60,9 @@ def propose_columns(path: Path | str) -> Proposal:
         if unit is None:
             unit, doubt = _guessed(signal, name, table)
             doubts.append(f"{name}: {doubt}")
-        entries[signal] = f"{name if name.isidentifier() else repr(name)}:{unit}"
+        entries[signal] = (
+            f"{name if name.isidentifier() and not keyword.iskeyword(name) else json.dumps(name, ensure_ascii=False)}:{unit}"
+        )
     if "voltage" not in entries and {"duty", "bus"} <= entries.keys():
         duty, bus = (entries[one].rpartition(":")[0] for one in ("duty", "bus"))
         part = "/100" if entries["duty"].endswith("percent") else ""

@@ -103,7 +103,10 @@ class Identified:
     def problem(self) -> str | None:
         """What stands against an actuator of these numbers, with a remedy; None: nothing."""
         bad = [one for one in self.estimates if one.name in OF_MOTOR and one.status not in USABLE]
-        told = "; ".join(f"{one.name} is {one.status}: {one.why}" for one in bad)
+        alike: dict[str, list[str]] = {}
+        for one in bad:
+            alike.setdefault(f"{one.status}: {one.why}", []).append(one.name)
+        told = "; ".join(f"{', '.join(s)} {'is' if len(s) == 1 else 'are'} {why}" for why, s in alike.items())
         if bad and self.unexplained > MISUNDERSTOOD:
             return (
                 f"the fit leaves {self.unexplained:.0%} of what moves in a log unexplained, so that numbers mean "

@@ -101,7 +101,7 @@ def test_a_column_that_is_not_there_is_named():
     [
         (
             "t [s],u [V],current(mA),pos_deg\n0,1,2,3\n1,2,3,4",
-            "time='t [s]':s,voltage='u [V]':V,current='current(mA)':mA,position=pos_deg:deg",
+            'time="t [s]":s,voltage="u [V]":V,current="current(mA)":mA,position=pos_deg:deg',
             None,
         ),
         ("time;speed;current\nms;rpm;A\n0;1;2,5\n1;2;3,5", "time=time:ms,velocity=speed:rpm,current=current:A", None),
