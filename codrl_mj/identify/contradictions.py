@@ -27,7 +27,7 @@ _RESISTANCES = 5e-3, 1e4
 """Of motors on a bench [ohm]: at 5 V the least would draw 1 kA; micromotors have some hundreds."""
 _CERTAIN = 10.0  # coefficient over its standard error
 _TURNED = 2.0 / 3.0  # of the residual, that a sign must leave at most to be the right one
-_DROWNED = 0.1  # noise over the motion, beyond which speeds are not compared
+_DROWNED = 0.1  # noise over the motion, beyond which no error of speeds is claimed
 _TILTED = 0.03  # rad, by which a pendulum hangs beside position 0
 
 
@@ -89,18 +89,20 @@ def _degrees(log: Log, effort: str | None, rig: str | None) -> Iterator[Finding]
 def _velocity(log: Log) -> Iterator[Finding]:
     """The velocity against the differentiated position."""
     found = velocity_lag(log)
-    if found is None or found.noise > _DROWNED:
+    if found is None:
         return
+    clear = found.noise < _DROWNED
     if found.unexplained > 0.5:
         text = f"velocity and differentiated position have nothing in common ({found.unexplained:.0%} is left over)"
-        yield Finding("error", "velocity", None, text, "check both columns; leave the velocity out")
+        if clear:
+            yield Finding("error", "velocity", None, text, "check both columns; leave the velocity out")
         return
-    if found.gain < 0.0:
+    if clear and found.gain < 0.0:
         text = "the velocity falls where the position grows"
         yield Finding("error", "sign", None, text, "give one of them a minus: velocity=-column:unit")
     # noise of the one takes from its factor, of the other it adds to it: the true one is between both regressions
     ends = [math.log(abs(found.gain)), math.log(abs(found.gain) / (1.0 - found.unexplained**2))]
-    if min(ends) > 0.1 or max(ends) < -0.1:
+    if clear and (min(ends) > 0.1 or max(ends) < -0.1):
         text = f"the velocity is {abs(found.gain):.4g} times what the position says: {name_of_factor(found.gain)}"
         yield Finding("error", "unit", None, text, "correct the unit of velocity, position or time")
     rows = abs(found.lag) / log.step

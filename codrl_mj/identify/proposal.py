@@ -13,6 +13,7 @@ from codrl_mj.identify.log import SIGNALS, find_resolution
 from codrl_mj.identify.reading import Table, number, read_table
 
 _WORDS = {
+    "only": "enable enabled armed",
     "time": "t time timestamp stamp zeit",
     "command": "goal target command setpoint reference ref cmd desired",
     "temperature": "temp temperature",
@@ -60,9 +61,8 @@ def propose_columns(path: Path | str) -> Proposal:
         if unit is None:
             unit, doubt = _guessed(signal, name, table)
             doubts.append(f"{name}: {doubt}")
-        entries[signal] = (
-            f"{name if name.isidentifier() and not keyword.iskeyword(name) else json.dumps(name, ensure_ascii=False)}:{unit}"
-        )
+        plain = name.isidentifier() and not keyword.iskeyword(name)
+        entries[signal] = f"{name if plain else json.dumps(name, ensure_ascii=False)}:{unit}"
     if "voltage" not in entries and {"duty", "bus"} <= entries.keys():
         duty, bus = (entries[one].rpartition(":")[0] for one in ("duty", "bus"))
         part = "/100" if entries["duty"].endswith("percent") else ""
