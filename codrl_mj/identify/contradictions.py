@@ -69,7 +69,7 @@ def _degrees(log: Log, effort: str | None, rig: str | None) -> Iterator[Finding]
     remedy = "write position=column:deg"
     if effort is not None and rig in (None, "pendulum"):
         turned = replaced(log, "position", np.deg2rad(log.signals["position"]))
-        now, then = (torque_balance(one, effort) for one in (log, turned))
+        now, then = (torque_balance(one, effort, aside=True) for one in (log, turned))
         pulls = then is not None and then.certainty.get("gravity", 0.0) > _CERTAIN
         if now and then and pulls and then.residual < 0.5 * now.residual and now.unexplained > 0.1:
             text = f"gravity pulls as if the position were in degrees: so {then.unexplained:.0%} of the {effort} are "
@@ -182,7 +182,8 @@ def _mechanical(log: Log, effort: str, rig: str | None) -> Iterator[Finding]:
     if not balances:
         return
     balance, certain = balances[0], balances[0].certainty
-    heavy = max((one.certainty.get("inertia", 0.0) for one in balances), key=abs)
+    both = [one.certainty.get("inertia", 0.0) for one in balances]
+    heavy = max(both, key=abs) if max(both) < 3.0 else 0.0
     wrong = heavy < -_CERTAIN or (certain.get("gravity", 0.0) < -_CERTAIN and heavy < -3.0)
     if wrong and (told := _told_sign(log, effort, rig)):
         remedy = f"give the {effort}, or position and velocity, a minus"
