@@ -8,9 +8,13 @@ import pytest
 import tyro
 
 from codrl_mj import Actuator, CurrentLoop, Motor, named_actuator
-from codrl_mj.actuators import mapping_of
+from codrl_mj.actuators import actuator_over, mapping_of, resolve
 from codrl_mj.cli.runs import Runs
+from codrl_mj.foreign.config import ForeignConfig
+from codrl_mj.pages import report
 from codrl_mj.runs.summaries import SORT_KEYS, compare, find_runs, read_run, sort_runs
+from codrl_mj.training.config import TrainConfig
+from codrl_mj.training.folder import load_config, start_folder
 
 PROGRESS = "steps,episodes,mean_return,steps_per_second,seconds\n"
 UNITS = {"returns": "reward", "tracking_rms": "N*m", "peak_voltage": "V"}
@@ -92,7 +96,24 @@ def test_the_actuator_has_its_name_on_the_task(tmp_path, actuator, task, name):
     assert read_run(make_run(tmp_path / "mine", actuator, task=task)).actuator == name
 
 
-@pytest.mark.parametrize("actuator", [{"motor": {"colour": 3}}, 7, ["weaker"]])
+def test_motors_keep_their_names(tmp_path):
+    """Known by their numbers where they are the catalogue's, whatever their gear; others by what the run was told."""
+    geared = actuator_over(resolve("kraken-x60", None, "nobody"), {"motor": {"gear_ratio": 70.3}})
+    own = actuator_over(geared, {"motor": {"resistance": 0.5}})
+    assert read_run(make_run(tmp_path / "one", geared)).actuator == "kraken-x60"
+    assert read_run(make_run(tmp_path / "two", own)).actuator == "drive"
+    (tmp_path / "three").mkdir()
+    patterns = {"a": "kraken-x60", "b": {"label": "drawer", **own.as_mapping()}, "c": None}
+    config = TrainConfig(ForeignConfig("HalfCheetah-v5", patterns))
+    start_folder(tmp_path / "three", config)
+    assert read_run(tmp_path / "three").actuator == "kraken-x60, drawer, ideal"
+    assert load_config(tmp_path / "three").env.through == config.env.through == "kraken-x60, drawer, ideal"
+    sentence = " ".join(report._sentence(read_run(tmp_path / "three")).split())
+    assert "SAC on HalfCheetah-v5 through the actuators kraken-x60, drawer, ideal" in sentence.replace("PPO", "SAC")
+    assert "labels" not in str(config.as_mapping()) + str(read_run(tmp_path / "three").configuration)
+
+
+@pytest.mark.parametrize("actuator", [{"motor": {"colour": 3}}, 7, [["weaker"]]])
 def test_an_actuator_that_cannot_be_read_is_custom(tmp_path, actuator):
     folder = make_run(tmp_path / "mine")
     content = json.loads((folder / "config.json").read_text())

@@ -6,9 +6,9 @@ from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.cli.environments import environment, through
+from codrl_mj.cli.environments import environment
 from codrl_mj.cli.fields import AS_TRAINED, ActuatorName
-from codrl_mj.cli.subject import Source
+from codrl_mj.cli.subject import Source, title_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Evaluate:
                 not self.stochastic,
                 on_step=lambda _, ended: bar.update(row, completed=ended),
             )
-        print_evaluations({f"{self.policy.name} on {through(self.actuators, self.actuator_name)}": evaluation})
+        print_evaluations({title_of(self.policy, env): evaluation})
         if self.out is not None:
             from codrl_mj.runs.files import write_json
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from codrl_mj.actuators import trusting
+from codrl_mj.actuators import label_of, labelled, trusting
 from codrl_mj.runs.files import leftovers, read_json, sealed, write_json
 from codrl_mj.runs.layout import CONFIG, EVALUATION, POLICY_FILES, PROGRESS, RESULT
 from codrl_mj.training.config import TrainConfig
@@ -44,7 +44,10 @@ def load_config(run: Path, trust: bool = False) -> TrainConfig:
     content = read_json(run / CONFIG, "run configuration")
     try:
         with trusting(trust):
-            return TrainConfig.from_mapping(content["train"], whole=True)
+            config = TrainConfig.from_mapping(content["train"], whole=True)
+        for actuator, label in zip(config.actuators, content.get("labels", ()), strict=False):
+            labelled(actuator, label)
+        return config
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{run / CONFIG}: not a run configuration: {error}") from None
 
@@ -67,7 +70,9 @@ def _leftovers(place: Path) -> list[Path]:
 
 def start_folder(run: Path, config: TrainConfig) -> None:
     """Write what the run is, before anything else is in the folder."""
-    write_json(run / CONFIG, sealed({"train": config.as_mapping(), **provenance(config)}))
+    labels = [label_of(one) for one in config.actuators]
+    known = {"labels": labels} if any(labels) else {}
+    write_json(run / CONFIG, sealed({"train": config.as_mapping(), **provenance(config), **known}))
 
 
 def check_same(run: Path, config: TrainConfig, accept_changes: bool) -> None:
