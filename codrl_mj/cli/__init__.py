@@ -103,7 +103,7 @@ def _run(arguments: list[str]) -> int:
 
 @contextlib.contextmanager
 def _engine_warnings() -> Iterator[None]:
-    """Show MuJoCo's warnings as ours, each kind once: it would write MUJOCO_LOG.TXT, unless somebody's handler is there.
+    """Show MuJoCo's warnings as ours, each kind once, for it would write MUJOCO_LOG.TXT; not if somebody else has them.
 
     That a simulation diverged is left out, which ends in an error.
     """

@@ -139,7 +139,9 @@ class Simulated:
         if kind == mujoco.mjtWarning.mjWARN_BADCTRL:
             what = f"control {place}"
         else:
-            joint = np.searchsorted(model.jnt_qposadr, place, "right") - 1 if kind == _POSITION else model.dof_jntid[place]
+            joint = (
+                np.searchsorted(model.jnt_qposadr, place, "right") - 1 if kind == _POSITION else model.dof_jntid[place]
+            )
             of = {_POSITION: "position", _POSITION + 1: "speed"}.get(kind, "acceleration")
             what = f"the {of} of {model.joint(joint).name or f'joint {joint}'}"
         raise diverged(who, time, f"{what} is no number, or too large", f"the model's {model.opt.timestep:g} s")
