@@ -1,6 +1,7 @@
 """Run folders: what is read from them, whatever is missing or damaged, and how they are compared."""
 
 import datetime
+import hashlib
 import json
 import os
 
@@ -33,10 +34,15 @@ def make_run(folder, actuator="weaker", *, seed=3, task="cartpole", finished=Tru
         "env": {"center_radius": None, "disturbances": {"command_delay": 0.0}},
     } | train
     (folder / "config.json").write_text(json.dumps({"train": config, "versions": {"torch": "2.13.0"}}))
-    (folder / "progress.csv").write_text(f"{PROGRESS}1000,9,20.5,500,2.5\n2000,12,90.25,500,4.5\n")
+    (folder / "progress.csv").write_text(
+        f"{PROGRESS}1000,9,20.5,500,2.5\n{4096 if finished else 2000},12,90.25,500,4.5\n"
+    )
     if finished:
-        (folder / "policy.json").write_text("{}")
-        (folder / "policy.safetensors").write_bytes(b"")
+        for place in (folder, folder / "best"):
+            place.mkdir(exist_ok=True)
+            (place / "policy.safetensors").write_bytes(b"weights")
+            digest = hashlib.sha256(b"weights").hexdigest()
+            (place / "policy.json").write_text(json.dumps({"weights_sha256": digest}))
         (folder / "result.json").write_text(json.dumps({"steps": 4096, "mean_return": 91.0, "seconds": 8.25}))
     if evaluated:
         returns = {"mean": 400.0 + seed, "low": 380.0, "high": 420.0}
@@ -136,6 +142,14 @@ def test_an_actuator_that_cannot_be_read_is_custom(tmp_path, actuator):
         ("progress.csv", b"\xff\xfe\x00", "progress.csv"),
         ("progress.csv", b"a,b\n1,2\n", "progress.csv has no column 'steps'"),
         ("policy.safetensors", None, "policy.safetensors is missing"),
+        (
+            "policy.safetensors",
+            b"exchanged",
+            "policy.safetensors is truncated or damaged, or it and policy.json do not",
+        ),
+        ("policy.json", b'{"format"', "policy.json is not a policy description: it is truncated"),
+        ("best/policy.safetensors", b"weig", "best/policy.safetensors is truncated or damaged"),
+        ("progress.csv", PROGRESS.encode() + b"1000,9,20.5,500,2.5\n", "progress.csv ends at step 1000 of 4096"),
     ],
 )
 def test_a_damaged_run_is_listed_with_what_is_wrong_among_the_others(tmp_path, file, content, problem):
@@ -170,7 +184,7 @@ def test_a_configuration_with_little_in_it_is_no_damage(tmp_path, content):
 def test_runs_are_found_at_any_depth_but_not_in_each_other_nor_in_hidden_folders(tmp_path):
     make_run(tmp_path / "b")
     make_run(tmp_path / "deep" / "er" / "a")
-    make_run(tmp_path / "b" / "best")
+    make_run(tmp_path / "b" / "inner")
     make_run(tmp_path / ".being-written")
     (tmp_path / "empty").mkdir()
     assert [run.name for run in find_runs(tmp_path)] == ["b", "deep/er/a"]

@@ -13,8 +13,19 @@ from typing import Any, Literal
 
 from codrl_mj.actuators import actuator_from_mapping, name_of, trusting
 from codrl_mj.envs.config import upgraded
-from codrl_mj.runs.files import read_json
-from codrl_mj.runs.layout import CONFIG, EVALUATION, POLICY_FILES, PROGRESS, RESULT, finished
+from codrl_mj.runs.files import check_digest, read_json
+from codrl_mj.runs.layout import (
+    BEST,
+    CONFIG,
+    DESCRIPTION,
+    DIGEST,
+    EVALUATION,
+    POLICY_FILES,
+    PROGRESS,
+    RESULT,
+    WEIGHTS,
+    finished,
+)
 from codrl_mj.tasks import TASKS
 
 
@@ -118,7 +129,12 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
     missing = [file for file in POLICY_FILES if not (path / file).is_file()]
     done = finished(path)
     if done and missing:
-        problems.append(f"it is finished, but {' and '.join(missing)} is missing")
+        problems.append(f"it is finished, but {' and '.join(missing)} is missing: copy the folder anew")
+    for folder in (path, path / BEST):
+        _check_policy(folder, problems)
+    reported, learned = _first(progress, None, "steps"), _first(result, None, "steps")
+    if None not in (reported, learned) and reported != learned:
+        problems.append(f"{path / PROGRESS} ends at step {reported:.0f} of {learned:.0f}: copy it anew")
     agent = config.get("agent")
     task = env["task"] if isinstance(env.get("task"), str) else None
     steps = _first(result, progress, "steps")
@@ -144,6 +160,16 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
             _flat({**config, **{key: one for key, one in (content or {}).items() if key not in ("train", "labels")}})
         ),
     )
+
+
+def _check_policy(folder: Path, problems: list[str]) -> None:
+    """Note if a folder's policy, where there is one, is damaged or not the one that it says."""
+    described = _mapping(folder / DESCRIPTION, "policy description", problems)
+    try:
+        if described is not None and (folder / WEIGHTS).is_file():
+            check_digest(folder / WEIGHTS, (folder / WEIGHTS).read_bytes(), described.get(DIGEST), DESCRIPTION)
+    except (ValueError, OSError) as error:
+        problems.append(str(error))
 
 
 def _mapping(path: Path, what: str, problems: list[str]) -> Mapping[str, Any] | None:

@@ -15,11 +15,11 @@ from typing import Any
 
 from codrl_mj.actuators import label_of, labelled, trusting
 from codrl_mj.runs.files import check_writable, leftovers, read_json, sealed, write_json
-from codrl_mj.runs.layout import CONFIG, EVALUATION, POLICY_FILES, PROGRESS, RESULT, finished
+from codrl_mj.runs.layout import BEST, CONFIG, EVALUATION, POLICY_FILES, PROGRESS, RESULT, finished
 from codrl_mj.training.config import TrainConfig
 
 EPISODES, CURVE = "episodes.csv", "learning_curve.png"
-CHECKPOINTS, BEST, TENSORBOARD, LOCK = "checkpoints", "best", "tensorboard", ".lock"
+CHECKPOINTS, TENSORBOARD, LOCK = "checkpoints", "tensorboard", ".lock"
 
 CHECKPOINT = re.compile(r"step-(?P<step>\d{12})-(?P<digest>[0-9a-f]{16})\.safetensors")
 """Names of checkpoints."""
