@@ -1,13 +1,16 @@
 """The command line: parses, calls the package, prints. Nothing imports it."""
 
+import contextlib
 import functools
 import os
+import re
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import gymnasium
+import mujoco
 import tyro
 
 from codrl_mj.cli.advise import Advise
@@ -64,7 +67,7 @@ def main(arguments: list[str] | None = None) -> int:
             reads on, 143 after SIGTERM.
     """
     given = sys.argv[1:] if arguments is None else arguments
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), _engine_warnings():
         warnings.showwarning = _show_warning
         return _run(given)
 
@@ -96,6 +99,28 @@ def _run(arguments: list[str]) -> int:
         return 128 + stopped.signal_number
     except KeyboardInterrupt:
         return 130
+
+
+@contextlib.contextmanager
+def _engine_warnings() -> Iterator[None]:
+    """Show MuJoCo's warnings as ours, each kind once, for it would write MUJOCO_LOG.TXT; not if somebody else has them.
+
+    That a simulation diverged is left out, which ends in an error.
+    """
+    shown = {"Nan, Inf or huge value in "}
+
+    def show(text: str) -> None:
+        if not any(text.startswith(kind) for kind in shown):
+            shown.add(re.split(r"\d", text)[0])
+            _show_warning(f"MuJoCo: {text}")
+
+    if mujoco.get_mju_user_warning() is None:
+        mujoco.set_mju_user_warning(show)
+    try:
+        yield
+    finally:
+        if mujoco.get_mju_user_warning() is show:
+            mujoco.set_mju_user_warning(None)
 
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:

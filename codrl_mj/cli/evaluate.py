@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.cli.environments import environment, through
+from codrl_mj.cli.environments import environment
 from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, with_environment
 from codrl_mj.cli.subject import Source
 
@@ -53,7 +53,7 @@ class Evaluate:
             subject = verb.source.load(path)
             env = environment(verb, subject.env.task, verb.actuator_name, subject.env)
             subject.check_interface(env)
-            to_do[f"{name} on {through(verb.actuators, verb.actuator_name)}"] = subject.policy, env
+            to_do[f"{name} on {env.through}"] = subject.policy, env
         with progress_bar("{task.completed}/{task.total} episodes") as bar:
             for name, (policy, env) in to_do.items():
                 row = bar.add_task("evaluating" if len(to_do) == 1 else name, total=self.episodes)

@@ -47,7 +47,7 @@ class Render:
 
         policy, env = policy_and_environment(self)
         episode, frames = record(policy, env, self.seed, self.width, self.height, self.camera, self.pretty)
-        title = f"{title_of(self)}: return {episode.total:.0f}"
+        title = f"{title_of(self.subject, env)}: return {episode.total:.0f}"
         if episode.motors:
             title += f"; {episode.motors[self._motor(episode)]}"
         panel = Panel(title, env.task, episode.actuator, episode, self._motor(episode), frames)

@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from codrl_mj.cli.environments import default_actuator, environment, through
-from codrl_mj.cli.fields import AS_TRAINED, is_task
+from codrl_mj.cli.environments import environment
+from codrl_mj.cli.fields import is_task
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.foreign.config import ForeignConfig, environment_from
 
@@ -129,9 +129,6 @@ def policy_and_environment(verb: Any) -> tuple[Any, EnvConfig | ForeignConfig]:
     return loaded.policy, env
 
 
-def title_of(verb: Any) -> str:
+def title_of(policy: Path | str, env: EnvConfig | ForeignConfig) -> str:
     """What acts, and what its episode runs on."""
-    name = verb.actuator_name
-    if name == AS_TRAINED and is_task(verb.subject):
-        name = default_actuator(verb.subject)
-    return f"{Path(verb.subject).name} on {through(verb.actuators, name)}"
+    return f"{Path(policy).name} on {env.through}"

@@ -22,7 +22,7 @@ from codrl_mj.foreign.config import ForeignConfig, environment_from
 from codrl_mj.runs.layout import finished
 from codrl_mj.tasks import TASKS
 from codrl_mj.training.config import TrainConfig, default_agent, read_config
-from codrl_mj.training.folder import load_config
+from codrl_mj.training.folder import admit, load_config
 
 _OWN_FLAGS = ("agent", "env")  # of the configuration: not made from its fields' types
 
@@ -141,6 +141,7 @@ class Train:
             return 0
         name = "-".join(re.sub(r"[^\w.]+", "_", part) for part in parts)
         out = self.resume or self.out or Path("runs") / name
+        admit(out, config, self.resume is not None, self.accept_changes)
         if isinstance(config.env, ForeignConfig):
             config.env.make().close()  # what is wrong with it is said before there is a bar
         driven = config.env.actuator if isinstance(config.env.actuator, tuple) else (config.env.actuator,)

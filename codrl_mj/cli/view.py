@@ -47,7 +47,7 @@ class View:
         if self.native:
             run(session)
             return 0
-        shown = browser(session, self.port, title_of(self), field_docs)
+        shown = browser(session, self.port, title_of(self.subject, env), field_docs)
         print(f"{shown.url} (on this machine alone; Ctrl-C ends it)", flush=True)
         try:
             shown.run()

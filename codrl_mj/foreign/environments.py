@@ -277,9 +277,12 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
 
         Raises:
             ValueError: the action has not the shape of the action space.
+            SimulationDivergedError: the simulation left the finite numbers.
         """
+        time = self._data.time
         with contextlib.nullcontext() if self._recorder is None else self._recorder.watching():
             observation, reward, terminated, truncated, info = self.env.step(self._simulated.controls(action))
+        self._simulated.check_finite(self._motorised_id, time)
         seen = readings(self._simulated.readout, self._data)
         return self._observed(observation), reward, terminated, truncated, info | seen
 

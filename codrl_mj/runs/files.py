@@ -101,6 +101,20 @@ def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
     return {_SEAL: hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest(), **plain}
 
 
+def check_digest(path: Path, content: bytes, expected: Any, beside: str) -> None:
+    """Refuse a file's content that has not the SHA-256 which the file `beside` it names; any where that is None.
+
+    Raises:
+        ValueError: it has another; what may have happened, and the remedy.
+    """
+    if expected is not None and hashlib.sha256(content).hexdigest() != expected:
+        raise ValueError(
+            f"{path} is truncated or damaged, or it and {beside} do not belong together: its sha256 is not the one "
+            "there. Copy both files anew from where they came; a training that was killed mends its own when it is "
+            "resumed"
+        )
+
+
 def read_json(path: Path, what: str) -> Any:
     """Read JSON; of what is `sealed`, the content alone.
 

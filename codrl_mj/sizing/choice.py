@@ -4,11 +4,12 @@ import dataclasses
 import math
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from codrl_mj.actuators import Drive, mapping_of
+from codrl_mj.actuators import Drive, labelled, named_mapping
 from codrl_mj.catalogue import motor_names
 from codrl_mj.motor_design.drives import find_drive, find_entry, most_power
 from codrl_mj.sizing.bounds import SURELY, VERDICTS, Feasibility, feasibility, margin
@@ -73,10 +74,11 @@ def actuators_of(choices: Mapping[str, tuple[Choice, Demand]]) -> dict[str, Any]
         choices: name of a motor of the model -> what was chosen for it, and for what; of a single one the name may be
             empty.
     """
-    return {
-        re.escape(name) if name else ".*": mapping_of(choice.behind(demand.model_gear))
-        for name, (choice, demand) in choices.items()
-    }
+    found = {}
+    for name, (choice, demand) in choices.items():
+        drive = labelled(choice.behind(demand.model_gear), Path(choice.name).stem)
+        found[re.escape(name) if name else ".*"] = named_mapping(drive)
+    return found
 
 
 def catalogued(name: str, gear_ratio: float | None = None, voltage: float | None = None) -> Catalogued:

@@ -1,9 +1,10 @@
 """Watches a model learn: records, reports, evaluates, writes checkpoints, and stops it."""
 
+import contextlib
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from codrl_mj.training.state import State, capture, restore
 
 REPORT_INTERVAL = 1000
 """Environment steps between two reports; the next end of a rollout counts."""
+_RATES = ("learning_rate", "critic_learning_rate", "step_size")
 _REMEMBERED = ("marks", "squares", "samples", "best")
 
 
@@ -125,6 +127,37 @@ class Watcher(BaseCallback):
         steps = self._config.total_steps
         return self._episodes_done or (steps is not None and self.model.num_timesteps >= steps)
 
+    @contextlib.contextmanager
+    def explaining(self) -> Iterator[None]:
+        """Say why the block could not go on: of a full disk and its like, and of weights that are no numbers.
+
+        Raises:
+            OSError: what could not be written, with what there is to go on from.
+        """
+        try:
+            yield
+        except OSError as error:
+            raise OSError(f"training in {self._out} was broken off: {error}. {folder.standing(self._out)}") from error
+        except Exception:
+            self._check_weights()
+            raise
+
+    def _check_weights(self) -> None:
+        """Raise if a weight is no finite number, before that is kept.
+
+        Raises:
+            FloatingPointError: as it says, with what makes it likely.
+        """
+        model = getattr(self, "model", None)  # not before learning begins
+        if model is None or all(tensor.isfinite().all() for tensor in model.policy.state_dict().values()):
+            return
+        agent = self._config.agent.as_mapping()
+        rates = [f"agent.{name} = {agent[name]:g}" for name in _RATES if agent.get(name)]
+        raise FloatingPointError(
+            f"the weights of {agent['name']} became no finite numbers by step {self.model.num_timesteps:,}: learning "
+            f"diverged. Lower {' or '.join(rates)}, or scale the rewards down"
+        )
+
     # -- between two rollouts -----------------------------------------------------------------------------
 
     def boundary(self, stopping: bool = False, last: bool = False) -> None:
@@ -136,12 +169,16 @@ class Watcher(BaseCallback):
         """
         if self.model.num_timesteps == 0:
             return
-        evaluated = self._due("evaluation", self._config.evaluation_interval) or last
-        if evaluated:
+        evaluation = self._due("evaluation", self._config.evaluation_interval) or last
+        report = self._due("report", REPORT_INTERVAL) or evaluation
+        checkpoint = self._due("checkpoint", self._config.checkpoint_interval) or last or stopping
+        if report or checkpoint:
+            self._check_weights()
+        if evaluation:
             self._evaluate()
-        if self._due("report", REPORT_INTERVAL) or evaluated:
-            self._report(evaluated)
-        if self._due("checkpoint", self._config.checkpoint_interval) or last or stopping:
+        if report:
+            self._report(evaluation)
+        if checkpoint:
             self._save()
 
     def _due(self, what: str, interval: int) -> bool:

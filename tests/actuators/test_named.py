@@ -23,7 +23,11 @@ from codrl_mj.actuators import (
     actuator_over,
     check_same_family,
     find_family,
+    label_of,
+    labelled,
     mapping_of,
+    name_of,
+    named_mapping,
     resolve,
 )
 from codrl_mj.fields import real
@@ -249,6 +253,81 @@ def test_a_mapping_that_its_family_cannot_read_is_refused(mapping, message):
 def test_a_place_where_there_is_no_family_is_refused(place, message):
     with pytest.raises(ValueError, match=message):
         find_family(place)
+
+
+# -- what an actuator is called -------------------------------------------------------------------------------
+
+
+def drawer_motor(folder, **changes):
+    """A motor's file of one's own: a copy of one of the catalogue, and what is changed in it."""
+    from codrl_mj.tasks.assets import asset_folder
+
+    text = (asset_folder() / "motors" / "maxon-re65.toml").read_text()
+    for old, new in changes.items():
+        text = re.sub(rf"^{old} = .*$", f'{old} = "{new}"', text, flags=re.MULTILINE)
+    (folder / "drawer.toml").write_text(text)
+    return folder / "drawer.toml"
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        (None, "ideal"),
+        ("weaker", "weaker"),
+        ({"name": "weaker", "controller": {"kp": 9.0}}, "custom"),
+        ("lag", "lag"),
+        ("drive", "quanser-qube-servo-2"),  # whose numbers are the defaults
+        ("kraken-x60", "kraken-x60"),
+        ({"name": "kraken-x60", "motor": {"gear_ratio": 70.3, "arm_radius": 200}}, "kraken-x60"),
+        ({"name": "kraken-x60", "supply": {"voltage": 10}, "controller": {"max_current": 3}}, "kraken-x60"),
+        ({"name": "kraken-x60", "motor": {"resistance": 1.0}}, "kraken-x60, changed"),
+        ({"name": "kraken-x60", "motor": {"resistance": 1.0}, "label": "rewound"}, "rewound"),
+        ("drawer.toml", "drawer"),
+        ({"name": "drawer.toml", "motor": {"gear_ratio": 5.0}}, "drawer"),
+        ("swing.yaml", "swing"),
+        ("bench/actuator.yaml", "bench"),
+        ("short.yaml", "kraken-x60"),
+        (f"{__name__}:MINE", f"{__name__}:MINE"),
+        (f"{__name__}:Mine", f"{__name__}:Mine"),
+    ],
+)
+def test_an_actuator_is_called_what_it_was_asked_for_by(tmp_path, monkeypatch, given, name):
+    monkeypatch.chdir(tmp_path)
+    drawer_motor(tmp_path)
+    (tmp_path / "bench").mkdir()
+    for file in ("swing.yaml", "bench/actuator.yaml"):
+        (tmp_path / file).write_text(json.dumps(Lag(0.2).as_mapping()))
+    (tmp_path / "short.yaml").write_text("name: kraken-x60\nmotor: {gear_ratio: 70.3}")
+    made = resolve(given, CARTPOLE.paper[0], "cartpole")
+    assert name_of(made, CARTPOLE.paper[0]) == name
+    short = named_mapping(made)
+    again = resolve(json.loads(json.dumps(short)), None, "nobody")
+    assert again == made
+    assert label_of(again) == label_of(made)
+
+
+def test_a_motor_of_the_catalogue_is_known_by_its_numbers_and_written_short():
+    there = resolve("kraken-x60", None, "nobody")
+    geared = dataclasses.replace(there, motor=dataclasses.replace(there.motor, gear_ratio=70.3, arm_radius=200.0))
+    assert label_of(geared) == ""
+    assert name_of(geared) == "kraken-x60"
+    assert named_mapping(labelled(geared, "kraken-x60")) == {
+        "name": "kraken-x60",
+        "motor": {"gear_ratio": 70.3, "arm_radius": 200.0},
+    }
+    other = dataclasses.replace(there, motor=dataclasses.replace(there.motor, resistance=1.0))
+    assert name_of(other) == "drive"
+    assert named_mapping(labelled(other, "kraken-x60")) == {"name": "kraken-x60", "motor": {"resistance": 1.0}}
+    assert named_mapping(labelled(Lag(0.2), "slow")) == {"label": "slow", **Lag(0.2).as_mapping()}
+
+
+def test_a_name_is_nothing_of_the_actuator(tmp_path):
+    asked, plain = resolve(str(drawer_motor(tmp_path)), None, "nobody"), resolve("maxon-re65", None, "nobody")
+    assert (name_of(asked), name_of(plain)) == ("drawer", "maxon-re65")
+    assert asked == plain
+    assert hash(asked) == hash(plain)
+    assert asked.as_mapping() == plain.as_mapping()
+    assert label_of(labelled(IDEAL, "nothing")) == ""
 
 
 # -- places and files ---------------------------------------------------------------------------------------
