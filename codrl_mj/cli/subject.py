@@ -1,5 +1,6 @@
 """The trained policy that a verb is about, wherever it comes from."""
 
+import contextlib
 import dataclasses
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -9,7 +10,10 @@ import tyro
 from codrl_mj.cli.environments import default_actuator, environment, through
 from codrl_mj.cli.fields import AS_TRAINED, is_task
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.fields import did_you_mean
 from codrl_mj.foreign.config import ForeignConfig, environment_from
+from codrl_mj.runs.layout import CONFIG, finished
+from codrl_mj.tasks import TASKS
 
 SubjectWord = Annotated[
     tyro.conf.Positional[str],
@@ -78,9 +82,8 @@ class Source:
             FileNotFoundError: nothing is there.
             ValueError: it is damaged, or needs a flag to be loaded.
         """
-        from codrl_mj.runs.layout import finished
         from codrl_mj.runs.policies import load_policy, load_sb3_zip
-        from codrl_mj.training.folder import BEST, CONFIG, load_config
+        from codrl_mj.training.folder import BEST, load_config
 
         alone = path.suffix == ".zip" or ((path / "policy.json").exists() and not (path / CONFIG).exists())
         if not alone:
@@ -119,10 +122,13 @@ def policy_and_environment(verb: Any) -> tuple[Any, EnvConfig | ForeignConfig]:
 
         known = environment_from({"task": verb.subject})
         env = environment(verb, known.task, verb.actuator_name, known)
-        made = env.make()
-        space = made.action_space
-        made.close()
-        return RandomPolicy(space, verb.seed), env
+        if env.action == "force":
+            return RandomPolicy(env.action_space, verb.seed), env
+        with contextlib.closing(env.make()) as made:
+            return RandomPolicy(made.action_space, verb.seed), env
+    if not Path(verb.subject).exists():
+        hint = did_you_mean(verb.subject, TASKS)
+        raise FileNotFoundError(f"no run configuration at {verb.subject}/{CONFIG}: {hint}It is no run and no task")
     loaded = verb.source.load(Path(verb.subject))
     env = environment(verb, loaded.env.task, verb.actuator_name, loaded.env)
     loaded.check_interface(env)

@@ -73,7 +73,7 @@ def make(
     entry = gymnasium.spec(env_id)
     resolved = resolve_patterns(actuators, f"the environment {env_id}")
     spec = copy.copy(entry)
-    spec.entry_point = Motorised(entry.entry_point, resolved, action, allow_unstable)
+    spec.entry_point = Motorised(entry.entry_point, resolved, action, allow_unstable, env_id)
     return MotorisedEnv(gymnasium.make(spec, **options), observe_actuator, randomize, disturbances)
 
 
@@ -89,6 +89,8 @@ class Motorised:
     """What actions stand for."""
     allow_unstable: bool
     """As for `codrl_mj.motorise`."""
+    env_id: str = ""
+    """The environment's, for messages."""
 
     @functools.cached_property
     def commands(self) -> dict[str, Command | None]:
@@ -126,7 +128,7 @@ class Motorised:
         ours = isinstance(creator, type) and issubclass(creator, MujocoEnv)
         with building.motorising():
             env = _with_motors(creator)(**options) if ours else creator(**options)
-        building.check()
+        building.check(self.env_id)
         if ours:
             env.remade = functools.partial(self, **options)
         return env

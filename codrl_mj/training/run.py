@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from codrl_mj.foreign.config import ForeignConfig
-from codrl_mj.runs.files import sealed, write_json
+from codrl_mj.runs.files import check_writable, sealed, write_json
 from codrl_mj.runs.layout import finished
 from codrl_mj.training import folder
 from codrl_mj.training.config import TrainConfig
@@ -68,6 +68,7 @@ def train(
 
     Raises:
         FileExistsError: `out` exists and `resume` is False; nothing in it was touched.
+        OSError: `out` cannot be written.
         ValueError: the configuration cannot be trained, for instance because the actuator is unstable; or the run in
             `out` has another one, or was started with other software.
         RunInUseError: another process trains in `out`.
@@ -77,6 +78,7 @@ def train(
     if out.exists() and not (resume and (exists or folder.unused(out))):
         remedy = "continue it with --resume, " if exists and not finished(out) else ""
         raise FileExistsError(f"run folder {out} exists already: {remedy}choose another --out, or delete it")
+    check_writable(out)
     if exists:
         folder.check_same(out, config, accept_changes)
         if finished(out):

@@ -1,0 +1,162 @@
+"""From the words of a command line to a verb: its own modules and numbers understood, errors in one plain sentence."""
+
+import contextlib
+import io
+import os
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Union
+
+import tyro
+
+from codrl_mj.fields import did_you_mean
+
+_REGISTRY = tyro.constructors.ConstructorRegistry()
+_SHORT = {"--gear-ratio": "gear ratio", "--voltage": "supply voltage"}
+
+
+@_REGISTRY.primitive_rule
+def _whole_numbers(info: Any) -> Any:
+    """Whole numbers may be written as 1e5."""
+    if info.type is not int:
+        return None
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="INT",
+        instance_from_str=lambda texts: _whole(texts[0]),
+        is_instance=lambda value: isinstance(value, int),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+def _whole(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        if not float(text).is_integer():
+            raise
+        return int(float(text))
+
+
+def parse(verbs: Mapping[str, Any], arguments: Sequence[str]) -> Any:
+    """The verb, with its settings.
+
+    Raises:
+        ValueError: a word is not understood.
+        SystemExit: help was asked for, and is printed.
+    """
+    errors: Any = getattr(tyro, "_errors", None)  # of no public name; without it errors come in boxes
+    hook = errors and errors.on_parse_error(lambda event: _refuse(event, verbs, arguments))
+    kinds = [
+        Annotated[Any, tyro.conf.subcommand(name=name, constructor=constructor)] for name, constructor in verbs.items()
+    ]
+    with hook or contextlib.nullcontext():
+        return tyro.cli(
+            Union[tuple(kinds)],  # type: ignore[arg-type]  # noqa: UP007 - of as many as there are
+            prog="codrl-mj",
+            description="Reinforcement learning through a real actuator: classic control in MuJoCo, driven by a motor."
+            " -h instead of --help leaves descriptions out; --version; --traceback shows where an error arose.",
+            args=arguments,
+            registry=_REGISTRY,
+            compact_help=not {"-h", "-H", "--help-verbose"}.isdisjoint(arguments),
+        )
+
+
+def _refuse(event: Any, verbs: Mapping[str, Any], arguments: Sequence[str]) -> None:
+    """Say in a sentence what the parser would in a box; of kinds of errors that are not known here its box remains."""
+    words = [word for word in arguments[:2] if re.fullmatch(r"[a-z]+", word)]
+    shown = "codrl-mj " + " ".join(words[: 2 if words[:1] in (["motor"], ["identify"]) else 1])
+    match type(event).__name__:
+        case "MissingSubcommand":
+            known = ", ".join(event.subcommand_spec.parser_from_name)
+            raise ValueError(f"{shown.strip()} needs a verb, one of {known}; {shown.strip()} --help says more")
+        case "MissingArgs":
+            missing = [_called(one.arg) for one in event.missing_arguments]
+            raise ValueError(f"{shown} needs {', '.join(missing)}; {shown} --help says more")
+        case "BadValue" if event.reason == "too_few_values":
+            raise ValueError(f"{_called(event.argument)} needs a value: {_kind(event.argument)}")
+        case "InvalidChoice":
+            hint = did_you_mean(event.value, event.choices)
+            known = ", ".join(event.choices)
+            raise ValueError(f"{_called(event.argument)} {event.value}: {hint}must be one of {known}")
+        case "InstantiationFailure" if event.argument is not None:
+            value = re.search(r"'([^']*)'", event.message)
+            given = f" {value[1]}" if value else ""
+            raise ValueError(f"{_called(event.argument)}{given}: must be {_kind(event.argument)}")
+        case "UnrecognizedArgs":
+            _refuse_words(event.tokens, parse_help(verbs, words), shown)
+
+
+def _refuse_words(tokens: Sequence[str], text: str, shown: str) -> None:
+    """Refuse words that the parser left over, by what the verb's help has."""
+    flag = next((token.partition("=")[0] for token in tokens if token.startswith("-")), None)
+    if flag is None:
+        verbs = re.match(r"usage: [^\n]*\{([\w,]+)\}\n", text)
+        choice = verbs[1].split(",") if verbs else []
+        listed = f"verbs are {', '.join(choice)}" if choice else f"{shown} --help says what it takes"
+        what = "unknown verb" if choice else "unexpected"
+        raise ValueError(f"{what} {tokens[0]!r}: {did_you_mean(tokens[0], choice)}{listed}")
+    known = list(dict.fromkeys(re.findall(r"(?<![\w-])--[a-z][\w-]*(?:\.[\w-]+)*", text)))
+    inner = [f"did you mean {one!r}? " for one in known if one.rpartition(".")[2] == flag.lstrip("-")]
+    hint = "".join(inner[:1]) or did_you_mean(flag, known)
+    if flag in _SHORT and "--actuator" in known:
+        raise ValueError(f"{flag}: the actuator has no {_SHORT[flag]}; motors of codrl-mj motor list have one")
+    raise ValueError(f"unknown flag {flag}: {hint}{shown} --help lists them")
+
+
+def parse_help(verbs: Mapping[str, Any], words: Sequence[str]) -> str:
+    """What `codrl-mj WORDS --help` prints."""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
+        parse(verbs, [*words, "--help"])
+    return printed.getvalue()
+
+
+def _called(argument: Any) -> str:
+    """What a person calls an argument: its flag, or its name in capitals with what it is."""
+    if not argument.is_positional():
+        return str(argument.lowered.name_or_flags[0])
+    return str(argument.field.intern_name).upper()
+
+
+def _kind(argument: Any) -> str:
+    """What an argument has to be."""
+    kind = str(argument.lowered.metavar).replace("{None}|", "None or ")
+    return kind.replace("INT", "a whole number").replace("FLOAT", "a number")
+
+
+def understood(arguments: Sequence[str]) -> list[str]:
+    """The words with gear ratios as numbers, and `FILE.py:NAME` as modules.
+
+    Python finds the modules of the present folder from here on if the person who typed the words names one of them, or
+    says `--trust`: what a file names stays to be refused.
+
+    Raises:
+        ValueError: a file is not there, or no module below the present folder.
+    """
+    here, found = Path.cwd(), []
+    for word in arguments:
+        word = re.sub(r"^(--[\w.-]+=)?(\d+(?:\.\d+)?):1$", r"\1\2", word)
+        if match := re.fullmatch(r"(.*=)?([^=:]+\.py):([\w.-]+)", word):
+            word = f"{match[1] or ''}{_module(Path(match[2]), here)}:{match[3]}"
+        found.append(word)
+    typed = re.findall(r"^(?:.*=)?(\w+)[\w.]*:[\w./-]+$", "\n".join(found), re.MULTILINE)
+    if "--trust" in found or any((here / name).is_dir() or (here / f"{name}.py").is_file() for name in typed):
+        sys.path += [str(here)] if str(here) not in sys.path and "" not in sys.path else []
+    return found
+
+
+def _module(file: Path, here: Path) -> str:
+    """The module that a file is, by which what is written here today finds it tomorrow."""
+    path = Path(os.path.normpath(here / file))
+    parts = path.relative_to(here).with_suffix("").parts if path.is_relative_to(here) else ("..",)
+    if not path.is_file():
+        raise ValueError(f"{file}: there is no such file; must be FILE.py:NAME or module:NAME")
+    if not all(part.isidentifier() for part in parts):
+        raise ValueError(
+            f"{file}: must be a file of the present folder {here} or below it, with names that Python takes for modules"
+            f" (letters, digits, _): go to {path.parent} and name {path.name}"
+        )
+    return ".".join(parts)
