@@ -413,7 +413,7 @@ def test_a_certificate_that_is_stopped_exits_with_130_and_leaves_nothing(monkeyp
         ("train cartpole more", "unexpected 'more': codrl-mj train --help"),
         ("train cartpole --seed", "--seed needs a value: a whole number"),
         ("train cartpole --seed two", "--seed two: must be a whole number"),
-        ("train cartpole --total-steps 1.5e0", "--total-steps 1.5e0: must be None or a whole number"),
+        ("train cartpole --total-steps 1.5e0", "--total-steps 1.5: must be None or a whole number"),
         ("train cartpole --sed 3", "unknown flag --sed: did you mean '--seed'?"),
         ("train cartpole --kp 3", "unknown flag --kp: did you mean '--actuator.controller.kp'?"),
         ("train cartpole --agent pp", "--agent pp: did you mean 'ppo'? must be one of ppo, ddpg"),

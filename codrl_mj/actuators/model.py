@@ -17,7 +17,6 @@ import traceback
 from collections import namedtuple
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -494,7 +493,7 @@ def look_up(
     what: str,
     anybodys: bool = True,
     of: type | None = None,
-    others: Mapping[str, Iterable[str]] = MappingProxyType({}),
+    others: Mapping[str, Iterable[str]] | None = None,
 ) -> Any:
     """What a name stands for: a value of `known`, or what stands at `module:NAME`.
 
@@ -516,9 +515,7 @@ def look_up(
         if of is None or (isinstance(found, type) and issubclass(found, of)):
             return found
         raise ValueError(f"{what} {name!r}: {found!r} is no subclass of codrl_mj's {of.__name__}")
-    hint = fields.did_you_mean(name, [*known, *itertools.chain(*others.values())])
-    own = "module:NAME of your own"
-    if hint:
-        raise ValueError(f"unknown {what} {name!r}: {hint}{f'It can be {own}, too' if anybodys else ''}".rstrip())
-    listed = ", ".join([*known, *others])
-    raise ValueError(f"unknown {what} {name!r}: Known: {listed}{f', or {own}' if anybodys else ''}")
+    hint = fields.did_you_mean(name, [*known, *itertools.chain(*(others or {}).values())])
+    listed = hint + "It can be" if hint else f"Known: {', '.join([*known, *(others or {})])}, or"
+    own = f"{listed} module:NAME of your own" if anybodys else hint or listed.removesuffix(", or")
+    raise ValueError(f"unknown {what} {name!r}: {own.rstrip()}")

@@ -2,7 +2,6 @@
 
 import argparse
 import ast
-import contextlib
 import dataclasses
 import functools
 import inspect
@@ -156,39 +155,19 @@ def _foreign_flags(defaults: ForeignConfig) -> Any:
 
 def named_actuators(name: str, task: str) -> tuple[Any, ...]:
     """The actuators that a name stands for in a task, or in an environment of somebody else's."""
-    if _is_of_patterns(Path(name)):
-        raise ValueError(f"--actuator {name}: the file has patterns of motors' names: give it as --actuators {name}")
-    if is_gymnasium_id(task):
-        return ForeignConfig(task, {EVERY: name}).actuator
-    return resolve_actuators(name, find_task(task))
-
-
-def _is_of_patterns(file: Path) -> bool:
-    """Whether a file has patterns -> actuators, as `motor choose` writes, and not one actuator's fields."""
-    if file.suffix not in (".yaml", ".yml", ".json") or not file.is_file():
-        return False
-    import yaml
-
-    with contextlib.suppress(yaml.YAMLError, UnicodeDecodeError), file.open() as opened:
-        content = yaml.safe_load(opened)
-        own = {"family", "name"}
-        return (
-            isinstance(content, Mapping)
-            and own.isdisjoint(content)
-            and any(
-                isinstance(one, str) or (isinstance(one, Mapping) and not own.isdisjoint(one))
-                for one in content.values()
-            )
+    try:
+        if is_gymnasium_id(task):
+            return ForeignConfig(task, {EVERY: name}).actuator
+        return resolve_actuators(name, find_task(task))
+    except ValueError as error:
+        hint = (
+            f"; a file of patterns and actuators goes by --actuators {name}" if name.endswith((".yaml", ".yml")) else ""
         )
-    return False
+        raise ValueError(f"{error}{hint}") from None
 
 
 def refuse_task(word: str) -> None:
-    """Refuse a word that is no task's name.
-
-    Raises:
-        ValueError: always; the nearest known names are suggested.
-    """
+    """Refuse a word that is no task's name, as it stands."""
     try:
         find_task(word)
     except ValueError as error:

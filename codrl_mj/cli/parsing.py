@@ -13,40 +13,11 @@ import tyro
 
 from codrl_mj.fields import did_you_mean
 
-_REGISTRY = tyro.constructors.ConstructorRegistry()
 _SHORT = {"--gear-ratio": "gear ratio", "--voltage": "supply voltage"}
 
 
-@_REGISTRY.primitive_rule
-def _whole_numbers(info: Any) -> Any:
-    """Whole numbers may be written as 1e5."""
-    if info.type is not int:
-        return None
-    return tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="INT",
-        instance_from_str=lambda texts: _whole(texts[0]),
-        is_instance=lambda value: isinstance(value, int),
-        str_from_instance=lambda value: [str(value)],
-    )
-
-
-def _whole(text: str) -> int:
-    try:
-        return int(text)
-    except ValueError:
-        if not float(text).is_integer():
-            raise
-        return int(float(text))
-
-
 def parse(verbs: Mapping[str, Any], arguments: Sequence[str]) -> Any:
-    """The verb, with its settings.
-
-    Raises:
-        ValueError: a word is not understood.
-        SystemExit: help was asked for, and is printed.
-    """
+    """The verb, with its settings; SystemExit after help."""
     errors: Any = getattr(tyro, "_errors", None)  # of no public name; without it errors come in boxes
     hook = errors and errors.on_parse_error(lambda event: _refuse(event, verbs, arguments))
     kinds = [
@@ -59,7 +30,6 @@ def parse(verbs: Mapping[str, Any], arguments: Sequence[str]) -> Any:
             description="Reinforcement learning through a real actuator: classic control in MuJoCo, driven by a motor."
             " -h instead of --help leaves descriptions out; --version; --traceback shows where an error arose.",
             args=arguments,
-            registry=_REGISTRY,
             compact_help=not {"-h", "-H", "--help-verbose"}.isdisjoint(arguments),
         )
 
@@ -86,7 +56,9 @@ def _refuse(event: Any, verbs: Mapping[str, Any], arguments: Sequence[str]) -> N
             given = f" {value[1]}" if value else ""
             raise ValueError(f"{_called(event.argument)}{given}: must be {_kind(event.argument)}")
         case "UnrecognizedArgs":
-            _refuse_words(event.tokens, parse_help(verbs, words), shown)
+            with contextlib.redirect_stdout(io.StringIO()) as printed, contextlib.suppress(SystemExit):
+                parse(verbs, [*words, "--help"])
+            _refuse_words(event.tokens, printed.getvalue(), shown)
 
 
 def _refuse_words(tokens: Sequence[str], text: str, shown: str) -> None:
@@ -106,19 +78,10 @@ def _refuse_words(tokens: Sequence[str], text: str, shown: str) -> None:
     raise ValueError(f"unknown flag {flag}: {hint}{shown} --help lists them")
 
 
-def parse_help(verbs: Mapping[str, Any], words: Sequence[str]) -> str:
-    """What `codrl-mj WORDS --help` prints."""
-    printed = io.StringIO()
-    with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
-        parse(verbs, [*words, "--help"])
-    return printed.getvalue()
-
-
 def _called(argument: Any) -> str:
-    """What a person calls an argument: its flag, or its name in capitals with what it is."""
-    if not argument.is_positional():
-        return str(argument.lowered.name_or_flags[0])
-    return str(argument.field.intern_name).upper()
+    """What a person calls an argument: its flag, or its name in capitals."""
+    name = argument.field.intern_name.upper() if argument.is_positional() else argument.lowered.name_or_flags[0]
+    return str(name)
 
 
 def _kind(argument: Any) -> str:
@@ -128,19 +91,18 @@ def _kind(argument: Any) -> str:
 
 
 def understood(arguments: Sequence[str]) -> list[str]:
-    """The words with gear ratios as numbers, and `FILE.py:NAME` as modules.
+    """The words with 1e5 and 20:1 as plain numbers, and FILE.py:NAME as modules.
 
     Python finds the modules of the present folder from here on if the person who typed the words names one of them, or
     says `--trust`: what a file names stays to be refused.
-
-    Raises:
-        ValueError: a file is not there, or no module below the present folder.
     """
     here, found = Path.cwd(), []
     for word in arguments:
-        word = re.sub(r"^(--[\w.-]+=)?(\d+(?:\.\d+)?):1$", r"\1\2", word)
-        if match := re.fullmatch(r"(.*=)?([^=:]+\.py):([\w.-]+)", word):
-            word = f"{match[1] or ''}{_module(Path(match[2]), here)}:{match[3]}"
+        if number := re.fullmatch(r"(--[\w.-]+=)?(\d+(?:\.\d+)?)(?::1|(e\+?\d{1,2}))", word):
+            value = float(number[2] + (number[3] or ""))
+            word = f"{number[1] or ''}{int(value) if value.is_integer() else value}"
+        elif file := re.fullmatch(r"(.*=)?([^=:]+\.py):([\w.-]+)", word):
+            word = f"{file[1] or ''}{_module(Path(file[2]), here)}:{file[3]}"
         found.append(word)
     typed = re.findall(r"^(?:.*=)?(\w+)[\w.]*:[\w./-]+$", "\n".join(found), re.MULTILINE)
     if "--trust" in found or any((here / name).is_dir() or (here / f"{name}.py").is_file() for name in typed):
@@ -150,13 +112,13 @@ def understood(arguments: Sequence[str]) -> list[str]:
 
 def _module(file: Path, here: Path) -> str:
     """The module that a file is, by which what is written here today finds it tomorrow."""
-    path = Path(os.path.normpath(here / file))
-    parts = path.relative_to(here).with_suffix("").parts if path.is_relative_to(here) else ("..",)
-    if not path.is_file():
+    path = Path(os.path.normpath(here / file)).with_suffix("")
+    if not file.is_file():
         raise ValueError(f"{file}: there is no such file; must be FILE.py:NAME or module:NAME")
+    parts = path.relative_to(here).parts if path.is_relative_to(here) else ("..",)
     if not all(part.isidentifier() for part in parts):
         raise ValueError(
-            f"{file}: must be a file of the present folder {here} or below it, with names that Python takes for modules"
-            f" (letters, digits, _): go to {path.parent} and name {path.name}"
+            f"{file}: must be a file in the present folder {here} or below it, in folders whose names Python takes for "
+            f"modules (letters, digits, _): go to {path.parent} and name {file.name}"
         )
     return ".".join(parts)

@@ -37,11 +37,7 @@ class Subject:
     """The run folder that says so; None if there is none."""
 
     def check_interface(self, env: EnvConfig | ForeignConfig) -> None:
-        """Refuse an environment in which the policy would command or observe something else than in its training.
-
-        Raises:
-            ValueError: it does, by what its run folder says.
-        """
+        """Refuse an environment in which the policy would command or observe something else than in its training."""
         for name, trained in self.env.interface.items() if self.run is not None else ():
             if (value := env.interface[name]) != trained:
                 flag = f"--env.{name.replace('_', '-')}"
@@ -76,12 +72,7 @@ class Source:
     ] = False
 
     def load(self, path: Path) -> Subject:
-        """The policy at a path: a run folder, a folder with a policy alone, or a Stable-Baselines3 zip.
-
-        Raises:
-            FileNotFoundError: nothing is there.
-            ValueError: it is damaged, or needs a flag to be loaded.
-        """
+        """The policy at a path: a run folder, a folder with a policy alone, or a Stable-Baselines3 zip."""
         from codrl_mj.runs.policies import load_policy, load_sb3_zip
         from codrl_mj.training.folder import BEST, load_config
 
@@ -111,12 +102,7 @@ class Source:
 
 
 def policy_and_environment(verb: Any) -> tuple[Any, EnvConfig | ForeignConfig]:
-    """What acts, and in what, by a verb's `subject` and its flags: of a task or an id random actions.
-
-    Raises:
-        FileNotFoundError: there is no such run.
-        ValueError: the run cannot be loaded, or the flags do not fit it.
-    """
+    """What acts, and in what, by a verb's `subject` and its flags: of a task or an id random actions."""
     if is_task(verb.subject):
         from codrl_mj.evaluation import RandomPolicy
 

@@ -57,11 +57,7 @@ def progress_bar(*columns: str) -> Progress:
 
 @contextlib.contextmanager
 def training_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> Iterator[None]:
-    """Show a bar for each training while the block runs, by what the run folders say, whatever process writes them.
-
-    Args:
-        runs: description -> (configuration, run folder).
-    """
+    """Show a bar for each training while the block runs, by what the run folders say, whatever process writes them."""
     columns = (
         "{task.completed:,}/{task.total:,} {task.fields[unit]}",
         "return {task.fields[mean_return]:.1f}",
@@ -100,12 +96,7 @@ def training_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> Iterator[None
 
 
 def print_evaluations(evaluations: Mapping[str, Evaluation], details: bool = True) -> None:
-    """Print the most telling measures in one table, a row for each evaluation by its name, and the others below it.
-
-    Args:
-        evaluations: by their names; at least one.
-        details: whether to print the others.
-    """
+    """Print the most telling measures in one table, a row for each evaluation by its name, and details below it."""
     for table in evaluation_tables(evaluations, details):
         console().print(table)
 

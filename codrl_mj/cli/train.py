@@ -21,7 +21,7 @@ from codrl_mj.cli.fields import (
     scan,
 )
 from codrl_mj.foreign.config import ForeignConfig, environment_from
-from codrl_mj.runs.layout import CONFIG, finished
+from codrl_mj.runs.layout import finished
 from codrl_mj.tasks import TASKS
 from codrl_mj.training.config import TrainConfig, default_agent, read_config
 from codrl_mj.training.folder import load_config
@@ -139,21 +139,15 @@ class Train:
         out = self.resume or self.out or Path("runs") / name
         if isinstance(config.env, ForeignConfig):
             config.env.make().close()  # what is wrong with it is said before there is a bar
-        try:
-            with training_bars({f"{config.agent.name.upper()} on {config.task}": (config, out)}):
-                train(
-                    config,
-                    out,
-                    resume=self.resume is not None,
-                    accept_changes=self.accept_changes,
-                    tensorboard=self.tensorboard,
-                    wandb=self.wandb,
-                )
-        except KeyboardInterrupt:  # the second Ctrl-C, or one before there is anything to save
-            if not (out / CONFIG).is_file():
-                raise
-            again = "continue from the last checkpoint, or from the start if there is none yet, with codrl-mj train"
-            raise KeyboardInterrupt(f"stopped at once: {again} --resume {out}") from None
+        with training_bars({f"{config.agent.name.upper()} on {config.task}": (config, out)}):
+            train(
+                config,
+                out,
+                resume=self.resume is not None,
+                accept_changes=self.accept_changes,
+                tensorboard=self.tensorboard,
+                wandb=self.wandb,
+            )
         print(f"wrote {out}: see {out / 'learning_curve.png'}; {following} {out}")
         return 0
 

@@ -145,13 +145,18 @@ def _finish(config: TrainConfig, out: Path, model: Any, watcher: Any) -> None:
 
 @contextlib.contextmanager
 def _saying_how_to_continue(out: Path) -> Iterator[None]:
-    """Add to the error of a file that could not be written, such as on a full disk, that nothing is lost.
+    """Add to the error of a file that could not be written, such as on a full disk, or to a second Ctrl-C, what next.
 
     Raises:
         OSError: with the run folder's name.
+        KeyboardInterrupt: likewise.
     """
     try:
         yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            f"stopped at once, after the last checkpoint: continue with codrl-mj train --resume {out}"
+        ) from None
     except OSError as error:
         raise OSError(
             f"training in {out} was broken off: {error}. Its last checkpoint is intact: once the cause is mended, "

@@ -105,7 +105,7 @@ def test_every_named_actuator_is_stable_at_the_step_it_is_used_with(name, task):
 def test_an_unknown_name_suggests_the_nearest_and_no_others(wrong, near):
     with pytest.raises(ValueError, match="unknown actuator") as refused:
         named_actuator(wrong, "cartpole")
-    said = f"unknown actuator '{wrong}': did you mean {near}? It can be module:NAME of your own, too"
+    said = f"unknown actuator '{wrong}': did you mean {near}? It can be module:NAME of your own"
     assert str(refused.value) == said
 
 
