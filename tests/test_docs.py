@@ -117,24 +117,28 @@ SHORTER = {
 }
 """Verb -> flags with which a command takes seconds."""
 NEEDING_MORE = (
-    r"identify|view|validate (--model|--mutations|--out)|validate *(#.*)?$|.*policies/theirs|.*model.zip|.*--backend ray"
-    "|.*motor/actuator.yaml"
+    r"identify|view|validate (--model|--mutations|--out)|validate *(#.*)?$|.*policies/theirs|.*model.zip"
+    "|.*--backend ray|.*motor/actuator.yaml"
 )
 """Commands that have logs, a browser, a cluster, somebody else's files or minutes before them: they are only parsed."""
 RUNNER = """
 import json, runpy, sys
-paths, modules = list(sys.path), set(sys.modules)
+from gymnasium.envs.registration import registry
+from codrl_mj.tasks import TASKS
+paths, ours = list(sys.path), set(TASKS)
 for line in json.load(sys.stdin):
     sys.argv, sys.path[:] = [sys.argv[0], *line], paths  # nothing is left of the command before but what is compiled
     for own in ("my_gearbox", "my_module", "ball_and_beam"):
         sys.modules.pop(own, None)
+    for own in set(TASKS) - ours:
+        registry.pop(TASKS.pop(own).env_id)
     try:
         runpy.run_path(sys.argv[0], run_name="__main__")
     except SystemExit as done:
         if done.code:
             sys.exit(f"exit {done.code}: {line}")
 """
-"""Runs command lines by the console script as a shell would, but in one process: numba compiles for all of them once."""
+"""Runs command lines by the console script as a shell would, but in one process: numba compiles for all once."""
 
 
 def shortened(command):

@@ -18,14 +18,15 @@ _SHORT = {"--gear-ratio": "gear ratio", "--voltage": "supply voltage"}
 
 def parse(verbs: Mapping[str, Any], arguments: Sequence[str]) -> Any:
     """The verb, with its settings; SystemExit after help."""
+    cli: Any = tyro.cli  # of a union of as many kinds as there are
     errors: Any = getattr(tyro, "_errors", None)  # of no public name; without it errors come in boxes
     hook = errors and errors.on_parse_error(lambda event: _refuse(event, verbs, arguments))
     kinds = [
         Annotated[Any, tyro.conf.subcommand(name=name, constructor=constructor)] for name, constructor in verbs.items()
     ]
     with hook or contextlib.nullcontext():
-        return tyro.cli(
-            Union[tuple(kinds)],  # type: ignore[arg-type]  # noqa: UP007 - of as many as there are
+        return cli(
+            Union[tuple(kinds)],  # noqa: UP007
             prog="codrl-mj",
             description="Reinforcement learning through a real actuator: classic control in MuJoCo, driven by a motor."
             " -h instead of --help leaves descriptions out; --version; --traceback shows where an error arose.",
