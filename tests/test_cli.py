@@ -4,6 +4,7 @@ import dataclasses
 import importlib
 import json
 import math
+import os
 import re
 import shutil
 import subprocess
@@ -712,3 +713,18 @@ def test_draws_of_the_training_over_another_actuator_are_said(capsys):
     assert main(["evaluate", "drawn", "--episodes", "1", "--actuator", "weak", "--env.randomize", "None"]) == 0
     assert main(["evaluate", "drawn", "--episodes", "1"]) == 0
     assert "drawn as in" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("program", [[str(PROGRAM)], [sys.executable, "-m", "codrl_mj"]])
+def test_ctrl_c_while_the_program_is_imported_is_one_line(program):
+    """At its first import of a library, whatever that takes."""
+    code = "import os, signal, sys\nclass Stop:\n    def find_spec(self, name, *_):\n"
+    code += (
+        "        if name == 'tyro':\n            os.kill(os.getpid(), signal.SIGINT)\nsys.meta_path.insert(0, Stop())\n"
+    )
+    Path("sitecustomize.py").write_text(code)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path.cwd()), *filter(None, sys.path)])}
+    done = subprocess.run(
+        [*program, "--help"], capture_output=True, text=True, timeout=60, check=False, env=environment
+    )
+    assert (done.returncode, done.stderr) == (130, "codrl-mj: stopped before anything was begun\n")
