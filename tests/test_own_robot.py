@@ -20,7 +20,7 @@ ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "examples" / "own_robot"
 PAGE = (ROOT / "docs" / "own_robot.md").read_text()
 BLOCKS = re.findall(r"```(xml|python|console)\n(.*?)```", PAGE, re.DOTALL)
-FILES, COMMANDS = BLOCKS[:2], re.findall(r"^\$ python -m codrl_mj (.*)$", PAGE, re.MULTILINE)
+FILES, COMMANDS = BLOCKS[:2], re.findall(r"^\$ codrl-mj (.*)$", PAGE, re.MULTILINE)
 SHORT = {"100000": "512", "50": "1"}
 """Numbers of the page's commands -> those of the tests, whose machine has other things to do."""
 

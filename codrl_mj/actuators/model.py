@@ -11,9 +11,12 @@ import dataclasses
 import functools
 import hashlib
 import importlib
+import itertools
 import math
+import traceback
 from collections import namedtuple
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -497,7 +500,7 @@ def load_module(text: str) -> Any:
     """The module of `module:NAME`.
 
     Raises:
-        ValueError: there is no such module; or it may not be imported (`trusting`).
+        ValueError: there is no such module, or it cannot be imported; or it may not be (`trusting`).
     """
     module = text.partition(":")[0]
     if not _TRUSTED.get():
@@ -507,11 +510,17 @@ def load_module(text: str) -> Any:
         )
     try:
         return importlib.import_module(module)
-    except (ImportError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{text!r}: {error}; must be module:NAME, of a module that Python finds: `python -m codrl_mj` in the place "
-            "of `codrl-mj` finds those of the present folder"
-        ) from None
+    except Exception as error:
+        if not module or (isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}.")):
+            raise ValueError(
+                f"{text!r}: {error}; must be module:NAME of a module that is installed or in the present folder, "
+                f"{Path.cwd()}; on the command line FILE.py:NAME does as well"
+            ) from None
+        frames, package = traceback.extract_tb(error.__traceback__), Path(__file__).parents[1]
+        ours = [Path(frame.filename).is_relative_to(package) for frame in frames]
+        where = next(frame for frame, own in zip(frames[::-1], ours[::-1], strict=True) if not own)
+        said = str(error) if ours[-1] else f"importing {module} failed: {type(error).__name__}: {error}"
+        raise ValueError(f"{text!r}: {said} ({where.filename}, line {where.lineno})") from error
 
 
 def load_object(text: str) -> Any:
@@ -520,14 +529,22 @@ def load_object(text: str) -> Any:
     Raises:
         ValueError: as for `load_module`, or there is nothing of that name in it.
     """
-    module = load_module(text)
+    module, name = load_module(text), text.partition(":")[2]
     try:
-        return functools.reduce(getattr, text.partition(":")[2].split("."), module)
+        return functools.reduce(getattr, name.split("."), module)
     except AttributeError as error:
-        raise ValueError(f"{text!r}: {error}; must be module:NAME, of a module that Python finds") from None
+        hint = fields.did_you_mean(name, vars(module)).rstrip() or "see"
+        raise ValueError(f"{text!r}: {error}; must be module:NAME; {hint} {getattr(module, '__file__', '')}") from None
 
 
-def look_up(name: str, known: Mapping[str, Any], what: str, anybodys: bool = True, of: type | None = None) -> Any:
+def look_up(
+    name: str,
+    known: Mapping[str, Any],
+    what: str,
+    anybodys: bool = True,
+    of: type | None = None,
+    others: Mapping[str, Iterable[str]] | None = None,
+) -> Any:
     """What a name stands for: a value of `known`, or what stands at `module:NAME`.
 
     Args:
@@ -536,9 +553,10 @@ def look_up(name: str, known: Mapping[str, Any], what: str, anybodys: bool = Tru
         what: what to call one in messages.
         anybodys: whether to import what is not ours.
         of: the class that what is not ours has to be a subclass of; None for no matter what.
+        others: names that are known elsewhere, to be suggested but not listed, by what lists them.
 
     Raises:
-        ValueError: unknown name; the nearest known one is suggested. Or no such subclass, or as for `load_object`.
+        ValueError: unknown name; the nearest known ones are suggested. Or no such subclass, or as for `load_object`.
     """
     if isinstance(name, str) and name in known:
         return known[name]
@@ -547,5 +565,7 @@ def look_up(name: str, known: Mapping[str, Any], what: str, anybodys: bool = Tru
         if of is None or (isinstance(found, type) and issubclass(found, of)):
             return found
         raise ValueError(f"{what} {name!r}: {found!r} is no subclass of codrl_mj's {of.__name__}")
-    own = ", or module:NAME of your own" if anybodys else ""
-    raise ValueError(f"unknown {what} {name!r}: {fields.did_you_mean(name, known)}Known: {', '.join(known)}{own}")
+    hint = fields.did_you_mean(name, [*known, *itertools.chain(*(others or {}).values())])
+    listed = hint + "It can be" if hint else f"Known: {', '.join([*known, *(others or {})])}, or"
+    own = f"{listed} module:NAME of your own" if anybodys else hint or listed.removesuffix(", or")
+    raise ValueError(f"unknown {what} {name!r}: {own.rstrip()}")

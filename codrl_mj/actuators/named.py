@@ -184,7 +184,7 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
 
     if given in motor_names() or Path(given).suffix == ".toml":
         return labelled(Drive.of(motor_entry(given).numbers), Path(given).stem)
-    found = look_up(given, NAMED | FAMILIES | dict.fromkeys(motor_names()), "actuator")
+    found = look_up(given, NAMED | FAMILIES, "actuator", others={"the motors of `codrl-mj motor list`": motor_names()})
     made = found
     if isinstance(found, type) and issubclass(found, ActuatorModel):
         check_family(found)  # type: ignore[arg-type]

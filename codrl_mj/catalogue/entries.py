@@ -77,7 +77,7 @@ def motor_entry(name: str) -> MotorEntry:
     """
     path = Path(name)
     if path.suffix != ".toml":
-        check_names([name], motor_names(), "motor")
+        check_names([name], motor_names(), "motor", listed_by="codrl-mj motor list")
         path = asset_folder() / "motors" / f"{name}.toml"
     try:
         return _entry(path.stem, tomllib.loads(path.read_text(encoding="utf-8")), name.endswith(".toml"))

@@ -17,12 +17,7 @@ _NOTHING = "–"
 
 
 def evaluation_tables(evaluations: Mapping[str, Evaluation], details: bool = True) -> list[Table]:
-    """The most telling measures with a row for each evaluation, and then the others with a column for each.
-
-    Args:
-        evaluations: by their names; at least one.
-        details: whether to show the others.
-    """
+    """The most telling measures with a row for each evaluation, and then, as details, the others with a column."""
     names = list(evaluations) if details else []
     chunks = [names[begin : begin + _COLUMNS] for begin in range(0, len(names), _COLUMNS)]
     of_motors = [_motors(name, evaluations[name]) for name in names if evaluations[name].motors]

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from codrl_mj.actuators.model import family_name
 from codrl_mj.agents import AGENTS
 from codrl_mj.agents.presets import SETTINGS
 from codrl_mj.cli.environments import default_actuator, environment, through
@@ -16,6 +17,7 @@ from codrl_mj.cli.fields import (
     ActuatorName,
     environment_fields,
     flags,
+    refuse_task,
     scan,
 )
 from codrl_mj.foreign.config import ForeignConfig, environment_from
@@ -28,17 +30,10 @@ _OWN_FLAGS = ("agent", "env")  # of the configuration: not made from its fields'
 
 
 def train_verb(arguments: list[str]) -> Any:
-    """The verb's dataclass for a command line, whose agent, task, settings and files decide on flags and defaults.
-
-    Args:
-        arguments: what follows `train`.
-
-    Raises:
-        FileNotFoundError: the configuration file or the run folder is missing.
-        ValueError: it cannot be read, there are no such settings for the agent on the task, or the run has another
-            agent.
-    """
+    """The verb's dataclass for a command line, whose agent, task, settings and files decide on flags and defaults."""
     chosen = scan(arguments, "agent", "settings", "actuator", "config", "resume")
+    if chosen.task is None and arguments and not arguments[0].startswith("-"):
+        refuse_task(arguments[0])
     base = _base(chosen)
     resuming = chosen.resume is not None
     configured = resuming or chosen.config is not None
@@ -134,8 +129,9 @@ class Train:
             },
         )
         parts = config.task, config.agent.name, through(self.actuators, self.actuator_name), str(config.seed)
-        own = any(":" in part for part in parts)  # module:NAME
-        following = "next: " + ("python -m codrl_mj evaluate --trust" if own else "codrl-mj evaluate")
+        actuators = config.env.actuator if isinstance(config.env, ForeignConfig) else config.env.actuators
+        own = any(":" in one for one in (*parts, *(family_name(type(each)) for each in actuators)))  # module:NAME
+        following = "next: codrl-mj evaluate" + (" --trust" if own else "")
         if self.resume is not None and finished(self.resume) and config == load_config(self.resume, self.trust):
             print(f"{self.resume} is finished already; {following} {self.resume}")
             return 0

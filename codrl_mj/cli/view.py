@@ -36,6 +36,8 @@ class View:
         """Serve until Ctrl-C."""
         from codrl_mj.view.session import Session
 
+        if not 1 <= self.port <= 65535:
+            raise ValueError(f"--port {self.port}: must be from 1 to 65535")
         if self.native:
             from codrl_mj.view.native import check_display, run
 

@@ -75,7 +75,7 @@ def make(
         raise ValueError(f"{env_id}: its actuators are its own: gymnasium.make({env_id!r}, actuator=...)")
     resolved = resolve_patterns(actuators, f"the environment {env_id}")
     spec = copy.copy(entry)
-    spec.entry_point = Motorised(entry.entry_point, resolved, action, allow_unstable)
+    spec.entry_point = Motorised(entry.entry_point, resolved, action, allow_unstable, env_id)
     return MotorisedEnv(gymnasium.make(spec, **options), observe_actuator, randomize, disturbances)
 
 
@@ -91,6 +91,8 @@ class Motorised:
     """What actions stand for."""
     allow_unstable: bool
     """As for `codrl_mj.motorise`."""
+    env_id: str = ""
+    """The environment's, for messages."""
 
     @functools.cached_property
     def commands(self) -> dict[str, Command | None]:
@@ -128,7 +130,7 @@ class Motorised:
         ours = isinstance(creator, type) and issubclass(creator, MujocoEnv)
         with building.motorising():
             env = _with_motors(creator)(**options) if ours else creator(**options)
-        building.check()
+        building.check(self.env_id)
         if ours:
             env.remade = functools.partial(self, **options)
         return env

@@ -68,6 +68,7 @@ def train(
 
     Raises:
         FileExistsError: `out` exists and `resume` is False; nothing in it was touched.
+        OSError: `out` cannot be written.
         ValueError: the configuration cannot be trained, for instance because the actuator is unstable; or the run in
             `out` has another one, or was started with other software.
         RunInUseError: another process trains in `out`.

@@ -129,7 +129,7 @@ class Watcher(BaseCallback):
 
     @contextlib.contextmanager
     def explaining(self) -> Iterator[None]:
-        """Say why the block could not go on: of a full disk and its like, and of weights that are no numbers.
+        """Say why the block could not go on: a full disk and its like, a second Ctrl-C, weights that are no numbers.
 
         Raises:
             OSError: what could not be written, with what there is to go on from.
@@ -138,6 +138,8 @@ class Watcher(BaseCallback):
             yield
         except OSError as error:
             raise OSError(f"training in {self._out} was broken off: {error}. {folder.standing(self._out)}") from error
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(f"stopped at once. {folder.standing(self._out)}") from None
         except Exception:
             self._check_weights()
             raise

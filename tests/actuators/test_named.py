@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import sys
 
 import pytest
 from hypothesis import given
@@ -99,16 +100,28 @@ def test_every_named_actuator_is_stable_at_the_step_it_is_used_with(name, task):
     actuator.check(TASKS[task].step_duration / TASKS[task].motor_inner_steps)
 
 
-@pytest.mark.parametrize(("wrong", "near"), [("papr", "paper"), ("weakest", "weak"), ("open-loop", "open_loop")])
-def test_an_unknown_name_suggests_the_nearest_and_lists_all(wrong, near):
-    with pytest.raises(ValueError, match=f"unknown actuator '{wrong}': did you mean '{near}") as refused:
+@pytest.mark.parametrize(
+    ("wrong", "near"),
+    [
+        ("papr", "'paper'"),
+        ("weakest", "'weaker'"),
+        ("open-loop", "'open_loop'"),
+        ("maxon-ec45", "'maxon-ec45-flat-339285' or 'maxon-ec45-flat-50w'"),
+        ("Maxon-EC45-flat-50", "'maxon-ec45-flat-50w'"),
+    ],
+)
+def test_an_unknown_name_suggests_the_nearest_and_no_others(wrong, near):
+    with pytest.raises(ValueError, match="unknown actuator") as refused:
         named_actuator(wrong, "cartpole")
-    assert all(name in str(refused.value) for name in NAMED)
+    said = f"unknown actuator '{wrong}': did you mean {near}? It can be module:NAME of your own"
+    assert str(refused.value) == said
 
 
-def test_a_name_like_none_lists_the_known_ones():
-    with pytest.raises(ValueError, match="unknown actuator '12345': Known: ideal, paper, weak, weaker"):
+def test_a_name_like_none_lists_the_known_ones_and_says_who_lists_the_motors():
+    with pytest.raises(ValueError, match="unknown actuator '12345': Known: ideal, paper, weak, weaker") as refused:
         resolve_actuators("12345", CARTPOLE)
+    assert "torque_speed, the motors of `codrl-mj motor list`, or module:NAME of your own" in str(refused.value)
+    assert "maxon" not in str(refused.value)
 
 
 def test_resolve_takes_every_way_to_write_an_actuator():
@@ -220,10 +233,9 @@ def test_a_mapping_without_a_family_is_a_current_loop():
 
 
 @pytest.mark.parametrize(("wrong", "near"), [("lagg", "lag"), ("torque-speed", "torque_speed"), ("idael", "ideal")])
-def test_an_unknown_family_suggests_the_nearest_and_lists_all(wrong, near):
-    with pytest.raises(ValueError, match=f"unknown family '{wrong}': did you mean '{near}'") as refused:
+def test_an_unknown_family_suggests_the_nearest(wrong, near):
+    with pytest.raises(ValueError, match=f"unknown family '{wrong}': did you mean '{near}'"):
         actuator_from_mapping({"family": wrong})
-    assert all(name in str(refused.value) for name in FAMILIES)
 
 
 @pytest.mark.parametrize(
@@ -245,7 +257,7 @@ def test_a_mapping_that_its_family_cannot_read_is_refused(mapping, message):
     ("place", "message"),
     [
         ("nowhere_at_all:Mine", "'nowhere_at_all:Mine': No module named 'nowhere_at_all'; must be module:NAME"),
-        (f"{__name__}:Yours", "has no attribute 'Yours'; must be module:NAME, of a module that Python finds"),
+        (f"{__name__}:Yours", "has no attribute 'Yours'; must be module:NAME"),
         (f"{__name__}:Motor", "is no subclass of codrl_mj's ActuatorModel"),
         (f"{__name__}:MINE", "is no subclass of codrl_mj's ActuatorModel"),
     ],
@@ -328,6 +340,27 @@ def test_a_name_is_nothing_of_the_actuator(tmp_path):
     assert hash(asked) == hash(plain)
     assert asked.as_mapping() == plain.as_mapping()
     assert label_of(labelled(IDEAL, "nothing")) == ""
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        (
+            "import nowhere_at_all",
+            r"importing slipped failed: ModuleNotFoundError: .*'nowhere_at_all' \(.*slipped\.py, l",
+        ),
+        ("x = 1\ny = z", r"importing slipped failed: NameError: name 'z' is not defined \(.*slipped\.py, line 2\)"),
+        ("def :", "importing slipped failed: SyntaxError"),
+        ("MINES = 1", r"has no attribute 'Mine'; must be module:NAME; did you mean 'MINES'\? .*slipped\.py"),
+    ],
+)
+def test_of_a_module_that_cannot_be_used_the_cause_is_said(source, message, tmp_path, monkeypatch):
+    (tmp_path / "slipped.py").write_text(source)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "slipped", raising=False)
+    with pytest.raises(ValueError, match=message):
+        find_family("slipped:Mine")
+    sys.modules.pop("slipped", None)
 
 
 # -- places and files ---------------------------------------------------------------------------------------
