@@ -28,7 +28,7 @@ def refused(act, begins=r"slips?\.py:\d+, in "):
 
 
 def name_of(case):
-    return str(case)[:30]
+    return str(case).partition(" at 0x")[0][:30]
 
 
 @pytest.mark.parametrize(("field", "value"), slips.TASKS, ids=name_of)
