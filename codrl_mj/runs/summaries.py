@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 from codrl_mj.actuators import NAMED, actuator_from_mapping, trusting
-from codrl_mj.envs.config import upgraded
 from codrl_mj.runs.files import read_json
 from codrl_mj.runs.layout import CONFIG, EVALUATION, POLICY_FILES, PROGRESS, RESULT, finished
 from codrl_mj.tasks import named_actuator
@@ -108,7 +107,6 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
     if not isinstance(config, Mapping):
         problems.append(f"{CONFIG} is not a run configuration: it has no 'train'")
         config = {}
-    config = upgraded(config)
     env = config.get("env")
     env = env if isinstance(env, Mapping) else {}
     progress = last_report(path / PROGRESS, problems)
