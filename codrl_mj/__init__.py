@@ -10,6 +10,7 @@ Everything named here is imported on first use, so that `import codrl_mj` costs 
 
 import importlib
 import os
+import signal
 import sys
 from typing import Any
 
@@ -58,6 +59,19 @@ _PUBLIC = {
 __all__ = ["__version__", *_PUBLIC]
 
 
+def _stopped_early(*_: object) -> None:
+    """End the program at Ctrl-C while it imports what it needs; `cli.main` puts the usual handler back."""
+    os.write(2, b"codrl-mj: stopped before anything was begun\n")
+    os._exit(130)
+
+
+def _is_program() -> bool:
+    """Whether this is the process of `codrl-mj` or `python -m codrl_mj`, with nobody else's handler of Ctrl-C."""
+    called = os.path.basename((getattr(sys, "argv", None) or [""])[0])  # noqa: PTH119 - without importing more
+    named = called == "codrl-mj" or (called == "-m" and "codrl_mj" in sys.orig_argv)
+    return named and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
 def _choose_headless_backend() -> None:
     """On Linux without a display let MuJoCo render through EGL; it reads the variable when it is first imported."""
     has_display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
@@ -77,6 +91,8 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
 
 
+if _is_program():
+    signal.signal(signal.SIGINT, _stopped_early)
 _choose_headless_backend()
 importlib.import_module("codrl_mj.plugin").register()  # imports mujoco, which reads the variable
 importlib.import_module("codrl_mj.tasks")  # registers them with Gymnasium

@@ -118,8 +118,10 @@ def check(settings: Any) -> None:
             object.__setattr__(settings, field.name, kind(value))
 
 
-def check_names(given: Iterable[Any], known: Iterable[str], what: str, prefix: str = "", every: bool = False) -> None:
-    """Refuse names that are not known; the nearest known one is suggested.
+def check_names(
+    given: Iterable[Any], known: Iterable[str], what: str, prefix: str = "", every: bool = False, listed_by: str = ""
+) -> None:
+    """Refuse names that are not known; the nearest known ones are suggested.
 
     Args:
         given: the names.
@@ -127,6 +129,7 @@ def check_names(given: Iterable[Any], known: Iterable[str], what: str, prefix: s
         what: what to call them, such as `actuator field`.
         prefix: stands before each of them in the message.
         every: list the known ones beside the nearest, too: for names that somebody else has for the same.
+        listed_by: the command that lists them, where they are many.
 
     Raises:
         ValueError: one is unknown.
@@ -135,19 +138,23 @@ def check_names(given: Iterable[Any], known: Iterable[str], what: str, prefix: s
     for name in given:
         if name not in known:
             near = _nearest(name, known)
-            hints = [f"did you mean {prefix}{near[0]}?"] if near else []
+            hints = [f"did you mean {' or '.join(f'{prefix}{one}' for one in near)}?"] if near else []
             if every or not near:
-                hints.append(f"known: {', '.join(known)}")
+                hints.append(f"`{listed_by}` lists the known ones" if listed_by else f"known: {', '.join(known)}")
             raise ValueError(f"unknown {what} {prefix}{name}; {' '.join(hints)}")
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """A question with the nearest known name and a space, for the message about an unknown one; or nothing."""
-    return "".join(f"did you mean {near!r}? " for near in _nearest(name, known))
+    """A question with the nearest known names and a space, for the message about an unknown one; or nothing."""
+    near = _nearest(name, known)
+    return f"did you mean {' or '.join(map(repr, near))}? " if near else ""
 
 
 def _nearest(name: object, known: Iterable[str]) -> list[str]:
-    return difflib.get_close_matches(str(name), list(known), n=1)
+    """The few names that begin with a name of which the end was left out, or else the one that is most like it."""
+    text, spelt = str(name).lower(), {one.lower(): one for one in known}
+    begun = [spelt[one] for one in spelt if len(text) > 2 and one.startswith(text)]
+    return begun if 0 < len(begun) < 4 else [spelt[one] for one in difflib.get_close_matches(text, spelt, n=1)]
 
 
 def build(cls: type, mapping: object, what: str, prefix: str = "") -> Any:

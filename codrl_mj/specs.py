@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NoReturn
 
 import mujoco
@@ -47,9 +48,12 @@ def motorise(spec: mujoco.MjSpec, actuators: Mapping[str, Any], allow_unstable: 
         A new spec, to be compiled.
 
     Raises:
-        ValueError: a pattern matches nothing, or two match the same actuator; an actuator of the model cannot be driven
-            like this; or one of ours is not valid, or not stable at the model's step.
+        ValueError: `spec` is none; a pattern matches nothing, or two match the same actuator; an actuator of the model
+            cannot be driven like this; or one of ours is not valid, or not stable at the model's step.
     """
+    if not isinstance(spec, mujoco.MjSpec):
+        given = repr(str(spec)) if isinstance(spec, str | Path) else "FILE"
+        raise ValueError(f"spec = {spec!r}: must be a mujoco.MjSpec, such as mujoco.MjSpec.from_file({given})")
     new, model = spec.copy(), spec.copy().compile()
     # MuJoCo 3.17 copies default classes without their numbers, and forgets those that are added then; this numbers them
     new.delete(new.add_default(NAME, new.default))
@@ -76,11 +80,7 @@ def _call(target: mujoco.MjsActuator, index: int) -> str:
 
 
 def resolve_patterns(actuators: Mapping[str, Any], whose: str) -> dict[str, ActuatorModel]:
-    """Pattern -> actuator, of whatever a user may write for either.
-
-    Args:
-        actuators: as for `motorise`.
-        whose: whose they are, for messages.
+    """Pattern -> actuator, of whatever a user may write for either; messages call the model `whose`.
 
     Raises:
         ValueError: it is no mapping, a pattern is no regular expression, or an actuator is none.
@@ -185,11 +185,7 @@ def _refusal(model: mujoco.MjModel, target: mujoco.MjsActuator, index: int, actu
 def _drive(spec: mujoco.MjSpec, model: mujoco.MjModel, index: int, actuator: ActuatorModel) -> None:
     """Make an actuator of a spec one of ours.
 
-    Args:
-        spec: the new model.
-        model: the old one, compiled: it has what defaults, `inheritrange` and automatic limits come to.
-        index: the actuator's.
-        actuator: what drives it.
+    The old `model` is compiled: it has what defaults, `inheritrange` and automatic limits come to.
     """
     target, name = spec.actuators[index], f"{NAME}.{index}"
     if actuator.MOTION:  # its own loops take the place of the model's

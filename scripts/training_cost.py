@@ -10,6 +10,7 @@ threads.
 import argparse
 import dataclasses
 import json
+import math
 import tempfile
 import time
 from pathlib import Path
@@ -37,15 +38,13 @@ class Clock:
         self.enough, self.start = enough, time.process_time()
         self.learnt = "-"
         self.curve: list[str] = []
-        self._evaluation = float("nan")
 
     def __call__(self, progress: Progress) -> None:
-        """Take a report; the evaluation in it counts when it is another than before."""
-        if progress.evaluation_return == self._evaluation or progress.evaluation_return != progress.evaluation_return:
+        """Take a report, and the evaluation in it if there was one."""
+        if math.isnan(progress.evaluation_return):
             return
-        self._evaluation = progress.evaluation_return
-        self.curve.append(f"{self._evaluation:.0f}")
-        if self.learnt == "-" and self._evaluation >= self.enough:
+        self.curve.append(f"{progress.evaluation_return:.0f}")
+        if self.learnt == "-" and progress.evaluation_return >= self.enough:
             self.learnt = f"{progress.steps:6d} steps {self.seconds:5.1f} s"
 
     @property

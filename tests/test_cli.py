@@ -4,6 +4,7 @@ import dataclasses
 import importlib
 import json
 import math
+import os
 import re
 import shutil
 import subprocess
@@ -15,6 +16,7 @@ import imageio
 import numpy as np
 import pytest
 
+import codrl_mj
 from codrl_mj import TASKS, CurrentLoop, Ideal, Lag, Motor, Supply, named_actuator, register
 from codrl_mj.actuators import NAMED
 from codrl_mj.agents.presets import ELSEWHERE, PRESETS
@@ -180,7 +182,31 @@ def test_evaluation_is_that_of_the_package(capsys, trained, tmp_path):
     assert result["episodes"] == 7
     text = capsys.readouterr().out
     assert f"{np.mean(totals):.1f}" in text
-    assert f"{result['tracking_rms']:.3f} N·m" in text
+    assert f"{result['tracking_rms']:.3g} N·m" in text
+
+
+def test_several_policies_have_a_row_each_in_the_environment_of_their_own_training(capsys, trained, tmp_path):
+    shutil.copytree(trained, tmp_path / "other" / trained.name)
+    config = tmp_path / "other" / trained.name / "config.json"
+    content = json.loads(config.read_text())
+    content["train"]["env"]["actuator"] = "paper"
+    content.pop("sha256", None)
+    config.write_text(json.dumps(content))
+    both = [str(trained), str(config.parent)]
+    assert main(["evaluate", *both, "--episodes", "3", "--out", "both.json"]) == 0
+    found = json.loads((tmp_path / "both.json").read_text())
+    assert list(found) == [f"{Path(one).parent.name}/{trained.name} on as-trained" for one in both]
+    for path, result in zip(both, found.values(), strict=True):
+        assert main(["evaluate", path, "--episodes", "3", "--out", "one.json"]) == 0
+        assert json.loads((tmp_path / "one.json").read_text()) == result
+    assert len({json.dumps(one["conditions"]) for one in found.values()}) == 2
+    assert "POLICY: none was given" in refused(capsys, "evaluate")
+
+
+def test_what_the_study_does_not_know_is_advised_to_be_compared(capsys):
+    said = refused(capsys, "advise", "re25", "Hopper-v5")
+    assert "knows pendulum, cartpole" in said
+    assert "codrl-mj evaluate RUN RUN --actuator re25" in said
 
 
 def test_a_policy_is_evaluated_on_any_actuator(trained, tmp_path):
@@ -354,6 +380,7 @@ def test_the_source_of_a_family_is_part_of_what_a_run_was_made_with(own_family, 
 
 def test_so_is_the_file_of_a_model_of_somebody_s_own(tmp_path):
     arm, path = find_task("tests.own_project.arm:TASK"), tmp_path / "arm.xml"
+    path.touch()
     register(dataclasses.replace(arm, name="copied_arm", env_id="tests/CopiedArm-v0", asset=str(path)))
     own, foreign = EnvConfig("copied_arm", "lag"), ForeignConfig("HalfCheetah-v5", options={"xml_file": str(path)})
     digests = []
@@ -391,13 +418,138 @@ def test_a_certificate_that_is_stopped_exits_with_130_and_leaves_nothing(monkeyp
 
 
 @pytest.mark.parametrize(
-    "line", ["", "fly cartpole", "train", "train cartpoll", "train cartpole --seed two", "train cartpole --typo"]
+    ("line", "expected"),
+    [
+        ("", "codrl-mj needs a verb, one of train, evaluate, runs,"),
+        ("trian cartpole", "unknown verb 'trian': did you mean 'train'? verbs are train, evaluate,"),
+        ("motor", "codrl-mj motor needs a verb, one of list, show,"),
+        ("motor lst", "unknown verb 'lst': did you mean 'list'? verbs are list, show,"),
+        ("motor show", "codrl-mj motor show needs NAME;"),
+        ("motor show maxon-ec45", "did you mean 'maxon-ec45-flat-339285' or 'maxon-ec45-flat-50w'?"),
+        ("motor list --sort stal", "--sort stal: did you mean 'stall_torque' or 'stall_current'? must be one of"),
+        ("identify check", "codrl-mj identify check needs --columns;"),
+        ("train", "codrl-mj train needs TASK; codrl-mj train --help says more"),
+        (
+            "train pendulm --agent sac",
+            "unknown task 'pendulm': did you mean 'pendulum'? It can be module:NAME of your own",
+        ),
+        ("train pendulm", "Gymnasium's goes by its id, such as HalfCheetah-v5"),
+        ("render pendulm", "no run configuration at pendulm/config.json: did you mean 'pendulum'?"),
+        ("train CartPole-v1", "has no MuJoCo model built from XML, and so no motors: take 'cartpole', our task"),
+        ("train cartpole more", "unexpected 'more': codrl-mj train --help"),
+        ("train cartpole --seed", "--seed needs a value: a whole number"),
+        ("train cartpole --seed two", "--seed two: must be a whole number"),
+        ("train cartpole --total-steps 1.5e0", "--total-steps 1.5: must be None or a whole number"),
+        ("train cartpole --sed 3", "unknown flag --sed: did you mean '--seed'?"),
+        ("train cartpole --kp 3", "unknown flag --kp: did you mean '--actuator.controller.kp'?"),
+        ("train cartpole --agent pp", "--agent pp: did you mean 'ppo'? must be one of ppo, ddpg"),
+        (
+            "train cartpole --gear-ratio 20",
+            "--gear-ratio: the actuator has no gear ratio; motors of codrl-mj motor list",
+        ),
+        (
+            "train cartpole --actuator nope:X --actuator.efficiency 1",
+            "'nope:X': No module named 'nope'; must be module:",
+        ),
+        ("train cartpole --actuator nope.py:X", "nope.py: there is no such file; must be FILE.py:NAME"),
+        ("train cartpole --actuator ../up/nope.py:X", "nope.py: there is no such file; must be FILE.py:NAME"),
+        ("train cartpole --num-envs 1e12 --agent dqn --out run", "num_envs = 1000000000000: takes about 3e+06 GB of"),
+        ("train InvertedPendulum-v5 --num-envs 1e9", "num_envs = 1000000000: takes about 2e+05 GB of memory, of which"),
+        ("view cartpole --port 99999", "--port 99999: must be from 1 to 65535"),
+    ],
 )
-def test_a_line_that_cannot_be_parsed_exits_with_2(capsys, line):
-    with pytest.raises(SystemExit) as done:
-        main(line.split())
-    assert done.value.code == 2
-    assert "Traceback" not in capsys.readouterr().err
+def test_a_line_that_is_not_understood_costs_one_line(capsys, line, expected):
+    assert expected in refused(capsys, *line.split())
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *(
+            "train cartpole --out {}",
+            "evaluate run --out {}/e.json",
+            "runs . --out {}/r.json",
+            "render furuta --out {}/a.gif",
+        ),
+        *("render furuta --trajectory {}/a.npz", "replay furuta --out {}/a.html", "report run --out {}/a.html"),
+        *(
+            "motor show maxon-re65 --out {}",
+            "motor show maxon-re65 --html {}/a.html",
+            "motor design maxon-re65 --out {}",
+        ),
+        *(
+            "motor choose pendulum --out {}",
+            "identify plan maxon-re65 --out {}",
+            "identify simulate maxon-re65 --out {}/l.csv",
+        ),
+        *("identify log.csv --columns time=t:s --out {}", "validate --out {}", "study actuators --out {}"),
+        *("reproduce --root {}", "study actuators --root {} --out ."),
+    ],
+)
+def test_what_cannot_be_written_is_refused_before_anything_is_computed(capsys, tmp_path, line):
+    (tmp_path / "file").touch()
+    for place in ("file", "/proc/nowhere"):
+        error = refused(capsys, *line.format(place).split())
+        assert "cannot write to" in error
+        assert Path(place).name in error
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("evaluate run --out .", "cannot write .: it is a folder"),
+        ("replay furuta --out a.mp4", "the suffix is '.mp4', must be .html"),
+        ("render furuta --trajectory a.csv", "the suffix is '.csv', must be .npz"),
+    ],
+)
+def test_an_output_of_another_kind_is_refused(capsys, line, expected):
+    assert expected in refused(capsys, *line.split())
+
+
+def test_what_is_no_fault_of_the_input_is_one_line_and_whole_on_request(capsys, monkeypatch):
+    monkeypatch.setattr("codrl_mj.runs.summaries.find_runs", lambda _: {}["absent"])
+    assert refused(capsys, "runs") == "codrl-mj: error: KeyError: 'absent' (--traceback shows where)\n"
+    assert main(["runs", "--traceback"]) == 2
+    traced = capsys.readouterr().err
+    assert traced.startswith("Traceback (most recent call last):")
+    assert traced.endswith("codrl-mj: error: KeyError: 'absent' (--traceback shows where)\n")
+
+
+def test_a_library_that_trips_over_ctrl_c_is_ctrl_c(capsys, monkeypatch):
+    def imported(_):
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            raise ImportError("initialisation of a library failed")  # noqa: B904
+
+    monkeypatch.setattr("codrl_mj.runs.summaries.find_runs", imported)
+    assert main(["runs"]) == 130
+    assert capsys.readouterr().err == "codrl-mj: stopped: the same command begins anew\n"
+
+
+def test_numbers_are_understood_as_people_write_them(monkeypatch):
+    given = []
+    monkeypatch.setattr("codrl_mj.cli.train.Train.run", lambda self: given.append(self) or 0)
+    motor = "--actuator maxon-re65 --gear-ratio 20:1 --voltage=12 --total-steps 1e5 --num-envs 64 --agent.hidden 1e1 8"
+    assert main(["train", "pendulum", "--agent", "ppo", *motor.split()]) == 0
+    assert (given[0].total_steps, given[0].num_envs, given[0].agent.hidden) == (100_000, 64, (10, 8))
+    assert given[0].actuator_fields.motor.gear_ratio == 20.0
+    assert given[0].actuator_fields.supply.voltage == 12.0
+
+
+def test_the_version_is_told(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"codrl-mj {codrl_mj.__version__}\n"
+
+
+def test_the_short_help_has_every_flag_and_half_the_lines(capsys):
+    long = helped(capsys, "train", "pendulum")
+    with pytest.raises(SystemExit):
+        main(["train", "pendulum", "-h"])
+    short = capsys.readouterr().out
+    assert set(re.findall(r" --[a-z][\w.-]+", long)) <= set(re.findall(r" --[a-z][\w.-]+", f" {short} --actuators "))
+    assert "--help-verbose" in short
+    assert short.count("\n") < 130
 
 
 @pytest.mark.parametrize("missing", but(["torch"], ["torch", "stable_baselines3", "safetensors", "matplotlib"]))
@@ -586,3 +738,28 @@ def test_draws_of_the_training_over_another_actuator_are_said(capsys):
     assert main(["evaluate", "drawn", "--episodes", "1", "--actuator", "weak", "--env.randomize", "None"]) == 0
     assert main(["evaluate", "drawn", "--episodes", "1"]) == 0
     assert "drawn as in" not in capsys.readouterr().err
+
+
+def test_training_says_first_what_is_assumed_of_the_motor(capsys, monkeypatch):
+    monkeypatch.setattr("codrl_mj.training.train", lambda *_, **__: None)
+    assert main(["train", "pendulum", "--actuator", "maxon-ec45-flat-339285", "--out", "assumed"]) == 0
+    assumed = "assumed, for none is given: supply.voltage = 24 V, controller.max_current = inf"
+    assert capsys.readouterr().out.splitlines()[0] == assumed
+    flags = "--actuator.supply.voltage", "12", "--actuator.controller.max-current", "5"
+    assert main(["train", "pendulum", "--actuator", "maxon-ec45-flat-339285", "--out", "assumed", *flags]) == 0
+    assert "assumed, for" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("program", [[str(PROGRAM)], [sys.executable, "-m", "codrl_mj"]])
+def test_ctrl_c_while_the_program_is_imported_is_one_line(program):
+    """At its first import of a library, whatever that takes."""
+    code = "import os, signal, sys\nclass Stop:\n    def find_spec(self, name, *_):\n"
+    code += (
+        "        if name == 'tyro':\n            os.kill(os.getpid(), signal.SIGINT)\nsys.meta_path.insert(0, Stop())\n"
+    )
+    Path("sitecustomize.py").write_text(code)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path.cwd()), *filter(None, sys.path)])}
+    done = subprocess.run(
+        [*program, "--help"], capture_output=True, text=True, timeout=60, check=False, env=environment
+    )
+    assert (done.returncode, done.stderr) == (130, "codrl-mj: stopped before anything was begun\n")

@@ -2,8 +2,11 @@
 
 import contextlib
 import csv
+import json
 import re
 import shlex
+import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -101,6 +104,92 @@ def test_a_command_of_a_page_is_understood(page, command, monkeypatch):
     with contextlib.suppress(SystemExit):
         assert cli.main(shlex.split(command, comments=True)) == 0
     assert len(parsed) == 1
+
+
+SHORTER = {
+    "train": "--total-steps 300 --evaluation-episodes 1",
+    "evaluate": "--episodes 1",
+    "render": "--env.max-episode-steps 4 --width 160 --height 120",
+    "report": "--no-film",
+    "study": "--dry-run",
+    "reproduce": "--dry-run",
+    "validate": "--quick",
+}
+"""Verb -> flags with which a command takes seconds."""
+NEEDING_MORE = (
+    r"identify|view|validate (--model|--mutations|--out)|validate *(#.*)?$|.*policies/theirs|.*model.zip"
+    "|.*--backend ray|.*motor/actuator.yaml"
+)
+"""Commands that have logs, a browser, a cluster, somebody else's files or minutes before them: they are only parsed."""
+RUNNER = """
+import json, runpy, sys
+from gymnasium.envs.registration import registry
+from codrl_mj.tasks import TASKS
+paths, ours = list(sys.path), set(TASKS)
+for line in json.load(sys.stdin):
+    sys.argv, sys.path[:] = [sys.argv[0], *line], paths  # nothing is left of the command before but what is compiled
+    for own in ("my_gearbox", "my_module", "ball_and_beam"):
+        sys.modules.pop(own, None)
+    for own in set(TASKS) - ours:
+        registry.pop(TASKS.pop(own).env_id)
+    try:
+        runpy.run_path(sys.argv[0], run_name="__main__")
+    except SystemExit as done:
+        if done.code:
+            sys.exit(f"exit {done.code}: {line}")
+"""
+"""Runs command lines by the console script as a shell would, but in one process: numba compiles for all once."""
+
+
+def shortened(command):
+    words = shlex.split(command, comments=True)
+    if "--measure" in words:  # minutes, and the last flag
+        words = words[: words.index("--measure")]
+    more = SHORTER.get(words[0], "") if "--resume" not in words else ""
+    if "sarsa" in words:
+        more = "--total-episodes 2 --evaluation-episodes 1"
+    return words + more.split()  # the last one of a flag counts
+
+
+RUN = {
+    page: [command for name, command in (one.values for one in COMMANDS) if name == page]
+    for page in dict.fromkeys(one.values[0] for one in COMMANDS)
+}
+RUN = {page: [one for one in lines if not re.match(NEEDING_MORE, one)] for page, lines in RUN.items()}
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=[] if page == "docs/actuators.md" else pytest.mark.matrix)
+        for page, lines in RUN.items()
+        if lines
+    ],
+)
+def test_the_commands_of_a_page_run_as_typed(page, trained, tmp_path):
+    """By the console script, in a folder that has what the page says to write, and the runs that it does not make."""
+    text = " ".join(RUN[page])
+    for run in set(re.findall(r"runs/\w+", text)) - set(re.findall(r"--out (runs/\w+)", text)):
+        path = tmp_path / run
+        if not path.exists():
+            path.symlink_to(trained)
+    for run in ("mine", "through"):
+        if f"--out runs/{run}" in text:
+            (tmp_path / "runs" / run).unlink(missing_ok=True)
+    for file in (ROOT / "examples/own_robot").iterdir():
+        if file.is_file():
+            shutil.copy(file, tmp_path)
+    shutil.copy(tmp_path / "ball_and_beam.py", tmp_path / "my_module.py")
+    program = Path(sys.executable).with_name("codrl-mj")
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", f"import sys; sys.argv = [{str(program)!r}]{RUNNER}"],
+        input=json.dumps([shortened(command) for command in RUN[page]]),
+        capture_output=True,
+        text=True,
+        timeout=500,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
 
 
 @pytest.mark.parametrize("page", PAGES)

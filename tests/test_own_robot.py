@@ -1,5 +1,6 @@
 """What docs/own_robot.md tells a reader to type works as it stands, and the robot is what it says it is."""
 
+import dataclasses
 import math
 import re
 import shlex
@@ -12,13 +13,14 @@ import mujoco
 import numpy as np
 import pytest
 
+import codrl_mj
 from codrl_mj.cli import main
 
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "examples" / "own_robot"
 PAGE = (ROOT / "docs" / "own_robot.md").read_text()
 BLOCKS = re.findall(r"```(xml|python|console)\n(.*?)```", PAGE, re.DOTALL)
-FILES, COMMANDS = BLOCKS[:2], re.findall(r"^\$ python -m codrl_mj (.*)$", PAGE, re.MULTILINE)
+FILES, COMMANDS = BLOCKS[:2], re.findall(r"^\$ codrl-mj (.*)$", PAGE, re.MULTILINE)
 SHORT = {"100000": "512", "50": "1"}
 """Numbers of the page's commands -> those of the tests, whose machine has other things to do."""
 
@@ -39,6 +41,11 @@ def test_the_page_has_the_files_whole():
         ("xml", (FOLDER / "ball_and_beam.xml").read_text()),
         ("python", (FOLDER / "ball_and_beam.py").read_text()),
     ] == FILES
+
+
+def test_the_page_has_every_field_of_a_task():
+    named = set(re.findall(r"`(\w+)`", "".join(re.findall(r"^\| (`.*?) \|", PAGE, re.MULTILINE))))
+    assert named == {field.name for field in dataclasses.fields(codrl_mj.Task)}
 
 
 def test_the_python_examples_run(capsys):

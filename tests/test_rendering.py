@@ -1,24 +1,31 @@
 """Films: the right format, size and length, the right content, and no file when something fails."""
 
 import contextlib
+import dataclasses
+import re
 
 import imageio
+import mujoco
 import numpy as np
 import pytest
 from PIL import Image
 
-from codrl_mj import TASKS, Actuator, Motor, named_actuator
+from codrl_mj import TASKS, Actuator, Drive, Motor, named_actuator
+from codrl_mj.actuators import IDEAL
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import Episode, RandomPolicy, run_episodes
 from codrl_mj.films.film import Panel, film
 from codrl_mj.films.strip import torque_label
 from codrl_mj.physics import signal_names
+from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.offscreen import OffscreenRenderer
+from codrl_mj.tasks.assets import asset_path
 
 WIDTH, HEIGHT = 200, 120
 FRAME_HEIGHT = 40 + HEIGHT + 24 + 120 + 8 + 60 + 26  # title, scene, and the strip's legend, plots and time axis
 PLOT_TOP = 40 + HEIGHT + 24
 DESIRED, ACTUAL, SATURATED, VOLTAGE = (0, 114, 178), (213, 94, 0), (204, 121, 167), (0, 158, 115)
+LIMITS = {"voltage": SATURATED, "current": (230, 159, 0), "temperature": (86, 180, 233)}
 SIGNALS = signal_names(Actuator)
 
 
@@ -186,12 +193,34 @@ def test_a_long_episodes_strip_slides(monkeypatch, tmp_path):
     assert late > 70  # below it: the first half has left the window
 
 
-@pytest.mark.parametrize("saturated", [True, False])
-def test_saturation_is_marked(monkeypatch, tmp_path, saturated):
-    frame = filmed(monkeypatch, tmp_path, [made_up(8.0, -4.0, saturated=saturated)])[-1]
-    pale = 0.3 * np.array(SATURATED) + 0.7 * 255
-    marked = (np.abs(frame[PLOT_TOP : PLOT_TOP + 120] - pale).max(axis=-1) < 12).mean()
-    assert (marked > 0.3) if saturated else (marked == 0.0)
+@pytest.mark.parametrize("limit", ["voltage", "current", "temperature", "", None])
+def test_saturation_is_marked_in_the_colour_of_its_limit(monkeypatch, tmp_path, limit):
+    """Of a drive the limit that is met, or none; of a current loop its only one."""
+    panel = made_up(8.0, -4.0, saturated=limit != "")
+    if limit is not None:
+        signals = panel.episode.signals | {f"{one}_saturated": np.full(40, float(one == limit)) for one in LIMITS}
+        panel = dataclasses.replace(
+            panel, actuator=Drive(), episode=dataclasses.replace(panel.episode, signals=signals)
+        )
+    frame = filmed(monkeypatch, tmp_path, [panel])[-1]
+    for one, colour in LIMITS.items():
+        pale = 0.3 * np.array(colour) + 0.7 * 255
+        marked = (np.abs(frame[PLOT_TOP : PLOT_TOP + 120] - pale).max(axis=-1) < 12).mean()
+        met = limit != "" and one == (limit or "voltage")
+        assert (marked > 0.3) if met else (marked < 0.1), one  # the edges of lines are pale too
+
+
+def test_a_model_without_a_sky_is_drawn_on_ours(tmp_path):
+    """Pendulum's own, its sky taken out."""
+    bare = tmp_path / "bare.xml"
+    bare.write_text(re.sub(r'<texture name="sky".*?/>', "", asset_path("pendulum.xml").read_text()))
+    images = []
+    for task in (TASKS["pendulum"], dataclasses.replace(TASKS["pendulum"], asset=str(bare))):
+        model = task_model(task, (IDEAL,), 0.01)
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        images.append(OffscreenRenderer(model, WIDTH, HEIGHT).render(data))
+    np.testing.assert_array_equal(*images)
 
 
 def test_the_scene_shows_the_states(monkeypatch, tmp_path):

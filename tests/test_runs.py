@@ -1,6 +1,7 @@
 """Run folders: what is read from them, whatever is missing or damaged, and how they are compared."""
 
 import datetime
+import hashlib
 import json
 import os
 
@@ -8,9 +9,13 @@ import pytest
 import tyro
 
 from codrl_mj import Actuator, CurrentLoop, Motor, named_actuator
-from codrl_mj.actuators import mapping_of
+from codrl_mj.actuators import actuator_over, mapping_of, resolve
 from codrl_mj.cli.runs import Runs
+from codrl_mj.foreign.config import ForeignConfig
+from codrl_mj.pages import report
 from codrl_mj.runs.summaries import SORT_KEYS, compare, find_runs, read_run, sort_runs
+from codrl_mj.training.config import TrainConfig
+from codrl_mj.training.folder import load_config, start_folder
 
 PROGRESS = "steps,episodes,mean_return,steps_per_second,seconds\n"
 UNITS = {"returns": "reward", "tracking_rms": "N*m", "peak_voltage": "V"}
@@ -21,18 +26,21 @@ def make_run(folder, actuator="weaker", *, seed=3, task="cartpole", finished=Tru
     folder.mkdir(parents=True)
     motor = named_actuator(actuator, task) if isinstance(actuator, str) else actuator
     config = {
-        "task": task,
-        "actuator": mapping_of(motor),
         "agent": {"name": "ppo", "learning_rate": 1e-3, "hidden": [64, 64]},
         "seed": seed,
         "total_steps": 4000,
-        "env": {"center_radius": None, "disturbances": {"command_delay": 0.0}},
+        "env": {"task": task, "actuator": mapping_of(motor), "disturbances": {"command_delay": 0.0}},
     } | train
     (folder / "config.json").write_text(json.dumps({"train": config, "versions": {"torch": "2.13.0"}}))
-    (folder / "progress.csv").write_text(f"{PROGRESS}1000,9,20.5,500,2.5\n2000,12,90.25,500,4.5\n")
+    (folder / "progress.csv").write_text(
+        f"{PROGRESS}1000,9,20.5,500,2.5\n{4096 if finished else 2000},12,90.25,500,4.5\n"
+    )
     if finished:
-        (folder / "policy.json").write_text("{}")
-        (folder / "policy.safetensors").write_bytes(b"")
+        for place in (folder, folder / "best"):
+            place.mkdir(exist_ok=True)
+            (place / "policy.safetensors").write_bytes(b"weights")
+            digest = hashlib.sha256(b"weights").hexdigest()
+            (place / "policy.json").write_text(json.dumps({"weights_sha256": digest}))
         (folder / "result.json").write_text(json.dumps({"steps": 4096, "mean_return": 91.0, "seconds": 8.25}))
     if evaluated:
         returns = {"mean": 400.0 + seed, "low": 380.0, "high": 420.0}
@@ -92,11 +100,28 @@ def test_the_actuator_has_its_name_on_the_task(tmp_path, actuator, task, name):
     assert read_run(make_run(tmp_path / "mine", actuator, task=task)).actuator == name
 
 
-@pytest.mark.parametrize("actuator", [{"motor": {"colour": 3}}, 7, ["weaker"]])
+def test_motors_keep_their_names(tmp_path):
+    """Known by their numbers where they are the catalogue's, whatever their gear; others by what the run was told."""
+    geared = actuator_over(resolve("kraken-x60", None, "nobody"), {"motor": {"gear_ratio": 70.3}})
+    own = actuator_over(geared, {"motor": {"resistance": 0.5}})
+    assert read_run(make_run(tmp_path / "one", geared)).actuator == "kraken-x60"
+    assert read_run(make_run(tmp_path / "two", own)).actuator == "drive"
+    (tmp_path / "three").mkdir()
+    patterns = {"a": "kraken-x60", "b": {"label": "drawer", **own.as_mapping()}, "c": None}
+    config = TrainConfig(ForeignConfig("HalfCheetah-v5", patterns))
+    start_folder(tmp_path / "three", config)
+    assert read_run(tmp_path / "three").actuator == "kraken-x60, drawer, ideal"
+    assert load_config(tmp_path / "three").env.through == config.env.through == "kraken-x60, drawer, ideal"
+    sentence = " ".join(report._sentence(read_run(tmp_path / "three")).split())
+    assert "SAC on HalfCheetah-v5 through the actuators kraken-x60, drawer, ideal" in sentence.replace("PPO", "SAC")
+    assert "labels" not in str(config.as_mapping()) + str(read_run(tmp_path / "three").configuration)
+
+
+@pytest.mark.parametrize("actuator", [{"motor": {"colour": 3}}, 7, [["weaker"]]])
 def test_an_actuator_that_cannot_be_read_is_custom(tmp_path, actuator):
     folder = make_run(tmp_path / "mine")
     content = json.loads((folder / "config.json").read_text())
-    content["train"]["actuator"] = actuator
+    content["train"]["env"]["actuator"] = actuator
     (folder / "config.json").write_text(json.dumps(content))
     assert read_run(folder).actuator == "custom"
 
@@ -115,6 +140,14 @@ def test_an_actuator_that_cannot_be_read_is_custom(tmp_path, actuator):
         ("progress.csv", b"\xff\xfe\x00", "progress.csv"),
         ("progress.csv", b"a,b\n1,2\n", "progress.csv has no column 'steps'"),
         ("policy.safetensors", None, "policy.safetensors is missing"),
+        (
+            "policy.safetensors",
+            b"exchanged",
+            "policy.safetensors is truncated or damaged, or it and policy.json do not",
+        ),
+        ("policy.json", b'{"format"', "policy.json is not a policy description: it is truncated"),
+        ("best/policy.safetensors", b"weig", "best/policy.safetensors is truncated or damaged"),
+        ("progress.csv", PROGRESS.encode() + b"1000,9,20.5,500,2.5\n", "progress.csv ends at step 1000 of 4096"),
     ],
 )
 def test_a_damaged_run_is_listed_with_what_is_wrong_among_the_others(tmp_path, file, content, problem):
@@ -149,7 +182,7 @@ def test_a_configuration_with_little_in_it_is_no_damage(tmp_path, content):
 def test_runs_are_found_at_any_depth_but_not_in_each_other_nor_in_hidden_folders(tmp_path):
     make_run(tmp_path / "b")
     make_run(tmp_path / "deep" / "er" / "a")
-    make_run(tmp_path / "b" / "best")
+    make_run(tmp_path / "b" / "inner")
     make_run(tmp_path / ".being-written")
     (tmp_path / "empty").mkdir()
     assert [run.name for run in find_runs(tmp_path)] == ["b", "deep/er/a"]

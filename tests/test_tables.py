@@ -39,7 +39,7 @@ def test_a_row_has_the_most_telling_measures(results):
     assert " ".join(row.split()) == (
         f"mine {100 * result.success.mean:.0f} % "
         f"{result.returns.mean:.1f} [{result.returns.low:.1f}, {result.returns.high:.1f}] "
-        f"{result.tracking_rms:.3f} N·m {result.saturated_percent:.1f} % {result.peak_voltage:.1f} V "
+        f"{result.tracking_rms:.3g} N·m {result.saturated_percent:.1f} % {result.peak_voltage:.1f} V "
         f"{result.energy_drawn.mean:.3g} J"
     )
     assert "3 episodes a row" in lines[0]
@@ -63,7 +63,7 @@ def test_tables_fit_and_break_no_number(results, count):
     text = "\n".join(lines)
     for result in list(results.values())[:count]:
         assert "{:.1f} [{:.1f}, {:.1f}]".format(*result.returns) in text
-        assert f"{result.tracking_rms:.3f} N·m" in text
+        assert f"{result.tracking_rms:.3g} N·m" in text
 
 
 def test_every_measure_is_in_one_of_the_tables(results):

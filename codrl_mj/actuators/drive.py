@@ -58,7 +58,17 @@ class Signals(NamedTuple):
     temperature: float
     """Of the winding [degC], at the end of the step."""
     saturated: float
-    """1 where the voltage, or the current asked for, was at its limit in some sample."""
+    """1 where any of the three that follow is."""
+    voltage_saturated: float
+    """1 where the voltage was at the supply's limit in some sample."""
+    current_saturated: float
+    """1 where more than `max_current` was asked for."""
+    temperature_saturated: float
+    """1 where more was asked for than takes the winding to `max_temperature`, and less than `max_current` was given."""
+    electrical_power: float
+    """Mean of voltage times current at the winding's terminals [W]."""
+    copper_loss: float
+    """Mean heat [W] in the winding, by the square of the current within the samples."""
 
 
 def limited(parameters: Any, timestep: float, heat: Heat, resistance: float, asked: float) -> float:
@@ -118,20 +128,25 @@ def _advance(
     winding, _, means = shaft.turn(parameters, resistance, timestep, samples, winding, moving, closed, reference)
     after = end(parameters, timestep, inputs.time, heat, resistance, winding, moving, means)
     temperature = shaft.temperature_of(parameters, Heat(after.winding_rise, after.housing_rise))
-    at_limit = 1.0 if means.saturated > 0.0 or reference != asked else 0.0
     shown = reference if closed else means.current
-    return after, means.torque, Signals(means.current, shown, means.voltage, temperature, at_limit)
+    less, warm = reference != asked, abs(reference) < parameters.max_current
+    signals = Signals(
+        means.current,
+        shown,
+        means.voltage,
+        temperature,
+        1.0 if means.saturated > 0.0 or less else 0.0,
+        1.0 if means.saturated > 0.0 else 0.0,
+        1.0 if less and not warm else 0.0,
+        1.0 if less and warm else 0.0,
+        means.power,
+        means.heat,
+    )
+    return after, means.torque, signals
 
 
 def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Signals]:
-    """Advance winding, loop and shaft by one mechanical step.
-
-    Args:
-        parameters: named as the fields of `Drive` and its parts.
-        timestep: mechanical step [s].
-        state: as the step before left it.
-        inputs: desired torque [N*m], speed [rad/s] and inertia [kg*m^2] at the rotor.
-    """
+    """Advance winding, loop and shaft by one mechanical step [s]; speed and inertia of the inputs are the rotor's."""
     return _advance(parameters, timestep, state, inputs, True)
 
 
@@ -156,6 +171,8 @@ class Drive(ActuatorModel):
         "reference_current": "A",
         "voltage": "V",
         "temperature": "degC",
+        **dict.fromkeys(("voltage_saturated", "current_saturated", "temperature_saturated"), "1"),
+        **dict.fromkeys(("electrical_power", "copper_loss"), "W"),
     }
     OBSERVED: ClassVar[tuple[str, ...]] = ("current", "reference_current")
     INERTIA: ClassVar[bool] = True
@@ -211,17 +228,20 @@ class Drive(ActuatorModel):
         """The supply's voltage [V]."""
         return 24.0 if self.supply is None else self.supply.voltage
 
+    @property
+    def assumed(self) -> str:
+        """As `ActuatorModel.assumed`: the supply, the largest current, the inertia of the rotor."""
+        missing = {
+            f"supply.voltage = {self.voltage_limit:g} V": self.supply is None,
+            "controller.max_current = inf": math.isinf(self.controller.max_current),
+            "motor.rotor_inertia = 0": self.motor.rotor_inertia == 0.0,
+        }
+        told = ", ".join(text for text, is_missing in missing.items() if is_missing)
+        return f"assumed, for none is given: {told}" if told else ""
+
     @classmethod
     def from_numbers(cls, numbers: Any, arm_radius: float = 1.0) -> Any:
-        """As `ActuatorModel.from_numbers`: the arm is that between rotor and load, the gear's ratio among the numbers.
-
-        Args:
-            numbers: shape (p,).
-            arm_radius: [m].
-
-        Raises:
-            ValueError: a number is out of its field's bounds.
-        """
+        """As `ActuatorModel.from_numbers`: the arm is that between rotor and load, the gear among the numbers."""
         family: Any = cls
         return super().from_numbers(numbers, arm_radius * parameters_type(family)(*numbers).gear_ratio)
 
@@ -299,10 +319,6 @@ class Drive(ActuatorModel):
         """The spectral radius of the loop over a sample; infinite where a step holds no whole number of samples.
 
         And where two fields are together what their class refuses.
-
-        Args:
-            numbers: shape (m, p), rows as `numbers` returns them.
-            timestep: mechanical step [s].
         """
         columns = stability.columns(cls, numbers)
         samples = timestep * columns.sample_rate

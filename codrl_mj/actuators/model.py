@@ -11,14 +11,18 @@ import dataclasses
 import functools
 import hashlib
 import importlib
+import itertools
 import math
+import traceback
 from collections import namedtuple
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from codrl_mj import fields
+from codrl_mj.own_code import Form, call, check_form, place
 
 
 class Inputs(NamedTuple):
@@ -94,8 +98,8 @@ class ActuatorModel:
     """What it remembers: a `NamedTuple` of floats, all 0 at the start of an episode."""
     Signals: ClassVar[type] = Nothing
     """What can be seen of it after a step: a `NamedTuple` of floats. A signal called `saturated` is 1 where the
-    actuator is at its limit. Signals called `current` [A] and `voltage` [V] make the electrical measures of an
-    evaluation."""
+    actuator is at its limit; `voltage_saturated`, `current_saturated` and `temperature_saturated` may say at which.
+    Signals called `current` [A] and `voltage` [V] make the electrical measures of an evaluation."""
     SIGNAL_UNITS: ClassVar[Mapping[str, str]] = {}
     """Units of the signals, for tables and figures."""
     OBSERVED: ClassVar[tuple[str, ...]] = ()
@@ -166,6 +170,11 @@ class ActuatorModel:
     def voltage_limit(self) -> float | None:
         """The largest voltage [V], to be drawn in figures of the signal `voltage`."""
         return None
+
+    @property
+    def assumed(self) -> str:
+        """A sentence on what is taken for numbers that nobody gave, for whoever uses it; empty where all are given."""
+        return ""
 
     def commands(self) -> Mapping[str, Command]:
         """What an agent can command besides the force, by name.
@@ -386,7 +395,7 @@ def parameter_paths(cls: type) -> Mapping[str, str]:
     A parameter is called as its field is, and in a part that may be None by the part's name and the field's.
 
     Raises:
-        TypeError: two of them have the same name.
+        ValueError: two of them have the same name.
     """
     optional = {field.name for field in dataclasses.fields(cls) if "absent" in field.metadata}
     paths = [path for path in field_paths(cls) if not _is_arm(path)]
@@ -394,7 +403,8 @@ def parameter_paths(cls: type) -> Mapping[str, str]:
         path.replace(".", "_") if path.split(".")[0] in optional else path.rpartition(".")[2]: path for path in paths
     }
     if len(named) < len(paths):
-        raise TypeError(f"{cls.__name__}: two parameters have the same name: {', '.join(paths)}")
+        twice = [path for path in paths if path not in named.values()]
+        raise ValueError(f"{cls.__name__}: another parameter has the same name as {', '.join(twice)}: rename one")
     return named
 
 
@@ -409,6 +419,49 @@ def parameters_type(cls: type) -> Any:
 
 def _parameters(cls: type, *numbers: float) -> Any:
     return parameters_type(cls)(*numbers)
+
+
+def advance_form(cls: Family) -> tuple[Form, str]:
+    """What `advance` is to return, and what says so."""
+    return (cls.State._fields, "torque", cls.Signals._fields), f"{cls.__name__}.State and {cls.__name__}.Signals"
+
+
+@functools.cache
+def check_family(cls: Family) -> None:
+    """Refuse a family whose functions do not return what it declares: each is called once on plain numbers.
+
+    Raises:
+        ValueError: as it says; the message has the place, or the name of what is declared.
+    """
+    for name in ("State", "Signals"):
+        if not hasattr(kind := getattr(cls, name), "_fields"):
+            raise ValueError(f"{cls.__name__}.{name} = {kind!r}: must be a typing.NamedTuple of floats")
+    if any(isinstance(value, dataclasses.Field) for value in vars(cls).values()):
+        raise ValueError(f"{cls.__name__}: must be decorated with @dataclasses.dataclass(frozen=True)")
+    if reserved := {"desired_force", "actual_force", "speed"} & {*cls.Signals._fields}:
+        raise ValueError(f"{cls.__name__}.Signals: {', '.join(reserved)}: every family has that: choose another name")
+    fields.check_names(cls.SIGNAL_UNITS, cls.Signals._fields, "signal", "SIGNAL_UNITS.")
+    fields.check_names(cls.RANDOM, field_paths(cls), "field", "RANDOM: ")
+    if missing := [one.name for one in dataclasses.fields(cls) if one.default is dataclasses.MISSING]:
+        raise ValueError(f"{cls.__name__}.{missing[0]}: must have a default")
+    actuator = cls()
+    for path in field_paths(cls):
+        if not isinstance(value := _get(actuator, path), int | float):
+            raise ValueError(f"{cls.__name__}.{path} = {value!r}: must be a number; see `codrl_mj.fields`")
+    parameters, step = parameters_type(cls)(*actuator.numbers), np.float64(1e-3)
+    inputs = Inputs(*map(np.float64, (0.1, 0.2, 0.3, 0.0, 0.0, 1.0)))
+    state, signals = (kind(*map(np.float64, [0.0] * len(kind._fields))) for kind in (cls.State, cls.Signals))
+    if cls.advance is ActuatorModel.advance:
+        raise ValueError(f"{cls.__name__}: has no `advance`")
+    result = call(f"{cls.__name__}.advance", cls.advance, parameters, step, state, inputs)
+    after, torque, _ = check_form(cls.advance, result, *advance_form(cls))
+    if not np.isfinite([*after, torque]).all():
+        raise ValueError(
+            f"{place(cls.advance)}: returns the state {(*map(float, after),)} and the torque {torque}: must be finite"
+        )
+    if cls.OBSERVED:
+        seen = call(f"{cls.__name__}.observe", cls.observe, parameters, step, signals, inputs)
+        check_form(cls.observe, seen, cls.OBSERVED, f"{cls.__name__}.OBSERVED")
 
 
 def reference(cls: type) -> str:
@@ -447,7 +500,7 @@ def load_module(text: str) -> Any:
     """The module of `module:NAME`.
 
     Raises:
-        ValueError: there is no such module; or it may not be imported (`trusting`).
+        ValueError: there is no such module, or it cannot be imported; or it may not be (`trusting`).
     """
     module = text.partition(":")[0]
     if not _TRUSTED.get():
@@ -457,11 +510,17 @@ def load_module(text: str) -> Any:
         )
     try:
         return importlib.import_module(module)
-    except (ImportError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{text!r}: {error}; must be module:NAME, of a module that Python finds: `python -m codrl_mj` in the place "
-            "of `codrl-mj` finds those of the present folder"
-        ) from None
+    except Exception as error:
+        if not module or (isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}.")):
+            raise ValueError(
+                f"{text!r}: {error}; must be module:NAME of a module that is installed or in the present folder, "
+                f"{Path.cwd()}; on the command line FILE.py:NAME does as well"
+            ) from None
+        frames, package = traceback.extract_tb(error.__traceback__), Path(__file__).parents[1]
+        ours = [Path(frame.filename).is_relative_to(package) for frame in frames]
+        where = next(frame for frame, own in zip(frames[::-1], ours[::-1], strict=True) if not own)
+        said = str(error) if ours[-1] else f"importing {module} failed: {type(error).__name__}: {error}"
+        raise ValueError(f"{text!r}: {said} ({where.filename}, line {where.lineno})") from error
 
 
 def load_object(text: str) -> Any:
@@ -470,14 +529,22 @@ def load_object(text: str) -> Any:
     Raises:
         ValueError: as for `load_module`, or there is nothing of that name in it.
     """
-    module = load_module(text)
+    module, name = load_module(text), text.partition(":")[2]
     try:
-        return functools.reduce(getattr, text.partition(":")[2].split("."), module)
+        return functools.reduce(getattr, name.split("."), module)
     except AttributeError as error:
-        raise ValueError(f"{text!r}: {error}; must be module:NAME, of a module that Python finds") from None
+        hint = fields.did_you_mean(name, vars(module)).rstrip() or "see"
+        raise ValueError(f"{text!r}: {error}; must be module:NAME; {hint} {getattr(module, '__file__', '')}") from None
 
 
-def look_up(name: str, known: Mapping[str, Any], what: str, anybodys: bool = True, of: type | None = None) -> Any:
+def look_up(
+    name: str,
+    known: Mapping[str, Any],
+    what: str,
+    anybodys: bool = True,
+    of: type | None = None,
+    others: Mapping[str, Iterable[str]] | None = None,
+) -> Any:
     """What a name stands for: a value of `known`, or what stands at `module:NAME`.
 
     Args:
@@ -486,9 +553,10 @@ def look_up(name: str, known: Mapping[str, Any], what: str, anybodys: bool = Tru
         what: what to call one in messages.
         anybodys: whether to import what is not ours.
         of: the class that what is not ours has to be a subclass of; None for no matter what.
+        others: names that are known elsewhere, to be suggested but not listed, by what lists them.
 
     Raises:
-        ValueError: unknown name; the nearest known one is suggested. Or no such subclass, or as for `load_object`.
+        ValueError: unknown name; the nearest known ones are suggested. Or no such subclass, or as for `load_object`.
     """
     if isinstance(name, str) and name in known:
         return known[name]
@@ -497,5 +565,7 @@ def look_up(name: str, known: Mapping[str, Any], what: str, anybodys: bool = Tru
         if of is None or (isinstance(found, type) and issubclass(found, of)):
             return found
         raise ValueError(f"{what} {name!r}: {found!r} is no subclass of codrl_mj's {of.__name__}")
-    own = ", or module:NAME of your own" if anybodys else ""
-    raise ValueError(f"unknown {what} {name!r}: {fields.did_you_mean(name, known)}Known: {', '.join(known)}{own}")
+    hint = fields.did_you_mean(name, [*known, *itertools.chain(*(others or {}).values())])
+    listed = hint + "It can be" if hint else f"Known: {', '.join([*known, *(others or {})])}, or"
+    own = f"{listed} module:NAME of your own" if anybodys else hint or listed.removesuffix(", or")
+    raise ValueError(f"unknown {what} {name!r}: {own.rstrip()}")

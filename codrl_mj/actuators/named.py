@@ -1,16 +1,19 @@
 """Families and actuators by name, and whatever a user may write for an actuator."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+import functools
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from codrl_mj.actuators.current_loop import Actuator, CurrentLoop, VoltageDriven
 from codrl_mj.actuators.drive import Drive, VoltageDrive
+from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.identified import usable_fields
 from codrl_mj.actuators.lag import Lag
-from codrl_mj.actuators.model import ActuatorModel, Family, family_name, look_up
+from codrl_mj.actuators.model import ActuatorModel, Family, check_family, family_name, look_up
 from codrl_mj.actuators.servo import Servo
 from codrl_mj.actuators.torque_speed import TorqueSpeed
 
@@ -50,6 +53,7 @@ def find_family(name: str) -> Family:
         ValueError: there is none; the nearest known name is suggested.
     """
     family: Family = look_up(name, FAMILIES, "family", of=ActuatorModel)
+    check_family(family)
     return family
 
 
@@ -68,13 +72,79 @@ def mapping_of(actuator: ActuatorModel) -> dict[str, Any] | None:
     return None if actuator == IDEAL else actuator.as_mapping()
 
 
+def name_of(actuator: ActuatorModel, paper: Actuator | None = None) -> str:
+    """What to call an actuator wherever it is shown.
+
+    What it was asked for by (`label_of`), or the motor of the catalogue that has its numbers but for gear, loop and
+    supply; of a current loop the variation of `paper` that it is, `custom` if none; else its family.
+    """
+    kind, known = type(actuator), {}
+    if kind is Actuator:
+        known = {name: vary(paper) for name, (_, vary) in NAMED.items()} if paper else {}
+    elif kind is Drive and not label_of(actuator):
+        known = _catalogue()
+    family = "custom" if kind is Actuator else family_name(kind)
+    same = (name for name, one in known.items() if one in (actuator, _own_numbers(actuator)))
+    return label_of(actuator) or next(same, family)
+
+
+def names_of(actuators: Iterable[ActuatorModel], papers: Iterable[Actuator] | None = None) -> str:
+    """What to call several, each name once."""
+    pairs = itertools.zip_longest(actuators, papers or ())
+    return ", ".join(dict.fromkeys(name_of(one, paper) for one, paper in pairs))
+
+
+def label_of(actuator: ActuatorModel) -> str:
+    """The motor, file or `module:NAME` that an actuator was asked for by; empty where it was none of these.
+
+    It is no field: equality, mappings and hashes of configurations do not know of it.
+    """
+    return str(vars(actuator).get("_label", ""))
+
+
+def labelled(actuator: ActuatorModel, label: str) -> Any:
+    """The very actuator, called something from now on; but for the ideal one."""
+    if label and actuator is not IDEAL:
+        vars(actuator)["_label"] = str(label)
+    return actuator
+
+
+@functools.cache
+def _catalogue() -> dict[str, Any]:
+    from codrl_mj.catalogue import motor_entry, motor_names
+
+    return {name: _own_numbers(Drive.of(motor_entry(name).numbers)) for name in motor_names()}
+
+
+def _own_numbers(actuator: Any) -> Any:
+    """Of a motor all that it is but for the gear that it has here; of other actuators they themselves."""
+    motor = getattr(actuator, "motor", None)
+    return dataclasses.replace(motor, gear_ratio=1.0, arm_radius=1.0) if isinstance(motor, GearMotor) else actuator
+
+
+def named_mapping(actuator: ActuatorModel) -> Any:
+    """A mapping for `resolve`: of a motor of the catalogue `name` and what is set over it; else `label` and fields."""
+    name, whole = label_of(actuator), mapping_of(actuator) or {}
+    if name in _catalogue():
+        there = resolve(name, None, "a motor").as_mapping()
+        short = {
+            part: {key: one for key, one in inner.items() if one != (there[part] or {}).get(key)}
+            for part, inner in whole.items()
+            if inner and inner != there[part]
+        }
+        if resolve(found := {"name": name, **short}, None, "a motor") == actuator:
+            return found
+    return {"label": name, **whole} if name else mapping_of(actuator)
+
+
 def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
     """Turn whatever a user may write for an actuator into an `ActuatorModel`.
 
     Args:
         given: a name of `NAMED`, `FAMILIES` or the catalogue of motors, a motor's TOML file, `module:NAME` of an
             actuator or a family, a YAML or JSON file of such a mapping, an actuator, a mapping of its fields (with a
-            `name`, over that actuator's), or None (ideal). Files may be given as a `pathlib.Path`.
+            `name`, over that actuator's; with a `label`, what to call it), or None (ideal). Files may be given as a
+            `pathlib.Path`.
         paper: the actuator that the names vary; None where there is none.
         whose: whose it is, for messages.
 
@@ -85,6 +155,9 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
         return IDEAL
     if isinstance(given, ActuatorModel):
         return given
+    if isinstance(given, Mapping) and "label" in given:
+        rest = {name: value for name, value in given.items() if name != "label"}
+        return labelled(resolve(rest, paper, whose), given["label"])
     if isinstance(given, Mapping) and "name" in given:
         changes = {name: value for name, value in given.items() if name != "name"}
         return actuator_over(resolve(given["name"], paper, whose), changes)
@@ -110,14 +183,18 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
     from codrl_mj.catalogue import motor_entry, motor_names
 
     if given in motor_names() or Path(given).suffix == ".toml":
-        return Drive.of(motor_entry(given).numbers)
-    found = look_up(given, NAMED | FAMILIES | dict.fromkeys(motor_names()), "actuator")
-    made = found() if isinstance(found, type) and issubclass(found, ActuatorModel) else found
+        return labelled(Drive.of(motor_entry(given).numbers), Path(given).stem)
+    found = look_up(given, NAMED | FAMILIES, "actuator", others={"the motors of `codrl-mj motor list`": motor_names()})
+    made = found
+    if isinstance(found, type) and issubclass(found, ActuatorModel):
+        check_family(found)  # type: ignore[arg-type]
+        made = found()
     if isinstance(made, ActuatorModel):
-        return made
+        return made if made is not found else labelled(made, given)
     raise ValueError(f"actuator = {given!r}: {found!r} is neither an actuator nor a family of them")
 
 
+_CHANGED = ", changed"
 _FILES = (".yaml", ".yml", ".json")
 
 
@@ -143,9 +220,11 @@ def actuator_from_file(path: Path, paper: Actuator | None, whose: str) -> Any:
             raise ValueError(f"{fields!r}: must be a mapping of an actuator's fields")
         if Path(str(fields.get("name"))).suffix in _FILES:
             raise ValueError(f"name = {fields['name']!r}: must be an actuator's name, and no file")
-        return resolve(usable_fields(fields), paper, whose)
+        made = resolve(usable_fields(fields), paper, whose)
     except (yaml.YAMLError, UnicodeDecodeError, ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
+    stem = path.stem if path.stem not in ("actuator", "actuators") else path.absolute().parent.name
+    return made if label_of(made) else labelled(made, stem)
 
 
 def actuator_over(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
@@ -175,7 +254,9 @@ def actuator_over(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
     for name, value in given.items():
         inner = merged.get(name)
         merged[name] = {**(inner or {}), **value} if isinstance(value, Mapping) else value
-    return type(base).from_mapping({name: value for name, value in merged.items() if name != "family"})
+    made = type(base).from_mapping({name: value for name, value in merged.items() if name != "family"})
+    label = label_of(base).removesuffix(_CHANGED)
+    return labelled(made, label + _CHANGED * (_own_numbers(made) != _own_numbers(base))) if label else made
 
 
 def check_same_family(actuators: Sequence[ActuatorModel]) -> Family:
@@ -188,4 +269,6 @@ def check_same_family(actuators: Sequence[ActuatorModel]) -> Family:
     if len(kinds) > 1:
         names = ", ".join(sorted(kind.__name__ for kind in kinds))
         raise ValueError(f"actuators of several families ({names}): the actuators of one environment must be of one")
-    return kinds.pop()
+    family: Family = kinds.pop()
+    check_family(family)
+    return family

@@ -11,6 +11,10 @@ back-EMF that is not compensated; then, with P = 1 - exp(-wc*T) and G = P/(1 - e
 
 and i - c decays as e^k whether the voltage saturates or not. Unsaturated, q - i_ref decays as (1 - P)^k, so it reaches
 a limit once at most; saturated, i and c approach v as e^k, so it leaves the limit once at most.
+
+What the winding draws in a sample is u times the sample's mean current, i + (1 - m)*(v - i) with m = (1 - e)*L/(R*T).
+Unsaturated, with E = i_ref - i and l = i - c, v - i = G*E - l, E+ = (1 - P)*E + (1 - e)*l and l+ = e*l. What is
+quadratic in E and l is then what p*E^2 + q*E*l + r*l^2 loses in a sample, for some p, q and r: its sum is in both ends.
 """
 
 import math
@@ -42,26 +46,19 @@ def jump(
     x: float,
     y: float,
     lost: float,
-) -> tuple[float, float, float, int]:
-    """A designed loop over many samples in closed form; all in amperes, as the module's docstring has it.
+) -> tuple[float, float, float, float, int]:
+    """A designed loop over n samples in closed form; all in amperes, with x = R*T/L, y = wc*T and `lost` = 1 - e.
 
-    Args:
-        current: i [A].
-        integral: c [A].
-        reference: i_ref [A].
-        low: the lowest (u - b)/R [A].
-        high: the highest.
-        samples: n.
-        x: R*T/L.
-        y: wc*T.
-        lost: 1 - exp(-x).
-
-    Returns:
-        i, c, the sum of i over the samples' starts [A], and how many samples were saturated.
+    v lies from `low` to `high`. Found are i, c, the sum of i over the samples' starts [A], that of v times the mean
+    current of each sample [A^2], and how many samples were saturated.
     """
     step = -math.expm1(-y)  # P
     gain, apart = step / lost, lost - step
-    total, saturated, left = 0.0, 0, samples
+    kept, rest, rising = 1.0 - step, 1.0 - lost, 1.0 - lost / x  # rising: 1 - m
+    p = (1.0 - gain) * (1.0 - rising * gain) / (step * (1.0 + kept))
+    q = (1.0 + rising * (1.0 - 2.0 * gain) + 2.0 * p * kept * lost) / (lost + step * rest)
+    r = (rising + lost * (p * lost + q * rest)) / (lost * (1.0 + rest))
+    total, drawn, saturated, left = 0.0, 0.0, 0, samples
     while left > 0:
         asked = gain * (reference - current) + integral
         held = left
@@ -80,7 +77,11 @@ def jump(
                 ratio = held * faster / (1.0 - lost)
             error = before * slower + lost * lag * ratio
             lag_after = lag * faster
-            total += held * reference - (before - error + lag - lag_after) / step
+            errors = (before - error + lag - lag_after) / step
+            total += held * reference - errors
+            drawn += reference * (held * reference - 2.0 * errors + (1.0 + rising) * (before - error) / lost)
+            drawn += p * (before * before - error * error) + q * (before * lag - error * lag_after)
+            drawn += r * (lag * lag - lag_after * lag_after)
             current = reference - error
             integral = current - lag_after
         else:
@@ -91,10 +92,11 @@ def jump(
             decay = math.exp(-held * x)
             after = reached + (current - reached) * decay
             total += held * reached + (current - after) / lost
+            drawn += reached * (held * reached + (current - after) / x)
             current, integral = after, reached + (integral - reached) * decay
             saturated += held
         left -= held
-    return current, integral, total, saturated
+    return current, integral, total, drawn, saturated
 
 
 def until(bound: float, start: float, rate: float, most: int) -> int:
@@ -118,35 +120,20 @@ def run_samples(
     samples: int,
     resistance: float,
     decay: float,
+    lasting: float,
     kp: float,
     ki: float,
     anti_windup: float,
     delayed: float,
-) -> tuple[float, float, float, float, int]:
-    """Any PI loop, sample by sample.
+) -> tuple[float, float, float, float, float, int]:
+    """Any PI loop, sample by sample: i [A], the integral [V], the pending voltage, and then what `jump` finds.
 
-    Args:
-        current: i [A].
-        integral: of the controller [V].
-        pending: the voltage [V] computed in the sample before, which a delayed loop applies now.
-        reference: i_ref [A].
-        back_emf: b [V].
-        compensated: the part of it [V] that is added to the voltage.
-        voltage: the supply's [V].
-        sag: its resistance [ohm].
-        deadband: voltage [V] that the bridge loses.
-        samples: n.
-        resistance: R [ohm].
-        decay: exp(-R*T/L).
-        kp: proportional gain [V/A].
-        ki: integral gain per sample [V/A].
-        anti_windup: 0 back-calculation with the tracking time kp/ki, 1 clamping, 2 none.
-        delayed: 1 if a sample's voltage is applied in the next one.
-
-    Returns:
-        i, integral, pending voltage, the sum of i over the samples' starts [A], and how many samples were saturated.
+    `ki` is the integral gain per sample [V/A], `compensated` the part of the back-EMF [V] that is added to the voltage,
+    `sag` the supply's resistance [ohm], `deadband` what the bridge loses [V], `decay` e, and `lasting` m. A `delayed`
+    loop applies the voltage of the sample before, `pending`. `anti_windup` is 0 for back-calculation with the tracking
+    time kp/ki, 1 for clamping, 2 for none.
     """
-    total, saturated, gain = 0.0, 0, kp + ki
+    total, drawn, saturated, gain = 0.0, 0.0, 0, kp + ki
     tracking = ki / gain if gain > 0.0 else 0.0
     for _ in range(samples):
         limit = max(voltage - sag * abs(current), 0.0) if sag > 0.0 else voltage
@@ -164,5 +151,6 @@ def run_samples(
             applied = math.copysign(max(abs(applied) - deadband, 0.0), applied)
         total += current
         reached = (applied - back_emf) / resistance
+        drawn += reached * (reached + (current - reached) * lasting)
         current = reached + (current - reached) * decay
-    return current, integral, pending, total, saturated
+    return current, integral, pending, total, drawn, saturated

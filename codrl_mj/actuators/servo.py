@@ -97,25 +97,22 @@ class Signals(NamedTuple):
     error: float
     """What is asked for less what there is, at the output shaft [rad] or [rad/s], at the beginning of the step."""
     saturated: float
-    """1 where the voltage or the current was at its limit at some time."""
+    """1 where any of the three that follow is."""
+    voltage_saturated: float
+    """As a drive's, at some time of the step, and so are the others."""
+    current_saturated: float
+    """1 where more than `max_current` or `max_torque` was asked for."""
+    temperature_saturated: float
+    electrical_power: float
+    copper_loss: float
 
 
 def demand(
     parameters: Any, period: float, target: float, rate: float, position: float, speed: float, integral: float
 ) -> tuple[float, float]:
-    """One sample of the outer loops, at the rotor.
+    """One sample of the outer loops, at the rotor: the torque [N*m] asked for, and the integral that would follow.
 
-    Args:
-        parameters: a servo's.
-        period: time to the next sample [s].
-        target: what is asked for [rad] or [rad/s].
-        rate: its own rate of change [rad/s] or [rad/s^2].
-        position: [rad].
-        speed: [rad/s].
-        integral: torque [N*m] of the velocity loop's integral.
-
-    Returns:
-        The torque asked for [N*m], before it is limited, and the integral that would follow.
+    The target [rad] or [rad/s] has a rate of change of its own, and the period [s] is that to the next sample.
     """
     ratio = parameters.gear_ratio
     gain, fastest = parameters.velocity_gain / (ratio * ratio), parameters.max_velocity * ratio
@@ -132,11 +129,7 @@ def demand(
 def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Signals]:
     """Advance all loops by one mechanical step; between its samples the outer loops see the speed as it is predicted.
 
-    Args:
-        parameters: named as the fields of `Servo` and its parts.
-        timestep: mechanical step [s].
-        state: as the step before left it.
-        inputs: in place of the desired torque, position [rad] or speed [rad/s] of the rotor; and as for a drive.
+    In place of a desired torque the inputs have a position [rad] or a speed [rad/s] of the rotor.
     """
     winding, heat, moving = drive.begin(parameters, timestep, state, inputs)
     resistance = shaft.resistance_at(parameters, shaft.temperature_of(parameters, heat))
@@ -149,32 +142,36 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
     most = parameters.max_torque / parameters.gear_ratio
     integral, asked, waiting = state.velocity_integral, state.asked, state.waiting
     position, speed, given = inputs.position, inputs.speed, 0.0
-    amperes, volts, torque, saturated = 0.0, 0.0, 0.0, 0.0
+    amperes, volts, torque, power, loss = 0.0, 0.0, 0.0, 0.0, 0.0
+    at_volts, at_amperes, too_warm = 0.0, 0.0, 0.0
     for _ in range(count):
         if waiting <= 0.0:
             asked, after = demand(parameters, period * every, target, rate, position, speed, integral)
             waiting = float(every)
         else:
             after = integral
-        given = min(max(asked, -most), most) / constant
-        given = drive.limited(parameters, timestep, heat, resistance, given)
+        wanted = min(max(asked, -most), most) / constant
+        given = drive.limited(parameters, timestep, heat, resistance, wanted)
         if given == asked / constant or (after - integral) * asked < 0.0:
             integral = after  # it does not wind up
-        else:
-            saturated += 1.0
+        if given != wanted and abs(given) < parameters.max_current:
+            too_warm = 1.0
+        elif given != asked / constant:
+            at_amperes = 1.0
         now = Shaft(moving.inertia, moving.others, speed)
         winding, next_speed, means = shaft.turn(parameters, resistance, period, samples, winding, now, True, given)
         position += 0.5 * period * (speed + next_speed)
         speed = next_speed
-        saturated += means.saturated
+        at_volts += means.saturated
         amperes, volts = amperes + means.current / count, volts + means.voltage / count
         torque += means.torque / count
+        power, loss = power + means.power / count, loss + means.heat / count
     waiting -= 1.0
-    mean = Means(amperes, volts, torque, saturated)
+    mean = Means(amperes, volts, torque, at_volts, power, loss)
     followed = drive.end(parameters, timestep, inputs.time, heat, resistance, winding, moving, mean)
     temperature = shaft.temperature_of(parameters, Heat(followed.winding_rise, followed.housing_rise))
     error = (target - (inputs.position if parameters.controls == 0.0 else inputs.speed)) / parameters.gear_ratio
-    at_limit = 1.0 if saturated > 0.0 else 0.0
+    at_volts = 1.0 if at_volts > 0.0 else 0.0
     after_step = State(
         followed.current,
         followed.integral,
@@ -190,7 +187,9 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
         asked,
         waiting,
     )
-    return after_step, torque, Signals(amperes, given, volts, temperature, error, at_limit)
+    at_limit = max(at_volts, at_amperes, too_warm)
+    limits = at_limit, at_volts, at_amperes, too_warm
+    return after_step, torque, Signals(amperes, given, volts, temperature, error, *limits, power, loss)
 
 
 @dataclasses.dataclass(frozen=True)

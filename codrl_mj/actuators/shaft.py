@@ -56,6 +56,10 @@ class Means(NamedTuple):
     """Delivered by the gear, at the rotor's side of it [N*m]."""
     saturated: float
     """How many samples were at the voltage's limit."""
+    power: float
+    """Into the winding at its terminals [W]."""
+    heat: float
+    """Lost in the winding [W]: of its resistance and the square of its current, within the samples too."""
 
 
 def temperature_of(parameters: Any, heat: Heat) -> float:
@@ -69,15 +73,7 @@ def resistance_at(parameters: Any, temperature: float) -> float:
 
 
 def warmer(resistance: float, constant: float, duration: float, rise: float, watts: float) -> float:
-    """Temperature rise [K] over a thermal resistance [K/W] after some time [s] of a held loss [W].
-
-    Args:
-        resistance: of the body to what surrounds it [K/W].
-        constant: its time constant [s].
-        duration: [s].
-        rise: at the beginning [K].
-        watts: lost in it [W].
-    """
+    """Rise [K] over a thermal resistance [K/W] with a time constant [s] after a duration [s] of a held loss [W]."""
     kept = math.exp(-duration / constant)
     return rise * kept + resistance * watts * (1.0 - kept)
 
@@ -123,13 +119,8 @@ def others_after(timestep: float, change: float, own: float, others: float) -> f
     """Acceleration [rad/s^2] of the rotor by all but its motor, from what the last step showed.
 
     Half of it is what was taken then: two joints that move each other, each with a stiff motor, would answer to what
-    the other did a step ago, back and forth.
-
-    Args:
-        timestep: [s].
-        change: of the rotor's speed in the step [rad/s].
-        own: its acceleration by the motor's torque in the step [rad/s^2].
-        others: what was taken for it in the step [rad/s^2].
+    the other did a step ago, back and forth. From the rotor's change of speed in the step [rad/s] and, [rad/s^2], its
+    acceleration by the motor's torque and what was taken for that by all else.
     """
     return 0.5 * (change / timestep - own) + 0.5 * others
 
@@ -141,12 +132,6 @@ def friction(parameters: Any, duration: float, torque: float, shaft: Shaft) -> f
     the rotor back, and where the inertia is known it holds what pushes less than it: the rotor sticks. Where the speed
     is held it stops no more than the rotor alone, and nothing sticks. Source: the friction of Duclusaud, Passault,
     Padois, Ly, *Extended Friction Models for the Physics Simulation of Servo Actuators* (2024), sec. III.
-
-    Args:
-        parameters: a drive's.
-        duration: [s].
-        torque: of the motor [N*m].
-        shaft: at the beginning.
     """
     if shaft.inertia < math.inf:
         free = shaft.speed + duration * (torque / shaft.inertia + shaft.others)
@@ -169,24 +154,18 @@ def is_warming(parameters: Any) -> bool:
 
 def run_over(
     parameters: Any, resistance: float, samples: int, winding: Winding, closed: bool, asked: float, speed: float
-) -> tuple[Winding, float, float, int]:
+) -> tuple[Winding, float, float, int, float, float]:
     """Winding and loop over some samples at a held speed: at once where that has a closed form.
 
     The sums that it needs telescope: with S the sum of the current over the samples' starts, the mean of (u - b)/R is
     (S + (i_n - i_0)/(1 - e))/n, and that of the current, the mean of every sample included,
-    (S + (1 - m)/(1 - e)*(i_n - i_0))/n with m = (1 - e)/x and x = R*T/L.
-
-    Args:
-        parameters: a drive's.
-        resistance: of the winding at present [ohm].
-        samples: n.
-        winding: at the beginning.
-        closed: whether a current is asked for, and not a voltage.
-        asked: the current [A], or the voltage [V].
-        speed: of the rotor [rad/s].
+    (S + (1 - m)/(1 - e)*(i_n - i_0))/n with m = (1 - e)/x and x = R*T/L. What is drawn and neither moves the rotor nor
+    is left in the winding's field, L*i^2/2, is heat. Where the loop is `closed` a current [A] is asked for, else a
+    voltage [V].
 
     Returns:
-        The winding afterwards, the mean current [A], the mean voltage [V], and how many samples were saturated.
+        The winding afterwards, the mean current [A], the mean voltage [V], how many samples were saturated, and the
+        mean of the power [W] at the terminals and of the heat [W].
     """
     sample_time, voltage = 1.0 / parameters.sample_rate, parameters.supply_voltage
     stiff = parameters.delayed == 0.0 and parameters.supply_resistance == 0.0
@@ -201,7 +180,7 @@ def run_over(
     as_designed = closed and designed and parameters.anti_windup == 0.0 and parameters.deadband == 0.0
     if as_designed and stiff:
         offset = back_emf - compensated
-        current, integral, total, saturated = sampled.jump(
+        current, integral, total, drawn, saturated = sampled.jump(
             winding.current,
             (winding.integral - offset) / resistance,
             asked,
@@ -219,7 +198,7 @@ def run_over(
             kp, ki, compensated, asked = 0.0, 0.0, asked, 0.0
         elif designed:
             kp, ki = sampled.designed_gains(resistance, parameters.inductance, sample_time, y * parameters.sample_rate)
-        current, integral, pending, total, saturated = sampled.run_samples(
+        current, integral, pending, total, drawn, saturated = sampled.run_samples(
             winding.current,
             winding.integral if closed else 0.0,
             winding.pending,
@@ -232,6 +211,7 @@ def run_over(
             samples,
             resistance,
             1.0 - lost,
+            lost / x,
             kp,
             ki,
             parameters.anti_windup,
@@ -240,7 +220,10 @@ def run_over(
         after = Winding(current, integral, pending)
     change = (after.current - winding.current) / lost
     mean = (total + (1.0 - lost / x) * change) / samples
-    return after, mean, back_emf + resistance * (total + change) / samples, saturated
+    stored = (after.current - winding.current) * (after.current + winding.current) / (2.0 * x)
+    scale = resistance / samples
+    power, heat = back_emf * mean + scale * drawn, scale * (drawn - stored)
+    return after, mean, back_emf + resistance * (total + change) / samples, saturated, power, heat
 
 
 def turn(
@@ -257,38 +240,29 @@ def turn(
 
     Where a saturated voltage meets a light load, the speed cannot be held: c = h*kT*kE/(R*J) is the share of it that
     the back-EMF takes off in a time h; above 1 it rings, above 2 it grows. So the time is cut into 2*c pieces, and the
-    speed goes on from piece to piece.
-
-    Args:
-        parameters: a drive's.
-        resistance: of the winding at present [ohm].
-        duration: h [s].
-        samples: of the loop in it.
-        winding: at the beginning.
-        shaft: likewise.
-        closed: whether a current is asked for, and not a voltage.
-        asked: the current [A], or the voltage [V].
-
-    Returns:
-        The winding and the rotor's speed [rad/s] afterwards, and what there was in between.
+    speed goes on from piece to piece. Found are winding and speed [rad/s] afterwards, and what there was in between.
     """
     viscous = parameters.viscous_friction  # of the joint, which `others` has at the speed of the beginning
     braking = parameters.torque_constant * parameters.back_emf_constant / resistance + viscous
     pieces = min(max(math.ceil(2.0 * duration * braking / shaft.inertia), 1), samples)
     lossy = parameters.gear_efficiency < 1.0 or parameters.stribeck_friction > 0.0
-    amperes, volts, torque, saturated, left, speed = 0.0, 0.0, 0.0, 0, samples, shaft.speed
+    amperes, volts, torque, power, heat = 0.0, 0.0, 0.0, 0.0, 0.0
+    saturated, left, speed = 0, samples, shaft.speed
     for piece in range(pieces):
-        count = left // (pieces - piece)
-        winding, mean, voltage, limited = run_over(parameters, resistance, count, winding, closed, asked, speed)
+        count = left // (pieces - piece) if piece < pieces - 1 else left
+        winding, mean, voltage, limited, drawn, lost = run_over(
+            parameters, resistance, count, winding, closed, asked, speed
+        )
         left, saturated = left - count, saturated + limited
         share, delivered = count / samples, parameters.torque_constant * mean
         if lossy:
             now = Shaft(shaft.inertia, shaft.others, speed)
             delivered -= friction(parameters, share * duration, delivered, now)
         amperes, volts, torque = amperes + share * mean, volts + share * voltage, torque + share * delivered
+        power, heat = power + share * drawn, heat + share * lost
         changed = delivered - viscous * (speed - shaft.speed)
         speed += share * duration * (changed / shaft.inertia + shaft.others)
-    return winding, speed, Means(amperes, volts, torque, float(saturated))
+    return winding, speed, Means(amperes, volts, torque, float(saturated), power, heat)
 
 
 HELPERS = (

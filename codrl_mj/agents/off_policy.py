@@ -13,8 +13,8 @@ from codrl_mj.fields import integer, real
 class OffPolicyConfig(DeepAgentConfig):
     """Settings of an agent that learns from a replay buffer."""
 
-    learning_rate: float = real(1e-3, above=0)
-    """Adam's step size, > 0."""
+    learning_rate: float = real(1e-3, above=0, most=1)
+    """Adam's step size, in (0, 1]."""
     gamma: float = real(0.99, above=0, most=1)
     """Discount factor, in (0, 1]."""
     tau: float = real(5e-3, above=0, most=1)
@@ -70,8 +70,8 @@ class ActorCriticConfig(OffPolicyConfig):
     starts at 0 in every episode. `noise_theta = noise_dt = 1` is independent noise of standard deviation sigma.
     """
 
-    critic_learning_rate: float | None = real(None, above=0)
-    """Adam's step size for the critic, > 0; None: `learning_rate`."""
+    critic_learning_rate: float | None = real(None, above=0, most=1)
+    """Adam's step size for the critic, in (0, 1]; None: `learning_rate`."""
     noise_sigma: float = real(0.0, least=0)
     """Scale sigma of the exploration noise, >= 0, in shares of half the action's range; 0: none."""
     noise_theta: float = real(0.15, least=0)

@@ -20,11 +20,11 @@ class PPOConfig(DeepAgentConfig):
     name: ClassVar[str] = "ppo"
     action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (spaces.Box, spaces.Discrete)
 
-    learning_rate: float = real(1e-3, above=0)
-    """Adam's step size, > 0: the actor's, and the critic's too unless it has its own. The paper: 3e-4."""
-    critic_learning_rate: float | None = real(None, above=0)
-    """Adam's step size for the critic, > 0: actor and critic then take separate passes over a rollout, and `target_kl`
-    stops the actor's alone. None: one optimiser and one loss for both. The paper: 1e-3."""
+    learning_rate: float = real(1e-3, above=0, most=1)
+    """Adam's step size, in (0, 1]: the actor's, and the critic's too unless it has its own. The paper: 3e-4."""
+    critic_learning_rate: float | None = real(None, above=0, most=1)
+    """Adam's step size for the critic, in (0, 1]: actor and critic then take separate passes over a rollout, and
+    `target_kl` stops the actor's alone. None: one optimiser and one loss for both. The paper: 1e-3."""
     rollout_steps: int = integer(2048, least=2)
     """Environment steps, over all environments, between two updates, >= 2; a multiple of the environments."""
     batch_size: int | None = integer(256, least=2, optional=True)
@@ -48,8 +48,8 @@ class PPOConfig(DeepAgentConfig):
     """Units of the hidden layers of actor and critic, each. The paper: 64-64."""
     activation: Literal["tanh", "relu"] = choice("tanh", "tanh", "relu")
     """Activation of the hidden layers. The paper: tanh."""
-    log_std_init: float = real(0.0)
-    """Continuous actions: natural logarithm of the standard deviation at the start."""
+    log_std_init: float = real(0.0, least=-20, most=10)
+    """Continuous actions: natural logarithm of the standard deviation at the start, in [-20, 10]."""
     state_dependent_noise: bool = flag(False)
     """Continuous actions: explore by noise that is a function of the state, drawn anew every `noise_steps` (Raffin et
     al., 2021), which moves a system more than independent noise at every step does."""

@@ -2,7 +2,7 @@
 
 from codrl_mj.catalogue.datasheet import Datasheet, from_datasheet
 from codrl_mj.catalogue.derivation import Disagreement, MotorNumbers
-from codrl_mj.catalogue.entries import MotorEntry, motor_entry, motor_names
+from codrl_mj.catalogue.entries import MotorEntry, motor_entry, motor_names, new_motor
 
 __all__ = [
     "Datasheet",
@@ -12,4 +12,5 @@ __all__ = [
     "MotorEntry",
     "motor_entry",
     "motor_names",
+    "new_motor",
 ]

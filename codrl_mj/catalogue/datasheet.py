@@ -1,6 +1,7 @@
 """A motor's datasheet, as it is printed."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 from codrl_mj.catalogue.derivation import MotorNumbers, derive
@@ -8,8 +9,9 @@ from codrl_mj.catalogue.units import Kind, read
 from codrl_mj.fields import check_names
 
 
-def _printed(unit: str, example: str, power: int = 0, zero: bool = False) -> Any:
-    return dataclasses.field(default=None, metadata={"kind": Kind(unit, example, power, zero)})
+def _printed(unit: str, example: str, power: int = 0, zero: bool = False, also: str = "") -> Any:
+    """A field that may be printed; `also` is what others call it."""
+    return dataclasses.field(default=None, metadata={"kind": Kind(unit, example, power, zero), "also": also})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,25 +29,25 @@ class Datasheet:
     Torques, speeds, inertias and friction are at `shaft`, unless the value ends in `at motor` or `at output`.
     """
 
-    shaft: str = "motor"
-    """At which shaft mechanical values are printed: `motor`, or `output`, past the gear."""
-    nominal_voltage: str | None = _printed("V", "12 V")
+    shaft: str | None = None
+    """At which shaft mechanical values are printed: `motor`, or `output`, past the gear; needed with a gear."""
+    nominal_voltage: str | None = _printed("V", "12 V", also="voltage rated_voltage")
     """Voltage that the values below are at."""
-    stall_torque: str | None = _printed("N*m", "2.42 N*m", -1)
+    stall_torque: str | None = _printed("N*m", "2.42 N*m", -1, also="starting_torque")
     """Torque of the blocked shaft, friction already taken off."""
-    stall_current: str | None = _printed("A", "133 A")
+    stall_current: str | None = _printed("A", "133 A", also="starting_current")
     """Current of the blocked motor."""
     no_load_speed: str | None = _printed("rad/s", "5310 rpm", 1)
     """Speed of the free shaft."""
     no_load_current: str | None = _printed("A", "2.7 A", zero=True)
     """Current of the free motor, which overcomes its friction."""
-    continuous_torque: str | None = _printed("N*m", "91.1 mN*m", -1)
+    continuous_torque: str | None = _printed("N*m", "91.1 mN*m", -1, also="rated_torque nominal_torque")
     """Torque that it bears for ever; many call it nominal or rated."""
-    continuous_current: str | None = _printed("A", "2.52 A")
+    continuous_current: str | None = _printed("A", "2.52 A", also="rated_current nominal_current")
     """Current that it bears for ever."""
-    continuous_speed: str | None = _printed("rad/s", "5170 rpm", 1)
+    continuous_speed: str | None = _printed("rad/s", "5170 rpm", 1, also="rated_speed nominal_speed")
     """Speed at the nominal voltage and the continuous current."""
-    peak_current: str | None = _printed("A", "24 A")
+    peak_current: str | None = _printed("A", "24 A", also="max_current")
     """Largest current of motor or drive."""
     resistance: str | None = _printed("ohm", "0.464 ohm")
     """Resistance between the terminals."""
@@ -53,17 +55,17 @@ class Datasheet:
     """Inductance between the terminals."""
     electrical_time_constant: str | None = _printed("s", "0.5 ms")
     """Inductance over resistance."""
-    torque_constant: str | None = _printed("N*m/A", "25.1 mN*m/A", -1)
+    torque_constant: str | None = _printed("N*m/A", "25.1 mN*m/A", -1, also="kt")
     """Torque per current; at the output, of a gear without losses."""
-    back_emf_constant: str | None = _printed("V*s/rad", "0.56 mV/rpm", -1)
+    back_emf_constant: str | None = _printed("V*s/rad", "0.56 mV/rpm", -1, also="ke")
     """Voltage per speed."""
-    speed_constant: str | None = _printed("rad/s/V", "380 rpm/V", 1)
+    speed_constant: str | None = _printed("rad/s/V", "380 rpm/V", 1, also="kv")
     """Speed per voltage, Kv."""
     rotor_inertia: str | None = _printed("kg*m^2", "135 g*cm^2", -2)
     """Inertia of the rotor; at the output, the reflected one (`armature`)."""
     mechanical_time_constant: str | None = _printed("s", "9.92 ms")
     """How fast the free rotor follows a step of voltage: R*J/(kT*kE)."""
-    gear_ratio: str | float | None = _printed("", "30")
+    gear_ratio: str | float | None = _printed("", "30", also="gear reduction")
     """Turns of the motor for a turn of the output."""
     gear_efficiency: str | float | None = _printed("", "0.74")
     """Share of the torque that the gear passes on."""
@@ -86,7 +88,7 @@ class Datasheet:
 
     def __post_init__(self) -> None:
         """Read every value once, so that a datasheet that exists can be read."""
-        if self.shaft not in ("motor", "output"):
+        if self.shaft not in (None, "motor", "output"):
             raise ValueError(f"datasheet.shaft = {self.shaft!r}: must be motor or output")
         self.readings()
 
@@ -94,14 +96,19 @@ class Datasheet:
         """The values that are printed, each a `Reading` in the SI unit of its field, at the shaft it is printed at.
 
         Raises:
-            ValueError: a value has no unit or a wrong one, is not positive, or an efficiency is above 1.
+            ValueError: a value has no unit or a wrong one, is not positive, or an efficiency is above 1; or nothing
+                says at which shaft of a gear one is.
         """
-        found = {}
-        for name, kind in KINDS.items():
-            printed = getattr(self, name)
-            if printed is not None:
-                reading = read(name, printed, kind)
-                found[name] = reading._replace(shaft=reading.shaft or self.shaft)
+        given = {name: getattr(self, name) for name in KINDS}
+        found = {name: read(name, printed, KINDS[name]) for name, printed in given.items() if printed is not None}
+        either = [name for name, reading in found.items() if KINDS[name].power and reading.shaft is None]
+        if self.shaft is None and either and "gear_ratio" in found and found["gear_ratio"].value != 1.0:
+            raise ValueError(
+                f"datasheet.shaft is missing: {', '.join(either)} may be before or past the gear of "
+                f'{self.gear_ratio}; write shaft = "motor" or shaft = "output", or "... at motor" in a single value'
+            )
+        at = self.shaft or "motor"
+        found = {name: reading._replace(shaft=reading.shaft or at) for name, reading in found.items()}
         if "gear_efficiency" in found and found["gear_efficiency"].value > 1.0:
             raise ValueError(
                 f"datasheet.gear_efficiency = {self.gear_efficiency!r}: must be a finite number > 0 and <= 1; "
@@ -116,6 +123,31 @@ class Datasheet:
 
 KINDS: dict[str, Kind] = {f.name: f.metadata["kind"] for f in dataclasses.fields(Datasheet) if "kind" in f.metadata}
 """The printed fields and what each may hold."""
+_OTHERWISE = {other: f.name for f in dataclasses.fields(Datasheet) for other in f.metadata.get("also", "").split()}
+_PHASE = "write what is between two phases: of a star twice the phase's, of a delta two thirds"
+_LEFT_OUT = {
+    "pole_pairs": "leave it out: turns are the rotor's here; where a maker prints electrical rpm, divide these by it",
+    "phase_resistance": f'{_PHASE}, resistance = "2 * 0.3 ohm"',
+    "phase_inductance": f'{_PHASE}, inductance = "2 * 0.1 mH"',
+}
+
+
+def named(printed: Mapping[str, Any]) -> dict[str, Any]:
+    """Printed values by the names of `Datasheet`'s fields, in whatever case, or by what others call them, such as kv.
+
+    Raises:
+        ValueError: a name is unknown, or one field has two.
+    """
+    found: dict[str, Any] = {}
+    for name, value in printed.items():
+        field = _OTHERWISE.get(name.lower(), name.lower())
+        if field in _LEFT_OUT:
+            raise ValueError(f"datasheet.{name}: {_LEFT_OUT[field]}")
+        check_names([field if field in ("shaft", *KINDS) else name], ("shaft", *KINDS), "datasheet field", every=True)
+        if field in found:
+            raise ValueError(f"datasheet.{name} is {field}, which is given already: leave one of them out")
+        found[field] = value
+    return found
 
 
 def from_datasheet(*, strict: bool = True, tolerance: float = 0.2, **printed: Any) -> MotorNumbers:
@@ -138,5 +170,4 @@ def from_datasheet(*, strict: bool = True, tolerance: float = 0.2, **printed: An
         ValueError: a field is unknown, is without its unit, has a wrong one or is out of bounds; the fields do not
             suffice; or two of them contradict each other. The message names field, value and remedy.
     """
-    check_names(printed, ("shaft", *KINDS), "datasheet field", every=True)
-    return Datasheet(**printed).numbers(strict, tolerance)
+    return Datasheet(**named(printed)).numbers(strict, tolerance)

@@ -32,7 +32,8 @@ class Disagreement(NamedTuple):
 
     def __str__(self) -> str:
         """In a sentence."""
-        by = f"{self.difference:+.1%}" if abs(self.difference) < 1.0 else f"{self.difference + 1.0:.3g} times that"
+        share = self.difference
+        by = f"{100.0 * share:+.3g}%" if abs(share) < 1.0 else f"{share + 1.0:.3g} times that"
         return (
             f"{self.quantity} = {self.printed:.4g} {self.unit}, but {self.formula} = {self.computed:.4g} {self.unit}, "
             f"{by}: {self.reading}"
@@ -122,10 +123,11 @@ def derive(readings: Mapping[str, Reading], kinds: Mapping[str, Kind], strict: b
     disagreements = _disagreements(known, printed, text)
     if strict and disagreements and not abs(disagreements[0].difference) <= tolerance:
         worst = disagreements[0]
-        behind = text.behind([worst.quantity, *text.named(worst.formula)], how)
+        behind = ", ".join(text.behind([worst.quantity, *text.named(worst.formula)], how))
+        behind += ", and at which shaft they are (shaft, gear_ratio)" if known["gear_ratio"] != 1.0 else ""
         raise ValueError(
             f"datasheet.{worst.quantity} contradicts the rest by more than {tolerance:.0%}: {worst}. Check the values "
-            f"and units of {', '.join(behind)}; raise tolerance, or pass strict=False, if the maker does print them so"
+            f"and units of {behind}; raise tolerance, or pass strict=False, if the maker does print them so"
         )
     for name, field in OTHER_NAMES.items():
         if field in printed:

@@ -11,7 +11,14 @@ _ANGLES = {"radian", "degree", "turn", "revolution", "revolutions_per_minute", "
 _SPELLINGS = (
     (r"([mkµμ]?N)([cm]?)m\b", r"\1*\2m"),  # mNm, Nm, Ncm
     (r"(k?g)([cm]?)m(?:\^2|\*\*2|²|2)", r"\1*\2m**2"),  # gcm2, kgm²
-    (r"\bmin(?:\^-1|⁻¹|-¹|-1)", "rpm"),
+    (r"\bmin(?:\^-1|⁻¹|-¹|-1)|(?:\b(?:rev|r|U|tr|1)|^)/min\b", "rpm"),
+    (r"(?i)rpm", "rpm"),  # RPM, kRPM
+    (r"(?i)ohms?\b", "ohm"),
+    (r"(?i)\bvolts?\b", "V"),
+    (r"(?i)\bamp(?:ere)?s?\b", "A"),
+    (r"(?i)\bkg(f?)[-.*· ]?([cm]?m)\b", r"kg\1*\2"),  # kgcm, Kg-cm
+    (r"(?i)\boz(f?)[-.*· ]?in\b", r"oz\1*in"),
+    (r"(?<=[A-Za-z])-(?=[A-Za-z])", "*"),  # lb-ft, N-m
 )
 
 
@@ -40,12 +47,7 @@ class Reading(NamedTuple):
 
 
 def read(name: str, printed: Any, kind: Kind) -> Reading:
-    """A printed value in SI.
-
-    Args:
-        name: of the field, for messages.
-        printed: such as `25.1 mN*m/A`, `2 * 0.3 ohm` or `2.42 N*m at output`; where the kind has no unit, a number too.
-        kind: what it has to be.
+    """A printed value in SI, such as `25.1 mN*m/A`, `2 * 0.3 ohm`, `2.42 N*m at output`; without a unit, a number too.
 
     Raises:
         ValueError: it has no unit, a wrong or unknown one, more than one number, or it is not positive.
@@ -59,7 +61,7 @@ def read(name: str, printed: Any, kind: Kind) -> Reading:
     if match is None:
         raise ValueError(f"datasheet.{name} = {printed!r}: must be a number with its unit, as text; {remedy}")
     factors, unit, shaft = match.groups()
-    if re.match(r"[,:\d]", unit):
+    if re.match(r"[,:\d](?!/min)", unit):
         raise ValueError(
             f"datasheet.{name} = {printed!r}: must be one number, without a space or a comma in it; {remedy}"
         )
@@ -71,17 +73,22 @@ def read(name: str, printed: Any, kind: Kind) -> Reading:
 
 
 def _si(name: str, printed: str, number: float, unit: str, kind: Kind, remedy: str) -> float:
+    if re.search(r"(?i)\be-?rpm", unit):
+        raise ValueError(
+            f"datasheet.{name} = {printed!r}: electrical turns are not the rotor's; divide by the pole pairs, write rpm"
+        )
     unit = respelled(unit)
     if not unit and kind.unit:
         raise ValueError(f"datasheet.{name} = {printed!r}: has no unit; {remedy}")
     registry = unit_registry()
     try:
         quantity = registry.Quantity(number, unit)
-    except (
-        Exception
-    ) as error:  # pint raises what its parser stumbles over: AttributeError, TypeError, AssertionError ...
+    except Exception as error:  # of any kind: what pint's parser stumbles over
         raise ValueError(f"datasheet.{name} = {printed!r}: its unit {unit!r} is not known; {remedy}") from error
-    if quantity.dimensionality != registry.Quantity(1.0, kind.unit).dimensionality:
+    wanted = registry.Quantity(1.0, kind.unit).dimensionality
+    if quantity.dimensionality == wanted / registry.standard_gravity.dimensionality:
+        quantity = quantity * registry.standard_gravity  # kg*cm, oz*in: the weight of a kilogram, of an ounce
+    if quantity.dimensionality != wanted:
         raise ValueError(
             f"datasheet.{name} = {printed!r}: {unit!r} is no unit of this quantity, which is in "
             f"{kind.unit or 'no unit'}; {remedy}"

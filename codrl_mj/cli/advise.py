@@ -8,6 +8,8 @@ from typing import Annotated, Any
 
 import tyro
 
+from codrl_mj.fields import did_you_mean
+
 _DELIVERED = {
     # field of Delivery: what it is, unit, digits
     "lag": ("lag: time constant of a first-order one that is as late", "policy steps", ".3g"),
@@ -61,12 +63,17 @@ class Advise:
 
     def run(self) -> int:
         """Print the doses, what they cost, and the verdict last."""
+        from codrl_mj.cli.terminal import say
         from codrl_mj.study.actuators.advice import advise
         from codrl_mj.study.actuators.evidence import Evidence
         from codrl_mj.study.actuators.levels import REFERENCE_SPEEDS, posed
-        from codrl_mj.study.grid import check_chosen
 
-        check_chosen("TASK", [self.task], REFERENCE_SPEEDS)
+        if self.task not in REFERENCE_SPEEDS:
+            raise ValueError(
+                f"TASK = {self.task!r}: {did_you_mean(self.task, REFERENCE_SPEEDS)}The study, and so --measure, knows "
+                f"{', '.join(REFERENCE_SPEEDS)}; for any other train a policy on ideal forces and one through the "
+                f"actuator, and compare them on it: codrl-mj evaluate RUN RUN --actuator {self.actuator}"
+            )
         if self.measure is not None and self.measure < 2:
             raise ValueError(f"--measure {self.measure}: must be >= 2, or there is no interval")
         try:
@@ -78,6 +85,7 @@ class Advise:
         found = advise(actuator, self.task, Evidence.read(self.evidence))
         if not self.as_json:
             _print(self.actuator, found)
+            say(actuator.assumed)
         measured = None if self.measure is None else self._measured(actuator, self.measure)
         if self.as_json:
             print(json.dumps({"advice": _plain(found), "measured": measured and _plain(measured)}, indent=2))

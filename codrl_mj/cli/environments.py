@@ -26,17 +26,7 @@ def through(actuators: Sequence[str], name: str) -> str:
 
 
 def environment(verb: Any, task: str, name: str, known: Any = None) -> EnvConfig | ForeignConfig:
-    """The environment that a verb's flags describe.
-
-    Args:
-        verb: has the fields of `environment_fields`.
-        task: the task's name, or the id of an environment of somebody else's.
-        name: a named actuator, or `AS_TRAINED` or `AS_CONFIGURED`.
-        known: the environment whose actuators these stand for.
-
-    Raises:
-        ValueError: unknown name, value out of bounds, or fields set over the ideal actuator, which has none.
-    """
+    """The environment that a verb's flags, those of `environment_fields`, describe; `known` has those of its run."""
     _warn_of_draws(verb, name, known)
     if is_gymnasium_id(task):
         return _foreign_environment(verb, task, name, known)
@@ -135,16 +125,7 @@ def _overlaid(base: ForeignConfig, patterns: Mapping[str, Any]) -> dict[str, Any
 
 
 def _pairs(items: Sequence[str], flag: str, split: Callable[[str, str], Any] = str.rpartition) -> dict[str, str]:
-    """Name -> value of NAME=VALUE.
-
-    Args:
-        items: these.
-        flag: whose they are.
-        split: at which '=': at the last, where names may be regular expressions, or at the first.
-
-    Raises:
-        ValueError: there is no '='.
-    """
+    """Name -> value of NAME=VALUE, split at the last '=', as names may be regular expressions, or at the first."""
     pairs = {}
     for item in items:
         name, equals, value = split(item, "=")
@@ -163,11 +144,7 @@ def _value(text: str) -> Any:
 
 
 def _ranges(randomize: Any, actuator: str) -> Any:
-    """What `--env.randomize` says, `identified` replaced by the intervals that the actuator's file has.
-
-    Raises:
-        ValueError: the actuator is no file that has any.
-    """
+    """What `--env.randomize` says, `identified` replaced by the intervals that the actuator's file has."""
     if randomize is None or "identified" not in randomize:
         return randomize
     if Path(actuator).suffix not in (".yaml", ".yml", ".json"):

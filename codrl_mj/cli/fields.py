@@ -2,7 +2,6 @@
 
 import argparse
 import ast
-import contextlib
 import dataclasses
 import functools
 import inspect
@@ -17,10 +16,10 @@ from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.actuators import FAMILIES, NAMED, Actuator, Ideal
+from codrl_mj.actuators import FAMILIES, NAMED, Actuator, Ideal, Supply
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import parts
-from codrl_mj.foreign.config import EVERY, ForeignConfig, is_gymnasium_id
+from codrl_mj.foreign.config import EVERY, ForeignConfig, environment_from, is_gymnasium_id
 from codrl_mj.runs.layout import CONFIG
 from codrl_mj.tasks import TASKS, find_task, resolve_actuators
 
@@ -53,25 +52,23 @@ def field_docs(kind: type) -> Mapping[str, str]:
 
 
 def flags(kind: type, defaults: Any = None, leaving_out: tuple[str, ...] = (), adding: Sequence[Any] = ()) -> Any:
-    """A dataclass without its validation, which the verb makes up for: errors while parsing look like bugs.
+    """A dataclass, and those in its fields, without validation, which the verb makes up for, to make flags from.
 
-    Args:
-        kind: the dataclass; its fields that are dataclasses are treated likewise.
-        defaults: its instance with the default values; None makes all optional: set over what is known only later.
-        leaving_out: names of fields that get no flag.
-        adding: fields to come last, as `dataclasses.make_dataclass` takes them.
+    Without an instance with the defaults all are optional: set over what is known only later.
     """
     docs, hints, nested = field_docs(kind), typing.get_type_hints(kind), parts(kind)
     fields: list[Any] = []
     for name in (field.name for field in dataclasses.fields(kind) if field.name not in leaving_out):
         hint, value = hints[name], getattr(defaults, name, None)
         setting: dict[str, Any] = {"help": docs.get(name, "")}
+        if name == "gear_ratio" or (kind is Supply and name == "voltage"):
+            setting["aliases"] = (f"--{name.replace('_', '-')}",)  # as the verbs about motors call it
         if name in nested:
             hint = flags(nested[name], value)
             value = hint()
         elif defaults is None:
             hint, text = hint | None, f"{setting['help']} Default: the named actuator's.".strip()
-            setting = {"help": text, "help_behavior_hint": ""}
+            setting |= {"help": text, "help_behavior_hint": ""}
         fields.append((name, Annotated[hint, tyro.conf.arg(**setting)], value))
     return dataclasses.make_dataclass(f"{kind.__name__}Fields", [*fields, *adding], frozen=True)
 
@@ -115,14 +112,8 @@ AS_TRAINED, AS_CONFIGURED = "as-trained", "as-configured"
 def environment_fields(defaults: EnvConfig | ForeignConfig, name: str | None, task: str) -> list[Any]:
     """Flags for an environment: single fields over its actuators, all else but its task, and the options of all tasks.
 
-    Args:
-        defaults: the environment whose values are the defaults.
-        name: what `--actuator` says; None if it is not there. Its family has the fields, of the ideal one a current
-            loop, to be refused.
-        task: the task whose actuators the names vary.
-
-    Returns:
-        Fields for `dataclasses.make_dataclass`; `environment` reads them.
+    The family of what `--actuator` names has the fields, of the ideal one a current loop, to be refused. What cannot be
+    made is refused here: its flags would be unknown. `environment` reads what `dataclasses.make_dataclass` makes.
     """
     if isinstance(defaults, ForeignConfig):
         env, family = _foreign_flags(defaults), type(defaults.actuator[0])
@@ -135,8 +126,7 @@ def environment_fields(defaults: EnvConfig | ForeignConfig, name: str | None, ta
         env = flags(EnvConfig, defaults, ("task", "actuator", "options"), of_tasks)
         family = type(defaults.actuators[0])
     if name not in (None, AS_TRAINED, AS_CONFIGURED):
-        with contextlib.suppress(ValueError, OSError):  # the verb says so better
-            family = type(named_actuators(str(name), task)[0])
+        family = type(named_actuators(str(name), task)[0])
     over = flags(Actuator if issubclass(family, Ideal) else family)
     return [
         ("actuators", Actuators, ()),
@@ -165,21 +155,28 @@ def _foreign_flags(defaults: ForeignConfig) -> Any:
 
 def named_actuators(name: str, task: str) -> tuple[Any, ...]:
     """The actuators that a name stands for in a task, or in an environment of somebody else's."""
-    if is_gymnasium_id(task):
-        return ForeignConfig(task, {EVERY: name}).actuator
-    return resolve_actuators(name, find_task(task))
+    try:
+        if is_gymnasium_id(task):
+            return ForeignConfig(task, {EVERY: name}).actuator
+        return resolve_actuators(name, find_task(task))
+    except ValueError as error:
+        hint = (
+            f"; a file of patterns and actuators goes by --actuators {name}" if name.endswith((".yaml", ".yml")) else ""
+        )
+        raise ValueError(f"{error}{hint}") from None
+
+
+def refuse_task(word: str) -> None:
+    """Refuse a word that is no task's name, as it stands."""
+    try:
+        find_task(word)
+    except ValueError as error:
+        others = "an environment of Gymnasium's goes by its id, such as HalfCheetah-v5"
+        raise ValueError(f"{error}; {others}") from None
 
 
 def scan(arguments: Sequence[str], *names: str) -> argparse.Namespace:
-    """What decides on other flags and their defaults; the rest is left to the real parser.
-
-    Args:
-        arguments: the command line.
-        names: of flags with a value, whose values are wanted; None where they are not there.
-
-    Returns:
-        The values, `task`, None if none is named, and `trust`.
-    """
+    """The values of some flags, None where they are not there, `task` and `trust`: what decides on other flags."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for name in (*names, "task"):
         parser.add_argument(f"--{name}")
@@ -196,27 +193,17 @@ def scan(arguments: Sequence[str], *names: str) -> argparse.Namespace:
 
 
 def with_environment(verb: Any, arguments: Sequence[str]) -> Any:
-    """A verb about a run, with flags for environment and actuator.
-
-    Args:
-        verb: its dataclass.
-        arguments: what follows the verb.
-    """
+    """A verb about a run, with flags for environment and actuator: those of the first run that the line names."""
     from codrl_mj.training.folder import load_config
 
     chosen = scan(arguments, "actuator")
-    task = chosen.task or "cartpole"
     known: Any = EnvConfig("cartpole", Actuator())
-    with contextlib.suppress(ValueError):  # the verb says so better
-        if is_gymnasium_id(task):
-            known = ForeignConfig(task)
-        else:
-            find_task(task)  # its options are flags
-    for run in map(Path, arguments):
-        if (run / CONFIG).is_file():
-            with contextlib.suppress(ValueError, OSError):  # the verb says so better
-                known = load_config(run, chosen.trust).evaluation_env
-    fields = environment_fields(known, chosen.actuator, known.task if isinstance(known, ForeignConfig) else task)
-    made = dataclasses.make_dataclass(verb.__name__, fields, bases=(verb,), frozen=True)
-    made.__doc__ = verb.__doc__
+    run = next((run for run in map(Path, arguments) if (run / CONFIG).is_file()), None)
+    if run is not None:
+        known = load_config(run, chosen.trust).evaluation_env
+    elif chosen.task is not None:
+        known = environment_from({"task": chosen.task, "actuator": Actuator()})
+    fields = environment_fields(known, chosen.actuator, known.task)
+    made: Any = dataclasses.make_dataclass(verb.__name__, fields, bases=(verb,), frozen=True)
+    made.__doc__, made.line = verb.__doc__, tuple(arguments)
     return made

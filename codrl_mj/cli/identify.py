@@ -54,25 +54,27 @@ class Identify:
     def run(self) -> int:
         """Check the logs, fit, print a table, write the files."""
         from codrl_mj.cli.terminal import console, progress_bar
-        from codrl_mj.identify import identify
+        from codrl_mj.identify.identify import checked, foreseen, identify
         from codrl_mj.identify.reading import read_log
 
         logs, held_out = ([read_log(path, self.columns) for path in paths] for paths in (self.logs, self.holdout))
         known, base = _numbers(self.known), self._base()
         if base is not None and "gear_ratio" in known:
             base = base.replaced({"motor.gear_ratio": known["gear_ratio"]})
-        self._check([*logs, *held_out], base)
+        mapping = base and base.as_mapping()
+        wanted = logs, self.rig, known, self.friction
+        known_too = checked(*wanted, self.estimate, self.segment, mapping)
+        if (lacking := foreseen(logs, known_too, mapping)) and not self.as_json:
+            console().print(f"there will be no actuator. {lacking}", markup=False, highlight=False, style="yellow")
+        held_out = self._check(logs, held_out, base)
         with progress_bar("{task.completed}/{task.total}") as bar:
-            row = bar.add_task("identifying", total=None)
+            row = bar.add_task("identifying", total=1)
             found = identify(
-                logs,
-                self.rig,
-                known,
-                self.friction,
+                *wanted,
                 held_out,
                 self.estimate,
                 self.segment,
-                base and base.as_mapping(),
+                mapping,
                 lambda what, done, total: bar.update(row, description=f"fitting: {what}", completed=done, total=total),
             )
         if self.as_json:
@@ -103,27 +105,33 @@ class Identify:
 
         return None if self.motor is None else find_drive(self.motor)
 
-    def _check(self, logs: list[Any], base: Any) -> None:
-        """Print what is wrong with the logs.
+    def _check(self, logs: list[Any], held_out: list[Any], base: Any) -> list[Any]:
+        """Print what is wrong with the logs; returns those held out that have no errors.
 
         Raises:
-            ValueError: one has errors.
+            ValueError: one that is fitted has errors.
         """
         from codrl_mj.cli.identify_tools import findings_table
         from codrl_mj.cli.terminal import console
         from codrl_mj.identify.checks import check
 
-        found = {log.name: check(log, base and base.motor) for log in logs}
-        wrong = [name for name, findings in found.items() if any(one.severity == "error" for one in findings)]
-        for name, findings in found.items():
+        found = [(log, check(log, base and base.motor, self.rig)) for log in (*logs, *held_out)]
+        wrong = [log for log, findings in found if any(one.severity == "error" for one in findings)]
+        for log, findings in found:
             worth = [one for one in findings if one.severity != "info"]
             if worth and not self.as_json:
-                console().print(findings_table(name, worth))
-        if wrong and not self.ignore_errors:
+                console().print(findings_table(log.name, worth))
+        if self.ignore_errors:
+            return held_out
+        if fitted := [log.name for log in logs if any(log is one for one in wrong)]:
             raise ValueError(
-                f"logs {', '.join(wrong)} have errors, with which a fit would be wrong: see codrl-mj identify check; "
+                f"logs {', '.join(fitted)} have errors, with which a fit would be wrong: see codrl-mj identify check; "
                 "correct the columns, leave the logs out, or pass --ignore-errors"
             )
+        for log in wrong:
+            text = f"warning: {log.name}, which is held out, has errors, and is left out"
+            console().print(text, markup=False, highlight=False, style="yellow")
+        return [log for log in held_out if not any(log is one for one in wrong)]
 
 
 def identify_verb(arguments: list[str]) -> Any:
@@ -186,6 +194,8 @@ def print_identified(found: Any) -> None:
             print(f"{part}: the input is late by {rows} row{'s' if abs(rows) > 1 else ''}, which is allowed for")
     for text in found.warnings:
         console().print(f"warning: {text}", markup=False, highlight=False, style="yellow")
+    if found.supply_text:
+        print(found.supply_text)
     problem = found.problem()
     if problem:
         console().print(f"not to be used as an actuator: {problem}", markup=False, highlight=False, style="yellow")

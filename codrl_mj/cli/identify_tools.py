@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -38,6 +39,8 @@ class Check:
     columns: Columns
     motor: str | None = None
     """Motor of the catalogue, or a file with a datasheet, that resistance and back-EMF are compared with."""
+    rig: Literal["pendulum", "free", "load"] | None = None
+    """What the output moves, as for the fit; where it is not said, it may be a pendulum."""
     as_json: AsJson = False
 
     def run(self) -> int:
@@ -51,7 +54,7 @@ class Check:
         if not self.logs:
             raise ValueError("no log is given: name one or more files")
         logs = [read_log(path, self.columns) for path in self.logs]
-        found = {path: check(log, motor) for path, log in zip(self.logs, logs, strict=True)}
+        found = {path: check(log, motor, self.rig) for path, log in zip(self.logs, logs, strict=True)}
         if self.as_json:
             content = [{"log": str(path), **vars(one)} for path, findings in found.items() for one in findings]
             print(json.dumps(content, indent=2))
@@ -256,7 +259,34 @@ def _sensors(texts: Sequence[str]) -> dict[str, Any]:
     return found
 
 
-TOOLS: dict[str, Any] = {"check": Check, "plan": Plan, "simulate": Simulate}
+@dataclasses.dataclass(frozen=True)
+class ProposeColumns:
+    """Propose the --columns of a log, by its names, units and values, and print what to type next.
+
+    Example: codrl-mj identify columns log.csv
+    """
+
+    log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="LOG", help="CSV, JSON (or .gz), Parquet.")]
+    as_json: AsJson = False
+
+    def run(self) -> int:
+        """Print the mapping, what could not be told, and the next line."""
+        from codrl_mj.identify.proposal import propose_columns
+
+        found = propose_columns(self.log)
+        if self.as_json:
+            print(json.dumps(found._asdict(), indent=2))
+            return 0
+        for doubt in found.doubts:
+            print(f"to be checked: {doubt}")
+        rig = " --rig free --known load_inertia=0" if any(f"{one}=" in found.columns for one in _MOTION) else ""
+        print("next (--rig pendulum if one hangs at position 0, load if it lifts one):" if rig else "next:")
+        print(f"codrl-mj identify {shlex.quote(str(self.log))} --columns {shlex.quote(found.columns)}{rig} --out motor")
+        return 0
+
+
+_MOTION = "position", "velocity"
+TOOLS: dict[str, Any] = {"check": Check, "columns": ProposeColumns, "plan": Plan, "simulate": Simulate}
 """What `codrl-mj identify` does besides fitting, by its word."""
 
 
@@ -266,6 +296,7 @@ class IdentifyTools:
 
     verb: tyro.conf.OmitSubcommandPrefixes[
         Annotated[Check, tyro.conf.subcommand("check")]
+        | Annotated[ProposeColumns, tyro.conf.subcommand("columns")]
         | Annotated[Plan, tyro.conf.subcommand("plan")]
         | Annotated[Simulate, tyro.conf.subcommand("simulate")]
     ]

@@ -59,18 +59,14 @@ AsJson = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(name="json"
 _LISTED = {
     # column: header, its unit, SI values to it
     "name": ("name", "", 0.0),
-    "kind": ("kind", "", 0.0),
     "voltage": ("V", "V", 1.0),
-    "resistance": ("R", "ohm", 1.0),
-    "inductance": ("L", "mH", 1e3),
+    "power": ("power", "W", 1.0),
+    "continuous_torque": ("continuous", "N·m", 1.0),
+    "stall_torque": ("stall", "N·m", 1.0),
+    "no_load_speed": ("free", "rad/s", 1.0),
+    "gear_ratio": ("gear", "", 1.0),
     "torque_constant": ("kT", "mN·m/A", 1e3),
     "rotor_inertia": ("J", "g·cm²", 1e7),
-    "gear_ratio": ("gear", "", 1.0),
-    "stall_torque": ("stall", "N·m", 1.0),
-    "stall_current": ("stall", "A", 1.0),
-    "no_load_speed": ("free", "rad/s", 1.0),
-    "electrical_time_constant": ("L/R", "ms", 1e3),
-    "mechanical_time_constant": ("τm", "ms", 1e3),
 }
 
 
@@ -78,15 +74,14 @@ _LISTED = {
 class List:
     """List the motors of the catalogue, with what they can do at their nominal voltage.
 
-    Winding and rotor (R, L, kT, J, the time constants L/R and R*J/(kT*kE)) are the motor's alone; the torque of the
-    blocked shaft and the speed of the free one are those of the gear's output, past friction. A current loop has to be
-    much faster than L/R to be worth its name; a free rotor follows a step of voltage within τm.
+    Power is the most that the motor makes; the torque that it bears for ever, that of the blocked shaft and the speed
+    of the free one are those of the gear's output, past friction; kT and J are the motor's alone. --json has more.
 
-    Example: codrl-mj motor list --sort stall_torque
+    Example: codrl-mj motor list --sort power
     """
 
     sort: Literal[tuple(_LISTED)] = "name"  # type: ignore[valid-type]
-    """Order: names and kinds from A, numbers from the highest."""
+    """Order: names from A, numbers from the highest."""
     as_json: AsJson = False
 
     def run(self) -> int:
@@ -97,11 +92,11 @@ class List:
         rows = catalogue_rows(self.sort)
         if self.as_json:
             return _print_json(rows)
-        table = _table("Motors of the catalogue", *(f"{head}\n{unit}" for head, unit, _ in _LISTED.values()), left=2)
+        table = _table("Motors of the catalogue", *(f"{head}\n{unit}" for head, unit, _ in _LISTED.values()), left=1)
         table.padding, table.columns[0].no_wrap = (0, 0), True
         for row in rows:
-            texts = (_text(row[name] and row[name] * scale, 3) for name, (*_, scale) in list(_LISTED.items())[2:])
-            table.add_row(row["name"], row["kind"], *texts)
+            texts = (_text(row[name] and row[name] * scale, 3) for name, (*_, scale) in list(_LISTED.items())[1:])
+            table.add_row(row["name"], *texts)
         console().print(table)
         print("V: nominal, –: not printed, and taken as 24 V. codrl-mj motor show NAME says where each number is from.")
         return 0
@@ -136,7 +131,7 @@ class Show:
         if self.as_json:
             _print_json(found)
         else:
-            _print_explained(self.name, found)
+            _print_explained(f"{self.name}: {entry.title}" if entry else "", drive.voltage_limit, found)
         if self.html is not None:
             from codrl_mj.pages.motor import motor_page
 
@@ -146,16 +141,22 @@ class Show:
         return _save(figure, self.out, "torque_speed.png", self.as_json)
 
 
-def _print_explained(name: str, found: dict[str, Any]) -> None:
-    from codrl_mj.cli.terminal import console
+def _print_explained(title: str, volts: float, found: dict[str, Any]) -> None:
+    """What it can do first, then its numbers, then what to know of them."""
+    from codrl_mj.cli.terminal import console, say
     from codrl_mj.motor_design import unknown_in_words
 
-    def say(text: str) -> None:
-        console().print(text, markup=False, highlight=False)
+    def show(title: str, part: str) -> None:
+        table = _table(title, "number", "value", "unit", left=1)
+        for row in found[part]:
+            table.add_row(row["name"], _text(row["value"]), row["unit"])
+        console().print(table)
 
     sources: list[str] = []
+    say(title)
+    show(f"What it can do at its output, at {volts:g} V", "abilities")
+    say(found["assumed"])
     if "numbers" in found:
-        say(f"{name}: {found['manufacturer']} {found['product']}, {found['kind']}")
         table = _table("The motor, at its rotor", "number", "value", "unit", "how it came about", "source", left=1)
         for row in found["numbers"]:
             sources += [source for source in row["sources"] if source not in sources]
@@ -163,21 +164,16 @@ def _print_explained(name: str, found: dict[str, Any]) -> None:
             estimated = "" if row["name"] not in found["estimated"] else " (estimated)"
             table.add_row(row["name"], _text(row["value"]), row["unit"], row["how"] + estimated, places)
         console().print(table)
-    for title, part in (("As it is simulated", "drive"), ("What it can do at its output", "abilities")):
-        table = _table(title, "number", "value", "unit", left=1)
-        for row in found[part]:
-            table.add_row(row["name"], _text(row["value"]), row["unit"])
-        console().print(table)
+    show("As it is simulated", "drive")
     if "numbers" in found:
-        say(unknown_in_words(found["unknown"]) or "All numbers are known.")
         for kind, texts in (
-            ("source", [f"{number}: {source}" for number, source in enumerate(sources, 1)]),
-            ("estimated", [f"{field}: {why}" for field, why in found["estimated"].items()]),
             ("disagreement", found["disagreements"]),
             ("note", [" ".join(found["notes"].split())] if found["notes"] else []),
+            ("estimated", [f"{field}: {why}" for field, why in found["estimated"].items()]),
+            ("source", [f"{number}: {source}" for number, source in enumerate(sources, 1)]),
         ):
-            for text in texts:
-                say(f"{kind} {text}" if kind == "source" else f"{kind}: {text}")
+            say(*(f"{kind} {text}" if kind == "source" else f"{kind}: {text}" for text in texts))
+        say(unknown_in_words(found["unknown"]))
 
 
 _DESIGNED = (
@@ -208,8 +204,8 @@ class Design:
 
     def run(self) -> int:
         """Print the table, draw Bode's diagram."""
-        from codrl_mj.cli.terminal import console
-        from codrl_mj.motor_design import LoopDesign, bode_diagram, design, designs
+        from codrl_mj.cli.terminal import console, say
+        from codrl_mj.motor_design import LoopDesign, bode_diagram, design, designs, sampled_too_seldom
 
         drive = self.changes.drive(self.name)
         own, every = design(drive), designs(drive)
@@ -232,6 +228,7 @@ class Design:
         console().print(table)
         for why in dict.fromkeys(one for one in every.values() if isinstance(one, str)):
             print(f"not possible: {why}")
+        say(sampled_too_seldom(drive), drive.assumed)
         return _save(figure, self.out, "bode.png", False)
 
 
@@ -254,8 +251,8 @@ class Step:
 
     def run(self) -> int:
         """Print the table, draw the responses."""
-        from codrl_mj.cli.terminal import console
-        from codrl_mj.motor_design import step, step_diagram
+        from codrl_mj.cli.terminal import console, say
+        from codrl_mj.motor_design import sampled_too_seldom, step, step_diagram
 
         drive = self.changes.drive(self.name)
         steps = step(drive)
@@ -278,19 +275,41 @@ class Step:
         for kind, one in recoveries.items():
             table.add_row(kind, _text(1e3 * one["time"], 3), _text(100.0 * one["undershoot"], 2))
         console().print(table)
+        say(sampled_too_seldom(drive), drive.assumed)
         return _save(figure, self.out, "step.png", False)
 
 
 @dataclasses.dataclass(frozen=True)
-class Motor:
-    """Motors that one can buy: list them, look at one, design its current loop, and see it step.
+class New:
+    """Write a file for a motor of your own, to be filled in with what its datasheet prints; docs/own_motor.md.
 
-    From a datasheet to a loop in three commands: show says what the motor is and can do, design what its drive makes of
-    it, step how that looks. docs/motors.md has more. Example: codrl-mj motor show maxon-ec45-flat-50w
+    Example: codrl-mj motor new my_motor.toml
+    """
+
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE.toml")]
+    """The file; one that exists is left alone."""
+
+    def run(self) -> int:
+        """Write it."""
+        from codrl_mj.catalogue import new_motor
+
+        new_motor(self.file)
+        print(f"wrote {self.file}: fill it in; next: codrl-mj motor show {self.file}")
+        return 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Motor:
+    """Motors that one can buy: list them, look at one, design its current loop, and see it step; or write one down.
+
+    New writes a file to fill in with a datasheet, show says what the motor is and can do, design what its drive makes
+    of it, step how that looks; feasible and choose say whether it can do a task. docs/own_motor.md has more.
+    Example: codrl-mj motor show maxon-ec45-flat-50w
     """
 
     verb: tyro.conf.OmitSubcommandPrefixes[
         Annotated[List, tyro.conf.subcommand("list")]
+        | Annotated[New, tyro.conf.subcommand("new")]
         | Annotated[Show, tyro.conf.subcommand("show")]
         | Annotated[Design, tyro.conf.subcommand("design")]
         | Annotated[Step, tyro.conf.subcommand("step")]

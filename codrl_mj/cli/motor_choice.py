@@ -1,8 +1,7 @@
 """`codrl-mj motor feasible` and `codrl-mj motor choose`."""
 
 import dataclasses
-import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,9 +27,9 @@ Trust = Annotated[
 
 @dataclasses.dataclass(frozen=True)
 class Feasible:
-    """Ask whether a motor can do a task, before anything is trained: surely, surely not, or try it. docs/motors.md.
+    """Ask whether a motor can do a task, before training: surely, try it, hopeless, surely not; docs/motors.md.
 
-    Exit status 1 if surely not. Example: codrl-mj motor feasible maxon-ec45-flat-50w pendulum --gear-ratio 20
+    Exit status 1 for the last two. Example: codrl-mj motor feasible maxon-ec45-flat-50w pendulum --gear-ratio 20
     """
 
     name: Annotated[
@@ -50,50 +49,58 @@ class Feasible:
     def run(self) -> int:
         """Print the bounds, and the verdict last."""
         from codrl_mj.cli.look import titled_table
-        from codrl_mj.cli.terminal import console
-        from codrl_mj.sizing import SURELY_NOT, catalogued, demand_of, feasibility
+        from codrl_mj.cli.terminal import console, say
+        from codrl_mj.sizing import HOPELESS, SURELY_NOT, catalogued, demand_of, feasibility, geared
 
         drive, continuous, unknown = catalogued(self.name, self.gear_ratio, self.voltage)
         demand = demand_of(self.asked, trust=self.trust, motor=self.motor)
         found = feasibility(drive, demand, continuous)
-        table = titled_table(
-            f"{self.name}, gear {1.0 / drive.arm_radius:.4g}, {drive.voltage_limit:g} V: {demand.source}"
-        )
+        table = titled_table(f"{self.name}, {_gear(drive, demand)}, {drive.voltage_limit:g} V: {demand.source}")
         for header in ("bound", "of", "needs", "has", "unit", "", "says"):
             table.add_column(header, justify="right" if header in ("needs", "has") else "left")
         for bound in found.bounds:
             numbers = f"{bound.needed:.4g}", f"{bound.available:.4g}"
-            table.add_row(bound.name, bound.formula, *numbers, bound.unit, _mark(bound.holds), bound.verdict)
+            mark = "[green]holds" if bound.holds else "[red]fails"
+            table.add_row(bound.name, bound.formula, *numbers, bound.unit, mark, bound.verdict)
         console().print(table)
-        asked = found.operation
-        lines = [
+        asked, best = found.operation, geared(drive, demand, continuous)
+        at_best = feasibility(best, demand, continuous)
+        say(
             f"{asked.energy_drawn:.3g} J drawn and {asked.copper_loss:.3g} J of heat in an episode, "
-            f"{asked.rms_current:.3g} A rms; rotor and friction add up to {asked.own_share:.0%} of the largest load",
+            f"{asked.rms_current:.3g} A rms; share of rotor and friction in the largest load: {_share(drive, asked)}",
             *(f"{bound.name}: {bound.remedy}" for bound in found.bounds if not bound.holds),
-        ]
-        if unknown:
-            lines.append(f"not in the datasheet, and not counted: {', '.join(unknown)}")
-        for line in lines:
-            console().print(line, markup=False, highlight=False)
+            f"best: {_gear(best, demand)}, {at_best.verdict}, with a margin of {at_best.margin:.0%}",
+            f"not known, and not counted: {', '.join(unknown)}" if unknown else "",
+            drive.assumed,
+        )
         if self.out is not None:
             _draw(drive, demand, self.name, self.out / "torque_speed.png")
-        console().print(found.verdict, markup=False, highlight=False)
-        return 1 if found.verdict == SURELY_NOT else 0
+        say(found.verdict)
+        return 1 if found.verdict in (HOPELESS, SURELY_NOT) else 0
 
 
 @dataclasses.dataclass(frozen=True)
 class Choose:
-    """Rank the catalogue's motors for a task, the smallest that does it first, and say what is wrong with the others.
+    """Rank motors for a task, the smallest that does it first, and say what is wrong with the others.
 
+    Motors of your own (files) or of the catalogue are named beside the task; without any the catalogue's are ranked.
     Each is taken at its best gear. It does the task if voltage, largest current and heat hold with the margin, its heat
     is known, and the rotor leaves half to the load; smallest means by the most mechanical power at its supply. A run
     with several motors gets one for each of them. With --out there is the file actuators.yaml, which train, evaluate
     and render take as --actuators FILE.
 
-    Example: codrl-mj motor choose pendulum --top 5 --out chosen, or codrl-mj motor choose runs/Hopper_v5-sac-ideal-0
+    Example: codrl-mj motor choose pendulum --top 5 --out chosen, codrl-mj motor choose a.toml b.toml pendulum, or
+    codrl-mj motor choose runs/Hopper_v5-sac-ideal-0
     """
 
-    asked: Asked
+    words: Annotated[
+        tyro.conf.Positional[tuple[str, ...]],
+        tyro.conf.arg(
+            metavar="[MOTOR ...] TASK|RUN",
+            help="Motors to rank, as for motor show, if not the whole catalogue; and a task, run folder or .npz file, "
+            "as for motor feasible.",
+        ),
+    ]
     top: int = 5
     """How many to show in the table; of those that do not do it is told why."""
     margin: float = 0.2
@@ -106,52 +113,36 @@ class Choose:
     trust: Trust = False
 
     def run(self) -> int:
-        """Print the ranking."""
-        from codrl_mj.cli.terminal import console
+        """Print the ranking, or of several motors the best for each."""
+        from codrl_mj.cli.terminal import console, say
         from codrl_mj.sizing import choose, demand_of, demands_of
 
         if self.top < 1:
             raise ValueError(f"--top {self.top}: must be >= 1")
-        if self.motor is None and len(demands := demands_of(self.asked, trust=self.trust)) > 1:
-            return self._for_each(demands)
-        demand = demand_of(self.asked, trust=self.trust, motor=self.motor)
-        choices = choose(demand, voltage=self.voltage, least_margin=self.margin)
-        shown, console_ = choices[: self.top], console()
-        if demand.model_gear != 1.0:
-            text = f"gears are at the joint; the model's actuator has one of {demand.model_gear:g}, which the motor's "
-            console_.print(f"{text}arm_radius {demand.model_gear:g} undoes", markup=False, highlight=False)
-        console_.print(_ranking(shown, f"smallest that does it with {self.margin:.0%} left first: {demand.source}"))
-        for choice in shown:
-            if choice.unknown:
-                text = f"{choice.name}: not in its datasheet, and not counted: {', '.join(choice.unknown)}"
-                console_.print(text, markup=False, highlight=False)
-        for choice in choices:
-            if choice.lacks:
-                text = f"{choice.name} at gear {choice.ratio:.4g}: {choice.lacks}"
-                console_.print(text, markup=False, highlight=False)
-        for choice in shown if self.out is not None else ():
+        asked, motors = _told_apart(self.words)
+        one = self.motor is not None and {self.motor: demand_of(asked, trust=self.trust, motor=self.motor)}
+        demands = one or demands_of(asked, trust=self.trust)
+        ranked = {name: choose(demand, motors or None, self.voltage, self.margin) for name, demand in demands.items()}
+        alone = next(iter(demands.values())) if len(demands) == 1 else None
+        if alone is not None and alone.model_gear != 1.0:
+            text = f"gears are at the joint; the model's actuator has one of {alone.model_gear:g}, which the motor's "
+            say(f"{text}arm_radius {alone.model_gear:g} undoes")
+        told = [(name, choice) for name, found in ranked.items() for choice in (found if alone else found[:1])]
+        shown = told[: self.top] if alone else told
+        title = f"smallest that does it with {self.margin:.0%} left first: {alone.source if alone else asked}"
+        console().print(_ranking(shown, demands, title))
+        for place, (name, choice) in enumerate(told):
+            at = f"{choice.name} at {_gear(choice.drive, demands[name])}"
+            rest = ", ".join(one for one in choice.unknown if one not in choice.lacks)
+            unknown = f"not known, and not counted: {rest}" if rest else ""
+            about = "; ".join(filter(None, (choice.lacks, unknown, choice.drive.assumed)))
+            if about and (choice.lacks or place < len(shown)):
+                say(f"{at}: {about}" if alone else f"{name}: {at}: {about}")
+        for name, choice in shown if self.out is not None else ():
             assert self.out is not None
-            _draw(choice.drive, demand, choice.name, self.out / f"{Path(choice.name).stem}.png")
-        self._write({self.motor or "": (choices[0], demand)})
-        return 0
-
-    def _for_each(self, demands: Mapping[str, Any]) -> int:
-        """Choose for each of several motors, and say how to go on."""
-        from codrl_mj.cli.terminal import console
-        from codrl_mj.sizing import choose
-
-        best = {}
-        for name, demand in demands.items():
-            ranked = choose(demand, voltage=self.voltage, least_margin=self.margin)
-            best[name] = ranked[0]
-            if self.out is not None:
-                _draw(ranked[0].drive, demand, ranked[0].name, self.out / f"{name}.png")
-        console().print(_ranking(best.values(), f"smallest with {self.margin:.0%} left: {self.asked}", list(best)))
-        for name, choice in best.items():
-            if choice.lacks:
-                text = f"{name}: none does it; {choice.name} comes nearest at gear {choice.ratio:.4g}: {choice.lacks}"
-                console().print(text, markup=False, highlight=False)
-        self._write({name: (choice, demands[name]) for name, choice in best.items()})
+            picture = Path(choice.name).stem if alone else name
+            _draw(choice.drive, demands[name], choice.name, self.out / f"{picture}.png")
+        self._write({name: (found[0], demands[name]) for name, found in ranked.items()})
         return 0
 
     def _write(self, choices: Mapping[str, Any]) -> None:
@@ -168,30 +159,53 @@ class Choose:
         print(f"wrote {self.out / 'actuators.yaml'}")
 
 
-def _ranking(choices: Iterable[Any], title: str, driven: Sequence[str] = ()) -> Any:
+def _told_apart(words: Sequence[str]) -> tuple[str, list[str]]:
+    """The task, run or recording among some words, and the motors."""
+    from codrl_mj.catalogue import motor_names
+    from codrl_mj.tasks import TASKS
+
+    asked = [word for word in words if word in TASKS or Path(word).suffix == ".npz" or Path(word).is_dir()]
+    files = ".toml", ".yaml", ".yml", ".json"
+    asked = asked or [word for word in words if not word.endswith(files) and word not in motor_names()]
+    if len(asked) != 1:
+        raise ValueError(
+            f"motor choose: {' and '.join(asked) or 'nothing'} to choose for: name one task, run folder or .npz file, "
+            "such as codrl-mj motor choose a.toml b.toml pendulum"
+        )
+    return asked[0], [word for word in words if word != asked[0]]
+
+
+def _gear(drive: Any, demand: Any) -> str:
+    """Its gear, with the unit that it has on a slide."""
+    return f"gear {1.0 / drive.arm_radius:.4g}{' rad/m' if demand.linear else ''}"
+
+
+def _share(drive: Any, asked: Any) -> str:
+    """What rotor and friction take of the load, where the rotor is known."""
+    return f"{asked.own_share:.0%}" if drive.motor.rotor_inertia > 0.0 else "unknown"
+
+
+def _ranking(choices: Sequence[tuple[str, Any]], demands: Mapping[str, Any], title: str) -> Any:
     """A row for each choice; of several motors, each with what it drives."""
     from codrl_mj.cli.look import titled_table
 
     table = titled_table(title)
-    if driven:
+    several = len(demands) > 1
+    if several:
         table.add_column("drives", overflow="fold")
     columns = ("motor", "gear", "supply\n[V]", "power\n[W]", "does\nit", "margin", "rotor's\nshare", "peak\n[A]")
     for header in (*columns, "rms\n[A]", "drawn\n[J]", "heat\n[J]"):
         table.add_column(header, justify="left" if header in ("motor", "does\nit") else "right", no_wrap=True)
-    for choice, name in itertools.zip_longest(choices, driven):
+    for name, choice in choices:
         asked = choice.feasibility.operation
         numbers = abs(asked.current).max(), asked.rms_current, asked.energy_drawn, asked.copper_loss
+        gear, does = _gear(choice.drive, demands[name]), "[red]no" if choice.lacks else "[green]yes"
         table.add_row(
-            *((name,) if driven else ()),
-            *(choice.name, f"{choice.ratio:.4g}", f"{choice.drive.voltage_limit:g}", f"{choice.power:,.0f}"),
-            "[red]no" if choice.lacks else "[green]yes",
-            *(f"{choice.feasibility.margin:.0%}", f"{asked.own_share:.0%}", *(f"{number:.3g}" for number in numbers)),
+            *((name, choice.name) if several else (choice.name,)),
+            *(gear.removeprefix("gear "), f"{choice.drive.voltage_limit:g}", f"{choice.power:,.0f}", does),
+            *(f"{choice.feasibility.margin:.0%}", _share(choice.drive, asked), *(f"{one:.3g}" for one in numbers)),
         )
     return table
-
-
-def _mark(holds: bool) -> str:
-    return "[green]holds" if holds else "[red]fails"
 
 
 def _draw(drive: Any, demand: Any, name: str, path: Path) -> None:

@@ -34,7 +34,7 @@ class Replay:
         check_page(self.out)
         policy, env = policy_and_environment(self)
         (episode,) = run_episodes(policy, env.make, 1, self.seed)
-        title = f"{title_of(self)}: return {episode.total:.0f}"
+        title = f"{title_of(self.subject, env)}: return {episode.total:.0f}"
         write_replay(motion_of_episode(episode, env), self.out, title)
         print(f"wrote {self.out} ({self.out.stat().st_size / 1e6:.1f} MB)")
         return 0

@@ -55,7 +55,7 @@ class Computed:
             left = self.print_costs(grid)
             print(f"about {left:.2f} core hours are left: {left / workers.cores:.2f} hours with {workers.cores} jobs")
             return 0
-        check_writable(self.out)
+        check_writable(self.root)
         if not self.only_page:
             import matplotlib  # noqa: F401 - what is missing is missed now and not in the end
 

@@ -1,15 +1,19 @@
 """The trained policy that a verb is about, wherever it comes from."""
 
+import contextlib
 import dataclasses
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from codrl_mj.cli.environments import default_actuator, environment, through
-from codrl_mj.cli.fields import AS_TRAINED, is_task
+from codrl_mj.cli.environments import environment
+from codrl_mj.cli.fields import is_task
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.fields import did_you_mean
 from codrl_mj.foreign.config import ForeignConfig, environment_from
+from codrl_mj.runs.layout import CONFIG, finished
+from codrl_mj.tasks import TASKS
 
 SubjectWord = Annotated[
     tyro.conf.Positional[str],
@@ -33,11 +37,7 @@ class Subject:
     """The run folder that says so; None if there is none."""
 
     def check_interface(self, env: EnvConfig | ForeignConfig) -> None:
-        """Refuse an environment in which the policy would command or observe something else than in its training.
-
-        Raises:
-            ValueError: it does, by what its run folder says.
-        """
+        """Refuse an environment in which the policy would command or observe something else than in its training."""
         for name, trained in self.env.interface.items() if self.run is not None else ():
             if (value := env.interface[name]) != trained:
                 flag = f"--env.{name.replace('_', '-')}"
@@ -72,15 +72,9 @@ class Source:
     ] = False
 
     def load(self, path: Path) -> Subject:
-        """The policy at a path: a run folder, a folder with a policy alone, or a Stable-Baselines3 zip.
-
-        Raises:
-            FileNotFoundError: nothing is there.
-            ValueError: it is damaged, or needs a flag to be loaded.
-        """
-        from codrl_mj.runs.layout import finished
+        """The policy at a path: a run folder, a folder with a policy alone, or a Stable-Baselines3 zip."""
         from codrl_mj.runs.policies import load_policy, load_sb3_zip
-        from codrl_mj.training.folder import BEST, CONFIG, load_config
+        from codrl_mj.training.folder import BEST, load_config
 
         alone = path.suffix == ".zip" or ((path / "policy.json").exists() and not (path / CONFIG).exists())
         if not alone:
@@ -108,30 +102,25 @@ class Source:
 
 
 def policy_and_environment(verb: Any) -> tuple[Any, EnvConfig | ForeignConfig]:
-    """What acts, and in what, by a verb's `subject` and its flags: of a task or an id random actions.
-
-    Raises:
-        FileNotFoundError: there is no such run.
-        ValueError: the run cannot be loaded, or the flags do not fit it.
-    """
+    """What acts, and in what, by a verb's `subject` and its flags: of a task or an id random actions."""
     if is_task(verb.subject):
         from codrl_mj.evaluation import RandomPolicy
 
         known = environment_from({"task": verb.subject})
         env = environment(verb, known.task, verb.actuator_name, known)
-        made = env.make()
-        space = made.action_space
-        made.close()
-        return RandomPolicy(space, verb.seed), env
+        if env.action == "force":
+            return RandomPolicy(env.action_space, verb.seed), env
+        with contextlib.closing(env.make()) as made:
+            return RandomPolicy(made.action_space, verb.seed), env
+    if not Path(verb.subject).exists():
+        hint = did_you_mean(verb.subject, TASKS)
+        raise FileNotFoundError(f"no run configuration at {verb.subject}/{CONFIG}: {hint}It is no run and no task")
     loaded = verb.source.load(Path(verb.subject))
     env = environment(verb, loaded.env.task, verb.actuator_name, loaded.env)
     loaded.check_interface(env)
     return loaded.policy, env
 
 
-def title_of(verb: Any) -> str:
+def title_of(policy: Path | str, env: EnvConfig | ForeignConfig) -> str:
     """What acts, and what its episode runs on."""
-    name = verb.actuator_name
-    if name == AS_TRAINED and is_task(verb.subject):
-        name = default_actuator(verb.subject)
-    return f"{Path(verb.subject).name} on {through(verb.actuators, name)}"
+    return f"{Path(policy).name} on {env.through}"

@@ -17,12 +17,7 @@ _NOTHING = "–"
 
 
 def evaluation_tables(evaluations: Mapping[str, Evaluation], details: bool = True) -> list[Table]:
-    """The most telling measures with a row for each evaluation, and then the others with a column for each.
-
-    Args:
-        evaluations: by their names; at least one.
-        details: whether to show the others.
-    """
+    """The most telling measures with a row for each evaluation, and then, as details, the others with a column."""
     names = list(evaluations) if details else []
     chunks = [names[begin : begin + _COLUMNS] for begin in range(0, len(names), _COLUMNS)]
     of_motors = [_motors(name, evaluations[name]) for name in names if evaluations[name].motors]
@@ -35,7 +30,7 @@ _TELLING: dict[str, tuple[str, Callable[[Any], str]]] = {
     "success": ("success", lambda value: f"{100 * value.mean:.0f} %"),
     "returns": ("return", lambda value: "{:.1f} [{:.1f}, {:.1f}]".format(*value)),
     "time_to_goal": ("time to\ngoal", lambda value: f"{value.median:.1f} s"),
-    "tracking_rms": ("shaft torque\nerror", lambda value: f"{value:.3f} N·m"),
+    "tracking_rms": ("shaft torque\nerror", lambda value: f"{_text(value)} N·m"),
     "saturated_percent": ("saturated", lambda value: f"{value:.1f} %"),
     "peak_voltage": ("peak\n|u|", lambda value: f"{value:.1f} V"),
     "energy_drawn": ("energy\ndrawn", lambda value: f"{_text(value.mean)} J"),

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
+from rich.progress import BarColumn, Progress, Task, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Column, Table
+from rich.text import Text
 
 from codrl_mj.cli.tables import comparison_tables, evaluation_tables, run_table
 from codrl_mj.evaluation import Evaluation
@@ -27,34 +28,49 @@ def console() -> Console:
     return Console() if sys.stdout.isatty() else Console(width=110)
 
 
+def say(*texts: str) -> None:
+    """Print each text that is not empty, as wide as the terminal."""
+    for text in filter(None, texts):
+        console().print(text, markup=False, highlight=False)
+
+
+class _Line(TextColumn):
+    """Text in one line; nothing while numbers in it are not known, such as of how many a count is."""
+
+    def render(self, task: Task) -> Text:
+        """The text of a task."""
+        text = super().render(task)
+        text = Text() if "/None" in text.plain or " nan" in f" {text.plain}" else text
+        text.no_wrap, text.overflow = True, "ellipsis"
+        return text
+
+
 def progress_bar(*columns: str) -> Progress:
-    """A progress display with the given text columns, the time elapsed and the time left."""
+    """A progress display with the given text columns, the time elapsed and the time left.
+
+    Where all is too long for a line, the bar and the description give way.
+    """
     return Progress(
-        TextColumn("{task.description}"),
+        _Line("{task.description}", table_column=Column()),
         BarColumn(),
-        *(TextColumn(column) for column in columns),
-        TimeElapsedColumn(),
+        *(_Line(column) for column in columns if column),
+        TimeElapsedColumn(table_column=Column(no_wrap=True)),
         TextColumn("left"),
-        TimeRemainingColumn(),
+        TimeRemainingColumn(table_column=Column(no_wrap=True)),
         console=console(),
     )
 
 
 @contextlib.contextmanager
 def training_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> Iterator[None]:
-    """Show a bar for each training while the block runs, by what the run folders say, whatever process writes them.
-
-    Args:
-        runs: description -> (configuration, run folder).
-    """
+    """Show a bar for each training while the block runs, by what the run folders say, whatever process writes them."""
     columns = (
         "{task.completed:,}/{task.total:,} {task.fields[unit]}",
         "return {task.fields[mean_return]:.1f}",
-        "length {task.fields[mean_length]:.0f}",
-        "torque err {task.fields[torque_error]:.2g} N·m",
+        "end torque err {task.fields[torque_error]:.2g} N·m",
         "{task.fields[steps_per_second]:.0f}/s",
     )
-    with progress_bar(*columns) as bar:
+    with progress_bar(*(one for one in columns if "torque" not in one or console().width >= 100)) as bar:
         rows = {}
         for name, (config, folder) in runs.items():
             unit, total = (
@@ -86,12 +102,7 @@ def training_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> Iterator[None
 
 
 def print_evaluations(evaluations: Mapping[str, Evaluation], details: bool = True) -> None:
-    """Print the most telling measures in one table, a row for each evaluation by its name, and the others below it.
-
-    Args:
-        evaluations: by their names; at least one.
-        details: whether to print the others.
-    """
+    """Print the most telling measures in one table, a row for each evaluation by its name, and details below it."""
     for table in evaluation_tables(evaluations, details):
         console().print(table)
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from codrl_mj.actuators.model import family_name
 from codrl_mj.agents import AGENTS
 from codrl_mj.agents.presets import SETTINGS
 from codrl_mj.cli.environments import default_actuator, environment, through
@@ -16,29 +17,23 @@ from codrl_mj.cli.fields import (
     ActuatorName,
     environment_fields,
     flags,
+    refuse_task,
     scan,
 )
 from codrl_mj.foreign.config import ForeignConfig, environment_from
 from codrl_mj.runs.layout import finished
 from codrl_mj.tasks import TASKS
 from codrl_mj.training.config import TrainConfig, default_agent, read_config
-from codrl_mj.training.folder import load_config
+from codrl_mj.training.folder import admit, load_config
 
 _OWN_FLAGS = ("agent", "env")  # of the configuration: not made from its fields' types
 
 
 def train_verb(arguments: list[str]) -> Any:
-    """The verb's dataclass for a command line, whose agent, task, settings and files decide on flags and defaults.
-
-    Args:
-        arguments: what follows `train`.
-
-    Raises:
-        FileNotFoundError: the configuration file or the run folder is missing.
-        ValueError: it cannot be read, there are no such settings for the agent on the task, or the run has another
-            agent.
-    """
+    """The verb's dataclass for a command line, whose agent, task, settings and files decide on flags and defaults."""
     chosen = scan(arguments, "agent", "settings", "actuator", "config", "resume")
+    if chosen.task is None and arguments and not arguments[0].startswith("-"):
+        refuse_task(arguments[0])
     base = _base(chosen)
     resuming = chosen.resume is not None
     configured = resuming or chosen.config is not None
@@ -116,7 +111,7 @@ class Train:
 
     def run(self: Any) -> int:
         """Train, with a progress bar."""
-        from codrl_mj.cli.terminal import training_bars
+        from codrl_mj.cli.terminal import say, training_bars
         from codrl_mj.training import train
 
         if _task(self.task) != _task(self.base.task) and self.resume is None:
@@ -134,15 +129,19 @@ class Train:
             },
         )
         parts = config.task, config.agent.name, through(self.actuators, self.actuator_name), str(config.seed)
-        own = any(":" in part for part in parts)  # module:NAME
-        following = "next: " + ("python -m codrl_mj evaluate --trust" if own else "codrl-mj evaluate")
+        actuators = config.env.actuator if isinstance(config.env, ForeignConfig) else config.env.actuators
+        own = any(":" in one for one in (*parts, *(family_name(type(each)) for each in actuators)))  # module:NAME
+        following = "next: codrl-mj evaluate" + (" --trust" if own else "")
         if self.resume is not None and finished(self.resume) and config == load_config(self.resume, self.trust):
             print(f"{self.resume} is finished already; {following} {self.resume}")
             return 0
         name = "-".join(re.sub(r"[^\w.]+", "_", part) for part in parts)
         out = self.resume or self.out or Path("runs") / name
+        admit(out, config, self.resume is not None, self.accept_changes)
         if isinstance(config.env, ForeignConfig):
             config.env.make().close()  # what is wrong with it is said before there is a bar
+        driven = config.env.actuator if isinstance(config.env.actuator, tuple) else (config.env.actuator,)
+        say(*dict.fromkeys(one.assumed for one in driven))
         with training_bars({f"{config.agent.name.upper()} on {config.task}": (config, out)}):
             train(
                 config,

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from codrl_mj.tasks import TASKS
+from codrl_mj.tasks import TASKS, find_task
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,15 +37,14 @@ class Validate:
     def run(self) -> int:
         """Validate and print a table for each group."""
         from codrl_mj.cli.terminal import print_certificate, print_mutations, progress_bar
-        from codrl_mj.runs.files import check_writable
         from codrl_mj.validation import own_model, try_mutations, validate, validate_model
         from codrl_mj.validation.mutations import faulty, unfailed
 
         if self.model is not None and (self.tasks or self.mutations):
             raise ValueError("--model: give a model or tasks, and no --mutations, which are faults of the tasks")
         tasks = faulty(self.tasks) if self.mutations else self.tasks
-        if self.out is not None:
-            check_writable(self.out)
+        for task in self.tasks:
+            find_task(task)
         model = None if self.model is None else own_model.load(self.model)
         with progress_bar("{task.completed}/{task.total}") as bar:
             row = bar.add_task("validating", total=None)

@@ -36,6 +36,8 @@ class View:
         """Serve until Ctrl-C."""
         from codrl_mj.view.session import Session
 
+        if not 1 <= self.port <= 65535:
+            raise ValueError(f"--port {self.port}: must be from 1 to 65535")
         if self.native:
             from codrl_mj.view.native import check_display, run
 
@@ -47,7 +49,7 @@ class View:
         if self.native:
             run(session)
             return 0
-        shown = browser(session, self.port, title_of(self), field_docs)
+        shown = browser(session, self.port, title_of(self.subject, env), field_docs)
         print(f"{shown.url} (on this machine alone; Ctrl-C ends it)", flush=True)
         try:
             shown.run()

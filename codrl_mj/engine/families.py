@@ -16,8 +16,10 @@ from numba import types
 from numba.extending import register_jitable
 
 from codrl_mj.actuators import Family, Inputs, family_number, parameters_type, reference
+from codrl_mj.actuators.model import advance_form, check_family
 from codrl_mj.engine.inertia import load_inertia
-from codrl_mj.engine.memory import call_family, f64, i32, internal, read, u8, u64, write
+from codrl_mj.engine.memory import call_family, f64, i32, internal, read, tuple_of, u8, u64, write
+from codrl_mj.own_code import Form, check_form, not_compiled
 
 SIGNATURE = (250700.0, 268401.0)
 """First two numbers of the `user` data of every actuator and joint that is ours: the paper's arXiv identifier, in two,
@@ -93,9 +95,10 @@ def load_family(family: Family) -> None:
 
     Raises:
         ValueError: another family has the same number: rename one of the two. Or the one before had other numbers of
-            states, signals or parameters, which models that exist rely on.
-        numba.core.errors.NumbaError: `advance` is not what numba compiles.
+            states, signals or parameters, which models that exist rely on. Or `advance` is not what numba compiles, or
+            does not return what the family declares.
     """
+    check_family(family)
     number, sizes = family_number(family), family_sizes(family)
     other, _ = _COMPILED.get(number, (None, None))
     if other is family:
@@ -125,12 +128,7 @@ def family_sizes(family: Family) -> tuple[int, ...]:
 
 @contextlib.contextmanager
 def replaced(family: Family, other: Family) -> Iterator[None]:
-    """Run another's `advance` in place of a family's, in all models, for the length of a `with` block.
-
-    Args:
-        family: the family.
-        other: has the same parameters, states and signals.
-    """
+    """Run another's `advance` in place of a family's in a `with` block; both have the same states and signals."""
     load_family(family)
     number, function = family_number(family), _compile(other)
     right = _ADDRESSES[number]
@@ -153,10 +151,34 @@ def _register(helper: Callable[..., Any]) -> None:
 
 
 @functools.cache
+def compiled_function(function: Callable[..., Any], form: Form, declared: str, *kinds: Any) -> Any:
+    """A user's function, compiled for arguments of such types, whose result is of a form in numba's eyes too.
+
+    Raises:
+        ValueError: it is not what numba compiles, or returns something else.
+    """
+    compiled = internal(function)
+    try:
+        compiled.compile(kinds)
+    except Exception as error:
+        raise ValueError(not_compiled(function, error)) from error
+    check_form(function, _example(compiled.overloads[kinds].signature.return_type), form, declared)
+    return compiled
+
+
+def _example(kind: Any) -> Any:
+    """A value of one of numba's types; of one that is neither a number nor a tuple of these, the type."""
+    if isinstance(kind, types.BaseTuple):
+        return tuple(map(_example, kind))
+    return 0.0 if isinstance(kind, types.Float | types.Integer | types.Boolean) else kind
+
+
+@functools.cache
 def _compile(family: Any) -> Any:
     jitable(family)
-    advance = internal(family.advance)
     parameters_of, state_of = parameters_type(family), family.State
+    kinds = tuple_of(parameters_of), _F64, tuple_of(state_of), tuple_of(Inputs)
+    advance = compiled_function(family.advance, *advance_form(family), *kinds)
 
     @numba.cfunc(_FUNCTION, nogil=True, error_model="numpy")
     def step(
@@ -253,21 +275,10 @@ def advance_slot(
     time: float,
     inertia: float,
 ) -> float:
-    """Compute an actuator's candidate and signals from its committed state.
+    """Compute an actuator's candidate and signals from its committed state; the torque [N*m], which its slot keeps too.
 
-    Args:
-        number: the family's.
-        parameters: address of its parameters.
-        timestep: mechanical step [s].
-        slot: address of the actuator's state.
-        desired: torque asked for [N*m].
-        position: of the shaft [rad].
-        speed: of the shaft [rad/s].
-        time: [s].
-        inertia: at the shaft [kg*m^2].
-
-    Returns:
-        The torque [N*m], which the slot keeps too.
+    By address are the parameters and the slot; torque asked for [N*m], position [rad], speed [rad/s] and inertia
+    [kg*m^2] are the shaft's.
     """
     own, size = f64(slot), 8 * state_count(number)
     before = slot + 8 * SLOT

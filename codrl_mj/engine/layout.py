@@ -63,10 +63,7 @@ def _structure(name: str, fields: Any) -> type[ctypes.Structure]:
 
 @functools.cache
 def struct(name: str) -> type[ctypes.Structure]:
-    """MuJoCo's structure `name` (`mjModel`, `mjData`, `mjOption`, ...) as a ctypes structure.
-
-    Args:
-        name: the C name.
+    """MuJoCo's structure of a C name (`mjModel`, `mjData`, `mjOption`, ...) as a ctypes structure.
 
     Raises:
         LayoutError: the structure holds a type that is not known here.
@@ -75,11 +72,7 @@ def struct(name: str) -> type[ctypes.Structure]:
 
 
 def offset(struct_name: str, field: str) -> int:
-    """Offset of a field in bytes; `field` may be dotted (`opt.timestep`).
-
-    Args:
-        struct_name: `mjModel` or `mjData`.
-        field: the C field name.
+    """Offset in bytes of a field of `mjModel` or `mjData`, which may be dotted (`opt.timestep`).
 
     Raises:
         LayoutError: there is no such field in the installed MuJoCo.

@@ -100,7 +100,7 @@ def on_stack(typing_context: Any, count: Any) -> Any:  # noqa: ARG001 - numba fi
 @intrinsic
 def read(typing_context: Any, address: Any, kind: Any) -> Any:  # noqa: ARG001 - numba fixes the arguments
     """The named tuple of class `kind` whose entries are the float64 numbers from an address on."""
-    made = types.BaseTuple.from_types((types.float64,) * len(kind.instance_class._fields), kind.instance_class)
+    made = tuple_of(kind.instance_class)
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
         pointer = builder.inttoptr(arguments[0], ir.PointerType(context.get_value_type(types.float64)))
@@ -110,10 +110,30 @@ def read(typing_context: Any, address: Any, kind: Any) -> Any:  # noqa: ARG001 -
     return made(types.uintp, kind), codegen
 
 
+def tuple_of(kind: type) -> Any:
+    """Numba's type of a named tuple of float64."""
+    return types.BaseTuple.from_types((types.float64,) * len(kind._fields), kind)  # type: ignore[attr-defined]
+
+
 @functools.cache
 def entries_type(size: int) -> Any:
     """A named tuple of so many entries, to `read` a row of an array with."""
     return namedtuple("Entries", [f"entry{at}" for at in range(size)])
+
+
+@intrinsic
+def floats(typing_context: Any, values: Any) -> Any:  # noqa: ARG001 - numba fixes the arguments
+    """A tuple of numbers, of whatever types, as float64."""
+    made = types.UniTuple(types.float64, len(values))
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
+        parts = [
+            context.cast(builder, builder.extract_value(arguments[0], at), kind, types.float64)
+            for at, kind in enumerate(values)
+        ]
+        return context.make_tuple(builder, made, parts)
+
+    return made(values), codegen
 
 
 @intrinsic

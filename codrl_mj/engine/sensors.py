@@ -3,10 +3,12 @@
 import functools
 from typing import Any
 
+from numba import types
+
 from codrl_mj.actuators import Family, Inputs, parameters_type
-from codrl_mj.engine.families import HEAD, jitable
+from codrl_mj.engine.families import HEAD, compiled_function, jitable
 from codrl_mj.engine.layout import offset
-from codrl_mj.engine.memory import array, i64, internal, read, write
+from codrl_mj.engine.memory import array, i64, internal, read, tuple_of, write
 
 
 @functools.cache
@@ -14,13 +16,11 @@ def compiled_observe(family: Family) -> Any:
     """(parameters, signals, timestep, time, key, seen) -> nothing: writes what the sensors say.
 
     Vectors go by their addresses.
-
-    Args:
-        family: one that can be observed.
     """
     jitable(family)
-    observe = internal(family.observe)
     parameters_of, signals_of = parameters_type(family), family.Signals
+    kinds = tuple_of(parameters_of), types.float64, tuple_of(signals_of), tuple_of(Inputs)
+    observe = compiled_function(family.observe, family.OBSERVED, f"{family.__name__}.OBSERVED", *kinds)
 
     @internal
     def fill(parameters: int, shown: int, timestep: float, time: float, key: float, seen: int) -> None:

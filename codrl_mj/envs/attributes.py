@@ -29,12 +29,7 @@ def shared(attribute: Attribute) -> bool:
 
 
 def read(name: str, setup: Setup, model: Any) -> Any:
-    """The value of an attribute of an environment.
-
-    Args:
-        name: its name.
-        setup: of the environment.
-        model: the `mjModel`; or the physics, where it has none.
+    """The value of an attribute of an environment, whose simulation has this `mjModel`; without one, the physics.
 
     Raises:
         AttributeError: the physics is on no model, of MuJoCo or Gymnasium, that has the number.

@@ -35,13 +35,7 @@ class Commands:
     def build(
         cls, task: Task, actuators: tuple[ActuatorModel, ...], name: str, levels: Sequence[float] | None
     ) -> "Commands":
-        """Resolve a command.
-
-        Args:
-            task: the task.
-            actuators: one for each of its motors, of one family.
-            name: the command.
-            levels: for discrete tasks and other commands than `force`.
+        """Resolve a command by its name; `levels` are for discrete tasks and other commands than `force`.
 
         Raises:
             ValueError: an unknown command, one that the actuator or the task cannot take, or a missing or invalid
@@ -135,7 +129,7 @@ class Commands:
         """Forces [N or N*m] of the discrete actions, in order, shape (k,) or (k, n); None where the space is a box."""
         if self.levels is not None:
             return self.levels * self.scales[0]
-        return None if self.task.forces is None else np.array(self.task.forces)
+        return None if self.task.forces is None else np.array(self.task.forces, dtype=np.float64)
 
     @functools.cached_property
     def _box(self) -> tuple[Any, Any, int]:
@@ -148,8 +142,7 @@ class Commands:
     def force(self, action: Any) -> Any:
         """The force [N] or torque [N*m] that the physics is to ask the actuator for; with several motors an array (n,).
 
-        Args:
-            action: an element of the action space; a box's saturates.
+        An action of a box saturates.
 
         Raises:
             ValueError: the action is no element, or not a number.
@@ -173,13 +166,7 @@ class Commands:
         return np.clip(array.astype(np.float64), -limit, limit) * scale
 
     def forces(self, actions: Any) -> np.ndarray:
-        """What `force` does, for a batch.
-
-        Args:
-            actions: a batch of elements of the action space, shape (N, ...).
-
-        Returns:
-            Shape (N,), or with several motors (N, n), float64.
+        """What `force` does, for a batch (N, ...): forces (N,), or with several motors (N, n), float64.
 
         Raises:
             ValueError: wrong shape or type, or a row that is no element; the message has its index.

@@ -29,10 +29,11 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from numba import types
 
 from codrl_mj.actuators.noise import LARGEST_KEY
-from codrl_mj.engine.families import jitable
-from codrl_mj.engine.memory import internal
+from codrl_mj.engine.families import compiled_function, jitable
+from codrl_mj.engine.memory import floats, internal
 from codrl_mj.envs.outcomes import Outcomes, compiled_outcomes
 from codrl_mj.envs.setup import Setup
 from codrl_mj.physics.constrain import Compiled
@@ -61,7 +62,7 @@ class Kernels(NamedTuple):
     the arguments; columns as in `codrl_mj.physics.trace_names`."""
     reset: Compiled
     """(generator, low, high, observation, *arguments) -> nothing: starts an episode from a state that the numpy
-    `Generator` draws between `low` and `high` (see `Task.initial_bounds`), and fills the observation."""
+    `Generator` draws between `low` and `high` (see `Task.bounds`), and fills the observation."""
 
 
 class CompiledEnv(NamedTuple):
@@ -90,33 +91,27 @@ def compiled_env(env: Any) -> CompiledEnv | None:
     Returns:
         None where they would not be the whole of it: on physics that are Python, such as the analytic one, and where
         actuator or model are drawn at resets, which is Python too.
+
+    Raises:
+        ValueError: a function of the task's is not what numba compiles.
     """
     setup, physics = env.setup, env.physics
     if physics.compiled is None or setup.randomization is not None:
         return None
-    kernels = compiled_kernels(setup, physics)
-    low, high = setup.task.initial_bounds(None)
+    kernels, task = compiled_kernels(setup, physics), setup.task
+    compiled_function(task.initial_state, task.state_names, "Task.state_names", types.float64[::1])
+    low, high = setup.initial_bounds
     return CompiledEnv(kernels.step, kernels.reset, arguments(setup, physics), setup.commands.action_forces, low, high)
 
 
 def arguments(setup: Setup, physics: Any) -> tuple[Any, ...]:
-    """The last arguments of an environment's kernels.
-
-    Args:
-        setup: the environment's.
-        physics: its simulation, one whose steps are compiled.
-    """
+    """The last arguments of an environment's kernels, of a simulation whose steps are compiled."""
     kind = Interface(bool(setup.view.sensors), setup.random)
     return (np.array([*kind, *setup.view.options], dtype=np.float64), *physics.compiled.arguments)
 
 
 def compiled_kernels(setup: Setup, physics: Any) -> Kernels:
-    """The functions for environments of one kind; compiled as they are used, once a process.
-
-    Args:
-        setup: the environment's.
-        physics: its simulation, one whose steps are compiled.
-    """
+    """The functions for environments of one kind, whose simulation's steps are compiled; compiled once a process."""
     task = setup.task
     jitable(task)
     sensors = len(setup.family.OBSERVED) if setup.view.sensors else 0
@@ -204,7 +199,7 @@ def _kernels(
         draws, state = np.empty(len(low)), np.empty(size)
         for entry in range(len(low)):
             draws[entry] = low[entry] + (high[entry] - low[entry]) * generator.random()
-        entries = initial_entries(draws)
+        entries = floats(initial_entries(draws))
         for entry in range(size):
             state[entry] = entries[entry]
         key = generator.random() * LARGEST_KEY if interface[RANDOM] != 0.0 else 0.0

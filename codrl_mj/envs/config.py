@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from codrl_mj.actuators import ActuatorModel, mapping_of
+from codrl_mj.actuators import ActuatorModel, mapping_of, names_of
 from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint, resolve_disturbances, resolve_joint
 from codrl_mj.envs.distributions import Distribution, parse
 from codrl_mj.fields import check_names
@@ -117,6 +117,11 @@ class EnvConfig:
     def actuators(self) -> tuple[ActuatorModel, ...]:
         """The actuator of each motor."""
         return self.actuator if isinstance(self.actuator, tuple) else (self.actuator,)
+
+    @property
+    def through(self) -> str:
+        """What to call the actuators."""
+        return names_of(self.actuators, find_task(self.task).paper)
 
     @property
     def distributions(self) -> dict[str, Distribution] | None:

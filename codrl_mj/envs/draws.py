@@ -18,13 +18,7 @@ class Draws:
     def __init__(
         self, randomization: Randomization, physics: MujocoBatchPhysics, actuators: Sequence[Sequence[ActuatorModel]]
     ) -> None:
-        """Begin with nothing drawn.
-
-        Args:
-            randomization: what is drawn.
-            physics: the N simulations.
-            actuators: the nominal ones of each.
-        """
+        """Begin with nothing drawn for N simulations, of which each has its nominal actuators."""
         self._randomization, self._actuators = randomization, actuators
         self._physics = physics
         count = physics.num_envs
@@ -34,14 +28,7 @@ class Draws:
         self._rejected = np.zeros(count, dtype=np.int64)
 
     def draw(self, streams: Streams, rows: np.ndarray) -> dict[str, Any]:
-        """Draw anew for some environments, whose simulations are to be reset afterwards.
-
-        Args:
-            streams: their generators.
-            rows: their indices, shape (m,).
-
-        Returns:
-            Their infos, in Gymnasium's form.
+        """Draw anew for the environments `rows` (m,), whose simulations are to be reset afterwards; their infos.
 
         Raises:
             ValueError: no stable current loop was drawn.

@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from numba import types
 from numba.np.unsafe.ndarray import to_fixed_tuple
 
-from codrl_mj.engine.families import jitable
-from codrl_mj.engine.memory import entries_type, internal, read
+from codrl_mj.engine.families import compiled_function, jitable
+from codrl_mj.engine.memory import entries_type, floats, internal, read, tuple_of
 from codrl_mj.physics.constrain import Compiled, is_fine
 from codrl_mj.tasks import Task
 
@@ -45,14 +46,15 @@ class Outcomes(NamedTuple):
 
 
 def compiled_outcomes(task: Task) -> Outcomes:
-    """The functions of a task; compiled as they are used, once a process.
+    """The functions of a task; its own are compiled at once, ours as they are used, once a process.
 
-    Args:
-        task: the task.
+    Raises:
+        ValueError: one of its own is not what numba compiles.
     """
     jitable(task)
-    size = len(task.state_names)
-    return _compiled(task.observation, task.reward, task.terminated, task.options, size)  # type: ignore[arg-type]
+    size, several = len(task.state_names), len(task.motors) > 1
+    functions = task.observation, task.reward, task.terminated
+    return _compiled(*functions, task.options, size, task.observation_names, several)  # type: ignore[arg-type]
 
 
 @functools.cache
@@ -60,26 +62,39 @@ def _compiled(
     observation: Callable[..., Any],
     reward: Callable[..., Any],
     terminated: Callable[..., Any],
-    options_type: Callable[..., Any],
+    options_type: Any,
     size: int,
+    names: tuple[str, ...],
+    several: bool,
 ) -> Outcomes:
     compiled = numba.njit(nogil=True, error_model="numpy")
-    observation_of, reward_of, terminated_at = internal(observation), internal(reward), internal(terminated)
-    options_count, entries = len(options_type._fields), entries_type(size)  # type: ignore[attr-defined]
+    options_count, entries = len(options_type._fields), entries_type(size)
+    state, force = tuple_of(entries), types.float64[::1] if several else types.float64
+    observation_of = compiled_function(observation, names, "Task.observation_names", state)
+    reward_of = compiled_function(reward, "", "Task.reward", state, force, state, tuple_of(options_type))
+    terminated_at = compiled_function(terminated, "", "Task.terminated", state)
+
+    @internal
+    def of(state: np.ndarray) -> Any:
+        return read(state.ctypes.data, entries)
 
     @internal
     def observe(state: np.ndarray, observation: np.ndarray) -> None:
-        seen = observation_of(state)
+        seen = floats(observation_of(of(state)))
         for entry in range(len(seen)):
             observation[entry] = seen[entry]
 
     @internal
-    def rewarded(before: np.ndarray, force: float, after: np.ndarray, options: np.ndarray) -> float:
+    def rewarded(before: Any, force: float, after: Any, options: np.ndarray) -> float:
         return float(reward_of(before, force, after, options_type(*to_fixed_tuple(options, options_count))))
 
     @internal
+    def rewarded_step(before: np.ndarray, force: float, after: np.ndarray, options: np.ndarray) -> float:
+        return rewarded(of(before), force, of(after), options)
+
+    @internal
     def ended(state: np.ndarray) -> bool:
-        return bool(terminated_at(state))
+        return bool(terminated_at(of(state)))
 
     @internal
     def of_row(states: np.ndarray, row: int) -> Any:  # entries instead of a view, which costs several times the rest
@@ -87,7 +102,7 @@ def _compiled(
 
     @internal
     def observe_row(state: Any, observations: np.ndarray, row: int) -> None:
-        seen = observation_of(state)
+        seen = floats(observation_of(state))
         for entry in range(len(seen)):
             observations[row, entry] = seen[entry]
 
@@ -106,7 +121,7 @@ def _compiled(
     @compiled
     def terminated_all(states: np.ndarray, terminated: np.ndarray) -> None:
         for row in range(len(states)):
-            terminated[row] = ended(of_row(states, row))
+            terminated[row] = bool(terminated_at(of_row(states, row)))
 
     @compiled
     def judge(
@@ -133,8 +148,8 @@ def _compiled(
             if broken < 0 and not is_fine(state):
                 broken = row
             rewards[row] = rewarded(of_row(before, row), forces[row], state, options)
-            terminated[row] = ended(state)
+            terminated[row] = bool(terminated_at(state))
             truncated[row] = elapsed[row] >= limit
         return broken
 
-    return Outcomes(observe, rewarded, ended, observe_all, reward_all, terminated_all, judge)
+    return Outcomes(observe, rewarded_step, ended, observe_all, reward_all, terminated_all, judge)

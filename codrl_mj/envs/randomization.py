@@ -120,14 +120,11 @@ class Randomization:
     def draw(
         self, random: Callable[[np.ndarray, int], np.ndarray], nominal: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Draw the fields of some environments; whole sets are redrawn until their actuators are stable.
+        """Draw the fields of m environments; whole sets are redrawn until their actuators are stable.
 
-        Args:
-            random: (positions in `nominal`, count) -> the next `count` numbers in [0, 1) of each of their generators.
-            nominal: of what is simulated, as `nominal_fields` has it.
-
-        Returns:
-            Values (m, k), and how many sets were rejected before, (m,).
+        `random` takes (positions in `nominal`, count), and returns the next `count` numbers in [0, 1) of each of their
+        generators; `nominal` is of what is simulated, as `nominal_fields` has it. Returned are the values (m, k), and
+        how many sets were rejected before, (m,).
 
         Raises:
             ValueError: `LIMIT` sets in a row were unstable.
@@ -202,10 +199,7 @@ class Randomization:
     def reports(self, rows: np.ndarray, values: np.ndarray, rejected: np.ndarray) -> dict[str, Any]:
         """The same for rows of a vector environment, as Gymnasium's vector infos: nested, with masks.
 
-        Args:
-            rows: the rows that were drawn.
-            values: of all environments, shape (N, k).
-            rejected: of all environments, shape (N,).
+        `values` (N, k) and `rejected` (N,) are of all environments.
         """
         mask = np.zeros(len(values), dtype=bool)
         mask[rows] = True

@@ -41,7 +41,7 @@ class SerialVectorEnv(SteppedVectorEnv):
             ValueError: an argument is unknown or out of bounds, or a current loop is unstable; the message names it.
             CallbackInUseError: another library's MuJoCo callback is installed.
         """
-        check_counts(num_envs, max_episode_steps)
+        check_counts(num_envs, max_episode_steps, 20_000)
         each: Sequence[Any] = actuator if one_for_each(actuator, task) else [actuator] * num_envs
         if len(each) != num_envs:
             raise ValueError(f"actuator: {len(each)} actuators for {num_envs} environments: there must be one for each")

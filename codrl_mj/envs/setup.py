@@ -124,15 +124,8 @@ class Setup:
     ) -> tuple[Any, dict[str, Any]]:
         """Start an episode: draw the initial state and then, if anything is randomised, actuator and model.
 
-        Disturbances and sensors that are random draw the key of their numbers last.
-
-        Args:
-            physics: what `simulate` returned.
-            generator: draws both.
-            options: reset options of the task.
-
-        Returns:
-            The episode's actuator, and what `info` says of the draw; empty if nothing is randomised.
+        Disturbances and sensors that are random draw the key of their numbers last. The episode's actuator is returned,
+        and what `info` says of the draw.
 
         Raises:
             ValueError: no stable current loop was drawn.
@@ -149,15 +142,7 @@ class Setup:
         return actuator, info
 
     def vary(self, physics: Physics, values: np.ndarray) -> Any:
-        """Give a simulation what was drawn; to be followed by a reset, or a restoring of its state.
-
-        Args:
-            physics: what `simulate` returned.
-            values: of the fields that are randomised, shape (k,).
-
-        Returns:
-            The actuator with these values.
-        """
+        """Give a simulation what was drawn, shape (k,), before it is reset or restored; the actuator that has it."""
         randomization, actuators, simulated = self.randomization, self.actuators, self.commands.simulated
         assert randomization is not None
         if randomization.draws_actuator:
@@ -172,8 +157,8 @@ class Setup:
 
     @functools.cached_property
     def initial_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """`Task.initial_bounds` without reset options."""
-        return self.task.initial_bounds(None)
+        """`Task.bounds` without reset options."""
+        return self.task.bounds(None)
 
     @functools.cached_property
     def random(self) -> bool:
@@ -183,13 +168,9 @@ class Setup:
         return self.disturbances.random or noisy
 
     def keys(self, random: Callable[[int], np.ndarray]) -> np.ndarray:
-        """Keys of the random numbers of episodes' disturbances and sensors; 0 where none is needed.
+        """Keys of the random numbers of m episodes' disturbances and sensors, shape (m,); 0 where none is needed.
 
-        Args:
-            random: (numbers for each of m episodes) -> numbers uniform in [0, 1), shape (m, count).
-
-        Returns:
-            Shape (m,), float64.
+        They come of `random`: (count) -> numbers uniform in [0, 1), shape (m, count).
         """
         if not self.random:
             return np.zeros(1)

@@ -31,8 +31,8 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
 
     Every step's `info` has `desired_force`, `actual_force` [N or N*m], the signals of the actuator's family and
     `saturated` (bool), each at the end of the step: of a current loop `current`, `reference_current` [A] and `voltage`
-    [V], which are 0 where the actuator is ideal. Where the agent commands the voltage, what is delivered is what is
-    desired. With several motors each is an array (n,).
+    [V], which are 0 where the actuator is ideal; a drive also says which limit it met (`codrl_mj.actuators.drive`).
+    Where the agent commands the voltage, what is delivered is what is desired. Of several motors each is an array (n,).
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium has it

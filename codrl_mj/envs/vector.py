@@ -1,7 +1,9 @@
 """Thousands of environments as one, on MuJoCo's batched simulation: Gymnasium's `VectorEnv`."""
 
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -243,7 +245,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         Returns:
             The infos of the reset: what was drawn.
         """
-        low, high = self.setup.task.initial_bounds(options) if options else self.setup.initial_bounds
+        low, high = self.setup.task.bounds(options) if options else self.setup.initial_bounds
         draws = low + (high - low) * self._streams.random(rows, len(low))
         states = self.setup.task.initial_states(draws)
         infos = {} if self._draws is None else self._draws.draw(self._streams, rows)
@@ -400,16 +402,28 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             self._renderer = None
 
 
-def check_counts(num_envs: int, max_episode_steps: int | None) -> None:
+def check_counts(num_envs: int, max_episode_steps: int | None, each: int = 3_000) -> None:
     """Refuse impossible numbers of environments and steps.
 
+    Args:
+        num_envs: how many environments.
+        max_episode_steps: time limit of each; None for none.
+        each: memory that an environment takes [bytes].
+
     Raises:
-        ValueError: either is no integer >= 1.
+        ValueError: either is no integer >= 1, or the memory that is free does not hold so many environments.
     """
     limit = {} if max_episode_steps is None else {"max_episode_steps": max_episode_steps}
     for name, count in {"num_envs": num_envs, **limit}.items():
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
             raise ValueError(f"{name} = {count!r}: must be an integer >= 1")
+    meminfo = Path("/proc/meminfo")  # on Linux; others find out
+    free = re.search(r"MemAvailable:\s*(\d+) kB", meminfo.read_text() if meminfo.exists() else "")
+    if free and num_envs * each > (room := 1024 * int(free[1])):
+        raise ValueError(
+            f"num_envs = {num_envs}: takes about {num_envs * each / 1e9:.3g} GB of memory, of which {room / 1e9:.3g} "
+            f"are free: must be <= {room // each}"
+        )
 
 
 def one_for_each(actuator: Any, task: str) -> bool:

@@ -26,13 +26,7 @@ class View:
 
     @classmethod
     def build(cls, task: Task, options: Any, family: Family, observe_actuator: bool) -> "View":
-        """A view.
-
-        Args:
-            task: the task.
-            options: its options.
-            family: of its actuators.
-            observe_actuator: whether the observation ends with what their sensors say.
+        """A view of a task with its options; if `observe_actuator`, of what the sensors of its actuators say, too.
 
         Raises:
             ValueError: they have none.
@@ -73,14 +67,9 @@ class View:
         return (*self.task.observation_names, *self.sensors)
 
     def observation(self, state: np.ndarray, seen: np.ndarray | None) -> np.ndarray:
-        """What the agent sees.
+        """What the agent sees in a mechanical state (n,), or in N (N, n): shape (k,), or (N, k), float32.
 
-        Args:
-            state: the mechanical state, shape (n,); or a batch of them, (N, n).
-            seen: what the sensors say, as many numbers for each state as there are `sensors`; None if there are none.
-
-        Returns:
-            Shape (k,), or (N, k), float32.
+        `seen` is what the sensors say, as many numbers for each state as there are `sensors`; None if there are none.
         """
         size = len(self.task.observation_names)
         rows = np.empty((*state.shape[:-1], size + len(self.sensors)), np.float32)
@@ -108,13 +97,9 @@ class View:
 
 
 def signals_of(row: np.ndarray, family: Family, desired: Any, tracks: bool) -> Signals:
-    """The last row of a simulation's trace as signals.
+    """The last row of a simulation's trace, shape (motors, columns), as signals.
 
-    Args:
-        row: shape (motors, columns).
-        family: of the actuators.
-        desired: the force [N or N*m] that was asked for.
-        tracks: whether it counts; otherwise what was delivered does.
+    The force [N or N*m] that was asked for counts as `desired` if the actuator `tracks` it; else what was delivered.
     """
     names = ("desired_force", "actual_force", *family.Signals._fields)
     several = len(row) > 1

@@ -10,11 +10,7 @@ class Window:
     """Shows images one after another, no faster than a frame rate."""
 
     def __init__(self, width: int, height: int) -> None:
-        """Open it.
-
-        Args:
-            width: width of the images [px].
-            height: height of the images [px].
+        """Open it, for images of a size [px].
 
         Raises:
             DependencyNotInstalled: pygame is not installed.
@@ -29,12 +25,7 @@ class Window:
         self._clock = pygame.time.Clock()
 
     def show(self, image: np.ndarray, rate: float) -> None:
-        """Show an image.
-
-        Args:
-            image: shape (height, width, 3), uint8.
-            rate: frames per second [1/s] at the most: waits as long as it must.
-        """
+        """Show an image (height, width, 3), uint8, at most at a rate [1/s]: waits as long as it must."""
         self._screen.blit(self._pygame.surfarray.make_surface(image.swapaxes(0, 1)), (0, 0))
         self._pygame.event.pump()
         self._clock.tick(rate)

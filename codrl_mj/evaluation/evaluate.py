@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.actuators import ActuatorModel, Ideal
+from codrl_mj.actuators import ActuatorModel, Drive, Ideal, shaft
 from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.evaluation.measures import (
     Interval,
     Quartiles,
     bootstrap_mean,
     delay,
+    drawn_and_returned,
     electrical_energy,
     holds_since,
     integral_of_square,
@@ -74,8 +75,14 @@ class Evaluation:
     """Root mean square of the delivered torque: what wears gears and bearings, and heats a motor without a winding."""
     reversals: float = _measure("reversals", "1/s")
     """How often the delivered torque changes its sign, per second and motor: what wears gears with play."""
-    saturated_percent: float | None = _measure("voltage saturated", "%")
-    """Share of integration steps that ended with the voltage at its limit."""
+    saturated_percent: float | None = _measure("saturated, by any limit", "%")
+    """Share of integration steps in which the actuator was at a limit, whichever: a current loop's is the voltage's."""
+    voltage_saturated_percent: float | None = _measure("voltage saturated", "%")
+    """Of a drive: share of those in which the voltage was at the supply's."""
+    current_saturated_percent: float | None = _measure("current saturated", "%")
+    """Those in which more than its largest current, or a servo's largest torque, was asked for."""
+    temperature_saturated_percent: float | None = _measure("temperature saturated", "%")
+    """Those in which the winding's temperature allowed less than was asked for."""
     peak_voltage: float | None = _measure("voltage, peak", "V")
     """Largest absolute voltage."""
     peak_current: float | None = _measure("current, peak", "A")
@@ -87,7 +94,7 @@ class Evaluation:
     peak_temperature: float | None = _measure("winding, hottest", "degC")
     """Highest temperature of the winding; None where the motor has none."""
     energy_drawn: Interval | None = _measure("energy drawn", "J")
-    """Electrical energy drawn from the supply in an episode."""
+    """Electrical energy drawn, at the winding's terminals, in an episode."""
     energy_returned: Interval | None = _measure("energy returned", "J")
     """Electrical energy returned to it in an episode, which many supplies cannot take."""
     copper_loss: Interval | None = _measure("copper loss", "J")
@@ -321,15 +328,17 @@ def _root_mean_square(values: np.ndarray) -> float:
 
 def _electrical(episodes: Sequence[Episode], driven: Sequence[Sequence[_Driven]]) -> dict[str, Any]:
     """What was asked of the actuators: of any but the ideal one, and of windings, as far as the family shows it."""
-    names = ("saturated_percent", "peak_voltage", "peak_current", "rms_current", "peak_speed", "energy_drawn")
-    found: dict[str, Any] = dict.fromkeys((*names, "energy_returned", "copper_loss", "magnetic_energy"))
-    found["peak_temperature"] = None
+    each = (f"{limit}_saturated" for limit in ("voltage", "current", "temperature"))
+    limits = {f"{name}_percent": name for name in ("saturated", *each)}
+    names = ("peak_voltage", "peak_current", "rms_current", "peak_speed", "peak_temperature", "energy_drawn")
+    found: dict[str, Any] = dict.fromkeys((*limits, *names, "energy_returned", "copper_loss", "magnetic_energy"))
     every = [one for each in driven for one in each if not isinstance(one.actuator, Ideal)]
     if not every:
         return found
     found["peak_speed"] = max(float(np.abs(one.speed).max()) / one.actuator.arm_radius for one in every)
-    if limited := [one.signals["saturated"] for one in every if "saturated" in one.signals]:
-        found["saturated_percent"] = float(100 * np.concatenate(limited).mean())
+    for measure, name in limits.items():
+        if limited := [one.signals[name] for one in every if name in one.signals]:
+            found[measure] = float(100 * np.concatenate(limited).mean())
     warmed = [one.signals["temperature"] for one in every if "temperature" in one.signals]
     if warmed and any(np.ptp(values) > 0.0 for values in warmed):  # constant where nothing is known of it
         found["peak_temperature"] = float(np.concatenate(warmed).max())
@@ -355,6 +364,13 @@ def _energies(one: _Driven) -> tuple[float, float, float, float, float]:
     """Energy [J] drawn, returned, lost in the winding and left in it; the integral of the squared current [A^2*s]."""
     assert one.actuator.winding is not None
     resistance, inductance = one.actuator.winding
+    stored = inductance * one.current[-1] ** 2 / 2
+    if isinstance(one.actuator, Drive):  # whose steps are long beside its winding
+        heat = one.signals["copper_loss"] * one.timestep
+        temperature: Any = one.signals["temperature"]
+        warm = shaft.resistance_at(one.actuator.motor, temperature)
+        drawn, returned = drawn_and_returned(one.signals["electrical_power"] * one.timestep)
+        return drawn, returned, float(heat.sum()), stored, float((heat / warm).sum())
     drawn, returned = electrical_energy(one.signals["voltage"], one.current, one.timestep)
     square = integral_of_square(one.current, one.timestep)
-    return drawn, returned, resistance * square, inductance * one.current[-1] ** 2 / 2, square
+    return drawn, returned, resistance * square, stored, square

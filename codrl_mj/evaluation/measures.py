@@ -168,7 +168,11 @@ def electrical_energy(voltage: np.ndarray, current: np.ndarray, timestep: float)
         current: before the first step and after each [A], shape (n+1,).
         timestep: dt [s].
     """
-    energies = voltage * (current[1:] + current[:-1]) * (timestep / 2)
+    return drawn_and_returned(voltage * (current[1:] + current[:-1]) * (timestep / 2))
+
+
+def drawn_and_returned(energies: np.ndarray) -> tuple[float, float]:
+    """The sum of what is positive among energies of steps, shape (n,), and that of the rest, both >= 0."""
     return float(energies[energies > 0].sum()), float(-energies[energies < 0].sum())
 
 

@@ -79,21 +79,9 @@ def film(
         ValueError: no panel, unknown format, odd or too small a size, or unknown camera.
         RenderingUnavailableError: no OpenGL context can be made here; the message has the remedy.
     """
-    if out.suffix not in FORMATS:
-        raise ValueError(
-            f"film {out}: unknown format {out.suffix!r}: the suffix must be one of {', '.join(FORMATS[:-1])}, or none "
-            "for a folder of PNG frames"
-        )
-    if out.suffix == "" and out.exists():
-        raise FileExistsError(f"folder {out} exists already: choose another --out, or delete it")
+    check_film(out, width, height)
     if not panels:
         raise ValueError("panels: there must be at least one episode to show")
-    for name, size in (("width", width), ("height", height)):
-        if size % 2:
-            raise ValueError(f"{name} = {size}: must be even, as video encoders need it [px]")
-    for name, size, least in (("width", width, _MIN_WIDTH), ("height", height, _MIN_HEIGHT)):
-        if size < least:
-            raise ValueError(f"{name} = {size}: must be >= {least} [px], for the title and the strip")
     drawn: list[_DrawnPanel] = []
     try:
         for panel in panels:
@@ -114,6 +102,28 @@ def film(
         for drawing in drawn:
             drawing.close()
     return out
+
+
+def check_film(out: Path, width: int, height: int) -> None:
+    """Refuse a film's file and size, as `film` does, before there is an episode.
+
+    Raises:
+        FileExistsError: the folder for the frames exists.
+        ValueError: unknown format, odd or too small a size.
+    """
+    if out.suffix not in FORMATS:
+        raise ValueError(
+            f"film {out}: unknown format {out.suffix!r}: the suffix must be one of {', '.join(FORMATS[:-1])}, or none "
+            "for a folder of PNG frames"
+        )
+    if out.suffix == "" and out.exists():
+        raise FileExistsError(f"folder {out} exists already: choose another --out, or delete it")
+    for name, size in (("width", width), ("height", height)):
+        if size % 2:
+            raise ValueError(f"{name} = {size}: must be even, as video encoders need it [px]")
+    for name, size, least in (("width", width, _MIN_WIDTH), ("height", height, _MIN_HEIGHT)):
+        if size < least:
+            raise ValueError(f"{name} = {size}: must be >= {least} [px], for the title and the strip")
 
 
 def _end(panels: Sequence[Panel]) -> float:

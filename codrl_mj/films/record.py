@@ -4,10 +4,12 @@ import zlib
 from typing import Any
 
 import gymnasium
+import mujoco
 import numpy as np
 
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation.episodes import Episode, run_episodes
+from codrl_mj.physics.offscreen import check_view
 
 
 class Frames:
@@ -95,6 +97,8 @@ def record(
         ValueError: the environment draws no images, or not by this camera.
     """
     if isinstance(env, EnvConfig):
+        (file,) = env.models
+        check_view(mujoco.MjModel.from_xml_path(str(file)), width, height, camera)  # before anything is compiled
         return run_episodes(policy, env.make, 1, seed)[0], None
     view, made = env.view(width, height, None if camera == "fixed" else camera), []
 

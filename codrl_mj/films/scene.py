@@ -21,19 +21,10 @@ class Scene:
         camera: str = "fixed",
         pretty: bool = False,
     ) -> None:
-        """Make the OpenGL context, where one is needed.
-
-        Args:
-            task: the task's name.
-            episode: the episode.
-            taken: as `record` returned it beside the episode.
-            width: [px].
-            height: [px].
-            camera: of the model.
-            pretty: shadows, reflections and multisampling.
+        """Make the OpenGL context, where one is needed; `taken` is what `record` returned beside the episode.
 
         Raises:
-            ValueError: unknown camera, or a size out of bounds.
+            ValueError: unknown camera, or a size [px] out of bounds.
             RenderingUnavailableError: no OpenGL context can be made here; the message has the remedy.
         """
         self._states, self._taken, self._size = episode.state, taken, (width, height)

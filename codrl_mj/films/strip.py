@@ -14,6 +14,8 @@ HEADER_HEIGHT, TORQUE_HEIGHT, GAP, VOLTAGE_HEIGHT, TIME_HEIGHT = 24, 120, 8, 60,
 PLOT_HEIGHT = TORQUE_HEIGHT + GAP + VOLTAGE_HEIGHT
 AXIS_WIDTH, MARGIN = 62, 16  # px, left and right of the plots; half a label of the last time has room
 DESIRED, ACTUAL, VOLTAGE, SATURATED = "#0072B2", "#D55E00", "#009E73", "#CC79A7"  # colour-blind safe (Okabe and Ito)
+_LIMITS = {"voltage_saturated": SATURATED, "current_saturated": "#E69F00", "temperature_saturated": "#56B4E9"}
+"""Signals of families with several limits, and their colours."""
 
 
 def draw_text(text: str, width: int, height: int, colour: str = "#22313F") -> np.ndarray:
@@ -35,20 +37,11 @@ def pixels_per_second(width: int, window: float) -> float:
 def draw_strip(
     task: str, episode: Episode, actuator: Any, width: int, window: float, end: float, motor: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw an episode's signals once, so that frames can be cut from them.
+    """Draw an episode's signals once, so that frames `width` px wide that show `window` seconds can be cut from them.
 
-    Args:
-        task: its task's name.
-        episode: the episode.
-        actuator: what it ran on, a tuple with several motors; of the ideal one the strip shows forces.
-        width: width of a frame [px].
-        window: the span of time that a frame shows [s].
-        end: time at the right end of the whole strip [s].
-        motor: which of several motors.
-
-    Returns:
-        The strip's frame, `width` wide (legend and vertical axes), and its whole content below the legend, on which a
-        second is `pixels_per_second(width, window)` wide; `MARGIN` beyond its end.
+    The whole strip ends at the time `end` [s]; of several motors, where the actuator is a tuple, it is of one. Found
+    are the strip's frame (legend and vertical axes), and its whole content below the legend, which is `MARGIN` px wider
+    than the time that it shows.
     """
     body = PLOT_HEIGHT + TIME_HEIGHT
     frame = _figure(width, HEADER_HEIGHT + body)
@@ -68,7 +61,10 @@ def draw_strip(
         lines += plot(episode, actuator, axes)
         _share_axis(axis, axes, label, end, window)
     content.axes[0].set_xticks([])
-    frame.legend(handles=lines, loc="upper right", ncols=4, fontsize=8, frameon=False, borderaxespad=0.2)
+    tight = {"columnspacing": 1.0, "handlelength": 1.4, "handletextpad": 0.4} if len(lines) > 4 else {}
+    frame.legend(
+        handles=lines, loc="upper right", ncols=len(lines), fontsize=8, frameon=False, borderaxespad=0.2, **tight
+    )
     return _pixels(frame), _pixels(content)
 
 
@@ -117,10 +113,14 @@ def _plot_torque(episode: Episode, actuator: ActuatorModel, axes: Any) -> list[A
         axes.stairs(values, _edges(episode), baseline=None, color=colour, linewidth=line, label=label)
         for values, colour, label, line in ((desired, DESIRED, "desired", 1.0), (actual, ACTUAL, "actual", 2.0))
     ]
-    if episode.signals["saturated"].any():
-        band = np.where(episode.signals["saturated"], limit, -limit)
-        options = {"baseline": -limit, "fill": True, "color": SATURATED, "alpha": 0.3}
-        lines.append(axes.stairs(band, _edges(episode), label="saturated", **options))
+    own: Any = actuator.Signals
+    limits = [name for name in _LIMITS if name in own._fields] or ["saturated"]
+    for name in limits:
+        met = episode.signals[name] != 0.0
+        if met.any():
+            options = {"baseline": -limit, "fill": True, "color": _LIMITS.get(name, SATURATED), "alpha": 0.3}
+            band, label = np.where(met, limit, -limit), name.replace("_saturated", " limit")
+            lines.append(axes.stairs(band, _edges(episode), label=label, **options))
     return lines
 
 

@@ -11,6 +11,7 @@ import mujoco
 
 from codrl_mj.actuators import ActuatorModel
 from codrl_mj.specs import matched_by, motorise, names_of, refuse_unmatched, resolve_patterns
+from codrl_mj.tasks import TASKS
 
 
 class Building:
@@ -59,12 +60,19 @@ class Building:
             warnings.filterwarnings("ignore", category=UserWarning, module=r"codrl_mj\.(specs|foreign\.building)")
             return motorise(spec(), wanted, self._allow_unstable).compile()
 
-    def check(self) -> None:
+    def check(self, env_id: str = "") -> None:
         """Refuse patterns that were of no use.
+
+        Args:
+            env_id: of the environment of Gymnasium's that was built, if it was one.
 
         Raises:
             ValueError: no model was built, or a pattern matched nothing in any of them.
         """
+        if not self._met and env_id:
+            task = next((task.name for task in TASKS.values() if task.gymnasium_id == env_id), None)
+            remedy = f"take {task!r}, our task of it that has" if task else "only environments that have can get motors"
+            raise ValueError(f"the environment has no MuJoCo model built from XML, and so no motors: {remedy}")
         if not self._met:
             raise ValueError(
                 f"actuators = {list(self.actuators)}: no model was built inside by MjModel.from_xml_path or "

@@ -12,7 +12,7 @@ from typing import Any
 import gymnasium
 from gymnasium import spaces
 
-from codrl_mj.actuators import ActuatorModel, mapping_of
+from codrl_mj.actuators import ActuatorModel, mapping_of, names_of
 from codrl_mj.actuators.model import load_module
 from codrl_mj.disturbances import OFF, Disturbances, resolve_disturbances
 from codrl_mj.envs.config import EnvConfig
@@ -101,6 +101,11 @@ class ForeignConfig:
     def actuator(self) -> tuple[ActuatorModel, ...]:
         """The actuator of each pattern."""
         return tuple(self.actuators.values())
+
+    @property
+    def through(self) -> str:
+        """What to call the actuators."""
+        return names_of(self.actuator)
 
     @property
     def spec(self) -> gymnasium.envs.registration.EnvSpec:

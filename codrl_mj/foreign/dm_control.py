@@ -7,6 +7,7 @@ import dm_env
 import mujoco
 import numpy as np
 from dm_control import suite
+from dm_control.rl import control
 from dm_env import specs
 from gymnasium import spaces
 
@@ -87,11 +88,17 @@ class MotorisedEnvironment(dm_env.Environment):
 
         Raises:
             ValueError: the action has not the shape of the action specification.
+            SimulationDivergedError: the simulation left the finite numbers, where the environment does not end then.
         """
         if self._ended:
             return self.reset()
-        with self._building.motorising():
-            timestep = self._environment.step(self._simulated.controls(action))
+        simulated, time = self._simulated, self.mujoco[1].time
+        try:
+            with self._building.motorising():
+                timestep = self._environment.step(simulated.controls(action))
+        except control.PhysicsError:  # or whatever else ends its simulation
+            simulated.check_finite(type(self._environment).__name__, time)
+            raise
         self._ended = timestep.last()
         return timestep
 

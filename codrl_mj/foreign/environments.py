@@ -71,9 +71,11 @@ def make(
             actuators or the environment.
     """
     entry = gymnasium.spec(env_id)
+    if str(entry.entry_point).startswith("codrl_mj.envs:"):
+        raise ValueError(f"{env_id}: its actuators are its own: gymnasium.make({env_id!r}, actuator=...)")
     resolved = resolve_patterns(actuators, f"the environment {env_id}")
     spec = copy.copy(entry)
-    spec.entry_point = Motorised(entry.entry_point, resolved, action, allow_unstable)
+    spec.entry_point = Motorised(entry.entry_point, resolved, action, allow_unstable, env_id)
     return MotorisedEnv(gymnasium.make(spec, **options), observe_actuator, randomize, disturbances)
 
 
@@ -89,6 +91,8 @@ class Motorised:
     """What actions stand for."""
     allow_unstable: bool
     """As for `codrl_mj.motorise`."""
+    env_id: str = ""
+    """The environment's, for messages."""
 
     @functools.cached_property
     def commands(self) -> dict[str, Command | None]:
@@ -126,7 +130,7 @@ class Motorised:
         ours = isinstance(creator, type) and issubclass(creator, MujocoEnv)
         with building.motorising():
             env = _with_motors(creator)(**options) if ours else creator(**options)
-        building.check()
+        building.check(self.env_id)
         if ours:
             env.remade = functools.partial(self, **options)
         return env
@@ -275,9 +279,12 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
 
         Raises:
             ValueError: the action has not the shape of the action space.
+            SimulationDivergedError: the simulation left the finite numbers.
         """
+        time = self._data.time
         with contextlib.nullcontext() if self._recorder is None else self._recorder.watching():
             observation, reward, terminated, truncated, info = self.env.step(self._simulated.controls(action))
+        self._simulated.check_finite(self._motorised_id, time)
         seen = readings(self._simulated.readout, self._data)
         return self._observed(observation), reward, terminated, truncated, info | seen
 

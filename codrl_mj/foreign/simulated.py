@@ -13,7 +13,10 @@ from codrl_mj.disturbances import OFF, Disturbances
 from codrl_mj.engine.reading import Readout, bring_to_rest, check_shafts, slots
 from codrl_mj.foreign.commands import Commands, CommandsWay
 from codrl_mj.foreign.draws import Draws, Exchange
+from codrl_mj.physics.base import diverged
 from codrl_mj.specs import matched_by, names_of
+
+_POSITION = int(mujoco.mjtWarning.mjWARN_BADQPOS)  # followed by those of speeds, accelerations and controls
 
 
 class Simulated:
@@ -101,7 +104,8 @@ class Simulated:
 
     def begin(self, generator: np.random.Generator) -> None:
         """Bring all to rest after a reset: motors, with keys of their own for noise, and commands on their way."""
-        for slot, motor in zip(self._slots, self.motors.values(), strict=True):  # not all environments reset all data
+        self._data.warning.number[:] = 0  # not all environments reset all data
+        for slot, motor in zip(self._slots, self.motors.values(), strict=True):
             key = np.floor(generator.random() * LARGEST_KEY) if motor.random else 0.0
             bring_to_rest(slot, self._data.time, key)
         if self._way is not None:
@@ -116,6 +120,31 @@ class Simulated:
         if self._commands is not None:
             action = self._commands.controls(action)
         return action if self._way is None else self._way.controls(action)
+
+    def check_finite(self, who: str, time: float) -> None:
+        """Raise if the engine met what is no number, or too large a one; it starts anew then, and the episode goes on.
+
+        Args:
+            who: the environment.
+            time: before the step [s].
+
+        Raises:
+            SimulationDivergedError: as it says.
+        """
+        counts, model = self._data.warning.number, self._data.model
+        if not counts[_POSITION:].any():  # since the reset
+            return
+        kind = _POSITION + int(np.argmax(counts[_POSITION:]))
+        place = int(self._data.warning.lastinfo[kind])
+        if kind == mujoco.mjtWarning.mjWARN_BADCTRL:
+            what = f"control {place}"
+        else:
+            joint = (
+                np.searchsorted(model.jnt_qposadr, place, "right") - 1 if kind == _POSITION else model.dof_jntid[place]
+            )
+            of = {_POSITION: "position", _POSITION + 1: "speed"}.get(kind, "acceleration")
+            what = f"the {of} of {model.joint(joint).name or f'joint {joint}'}"
+        raise diverged(who, time, f"{what} is no number, or too large", f"the model's {model.opt.timestep:g} s")
 
     @property
     def report(self) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from gymnasium import spaces
 
 from codrl_mj.envs.sb3 import ActuatedVecEnv
 from codrl_mj.envs.stepped import SteppedVectorEnv
+from codrl_mj.envs.vector import check_counts
 
 
 class MotorisedVectorEnv(SteppedVectorEnv):
@@ -41,8 +42,9 @@ def make_sb3_vec_env(make: Callable[[], "gymnasium.Env[Any, Any]"], num_envs: in
         num_envs: how many, >= 1.
 
     Raises:
-        ValueError: observations are no vector, or actions neither a vector nor a choice.
+        ValueError: more than memory holds; observations are no vector, or actions neither a vector nor a choice.
     """
+    check_counts(num_envs, None, 200_000)
     envs = MotorisedVectorEnv([make] * num_envs)
     observed, acted = envs.single_observation_space, envs.single_action_space
     if not isinstance(observed, spaces.Box) or len(observed.shape) != 1:

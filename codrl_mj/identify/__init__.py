@@ -4,7 +4,19 @@ from codrl_mj.identify.identify import identify
 from codrl_mj.identify.log import Finding, Log
 from codrl_mj.identify.parameters import PARAMETERS
 from codrl_mj.identify.prediction import Prediction
+from codrl_mj.identify.proposal import Proposal, propose_columns
 from codrl_mj.identify.reading import read_log
 from codrl_mj.identify.result import Estimate, Identified
 
-__all__ = ["PARAMETERS", "Estimate", "Finding", "Identified", "Log", "Prediction", "identify", "read_log"]
+__all__ = [
+    "PARAMETERS",
+    "Estimate",
+    "Finding",
+    "Identified",
+    "Log",
+    "Prediction",
+    "Proposal",
+    "identify",
+    "propose_columns",
+    "read_log",
+]

@@ -20,6 +20,10 @@ _POWER = 5
 """Of s - s^2 in phi: so high that the trapezoidal rule is good for phi'' too."""
 
 
+BODY = "inertia", "viscous", "coulomb"
+"""Terms of a torque balance that no body and no friction has negative."""
+
+
 class Balance(NamedTuple):
     """A regression over the windows of a log."""
 
@@ -34,13 +38,7 @@ class Balance(NamedTuple):
 
 
 class Windows:
-    """A log cut into overlapping windows, in each of which signals are weighted by phi ~ (s - s^2)^5, s in [0, 1].
-
-    Args:
-        log: the log.
-        duration: of a window [s]; at least a dozen rows, at most a tenth of the log.
-        most: of the windows, evenly spread, that are looked at.
-    """
+    """A log cut into overlapping windows, in each of which signals are weighted by phi ~ (s - s^2)^5, s in [0, 1]."""
 
     def __init__(self, log: Log, duration: float = 0.0, most: int = 20_000) -> None:
         """Cut it."""
@@ -63,12 +61,7 @@ class Windows:
         return len(self.rows)
 
     def mean(self, signal: str | np.ndarray, order: int = 0) -> np.ndarray:
-        """The weighted mean of a signal's derivative of some order, shape (windows,).
-
-        Args:
-            signal: its name, or values of shape (n,).
-            order: 0, 1 or 2.
-        """
+        """The weighted mean of a signal's derivative of some order, shape (windows,)."""
         values = (self._log.signals[signal] if isinstance(signal, str) else signal)[self.rows]
         if order > 0:  # what is constant counts for nothing, and would only be rounded
             values = values - values.mean(axis=1, keepdims=True)
@@ -78,12 +71,7 @@ class Windows:
         return np.sum(0.5 * self._steps * (weighted[:, 1:] + weighted[:, :-1]), axis=1) / self.length[:, 0]
 
     def mean_held(self, signal: str, lag: float = 0.0) -> np.ndarray:
-        """The weighted mean of a signal that is held from a row to the next, shape (windows,).
-
-        Args:
-            signal: its name.
-            lag: how much later than its stamps it is in force [s].
-        """
+        """The weighted mean of a signal that is held from a row to the next, shape (windows,)."""
         values, time = self._log.signals[signal], self._log.time
         reach = 0 if lag == 0.0 else math.ceil(abs(lag) / self._log.step) + 1
         rows = np.arange(-reach, self.rows.shape[1] - 1 + reach) + self.rows[:, :1]
@@ -104,22 +92,25 @@ def _polynomials() -> dict[int, np.polynomial.Polynomial]:
     return {-1: phi.integ(), 0: phi, 1: phi.deriv(), 2: phi.deriv(2)}
 
 
-def regress(target: np.ndarray, terms: Mapping[str, np.ndarray]) -> Balance | None:
+def regress(target: np.ndarray, terms: Mapping[str, np.ndarray], least: float = -np.inf) -> Balance | None:
     """Least squares that outliers do not move; None where there are too few windows, or terms say the same.
 
-    Args:
-        target: shape (windows,).
-        terms: each of that shape; those that are 0 throughout are left out.
+    Inertia and friction (`BODY`) get coefficients of at least `least`; terms that are 0 throughout are left out.
     """
+    from scipy.optimize import lsq_linear
+
     terms = {name: values for name, values in terms.items() if np.any(values)}
     if len(target) < 3 * len(terms) or not terms or not np.any(target):
         return None
     matrix = np.column_stack(list(terms.values()))
     scales = np.sqrt(np.mean(matrix**2, axis=0))
     matrix = matrix / scales
+    bounds = [least if name in BODY else -np.inf for name in terms], np.inf
     weights = np.ones(len(target))
-    for _ in range(8):  # Huber's weights, reweighted
+    for _ in range(8 if least == -np.inf else 1):  # Huber's weights, reweighted
         solution, _, rank, _ = np.linalg.lstsq(matrix * weights[:, None], target * weights, rcond=1e-9)
+        if least > -np.inf:
+            solution = lsq_linear(matrix * weights[:, None], target * weights, bounds).x
         residual = target - matrix @ solution
         scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-12 * float(np.abs(target).max())
         weights = np.sqrt(np.minimum(1.0, 2.0 * scale / np.maximum(np.abs(residual), 1e-300)))
@@ -127,8 +118,8 @@ def regress(target: np.ndarray, terms: Mapping[str, np.ndarray]) -> Balance | No
         return None
     error = math.sqrt(float(np.mean((weights * residual) ** 2)))
     # phi is about half as wide as its window, and so overlaps by half with the next one: they count for half
-    covariance = 2.0 * error**2 * np.linalg.inv((matrix * weights[:, None]).T @ (matrix * weights[:, None]))
-    certain = solution / np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    variance = 2.0 * error**2 * np.sum(np.linalg.pinv(matrix * weights[:, None]) ** 2, axis=1)
+    certain = solution / np.sqrt(np.maximum(variance, 1e-300))
     return Balance(
         dict(zip(terms, map(float, solution / scales), strict=True)),
         dict(zip(terms, map(float, certain), strict=True)),
@@ -160,40 +151,48 @@ def voltage_terms(log: Log, windows: Windows, sag: bool = False) -> dict[str, np
 def voltage_balance(log: Log, duration: float = 0.0, sag: bool = False) -> Balance | None:
     """Fits `resistance`*i + `inductance`*di/dt + `back_emf_constant`*omega, of the output, to the voltage; all SI.
 
-    Args:
-        log: with voltage and current; without a motion the shaft counts as locked.
-        duration: of a window [s].
-        sag: whether to regress on (u/max u)^2*i too, which a supply takes whose resistance is `supply_resistance`.
+    Without a motion the shaft counts as locked. `sag`: on (u/max u)^2*i too, which a `supply_resistance` takes.
     """
     windows = Windows(log, duration)
     return regress(windows.mean_held("voltage"), voltage_terms(log, windows, sag)) if len(windows) else None
 
 
-def torque_terms(log: Log, windows: Windows, aside: bool = False) -> dict[str, np.ndarray] | None:
+def torque_terms(
+    log: Log, windows: Windows, aside: bool = False, rig: str | None = None
+) -> dict[str, np.ndarray] | None:
     """The terms of `torque_balance`; None without a motion."""
+    from scipy.integrate import cumulative_trapezoid
+
     speed, acceleration = speed_terms(log, windows), speed_terms(log, windows, 1)
     if speed is None or acceleration is None:
         return None
     one = windows.mean(np.ones(len(log.time)))
     terms = {"inertia": acceleration, "viscous": speed, "coulomb": np.sign(speed) * one, "constant": one}
-    if log.has("position"):
-        terms["gravity"] = windows.mean(np.sin(log.signals["position"]))
+    if rig in (None, "pendulum"):
+        known = log.has("position")
+        angle = log.signals["position"] if known else cumulative_trapezoid(log.signals["velocity"], log.time, initial=0)
+        terms["gravity"] = windows.mean(np.sin(angle))
         if aside:
-            terms["gravity_aside"] = windows.mean(np.cos(log.signals["position"]))
+            terms["gravity_aside"] = windows.mean(np.cos(angle))
     return terms
 
 
-def torque_balance(log: Log, effort: str = "torque", duration: float = 0.3, aside: bool = False) -> Balance | None:
+def torque_balance(
+    log: Log,
+    effort: str = "torque",
+    duration: float = 0.3,
+    aside: bool = False,
+    rig: str | None = None,
+    sign: float = 0.0,
+) -> Balance | None:
     """Fits `inertia`*alpha + `gravity`*sin(q) + `viscous`*omega + `coulomb`*sign(omega) + `constant` to the effort.
 
-    Args:
-        log: with the effort and a position or a velocity; gravity, and `gravity_aside`*cos(q), only with a position.
-        effort: `torque`, `current` or `voltage`.
-        duration: of a window [s].
-        aside: whether to regress on cos(q) too.
+    A velocity alone counts from where the pendulum hangs; a `rig` without gravity has no term of it. A `sign` is that
+    of the effort, with which inertia and friction must not be negative; 0: they may be. Windows have a `duration` [s].
     """
     windows = Windows(log, duration)
-    terms = torque_terms(log, windows, aside) if len(windows) else None
+    terms = torque_terms(log, windows, aside, rig) if len(windows) else None
     if terms is None:
         return None
-    return regress(windows.mean_held(effort) if effort == "voltage" else windows.mean(effort), terms)
+    given = windows.mean_held(effort) if effort == "voltage" else windows.mean(effort)
+    return regress(sign * given, terms, 0.0) if sign else regress(given, terms)

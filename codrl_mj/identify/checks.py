@@ -11,20 +11,24 @@ _DROPPED = 1.5  # median steps, from which on rows are missing
 _MOST_LISTED = 10
 _SAW = ("current", "torque", "velocity")  # signals that a sensor may clip or spoil; others rest where they like
 
+_MOST = {"voltage": 1e3, "bus": 1e3, "current": 1e3, "velocity": 2e4, "torque": 1e4}
+"""In SI: beyond the largest motors of robots, and beyond 190,000 rpm."""
 
-def check(log: Log, motor: Any = None) -> list[Finding]:
+
+def check(log: Log, motor: Any = None, rig: str | None = None) -> list[Finding]:
     """What is noteworthy about a log, errors first.
 
     Args:
         log: the log.
         motor: what its datasheet says, a `GearMotor`, to be compared with; None: nothing is known.
+        rig: what the output moves, as `identify` takes it; None: it may be a pendulum.
     """
     findings = [*log.findings, *_times(log)]
     for signal in log.signals:
         findings += _resolution(log, signal)
         if signal in _SAW:
             findings += [*_saturation(log, signal), *_outliers(log, signal)]
-    findings += [*_wrapped(log), *_beyond_supply(log), *contradictions(log, motor)]
+    findings += [*_wrapped(log), *_implausible(log, motor), *contradictions(log, motor, rig)]
     order = ("error", "warning", "info")
     return sorted(findings, key=lambda one: order.index(one.severity))
 
@@ -132,13 +136,27 @@ def _wrapped(log: Log) -> list[Finding]:
     return [Finding("error", "wrapped", int(log.row_numbers[jumps[0] + 1]), text, remedy)]
 
 
-def _beyond_supply(log: Log) -> list[Finding]:
-    """More voltage than the supply has."""
-    if not log.has("voltage", "bus"):
-        return []
-    excess = np.abs(log.signals["voltage"]) / np.maximum(np.abs(log.signals["bus"]), 1e-9)
-    row = int(np.argmax(excess))
-    if excess[row] < 1.1:
-        return []
-    text = f"the voltage is up to {excess[row]:.3g} times that of the supply"
-    return [Finding("error", "unit", int(log.row_numbers[row]), text, "correct the scale of the duty, or of the bus")]
+def _implausible(log: Log, motor: Any) -> list[Finding]:
+    """Values that no bench has, more voltage than the supply has, and what looks like a duty."""
+    found = []
+    for signal in _MOST.keys() & log.signals.keys():
+        largest = float(np.quantile(np.abs(log.signals[signal]), 0.99))  # not an outlier
+        if largest > _MOST[signal]:
+            unit = SIGNALS[signal]
+            text = f"the {signal} is up to {largest:.4g} {unit}, must be at most {_MOST[signal]:g} {unit} on a bench"
+            found.append(Finding("error", "unit", None, text, f"correct its unit, such as {signal}=column:m{unit}"))
+    if not log.has("voltage"):
+        return found
+    voltage = np.abs(log.signals["voltage"])
+    if log.has("bus"):
+        excess = voltage / np.maximum(np.abs(log.signals["bus"]), 1e-9)
+        row = int(np.argmax(excess))
+        if excess[row] >= 1.1:
+            text = f"the voltage is up to {excess[row]:.3g} times that of the supply"
+            remedy = "correct the scale of the duty, or of the bus"
+            found.append(Finding("error", "unit", int(log.row_numbers[row]), text, remedy))
+    elif motor is None and 0.0 < voltage.max() <= 1.0:
+        text = f"the voltage is at most {voltage.max():.3g} V: is it a duty?"
+        remedy = "if so, multiply it by that of the supply: voltage=column*24:V"
+        found.append(Finding("warning", "unit", None, text, remedy))
+    return found

@@ -8,42 +8,45 @@ import numpy as np
 
 from codrl_mj.identify.balances import Balance, torque_balance, voltage_balance
 from codrl_mj.identify.lags import current_lag, motion_lag, velocity_lag
-from codrl_mj.identify.log import Finding, Log, find_resolution
-from codrl_mj.identify.segments import moves
+from codrl_mj.identify.log import SIGNALS, Finding, Log, find_resolution
+from codrl_mj.identify.parameters import PARAMETERS
+from codrl_mj.identify.segments import moves, replaced
 
 FACTORS = {
-    "degrees and radians are confused": 180.0 / math.pi,
-    "rpm and rad/s are confused": 30.0 / math.pi,
-    "turns and radians are confused": 2.0 * math.pi,
-    "thousandths are confused with units, as mA with A or ms with s": 1000.0,
-    "hundredths are confused with units, as N*cm with N*m or percent with shares": 100.0,
-    "kgf*cm and N*m are confused": 10.197,
-    "degrees and turns, or rpm and deg/s, are confused": 360.0,
-    "rpm and turn/s are confused": 60.0,
+    "degrees for radians": 180.0 / math.pi,
+    "rpm for rad/s": 30.0 / math.pi,
+    "turns for radians": 2.0 * math.pi,
+    "thousandths for units, as mA for A or ms for s": 1000.0,
+    "hundredths for units, as N*cm for N*m or percent for shares": 100.0,
+    "kgf*cm for N*m": 10.197,
+    "degrees for turns": 360.0,
+    "rpm for turn/s": 60.0,
 }
-"""What a factor between two numbers that should be equal tells."""
+"""What a factor between two numbers that should be equal may tell, one for the other or the other way round."""
+_RESISTANCES = 5e-3, 1e4
+"""Of motors on a bench [ohm]: at 5 V the least would draw 1 kA; micromotors have some hundreds."""
 _CERTAIN = 10.0  # coefficient over its standard error
+_TURNED = 2.0 / 3.0  # of the residual, that a sign must leave at most to be the right one
+_DROWNED = 0.1  # noise over the motion, beyond which no error of speeds is claimed
 _TILTED = 0.03  # rad, by which a pendulum hangs beside position 0
 
 
-def name_of_factor(ratio: float) -> str:
-    """What confusion a ratio, or its inverse, looks like; else that it may be a gear."""
+def name_of_factor(ratio: float, angle: bool = True) -> str:
+    """What a ratio, or its inverse, could be: all confusions within 8 %, else a scale or a gear."""
     size = abs(math.log(abs(ratio)))
-    for name, factor in FACTORS.items():
-        if abs(size - math.log(factor)) < 0.04:
-            return name
-    return "a wrong scale, or two sides of a gear"
+    near = [
+        f"{name} ({factor:.4g})"
+        for name, factor in FACTORS.items()
+        if abs(size - math.log(factor)) < 0.08 and (angle or "units" in name)
+    ]
+    return f"a factor of {math.exp(size):.4g}, " + " or ".join([*near, "a wrong scale, another motor, or a gear"])
 
 
-def contradictions(log: Log, motor: Any = None) -> list[Finding]:
-    """What contradicts what.
-
-    Args:
-        log: the log.
-        motor: what its datasheet says, a `GearMotor`; None: nothing is known.
-    """
-    found: list[Finding] = [*_degrees(log)]
+def contradictions(log: Log, motor: Any = None, rig: str | None = None) -> list[Finding]:
+    """What contradicts what."""
     turns = moves(log)
+    effort = next((name for name in ("torque", "current", "voltage") if log.has(name)), None)
+    found: list[Finding] = [*_degrees(log, effort if turns else None, rig)]
     if log.has("position", "velocity") and turns:
         found += _velocity(log)
     electrical = voltage_balance(log) if log.has("voltage", "current") else None
@@ -52,22 +55,35 @@ def contradictions(log: Log, motor: Any = None) -> list[Finding]:
     if not turns and (log.has("position") or log.has("velocity")):
         text = "the shaft stands still, as if it were locked"
         found.append(Finding("info", "excitation", None, text, "leave position and velocity out if it is"))
-    effort = next((name for name in ("torque", "current", "voltage") if log.has(name)), None)
     if turns and effort is not None:
-        found += [*_mechanical(log, effort), *_motion(log)]
+        found += [*_mechanical(log, effort, rig), *_motion(log)]
     if electrical is not None:
         found += [*_two_constants(log, electrical), *_datasheet(electrical, motor)]
     return found
 
 
-def _degrees(log: Log) -> Iterator[Finding]:
-    """An encoder that divides 360 and not 2 pi."""
-    step = log.resolution.get("position", 0.0) or find_resolution(log.signals.get("position", np.zeros(2)))
+def _degrees(log: Log, effort: str | None, rig: str | None) -> Iterator[Finding]:
+    """A position in degrees: gravity pulls as at a fraction of it, or its encoder divides 360 and not 2 pi."""
+    if not log.has("position"):
+        return
+    remedy = "write position=column:deg"
+    if effort is not None and rig in (None, "pendulum"):
+        turned = replaced(log, "position", np.deg2rad(log.signals["position"]))
+        now, then = (torque_balance(one, effort, aside=True) for one in (log, turned))
+        pulls = then is not None and then.certainty.get("gravity", 0.0) > _CERTAIN
+        if now and then and pulls and then.residual < 0.5 * now.residual and now.unexplained > 0.1:
+            text = f"gravity pulls as if the position were in degrees: so {then.unexplained:.0%} of the {effort} are "
+            text += f"not explained, of radians {now.unexplained:.0%}"
+            yield Finding("error", "unit", None, text, remedy)
+            return
+    step = log.resolution.get("position", 0.0) or find_resolution(log.signals["position"])
     if step > 0.0 and 8.0 < (turns := 360.0 / step) < 1e5:
-        of_radians = 2.0 * math.pi / step
-        if abs(turns - round(turns)) < 1e-6 * turns and abs(of_radians - round(of_radians)) > 1e-3:
-            text = f"the position's steps of {step:.4g} are 1/{round(turns)} of 360, not of 2 pi: is it in degrees?"
-            yield Finding("warning", "unit", None, text, "write position=column:deg")
+        count, of_radians = round(turns), 2.0 * math.pi / step
+        if abs(turns - count) < 1e-6 * turns and abs(of_radians - round(of_radians)) > 1e-3:
+            text = f"the position's steps of {step:.4g} are 1/{count} of 360, not of 2 pi: is it in degrees?"
+            decimal = round(step / 10.0 ** math.floor(math.log10(step)), 5) in (1.0, 2.0, 2.5, 5.0)
+            encoder = not decimal and (count % 100 == 0 or count & (count - 1) == 0)
+            yield Finding("error" if encoder else "warning", "unit", None, text, remedy)
 
 
 def _velocity(log: Log) -> Iterator[Finding]:
@@ -75,14 +91,18 @@ def _velocity(log: Log) -> Iterator[Finding]:
     found = velocity_lag(log)
     if found is None:
         return
+    clear = found.noise < _DROWNED
     if found.unexplained > 0.5:
         text = f"velocity and differentiated position have nothing in common ({found.unexplained:.0%} is left over)"
-        yield Finding("error", "velocity", None, text, "check both columns; leave the velocity out")
+        if clear:
+            yield Finding("error", "velocity", None, text, "check both columns; leave the velocity out")
         return
-    if found.gain < 0.0:
+    if clear and found.gain < 0.0:
         text = "the velocity falls where the position grows"
         yield Finding("error", "sign", None, text, "give one of them a minus: velocity=-column:unit")
-    if abs(math.log(abs(found.gain))) > 0.1:
+    # noise of the one takes from its factor, of the other it adds to it: the true one is between both regressions
+    ends = [math.log(abs(found.gain)), math.log(abs(found.gain) / (1.0 - found.unexplained**2))]
+    if clear and (min(ends) > 0.1 or max(ends) < -0.1):
         text = f"the velocity is {abs(found.gain):.4g} times what the position says: {name_of_factor(found.gain)}"
         yield Finding("error", "unit", None, text, "correct the unit of velocity, position or time")
     rows = abs(found.lag) / log.step
@@ -103,6 +123,10 @@ def _electrical(balance: Balance | None) -> Iterator[Finding]:
     if certain["resistance"] < -_CERTAIN:
         text = f"the resistance would be {values['resistance']:.3g} ohm: the current flows against the voltage"
         yield Finding("error", "sign", None, text, "give one of them a minus: current=-column:A")
+    elif certain["resistance"] > _CERTAIN and not _RESISTANCES[0] <= values["resistance"] <= _RESISTANCES[1]:
+        text = f"the resistance would be {values['resistance']:.3g} ohm, outside {_RESISTANCES[0]:g} to 1e4 ohm"
+        remedy = "correct the unit of voltage or current: current=column:mA if it is in mA"
+        yield Finding("error", "unit", None, text, remedy)
     elif certain.get("back_emf_constant", 0.0) < -_CERTAIN:
         text = f"the back-EMF constant would be {values['back_emf_constant']:.3g} V*s/rad: the motor turns against it"
         remedy = "give position and velocity a minus, or voltage and current"
@@ -125,7 +149,7 @@ def _delay(log: Log) -> Iterator[Finding]:
     rows = found.lag / log.step
     if abs(rows) >= 0.7 and found.improvement < 0.55:
         late = "after" if rows > 0.0 else "before"
-        text = f"the current comes {abs(rows):.2g} rows ({1e6 * abs(found.lag):.3g} us) {late} the voltage"
+        text = f"the current comes {abs(rows):.2g} rows ({1e3 * abs(found.lag):.3g} ms) {late} the voltage"
         yield Finding("warning", "lag", None, text, "fit with a scan over delays, or shift a column of the log")
     elif -0.8 < rows < -0.2 and found.improvement < 0.8:
         declared = "declared as the mean to the next row" if log.mean_voltage else "held to the next row"
@@ -151,20 +175,20 @@ def _sag(log: Log, balance: Balance | None) -> Iterator[Finding]:
         yield Finding("warning", "sag", None, text, remedy)
 
 
-def _mechanical(log: Log, effort: str) -> Iterator[Finding]:
+def _mechanical(log: Log, effort: str, rig: str | None) -> Iterator[Finding]:
     """Signs of inertia and gravity; whether the motion follows from the torque."""
-    quick = torque_balance(log, effort, 0.03)  # where it shakes, shorter windows show more of the inertia
-    balance = torque_balance(log, effort) or quick
-    if balance is None:
+    # where it shakes, shorter windows show more of the inertia
+    balances = [one for seconds in (0.3, 0.03) if (one := torque_balance(log, effort, seconds, rig=rig)) is not None]
+    if not balances:
         return
-    certain = balance.certainty
-    both = [one.certainty.get("inertia", 0.0) for one in (balance, quick) if one is not None]
-    heavy, hangs = max(both, key=abs), certain.get("gravity", 0.0)
-    if heavy < -_CERTAIN or (hangs < -_CERTAIN and heavy < -3.0):
-        text = f"the {effort} accelerates the wrong way: the inertia would be negative, by {-heavy:.0f} standard errors"
+    balance, certain = balances[0], balances[0].certainty
+    both = [one.certainty.get("inertia", 0.0) for one in balances]
+    heavy = max(both, key=abs) if max(both) < 3.0 else 0.0
+    wrong = heavy < -_CERTAIN or (certain.get("gravity", 0.0) < -_CERTAIN and heavy < -3.0)
+    if wrong and (told := _told_sign(log, effort, rig)):
         remedy = f"give the {effort}, or position and velocity, a minus"
-        yield Finding("error", "sign", None, text, remedy)
-    elif log.has("position"):
+        yield Finding("error", "sign", None, f"the {effort} accelerates the wrong way: {told}", remedy)
+    elif log.has("position") and rig in (None, "pendulum"):
         yield from _zero(torque_balance(log, effort, aside=True), effort)
     large = 0.08 * float(np.std(log.signals[effort]))  # else it is what fast changes leave of rounding
     if effort == "torque" and balance.unexplained > 0.25 and balance.residual > large:
@@ -174,6 +198,21 @@ def _mechanical(log: Log, effort: str) -> Iterator[Finding]:
             text += f"; {lag.unexplained:.0%} if the motion came {1e3 * lag.lag:.3g} ms later"
         remedy = "something else moves it, or the columns are not of one time: trust this log less than others"
         yield Finding("warning", "torque", None, text, remedy)
+
+
+def _told_sign(log: Log, effort: str, rig: str | None) -> str:
+    """How much better a body with friction explains the effort with a minus; empty where it does not.
+
+    The other check, by standard errors, is fooled where friction that holds, or a controller, makes what it sees.
+    """
+    for seconds in (0.3, 0.03):
+        now, turned = (torque_balance(log, effort, seconds, rig=rig, sign=sign) for sign in (1.0, -1.0))
+        if now is None or turned is None or now.unexplained < 0.03:
+            continue  # as it is nothing is amiss
+        if turned.residual < _TURNED * now.residual:
+            shares = f"{now.unexplained:.1%} of it unexplained, with a minus {turned.unexplained:.2%}"
+            return f"inertia and friction leave {shares}"
+    return ""
 
 
 def _zero(balance: Balance | None, effort: str) -> Iterator[Finding]:
@@ -187,7 +226,8 @@ def _zero(balance: Balance | None, effort: str) -> Iterator[Finding]:
         return  # over a small arc a pull and a constant load against it are as good as nothing
     if pull > 2.0 * balance.residual and abs(zero) > (2.5 if effort == "voltage" else _TILTED):
         where = ", as if 0 were at the top" if abs(zero) > 2.5 else ""
-        text = f"gravity pulls towards position {zero:.3g} rad and not 0 (m*g*l about {pull:.3g}){where}"
+        most = f"with up to {pull:.3g} {SIGNALS[effort]} of the {effort}"
+        text = f"gravity pulls towards position {zero:.3g} rad and not 0{where}, {most}"
         remedy = f"write position=column{-zero:+.4g}:rad, so that it hangs at 0; or its sign is wrong"
         yield Finding("warning", "zero", None, text, remedy)
 
@@ -202,6 +242,8 @@ def _motion(log: Log) -> Iterator[Finding]:
 
 def _two_constants(log: Log, electrical: Balance) -> Iterator[Finding]:
     """The torque constant against the back-EMF constant, which in SI are equal but for losses and star or delta."""
+    slow = voltage_balance(log, 0.1)  # the steps of an encoder take less from the speed of longer windows
+    electrical = electrical if slow is None else slow
     back_emf = electrical.values.get("back_emf_constant", 0.0)
     if not log.has("torque", "current") or electrical.certainty.get("back_emf_constant", 0.0) < _CERTAIN:
         return
@@ -229,6 +271,8 @@ def _datasheet(balance: Balance, motor: Any) -> Iterator[Finding]:
     for name, value in printed.items():
         found = balance.values.get(name, 0.0)
         if balance.certainty.get(name, 0.0) > _CERTAIN and value > 0.0 and abs(math.log(found / value)) > math.log(2.0):
-            text = f"the {name.replace('_', ' ')} would be {found:.3g}, the datasheet says {value:.3g}: "
+            unit = PARAMETERS[name].unit
+            text = f"the {name.replace('_', ' ')} would be {found:.3g} {unit}, the datasheet says {value:.3g} {unit}: "
             remedy = "correct the units of voltage, current and motion, or name the right motor"
-            yield Finding("error", "unit", None, text + name_of_factor(found / value), remedy)
+            text += name_of_factor(found / value, name != "resistance")
+            yield Finding("error", "unit", None, text, remedy)

@@ -10,12 +10,6 @@ def speeds(times: np.ndarray, positions: np.ndarray, at: np.ndarray, window: flo
     """Slopes [rad/s] of straight lines through the positions within half a window of a time, at least three of them.
 
     In the middle of a window that is also the slope of the parabola. Near the ends the window is what there is.
-
-    Args:
-        times: [s], shape (n,), n >= 2, strictly increasing.
-        positions: [rad], shape (n,).
-        at: times [s] at which slopes are wanted, shape (m,).
-        window: [s].
     """
     count = len(times)
     first = np.searchsorted(times, at - 0.5 * window - 1e-9)

@@ -231,15 +231,6 @@ def estimate(
 ) -> tuple[Fit, tuple[Fit, ...]]:
     """Fit a model to segments.
 
-    Args:
-        model: the model.
-        segments: at least one.
-        starts: of the parameters, each (p,). Several are screened, and the two that get farthest go on; a single one
-            is taken to be near, and its states and scale begin as it has them.
-        on_start: called after each start.
-        most: evaluations for each start; 0: the fit is the start.
-        scale: of a single start: residuals beyond this count less, in standard deviations of the sensor.
-
     Returns:
         The best fit, and what each start led to.
     """

@@ -13,7 +13,7 @@ from codrl_mj.identify.friction import chosen_friction
 from codrl_mj.identify.log import Log
 from codrl_mj.identify.parameters import DEFAULTS, ESTIMABLE, FRICTION, OF_RIG, PARAMETERS
 from codrl_mj.identify.prediction import Prediction, predict
-from codrl_mj.identify.result import Estimate, Identified, Status
+from codrl_mj.identify.result import Estimate, Identified, Status, missing
 from codrl_mj.identify.segments import BLOCK, SEGMENT, moves, shifted
 from codrl_mj.identify.stages import PART, Fitted, Shaft, Winding, fitted
 from codrl_mj.identify.traces import correlations, fitted_traces
@@ -30,6 +30,16 @@ NARROW = 0.1
 """Friction whose interval is a larger share of itself is a rough number: what is sure is how much of all it may be."""
 BIASED = 0.5
 """The self-test fails where it is off by more than this share of the widest interval."""
+CAUSES = {
+    "curvature": "the logs hardly depend on it",
+    "resampling": "parts of the logs disagree",
+    "logs": "the logs disagree",
+    "half_rate": "every second row tells another value",
+    "self_test": "a fit to its own simulation does not find it again",
+    "unexplained": "the current is not explained",
+    "torque_constant": "the torque constant is not known better",
+}
+"""What widens an interval, in words."""
 STEPS_OF_A_STAGE = 8 + 4
 AT_BOUND = 1e-3
 """Nearer to a bound, in the parameter's scale, a value is at it."""
@@ -73,9 +83,7 @@ def identify(
     Raises:
         ValueError: unknown names, values out of bounds, or logs that tell nothing; the message says what is missing.
     """
-    given = _checked(logs, rig, _with_gear(known or {}, base), friction, estimated)
-    if not segment >= 0.05:
-        raise ValueError(f"segment = {segment!r}: must be >= 0.05 s; {SEGMENT:g} is the default")
+    given = checked(logs, rig, known or {}, friction, estimated, segment, base)
     rig = rig or ("pendulum" if "mgl" in given else "free")
     stages = 2 - (not _electrical(logs)) - (not any(moves(log) for log in logs))
     folds = 4 * sum(moves(log) for log in logs) if friction == "auto" else 0
@@ -98,18 +106,19 @@ def identify(
         stage = chosen_friction(stage, moving, friction, step("friction"))
         shaft = fitted(stage, moving, step("shaft"))
     estimates, warnings = [], []
+    unlike: dict[str, float] = {}
     if winding is not None:
         if shaft is not None and driven_by != "voltage":
             winding = winding.refitted(Winding(given, shaft))
         estimates += _judged(winding, seed, step("winding"))
-        warnings += _warnings(winding)
+        warnings += _warnings(winding, unlike)
     if shaft is not None:
         constant = _constant(given, winding, shaft.stage.driven_by, estimated)
         shaft = shaft.refitted(dataclasses.replace(shaft.stage, known={**shaft.stage.known, **constant}))
         found = _judged(shaft, seed, step("shaft"))
         own = next((one for one in estimates if one.name == "back_emf_constant"), None) if constant else None
         estimates += _with_constant(found, own, shaft.stage)
-        warnings += _warnings(shaft)
+        warnings += _warnings(shaft, unlike)
     estimates = _completed(estimates, given)
     return Identified(
         tuple(log.name for log in logs),
@@ -124,12 +133,31 @@ def identify(
         base,
         (*fitted_traces("winding", winding), *fitted_traces("shaft", shaft)),
         {"winding": correlations(winding), "shaft": correlations(shaft)},
+        max(
+            (float(np.abs(log.signals[name]).max()) for log in logs for name in {"voltage", "bus"} & {*log.signals}),
+            default=None,
+        ),
+        max(unlike.values(), default=0.0),
     )
 
 
-def _checked(
-    logs: Sequence[Log], rig: str | None, known: Mapping[str, float], friction: str, estimated: Sequence[str]
+def checked(
+    logs: Sequence[Log],
+    rig: str | None = None,
+    known: Mapping[str, float] | None = None,
+    friction: str = "coulomb",
+    estimated: Sequence[str] = (),
+    segment: float = SEGMENT,
+    base: Mapping[str, Any] | None = None,
 ) -> dict[str, float]:
+    """What is known, the gear of the base too, if the arguments of `identify` are such as it takes.
+
+    Raises:
+        ValueError: as `identify` does.
+    """
+    known = _with_gear(known or {}, base)
+    if not segment >= 0.05:
+        raise ValueError(f"segment = {segment!r}: must be >= 0.05 s; {SEGMENT:g} is the default")
     if not logs:
         raise ValueError("logs: none was given; give one or more")
     check_names(known, [name for name in PARAMETERS if name != "friction_torque"], "parameter", "known.")
@@ -166,9 +194,23 @@ def _checked(
         )
     if rig is None and "mgl" not in known and _driven_by(logs) is not None:
         raise ValueError(
-            "rig = None: what the output moves decides what is fitted, and must be said: pendulum, free or load"
+            "rig is not given (--rig on the command line, rig= in Python): what the output moves decides what is "
+            "fitted, must be pendulum, free or load; a motor on its own is free, with load_inertia=0 known"
         )
     return dict(known)
+
+
+def foreseen(logs: Sequence[Log], known: Mapping[str, float], base: Mapping[str, Any] | None) -> str | None:
+    """What will be missing for an actuator however well logs are fitted, by their signals; None: nothing."""
+    moving, driven_by = any(moves(log) for log in logs), _driven_by(logs)
+    names = {*known, *(("resistance", "inductance") if _electrical(logs) else ())}
+    names |= {"resistance"} if driven_by == "voltage" else set()
+    constants = {"torque_constant", "back_emf_constant"}
+    if names & constants or driven_by == "voltage" or (_electrical(logs) and moving):
+        names |= constants
+    if "load_inertia" in known and driven_by is not None:
+        names |= {"rotor_inertia"}
+    return missing(names, base)
 
 
 def _with_gear(known: Mapping[str, float], base: Mapping[str, Any] | None) -> dict[str, float]:
@@ -283,7 +325,7 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
         none = most if name == "gear_efficiency" else least
         nothing = name in FRICTION and abs(value - none) <= AT_BOUND * units[place]
         at_bound = min(value - least, most - value) <= AT_BOUND * units[place]
-        worst = max(by_cause, key=lambda cause: by_cause[cause]).replace("_", " ")
+        worst = CAUSES[max(by_cause, key=lambda cause: by_cause[cause])]
         status: Status = "identified"
         why = ""
         if own and (len(own[0]) > 1):
@@ -300,7 +342,7 @@ def _judged(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estima
         elif not share <= widest:
             status = "refused"
             whole = "all friction" if name in FRICTION else "it"
-            why = f"its interval is {100.0 * share:.3g} % of {whole} to either side, above all by {worst}"
+            why = f"its interval is {100.0 * share:.3g} % of {whole} to either side, mostly because {worst}"
         elif name in FRICTION and not half <= NARROW * abs(value - none):
             status = "rough"
             why = f"its interval is {100.0 * share:.3g} % of all friction to either side"
@@ -346,8 +388,11 @@ class _Friction(NamedTuple):
 
 
 def _text(direction: Mapping[str, float]) -> str:
-    moves = ", ".join(f"{name} by {100.0 * share:+.0f} %" for name, share in direction.items())
-    return f"changed together nothing is seen of it: {moves} (of friction: of all of it)"
+    moves = ", ".join(
+        f"{name} by {100.0 * share:+.0f} %{' of all friction' if name in FRICTION else ''}"
+        for name, share in direction.items()
+    )
+    return f"only their relation is known: the fit stays as good if all change together, {moves}"
 
 
 def _completed(estimates: list[Estimate], given: Mapping[str, float]) -> list[Estimate]:
@@ -377,8 +422,8 @@ def _rotor_inertia(whole: Estimate, load: float, ratio: float) -> Estimate:
     return Estimate("rotor_inertia", max(value, 0.0), max(low, 0.0), max(high, 0.0), status, why)
 
 
-def _warnings(part: Fitted) -> list[str]:
-    """What is wrong with logs, or with the model of them."""
+def _warnings(part: Fitted, shares: dict[str, float]) -> list[str]:
+    """What is wrong with logs, or with the model of them; `shares` gets what is unexplained of each such log."""
     unlike = {}
     for place, log in enumerate(part.logs):
         own = [index for index, segment in enumerate(part.segments) if segment.log == place]
@@ -387,6 +432,7 @@ def _warnings(part: Fitted) -> list[str]:
         swing = np.concatenate([part.segments[i].measured - part.segments[i].measured.mean() for i in own])
         share = float(np.std(rest) / max(np.std(swing), 1e-12))
         if sizes.mean() / 0.8 > UNEXPLAINED and share > UNLIKE:
+            shares[log.name] = max(share, shares.get(log.name, 0.0))
             unlike[log.name] = (
                 f"{sizes.mean() / 0.8:.1f} standard deviations of the sensor, {100.0 * share:.2g} % of what moves"
             )

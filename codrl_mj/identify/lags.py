@@ -1,6 +1,7 @@
 """How late one signal of a log is against another."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -8,6 +9,7 @@ import numpy as np
 
 from codrl_mj.identify.balances import Windows, regress, torque_terms, voltage_terms
 from codrl_mj.identify.log import Log
+from codrl_mj.identify.segments import sensor_deviation
 
 _ROWS = 20_000
 """More are not looked at."""
@@ -26,6 +28,8 @@ class Lag(NamedTuple):
     """Factor between the two."""
     unexplained: float = 0.0
     """Residual at that shift over what was to be explained, root mean squares."""
+    noise: float = 0.0
+    """Noise or step of the worse sensor over what it sees."""
 
 
 def velocity_lag(log: Log) -> Lag | None:
@@ -42,12 +46,16 @@ def velocity_lag(log: Log) -> Lag | None:
     def compare(lag: float) -> tuple[float, float]:
         seen = windows.mean(np.interp(time + lag, time, velocity))
         gain = float(seen @ rate / (rate @ rate))
-        return float(np.sqrt(np.mean((seen - gain * rate) ** 2))), gain
+        return float(np.linalg.norm(seen - gain * rate)) / max(float(np.linalg.norm(seen)), 1e-300), gain
 
-    lag = _least(lambda lag: compare(lag)[0], log.step, 0.1, 0.1)
+    longest = min(0.1, 0.1 * float(time[-1]))
+    lag = _least(lambda lag: compare(lag)[0], log.step, longest, longest)
     (best, gain), (now, _) = compare(lag), compare(0.0)
-    scale = abs(gain) * float(np.sqrt(np.mean(rate**2)))
-    return Lag(lag, best / max(now, 1e-300), gain, best / max(scale, 1e-300))
+    size, seen = (float(np.sqrt(np.mean(one**2))) for one in (rate, windows.mean("velocity")))
+    noisy = sensor_deviation(log, "velocity") * math.sqrt(2.0 / windows.rows.shape[1])
+    blurred = 4.0 * sensor_deviation(log, "position") / float(windows.length.mean())
+    noise = max(noisy / max(seen, 1e-300), blurred / size)
+    return Lag(lag, best / max(now, 1e-300), gain, best, noise)
 
 
 def current_lag(log: Log) -> Lag | None:

@@ -119,11 +119,7 @@ def usable(log: Log) -> list[slice]:
 
 
 def find_resolution(values: np.ndarray) -> float:
-    """The step of a signal's quantisation; 0 where its values do not lie on a grid.
-
-    Args:
-        values: shape (n,).
-    """
+    """The step of a signal's quantisation; 0 where its values do not lie on a grid."""
     levels = np.unique(values)
     spread = float(levels[-1] - levels[0])
     steps = np.diff(levels)

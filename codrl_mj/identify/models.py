@@ -68,10 +68,6 @@ def winding_model(segments: Sequence[Segment], known: Mapping[str, float]) -> tu
     """A winding, and starts: regressions of the voltage's integral over windows of several lengths.
 
     The integral over a window is R times that of the current, L times its change and kE times the turn.
-
-    Args:
-        segments: of `winding_segments`.
-        known: values of parameters that are not to be fitted.
     """
     moving = any(np.any(segment.speeds) for segment in segments)
     free = tuple(name for name in ELECTRICAL if name not in known and (moving or name != "back_emf_constant"))
@@ -119,17 +115,7 @@ def shaft_model(
     known: Mapping[str, float],
     estimated: Sequence[str] = (),
 ) -> tuple[ShaftModel, list[np.ndarray]]:
-    """A shaft, and starts: a regression of the input's integral, and changes of it.
-
-    Args:
-        segments: of `shaft_segments`.
-        rig: what is moved.
-        friction: which friction there is.
-        driven_by: the input.
-        output: `position` or `velocity`.
-        known: values of parameters that are not to be fitted.
-        estimated: parameters to fit that are otherwise taken as known.
-    """
+    """A shaft, and starts: a regression of the input's integral, and changes of it."""
     wanted = [*OF_RIG[rig], *OF_FRICTION[friction], *estimated]
     if driven_by != "torque":
         wanted.insert(0, "torque_constant")

@@ -34,13 +34,7 @@ class Prediction:
 
 
 def predict(model: ShaftModel, values: np.ndarray, log: Log) -> Prediction:
-    """Errors of a model's simulations of a log.
-
-    Args:
-        model: the shaft's.
-        values: its parameters, shape (p,).
-        log: with what drives the shaft.
-    """
+    """Errors of a model's simulations of a log."""
     simulate, found, pieces = model.at(values), [], []
     for segment in shaft_segments([log], model.driven_by, model.output, HORIZON):
         known = max(int(np.searchsorted(segment.times, segment.times[0] + KNOWN)), 5)

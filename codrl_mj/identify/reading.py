@@ -1,10 +1,12 @@
 """Logs from files: CSV (also .gz), JSON and, where pyarrow is installed, Parquet."""
 
 import csv
+import datetime
 import gzip
 import importlib
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,13 +16,19 @@ from codrl_mj.identify.columns import Column, parse_columns
 from codrl_mj.identify.log import SIGNALS, Finding, Log, find_resolution
 
 _WORDS = {"": np.nan, "nan": np.nan, "none": np.nan, "null": np.nan, "true": 1.0, "false": 0.0}
+_STAMP = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d")  # seconds since 1970, or since midnight
 _MOST_UNUSABLE = 0.2  # share of rows that may be left out as unreadable or out of order
 
 
-class _Table(NamedTuple):
+class Table(NamedTuple):
+    """What a file holds."""
+
     columns: Mapping[str, Any]  # texts or numbers, each of the same length
     constants: Mapping[str, float]
     ragged: list[int]  # rows that are incomplete, from 1
+    lines: Sequence[int] = ()  # of the file, of each row
+    units: Mapping[str, str] = {}  # by column, where a line states them
+    commas: bool = False  # whether a number may have a decimal comma
 
 
 def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
@@ -29,8 +37,10 @@ def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
     Rows with missing values, and those whose time does not increase, are left out. Time starts at 0.
 
     Args:
-        path: .csv, .csv.gz, .json, .json.gz or .parquet. CSV has a line of names, and a comma, semicolon or tab between
-            values. JSON is a list of rows, or an object with one such list, such as `entries`, and numbers beside it,
+        path: .csv, .txt, .dat, .tsv, .json, any of them .gz, or .parquet. CSV has a line of names, and a comma,
+            semicolon, tab or blanks between values; lines that begin with # or hold one cell are no rows, one without a
+            number under the names is of units. Decimal commas, times of day (ISO 8601) and Latin-1 are read.
+            JSON is a list of rows, or an object with one such list, such as `entries`, and numbers beside it,
             which formulas can use, or an object of columns.
         columns: see `codrl_mj.identify.columns.parse_columns`.
 
@@ -43,7 +53,7 @@ def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
     if not path.is_file():
         raise FileNotFoundError(f"no log at {path}")
     try:
-        table = _read(path)
+        table = read_table(path)
         values, count = _numbers(table, mapping)
         signals = {
             signal: np.broadcast_to(np.asarray(one.value(values), float), (count,)) for signal, one in mapping.items()
@@ -54,7 +64,7 @@ def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
 
 
 def _log(
-    name: str, signals: dict[str, np.ndarray], mapping: Mapping[str, Column], table: _Table, first: list[Finding]
+    name: str, signals: dict[str, np.ndarray], mapping: Mapping[str, Column], table: Table, first: list[Finding]
 ) -> Log:
     time, only = signals.pop("time"), signals.pop("only", None)
     wanted = np.ones(len(time), bool) if only is None else only != 0.0
@@ -127,40 +137,76 @@ def _left_out(rows: np.ndarray, check: str, what: str) -> list[Finding]:
     return [Finding(severity, check, int(rows[0]) + 1, text, remedy if check == "stamps" else "")]
 
 
-def _read(path: Path) -> _Table:
+def read_table(path: Path) -> Table:
+    """A file's columns as they stand there; see `read_log`, which says which files.
+
+    Raises:
+        ValueError: it is none of these.
+    """
     kind = Path(path.name.removesuffix(".gz")).suffix.lower()
     if kind == ".parquet":
         return _parquet(path)
-    if kind not in (".csv", ".txt", ".tsv", ".json"):
-        raise ValueError(f"unknown kind of file {kind!r}, must be .csv, .json (or either with .gz) or .parquet")
-    with gzip.open(path, "rt", newline="") if path.suffix == ".gz" else path.open(newline="") as file:
-        return _json(json.load(file)) if kind == ".json" else _csv(file)
+    if kind not in (".csv", ".txt", ".dat", ".tsv", ".json"):
+        raise ValueError(f"unknown kind of file {kind!r}, must be .csv, .txt, .dat, .tsv, .json (or .gz) or .parquet")
+    content = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+    try:
+        text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
+    except UnicodeDecodeError:
+        text = content.decode("latin-1")  # what instruments write for degrees and ohms
+    return _json(json.loads(text)) if kind == ".json" else _csv(text)
 
 
-def _csv(file: Any) -> _Table:
-    header = file.readline().lstrip("\ufeff#")
-    separator = max(",;\t", key=header.count)
-    names = [name.strip().strip('"') for name in header.strip().split(separator)]
+def _csv(text: str) -> Table:
+    """A table after whatever comments: names are in the last line before the numbers, or above units."""
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    bare = [(number, line) for number, line in lines if not line.startswith("#")]
+    last = [line for _, line in bare[-20:]]
+    separator = next((one for one in ";\t," if 2 * sum(one in line for line in last) > len(last)), " ")
+    cells = [
+        (number, [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True))])
+        for number, line in bare
+    ]
+    first = next((place for place, (_, row) in enumerate(cells) if any(map(_is_number, row))), len(cells))
+    above = [row for _, row in cells[:first] if len(row) > 1 or separator == " "]
+    if first == 0 or not above:  # names behind a #, as numpy writes them
+        above = [
+            next(csv.reader([line.lstrip("# ")], delimiter=separator)) for _, line in lines if line.startswith("#")
+        ]
+        above = [[cell.strip() for cell in row] for row in above[-1:]]
+    units: list[str] = []
+    width = len(cells[first][1]) if first < len(cells) else 0
+    if len(above) > 1 and len(above[-1]) == len(above[-2]) == width and all(len(one) < 12 for one in above[-1]):
+        units = above.pop()
+    names = above[-1] if above else []
     if len(set(names)) < len(names) or not any(names):
-        raise ValueError(f"the first line must name the columns, each once; it is {header.strip()!r}")
-    rows = [row for row in csv.reader(file, delimiter=separator) if row]
-    ragged = [number for number, row in enumerate(rows, 1) if len(row) != len(names)]
-    whole = [row for row in rows if len(row) == len(names)]
+        raise ValueError(f"a line must name the columns, each once, above the numbers; it is {separator.join(names)!r}")
+    rows = cells[first:]
+    ragged = [place for place, (_, row) in enumerate(rows, 1) if len(row) != len(names)]
+    whole = [row for _, row in rows if len(row) == len(names)]
     columns = dict(zip(names, zip(*whole, strict=True), strict=True)) if whole else dict.fromkeys(names, ())
-    return _Table(columns, {}, ragged)
+    kept = [number for number, row in rows if len(row) == len(names)]
+    return Table(columns, {}, ragged, kept, dict(zip(names, units, strict=False)), separator != ",")
 
 
-def _json(content: Any) -> _Table:
+def _is_number(text: str) -> bool:
+    try:
+        float(text.replace(",", "."))
+    except ValueError:
+        return bool(_STAMP.match(text))
+    return True
+
+
+def _json(content: Any) -> Table:
     if isinstance(content, dict):
         constants = {name: float(one) for name, one in content.items() if isinstance(one, int | float)}
         lists = {name: one for name, one in content.items() if isinstance(one, list) and one}
         tables = [one for one in lists.values() if isinstance(one[0], dict)]
         if len(tables) == 1:
-            return _Table(_by_column(tables[0]), constants, [])
+            return Table(_by_column(tables[0]), constants, [])
         if not tables and lists and len({len(one) for one in lists.values()}) == 1:
-            return _Table(lists, constants, [])
+            return Table(lists, constants, [])
     elif isinstance(content, list) and content and all(isinstance(row, dict) for row in content):
-        return _Table(_by_column(content), {}, [])
+        return Table(_by_column(content), {}, [])
     raise ValueError(
         "JSON must be a list of rows, an object with one such list and numbers beside it, or an object of columns of "
         "the same length"
@@ -172,30 +218,44 @@ def _by_column(rows: list[dict[str, Any]]) -> dict[str, list[Any]]:
     return {name: [row.get(name) for row in rows] for name in names}
 
 
-def _parquet(path: Path) -> _Table:
+def _parquet(path: Path) -> Table:
     try:
         parquet = importlib.import_module("pyarrow.parquet")
     except ModuleNotFoundError:
         raise ValueError("reading Parquet needs pyarrow: pip install pyarrow, or save the log as .csv") from None
-    return _Table(parquet.read_table(path).to_pydict(), {}, [])
+    return Table(parquet.read_table(path).to_pydict(), {}, [])
 
 
-def _numbers(table: _Table, mapping: Mapping[str, Column]) -> tuple[dict[str, Any], int]:
+def _numbers(table: Table, mapping: Mapping[str, Column]) -> tuple[dict[str, Any], int]:
     """The columns that are needed, as numbers, with the constants, and the number of rows."""
     needed = set().union(*(one.names for one in mapping.values()))
     count = len(next(iter(table.columns.values()), ()))
     values: dict[str, Any] = {**dict.fromkeys(table.columns), **table.constants}
     for name in needed & table.columns.keys():
-        values[name] = np.array([_number(name, row, one) for row, one in enumerate(table.columns[name], 1)])
+        lines = table.lines or range(1, count + 1)
+        pairs = zip(lines, table.columns[name], strict=True)
+        values[name] = np.array([number(name, line, one, table) for line, one in pairs])
     return values, count
 
 
-def _number(name: str, row: int, one: Any) -> float:
+def number(name: str, line: int, one: Any, table: Table) -> float:
+    """A cell as a number: NaN where it is empty.
+
+    Raises:
+        ValueError: it is none; the message names column and line.
+    """
     if isinstance(one, int | float):
         return float(one)
     text = "" if one is None else str(one).strip()
     try:
-        return _WORDS[text.lower()] if text.lower() in _WORDS else float(text)
+        if text.lower() in _WORDS:
+            return _WORDS[text.lower()]
+        if _STAMP.match(text):
+            day = "" if "-" in text[:5] else "1970-01-01T"
+            stamp = datetime.datetime.fromisoformat(day + text.replace(",", "."))
+            return (stamp.replace(tzinfo=stamp.tzinfo or datetime.UTC)).timestamp()
+        return float(text.replace(",", ".") if table.commas else text)
     except ValueError:
         remedy = "write a decimal point" if "," in text else "leave such rows out, or map another column"
-        raise ValueError(f"{name} in row {row} is {text!r}, must be a number; {remedy}") from None
+        where = "line" if table.lines else "row"
+        raise ValueError(f"column {name} in {where} {line} is {text!r}, must be a number; {remedy}") from None

@@ -1,7 +1,7 @@
 """What identification found: every parameter with its interval and status, and the actuator that follows."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,12 +11,31 @@ from codrl_mj.identify.traces import Trace
 from codrl_mj.runs.files import write_json, writing
 
 Status = Literal["identified", "rough", "given", "ratio", "unidentifiable", "refused"]
+ACTUATOR = "actuator.yaml"
+"""Name of the file in a folder of results."""
+MISUNDERSTOOD = 0.2
+"""Share of the motion beyond which it is not single numbers that are amiss."""
 USABLE = ("identified", "rough", "given")
 OF_MOTOR = (
     *("resistance", "inductance", "torque_constant", "back_emf_constant", "rotor_inertia", "gear_ratio"),
     *("gear_efficiency", "coulomb_friction", "viscous_friction", "stribeck_friction", "stribeck_speed"),
 )
 """Fields of `GearMotor` that are identified or known."""
+
+
+def missing(names: Collection[str], base: object) -> str | None:
+    """Which numbers of a motor are neither among these nor in a base, and what to do; None: none."""
+    needed = ("resistance", "inductance", "torque_constant", "back_emf_constant", "rotor_inertia")
+    lacking = [name for name in needed if name not in names]
+    if not lacking or base is not None:
+        return None
+    flags = " ".join(f"{name}=VALUE" for name in lacking)
+    remedy = f"--known {flags}, or the motor that has the rest of its numbers with --motor NAME"
+    if lacking[-1] == "rotor_inertia":
+        remedy += (
+            "; of the inertia that is found give the load's share: --known load_inertia=VALUE, 0 for a motor alone"
+        )
+    return f"{', '.join(lacking)}: these logs say nothing of {'it' if len(lacking) == 1 else 'them'}. Give {remedy}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +88,10 @@ class Identified:
     """Winding and shaft beside the logs that were fitted; in no file."""
     correlations: Mapping[str, Mapping[str, Mapping[str, float]]] = dataclasses.field(default_factory=dict)
     """Of the parameters of `winding` and `shaft`, each with each."""
+    supply: float | None = None
+    """Largest voltage [V] of the supply, or at the terminals, that the logs have; None: they have none."""
+    unexplained: float = 0.0
+    """Largest share of what moves in a log that the fit leaves unexplained, if that is more than sensors do."""
 
     def __getitem__(self, name: str) -> Estimate:
         """A parameter by its name."""
@@ -79,17 +102,32 @@ class Identified:
 
     def problem(self) -> str | None:
         """What stands against an actuator of these numbers, with a remedy; None: nothing."""
-        known = {one.name: one for one in self.estimates}
-        for one in self.estimates:
-            if one.name in OF_MOTOR and one.status not in USABLE:
-                return f"{one.name} is {one.status}: {one.why}. Give it with --known {one.name}=VALUE"
-        for name in ("resistance", "inductance", "torque_constant", "back_emf_constant", "rotor_inertia"):
-            if name not in known and self.base is None:
-                remedy = f"--known {name}=VALUE, or the motor that has the rest of its numbers with --motor NAME"
-                if name == "rotor_inertia":
-                    remedy += "; of the inertia that was found give the load's share: --known load_inertia=VALUE"
-                return f"{name}: these logs say nothing of it. Give {remedy}"
-        return None
+        bad = [one for one in self.estimates if one.name in OF_MOTOR and one.status not in USABLE]
+        alike: dict[str, list[str]] = {}
+        for one in bad:
+            alike.setdefault(f"{one.status}: {one.why}", []).append(one.name)
+        told = "; ".join(f"{', '.join(s)} {'is' if len(s) == 1 else 'are'} {why}" for why, s in alike.items())
+        if bad and self.unexplained > MISUNDERSTOOD:
+            return (
+                f"the fit leaves {self.unexplained:.0%} of what moves in a log unexplained, so that numbers mean "
+                f"little ({told}). Correct the columns, their units and signs, or the rig: codrl-mj identify check"
+            )
+        if bad:
+            them = "it" if len(bad) == 1 else "them"
+            return f"{told}. Give {them} with --known {' '.join(f'{one.name}=VALUE' for one in bad)}"
+        return missing([one.name for one in self.estimates], self.base)
+
+    @property
+    def supply_text(self) -> str | None:
+        """What feeds the actuator that is written, and where that is from; None where there is none."""
+        if self.problem() is not None:
+            return None
+        volts, of = self.actuator().voltage_limit, "assumed: set supply.voltage in actuator.yaml"
+        if self.base is not None:
+            of = "the motor's, by --motor"
+        elif self.supply is not None:
+            of = f"the largest of the logs; no current limit: set controller.max_current in {ACTUATOR}"
+        return f"supply {volts:.4g} V: {of}"
 
     def intervals(self) -> dict[str, tuple[float, float]]:
         """Field of a drive -> interval, of what is used and is not a point."""
@@ -105,17 +143,18 @@ class Identified:
         Raises:
             ValueError: one of them is neither; the message names it and what to do.
         """
-        from codrl_mj.actuators import Drive, actuator_from_mapping
+        from codrl_mj.actuators import Drive, Supply, actuator_from_mapping
 
         problem = self.problem()
         if problem is not None:
             raise ValueError(problem)
-        base = Drive() if self.base is None else actuator_from_mapping(self.base)
+        own = None if self.supply is None else Supply(self.supply)
+        base = Drive(supply=own) if self.base is None else actuator_from_mapping(self.base)
         return base.replaced({f"motor.{one.name}": one.value for one in self.estimates if one.name in OF_MOTOR})
 
     def as_mapping(self) -> dict[str, Any]:
         """As JSON-serialisable values."""
-        found = dataclasses.asdict(self) | {"problem": self.problem()}
+        found = dataclasses.asdict(self) | {"problem": self.problem(), "supply_text": self.supply_text}
         del found["traces"]
         for one in (*found["fitted"], *found["held_out"]):
             del one["trace"]
@@ -138,7 +177,7 @@ class Identified:
         """
         import yaml
 
-        actuator, result = folder / "actuator.yaml", folder / "result.json"
+        actuator, result = folder / ACTUATOR, folder / "result.json"
         with writing(actuator) as temporary:
             temporary.write_text(yaml.safe_dump(self.as_file(), sort_keys=False))
         write_json(result, self.as_mapping())

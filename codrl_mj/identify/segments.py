@@ -128,12 +128,7 @@ def turning(log: Log) -> np.ndarray:
 
 
 def winding_segments(logs: Sequence[Log], turned: Sequence[np.ndarray]) -> list[Segment]:
-    """Segments of a block each, in which voltage and speed drive the current.
-
-    Args:
-        logs: each with voltage and current.
-        turned: mean speed [rad/s] from each row to the next of each log, shape (n,).
-    """
+    """Segments of a block each, in which voltage and speed drive the current."""
     made: list[Segment] = []
     for place, (log, speed) in enumerate(zip(logs, turned, strict=True)):
         volts, deviation = log.signals["voltage"], sensor_deviation(log, "current")
@@ -147,15 +142,7 @@ def winding_segments(logs: Sequence[Log], turned: Sequence[np.ndarray]) -> list[
 def shaft_segments(
     logs: Sequence[Log], driven_by: str, output: str, longest: float = SEGMENT, shortest: float = SHAFT_STEP
 ) -> list[Segment]:
-    """Segments in which a torque, a current or a voltage drives the shaft.
-
-    Args:
-        logs: each with both of these.
-        driven_by: the input. A voltage holds from row to row; what a sensor samples is joined by straight lines.
-        output: `position` or `velocity`.
-        longest: [s].
-        shortest: step of time [s] below which rows are taken together.
-    """
+    """Segments in which a torque, a current or a voltage drives the shaft."""
     from scipy.integrate import cumulative_trapezoid
 
     made: list[Segment] = []

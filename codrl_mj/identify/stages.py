@@ -130,9 +130,6 @@ class Fitted:
         In the direction that the derivatives say is the weakest, the parameter that has most of it is moved by half its
         scale, and all others are fitted anew: if the logs are then explained as well, what the others did is the
         direction. (Derivatives alone do not tell: dry friction makes them rough, and what is flat looks known.)
-
-        Args:
-            scales: what a change of each is measured by, shape (p,).
         """
         found: list[dict[str, float]] = []
         here = self
@@ -212,12 +209,6 @@ def fitted(stage: Stage, logs: Sequence[Log], on_step: Callable[[], None] = lamb
 
     A voltage whose mean between two rows fits worse than itself is shown to hold from row to row: then it is also the
     mean, which fewer rows can be given. One that fits better is that of the rows' times, and taken half a row later.
-
-    Args:
-        stage: what is fitted.
-        logs: at least one.
-        on_step: called after each start and delay.
-        starts: how many at most.
     """
     segments, model, several = stage.build(logs)
     fit, tried = estimate(model, segments, several[: starts if model.names else 1], on_step)

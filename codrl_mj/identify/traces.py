@@ -33,12 +33,7 @@ def trace(log: str, part: str, output: str, pieces: Any) -> Trace:
 
 
 def fitted_traces(name: str, part: Any) -> tuple[Trace, ...]:
-    """The fit of each log of a `Fitted` part; none where the part was not fitted.
-
-    Args:
-        name: of the part.
-        part: it, or None.
-    """
+    """The fit of each log of a `Fitted` part; none where the part was not fitted."""
     if part is None:
         return ()
     pieces: dict[int, list[Any]] = {}
@@ -50,11 +45,7 @@ def fitted_traces(name: str, part: Any) -> tuple[Trace, ...]:
 
 
 def correlations(part: Any) -> dict[str, dict[str, float]]:
-    """Correlations of a `Fitted` part's parameters, by its Jacobian: near 1 or -1, one may stand for the other.
-
-    Args:
-        part: it, or None.
-    """
+    """Correlations of a `Fitted` part's parameters, by its Jacobian: near 1 or -1, one may stand for the other."""
     if part is None or not part.fit.names:
         return {}
     names = part.fit.names

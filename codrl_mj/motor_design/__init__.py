@@ -13,6 +13,7 @@ from codrl_mj.motor_design.loop import (
     is_closed,
     open_loop,
     respond,
+    sampled_too_seldom,
     small_step,
 )
 from codrl_mj.motor_design.overview import catalogue_rows, explain, unknown_in_words
@@ -33,6 +34,7 @@ __all__ = [
     "design",
     "designs",
     "gains",
+    "sampled_too_seldom",
     "open_loop",
     "closed_loop",
     "Response",

@@ -57,7 +57,12 @@ def find_entry(name: Any) -> MotorEntry | None:
 
 
 class Abilities(NamedTuple):
-    """What a drive can do at its supply's voltage, `max_current` aside."""
+    """What a drive can do at its supply's voltage, `max_current` aside in all but power and peak torque."""
+
+    power: float
+    """The most mechanical power [W] of the motor, gear and friction aside: see `most_power`."""
+    peak_torque: float
+    """As the stall torque [N*m], within `max_current`."""
 
     stall_torque: float
     """Of the output that just turns [N*m]; a gear does not lose anything where it stands still."""
@@ -73,7 +78,7 @@ class Abilities(NamedTuple):
     """Of the free motor's speed [s], R*J/(kT*kE), at the rotor; NaN where its inertia is not known: 0."""
 
 
-ABILITY_UNITS = dict(zip(Abilities._fields, ("N*m", "A", "rad/s", "A", "s", "s"), strict=True))
+ABILITY_UNITS = dict(zip(Abilities._fields, ("W", "N*m", "N*m", "A", "rad/s", "A", "s", "s"), strict=True))
 """Their units."""
 
 
@@ -87,14 +92,51 @@ def abilities(drive: Drive) -> Abilities:
     speed = left / slope if slope > 0.0 else math.inf
     friction = motor.coulomb_friction + (motor.viscous_friction * speed if motor.viscous_friction > 0.0 else 0.0)
     stall = drive.voltage_limit / resistance
+    peak, blocked = _at_output(motor, np.array([min(stall, drive.controller.max_current), stall]), np.zeros(2))
     return Abilities(
-        float(_at_output(motor, np.array(stall), np.array(0.0))),
+        most_power(drive),
+        float(peak),
+        float(blocked),
         stall,
         speed / motor.gear_ratio,
         friction / passed,
         motor.electrical_time_constant,
         motor.mechanical_time_constant if motor.rotor_inertia > 0.0 else math.nan,
     )
+
+
+def most_power(drive: Drive) -> float:
+    """The most mechanical power [W] that a motor makes at its supply, i (V - R i) kT/kE; infinite without back-EMF."""
+    motor, limit = drive.motor, drive.voltage_limit
+    current = min(limit / motor.resistance / 2, drive.controller.max_current)
+    power = current * (limit - motor.resistance * current) * motor.torque_constant
+    return power / motor.back_emf_constant if motor.back_emf_constant else math.inf
+
+
+def continuous_torque(drive: Drive, current: float | None) -> float | None:
+    """Torque [N*m] that the output that just turns bears for ever, by the winding's current [A]; None: not known."""
+    return None if current is None else float(_at_output(drive.motor, np.array(current), np.array(0.0)))
+
+
+def diagram_limits(drive: Drive, numbers: Any = None) -> list[tuple[str, float, int]]:
+    """The limits in a torque-speed diagram: name, current [A], and 0 of the voltage (infinite), 1 peak, 2 continuous.
+
+    Raises:
+        ValueError: the drive has no no-load speed to end the diagram at.
+    """
+    can, most = abilities(drive), drive.controller.max_current
+    if not 0.0 < can.no_load_speed < math.inf or can.stall_torque <= 0.0:
+        raise ValueError(
+            f"GearMotor.back_emf_constant = {drive.motor.back_emf_constant:g}, Supply.voltage = "
+            f"{drive.voltage_limit:g}: the no-load speed is {can.no_load_speed:g} rad/s and the stall torque "
+            f"{can.stall_torque:g} N*m, must be finite and > 0 for a torque-speed diagram; give a back-EMF constant, "
+            "and a voltage that overcomes the friction"
+        )
+    lines = [(f"voltage, {drive.voltage_limit:g} V", math.inf, 0)]
+    if math.isfinite(most):
+        lines.append((f"peak current, {most:.3g} A", most, 1))
+    continuous = getattr(numbers, "continuous_current", None)
+    return lines if continuous is None else [*lines, (f"continuous current, {continuous:.3g} A", continuous, 2)]
 
 
 def torque_limits(drive: Drive, speeds: Any, current: float = math.inf) -> tuple[np.ndarray, np.ndarray]:

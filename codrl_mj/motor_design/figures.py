@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import Drive
-from codrl_mj.motor_design.drives import abilities, torque_limits
+from codrl_mj.motor_design.drives import abilities, diagram_limits, torque_limits
 from codrl_mj.motor_design.loop import Response, closed_loop, design, open_loop
 from codrl_mj.motor_design.windup import Steps
 from codrl_mj.runs.files import writing
@@ -30,33 +30,20 @@ def torque_speed_diagram(drive: Drive, numbers: Any = None, points: Any = None) 
     Raises:
         ValueError: the drive has no no-load speed to end the diagram at, or `points` have another shape.
     """
-    can, most = abilities(drive), drive.controller.max_current
-    if not 0.0 < can.no_load_speed < math.inf or can.stall_torque <= 0.0:
-        raise ValueError(
-            f"GearMotor.back_emf_constant = {drive.motor.back_emf_constant:g}, Supply.voltage = "
-            f"{drive.voltage_limit:g}: the no-load speed is {can.no_load_speed:g} rad/s and the stall torque "
-            f"{can.stall_torque:g} N*m, must be finite and > 0 for a torque-speed diagram; give a back-EMF constant, "
-            "and a voltage that overcomes the friction"
-        )
+    can, most, lines = abilities(drive), drive.controller.max_current, diagram_limits(drive, numbers)
     points = np.empty((0, 2)) if points is None else np.asarray(points, dtype=float)
     if points.ndim != 2 or points.shape[1] != 2:
         raise ValueError(f"points: shape {points.shape}, must be (n, 2): speed [rad/s] and torque [N*m]")
-    limit = float(torque_limits(drive, 0.0, most)[1])
     width = 1.15 * max(can.no_load_speed, *np.abs(points[:, 0]), 0.0)
-    height = 1.25 * max(min(can.stall_torque, 3.0 * limit), *np.abs(points[:, 1]), 0.0)
+    height = 1.25 * max(min(can.stall_torque, 3.0 * can.peak_torque), *np.abs(points[:, 1]), 0.0)
     half = np.linspace(0.0, width, 400)[1:]
     speeds = np.concatenate([-half[::-1], [-1e-9 * width, 1e-9 * width], half])  # friction changes sign at standstill
 
     figure, axes = _figure(1, (8.0, 5.6))
     axes = axes[0]
     axes.fill_between(speeds, *torque_limits(drive, speeds, most), color=BLUE, alpha=0.12, linewidth=0)
-    lines = [(math.inf, BLUE, "-", f"voltage limit, {drive.voltage_limit:g} V")]
-    if math.isfinite(most):
-        lines.append((most, RED, "-", f"peak current, {most:.3g} A"))
-    continuous = getattr(numbers, "continuous_current", None)
-    if continuous is not None:
-        lines.append((continuous, GREEN, "--", f"continuous current, {continuous:.3g} A"))
-    for current, colour, style, label in lines:
+    for label, current, place in lines:
+        colour, style = ((BLUE, "-"), (RED, "-"), (GREEN, "--"))[place]
         for bound, text in zip(torque_limits(drive, speeds, current), (None, label), strict=True):
             axes.plot(speeds, bound, style, color=colour, label=text, linewidth=1.6)
     off = " (off the picture)" if can.stall_torque > height else ""
@@ -124,12 +111,7 @@ def bode_diagram(drive: Drive) -> Any:
 
 
 def step_diagram(drive: Drive, steps: Steps) -> Any:
-    """Current, torque and voltage of the steps that `codrl_mj.motor_design.step` took.
-
-    Args:
-        drive: the one that took them.
-        steps: what it returned.
-    """
+    """Current, torque and voltage of the steps that `codrl_mj.motor_design.step` took with a drive."""
     figure, (currents, voltages) = _figure(2, (14.0, 6.4), columns=3)
     _draw(currents[0], voltages[0], steps.small, BLUE, "sampled current")
     for (kind, recovery), colour in zip(steps.recoveries.items(), (BLUE, GREEN, RED), strict=True):

@@ -50,6 +50,14 @@ def _bandwidth_asked(drive: Drive) -> float:
     return drive.controller.bandwidth or DEFAULT_BANDWIDTH * drive.controller.sample_rate
 
 
+def sampled_too_seldom(drive: Drive) -> str:
+    """What to say of less than a sample in three L/R, within which 95 % of a current's change happen; else empty."""
+    rate, constant = drive.controller.sample_rate, drive.motor.electrical_time_constant
+    text = f"sample_rate = {rate:g} Hz: a sample lasts {1.0 / rate / constant:,.1f} times the winding's L/R = "
+    text += f"{1e3 * constant:.3g} ms, so that the current settles before the loop sees it: take "
+    return "" if 3.0 * rate * constant >= 1.0 else f"{text}{1.0 / 3.0 / constant:,.0f} Hz or more"
+
+
 def open_loop(one: Looped, timestep: float | None = None) -> Any:
     """The loop from error to sampled current, a `control.TransferFunction` in z."""
     import control

@@ -11,13 +11,16 @@ from codrl_mj.catalogue import MotorEntry, MotorNumbers, motor_entry, motor_name
 from codrl_mj.catalogue.datasheet import KINDS
 from codrl_mj.catalogue.derivation import OTHER_NAMES
 from codrl_mj.fields import check_names
-from codrl_mj.motor_design.drives import ABILITY_UNITS, Abilities, abilities
+from codrl_mj.motor_design.drives import ABILITY_UNITS, Abilities, abilities, continuous_torque
 
 COLUMNS = (
     *("name", "kind", "voltage", "resistance", "inductance", "torque_constant", "rotor_inertia", "gear_ratio"),
     *Abilities._fields,
+    "continuous_torque",
 )
 """What a row of `catalogue_rows` has, in SI."""
+_ROUNDED = 0.01
+"""Relative difference up to which a datasheet's values are taken to be rounded."""
 
 
 def catalogue_rows(sort: str = "name") -> list[dict[str, Any]]:
@@ -32,10 +35,11 @@ def catalogue_rows(sort: str = "name") -> list[dict[str, Any]]:
     check_names([sort], COLUMNS, "column")
     rows = []
     for entry in map(motor_entry, motor_names()):
-        numbers = entry.numbers
-        can = abilities(Drive.of(numbers))._asdict()
-        known = {name: getattr(numbers, name) for name in COLUMNS[2 : -len(can)]}
+        numbers, drive = entry.numbers, Drive.of(entry.numbers)
+        can = abilities(drive)._asdict()
+        known = {name: getattr(numbers, name) for name in COLUMNS[2:8]}
         known |= {name: value if math.isfinite(value) else None for name, value in can.items()}
+        known["continuous_torque"] = continuous_torque(drive, numbers.continuous_current)
         rows.append({"name": entry.name, "kind": entry.kind, **known})
     if sort in ("name", "kind"):
         return sorted(rows, key=lambda row: row[sort])
@@ -51,8 +55,8 @@ def explain(drive: Drive, entry: MotorEntry | None = None) -> dict[str, Any]:
 
     Returns:
         `drive`, the fields of motor, controller and supply, and `abilities`, each a list of mappings with `name`,
-        `value` and `unit`; and of a datasheet `manufacturer`, `product`, `kind`, `numbers`, such mappings with `how` it
-        came about and its `sources`, `unknown`, `disagreements`, `estimated` and `notes`.
+        `value` and `unit`; `assumed`; and of a datasheet `manufacturer`, `product`, `kind`, `numbers`, such mappings
+        with `how` it came about and its `sources`, `unknown`, `disagreements`, `estimated` and `notes`.
     """
     parts: dict[str, Any] = {"motor": drive.motor, "controller": drive.controller, "supply": drive.supply}
     found: dict[str, Any] = {
@@ -63,9 +67,12 @@ def explain(drive: Drive, entry: MotorEntry | None = None) -> dict[str, Any]:
             for field in dataclasses.fields(owner)
         ],
         "abilities": [_value(name, value, ABILITY_UNITS[name]) for name, value in abilities(drive)._asdict().items()],
+        "assumed": drive.assumed,
     }
     if entry is None:
         return found
+    torque = continuous_torque(drive, entry.numbers.continuous_current)
+    found["abilities"].insert(2, _value("continuous_torque", torque, "N*m"))
     names = [field.name for field in dataclasses.fields(MotorNumbers) if field.name not in ("derived", "disagreements")]
     derived = entry.numbers.derived
     return found | {
@@ -77,10 +84,17 @@ def explain(drive: Drive, entry: MotorEntry | None = None) -> dict[str, Any]:
             if name in derived
         ],
         "unknown": [name for name in names if name not in derived],
-        "disagreements": list(map(str, entry.numbers.disagreements)),
+        "disagreements": _disagreements(entry.numbers),
         "estimated": dict(entry.estimated),
         "notes": entry.notes,
     }
+
+
+def _disagreements(numbers: MotorNumbers) -> list[str]:
+    """What a datasheet contradicts itself in, and in one sentence what it only rounds."""
+    rounded = [one.quantity for one in numbers.disagreements if abs(one.difference) < _ROUNDED]
+    told = list(map(str, numbers.disagreements[: len(numbers.disagreements) - len(rounded)]))
+    return [*told, f"less than {_ROUNDED:.0%}, by rounding: {', '.join(rounded)}"] if rounded else told
 
 
 def unknown_in_words(names: Sequence[str]) -> str:

@@ -1,6 +1,7 @@
 """One episode of each of some runs: film and plots on one clock."""
 
 import dataclasses
+import itertools
 import re
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
@@ -124,12 +125,7 @@ class _Line:
 
 
 def episode_section(shown: Sequence[Shown], joined: Iterable[Markup] = ()) -> Markup:
-    """Films, controls and plots of some episodes side by side.
-
-    Args:
-        shown: the episodes.
-        joined: what else follows the clock: see `codrl_mj.pages.page.clocked`.
-    """
+    """Films, controls and plots of some episodes side by side, and what else follows the clock (`page.clocked`)."""
     lines = _lines(shown)
     end = max(float(one.episode.time[-1]) for one in shown)
     films = [page.film(_caption(one, len(shown) > 1), one.film.video, one.film.rate, one.film.still)
@@ -211,7 +207,6 @@ def _motor_plots(lines: Sequence[_Line]) -> list[Plot]:
     for line in lines:
         torque += [line.curve("actual", line.actual, 1), line.curve("desired", line.desired, 0, dashed=True)]
         error.append(line.curve("desired less actual", line.desired - line.actual, 4))
-        electric = line.has("current", "voltage")
         if line.has("current"):
             current.append(line.curve("current", line.trace("current"), 1, held=False))
         if line.has("current", "reference_current"):
@@ -219,22 +214,28 @@ def _motor_plots(lines: Sequence[_Line]) -> list[Plot]:
         if line.has("voltage"):
             voltage.append(line.curve("voltage", line.trace("voltage"), 2))
         power.append(line.curve("mechanical", line.actual * line.speed, 1))
-        if electric:
+        if line.has("electrical_power", "copper_loss"):
+            power.append(line.curve("electrical", line.trace("electrical_power"), 2, dashed=True))
+            power.append(line.curve("heat in the winding", line.trace("copper_loss"), 4))
+        elif line.has("current", "voltage"):
             amperes, volts = line.trace("current"), line.trace("voltage")
             power.append(line.curve("electrical", volts * amperes, 2, dashed=True))
             if line.actuator.winding is not None:
                 power.append(line.curve("heat in the winding", line.actuator.winding[0] * amperes**2, 4))
         if line.has("temperature") and np.ptp(line.trace("temperature")) > 0.0:
             warmth.append(line.curve("winding", line.trace("temperature"), 4, held=False))
-    shades = tuple(_shade(line) for line in lines if line.has("saturated"))
     title = "Force" if force else "Torque at the shaft"
-    found = [Plot(title, _TIME, unit, tuple(torque), clock=True, shades=shades)]
+    found = [Plot(title, _TIME, unit, tuple(torque), clock=True, shades=_shades(lines, "saturated"))]
     if any(np.ptp(curve.y) > 0.0 or curve.y.any() for curve in error):
         found.append(Plot("Error: desired less actual", _TIME, unit, tuple(error), clock=True))
     if current:
-        found.append(Plot("Current and its reference", _TIME, "current [A]", tuple(current), clock=True))
+        shades = _shades(lines, "current_saturated", "temperature_saturated")
+        found.append(Plot("Current and its reference", _TIME, "current [A]", tuple(current), clock=True, shades=shades))
     if voltage:
         curves = (*voltage, *_voltage_limits(lines, voltage))
+        split = [line for line in lines if line.has("voltage_saturated")]  # the only limit of others is the voltage's
+        others = [line for line in lines if line not in split and line.has("voltage")]
+        shades = _shades(split, "voltage_saturated") + _shades(others, "saturated")
         found.append(Plot("Voltage and its limit", _TIME, "voltage [V]", curves, clock=True, shades=shades))
     found += _other_signals(lines)
     if not force:
@@ -247,9 +248,14 @@ def _motor_plots(lines: Sequence[_Line]) -> list[Plot]:
 _TIME = "time [s]"
 
 
-def _shade(line: _Line) -> Shade:
-    times = line.timestep * np.arange(len(line.trace("saturated")) + 1)
-    return Shade(f"{line.before}saturated", spans(times, line.trace("saturated")), line.tags)
+def _shades(lines: Sequence[_Line], *names: str) -> tuple[Shade, ...]:
+    """Where the limits by these names were met."""
+    found = []
+    for line, name in itertools.product(lines, names):
+        if line.has(name):
+            times = line.timestep * np.arange(len(line.trace(name)) + 1)
+            found.append(Shade(line.before + name.replace("_", " "), spans(times, line.trace(name)), line.tags))
+    return tuple(found)
 
 
 def _voltage_limits(lines: Sequence[_Line], drawn: Sequence[Curve]) -> list[Curve]:
@@ -267,7 +273,10 @@ def _voltage_limits(lines: Sequence[_Line], drawn: Sequence[Curve]) -> list[Curv
     return found
 
 
-_KNOWN = ("current", "reference_current", "voltage", "temperature", "saturated")
+_KNOWN = (
+    *("current", "reference_current", "voltage", "temperature", "electrical_power", "copper_loss"),
+    *("saturated", "voltage_saturated", "current_saturated", "temperature_saturated"),
+)
 
 
 def _other_signals(lines: Sequence[_Line]) -> list[Plot]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 
+from codrl_mj.identify.identify import CAUSES
 from codrl_mj.identify.result import USABLE, Identified
 from codrl_mj.identify.traces import Trace
 from codrl_mj.pages import page
@@ -81,6 +82,7 @@ def _top(found: Identified) -> Markup:
     ]
     told = (
         f"{good} of {len(found.estimates)} numbers can be relied on. Rig: {found.rig}{by}; friction: {found.friction}"
+        f"{f'; {found.supply_text}' if found.supply_text else ''}"
     )
     usable = "usable as an actuator" if problem is None else "not to be used as an actuator"
     parts = [page.verdict(problem is None, usable), page.paragraph("; ".join([told, *late]) + ".", "lead")]
@@ -100,9 +102,9 @@ def _parameters(found: Identified) -> Markup:
         )
         share = f"{half:.2g} %" if interval and math.isfinite(half) else ""
         unit, name = page.unit(one.unit), one.name.replace("_", " ")
-        cells = name, page.number(one.value), interval, share, unit, status, one.why, worst.replace("_", " ")
+        cells = name, page.number(one.value), interval, share, unit, status, one.why, CAUSES.get(worst, "")
         rows.append(page.Row(cells, "" if good else "failed"))
-    columns = ("parameter", "value", "95 % interval", "half of it", "unit", "status", "why", "above all by")
+    columns = ("parameter", "value", "95 % interval", "half of it", "unit", "status", "why", "mostly because")
     return page.table("Parameters with 95 % intervals", columns, rows, numbers=(1, 2, 3), cards=True)
 
 

@@ -1,6 +1,5 @@
 """A motor's page: its numbers and where they are from, what it can do, its current loop."""
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,22 +10,14 @@ from markupsafe import Markup
 from codrl_mj.actuators import Drive
 from codrl_mj.catalogue import MotorEntry
 from codrl_mj.motor_design import abilities, explain, torque_limits, unknown_in_words
+from codrl_mj.motor_design.drives import diagram_limits
 from codrl_mj.pages import page
 from codrl_mj.pages.loop import loop_section, rates_table, step_plots
 from codrl_mj.pages.plots import Curve, Plot
 
 
 def motor_page(name: str, drive: Drive, entry: MotorEntry | None, out: Path) -> Path:
-    """Write a motor's page.
-
-    Args:
-        name: what the motor is called.
-        drive: it, with its drive.
-        entry: its datasheet, where it has one.
-        out: the page, an .html file.
-
-    Returns:
-        `out`.
+    """Write the page of a motor with its drive, and its datasheet where it has one, to an .html file, which it returns.
 
     Raises:
         ValueError: `out` is no .html file.
@@ -41,7 +32,7 @@ def motor_page(name: str, drive: Drive, entry: MotorEntry | None, out: Path) -> 
     kicker = "A motor"
     top = Markup()
     if entry is not None:
-        top = page.paragraph(f"{entry.manufacturer} {entry.product}, {entry.kind}.", "lead")
+        top = page.paragraph(f"{entry.title}.", "lead")
         if entry.notes:
             top += page.paragraph(" ".join(entry.notes.split()))
         for text in known["disagreements"]:
@@ -55,7 +46,9 @@ def _values(caption: str, rows: Any) -> Markup:
 
 
 def _abilities(known: Mapping[str, Any], drive: Drive, entry: MotorEntry | None) -> Markup:
-    table = _values("At the output of its gear, past friction", known["abilities"])
+    table = _values(f"At the output of its gear, past friction, at {drive.voltage_limit:g} V", known["abilities"])
+    if known["assumed"]:
+        table += page.paragraph(f"{known['assumed']}.", "soft")
     try:
         plots = page.plots([torque_speed(drive, entry)])
     except ValueError as error:
@@ -69,27 +62,15 @@ def torque_speed(drive: Drive, entry: MotorEntry | None = None) -> Plot:
     Raises:
         ValueError: it has no no-load speed to end the diagram at.
     """
-    can, most = abilities(drive), drive.controller.max_current
-    if not 0.0 < can.no_load_speed < math.inf or can.stall_torque <= 0.0:
-        raise ValueError(
-            f"No torque-speed diagram: the no-load speed is {can.no_load_speed:g} rad/s and the stall torque "
-            f"{can.stall_torque:g} N·m."
-        )
+    can, lines = abilities(drive), diagram_limits(drive, entry and entry.numbers)
     half = np.linspace(0.0, 1.15 * can.no_load_speed, 300)[1:]
     speeds = np.concatenate([-half[::-1], half])  # friction changes sign at standstill
-    bounds: list[tuple[str, float, int, bool]] = [(f"voltage, {drive.voltage_limit:g} V", math.inf, 0, False)]
-    if math.isfinite(most):
-        bounds.append((f"peak current, {most:.3g} A", most, 1, False))
-    continuous = getattr(entry and entry.numbers, "continuous_current", None)
-    if continuous is not None:
-        bounds.append((f"continuous current, {continuous:.3g} A", continuous, 2, True))
     curves = []
-    for label, current, colour, dashed in bounds:
+    for label, current, place in lines:
         low, high = torque_limits(drive, speeds, current)
-        more: Any = {"colour": colour, "dashed": dashed}
+        more: Any = {"colour": place, "dashed": place == 2}
         curves += [Curve(f"{label}, lowest", speeds, low, **more), Curve(f"{label}, highest", speeds, high, **more)]
     drawn = [*curves[:-1], Curve(**{**vars(curves[-1]), "filled": True})]
-    limit = float(torque_limits(drive, 0.0, most)[1])
     ratio = drive.motor.gear_ratio
     gear = f"behind a gear of {ratio:g}:1" if ratio != 1.0 else "without a gear"
     return Plot(
@@ -97,7 +78,7 @@ def torque_speed(drive: Drive, entry: MotorEntry | None = None) -> Plot:
         "speed of the output [rad/s]",
         "torque of the output [N·m]",
         tuple(drawn),
-        y_most=1.25 * min(can.stall_torque, 3.0 * limit),
+        y_most=1.25 * min(can.stall_torque, 3.0 * can.peak_torque),
     )
 
 

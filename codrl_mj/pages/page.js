@@ -115,7 +115,10 @@ const codrl = (() => {
     };
     clock.followers.add(own.follow);
     clock.told.add(drive);
-    video.addEventListener("loadedmetadata", () => own.follow(clock.time));
+    video.addEventListener("loadedmetadata", () => {
+      video.currentTime = frame / 2;  // sought, it shows its own frame in place of the poster
+      own.follow(clock.time);
+    });
     video.addEventListener("click", () => clock.play(!clock.playing));
     films.push(own);
   }

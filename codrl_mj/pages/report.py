@@ -240,7 +240,7 @@ def _learning(runs: Sequence[_Run]) -> Markup:
     if returns or evaluations:
         found.append(Plot("Return while learning", "environment steps", "return", (*returns, *evaluations)))
     if any(np.any(curve.y) for curve in errors):
-        title = "Torque asked for less torque delivered, rms"
+        title = "Torque asked for less torque delivered at the ends of environment steps, rms"
         found.append(Plot(title, "environment steps", "torque error [N·m]", tuple(errors)))
     if not found and not notes:
         notes.append(page.note("No learning curve yet: no training episode has ended."))
@@ -340,6 +340,8 @@ def _loop(runs: Sequence[_Run]) -> Markup:
             )
             name = "motor" if name in (".*", "motor") else name
             timestep = run.shown.episode.timestep if run.shown is not None else None
+            if actuator.assumed:
+                without[f"{name}: {actuator.assumed}."] = None
             if isinstance(actuator, Drive | Actuator) and is_closed(actuator):
                 loop = actuator, None if isinstance(actuator, Drive) else timestep
                 known = isinstance(actuator, Drive) or timestep is not None

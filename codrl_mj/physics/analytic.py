@@ -28,16 +28,7 @@ class AnalyticPhysics:
         disturbances: Disturbances = OFF,
         joint: Joint = PLAIN,
     ) -> None:
-        """Make the Gymnasium environment.
-
-        Args:
-            task: the task.
-            actuators: one for each of the task's motors, of one family.
-            inner_steps: integration steps per environment step.
-            integrator: one of the task's integrators.
-            max_forces: limits of the desired forces [N] or torques [N*m], shape (n,); None are the task's.
-            disturbances: imperfections of the commands' way, and load pulses.
-            joint: must be plain.
+        """Make the Gymnasium environment; arguments as for `MujocoPhysics`, `joint` being plain.
 
         Raises:
             ValueError: something is added to the joint, which Gymnasium's equations have no place for; or the task has
@@ -65,12 +56,7 @@ class AnalyticPhysics:
         self.reset(np.zeros(len(task.state_names)))
 
     def reset(self, state: np.ndarray, key: float = 0.0) -> None:
-        """Start an episode from `state`, with the actuators at rest.
-
-        Args:
-            state: the mechanical state.
-            key: of the random numbers of the episode's disturbances and sensors.
-        """
+        """See `Physics.reset`."""
         self.state = np.array(state, dtype=np.float64)
         rest = self.family.State(*[0.0] * len(self.family.State._fields))  # type: ignore[attr-defined]
         self._states = [rest] * len(self._actuators)
@@ -96,14 +82,7 @@ class AnalyticPhysics:
             )
 
     def step(self, desired_force: Any) -> None:
-        """Advance by one environment step, with the desired force (at most the task's `max_force`) held over it.
-
-        Args:
-            desired_force: a number; for several actuators an array (n,).
-
-        Raises:
-            SimulationDivergedError: the state is no longer finite.
-        """
+        """See `Physics.step`."""
         desired = np.atleast_2d(np.asarray(desired_force, dtype=np.float64))
         several, speeds = len(self._actuators) > 1, list(self.task.speeds)
         for rows in self.trace:
@@ -120,11 +99,7 @@ class AnalyticPhysics:
         self.check_finite()
 
     def check_finite(self) -> None:
-        """Raise if the state is not finite or beyond `LARGEST`, saying which entry and when.
-
-        Raises:
-            SimulationDivergedError: as it says.
-        """
+        """See `Physics.check_finite`."""
         check_finite(self.task, self.state, self._time)
 
     def _advance(self, number: int, command: float) -> tuple[float, ...]:
@@ -139,11 +114,7 @@ class AnalyticPhysics:
         return torque / arm, *signals
 
     def observed(self, row: np.ndarray) -> np.ndarray:
-        """What the sensors say at present, shape (actuators, k).
-
-        Args:
-            row: the last row of `trace`; zeros at the start of an episode.
-        """
+        """See `Physics.observed`."""
         return np.array(
             [
                 self.family.observe(

@@ -129,20 +129,19 @@ def check_finite(task: Task, state: np.ndarray, time: float) -> None:
     if fine.all():
         return
     broken = ", ".join(f"{n} = {v:g}" for n, v, ok in zip(task.state_names, state, fine, strict=True) if not ok)
-    raise SimulationDivergedError(
-        f"{task.name}: the simulation diverged at t = {time:g} s: {broken}. Reset the environment; if this repeats, "
-        "shorten the integration step (inner_steps) or lower the gains"
+    raise diverged(task.name, time, broken)
+
+
+def diverged(who: str, time: float, broken: str, step: str = "inner_steps") -> SimulationDivergedError:
+    """The error of an environment whose simulation broke down at a time [s], with what sets its integration step."""
+    return SimulationDivergedError(
+        f"{who}: the simulation diverged at t = {time:g} s: {broken}. Reset the environment; if this repeats, "
+        f"shorten the integration step ({step}) or lower the gains"
     )
 
 
 def inner_step_count(task: Task, actuator: ActuatorModel, inner_steps: int | None, timestep: float | None) -> int:
-    """Integration steps in one environment step.
-
-    Args:
-        task: the task, whose `step_duration` they divide.
-        actuator: whether it is ideal decides on the task's default.
-        inner_steps: their number, or None.
-        timestep: the integration step [s], or None; give at most one of the two.
+    """Integration steps in one environment step: their number, by the step [s], or the task's default for an actuator.
 
     Raises:
         ValueError: both were given, the number is below 1, or the timestep does not divide the environment step.

@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from numba import types
 
-from codrl_mj.engine.families import jitable
-from codrl_mj.engine.memory import f64, internal
+from codrl_mj.engine.families import compiled_function, jitable
+from codrl_mj.engine.memory import entries_type, f64, floats, internal, read, tuple_of
 from codrl_mj.physics.base import LARGEST
 from codrl_mj.tasks import Task
 
@@ -19,28 +20,21 @@ Compiled = Callable[..., Any]
 
 
 def compiled_reader(task: Task) -> Compiled:
-    """(qpos, qvel, state (n,)) -> nothing: fills `state`, in the task's order.
-
-    Args:
-        task: the task.
-    """
+    """(qpos, qvel, state (n,)) -> nothing: fills `state`, in the task's order."""
     return _reader(task.qpos, task.qvel)
 
 
 def compiled_constrain(task: Task) -> Compiled | None:
     """(qpos, qvel, scratch (n,), integration step [s]) -> nothing: the task's `constrain`, applied in place.
 
-    A state beyond `LARGEST` becomes NaN in all its entries, to be noticed: within its bounds it would look like any
-    other.
+    None for a task without bounds. A state beyond `LARGEST` becomes NaN in all its entries, to be noticed: within its
+    bounds it would look like any other.
 
-    Args:
-        task: the task.
-
-    Returns:
-        The function; None for a task without bounds.
+    Raises:
+        ValueError: `constrain` is not what numba compiles.
     """
     jitable(task)
-    return None if task.constrain is None else _keeper(task.constrain, task.qpos, task.qvel)
+    return None if task.constrain is None else _keeper(task.constrain, task.state_names, task.qpos, task.qvel)
 
 
 class BatchKernels(NamedTuple):
@@ -56,12 +50,7 @@ class BatchKernels(NamedTuple):
 
 
 def compiled_batch(task: Task, explicit: bool) -> BatchKernels:
-    """The functions for a task; compiled as they are used, once a process.
-
-    Args:
-        task: the task.
-        explicit: whether positions are moved by the old velocity.
-    """
+    """The functions for a task, with positions moved by the old velocity if `explicit`; compiled as they are used."""
     return _batch(compiled_reader(task), compiled_constrain(task), len(task.state_names), explicit)
 
 
@@ -117,16 +106,18 @@ def _reader(positions: tuple[int, ...], velocities: tuple[int, ...]) -> Compiled
 
 
 @functools.cache
-def _keeper(constrain: Callable[..., Any], positions: tuple[int, ...], velocities: tuple[int, ...]) -> Compiled:
-    read = _reader(positions, velocities)
-    bounded = internal(constrain)
+def _keeper(
+    constrain: Callable[..., Any], names: tuple[str, ...], positions: tuple[int, ...], velocities: tuple[int, ...]
+) -> Compiled:
+    fill, entries = _reader(positions, velocities), entries_type(len(names))
+    bounded = compiled_function(constrain, names, "Task.state_names", tuple_of(entries), types.float64)
 
     @numba.njit(nogil=True, error_model="numpy")
     def keep(qpos: Any, qvel: Any, state: np.ndarray, timestep: float) -> None:
-        read(qpos, qvel, state)
+        fill(qpos, qvel, state)
         if not is_fine(state):
             state[:] = np.nan
-        kept = bounded(state, timestep)
+        kept = floats(bounded(read(state.ctypes.data, entries), timestep))
         for entry in range(len(positions)):
             qpos[entry] = kept[positions[entry]]
         for entry in range(len(velocities)):

@@ -52,13 +52,9 @@ class Disturber:
     """
 
     def __init__(self, disturbances: Disturbances, timestep: float, limits: np.ndarray, simulations: int) -> None:
-        """Start with nothing remembered.
+        """Start with nothing remembered, for a number of simulations at a timestep [s].
 
-        Args:
-            disturbances: what to do.
-            timestep: integration step [s].
-            limits: the largest force [N or N*m] of each actuator of a simulation, shape (n,).
-            simulations: their number.
+        `limits`, shape (n,), are the largest forces [N or N*m] of the actuators of one.
         """
         whole, fraction = whole_and_fraction(disturbances.command_delay, timestep)
         self.numbers = np.array(
@@ -80,26 +76,14 @@ class Disturber:
         self.memory = np.zeros((simulations * len(limits), whole + 1 + (fraction > 0.0) + _AFTER_HISTORY))
 
     def reset(self, rows: np.ndarray, keys: Any) -> None:
-        """Forget everything at the start of episodes.
-
-        Args:
-            rows: indices of simulations, shape (m,).
-            keys: of their episodes' random numbers, shape (m,) or one number.
-        """
+        """Forget everything at the start of episodes of some simulations, with these keys of random numbers."""
         count = len(self.numbers)
         for actuator in range(count):
             self.memory[rows * count + actuator] = 0.0
             self.memory[rows * count + actuator, KEY_COLUMN] = np.asarray(keys) + actuator
 
     def commands(self, desired: np.ndarray) -> np.ndarray:
-        """The commands that arrive at the actuators in the next integration step.
-
-        Args:
-            desired: commands given [N or N*m], shape (N, n).
-
-        Returns:
-            Shape (N, n); a new array.
-        """
+        """The commands [N or N*m], shape (N, n), that arrive at the actuators in the next integration step."""
         arrived = np.empty(desired.size)
         compiled_disturbance().commands(self.numbers, self.memory, np.ascontiguousarray(desired).reshape(-1), arrived)
         return arrived.reshape(desired.shape)
@@ -117,14 +101,7 @@ KEY_COLUMN = KEY - len(PULSE_NAMES)
 
 
 def disturber(disturbances: Disturbances, timestep: float, limits: np.ndarray, simulations: int) -> Disturber | None:
-    """A disturber, or None where neither commands nor loads are disturbed.
-
-    Args:
-        disturbances: as for `Disturber`, and so are the others.
-        timestep: see there.
-        limits: see there.
-        simulations: see there.
-    """
+    """A `Disturber`, of its arguments, or None where neither commands nor loads are disturbed."""
     if not (disturbances.of_command or disturbances.pulse_force):
         return None
     return Disturber(disturbances, timestep, limits, simulations)

@@ -11,16 +11,13 @@ from codrl_mj.engine.families import SIGNATURE, slot_size, user_head
 from codrl_mj.engine.reading import motors
 from codrl_mj.tasks import Task
 from codrl_mj.tasks.assets import asset_path
+from codrl_mj.tasks.base import INTEGRATORS
 
 
 def drive(target: mujoco.MjsActuator, actuator: ActuatorModel, max_force: float | None) -> None:
     """Make an actuator of an `MjSpec` one of ours, at the control callback's door; an ideal one is a plain `<motor>`.
 
-    Args:
-        target: the actuator, with its joint transmission set; its gear, dynamics, gain, bias, range and user data are
-            overwritten.
-        actuator: what drives the joint.
-        max_force: limit of the desired force [N] or torque [N*m] at the joint; None for no limit.
+    All but its transmission is overwritten. `max_force` limits the desired force [N] or torque [N*m] at the joint.
     """
     ideal, family, arm = isinstance(actuator, Ideal), type(actuator), actuator.arm_radius
     target.gear = [1.0 / arm, 0, 0, 0, 0, 0]
@@ -92,20 +89,22 @@ def task_model(
     """Compile a task's model.
 
     A diverging simulation is left to diverge, so that it can be reported, instead of being reset by the engine. Where
-    the Euler integrator is made `explicit`, joint damping is explicit too.
-
-    Args:
-        task: the task.
-        actuators: one for each of the task's motors.
-        timestep: integration step [s].
-        max_forces: limits of the desired forces [N] or torques [N*m], shape (n,); None are the task's.
-        explicit: whether the positions will be moved by the old velocity.
-        joint: what is added to the actuated joints, besides what the actuators add.
+    the Euler integrator is made `explicit`, joint damping is explicit too. The integration step is in [s]; `max_forces`
+    [N or N*m], shape (n,), limit the desired forces in place of the task's; `joint` is added to the actuated joints.
 
     Raises:
-        ValueError: the model has no actuator of the name of one of the task's motors.
+        ValueError: it is no model, has no actuator of the name of one of the task's motors, or other joints than the
+            task's state has entries, or another integrator.
     """
-    spec = mujoco.MjSpec.from_file(str(asset_path(task.asset)))
+    try:
+        spec = mujoco.MjSpec.from_file(str(asset_path(task.asset)))
+    except ValueError as error:
+        raise ValueError(f"{task.asset}: {' '.join(str(error).split())}") from error
+    if other := [name for name in task.integrators if INTEGRATORS[name] != spec.option.integrator]:
+        kind = mujoco.mjtIntegrator(spec.option.integrator).name.removeprefix("mjINT_")
+        raise ValueError(
+            f"{task.asset}: its <option> has integrator {kind}, so Task.integrators cannot have {', '.join(other)}"
+        )
     spec.option.timestep = timestep
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     if explicit:
@@ -116,10 +115,31 @@ def task_model(
         if motor is None:
             there = ", ".join(repr(a.name) for a in spec.actuators) or "none"
             raise ValueError(f"{task.asset} has no actuator {name!r}; there are {there}: rename it, or set Task.motors")
+        joint_driven = spec.joint(motor.target) if motor.trntype == mujoco.mjtTrn.mjTRN_JOINT else None
+        if joint_driven is None or joint_driven.type not in _ALONG:
+            raise ValueError(f"{task.asset}: actuator {name!r} must drive a hinge or a slide joint")
         drive(motor, actuator, limit)
         for added in (JointAdditions(joint.armature, joint.damping, joint.friction), actuator.additions):
-            _add(spec, spec.joint(motor.target), added)
-    return spec.compile()
+            _add(spec, joint_driven, added)
+    if all(texture.type != mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
+        _add_sky(spec)
+    model = spec.compile()
+    if (model.nq, model.nv) != (len(task.qpos), len(task.qvel)):
+        raise ValueError(
+            f"{task.asset} has {model.nq} positions and {model.nv} velocities, and {task.name}'s state_names have "
+            f"{len(task.qpos)} and {len(task.qvel)} of them: {', '.join(task.state_names)}"
+        )
+    return model
+
+
+_ALONG = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+def _add_sky(spec: mujoco.MjSpec) -> None:
+    """Give a model without a sky that of our own models: it would be drawn on black."""
+    kind, gradient = mujoco.mjtTexture.mjTEXTURE_SKYBOX, mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
+    sky = spec.add_texture(type=kind, builtin=gradient, width=64, height=64)
+    sky.rgb1, sky.rgb2 = [0.93, 0.95, 0.97], [0.76, 0.82, 0.88]
 
 
 def _add(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, added: JointAdditions) -> None:

@@ -41,17 +41,10 @@ class MujocoBatchPhysics:
         disturbances: Disturbances = OFF,
         joint: Joint = PLAIN,
     ) -> None:
-        """Compile the model and make the batch.
+        """Compile the model and make the batch; arguments as for `MujocoPhysics`.
 
-        Args:
-            task: the task.
-            actuators: for each of N simulations one for each of the task's motors, all of one family.
-            inner_steps: integration steps per environment step.
-            integrator: one of the task's integrators.
-            max_forces: limits of the desired forces [N] or torques [N*m], shape (n,); None are the task's.
-            num_threads: threads of the engine; 0 uses every CPU.
-            disturbances: imperfections of the commands' way, and load pulses.
-            joint: what is added to the actuated joints.
+        But for `actuators`, which have one for each motor for each of N simulations, and `num_threads` of the engine; 0
+        uses every CPU.
         """
         self.task = task
         self.family = check_same_family([one for each in actuators for one in each])
@@ -129,13 +122,7 @@ class MujocoBatchPhysics:
         self.set_parameters(rows, numbers, np.array([[one.arm_radius for one in each] for each in actuators]))
 
     def set_parameters(self, rows: np.ndarray, numbers: np.ndarray, arms: np.ndarray) -> None:
-        """Do what `set_actuators` does, with actuators as arrays.
-
-        Args:
-            rows: indices of simulations, shape (m,).
-            numbers: as `ActuatorModel.numbers`, shape (m, n, p).
-            arms: [m], shape (m, n).
-        """
+        """Do what `set_actuators` does, with their `numbers` as an array (m, n, p) and their arms [m] as one (m, n)."""
         if not self.motorised:
             return
         user, gear, limits = map(self.field, ("actuator_user", "actuator_gear", "actuator_ctrlrange"))
@@ -147,12 +134,7 @@ class MujocoBatchPhysics:
         self._arms[rows] = arms
 
     def set_model(self, rows: np.ndarray, fields: Mapping[str, np.ndarray]) -> None:
-        """Change fields of the models of some simulations; to be followed by a reset of them.
-
-        Args:
-            rows: indices of simulations, shape (m,).
-            fields: as `codrl_mj.physics.variation.Variation.fields` returns them, for m simulations.
-        """
+        """Change fields of some simulations' models, as `Variation.fields` returns them, before these are reset."""
         for name, values in fields.items():
             self.field(name)[rows] = values
         if "dof_frictionloss" in fields:
@@ -183,12 +165,7 @@ class MujocoBatchPhysics:
             yield model
 
     def reset(self, rows: np.ndarray, states: np.ndarray, keys: np.ndarray | float = 0.0) -> None:
-        """Start episodes of some simulations, with their motors at rest.
-
-        Args:
-            rows: indices, shape (m,).
-            states: initial states in the task's order, shape (m, n).
-            keys: of the random numbers of the episodes' disturbances, shape (m,).
+        """Start episodes of m simulations, from states (m, n) with keys (m,) of random numbers, motors at rest.
 
         Raises:
             CallbackInUseError: another library's MuJoCo callback was installed in the meantime.
@@ -203,14 +180,7 @@ class MujocoBatchPhysics:
             self._disturber.reset(rows, keys)
 
     def step(self, desired_force: np.ndarray) -> Signals:
-        """Advance every simulation by one environment step.
-
-        Args:
-            desired_force: held over the step, shape (N,), or with several actuators (N, n), at most `max_forces`.
-
-        Returns:
-            The signals, each an array of the same shape.
-        """
+        """Advance every simulation by one environment step, under forces (N,) or (N, n); the signals, of that shape."""
         given = command = desired_force.reshape(self.num_envs, -1)
         if self._disturber is None:
             _write_columns(self._ctrl, self._controls, command, self._arms)
@@ -246,12 +216,7 @@ class MujocoBatchPhysics:
             self._kernels.correct(self._qpos, self._qvel, moved, timestep)
 
     def observed(self, signals: Signals | None, rows: np.ndarray | None = None) -> np.ndarray:
-        """What the sensors say at present, shape (m, n, k).
-
-        Args:
-            signals: of the last step; None at the start of episodes.
-            rows: indices of the simulations, shape (m,); None for all.
-        """
+        """What the sensors say at present, shape (m, n, k); without signals of a last step, as episodes start."""
         rows = np.arange(self.num_envs) if rows is None else rows
         names = self.family.Signals._fields  # type: ignore[attr-defined]
         shown = np.zeros((len(rows), len(self._wiring), len(names)))

@@ -114,12 +114,7 @@ class MujocoPhysics:
         self._qpos[:], self._qvel[:] = state[self._qpos_order], state[self._qvel_order]
 
     def reset(self, state: np.ndarray, key: float = 0.0) -> None:
-        """Start an episode from `state`, with the actuators at rest.
-
-        Args:
-            state: the mechanical state.
-            key: of the random numbers of the episode's disturbances and sensors.
-        """
+        """See `Physics.reset`."""
         self._install()  # raises if somebody replaced ours since the last episode
         stepping, arguments = self.compiled
         stepping.start(np.asarray(state, dtype=np.float64), float(key), *arguments)
@@ -139,11 +134,7 @@ class MujocoPhysics:
             self._settings[row, ARM] = arm
 
     def set_model(self, fields: Mapping[str, np.ndarray]) -> None:
-        """Change fields of the model; to be followed by a reset.
-
-        Args:
-            fields: as `codrl_mj.physics.variation.Variation.fields` returns them, for one simulation.
-        """
+        """Change fields of the model, as `Variation.fields` returns them for one simulation, before a reset."""
         write_fields(self.model, fields)
         if "dof_frictionloss" in fields:
             rubs = fields["dof_frictionloss"].any()
@@ -159,32 +150,17 @@ class MujocoPhysics:
         mujoco.mj_passive(self.model, self.data)  # where there is a hill, its callback puts the car on it
 
     def step(self, desired_force: Any) -> None:
-        """Advance by one environment step, with the desired force (at most `max_forces`) held over it.
-
-        Args:
-            desired_force: a number; for several actuators an array (n,).
-
-        Raises:
-            SimulationDivergedError: the state is no longer finite.
-        """
+        """See `Physics.step`."""
         stepping, arguments = self.compiled
         if not stepping.step(desired_force, *arguments):
             self.check_finite()
 
     def check_finite(self) -> None:
-        """Raise if the state is not finite or beyond `LARGEST`, saying which entry and when.
-
-        Raises:
-            SimulationDivergedError: as it says.
-        """
+        """See `Physics.check_finite`."""
         check_finite(self.task, self.state, self.data.time)
 
     def observed(self, row: np.ndarray) -> np.ndarray:
-        """What the sensors say at present, shape (actuators, k).
-
-        Args:
-            row: the last row of `trace`; zeros at the start of an episode.
-        """
+        """See `Physics.observed`."""
         stepping, arguments = self.compiled
         seen = np.empty((len(row), len(self.family.OBSERVED)))
         stepping.observed(row, seen, *arguments)
@@ -210,13 +186,7 @@ class MujocoPhysics:
 
 
 def wiring(model: mujoco.MjModel, name: str, actuator: ActuatorModel) -> Wiring:
-    """Where the numbers of a model's actuator are.
-
-    Args:
-        model: a task's.
-        name: of the actuator.
-        actuator: what drives it.
-    """
+    """Where the numbers are of the actuator of a task's model that has a name."""
     index = model.actuator(name).id
     dof = model.jnt_dofadr[model.actuator_trnid[index, 0]]
     address = max(int(model.actuator_actadr[index]), 0)

@@ -59,13 +59,9 @@ class Stepping(NamedTuple):
 
 
 def compiled_stepping(task: Task, family: Family, explicit: bool, disturbed: bool) -> Stepping:
-    """The functions for simulations of a task; compiled as they are used, once a process.
+    """The functions for simulations of a task with actuators of a family; compiled as they are used, once a process.
 
-    Args:
-        task: the task.
-        family: of its actuators.
-        explicit: whether positions are moved by the old velocity.
-        disturbed: whether there is a disturber.
+    Positions are moved by the old velocity if `explicit`, and there is a disturber if `disturbed`.
     """
     motorised = not issubclass(family, Ideal)
     if motorised:

@@ -37,27 +37,14 @@ class Streams:
         self._bind()
 
     def seed(self, rows: np.ndarray, seeds: Sequence[int | None]) -> None:
-        """Seed some streams as Gymnasium seeds an environment; None leaves a stream as it is.
-
-        Args:
-            rows: indices of streams, shape (m,).
-            seeds: one for each.
-        """
+        """Seed the streams `rows` (m,) as Gymnasium seeds an environment; None leaves a stream as it is."""
         for row, seed in zip(rows, seeds, strict=True):
             if seed is not None:
                 self.generators[row] = seeding.np_random(seed)[0]
         self._bind()
 
     def random(self, rows: np.ndarray, count: int) -> np.ndarray:
-        """The next `count` numbers in [0, 1) of each of some streams.
-
-        Args:
-            rows: indices of streams, shape (m,), without repetition.
-            count: numbers from each stream.
-
-        Returns:
-            Shape (m, count), float64.
-        """
+        """The next `count` numbers in [0, 1) of each of the streams `rows` (m,), which are different: (m, count)."""
         drawn = np.empty((len(rows), count))
         self._fill(self._addresses[rows], drawn)
         return drawn

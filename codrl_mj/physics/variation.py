@@ -31,11 +31,7 @@ def additions_of(actuators: Sequence[Sequence[ActuatorModel]]) -> np.ndarray:
 
 
 def variable(task: str) -> tuple[str, ...]:
-    """Names of what can be varied of a task's model.
-
-    Args:
-        task: the task's name.
-    """
+    """Names of what can be varied of the model of the task of a name."""
     model = _nominal_model(task)
     names = [f"model.mass.{model.body(body).name}" for body in range(1, model.nbody)]
     names += [f"model.length.{model.body(body).name}" for body in range(1, model.nbody) if _has_length(model, body)]
@@ -69,14 +65,9 @@ class Variation:
         joint: Joint = PLAIN,
         mounting: bool = False,
     ) -> None:
-        """Find the fields.
+        """Find the fields of what is varied, of `variable(task)`, in a model of the task: its own, or one given.
 
-        Args:
-            task: the task's name.
-            names: what is varied, of `variable(task)`.
-            model: a model of the task, whose present fields are varied; None is the task's own, with ideal actuators.
-            joint: what that one has on its actuated joints.
-            mounting: whether what actuators add to their joints is varied too.
+        That has `joint` on its actuated joints; `mounting` varies what actuators add to their joints, too.
 
         Raises:
             ValueError: an unknown name; the nearest known one is suggested.
@@ -102,15 +93,10 @@ class Variation:
     def fields(
         self, values: np.ndarray, additions: np.ndarray | None = None, drawn: bool = False
     ) -> dict[str, np.ndarray]:
-        """The varied fields of the model.
+        """The varied fields of the model, by name (`opt.` before an option's), shape (m, ...).
 
-        Args:
-            values: shape (m, k), one column for each of `names`.
-            additions: of the actuators to their joints, as `additions_of` has them; None where there are none.
-            drawn: include those that only what is drawn depends on.
-
-        Returns:
-            Field name (`opt.` before an option's) -> values, shape (m, ...).
+        `values`, shape (m, k), has a column for each of `names`; `additions` are as `additions_of` has them; `drawn`
+        includes the fields that only what is drawn depends on.
         """
         fields = {
             field: np.repeat(nominal[np.newaxis], len(values), axis=0)
@@ -180,12 +166,6 @@ def field_of(model: mujoco.MjModel, name: str) -> np.ndarray:
 
 
 def write_fields(model: mujoco.MjModel, fields: Mapping[str, np.ndarray], row: int = 0) -> None:
-    """Write one row of varied fields into a model; what the engine derives from them is not changed.
-
-    Args:
-        model: the model.
-        fields: as `Variation.fields` returns them.
-        row: the row.
-    """
+    """Write one row of varied fields into a model; what the engine derives from them is not changed."""
     for name, values in fields.items():
         setattr(model.opt if name.startswith("opt.") else model, name.removeprefix("opt."), values[row])

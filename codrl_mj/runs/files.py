@@ -68,25 +68,42 @@ def check_writable(folder: Path) -> None:
     """Find out before hours of work whether `folder` can hold results; makes nothing.
 
     Raises:
-        OSError: it is a file, or lies below one, or below a folder that may not be written to.
+        OSError: it is a file, or lies below one, or below a folder that cannot be written to.
     """
     present = folder.absolute()
     while not present.exists():
         present = present.parent
     if not present.is_dir():
         raise NotADirectoryError(f"cannot write to {folder}: {present} is not a folder")
-    if not os.access(present, os.W_OK | os.X_OK):
-        raise PermissionError(f"cannot write to {folder}: no permission to write in {present}")
+    try:
+        tempfile.TemporaryFile(dir=present).close()  # has no name; not even root may write everywhere
+    except OSError as error:
+        raise PermissionError(
+            f"cannot write to {folder}: no permission to write in {present} ({error.strerror})"
+        ) from None
+
+
+def check_file(path: Path) -> None:
+    """Find out before hours of work whether the file `path` can be written; makes nothing.
+
+    Raises:
+        OSError: it is a folder, or `check_writable` refuses where it would lie.
+    """
+    if path.is_dir():
+        raise IsADirectoryError(f"cannot write {path}: it is a folder: name a file, such as {path}/NAME")
+    check_writable(path.parent)
 
 
 def check_page(path: Path) -> None:
-    """Refuse a page's file by its suffix.
+    """Refuse a page's file by its suffix, or where it cannot be written.
 
     Raises:
         ValueError: it is none of a page.
+        OSError: see `check_file`.
     """
     if path.suffix not in (".html", ".htm"):
         raise ValueError(f"page {path}: the suffix is {path.suffix!r}, must be .html; write {path.stem}.html")
+    check_file(path)
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -99,6 +116,20 @@ def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
     """The content and, as its entry `sha256`, a digest of all the rest, which `read_json` checks and takes off."""
     plain = json.loads(json.dumps(content))  # what a reader will see: names that are text, lists for tuples
     return {_SEAL: hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest(), **plain}
+
+
+def check_digest(path: Path, content: bytes, expected: Any, beside: str) -> None:
+    """Refuse a file's content that has not the SHA-256 which the file `beside` it names; any where that is None.
+
+    Raises:
+        ValueError: it has another; what may have happened, and the remedy.
+    """
+    if expected is not None and hashlib.sha256(content).hexdigest() != expected:
+        raise ValueError(
+            f"{path} is truncated or damaged, or it and {beside} do not belong together: its sha256 is not the one "
+            "there. Copy both files anew from where they came; a training that was killed mends its own when it is "
+            "resumed"
+        )
 
 
 def read_json(path: Path, what: str) -> Any:

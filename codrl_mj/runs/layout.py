@@ -5,7 +5,10 @@ from pathlib import Path
 
 CONFIG, RESULT, EVALUATION = "config.json", "result.json", "evaluation.json"
 PROGRESS = "progress.csv"
+BEST = "best"
 POLICY_FILES = WEIGHTS, DESCRIPTION = "policy.safetensors", "policy.json"
+DIGEST = "weights_sha256"
+"""Entry of a policy's description: the digest of its weights."""
 
 
 def finished(run: Path) -> bool:

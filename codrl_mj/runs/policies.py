@@ -13,13 +13,11 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import trusting
 from codrl_mj.agents import AgentConfig, agent_from_mapping
-from codrl_mj.runs.files import read_json, sealed, write_json, writing
-from codrl_mj.runs.layout import DESCRIPTION, WEIGHTS
+from codrl_mj.runs.files import check_digest, read_json, sealed, write_json, writing
+from codrl_mj.runs.layout import DESCRIPTION, DIGEST, WEIGHTS
 
 FORMAT = "codrl_mj policy 2"
-_DIGEST = "weights_sha256"
-_REMEDY = "Copy both files anew from where they came; a training that was killed mends its own when it is resumed"
-_ENTRIES = {"format", _DIGEST, "agent", "observation_space", "action_space"}
+_ENTRIES = {"format", DIGEST, "agent", "observation_space", "action_space"}
 
 
 class Policy(Protocol):
@@ -65,7 +63,7 @@ def save_policy(policy: Any, agent: AgentConfig, folder: Path) -> None:
     weights = save({name: tensor.contiguous() for name, tensor in policy.state_dict().items()})
     description = {
         "format": FORMAT,
-        _DIGEST: hashlib.sha256(weights).hexdigest(),
+        DIGEST: hashlib.sha256(weights).hexdigest(),
         "agent": agent.as_mapping(),
         "observation_space": _describe_space(policy.observation_space),
         "action_space": _describe_space(policy.action_space),
@@ -97,16 +95,12 @@ def load_policy(folder: Path, trust: bool = False) -> Any:
     if not isinstance(description, dict) or description.get("format") != FORMAT:
         raise ValueError(f"{folder / DESCRIPTION}: not a policy of this program: its format must be {FORMAT!r}")
     if surplus := description.keys() - _ENTRIES:  # such as the digest's name, damaged
-        raise ValueError(f"{folder / DESCRIPTION} has unknown entries: {', '.join(sorted(surplus))}. {_REMEDY}")
+        raise ValueError(f"{folder / DESCRIPTION} has unknown entries: {', '.join(sorted(surplus))}. Copy it anew")
     weights = folder / WEIGHTS
     if not weights.is_file():
         raise FileNotFoundError(f"no policy weights at {weights}")
     content = weights.read_bytes()
-    if _DIGEST in description and hashlib.sha256(content).hexdigest() != description[_DIGEST]:
-        raise ValueError(
-            f"{weights} is truncated or damaged, or it and {DESCRIPTION} do not belong together: its sha256 is not the "
-            f"one there. {_REMEDY}"
-        )
+    check_digest(weights, content, description.get(DIGEST), DESCRIPTION)
     try:
         with trusting(trust):
             agent = agent_from_mapping(description["agent"])

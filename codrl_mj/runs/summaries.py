@@ -4,16 +4,28 @@ import contextlib
 import csv
 import dataclasses
 import datetime
+import itertools
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from codrl_mj.actuators import NAMED, actuator_from_mapping, trusting
-from codrl_mj.runs.files import read_json
-from codrl_mj.runs.layout import CONFIG, EVALUATION, POLICY_FILES, PROGRESS, RESULT, finished
-from codrl_mj.tasks import named_actuator
+from codrl_mj.actuators import actuator_from_mapping, name_of, trusting
+from codrl_mj.runs.files import check_digest, read_json
+from codrl_mj.runs.layout import (
+    BEST,
+    CONFIG,
+    DESCRIPTION,
+    DIGEST,
+    EVALUATION,
+    POLICY_FILES,
+    PROGRESS,
+    RESULT,
+    WEIGHTS,
+    finished,
+)
+from codrl_mj.tasks import TASKS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,7 +127,12 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
     missing = [file for file in POLICY_FILES if not (path / file).is_file()]
     done = finished(path)
     if done and missing:
-        problems.append(f"it is finished, but {' and '.join(missing)} is missing")
+        problems.append(f"it is finished, but {' and '.join(missing)} is missing: copy the folder anew")
+    for folder in (path, path / BEST):
+        _check_policy(folder, problems)
+    reported, learned = _first(progress, None, "steps"), _first(result, None, "steps")
+    if None not in (reported, learned) and reported != learned:
+        problems.append(f"{path / PROGRESS} ends at step {reported:.0f} of {learned:.0f}: copy it anew")
     agent = config.get("agent")
     task = env["task"] if isinstance(env.get("task"), str) else None
     steps = _first(result, progress, "steps")
@@ -129,7 +146,7 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
         problem="; ".join(problems) or None,
         task=task,
         agent=str(agent["name"]) if isinstance(agent, Mapping) and "name" in agent else None,
-        actuator=_actuator_of(env, task),
+        actuator=_actuator_of(env, task, (content or {}).get("labels")),
         seed=_whole(config.get("seed")),
         steps=_whole(steps),
         total_steps=_whole(config.get("total_steps")),
@@ -138,9 +155,19 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
         modified=_modified(path),
         evaluation=evaluation,
         configuration=dict(
-            _flat({**config, **{key: value for key, value in (content or {}).items() if key != "train"}})
+            _flat({**config, **{key: one for key, one in (content or {}).items() if key not in ("train", "labels")}})
         ),
     )
+
+
+def _check_policy(folder: Path, problems: list[str]) -> None:
+    """Note if a folder's policy, where there is one, is damaged or not the one that it says."""
+    described = _mapping(folder / DESCRIPTION, "policy description", problems)
+    try:
+        if described is not None and (folder / WEIGHTS).is_file():
+            check_digest(folder / WEIGHTS, (folder / WEIGHTS).read_bytes(), described.get(DIGEST), DESCRIPTION)
+    except (ValueError, OSError) as error:
+        problems.append(str(error))
 
 
 def _mapping(path: Path, what: str, problems: list[str]) -> Mapping[str, Any] | None:
@@ -210,26 +237,29 @@ def _first(one: Mapping[str, Any] | None, other: Mapping[str, Any] | None, name:
     return next((number for number in numbers if number is not None), None)
 
 
-def _actuator_of(env: Mapping[str, Any], task: Any) -> str | None:
-    """The name of an environment's actuator; in environments of others those of all patterns."""
+def _actuator_of(env: Mapping[str, Any], task: str | None, labels: Any) -> str | None:
+    """What to call an environment's actuators: those of motors, in environments of others those of patterns."""
     if isinstance(patterns := env.get("actuators"), Mapping):
-        return ", ".join(dict.fromkeys(_actuator_name(one, task) for one in patterns.values()))
-    return _actuator_name(env["actuator"], task) if "actuator" in env else None
+        each = list(patterns.values())
+    elif "actuator" in env:
+        each = env["actuator"] if isinstance(env["actuator"], list) else [env["actuator"]]
+    else:
+        return None
+    labels = labels if isinstance(labels, list) else []
+    papers = TASKS[task].paper if task in TASKS else ()
+    rows = itertools.zip_longest(each, labels[: len(each)], papers[: len(each)])
+    return ", ".join(dict.fromkeys(_actuator_name(*row) for row in rows))
 
 
-def _actuator_name(actuator: Any, task: Any) -> str:
-    """The name of an actuator among the task's named ones, or its family's; `custom` if it is a loop of no name."""
-    if actuator is None or isinstance(actuator, str):
-        return actuator or "ideal"
+def _actuator_name(actuator: Any, label: Any, paper: Any) -> str:
+    """What to call the actuator of a mapping: its family where that is somebody's, `custom` if it cannot be read."""
+    if label or actuator is None or isinstance(actuator, str):
+        return str(label or actuator or "ideal")
     try:
-        mapping = actuator if isinstance(actuator, Mapping) else actuator[0]
-        if mapping.get("family", "current_loop") != "current_loop":
-            return str(mapping["family"])
         with trusting(False):
-            made = actuator_from_mapping(mapping)
-            return next((name for name in NAMED if named_actuator(name, task) == made), "custom")
-    except (ValueError, TypeError, KeyError, AttributeError, IndexError):
-        return "custom"
+            return name_of(actuator_from_mapping(actuator), paper)
+    except (ValueError, TypeError, AttributeError):
+        return str(actuator.get("family", "custom")) if isinstance(actuator, Mapping) else "custom"
 
 
 def _flat(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -14,13 +14,7 @@ HORIZON = 20.0
 
 
 class Bench:
-    """One hinge that an actuator drives.
-
-    Args:
-        actuator: any family's.
-        timestep: integration step [s].
-        inertia: of the load [kg*m^2].
-    """
+    """One hinge with a load of some inertia [kg*m^2] that an actuator drives in steps of `timestep` [s]."""
 
     def __init__(self, actuator: Any, timestep: float, inertia: float) -> None:
         """Build it."""
@@ -35,16 +29,10 @@ class Bench:
         self._inertia = inertia + actuator.additions.armature
 
     def run(self, torque: float, duration: float, speed: float = 0.0) -> np.ndarray:
-        """Ask for a torque from rest of the actuator.
+        """Ask for a torque [N*m] at the joint for a `duration` [s], from a speed of the joint [rad/s].
 
-        Args:
-            torque: desired, at the joint [N*m].
-            duration: [s].
-            speed: of the joint at the start [rad/s].
-
-        Returns:
-            Shape (steps, 3): the actuator's torque [N*m] in each step, that which accelerates the hinge [N*m], and its
-            speed [rad/s] after the step.
+        Shape (steps, 3): the actuator's torque [N*m] in each step, that which accelerates the hinge [N*m], and its
+        speed [rad/s] after the step.
         """
         model, data = self._model, self._data
         mujoco.mj_resetData(model, data)
@@ -82,14 +70,9 @@ class Delivery(NamedTuple):
 
 
 def delivery(actuator: Any, timestep: float, step: float, force: float, speed: float) -> Delivery:
-    """Measure what an actuator makes of commands, on the bench.
+    """Measure what an actuator makes of commands up to a force [N*m; N on a slide] at a reference speed [rad/s; m/s].
 
-    Args:
-        actuator: any family's.
-        timestep: integration step [s].
-        step: of the policy [s].
-        force: the largest that is asked for [N*m; N on a slide].
-        speed: the reference speed [rad/s; m/s on a slide].
+    `timestep` is that of the integration, `step` the policy's [s].
     """
     duration = HORIZON * step
     blocked = Bench(actuator, timestep, BLOCKED)

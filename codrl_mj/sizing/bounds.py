@@ -6,13 +6,16 @@ import math
 import numpy as np
 
 from codrl_mj.actuators import Drive
+from codrl_mj.motor_design.drives import most_power
 from codrl_mj.sizing.demand import Demand
 from codrl_mj.sizing.operation import Operation, best_ratio, operation
 from codrl_mj.sizing.swing import Swing, least_gain, least_pumped, least_voltage
 
-SURELY, TRY_IT, SURELY_NOT = "surely", "try it", "surely not"
-VERDICTS = (SURELY, TRY_IT, SURELY_NOT)
+SURELY, TRY_IT, HOPELESS, SURELY_NOT = "surely", "try it", "hopeless", "surely not"
+VERDICTS = (SURELY, TRY_IT, HOPELESS, SURELY_NOT)
 """From the best."""
+SHORT = 10.0
+"""What is short by this factor is hopeless: in simulations none that was short by more than 7 got anywhere."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +35,7 @@ class Bound:
     holds: bool
     """Whether the motor has what is needed."""
     verdict: str
-    """`surely`, `surely not`, or `try it` where nothing follows."""
+    """`surely`, `surely not`, or where nothing follows `try it`; `hopeless` where most of it is missing."""
     remedy: str
     """What to change; empty where it holds."""
 
@@ -55,9 +58,10 @@ class Feasibility:
 
     @property
     def verdict(self) -> str:
-        """`surely not` if one bound says so, `surely` if voltage, current and heat do, else `try it`."""
-        if any(bound.verdict == SURELY_NOT for bound in self.bounds):
-            return SURELY_NOT
+        """`surely not` or `hopeless` if one bound says so, `surely` if voltage, current and heat do, else `try it`."""
+        worst = max((bound.verdict for bound in self.bounds), key=VERDICTS.index)
+        if worst in (HOPELESS, SURELY_NOT):
+            return worst
         return SURELY if self.margin >= 0.0 else TRY_IT
 
     @property
@@ -74,14 +78,6 @@ def margin(drive: Drive, asked: Operation, continuous_current: float | None) -> 
         float(np.abs(asked.current).max()) / drive.controller.max_current,
         asked.rms_current / continuous_current if continuous_current else 0.0,
     )
-
-
-def most_power(drive: Drive) -> float:
-    """The most mechanical power [W] that a motor makes at its supply, i (V - R i) kT/kE; infinite without back-EMF."""
-    motor, limit = drive.motor, drive.voltage_limit
-    current = min(limit / motor.resistance / 2, drive.controller.max_current)
-    power = current * (limit - motor.resistance * current) * motor.torque_constant
-    return power / motor.back_emf_constant if motor.back_emf_constant else math.inf
 
 
 def feasibility(drive: Drive, demand: Demand, continuous_current: float | None = None) -> Feasibility:
@@ -101,21 +97,16 @@ def feasibility(drive: Drive, demand: Demand, continuous_current: float | None =
     if not isinstance(drive, Drive):
         raise ValueError(f"{drive!r}: must be a codrl_mj.Drive, a motor with gear and supply, or a catalogue's name")
     asked, unmet = operation(demand, drive), SURELY_NOT if demand.exact else TRY_IT
-    bounds = [*_limits(drive, demand, asked, continuous_current, unmet), *_necessary(drive, demand, unmet)]
+    bounds = [*_limits(drive, asked, continuous_current, unmet), *_necessary(drive, demand, unmet)]
     if demand.swing is not None:
         bounds += _swinging(drive, demand.swing)
     return Feasibility(tuple(bounds), asked, margin(drive, asked, continuous_current))
 
 
-def _limits(
-    drive: Drive, demand: Demand, asked: Operation, continuous_current: float | None, unmet: str
-) -> list[Bound]:
+def _limits(drive: Drive, asked: Operation, continuous_current: float | None, unmet: str) -> list[Bound]:
     """What suffices: voltage and current at every operating point, and the heat of all of them."""
     needed, limit = float(asked.voltage.max()), drive.voltage_limit
-    ratio, least = _at_most_power(drive, demand)
-    remedy = f"raise the supply to {needed:.4g} V" + (
-        f", or take a gear nearer to {ratio:.3g}" if least < limit and math.isfinite(ratio) else ""
-    )
+    remedy = f"raise the supply to {needed:.4g} V"
     bounds = [_bound("voltage", "|R i + L di/dt + N kE omega|, largest", needed, limit, "V", (SURELY, unmet), remedy)]
     largest, most = float(np.abs(asked.current).max()), drive.controller.max_current
     remedy = f"raise controller.max_current to {largest:.4g} A, or the gear {largest / most:.3g} times"
@@ -136,7 +127,7 @@ def _necessary(drive: Drive, demand: Demand, unmet: str) -> list[Bound]:
     still = motor.torque_constant * motor.gear_efficiency * current / drive.arm_radius - drive.additions.friction
     still -= motor.stribeck_friction / drive.arm_radius
     needed = float(power.max(initial=0.0)) / motor.gear_efficiency
-    _, least = _at_most_power(drive, demand)
+    least = _at_most_power(drive, demand)
     return [
         _bound(
             *("stall", "|tau| but of braking, largest", largest, still, "N" if demand.linear else "N*m"),
@@ -169,17 +160,19 @@ def _swinging(drive: Drive, swing: Swing) -> list[Bound]:
 def _bound(
     name: str, formula: str, needed: float, available: float, unit: str, verdicts: tuple[str, str], remedy: str
 ) -> Bound:
-    """A bound with one of two verdicts: where it holds, and where it does not."""
+    """A bound with one of two verdicts, where it holds and where it does not; heat is by the square of the current."""
     holds = needed <= available
-    return Bound(name, formula, needed, available, unit, holds, verdicts[not holds], "" if holds else remedy)
+    verdict, most = verdicts[not holds], available * (math.sqrt(SHORT) if name == "heat" else SHORT)
+    if not holds and verdict == TRY_IT and needed >= most and name != "power":  # a policy may take its time over it
+        verdict = HOPELESS
+    return Bound(name, formula, needed, available, unit, holds, verdict, "" if holds else remedy)
 
 
-def _at_most_power(drive: Drive, demand: Demand) -> tuple[float, float]:
-    """The least voltage [V] that the demand's largest power takes, and its gear, first; NaN and 0 without power."""
+def _at_most_power(drive: Drive, demand: Demand) -> float:
+    """The least voltage [V] that the demand's largest power takes at any gear; 0 without power."""
     motor = drive.motor
     at = int(np.argmax(demand.torque * demand.speed))
     torque, speed = abs(float(demand.torque[at])) / motor.gear_efficiency, abs(float(demand.speed[at]))
     if not torque * speed * motor.back_emf_constant > 0.0:
-        return math.nan, 0.0
-    ratio = float(best_ratio(torque, speed, motor))
-    return ratio, 2.0 * ratio * motor.back_emf_constant * speed
+        return 0.0
+    return 2.0 * float(best_ratio(torque, speed, motor)) * motor.back_emf_constant * speed

@@ -4,14 +4,15 @@ import dataclasses
 import math
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from codrl_mj.actuators import Drive, mapping_of
+from codrl_mj.actuators import Drive, labelled, named_mapping
 from codrl_mj.catalogue import motor_names
-from codrl_mj.motor_design.drives import find_drive, find_entry
-from codrl_mj.sizing.bounds import SURELY, VERDICTS, Feasibility, feasibility, margin, most_power
+from codrl_mj.motor_design.drives import find_drive, find_entry, most_power
+from codrl_mj.sizing.bounds import SURELY, VERDICTS, Feasibility, feasibility, margin
 from codrl_mj.sizing.demand import Demand
 from codrl_mj.sizing.operation import best_ratio, operation
 
@@ -21,16 +22,8 @@ MOST_SHARE = 0.5
 """Largest share that rotor and friction may take of the largest load: in a task a policy can ask for no more."""
 _SPREAD = math.log(16.0)
 """Gears are tried up to this far, in logarithms, from that of the largest torque and the largest speed."""
-_WANTED = {
-    "rotor_inertia": "rotor inertia",
-    "coulomb_friction": "Coulomb friction",
-    "viscous_friction": "viscous friction",
-    "gear_efficiency": "gear efficiency",
-    "max_current": "largest current",
-    "continuous_current": "continuous current",
-    "voltage": "nominal voltage",
-}
-"""What a datasheet may leave open: losses and inertia are 0 then, currents have no limit, the supply has 24 V."""
+_WANTED = ("coulomb_friction", "viscous_friction", "gear_efficiency", "continuous_current")
+"""What a datasheet may leave open, and is not counted then, besides what `Drive.assumed` says."""
 
 
 class Catalogued(NamedTuple):
@@ -81,10 +74,11 @@ def actuators_of(choices: Mapping[str, tuple[Choice, Demand]]) -> dict[str, Any]
         choices: name of a motor of the model -> what was chosen for it, and for what; of a single one the name may be
             empty.
     """
-    return {
-        re.escape(name) if name else ".*": mapping_of(choice.behind(demand.model_gear))
-        for name, (choice, demand) in choices.items()
-    }
+    found = {}
+    for name, (choice, demand) in choices.items():
+        drive = labelled(choice.behind(demand.model_gear), Path(choice.name).stem)
+        found[re.escape(name) if name else ".*"] = named_mapping(drive)
+    return found
 
 
 def catalogued(name: str, gear_ratio: float | None = None, voltage: float | None = None) -> Catalogued:
@@ -101,9 +95,8 @@ def catalogued(name: str, gear_ratio: float | None = None, voltage: float | None
     drive, entry = find_drive(name, gear_ratio, voltage=voltage), find_entry(name)
     if entry is None:
         return Catalogued(drive, None, ("continuous current",))
-    unknown = [label for number, label in _WANTED.items() if getattr(entry.numbers, number) is None]
-    given = "" if voltage is None else "nominal voltage"
-    return Catalogued(drive, entry.numbers.continuous_current, tuple(one for one in unknown if one != given))
+    unknown = tuple(name.replace("_", " ") for name in _WANTED if getattr(entry.numbers, name) is None)
+    return Catalogued(drive, entry.numbers.continuous_current, unknown)
 
 
 def choose(
@@ -132,7 +125,8 @@ def choose(
     choices = []
     for name in motor_names() if motors is None else motors:
         drive, continuous, unknown = catalogued(name, None, voltage)
-        best = _geared(drive, demand, continuous)
+        fixed = drive.motor.gear_ratio != 1.0 and not demand.linear
+        best = drive if fixed else geared(drive, demand, continuous)
         found = feasibility(best, demand, continuous)
         choices.append(Choice(name, best, unknown, found, _lacks(found, demand, continuous, least_margin)))
 
@@ -157,29 +151,34 @@ def _lacks(found: Feasibility, demand: Demand, continuous: float | None, least: 
     return ""
 
 
-def _geared(drive: Drive, demand: Demand, continuous: float | None) -> Drive:
-    """The drive with the gear, or the wheel, whose margin is largest, the rotor's share considered.
+def geared(drive: Drive, demand: Demand, continuous: float | None = None) -> Drive:
+    """The drive with the gear, or on a slide the wheel, whose margin is largest, the rotor's share considered.
 
     Each of the margin's parts is, but for friction, the largest of functions a/N + b*N, so it has one maximum over N.
+
+    Args:
+        drive: the motor, with any gear.
+        demand: what is asked.
+        continuous: current that the winding bears for good [A]; None: unknown.
     """
     from scipy.optimize import minimize_scalar
 
     motor, own = drive.motor, drive.motor.gear_ratio
     torque, speed = np.abs(demand.torque).max(), np.abs(demand.speed).max()
-    if (own != 1.0 and not demand.linear) or not torque * speed * motor.back_emf_constant > 0.0:
+    if not torque * speed * motor.back_emf_constant > 0.0:
         return drive
     middle = math.log(best_ratio(torque, speed, motor))
 
-    def geared(logarithm: float) -> Drive:
+    def at(logarithm: float) -> Drive:
         ratio = math.exp(logarithm)
         change = {"arm_radius": own / ratio} if demand.linear else {"gear_ratio": ratio}
         return dataclasses.replace(drive, motor=dataclasses.replace(motor, **change))
 
     def load(logarithm: float) -> float:
-        asked = operation(demand, geared(logarithm))
+        asked = operation(demand, at(logarithm))
         share = 0.0 if demand.exact else asked.own_share / MOST_SHARE
-        return max(1.0 - margin(geared(logarithm), asked, continuous), share)
+        return max(1.0 - margin(at(logarithm), asked, continuous), share)
 
     bounds = middle - _SPREAD, middle + _SPREAD
     found = minimize_scalar(load, bounds=bounds, method="bounded", options={"xatol": 0.01})
-    return geared(float(found.x))
+    return at(float(found.x))

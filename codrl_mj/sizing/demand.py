@@ -55,17 +55,10 @@ class Demand:
 def demand_of(
     what: str | Path, episodes: int = EPISODES, seed: int = 0, trust: bool = False, motor: str | None = None
 ) -> Demand:
-    """What a task, a trained run or a recording asks of an actuator: `demands_of`, of one motor.
-
-    Args:
-        what: as for `demands_of`, and so are the others.
-        episodes: see there.
-        seed: see there.
-        trust: see there.
-        motor: which of several motors, by its name.
+    """What a task, a trained run or a recording asks of an actuator: `demands_of`, of the `motor` that is named.
 
     Raises:
-        ValueError: see there; or there are several motors and none of them is named, or another.
+        ValueError: as `demands_of`; or there are several motors and none of them is named, or another.
     """
     found = demands_of(what, episodes, seed, trust)
     if motor is None and len(found) > 1:
@@ -102,7 +95,11 @@ def demands_of(what: str | Path, episodes: int = EPISODES, seed: int = 0, trust:
             f"{what}: there is no scripted controller for it; train it with --actuator ideal and name the run"
         )
     task = find_task(str(what))
-    _alone(task)
+    if len(task.motors) > 1:
+        raise ValueError(
+            f"task {task.name!r} has {len(task.motors)} motors: there is no scripted controller; train it with "
+            "--actuator ideal and name the run, or give time, torque and speed of each joint as .npz files"
+        )
     env = _resolved(EnvConfig(str(what), "ideal"))
     policy = Scripted(task)
     ran = run_episodes(policy, lambda: StateObserved(env.make()), episodes, seed)
@@ -161,14 +158,6 @@ def _of_run(path: Path, episodes: int, seed: int, trust: bool) -> dict[str, Dema
         env = _resolved(env)
     ran = run_episodes(load_policy(path, trust), env.make, episodes, seed)
     return _gathered(f"the policy {path.name} of {env.task}", env, ran)
-
-
-def _alone(task: Task) -> None:
-    if len(task.motors) > 1:
-        raise ValueError(
-            f"task {task.name!r} has {len(task.motors)} motors: there is no scripted controller; train it with "
-            "--actuator ideal and name the run, or give time, torque and speed of each joint as .npz files"
-        )
 
 
 def _resolved(env: EnvConfig) -> EnvConfig:

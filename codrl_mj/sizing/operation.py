@@ -30,7 +30,8 @@ class Operation(NamedTuple):
     energy_drawn: float
     """Electrical energy drawn from the supply in an episode [J], what comes back not taken off."""
     own_share: float
-    """Largest torque that rotor and friction take, over the largest that the joint is asked for."""
+    """Largest torque that rotor and friction take, over the largest that the joint is asked for; at least that, where
+    the rotor's inertia is unknown and thus 0."""
 
 
 def operation(demand: Demand, drive: Drive) -> Operation:

@@ -50,7 +50,7 @@ torque is held over each of them.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -67,10 +67,6 @@ TORQUE = 1.0  # N*m
 MAX_SPEED_1 = 4 * math.pi  # rad/s
 MAX_SPEED_2 = 9 * math.pi  # rad/s
 GOAL_HEIGHT = 1.0  # m above the shoulder
-
-
-class Options(NamedTuple):
-    """Acrobot has no options."""
 
 
 def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
@@ -112,7 +108,7 @@ def terminated(state: Entries) -> Any:
     return -np.cos(state[0]) - np.cos(state[1] + state[0]) > GOAL_HEIGHT
 
 
-def reward(state: Entries, force: Any, next_state: Entries, options: Options) -> Any:
+def reward(state: Entries, force: Any, next_state: Entries, options: Any) -> Any:
     """-1 a step, 0 for the step that reaches the goal."""
     return -1.0 + terminated(next_state)
 
@@ -158,12 +154,8 @@ TASK = Task(
     render_fps=15,
     integrators=("rk4",),
     state_names=("theta1 [rad]", "theta2 [rad]", "theta1_dot [rad/s]", "theta2_dot [rad/s]"),
-    qpos=(0, 1),
-    qvel=(2, 3),
-    action_space=spaces.Discrete(3),
     observation_names=("cos_angle_1", "sin_angle_1", "cos_angle_2", "sin_angle_2", "velocity_1", "velocity_2"),
     observation_space=spaces.Box(-_HIGH, _HIGH, dtype=np.float32),
-    options=Options,
     initial_bounds=initial_bounds,
     initial_state=initial_state,
     observation=observation,
@@ -171,7 +163,6 @@ TASK = Task(
     terminated=terminated,
     constrain=constrain,
     goal=terminated,
-    speeds=(3,),
     helpers=(_rounded, _wrapped, terminated),
     # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
     paper=(Actuator(Motor(), CurrentLoop(kp=1.0, ki=10.0, kd=1e-6)),),

@@ -24,11 +24,13 @@ def asset_path(name: str) -> Path:
         name: file name, such as `cartpole.xml`; or the path of a file.
 
     Raises:
-        FileNotFoundError: neither the checkout nor the wheel has it.
+        FileNotFoundError: there is no such file, and neither the checkout nor the wheel has it.
     """
     if Path(name).is_file():
         return Path(name)
     for folder in (_PACKAGE / "_assets", _PACKAGE.parent / "assets"):
         if (folder / name).is_file():
             return folder / name
-    raise FileNotFoundError(f"no model {name!r} beside codrl_mj in {_PACKAGE}: the installation is incomplete")
+    if Path(name).parent == Path():
+        raise FileNotFoundError(f"no model {name!r} in {Path.cwd()}, nor among codrl_mj's: give the whole path")
+    raise FileNotFoundError(f"no model file {name}")

@@ -1,14 +1,20 @@
 """What a task is: a model file, a few numbers, and pure functions of a state's entries."""
 
+import functools
+from collections import UserDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+import mujoco
 import numpy as np
 from gymnasium import spaces
 
+from codrl_mj import fields
 from codrl_mj.actuators import Actuator
+from codrl_mj.tasks.assets import asset_path
 from codrl_mj.tasks.attributes import Attribute
+from codrl_mj.tasks.checks import check_fields, check_functions, check_layout
 from codrl_mj.tasks.trials import Trials
 from codrl_mj.tasks.twin import Twin
 
@@ -21,6 +27,15 @@ Options = Any
 """A task's options: a `NamedTuple` of floats and flags whose fields have defaults."""
 Entries = Any
 """A sequence of numbers, or of arrays with one number for each of N states."""
+_KINDS = {
+    "euler": "EULER",
+    "semi-implicit": "EULER",
+    "rk4": "RK4",
+    "implicit": "IMPLICIT",
+    "implicitfast": "IMPLICITFAST",
+}
+INTEGRATORS = {name: getattr(mujoco.mjtIntegrator, f"mjINT_{kind}") for name, kind in _KINDS.items()}
+"""Integrators by name, and what a model has to have for them; with `euler` positions are moved by the old velocity."""
 
 
 @dataclass(frozen=True)
@@ -31,25 +46,30 @@ class Task:
     number, or an array with a number for each of N states (`states.T` of states (N, n)). What is the same for all
     states may be returned as a single number. These functions are plain Python that numba compiles as it stands
     (`codrl_mj.envs.outcomes`); every face runs the compiled form. Helpers of theirs are named in `helpers`.
+
+    Raises:
+        ValueError: a field is out of bounds, or a function, called once on plain numbers, does not return what others
+            declare.
     """
 
     name: str
     """Name on the command line, such as `cartpole`."""
     env_id: str
     """Its id in Gymnasium's registry, such as `codrl_mj/CartPole-v0`."""
-    max_episode_steps: int | None
+    max_episode_steps: int | None = field(metadata=fields.integer(None, least=1).metadata)
     """Time limit [environment steps]; None for none."""
     asset: str
     """MJCF file: a name among ours, or a path."""
-    step_duration: float
+    step_duration: float = field(metadata=fields.real(1.0, above=0.0, unit="s").metadata)
     """Duration of one environment step [s]."""
-    motor_inner_steps: int
+    motor_inner_steps: int = field(metadata=fields.integer(1, least=1).metadata)
     """Integration steps per environment step when a motor is in the loop."""
     max_force: Any
     """Largest desired force [N] or torque [N*m] of any action; where the action is the force, it saturates here. One
     for each motor, or one for all."""
     integrators: tuple[str, ...]
-    """Names of the integrators that can be chosen; the first is Gymnasium's."""
+    """Names of the integrators that can be chosen, keys of `INTEGRATORS`; the first is Gymnasium's. The model's own has
+    to be of that kind."""
     state_names: tuple[str, ...]
     """Names of the state's entries, with units."""
     observation_names: tuple[str, ...]
@@ -72,7 +92,7 @@ class Task:
     """(state) -> whether the task's goal is reached there. An episode succeeds if it ends at the goal and has been
     there for `goal_hold`. None where the goal is to last: an episode then succeeds if it is not terminated before the
     time limit."""
-    goal_hold: float = 0.0
+    goal_hold: float = fields.real(0.0, least=0.0, unit="s")
     """How long an episode that succeeds has been at the goal when it ends [s]."""
 
     forces: tuple[Any, ...] | None = None
@@ -89,14 +109,14 @@ class Task:
     """The action space, Gymnasium's; unless told otherwise up to `max_force`, or which of `forces`."""
     observation_space: spaces.Box = None  # type: ignore[assignment]
     """The observation space, Gymnasium's; without bounds unless told otherwise."""
-    render_fps: int = 0
+    render_fps: int = fields.integer(0, least=0)
     """Frames per second of a video with one frame a step: real time unless told otherwise, as Gymnasium does."""
     motors: tuple[str, ...] = ("motor",)
     """Names of the MJCF model's actuators that the task drives, in the order of actions and forces. With several of
     them, forces and signals are arrays (n,) wherever they are numbers otherwise."""
     helpers: tuple[Callable[..., Any], ...] = ()
     """Plain functions that those above call, innermost first, to be compiled with them."""
-    reward_threshold: float | None = None
+    reward_threshold: float | None = fields.real(None)
     """Mean return at which the task counts as solved."""
     agent: str = "ppo"
     """The agent that `codrl-mj train` takes unless told otherwise."""
@@ -106,10 +126,8 @@ class Task:
     twin: Callable[[], Twin] | None = None
     """Makes that environment, or the equations of motion in closed form, to be driven by any force: the analytic
     physics, and the oracle of the certificate."""
-    ideal_inner_steps: int = 1
+    ideal_inner_steps: int = fields.integer(1, least=1)
     """Integration steps per environment step when the actuator is ideal: Gymnasium's."""
-    speeds: tuple[int, ...] = (1,)
-    """Which state entries are the velocities of the joints that the motors drive, in their order."""
     paper: tuple[Actuator, ...] = ()
     """The paper's actuators, one for each motor, of which other named actuators are variations; none where there are
     none."""
@@ -123,7 +141,11 @@ class Task:
     """What the certificate tries the task in; without it, the checks that need states of the task's are left out."""
 
     def __post_init__(self) -> None:
-        """Fill in what follows from the rest."""
+        """Validate, and fill in what follows from the rest."""
+        fields.check(self)
+        check_fields(self)
+        fields.check_names(self.integrators, INTEGRATORS, "integrator", every=True)
+        asset_path(self.asset)
         half, size = len(self.state_names) // 2, (len(self.observation_names),)
         limits = self.max_forces.astype(np.float32)
         derived = {
@@ -136,6 +158,8 @@ class Task:
         for name, value in derived.items():
             if not getattr(self, name):
                 object.__setattr__(self, name, value)
+        check_functions(self)
+        check_layout(self)
 
     @property
     def default_actuator(self) -> str:
@@ -152,10 +176,48 @@ class Task:
         """Largest desired forces [N] or torques [N*m], shape (n,)."""
         return np.broadcast_to(np.array(self.max_force, dtype=np.float64), (len(self.motors),)).copy()
 
+    @functools.cached_property
+    def speeds(self) -> tuple[int, ...]:
+        """Which state entries are the velocities of the joints that the motors drive, in their order: by the model."""
+        model = mujoco.MjSpec.from_file(str(asset_path(self.asset))).compile()
+        joints = [model.actuator_trnid[model.actuator(name).id, 0] for name in self.motors]
+        return tuple(self.qvel[model.jnt_dofadr[joint]] for joint in joints)
+
+    def bounds(self, options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
+        """`initial_bounds` under a reset's options.
+
+        Raises:
+            ValueError: the task asks for no option of such a name.
+        """
+        asked = None if options is None else _Asked(options)
+        low, high = self.initial_bounds(asked)  # type: ignore[arg-type]
+        if asked is not None:
+            fields.check_names(asked.data, sorted(map(str, asked.names)), "reset option", every=True)
+        return np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+
     def initial(self, generator: np.random.Generator, options: dict[str, Any] | None) -> np.ndarray:
         """One initial state, shape (n,): the state that Gymnasium's environment draws from the same generator."""
-        return np.array(self.initial_state(generator.uniform(*self.initial_bounds(options))))
+        state = np.array(self.initial_state(generator.uniform(*self.bounds(options))))
+        return state.reshape(len(self.state_names))
 
     def initial_states(self, draws: np.ndarray) -> np.ndarray:
         """Initial states, shape (N, n), from numbers drawn within the bounds, (N, k)."""
-        return np.stack(self.initial_state(draws.T), axis=-1)
+        states = np.empty((len(draws), len(self.state_names)))
+        for column, entry in zip(states.T, self.initial_state(draws.T), strict=True):
+            column[:] = entry
+        return states
+
+
+class _Asked(UserDict[str, Any]):
+    """Reset options that remember which names they were asked for."""
+
+    def __init__(self, options: Mapping[str, Any]) -> None:
+        self.names: set[Any] = set()
+        super().__init__(options)
+
+    def __contains__(self, name: object) -> bool:
+        self.names.add(name)
+        return super().__contains__(name)
+
+    def __getitem__(self, name: str) -> Any:
+        return self.data[name] if name in self else super().__getitem__(name)

@@ -109,7 +109,7 @@ bench's amplifier is made for 10 V and gives 15: `{"name": "default", "supply": 
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -123,10 +123,6 @@ MAX_TORQUE = 0.084  # N*m: 2 A, the amplifier's peak current, times kT = 0.042 N
 ARM_LIMIT = 2.0  # rad
 GOAL_ANGLE = 0.1  # rad
 GOAL_HOLD = 1.0  # s
-
-
-class Options(NamedTuple):
-    """Furuta has no options."""
 
 
 def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
@@ -155,7 +151,7 @@ def goal(state: Entries) -> Any:
     return np.cos(state[1]) > math.cos(GOAL_ANGLE)
 
 
-def reward(state: Entries, force: Any, next_state: Entries, options: Options) -> Any:
+def reward(state: Entries, force: Any, next_state: Entries, options: Any) -> Any:
     """The rod's height, less a share for the arm's angle and for the torque."""
     off, share = next_state[0] / ARM_LIMIT, force / MAX_TORQUE
     return 0.5 * (1.0 + np.cos(next_state[1])) * (1.0 - 0.5 * (off * off) - 0.1 * (share * share))
@@ -224,17 +220,10 @@ TASK = Task(
     motor_inner_steps=10,
     ideal_inner_steps=10,
     max_force=MAX_TORQUE,
-    forces=None,
-    render_fps=50,
     integrators=("rk4",),
     state_names=("arm [rad]", "rod [rad]", "arm_dot [rad/s]", "rod_dot [rad/s]"),
-    qpos=(0, 1),
-    qvel=(2, 3),
-    speeds=(2,),
-    action_space=spaces.Box(-MAX_TORQUE, MAX_TORQUE, (1,), np.float32),
     observation_names=("cos_arm", "sin_arm", "cos_rod", "sin_rod", "arm_velocity", "rod_velocity"),
     observation_space=spaces.Box(-_HIGH, _HIGH, dtype=np.float32),
-    options=Options,
     initial_bounds=initial_bounds,
     initial_state=initial_state,
     observation=observation,

@@ -43,7 +43,7 @@ environment step of 1 s is one semi-implicit Euler step (Gymnasium's) when the a
 with a motor, the paper's choice.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -60,10 +60,6 @@ FORCE = 1.0  # N
 MIN_POSITION, MAX_POSITION = -1.2, 0.6  # m
 MAX_SPEED = 0.07  # m/s
 GOAL = 0.5  # m
-
-
-class Options(NamedTuple):
-    """MountainCar has no options."""
 
 
 def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
@@ -95,7 +91,7 @@ def terminated(state: Entries) -> Any:
     return (state[0] >= GOAL) & (state[1] >= 0.0)
 
 
-def reward(state: Entries, force: Any, next_state: Entries, options: Options) -> Any:
+def reward(state: Entries, force: Any, next_state: Entries, options: Any) -> Any:
     """-1 a step."""
     return -1.0
 
@@ -159,12 +155,8 @@ TASK = Task(
     render_fps=30,
     integrators=("semi-implicit",),
     state_names=("x [m]", "x_dot [m/s]"),
-    qpos=(0,),
-    qvel=(1,),
-    action_space=spaces.Discrete(3),
     observation_names=("position", "velocity"),
     observation_space=spaces.Box(_LOW, _HIGH, dtype=np.float32),
-    options=Options,
     initial_bounds=initial_bounds,
     initial_state=initial_state,
     observation=observation,

@@ -45,7 +45,7 @@ with a motor, the paper's choice.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -60,16 +60,12 @@ FORCE = 1.0  # N
 GOAL = 0.45  # m
 
 
-class Options(NamedTuple):
-    """MountainCarContinuous has no options."""
-
-
 def terminated(state: Entries) -> Any:
     """The car is at the flag or beyond, and not rolling back."""
     return (state[0] >= GOAL) & (state[1] >= 0.0)
 
 
-def reward(state: Entries, force: Any, next_state: Entries, options: Options) -> Any:
+def reward(state: Entries, force: Any, next_state: Entries, options: Any) -> Any:
     """100 at the goal, minus the square of the force delivered."""
     return 100.0 * terminated(next_state) - 0.1 * (force * force)
 
@@ -97,7 +93,6 @@ TASK = dataclasses.replace(
     max_force=FORCE,
     forces=None,
     action_space=spaces.Box(-FORCE, FORCE, (1,), np.float32),
-    options=Options,
     reward=reward,
     terminated=terminated,
     goal=terminated,

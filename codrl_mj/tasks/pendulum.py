@@ -47,7 +47,7 @@ the installed Gymnasium (the paper says explicit).
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -66,10 +66,6 @@ MAX_SPEED = 8.0  # rad/s
 GOAL_ANGLE = 0.1  # rad
 GOAL_SPEED = 0.1  # rad/s
 GOAL_HOLD = 1.0  # s
-
-
-class Options(NamedTuple):
-    """Pendulum has no options."""
 
 
 def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
@@ -110,7 +106,7 @@ def goal(state: Entries) -> Any:
     return (np.abs(upright_angle(state)) < GOAL_ANGLE) & (np.abs(state[1]) < GOAL_SPEED)
 
 
-def reward(state: Entries, force: Any, next_state: Entries, options: Options) -> Any:
+def reward(state: Entries, force: Any, next_state: Entries, options: Any) -> Any:
     """Minus the squares of angle, speed and torque: the state's before the step, the torque's delivered in it."""
     angle, speed = upright_angle(state), state[1]
     return -(angle * angle + 0.1 * (speed * speed) + 0.001 * (force * force))
@@ -134,7 +130,6 @@ TASK = Task(
     name="pendulum",
     env_id="codrl_mj/Pendulum-v0",
     max_episode_steps=200,
-    reward_threshold=None,
     agent="ddpg",
     gymnasium_id="Pendulum-v1",
     twin=Twin,
@@ -142,16 +137,11 @@ TASK = Task(
     step_duration=0.05,
     motor_inner_steps=1,
     max_force=MAX_TORQUE,
-    forces=None,
     render_fps=30,
     integrators=("semi-implicit",),
     state_names=("theta [rad]", "theta_dot [rad/s]"),
-    qpos=(0,),
-    qvel=(1,),
-    action_space=spaces.Box(-MAX_TORQUE, MAX_TORQUE, (1,), np.float32),
     observation_names=("cos_angle", "sin_angle", "angular_velocity"),
     observation_space=spaces.Box(-_HIGH, _HIGH, dtype=np.float32),
-    options=Options,
     initial_bounds=initial_bounds,
     initial_state=initial_state,
     observation=observation,

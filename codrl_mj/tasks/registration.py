@@ -33,7 +33,6 @@ def register(task: Task) -> Task:
         raise ValueError(f"task {task.name!r} is registered already, of {reference_of(TASKS[task.name])}: rename one")
     if task.name not in TASKS and task.env_id in registry:
         raise ValueError(f"environment id {task.env_id!r} is registered already: choose another for task {task.name!r}")
-    TASKS[task.name] = task
     if task.env_id not in registry:
         register_with_gymnasium(
             id=task.env_id,
@@ -43,6 +42,7 @@ def register(task: Task) -> Task:
             max_episode_steps=task.max_episode_steps,
             reward_threshold=task.reward_threshold,
         )
+    TASKS[task.name] = task
     return task
 
 

@@ -84,6 +84,11 @@ class TrainConfig:
         """What is trained through; with several motors, or patterns of them, a tuple."""
         return self.env.actuator
 
+    @property
+    def actuators(self) -> tuple[Any, ...]:
+        """The same, always as a tuple."""
+        return self.actuator if isinstance(self.actuator, tuple) else (self.actuator,)
+
     @classmethod
     def preset(
         cls,

@@ -29,7 +29,9 @@ def draw_learning_curve(path: Path, config: TrainConfig, episodes: np.ndarray, r
         starts = np.maximum(0, ends - WINDOW)
         axes.plot(steps, (sums[ends] - sums[starts]) / (ends - starts), color="C0", label=f"mean of {WINDOW}")
     column = {name: reports[:, index] for index, name in enumerate(REPORT_COLUMNS)}
-    axes.plot(column["steps"], column["evaluation_return"], color="C1", drawstyle="steps-post", label="evaluations")
+    evaluated = np.isfinite(column["evaluation_return"])
+    evaluations = column["steps"][evaluated], column["evaluation_return"][evaluated]
+    axes.plot(*evaluations, "o-", color="C1", markersize=3, label="evaluations")
     axes.set(xlabel="environment steps", ylabel="return", title=f"{config.agent.name.upper()} on {config.task}")
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right", fontsize="small")

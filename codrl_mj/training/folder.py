@@ -7,18 +7,19 @@ import hashlib
 import importlib.metadata
 import platform
 import re
+import shutil
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from codrl_mj.actuators import trusting
-from codrl_mj.runs.files import leftovers, read_json, sealed, write_json
-from codrl_mj.runs.layout import CONFIG, EVALUATION, POLICY_FILES, PROGRESS, RESULT
+from codrl_mj.actuators import label_of, labelled, trusting
+from codrl_mj.runs.files import check_writable, leftovers, read_json, sealed, write_json
+from codrl_mj.runs.layout import BEST, CONFIG, EVALUATION, POLICY_FILES, PROGRESS, RESULT, finished
 from codrl_mj.training.config import TrainConfig
 
 EPISODES, CURVE = "episodes.csv", "learning_curve.png"
-CHECKPOINTS, BEST, TENSORBOARD, LOCK = "checkpoints", "best", "tensorboard", ".lock"
+CHECKPOINTS, TENSORBOARD, LOCK = "checkpoints", "tensorboard", ".lock"
 
 CHECKPOINT = re.compile(r"step-(?P<step>\d{12})-(?P<digest>[0-9a-f]{16})\.safetensors")
 """Names of checkpoints."""
@@ -44,20 +45,74 @@ def load_config(run: Path, trust: bool = False) -> TrainConfig:
     content = read_json(run / CONFIG, "run configuration")
     try:
         with trusting(trust):
-            return TrainConfig.from_mapping(content["train"], whole=True)
+            config = TrainConfig.from_mapping(content["train"], whole=True)
+        for actuator, label in zip(config.actuators, content.get("labels", ()), strict=False):
+            labelled(actuator, label)
+        return config
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{run / CONFIG}: not a run configuration: {error}") from None
 
 
+def admit(run: Path, config: TrainConfig, resume: bool, accept_changes: bool) -> bool:
+    """Find out, before anything is made or compiled, whether a training can begin or go on in a folder.
+
+    Returns:
+        Whether there is a training to go on with, finished or not.
+
+    Raises:
+        FileExistsError: there is something in the folder, and `resume` is False.
+        OSError: nothing can be written there.
+        RunInUseError: another process trains in it.
+        ValueError: the training in it is another one, see `check_same`.
+    """
+    check_writable(run)
+    if (run / LOCK).exists():
+        with owned(run):
+            pass
+    exists = (run / CONFIG).exists()
+    if resume and exists:
+        check_same(run, config, accept_changes)
+    elif run.exists() and not unused(run):
+        remedy = "continue it with --resume, " if exists and not finished(run) else ""
+        raise FileExistsError(f"run folder {run} exists already: {remedy}choose another --out, or delete it")
+    return resume and exists
+
+
 def unused(run: Path) -> bool:
-    """Whether no training has begun in a folder: it is empty, or who was to begin was killed before."""
-    return {path.name for path in run.iterdir()} <= {LOCK, *(path.name for path in _leftovers(run))}
+    """Whether nothing was learned in a folder: it is empty, or has what is there before the first checkpoint."""
+    before = {LOCK} | ({CONFIG, PROGRESS, EPISODES, TENSORBOARD} if (run / CONFIG).exists() else set())
+    half = {path.name for path in _leftovers(run)}
+    empty = {name for name in (CHECKPOINTS, BEST) if {*_files_of(run / name)} <= {*_leftovers(run / name)}}
+    return {path.name for path in run.iterdir()} <= before | half | empty
+
+
+def _files_of(folder: Path) -> list[Path]:
+    return list(folder.iterdir()) if folder.is_dir() else []
 
 
 def remove_leftovers(run: Path) -> None:
     """Delete what a killed process left half-written. Only for who owns the folder: others' are in use."""
     for path in [*_leftovers(run), *_leftovers(run / BEST), *_leftovers(run / CHECKPOINTS)]:
         path.unlink(missing_ok=True)
+
+
+def clear(run: Path) -> None:
+    """Empty a folder that is `unused`, but for the lock of who owns it."""
+    for path in _files_of(run):
+        if path.is_dir():
+            shutil.rmtree(path)
+        elif path.name != LOCK:
+            path.unlink()
+
+
+def standing(run: Path) -> str:
+    """What there is to go on from in the folder of a training that was broken off, and how."""
+    steps = [int(match["step"]) for path in _files_of(run / CHECKPOINTS) if (match := CHECKPOINT.fullmatch(path.name))]
+    if steps:
+        return f"Its last checkpoint is of step {max(steps):,}: continue with codrl-mj train --resume {run}"
+    if (run / BEST / EVALUATION).exists():
+        return f"It has no checkpoint to continue from, only its best policy so far, in {run / BEST}: start it anew"
+    return "It had no checkpoint yet, and nothing of it is left: start it anew"
 
 
 def _leftovers(place: Path) -> list[Path]:
@@ -67,7 +122,9 @@ def _leftovers(place: Path) -> list[Path]:
 
 def start_folder(run: Path, config: TrainConfig) -> None:
     """Write what the run is, before anything else is in the folder."""
-    write_json(run / CONFIG, sealed({"train": config.as_mapping(), **provenance(config)}))
+    labels = [label_of(one) for one in config.actuators]
+    known = {"labels": labels} if any(labels) else {}
+    write_json(run / CONFIG, sealed({"train": config.as_mapping(), **provenance(config), **known}))
 
 
 def check_same(run: Path, config: TrainConfig, accept_changes: bool) -> None:

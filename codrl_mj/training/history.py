@@ -28,9 +28,10 @@ class Progress:
     mean_length: float
     """Mean length of the same episodes [steps]."""
     torque_error: float
-    """Root mean square of desired minus delivered torque at the motor shaft [N*m] since the last report."""
+    """Root mean square of desired minus delivered torque at the motor shaft [N*m] at the ends of the environment steps
+    since the last report; an evaluation's is over all integration steps."""
     evaluation_return: float
-    """Mean return of the last evaluation (NaN before the first)."""
+    """Mean return of the evaluation that took place then (NaN where none did)."""
     steps_per_second: float
     """Environment steps per second since training started or was continued."""
     seconds: float

@@ -68,19 +68,15 @@ def train(
 
     Raises:
         FileExistsError: `out` exists and `resume` is False; nothing in it was touched.
+        OSError: `out` cannot be written.
         ValueError: the configuration cannot be trained, for instance because the actuator is unstable; or the run in
             `out` has another one, or was started with other software.
         RunInUseError: another process trains in `out`.
         TrainingStoppedError: a signal asked to stop.
     """
-    exists = (out / folder.CONFIG).exists()
-    if out.exists() and not (resume and (exists or folder.unused(out))):
-        remedy = "continue it with --resume, " if exists and not finished(out) else ""
-        raise FileExistsError(f"run folder {out} exists already: {remedy}choose another --out, or delete it")
-    if exists:
-        folder.check_same(out, config, accept_changes)
-        if finished(out):
-            return out
+    exists = folder.admit(out, config, resume, accept_changes)
+    if exists and finished(out):
+        return out
     if wandb is not None and importlib.util.find_spec("wandb") is None:
         raise ValueError(f"wandb = {wandb!r}: Weights & Biases is not installed: pip install wandb")
     import torch
@@ -89,16 +85,14 @@ def train(
     from codrl_mj.training.watcher import LearningEnded, Watcher
 
     torch.set_num_threads(1)  # networks this small run several times slower on two
-    with contextlib.closing(_make_envs(config)) as envs:
-        model = config.agent.make_model(envs, config.seed)
-        with folder.owned(out), stopping(signal.SIGINT, signal.SIGTERM) as stop, _reporting_to(wandb, out, config):
-            if (out / folder.CONFIG).exists() != exists or finished(out):
-                raise RunInUseError(f"{out}: another process trained in it in the meantime; start again")
-            folder.remove_leftovers(out)
-            if not exists:
-                folder.start_folder(out, config)
+    with _taking(out, exists), stopping(signal.SIGINT, signal.SIGTERM) as stop:
+        envs = _make_envs(config)
+        with contextlib.closing(envs), _reporting_to(wandb, out, config):
+            model = config.agent.make_model(envs, config.seed)
             watcher = Watcher(config, out, stop, on_progress, tensorboard)
-            with _saying_how_to_continue(out), contextlib.closing(watcher):
+            with contextlib.closing(watcher), watcher.explaining():
+                if not exists:
+                    folder.start_folder(out, config)
                 with contextlib.suppress(LearningEnded):
                     model.learn(_step_limit(config), callback=watcher, log_interval=None)
                 if stop.signal is not None and not watcher.complete:
@@ -108,6 +102,33 @@ def train(
                     )
                 _finish(config, out, model, watcher)
     return out
+
+
+@contextlib.contextmanager
+def _taking(out: Path, exists: bool) -> Iterator[None]:
+    """Own a run folder while the block runs, and leave none in which nothing was learned when it raises.
+
+    Raises:
+        RunInUseError: another process trains in it, or has in the meantime.
+    """
+    made = [path for path in (out, *out.parents) if not path.exists()]
+    with folder.owned(out):
+        if finished(out) or not ((out / folder.CONFIG).exists() if exists else folder.unused(out)):
+            raise RunInUseError(f"{out}: another process trained in it in the meantime; start again")
+        folder.remove_leftovers(out)
+        if not exists:
+            folder.clear(out)
+        try:
+            yield
+        except TrainingStoppedError:
+            raise
+        except BaseException:
+            if folder.unused(out):
+                folder.clear(out)
+                (out / folder.LOCK).unlink()
+                for path in made:
+                    path.rmdir()
+            raise
 
 
 def _make_envs(config: TrainConfig) -> Any:
@@ -139,22 +160,6 @@ def _finish(config: TrainConfig, out: Path, model: Any, watcher: Any) -> None:
     write_json(out / folder.EVALUATION, sealed(watcher.evaluation.as_mapping()))
     draw_learning_curve(out / folder.CURVE, config, watcher.episodes.array(), watcher.reports.array())
     folder.write_result(out, watcher.result())
-
-
-@contextlib.contextmanager
-def _saying_how_to_continue(out: Path) -> Iterator[None]:
-    """Add to the error of a file that could not be written, such as on a full disk, that nothing is lost.
-
-    Raises:
-        OSError: with the run folder's name.
-    """
-    try:
-        yield
-    except OSError as error:
-        raise OSError(
-            f"training in {out} was broken off: {error}. Its last checkpoint is intact: once the cause is mended, "
-            f"continue with codrl-mj train --resume {out}"
-        ) from error
 
 
 @contextlib.contextmanager

@@ -1,9 +1,10 @@
 """Watches a model learn: records, reports, evaluates, writes checkpoints, and stops it."""
 
+import contextlib
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,8 @@ from codrl_mj.training.state import State, capture, restore
 
 REPORT_INTERVAL = 1000
 """Environment steps between two reports; the next end of a rollout counts."""
-_REMEMBERED = ("marks", "squares", "samples", "best", "evaluation_return")
+_RATES = ("learning_rate", "critic_learning_rate", "step_size")
+_REMEMBERED = ("marks", "squares", "samples", "best")
 
 
 class LearningEnded(Exception):  # noqa: N818 - no error
@@ -55,7 +57,6 @@ class Watcher(BaseCallback):
         self._marks = {"report": 0, "evaluation": 0, "checkpoint": 0}
         self._squares, self._samples = 0.0, 0  # of the torque error since the last report
         self._best = {"return": -math.inf, "steps": 0}
-        self._evaluation_return = math.nan
         self._seconds_before, self._steps_before, self._start = 0.0, 0, time.perf_counter()
         self._identity = json.dumps(config.as_mapping(), sort_keys=True)
         self._resumed: State | None = None
@@ -126,6 +127,39 @@ class Watcher(BaseCallback):
         steps = self._config.total_steps
         return self._episodes_done or (steps is not None and self.model.num_timesteps >= steps)
 
+    @contextlib.contextmanager
+    def explaining(self) -> Iterator[None]:
+        """Say why the block could not go on: a full disk and its like, a second Ctrl-C, weights that are no numbers.
+
+        Raises:
+            OSError: what could not be written, with what there is to go on from.
+        """
+        try:
+            yield
+        except OSError as error:
+            raise OSError(f"training in {self._out} was broken off: {error}. {folder.standing(self._out)}") from error
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(f"stopped at once. {folder.standing(self._out)}") from None
+        except Exception:
+            self._check_weights()
+            raise
+
+    def _check_weights(self) -> None:
+        """Raise if a weight is no finite number, before that is kept.
+
+        Raises:
+            FloatingPointError: as it says, with what makes it likely.
+        """
+        model = getattr(self, "model", None)  # not before learning begins
+        if model is None or all(tensor.isfinite().all() for tensor in model.policy.state_dict().values()):
+            return
+        agent = self._config.agent.as_mapping()
+        rates = [f"agent.{name} = {agent[name]:g}" for name in _RATES if agent.get(name)]
+        raise FloatingPointError(
+            f"the weights of {agent['name']} became no finite numbers by step {self.model.num_timesteps:,}: learning "
+            f"diverged. Lower {' or '.join(rates)}, or scale the rewards down"
+        )
+
     # -- between two rollouts -----------------------------------------------------------------------------
 
     def boundary(self, stopping: bool = False, last: bool = False) -> None:
@@ -137,11 +171,16 @@ class Watcher(BaseCallback):
         """
         if self.model.num_timesteps == 0:
             return
-        if self._due("evaluation", self._config.evaluation_interval) or last:
+        evaluation = self._due("evaluation", self._config.evaluation_interval) or last
+        report = self._due("report", REPORT_INTERVAL) or evaluation
+        checkpoint = self._due("checkpoint", self._config.checkpoint_interval) or last or stopping
+        if report or checkpoint:
+            self._check_weights()
+        if evaluation:
             self._evaluate()
-        if self._due("report", REPORT_INTERVAL) or last:
-            self._report()
-        if self._due("checkpoint", self._config.checkpoint_interval) or last or stopping:
+        if report:
+            self._report(evaluation)
+        if checkpoint:
             self._save()
 
     def _due(self, what: str, interval: int) -> bool:
@@ -158,14 +197,13 @@ class Watcher(BaseCallback):
             config.evaluation_episodes,
             EVALUATION_SEED,
         )
-        self._evaluation_return = self.evaluation.returns.mean
-        if self._evaluation_return > self._best["return"]:
-            self._best = {"return": self._evaluation_return, "steps": self.model.num_timesteps}
+        if self.evaluation.returns.mean > self._best["return"]:
+            self._best = {"return": self.evaluation.returns.mean, "steps": self.model.num_timesteps}
             best = self._out / folder.BEST
             save_policy(self.model.policy, config.agent, best)
             write_json(best / folder.EVALUATION, sealed(self.evaluation.as_mapping()))
 
-    def _report(self) -> None:
+    def _report(self, evaluated: bool) -> None:
         if self.reports.last("steps") == self.model.num_timesteps:
             return  # killed after the last report, before the run was marked as finished
         elapsed = time.perf_counter() - self._start
@@ -175,7 +213,7 @@ class Watcher(BaseCallback):
             mean_return=self.episodes.last_mean("return"),
             mean_length=self.episodes.last_mean("length"),
             torque_error=math.sqrt(self._squares / self._samples) if self._samples else math.nan,
-            evaluation_return=self._evaluation_return,
+            evaluation_return=self.evaluation.returns.mean if self.evaluation and evaluated else math.nan,
             steps_per_second=(self.model.num_timesteps - self._steps_before) / elapsed,
             seconds=self._seconds_before + elapsed,
         )
@@ -184,7 +222,8 @@ class Watcher(BaseCallback):
         self.reports.flush()
         self.episodes.flush()
         for name in REPORT_COLUMNS[1:]:
-            self.logger.record(f"run/{name}", getattr(progress, name))
+            if not math.isnan(value := getattr(progress, name)):
+                self.logger.record(f"run/{name}", value)
         self.logger.dump(self.model.num_timesteps)
         if self._on_progress is not None:
             self._on_progress(progress)
@@ -204,7 +243,7 @@ class Watcher(BaseCallback):
             "steps": self.model.num_timesteps,
             "episodes": len(self.episodes),
             "mean_return": self.episodes.last_mean("return"),
-            "evaluation_return": self._evaluation_return,
+            "evaluation_return": self.evaluation.returns.mean if self.evaluation else math.nan,
             "best": self._best,
             "seconds": self._seconds_before + time.perf_counter() - self._start,
         }
@@ -214,5 +253,5 @@ class Watcher(BaseCallback):
         for name in ("episodes", "reports"):
             if hasattr(self, name):
                 getattr(self, name).close()
-        if self.model is not None and hasattr(self.model, "_logger"):
+        if hasattr(getattr(self, "model", None), "_logger"):  # learning may not have begun
             self.logger.close()

@@ -50,7 +50,6 @@ TASK = codrl_mj.register(
         integrators=("rk4",),
         state_names=("beam [rad]", "ball [m]", "beam_dot [rad/s]", "ball_dot [m/s]"),
         observation_names=("beam", "ball", "beam_dot", "ball_dot"),
-        speeds=(2,),
         initial_bounds=initial_bounds,
         initial_state=initial_state,
         observation=observation,

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 import codrl_mj
@@ -52,6 +53,13 @@ def responses(one, timestep, torques, speeds):
     return found
 
 
+def limits_of(signals):
+    """Names of the limits that a step met; `saturated` says whether there are any."""
+    met = [name for name in ("voltage", "current", "temperature") if getattr(signals, f"{name}_saturated")]
+    assert signals.saturated == float(bool(met))
+    return " ".join(met)
+
+
 @every_winding
 def test_the_winding_is_exact_and_what_is_delivered_is_its_mean(name):
     """Against the matrix exponential of current and charge, sample by sample, under the voltages of the same loop."""
@@ -81,6 +89,47 @@ def test_the_winding_is_exact_and_what_is_delivered_is_its_mean(name):
         assert abs(signals.voltage - volts / 40) < 1e-12 * voltage
 
 
+@pytest.mark.parametrize(
+    ("loop", "supply", "commanded"),
+    [
+        ({}, 0.0, False),
+        ({"bemf_compensation": False}, 0.0, False),
+        ({"anti_windup": "clamping", "delayed": True, "deadband": 0.3}, 0.5, False),
+        ({"max_current": 0.4}, 0.0, False),
+        ({}, 0.0, True),
+    ],
+    ids=["closed_form", "uncompensated", "stepped", "limited", "voltage"],
+)
+def test_what_is_drawn_is_heat_work_and_field_as_a_fine_integration_has_them(loop, supply, commanded):
+    """Volts times amperes and R*i^2 within the samples, by scipy under the voltages of a loop that is seen in each."""
+    resistance, inductance, constant, voltage = WINDINGS["qube"]
+    one, samples, rng = drive("qube", **loop), 40, np.random.default_rng(2)
+    one = dataclasses.replace(one, supply=Supply(voltage, supply))
+    torques = rng.uniform(-1.5, 1.5, 5) * constant * (voltage if commanded else voltage / resistance)
+    speeds = rng.uniform(-0.8, 0.8, 5) * voltage / constant
+    one = one.commands()["voltage"].actuator if commanded else one
+    whole = [step[2] for step in responses(one, samples / 20e3, torques, speeds)]
+    fine = responses(one, 1 / 20e3, np.repeat(torques, samples), np.repeat(speeds, samples))
+    volts, starts = [step[2].voltage for step in fine], np.append(0.0, [step[0].current for step in fine])
+    energies = []
+    for number, back_emf in enumerate(np.repeat(constant * speeds, samples)):
+
+        def flow(_, y, u=volts[number], b=back_emf):
+            return [(u - b - resistance * y[0]) / inductance, u * y[0], resistance * y[0] ** 2]
+
+        found = solve_ivp(flow, (0.0, 1 / 20e3), [starts[number], 0.0, 0.0], rtol=1e-12, atol=1e-15)
+        energies.append(found.y[1:, -1])
+    drawn, heat = np.array(energies).reshape(5, samples, 2).sum(axis=1).T * 20e3 / samples
+    watts = voltage**2 / resistance
+    np.testing.assert_allclose([step.electrical_power for step in whole], drawn, rtol=0, atol=1e-9 * watts)
+    np.testing.assert_allclose([step.copper_loss for step in whole], heat, rtol=0, atol=1e-9 * watts)
+    moved = constant * speeds * [step.current for step in whole]
+    field = np.diff(0.5 * inductance * starts[::samples] ** 2) * 20e3 / samples
+    balance = [step.electrical_power - step.copper_loss for step in whole] - moved - field
+    np.testing.assert_allclose(balance, 0.0, atol=1e-13 * watts)
+    assert all(step.copper_loss >= resistance * step.current**2 for step in whole)
+
+
 _share = st.floats(0.0, 1.0)
 
 
@@ -105,17 +154,18 @@ def test_the_closed_form_is_the_stepping(name, rate, bandwidth, samples, command
         reference, back_emf = ((2 * one - 1) * amplitude * voltage for one in (reference, 0.4 * back_emf))
         reference /= resistance
         limits = ((sign * voltage - back_emf) / resistance for sign in (-1, 1))
-        current, integral, total, _ = jump(
+        current, integral, total, drawn, _ = jump(
             current, integral, reference, *limits, samples, x, bandwidth, -math.expm1(-x)
         )
-        winding = (voltage, 0.0, 0.0, samples, resistance, math.exp(-x))
-        stepped, volts, _, expected, _ = run_samples(
+        winding = (voltage, 0.0, 0.0, samples, resistance, math.exp(-x), -math.expm1(-x) / x)
+        stepped, volts, _, expected, expected_drawn, _ = run_samples(
             stepped, volts, 0.0, reference, back_emf, back_emf, *winding, kp, ki, 0.0, 0.0
         )
         unit = voltage / resistance * max(1.0, amplitude)
         assert abs(current - stepped) <= 1e-13 * unit
         assert abs(integral - volts / resistance) <= 1e-13 * unit
         assert abs(total - expected) <= 1e-13 * unit * samples
+        assert abs(drawn - expected_drawn) <= 1e-12 * unit**2 * samples
 
 
 @every_winding
@@ -194,7 +244,7 @@ def test_stall_and_no_load_are_the_datasheet_s(name):
     one = drive(name)
     stall = responses(one, 0.02, [1e3] * 50, [0.0] * 50)[-1]
     assert stall[1] == pytest.approx(constant * voltage / resistance, rel=1e-6)
-    assert stall[2].saturated == 1.0
+    assert limits_of(stall[2]) == "voltage"
     no_load = responses(one, 0.02, [1e3] * 50, [voltage / constant] * 50)[-1]
     assert abs(no_load[1]) < 1e-6 * stall[1]
 
@@ -236,7 +286,7 @@ def test_the_largest_current_is_kept():
     one = drive("qube", max_current=0.3)
     steps = responses(one, 0.002, [1.0, -1.0, 0.042 * 0.2], [0.0] * 3)
     assert [step[2].reference_current for step in steps] == [0.3, -0.3, pytest.approx(0.2)]
-    assert [step[2].saturated for step in steps[:2]] == [1.0, 1.0]
+    assert [limits_of(step[2]) for step in steps] == ["current", "current", ""]
     assert abs(steps[0][0].current) <= 0.3
 
 

@@ -11,7 +11,7 @@ from scipy import signal
 
 import codrl_mj
 from codrl_mj import Servo, ServoLoop, Uniform
-from codrl_mj.actuators import GearMotor, SampledLoop, Supply
+from codrl_mj.actuators import GearMotor, Inputs, SampledLoop, Supply, parameters_type
 from tests.matrix import but
 
 INERTIA, RATIO = 0.02, 10.0
@@ -226,3 +226,26 @@ def test_servos_in_a_vector_are_the_servos_alone():
         (*one_step, infos), (*other, expected) = ours.step(action), alone.step(action)
         np.testing.assert_array_equal(one_step[0], other[0])
         np.testing.assert_array_equal(infos["error"], expected["error"])
+
+
+@pytest.mark.parametrize(
+    ("limits", "met"),
+    [({}, ""), ({"max_torque": 0.05}, "current"), ({"max_current": 0.1}, "current"), ({"volts": 2.0}, "voltage")],
+)
+def test_a_servo_says_which_limit_it_met_and_what_it_drew(limits, met):
+    """At a held speed, over two samples of the outer loop: what is drawn is heat, work and the field of the winding."""
+    kinds = {name: limits[name] for name in limits if name == "max_torque"}
+    current = {name: limits[name] for name in limits if name == "max_current"}
+    loop = ServoLoop("velocity", servo_rate=1000.0, velocity_gain=0.05, **kinds)
+    one = Servo(MOTOR, SampledLoop(20e3, **current), Supply(limits.get("volts", 1e4)), loop)
+    parameters, state, speed = parameters_type(Servo)(*one.numbers), one.State(*[0.0] * 13), 20.0
+    motor, before = one.motor, 0.0
+    for target in (80.0, -60.0):
+        state, _, seen = one.advance(parameters, 0.002, state, Inputs(target, 0.0, speed, 0.0, 0.0, math.inf))
+        found = {name: getattr(seen, f"{name}_saturated") for name in ("voltage", "current", "temperature")}
+        assert found == {name: float(name == met) for name in found}
+        assert seen.saturated == float(met != "")
+        field = 0.5 * motor.inductance * (state.current**2 - before**2) / 0.002
+        moved = motor.back_emf_constant * speed * seen.current
+        assert seen.electrical_power == pytest.approx(seen.copper_loss + moved + field, rel=1e-12)
+        before = state.current

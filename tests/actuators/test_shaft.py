@@ -110,7 +110,8 @@ def test_a_drive_keeps_the_winding_s_limit_and_then_gives_the_continuous_current
     assert temperatures.max() < 100.0 + 0.1
     continuous = math.sqrt(80.0 / (20.0 * 8.4 * (1.0 + 0.00393 * 75.0)))
     assert found[-1].current == pytest.approx(continuous, rel=1e-3)
-    assert found[-1].saturated == 1.0
+    at_limit = found[-1].saturated, found[-1].temperature_saturated, found[-1].current_saturated
+    assert at_limit == (1.0, 1.0, 0.0)
     assert temperatures[-1] == pytest.approx(100.0, abs=0.1)
 
 

@@ -28,9 +28,9 @@ DEEP = (PPOConfig, *BUFFERED)
 
 # field -> (agents, least, whether it is allowed, most, whether it is allowed)
 INTERVALS = {
-    "learning_rate": (DEEP, 0, False, math.inf, False),
+    "learning_rate": (DEEP, 0, False, 1, True),
     "gamma": (DEEP, 0, False, 1, True),
-    "critic_learning_rate": ((PPOConfig, *CONTINUOUS), 0, False, math.inf, False),
+    "critic_learning_rate": ((PPOConfig, *CONTINUOUS), 0, False, 1, True),
     "gae_lambda": ((PPOConfig,), 0, True, 1, True),
     "clip_range": ((PPOConfig,), 0, False, math.inf, False),
     "entropy_coefficient": ((PPOConfig, SACConfig), 0, True, math.inf, False),

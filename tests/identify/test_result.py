@@ -1,5 +1,6 @@
 """What comes out: an actuator's file, refusals, draws within intervals, the command line."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -11,7 +12,7 @@ from codrl_mj.actuators import Drive, identified_ranges, resolve
 from codrl_mj.cli import main
 from codrl_mj.cli.environments import environment
 from codrl_mj.cli.train import train_verb
-from codrl_mj.identify import identify
+from codrl_mj.identify.identify import checked, foreseen, identify
 from codrl_mj.identify.result import Estimate, Identified
 from codrl_mj.identify.segments import replaced
 from tests.identify import bench
@@ -64,7 +65,7 @@ def test_a_number_that_was_not_identified_is_refused_until_it_is_given(tmp_path,
 
 def test_what_the_logs_do_not_tell_is_asked_for_or_taken_from_a_motor():
     friction = Estimate("coulomb_friction", 1e-3, 5e-4, 2e-3, "identified")
-    with pytest.raises(ValueError, match="resistance: these logs say nothing of it"):
+    with pytest.raises(ValueError, match=r"resistance, .*: these logs say nothing of them"):
         identified(friction).actuator()
     whole = identified(friction, base=Drive().as_mapping()).actuator()
     assert whole == Drive().replaced({"motor.coulomb_friction": 1e-3})
@@ -80,6 +81,35 @@ def test_a_motor_with_a_gear_is_identified_at_its_rotor(known):
     assert (found["gear_ratio"].value, found["gear_ratio"].status) == (20.0, "given")
     assert found["back_emf_constant"].value == pytest.approx(bench.CONSTANT, rel=0.01)
     assert found["rotor_inertia"].value == pytest.approx(bench.INERTIA, rel=0.05)
+
+
+def test_all_that_is_refused_and_all_that_is_missing_is_named_at_once():
+    bad = {name: Estimate(name, 1.0, 0.1, 9.0, "refused", "wide") for name in ("resistance", "coulomb_friction")}
+    problem = motor(**bad).problem()
+    assert problem.endswith("Give them with --known resistance=VALUE coulomb_friction=VALUE")
+    lost = dataclasses.replace(motor(**bad), unexplained=0.89).problem()
+    assert "leaves 89% of what moves" in lost
+    assert "--known" not in lost
+    none = identified(Estimate("resistance", 1.0, 0.9, 1.1, "identified")).problem()
+    assert "inductance, torque_constant, back_emf_constant, rotor_inertia: these logs say nothing of them" in none
+    assert "load_inertia=VALUE, 0 for a motor alone" in none
+
+
+def test_the_supply_is_that_of_the_logs_and_is_said(tmp_path):
+    found = dataclasses.replace(motor(), supply=5.02)
+    assert resolve(str(found.write(tmp_path)[0]), None, "a test").voltage_limit == 5.02
+    assert found.supply_text.startswith("supply 5.02 V: the largest of the logs")
+    assert json.loads((tmp_path / "result.json").read_text())["supply"] == 5.02
+    assert "assumed" in motor().supply_text
+
+
+def test_a_rig_that_is_not_said_and_what_will_be_missing_are_told_before_the_fit():
+    log = bench.motor_log("sine", duration=0.5)
+    with pytest.raises(ValueError, match=r"--rig on the command line, rig= in Python.*pendulum, free or load"):
+        checked([log])
+    assert "rotor_inertia" in foreseen([log], {}, None)
+    assert "0 for a motor alone" in foreseen([log], {}, None)
+    assert foreseen([log], {"load_inertia": 0.0}, None) is foreseen([log], {}, Drive().as_mapping()) is None
 
 
 def test_only_files_of_identified_actuators_have_ranges(tmp_path):
@@ -102,9 +132,13 @@ def test_the_command_line_identifies_and_draws_within_the_intervals(tmp_path, ca
     columns = "time=t:s,voltage=mean(voltage):V,current=current:A,position=position:rad"
     out = tmp_path / "motor"
     known = ["--known", "torque_constant=0.05", "back_emf_constant=0.05", "rotor_inertia=2e-5"]
-    given = ["identify", log, "--columns", columns, *known, "--out", str(out)]
+    wrong = bench.motor_log("locked", duration=1.0)
+    wrong = write_csv(tmp_path / "wrong.csv", replaced(wrong, "current", -wrong.signals["current"]))
+    given = ["identify", log, "--columns", columns, *known, "--out", str(out), "--holdout", wrong]
     assert main(given) == 0
     shown = capsys.readouterr().out
+    assert "wrong, which is held out, has errors, and is left out" in shown
+    assert "supply 3 V: the largest of the logs" in shown
     assert "resistance" in shown
     assert "identified" in shown
     actuator = str(out / "actuator.yaml")

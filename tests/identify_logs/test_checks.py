@@ -11,6 +11,8 @@ from codrl_mj.actuators import Drive, GearMotor, SampledLoop, Supply
 from codrl_mj.identify.checks import check
 from codrl_mj.identify.contradictions import FACTORS, name_of_factor
 from codrl_mj.identify.excitations import Excitation
+from codrl_mj.identify.log import Log
+from codrl_mj.identify.simulation import Moved, moving
 from codrl_mj.identify.synthetic import Load, Sampler, Sensor, run, simulate
 
 MOTORS = {
@@ -120,6 +122,40 @@ def test_a_wrong_unit_is_found(name):
     assert found(UNITS[name](logged()), "unit")
 
 
+@pytest.mark.parametrize("amplitude", [6.0, 2.0])
+@pytest.mark.parametrize("signal", ["torque", "current"])
+def test_degrees_for_radians_are_an_error_by_the_encoder_and_by_gravity(amplitude, signal):
+    clean = simulate(drive_of("geared"), Excitation("slow_sine", amplitude, 4.0), Load(2e-2, gravity=0.8), {},
+                     Sampler(500.0))  # fmt: skip
+    clean = without(clean, "velocity", *{"torque", "current", "voltage"} - {signal})
+    (one,) = found(scaled(clean, position=180.0 / math.pi), "unit")
+    assert (one.severity, "gravity" in one.message, one.remedy) == ("error", True, "write position=column:deg")
+    assert found(clean, "unit") == []
+    encoder = without(logged(), "torque", "velocity")
+    (one,) = found(scaled(encoder, position=180.0 / math.pi), "unit")
+    assert (one.severity, "1/4096 of 360" in one.message) == ("error", True)
+    rounded = replaced(encoder, position=np.round(encoder.signals["position"], 2))
+    rounded = dataclasses.replace(rounded, resolution={**rounded.resolution, "position": 0.01})
+    assert [one.severity for one in found(rounded, "unit")] == ["warning"]  # decimals of a file may be of radians too
+
+
+@pytest.mark.parametrize(
+    ("make", "says", "severity"),
+    [
+        (lambda log: scaled(log, current=1000.0, voltage=3.0), "the resistance would be 0.00", "error"),
+        (lambda log: scaled(log, current=1000.0), "the current is up to ", "error"),
+        (lambda log: scaled(log, voltage=1000.0), "the voltage is up to ", "error"),
+        (lambda log: scaled(log, current=1e-5), "outside 0.005 to 1e4 ohm", "error"),
+        (lambda log: scaled(log, voltage=1 / 12.0), "is it a duty?", "warning"),
+    ],
+)
+def test_what_no_bench_has_is_found_without_a_datasheet(make, says, severity):
+    clean = without(logged(), "torque", "bus")
+    told = [one for one in found(make(clean), "unit") if says in one.message]
+    assert [one.severity for one in told] == [severity]
+    assert found(clean, "unit") == []
+
+
 @pytest.mark.matrix
 @pytest.mark.parametrize(("motor", "kind"), CLEAN)
 def test_wrong_signs_and_units_are_found_by_every_excitation(motor, kind):
@@ -129,14 +165,20 @@ def test_wrong_signs_and_units_are_found_by_every_excitation(motor, kind):
 
 
 def test_the_current_alone_needs_a_datasheet_for_its_unit():
-    log = without(scaled(logged(), current=1000.0), "torque")
+    log = without(scaled(logged(), current=100.0), "torque")
     assert found(log, "unit") == []
-    assert "thousandths" in found(log, "unit", MOTORS["small"])[0].message
+    assert "hundredths" in found(log, "unit", MOTORS["small"])[0].message
 
 
 @pytest.mark.parametrize("name", FACTORS)
 def test_factors_have_names(name):
-    assert name_of_factor(1.02 * FACTORS[name]) == name == name_of_factor(-0.98 / FACTORS[name])
+    assert name in name_of_factor(1.02 * FACTORS[name])
+    assert name in name_of_factor(-0.98 / FACTORS[name])
+
+
+def test_a_factor_that_may_be_several_things_is_said_to_be_any_of_them():
+    assert "rpm for rad/s (9.549) or kgf*cm for N*m (10.2) or a wrong scale" in name_of_factor(9.8)
+    assert "rpm" not in name_of_factor(9.43, angle=False)  # resistances have no angle
 
 
 def test_factors_without_a_name_may_be_gears():
@@ -248,6 +290,48 @@ def test_a_torque_that_does_not_move_it_is_found():
     assert found(log, "torque") == []
     other = np.random.default_rng(0).standard_normal(20)[np.arange(len(log.time)) // 251]
     assert found(replaced(log, torque=log.signals["torque"] + 0.3 * other), "torque")
+
+
+PUSHED = {  # J, m*g*l, Coulomb and viscous friction; torque of time; logged besides the torque
+    "below resonance": ((0.08, 2.3, 0.0, 0.39), lambda t: np.sin(np.pi * t), ["velocity"]),
+    "with friction": ((0.02, 1.3, 0.05, 0.2), lambda t: 0.5 * np.sin(np.pi * t), ["velocity"]),
+    "jerked": ((1e-3, 0.9, 0.2, 0.18), lambda t: np.where(t % 1.0 < 0.5, 1.0, -1.0), ["velocity"]),
+    "held nearly still": ((4e-4, 13.0, 0.03, 2e-3), lambda t: 0.25 * t, ["position", "velocity"]),
+    "held by a step": ((6e-4, 14.0, 0.3, 0.09), lambda t: np.ones(len(t)), ["position", "velocity"]),
+}
+
+
+def pushed(name, seed=0):
+    """A pendulum that a torque holds, or moves slowly: friction and gravity take nearly all of it."""
+    (inertia, mgl, coulomb, viscous), torque, signals = PUSHED[name]
+    time, random = np.arange(0.0, 4.0, 1e-3), np.random.default_rng(seed)
+    moved = Moved(inertia, mgl, 0.0, coulomb, viscous, 1.0, 0.0, 1.0, 2.0, 0.0, 1.0, 0.0)
+    position, velocity = moving()(time, torque(time), 0.0 * time, 0.0, 0.0, moved)
+    noisy = {"position": STEP * np.round(position / STEP), "velocity": velocity + 0.02 * random.standard_normal(4000)}
+    given = torque(time) + 0.005 * random.standard_normal(4000)
+    return Log(name, time, {"torque": given, **{one: noisy[one] for one in signals}}, {"position": STEP})
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("name", PUSHED)
+def test_a_pendulum_that_hardly_accelerates_is_not_said_to_have_a_wrong_sign_or_unit(name, seed):
+    assert [one for one in check(pushed(name, seed)) if one.severity == "error"] == []
+
+
+def test_the_rig_tells_a_sign_that_gravity_would_explain_too():
+    """A free rotor under a sine: with a minus it would be a pendulum."""
+    log = without(logged(kind="slow_sine"), "voltage", "current", "velocity")
+    (one,) = [one for one in check(scaled(log, torque=-1.0), rig="free") if one.check == "sign"]
+    assert "with a minus" in one.message
+    assert "zero" not in {one.check for one in check(replaced(log, position=log.signals["position"] + 1.0), rig="free")}
+
+
+def test_a_motor_that_holds_a_pendulum_is_not_said_to_have_two_constants():
+    motor = GearMotor(0.17, 1e-4, 0.09, 0.09, 6e-5, gear_ratio=6.0, coulomb_friction=0.02, viscous_friction=1e-4)
+    drive = Drive(motor, SampledLoop(), Supply(24.0))
+    volts = np.where(np.arange(1, 20 * 4000 + 2) > 10_000, 0.6, 0.0)
+    log = simulate(drive, volts, Load(0.146, gravity=9.53), {"position": Sensor(resolution=STEP)}, Sampler(RATE))
+    assert found(without(log, "velocity"), "unit") == []
 
 
 def test_a_held_or_one_way_shaft_is_told():

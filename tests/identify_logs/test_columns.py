@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from codrl_mj.identify import propose_columns, read_log
 from codrl_mj.identify.columns import parse_columns, twos_complement
 
 TABLE = {"t": np.array([0.0, 1.0]), "a": np.array([2.0, -3.0]), "b": np.array([5.0, 7.0]), "motor current": np.ones(2)}
@@ -93,3 +94,44 @@ def test_what_is_refused_says_why(text, says):
 def test_a_column_that_is_not_there_is_named():
     with pytest.raises(ValueError, match="unknown column"):
         value("current=c*2:A")
+
+
+@pytest.mark.parametrize(
+    ("lines", "columns", "doubt"),
+    [
+        (
+            "t [s],u [V],current(mA),pos_deg\n0,1,2,3\n1,2,3,4",
+            'time="t [s]":s,voltage="u [V]":V,current="current(mA)":mA,position=pos_deg:deg',
+            None,
+        ),
+        ("time;speed;current\nms;rpm;A\n0;1;2,5\n1;2;3,5", "time=time:ms,velocity=speed:rpm,current=current:A", None),
+        (
+            "t,u,i,q,spare\n0,1,2,3,9\n0.1,2,3,4,9",
+            "time=t:s,voltage=u:V,current=i:A,position=q:rad",
+            "spare: not known",
+        ),
+        (
+            "t,motorCurrent,angle\n0,900,0\n2,-800,90\n4,1,45",
+            "time=t:ms,current=motorCurrent:mA,position=angle:deg",
+            "deg is a",
+        ),
+        (
+            "t,duty,vbus\n0,0.5,12\n0.1,-0.5,12",
+            "time=t:s,duty=duty:1,bus=vbus:V,voltage=duty*vbus:V",
+            "share of the bus",
+        ),
+    ],
+)
+def test_columns_are_proposed_by_names_units_and_values(tmp_path, lines, columns, doubt):
+    path = tmp_path / "log.csv"
+    path.write_text(lines)
+    found = propose_columns(path)
+    assert found.columns == columns
+    assert found.doubts == () if doubt is None else doubt in " ".join(found.doubts)
+    read_log(path, found.columns)
+
+
+def test_without_a_time_nothing_is_proposed(tmp_path):
+    (tmp_path / "log.csv").write_text("a,u\n1,2\n")
+    with pytest.raises(ValueError, match=r"no time.* a, u"):
+        propose_columns(tmp_path / "log.csv")

@@ -51,6 +51,19 @@ def test_a_log_without_findings_says_so(capsys):
     assert "nothing is wrong" in said(capsys, f"check log.csv --columns {columns}")
 
 
+def test_columns_are_proposed_with_the_line_to_type_next(capsys):
+    said(capsys, "simulate quanser-qube-servo-2 --out log.csv --duration 1")
+    text = said(capsys, "columns log.csv")
+    assert "to be checked: current: no unit is stated, A is a guess" in text
+    line = text.splitlines()[-1].removeprefix("codrl-mj identify ")
+    assert "current=current:A" in line
+    assert line.endswith("--rig free --known load_inertia=0 --out motor")
+    said(capsys, f"check {line.partition(' --rig')[0]} --rig free")
+    columns = json.loads(said(capsys, "columns log.csv --json"))["columns"]
+    assert columns.startswith("time=time:s,current=current:A")
+    assert "rig is not given (--rig on the command line" in said(capsys, f"log.csv --columns {columns}", 2)
+
+
 def test_a_plan_is_printed_and_its_excitation_written(capsys, tmp_path):
     text = said(capsys, "plan maxon-ec45-flat-50w --inertia 1e-4 --duration 1 --out plan")
     assert "* play prbs" in text

@@ -31,6 +31,32 @@ def test_csv(tmp_path, separator):
     assert log.findings == ()
 
 
+BENCH = {
+    "comments": "# logged 2026-05-01\n# by us\nt,i\n0,1.5\n0.5,-2\n",
+    "a comment of names": "# t,i\n0,1.5\n0.5,-2\n",
+    "units": "t,i\ns,A\n0,1.5\n0.5,-2\n",
+    "decimal commas": "t;i\n0,0;1,5\n0,5;-2,0\n",
+    "decimal commas and units": "t;i\n[s];[A]\n0,0;1,5\n0,5;-2,0\n",
+    "stamps": "t,i\n2026-05-01T10:00:00.000,1.5\n2026-05-01T10:00:00.500,-2\n",
+    "stamps with a zone": "t,i\n2026-05-01 10:00:00.000Z,1.5\n2026-05-01 10:00:00.500Z,-2\n",
+    "times of day": "t\ti\n10:00:00.0\t1.5\n10:00:00.5\t-2\n",
+    "Latin-1": "t,i,Winkel [°]\n0,1.5,3\n0.5,-2,3\n",
+    "tabs": "t\ti\n0\t1.5\n0.5\t-2\n",
+    "blanks": "t   i\n0.0   1.5\n0.5  -2.0\n",
+    "an instrument's title": "My oscilloscope\nModel 5\nt,i\n0,1.5\n0.5,-2\n",
+}
+
+
+@pytest.mark.parametrize("suffix", ["csv", "txt", "dat"])
+@pytest.mark.parametrize("name", BENCH)
+def test_what_instruments_and_spreadsheets_write_is_read(tmp_path, name, suffix):
+    path = tmp_path / f"log.{suffix}"
+    path.write_bytes(BENCH[name].encode("latin-1"))
+    log = read_log(path, COLUMNS)
+    np.testing.assert_allclose(log.time, [0.0, 0.5], atol=1e-6)
+    np.testing.assert_array_equal(log.signals["current"], [1.5, -2.0])
+
+
 ROWS = {"t": [0.0, 1.0, 2.0], "i": [4.0, 5.0, 7.0]}
 ENTRIES = [dict(zip(ROWS, row, strict=True)) for row in zip(*ROWS.values(), strict=True)]
 
@@ -82,8 +108,8 @@ def test_a_register_with_a_sign_is_seen(tmp_path):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("t,i\n1,2\n2,a\n", "i in row 2 is 'a'"),
-        ("t;i\n1;2,5\n2;3,5\n", "decimal point"),
+        ("t,i\n1,2\n2,a\n", "column i in line 3 is 'a'"),
+        ('t,i\n1,"2,5"\n2,"3,5"\n', "decimal point"),
         ("t,t\n1,2\n", "name the columns"),
         ("t,i\n1,2\n", "cannot be used"),
         ("t,i\n3,2\n2,2\n1,2\n", "2 of 3 rows"),

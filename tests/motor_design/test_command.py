@@ -53,6 +53,7 @@ def is_png(path):
 
 def test_list_has_every_motor(capsys):
     text = printed(capsys, "list", "--sort", "stall_torque")
+    assert max(map(len, map(str.rstrip, text.splitlines()[:-1]))) <= 80
     first = [line.split()[0] for line in text.splitlines()[5:] if line.split()[:1] and line.split()[0] in motor_names()]
     assert sorted(first) == motor_names()
     assert first[0] == "heinzmann-pmg-132"
@@ -84,10 +85,41 @@ def test_show_says_where_every_number_is_from(capsys):
 
 def test_show_takes_a_datasheet_of_one_s_own_and_any_drive(capsys):
     Path("own.toml").write_text(OWN)
-    assert "we ours, brushed" in printed(capsys, "show", "own.toml", "--out", ".")
+    text = printed(capsys, "show", "own.toml", "--out", ".")
+    parts = (
+        "we ours, brushed",
+        "What it can do at its output, at 12 V",
+        "assumed",
+        "The motor, at its rotor",
+        "source 1",
+    )
+    assert sorted(parts, key=text.index) == list(parts)
     found = read(capsys, "show", "own.toml")
     assert {row["name"]: row["value"] for row in found["abilities"]}["stall_torque"] == pytest.approx(0.12)
     assert "numbers" not in read(capsys, "show", "codrl_mj:Drive")
+
+
+def test_a_file_is_written_filled_in_and_shown(capsys):
+    printed(capsys, "new", "mine.toml")
+    assert main(["motor", "new", "mine.toml"]) == 2
+    assert "mine.toml: is there already" in capsys.readouterr().err
+    assert main(["motor", "show", "mine.toml"]) == 2
+    assert "datasheet.resistance is not printed" in capsys.readouterr().err
+    text = Path("mine.toml").read_text()
+    for name, value in (
+        ("kv", "340 RPM/V"),
+        ("resistance", "64 mΩ"),
+        ("inductance", "30 µH"),
+        ("peak_current", "38 A"),
+    ):
+        text = text.replace(f'\n{name} = ""', f'\n{name} = "{value}"')
+    Path("mine.toml").write_text(text)
+    shown = printed(capsys, "show", "mine.toml")
+    assert "mine.toml: mine\n" in shown
+    assert "assumed, for none is given: supply.voltage = 24 V, motor.rotor_inertia = 0" in shown
+    assert "-0.0%" not in shown
+    found = {row["name"]: row["value"] for row in read(capsys, "show", "mine.toml")["abilities"]}
+    assert found["peak_torque"] == pytest.approx(38.0 * 60.0 / (2.0 * np.pi * 340.0))
 
 
 def test_design_prints_the_gains_and_the_margins(capsys):
@@ -102,6 +134,10 @@ def test_design_prints_the_gains_and_the_margins(capsys):
     assert content["phase_margin"] == pytest.approx(49.53, abs=0.01)
     assert len(content["others"]) == 4
     assert not read(capsys, *arguments[:4], "--no-delayed")["delayed"]
+    assert "a sample lasts" not in text
+    slow = " ".join(printed(capsys, "design", "quanser-qube-servo-2", "--sample-rate", "2000").split())
+    assert "2000 Hz: a sample lasts 3.6 times the winding's L/R = 0.138 ms" in slow
+    assert "take 2,414 Hz or more" in slow
 
 
 def test_step_compares_the_kinds_of_anti_windup(capsys):
@@ -124,7 +160,8 @@ def test_step_compares_the_kinds_of_anti_windup(capsys):
         ("design rev-neo --bandwidth 9000", "must be <= 3183.1 Hz at sample_rate = 20000 Hz"),
         ("design rev-neo --delayed --no-delayed", "--delayed and --no-delayed: give one of them"),
         ("show rev-neo --voltage 0.001 --out here", "a voltage that overcomes the friction"),
-        ("show nothing.toml", "No such file"),
+        ("show nothing.toml", "there is no such file; codrl-mj motor new nothing.toml writes one"),
+        ("new nothing.txt", "nothing.txt: must end in .toml"),
     ],
 )
 def test_bad_input_costs_one_line_and_leaves_nothing(capsys, arguments, message):

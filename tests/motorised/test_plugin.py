@@ -81,8 +81,10 @@ def test_a_structure_that_is_another_is_refused(change):
 
 def test_a_family_defined_anew_takes_the_place_of_the_one_before_if_models_can_go_on():
     def family(factor, **more):
+        shown = (0.0,) * len(more.get("Signals", Signals)._fields)
+
         def advance(parameters, timestep, state, inputs):
-            return state, factor * inputs.desired_torque, Signals(0.0, 0.0)
+            return state, factor * inputs.desired_torque, shown
 
         return type("Anew", (Worn,), {"__module__": __name__, "advance": staticmethod(advance), **more})
 

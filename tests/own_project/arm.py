@@ -75,6 +75,5 @@ TASK = Task(
     terminated=terminated,
     helpers=(error,),
     motors=("shoulder", "elbow"),
-    speeds=(2, 3),
     attributes={"gravity": GRAVITY, "upper_mass": mass("upper"), "most": Setting.LARGEST_FORCE, "reach": Fixed(0.9)},
 )

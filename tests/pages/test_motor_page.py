@@ -5,9 +5,9 @@ import re
 import numpy as np
 
 from codrl_mj.cli import main
-from codrl_mj.motor_design import abilities, find_drive
+from codrl_mj.motor_design import abilities, explain, find_drive
 from codrl_mj.pages.loop import limits, no_load_speed
-from codrl_mj.pages.motor import torque_speed
+from codrl_mj.pages.motor import _abilities, torque_speed
 from tests.pages.parsed import check_alone
 
 
@@ -19,6 +19,13 @@ def test_the_command_writes_a_page_with_every_number(tmp_path, capsys):
     for word in ("8.4", "resistance", "gain margin", "Quanser", "Bode: gain"):
         assert word in parsed.text
     assert {"abilities", "loop", "numbers", "drive"} <= set(parsed.ids)
+
+
+def test_what_is_assumed_stands_below_what_it_can_do():
+    drive = find_drive("kraken-x60")
+    text = str(_abilities(explain(drive), drive, None))
+    assert "at 12 V" in text
+    assert "assumed, for none is given: controller.max_current = inf, motor.rotor_inertia = 0." in text
 
 
 def test_the_diagram_goes_through_stall_and_no_load():

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from codrl_mj.actuators import Lag
+from codrl_mj.actuators import Drive, Lag, SampledLoop
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy, run_episodes
@@ -97,6 +97,7 @@ def test_it_says_which_loops_it_leaves_out_and_why_there_is_none():
     said = str(reports._loop([run({"lag": Lag(time_constant=0.1)})]))
     assert "lag: The delivered torque follows the desired one with a time constant" in said
     assert "There is no current loop in it." in said
+    assert "m: assumed, for none is given: supply.voltage = 24 V" in str(reports._loop([run({"m": Drive()})]))
 
 
 def test_without_opengl_there_is_no_film_and_everything_else(tmp_path, monkeypatch):
@@ -189,6 +190,22 @@ def test_an_ideal_actuator_beside_a_motor_has_a_force():
     assert labels["Torque at the shaft"] == "torque [N·m], of the ideal actuator force [N]"
     alone = Parsed(str(episode_section(shown[1:]))).data
     assert "Force" in [one["title"] for one in alone]
+
+
+def test_a_plot_is_shaded_where_its_own_limit_is_met():
+    drive = dataclasses.replace(
+        find_drive("maxon-ec45-flat-50w", gear_ratio=20.0), controller=SampledLoop(max_current=0.1)
+    )
+    env = EnvConfig("pendulum", drive, max_episode_steps=10)
+    section = str(episode_section([show("limited", env, RandomPolicy("pendulum"), 0, filmed=False)]))
+    plots = {one["title"]: [shade["label"] for shade in one["shades"]] for one in Parsed(section).data}
+    assert plots["Torque at the shaft"] == ["saturated"]
+    assert plots["Current and its reference"] == ["current saturated", "temperature saturated"]
+    assert plots["Voltage and its limit"] == ["voltage saturated"]
+    met = {
+        one["title"]: [len(one["arrays"][shade["spans"]]) for shade in one["shades"]] for one in Parsed(section).data
+    }
+    assert met["Current and its reference"][0] > met["Voltage and its limit"][0] == 0
 
 
 def test_states_of_every_kind_of_joint_have_units(monkeypatch):

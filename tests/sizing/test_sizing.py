@@ -15,6 +15,7 @@ from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes
 from codrl_mj.sizing import (
+    HOPELESS,
     SURELY,
     SURELY_NOT,
     TRY_IT,
@@ -147,6 +148,23 @@ def test_what_is_recorded_is_to_be_delivered_and_what_a_policy_asks_may_be_asked
     assert feasibility(drive(voltage=9.9), dataclasses.replace(asked, exact=False)).verdict == TRY_IT
 
 
+@pytest.mark.parametrize(
+    ("voltage", "loop", "continuous", "verdict"),
+    [
+        (3.1, {}, 2.1, SURELY),
+        (0.31, {}, None, TRY_IT),
+        (0.29, {}, None, HOPELESS),  # of 3 V
+        (24.0, {"max_current": 0.21}, None, TRY_IT),
+        (24.0, {"max_current": 0.19}, None, HOPELESS),  # of 2 A
+        (24.0, {}, 0.64, TRY_IT),
+        (24.0, {}, 0.62, HOPELESS),  # of 2 A rms: ten times the heat
+    ],
+)
+def test_what_is_short_by_ten_is_hopeless(voltage, loop, continuous, verdict):
+    asked = dataclasses.replace(steady(2.0, 1.0), exact=False)
+    assert feasibility(drive(voltage=voltage, **loop), asked, continuous).verdict == verdict
+
+
 # predictions
 
 
@@ -222,7 +240,7 @@ def test_the_smallest_motor_that_does_it_with_a_margin_comes_first_and_the_other
     others = {one.name: one for one in choices[len(good) :]}
     assert "no gear helps: raise the supply to 15.01 V" in others["dynamixel-mx-64"].lacks
     assert others["dynamixel-mx-64"].ratio == 200.0
-    assert "rotor inertia" in others["pololu-37d-30"].unknown
+    assert "motor.rotor_inertia = 0" in others["pololu-37d-30"].drive.assumed
     assert others["kraken-x60"].lacks == "surely, but how long: its continuous current is not known"
     assert "with a margin of 9%, must be 20%" in others["quanser-qube-servo-3"].lacks
     wide = [one.name for one in choose(pendulum, least_margin=0.6) if not one.lacks]
@@ -330,6 +348,7 @@ def test_the_command_judges_a_recording_and_draws_it(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "voltage: raise the supply to" in printed
     assert printed.splitlines()[-1] == "surely not"
+    assert "best: gear 9.5" in printed  # sqrt(0.942 * 1 / (0.036 * 0.036 * 8)) = 9.53
     assert main([*judge, "0"]) == 2
     assert "gear_ratio = 0" in capsys.readouterr().err
 
@@ -340,6 +359,45 @@ def test_the_command_chooses_and_says_what_is_wrong_with_the_rest(tmp_path, caps
     assert "smallest that does it with 20% left first" in printed
     assert "quanser-srv02 at gear 70: try it" in printed
     assert len(list(tmp_path.glob("*.png"))) == 2
+
+
+def test_on_a_slide_gears_have_a_unit_and_hopeless_is_a_failure(monkeypatch, capsys):
+    asked = dataclasses.replace(steady(10.0, 1.0), exact=False, linear=True)
+    monkeypatch.setattr("codrl_mj.sizing.demand_of", lambda *_, **__: asked)
+    assert main(["motor", "feasible", "rev-neo", "cartpole"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "rev-neo, gear 1 rad/m, 12 V" in printed
+    assert "share of rotor and friction in the largest load: unknown" in printed
+    assert printed.endswith(" try it")
+    assert main(["motor", "feasible", "rev-neo", "cartpole", "--voltage", "1"]) == 1
+    assert capsys.readouterr().out.splitlines()[-1] == "hopeless"
+
+
+def test_ones_own_motors_are_ranked_among_themselves(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    sheet = '[datasheet]\nkv = "340 rpm/V"\nresistance = "64 mohm"\ninductance = "30 uH"\n'
+    Path("a.toml").write_text(sheet)
+    Path("b.toml").write_text(
+        f'{sheet}rotor_inertia = "60 gcm2"\ncontinuous_current = "12 A"\nnominal_voltage = "12 V"'
+    )
+    np.savez("joint.npz", time=np.arange(3.0), torque=np.full(3, 1.0), speed=np.full(3, 8.0))
+    for words in (["a.toml", "b.toml", "joint.npz"], ["joint.npz", "a.toml", "b.toml"]):
+        assert main(["motor", "choose", *words]) == 0
+        printed = " ".join(capsys.readouterr().out.split())
+        assert "quanser" not in printed
+        assert printed.index("b.toml") < printed.index("a.toml")
+        assert printed.count("unknown") == 1
+        assert "a.toml at gear" in printed
+        assert "supply.voltage = 24 V, controller.max_current = inf, motor.rotor_inertia = 0" in printed
+    for words, said in (
+        (["a.toml"], "nothing to choose for: name one task"),
+        (["pendulum", "cartpole"], "pendulum and cartpole to choose for"),
+        (["c.toml", "joint.npz"], "there is no such file"),
+        (["pendulun", "a.toml"], "did you mean 'pendulum'"),
+        (["rev-nao", "joint.npz"], "did you mean 'rev-neo'"),
+    ):
+        assert main(["motor", "choose", *words]) == 2
+        assert said in capsys.readouterr().err
 
 
 def test_runs_count_where_they_were_trained_on_the_ideal_actuator(tmp_path, capsys):

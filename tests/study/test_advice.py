@@ -351,3 +351,8 @@ def test_a_motor_s_gear_and_supply_are_the_command_line_s(gear, volts, file, cap
         expected = min(float(torque_limits(frictionless, speed, drive.controller.max_current)[1]) / force, 1.0)
         assert found[name] == pytest.approx(expected, rel=2e-3), name
     assert found["friction"] == pytest.approx(gear * drive.motor.coulomb_friction / force, rel=1e-3)
+
+
+def test_what_is_assumed_of_a_motor_is_said(file, capsys):
+    assert cli.main(["advise", "maxon-dcx22l", "pendulum", "--gear-ratio", "59", "--evidence", str(file)]) == 0
+    assert "assumed, for none is given: controller.max_current = inf" in capsys.readouterr().out

@@ -94,7 +94,7 @@ def test_finished_cells_are_left_alone(computed):
 def test_a_failure_is_forgotten_when_the_cell_succeeds(tmp_path):
     folder = cell_folder(tmp_path, TINY)
     folder.write_text("a file in the way")
-    assert "Not a directory" in train_runs({folder: TINY}, ONE)[folder]
+    assert "is not a folder" in train_runs({folder: TINY}, ONE)[folder]
     assert failure_record(folder).is_file()
     folder.unlink()
     assert train_runs({folder: TINY}, ONE) == {}

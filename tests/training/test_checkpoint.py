@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import json
 import pickle
 import random
 import resource
@@ -258,3 +259,18 @@ def test_where_nothing_can_be_written_the_error_is_one_line_and_the_run_goes_on_
     assert [path for path in stopped.rglob(".*") if path.name != ".lock"] == []
     assert main(["train", "--resume", str(stopped)]) == 0
     assert differing(expected, outcome(stopped)) == []
+
+
+@pytest.mark.parametrize("best", [False, True])
+def test_where_nothing_can_be_written_before_a_checkpoint_it_says_what_there_is(tmp_path, capsys, limits, best):
+    """No policy fits into so much; or the best policy does, and no checkpoint."""
+    out = tmp_path / "run"
+    rarely = dataclasses.replace(CONFIG, checkpoint_interval=10**6)
+    yaml = tmp_path / "train.yaml"
+    yaml.write_text(json.dumps((rarely if best else CONFIG).as_mapping()))
+    no_file_larger_than(8000 if best else 1200)
+    assert main(["train", "--config", str(yaml), "--out", str(out), "--no-tensorboard"]) == 2
+    no_file_larger_than(resource.RLIM_INFINITY)
+    error = capsys.readouterr().err
+    assert "no checkpoint" in error
+    assert ("its best policy so far" in error) == best == out.exists()

@@ -132,9 +132,7 @@ def test_the_second_ctrl_c_stops_at_once(tmp_path):
         resume(CASES["ppo, one optimiser"], tmp_path / "run")
 
 
-@pytest.mark.parametrize(
-    "entry", ["marks", "squares", "samples", "best", "evaluation_return", "watch.episodes", "watch.reports"]
-)
+@pytest.mark.parametrize("entry", ["marks", "squares", "samples", "best", "watch.episodes", "watch.reports"])
 def test_what_the_watcher_remembers_matters(tmp_path, uninterrupted, monkeypatch, entry):
     """As tests/training/test_state.py shows of what the model remembers."""
     name, out = "ppo, one optimiser", tmp_path / "run"

@@ -4,6 +4,7 @@ import contextlib
 import csv
 import dataclasses
 import json
+import math
 import platform
 import sys
 from importlib.machinery import ModuleSpec
@@ -18,10 +19,13 @@ from safetensors.torch import load_file
 from codrl_mj import Actuator, CurrentLoop, Motor
 from codrl_mj.agents import PPOConfig
 from codrl_mj.agents.sarsa_episodes import CompiledEpisodes
+from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy, evaluate, run_episodes
 from codrl_mj.runs.policies import load_policy
-from codrl_mj.training import EVALUATION_SEED, TrainConfig, load_config, train
+from codrl_mj.training import EVALUATION_SEED, TrainConfig, curve, load_config, train, watcher
+from codrl_mj.training.folder import owned, start_folder
+from codrl_mj.training.watcher import Watcher
 
 TINY_PPO = PPOConfig(rollout_steps=256, batch_size=64, epochs=2, hidden=(8, 8))
 ENV = EnvConfig("cartpole", "weaker", options={"center_radius": 0.1})
@@ -157,6 +161,15 @@ def test_the_result_and_the_evaluation_agree_with_an_evaluation_of_the_saved_pol
     assert result["best"] == {"return": anew.returns.mean, "steps": 1024}  # the only evaluation
 
 
+def test_a_report_has_the_evaluation_that_took_place_then_and_no_other(tmp_path, monkeypatch):
+    monkeypatch.setattr(watcher, "REPORT_INTERVAL", 2500)
+    monkeypatch.setattr(curve, "draw_learning_curve", lambda *_: None)
+    config = dataclasses.replace(TINY, total_steps=5000, evaluation_interval=2000, evaluation_episodes=2)
+    rows = read_csv(train(config, tmp_path / "run") / "progress.csv")
+    found = {int(row["steps"]): math.isfinite(float(row["evaluation_return"])) for row in rows}
+    assert found == {2048: True, 2560: False, 4096: True, 5120: True}  # 2560: the report alone; 5120: the end
+
+
 def test_the_best_policy_is_kept_though_a_worse_one_comes_last(tmp_path):
     ppo = dataclasses.replace(TINY_PPO, learning_rate=0.05)  # unsteady
     config = dataclasses.replace(TINY, agent=ppo, total_steps=6000, evaluation_interval=256, evaluation_episodes=5)
@@ -221,16 +234,23 @@ def test_the_saved_policy_plays(run):
 # -- refusals -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("holds", ["a file", "nothing"])
-def test_an_existing_folder_is_refused_and_untouched(tmp_path, holds):
+@pytest.mark.parametrize("begun", [False, True], ids=["somebody's", "begun"])
+@pytest.mark.parametrize("holds", ["precious.txt", "tensorboard/mine", "best/policy.json", "policy.json"])
+def test_a_folder_that_holds_something_is_refused_and_untouched(tmp_path, holds, begun):
+    """But for what a training has before it learned anything, and only where it is one's."""
+    if begun and holds == "tensorboard/mine":
+        return
     out = tmp_path / "run"
-    out.mkdir()
-    if holds == "a file":
-        (out / "precious.txt").write_text("mine")
+    (out / holds).parent.mkdir(parents=True)
+    (out / holds).write_text("mine")
+    if begun:
+        start_folder(out, TINY)
+    before = sorted(out.rglob("*"))
     with pytest.raises(FileExistsError, match="exists already") as caught:
         train(TINY, out)
     assert str(out) in str(caught.value)
-    assert [path.read_text() for path in out.iterdir()] == (["mine"] if holds == "a file" else [])
+    assert sorted(out.rglob("*")) == before
+    assert (out / holds).read_text() == "mine"
 
 
 @pytest.mark.parametrize(
@@ -249,6 +269,57 @@ def test_what_cannot_be_trained_is_refused_with_nothing_written(tmp_path, change
     with pytest.raises(ValueError, match=message):
         train(config, tmp_path / "runs" / "run")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_training_that_breaks_off_before_it_learned_anything_does_not_block_the_next(tmp_path, monkeypatch):
+    out, kept = tmp_path / "runs" / "run", tmp_path / "kept"
+    kept.mkdir()
+    with monkeypatch.context() as patch:
+        patch.setattr(Watcher, "_on_step", lambda _: 1 / 0)
+        for path in (out, kept):
+            with pytest.raises(ZeroDivisionError):
+                train(TINY, path)
+    assert (out.parent.exists(), list(kept.iterdir())) == (False, [])  # what was there stays
+    start_folder(out, within(integrator="semi-implicit"))  # and that of one that was killed
+    (out / "checkpoints").mkdir()
+    assert json.loads((train(TINY, out) / "result.json").read_text())["steps"] == 1024
+    assert load_config(out) == TINY
+
+
+def test_weights_that_are_no_numbers_are_named_and_not_kept(tmp_path, monkeypatch):
+    plain = PPOConfig.make_model
+
+    def diverging(self, envs, seed):
+        model = plain(self, envs, seed)
+        step = model.train
+
+        def train_once():
+            step()
+            if model.num_timesteps >= 512:
+                next(iter(model.policy.parameters())).data[:] = torch.nan
+
+        model.train = train_once
+        return model
+
+    monkeypatch.setattr(PPOConfig, "make_model", diverging)
+    often = dataclasses.replace(TINY, checkpoint_interval=256)
+    message = r"weights of ppo became no finite numbers by step 512: .* Lower agent\.learning_rate = 0\.001, or"
+    with pytest.raises(FloatingPointError, match=message):
+        train(often, tmp_path / "run")
+    assert [path.name[:17] for path in (tmp_path / "run" / "checkpoints").iterdir()] == ["step-000000000256"]
+
+
+@pytest.mark.parametrize("line", ["train cartpole --out run", "train --resume run", "train --resume run --seed 4"])
+def test_a_folder_in_use_or_of_another_training_is_refused_before_anything_is_made(tmp_path, monkeypatch, capsys, line):
+    monkeypatch.chdir(tmp_path)
+    start_folder(tmp_path / "run", TrainConfig.preset("cartpole", "ppo"))
+    monkeypatch.setattr(PPOConfig, "make_model", lambda *_: pytest.fail("it was made"))
+    with contextlib.nullcontext() if "4" in line else owned(tmp_path / "run"):
+        assert main(line.split()) == 2
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    said = "with another configuration" if "4" in line else "another process is training in it; wait for it"
+    assert said in shown.err
 
 
 def test_an_unstable_actuator_can_be_trained_on_when_allowed(tmp_path):

@@ -1,0 +1,125 @@
+"""From the words of a command line to a verb: its own modules and numbers understood, errors in one plain sentence."""
+
+import contextlib
+import io
+import os
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Union
+
+import tyro
+
+from codrl_mj.fields import did_you_mean
+
+_SHORT = {"--gear-ratio": "gear ratio", "--voltage": "supply voltage"}
+
+
+def parse(verbs: Mapping[str, Any], arguments: Sequence[str]) -> Any:
+    """The verb, with its settings; SystemExit after help."""
+    cli: Any = tyro.cli  # of a union of as many kinds as there are
+    errors: Any = getattr(tyro, "_errors", None)  # of no public name; without it errors come in boxes
+    hook = errors and errors.on_parse_error(lambda event: _refuse(event, verbs, arguments))
+    kinds = [
+        Annotated[Any, tyro.conf.subcommand(name=name, constructor=constructor)] for name, constructor in verbs.items()
+    ]
+    with hook or contextlib.nullcontext():
+        return cli(
+            Union[tuple(kinds)],  # noqa: UP007
+            prog="codrl-mj",
+            description="Reinforcement learning through a real actuator: classic control in MuJoCo, driven by a motor."
+            " -h instead of --help leaves descriptions out; --version; --traceback shows where an error arose.",
+            args=arguments,
+            compact_help=not {"-h", "-H", "--help-verbose"}.isdisjoint(arguments),
+        )
+
+
+def _refuse(event: Any, verbs: Mapping[str, Any], arguments: Sequence[str]) -> None:
+    """Say in a sentence what the parser would in a box; of kinds of errors that are not known here its box remains."""
+    words = [word for word in arguments[:2] if re.fullmatch(r"[a-z]+", word)]
+    shown = "codrl-mj " + " ".join(words[: 2 if words[:1] in (["motor"], ["identify"]) else 1])
+    match type(event).__name__:
+        case "MissingSubcommand":
+            known = ", ".join(event.subcommand_spec.parser_from_name)
+            raise ValueError(f"{shown.strip()} needs a verb, one of {known}; {shown.strip()} --help says more")
+        case "MissingArgs":
+            missing = [_called(one.arg) for one in event.missing_arguments]
+            raise ValueError(f"{shown} needs {', '.join(missing)}; {shown} --help says more")
+        case "BadValue" if event.reason == "too_few_values":
+            raise ValueError(f"{_called(event.argument)} needs a value: {_kind(event.argument)}")
+        case "InvalidChoice":
+            hint = did_you_mean(event.value, event.choices)
+            known = ", ".join(event.choices)
+            raise ValueError(f"{_called(event.argument)} {event.value}: {hint}must be one of {known}")
+        case "InstantiationFailure" if event.argument is not None:
+            value = re.search(r"'([^']*)'", event.message)
+            given = f" {value[1]}" if value else ""
+            raise ValueError(f"{_called(event.argument)}{given}: must be {_kind(event.argument)}")
+        case "UnrecognizedArgs":
+            with contextlib.redirect_stdout(io.StringIO()) as printed, contextlib.suppress(SystemExit):
+                parse(verbs, [*words, "--help"])
+            _refuse_words(event.tokens, printed.getvalue(), shown)
+
+
+def _refuse_words(tokens: Sequence[str], text: str, shown: str) -> None:
+    """Refuse words that the parser left over, by what the verb's help has."""
+    flag = next((token.partition("=")[0] for token in tokens if token.startswith("-")), None)
+    if flag is None:
+        verbs = re.match(r"usage: [^\n]*\{([\w,]+)\}\n", text)
+        choice = verbs[1].split(",") if verbs else []
+        listed = f"verbs are {', '.join(choice)}" if choice else f"{shown} --help says what it takes"
+        what = "unknown verb" if choice else "unexpected"
+        raise ValueError(f"{what} {tokens[0]!r}: {did_you_mean(tokens[0], choice)}{listed}")
+    known = list(dict.fromkeys(re.findall(r"(?<![\w-])--[a-z][\w-]*(?:\.[\w-]+)*", text)))
+    inner = [f"did you mean {one!r}? " for one in known if one.rpartition(".")[2] == flag.lstrip("-")]
+    hint = "".join(inner[:1]) or did_you_mean(flag, known)
+    if flag in _SHORT and "--actuator" in known:
+        raise ValueError(f"{flag}: the actuator has no {_SHORT[flag]}; motors of codrl-mj motor list have one")
+    raise ValueError(f"unknown flag {flag}: {hint}{shown} --help lists them")
+
+
+def _called(argument: Any) -> str:
+    """What a person calls an argument: its flag, or its name in capitals."""
+    name = argument.field.intern_name.upper() if argument.is_positional() else argument.lowered.name_or_flags[0]
+    return str(name)
+
+
+def _kind(argument: Any) -> str:
+    """What an argument has to be."""
+    kind = str(argument.lowered.metavar).replace("{None}|", "None or ")
+    return kind.replace("INT", "a whole number").replace("FLOAT", "a number")
+
+
+def understood(arguments: Sequence[str]) -> list[str]:
+    """The words with 1e5 and 20:1 as plain numbers, and FILE.py:NAME as modules.
+
+    Python finds the modules of the present folder from here on if the person who typed the words names one of them, or
+    says `--trust`: what a file names stays to be refused.
+    """
+    here, found = Path.cwd(), []
+    for word in arguments:
+        if number := re.fullmatch(r"(--[\w.-]+=)?(\d+(?:\.\d+)?)(?::1|(e\+?\d{1,2}))", word):
+            value = float(number[2] + (number[3] or ""))
+            word = f"{number[1] or ''}{int(value) if value.is_integer() else value}"
+        elif file := re.fullmatch(r"(.*=)?([^=:]+\.py):([\w.-]+)", word):
+            word = f"{file[1] or ''}{_module(Path(file[2]), here)}:{file[3]}"
+        found.append(word)
+    typed = re.findall(r"^(?:.*=)?(\w+)[\w.]*:[\w./-]+$", "\n".join(found), re.MULTILINE)
+    if "--trust" in found or any((here / name).is_dir() or (here / f"{name}.py").is_file() for name in typed):
+        sys.path += [str(here)] if str(here) not in sys.path and "" not in sys.path else []
+    return found
+
+
+def _module(file: Path, here: Path) -> str:
+    """The module that a file is, by which what is written here today finds it tomorrow."""
+    path = Path(os.path.normpath(here / file)).with_suffix("")
+    if not file.is_file():
+        raise ValueError(f"{file}: there is no such file; must be FILE.py:NAME or module:NAME")
+    parts = path.relative_to(here).parts if path.is_relative_to(here) else ("..",)
+    if not all(part.isidentifier() for part in parts):
+        raise ValueError(
+            f"{file}: must be a file in the present folder {here} or below it, in folders whose names Python takes for "
+            f"modules (letters, digits, _): go to {path.parent} and name {file.name}"
+        )
+    return ".".join(parts)

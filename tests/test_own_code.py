@@ -1,0 +1,159 @@
+"""What users write for tasks and families is refused in one sentence where it is wrong, and never ends the process."""
+
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+
+import codrl_mj
+from codrl_mj.actuators import resolve
+from codrl_mj.engine import load_family
+from codrl_mj.engine.sensors import compiled_observe
+from codrl_mj.envs.outcomes import compiled_outcomes
+from codrl_mj.physics.constrain import compiled_constrain
+from tests import slips
+from tests.matrix import but
+
+FOUND = None
+
+
+def refused(act, begins=r"slips?\.py:\d+, in "):
+    """Refused in one sentence that begins with a place or a name; returned."""
+    with pytest.raises(ValueError, match=f"^({begins})") as caught:
+        act()
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def name_of(case):
+    return str(case)[:30]
+
+
+@pytest.mark.parametrize(("field", "value"), slips.TASKS, ids=name_of)
+def test_a_task_with_a_slip_is_refused_when_it_is_made(field, value):
+    refused(lambda: slips.task(**{field: value}), r"slips?\.py:\d+, in |Task\.|unknown integrator")
+
+
+@pytest.mark.parametrize(("part", "value"), slips.FAMILIES, ids=name_of)
+def test_a_family_with_a_slip_is_refused_at_every_door_before_it_is_compiled(part, value, monkeypatch):
+    family = slips.family(**{part: value})
+    monkeypatch.setattr(sys.modules[__name__], "FOUND", family)
+    begins = r"slips?\.py:\d+, in |Slipped|unknown (signal SIGNAL_UNITS|field RANDOM)"
+    told = {
+        refused(door, begins) for door in (lambda: load_family(family), lambda: resolve(f"{__name__}:FOUND", None, ""))
+    }
+    assert len(told) == 1
+
+
+def test_a_family_that_is_no_dataclass_or_has_no_advance_is_refused():
+    class Undecorated(codrl_mj.ActuatorModel):
+        gain = slips.real(1.0)
+
+    class Idle(codrl_mj.ActuatorModel):
+        pass
+
+    refused(lambda: load_family(Undecorated), "Undecorated: must be decorated with @dataclasses.dataclass")
+    refused(lambda: load_family(Idle), "Idle: has no `advance`")
+
+
+NUMBA = (*slips.LATE[1:], *slips.LATE_FAMILIES)
+
+
+@pytest.mark.parametrize(("name", "body"), but(NUMBA[::4], NUMBA), ids=name_of)
+def test_what_only_numba_can_refuse_is_a_sentence_too(name, body):
+    if name in slips.PARTS:
+        family = slips.family(**{name: body})
+        told = refused(lambda: (load_family(family), compiled_observe(family)))
+    else:
+        task = slips.late_task(name, body)
+        told = refused(lambda: (compiled_outcomes(task), compiled_constrain(task)))
+    assert f"in {name}: numba does not compile it: " in told or f"in {name}: returns " in told
+
+
+def test_the_message_has_what_numba_says_of_it_and_where():
+    task = slips.task(reward="x = next_state[0]\n    return float(np.linalg.norm(x))")
+    told = refused(lambda: compiled_outcomes(task))
+    assert told == "slip.py:3, in reward: numba does not compile it: np.linalg.norm() only supported for array types"
+    task = slips.task(terminated="plain(state)")
+    assert "name it in `helpers`" in refused(lambda: compiled_outcomes(task))
+
+
+@pytest.mark.parametrize("face", but(["vector"], ["single", "vector", "training"]))
+def test_no_slip_ends_the_process(face):
+    program = [sys.executable, "-m", "tests.slips", face]
+    done = subprocess.run(program, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 0, done.stderr
+    *told, last = done.stdout.splitlines()
+    assert last == "the sound one runs"
+    assert len(told) > 10
+    assert all(line.startswith("refused") for line in told)
+
+
+def test_an_integer_or_a_flag_among_the_numbers_is_a_number():
+    """In every function that returns several, of one kind of number or of many."""
+    task = slips.task(
+        initial_state="draws[0], 0, False, 0.5",
+        observation="state[0] > 5.0, 1, np.float32(0.5)",
+        constrain="state[0], 0, False, state[3]",
+        reward="1",
+    )
+    codrl_mj.register(task)
+    slips.run("single", task)
+    envs = gymnasium.make_vec(task.env_id, 2, vectorization_mode="vector_entry_point", actuator="ideal")
+    np.testing.assert_array_equal(envs.reset(seed=0)[0], [[0.0, 1.0, 0.5]] * 2)
+    assert envs.step(np.zeros((2, 1), np.float32))[1].tolist() == [1.0, 1.0]
+
+
+def test_a_models_joints_and_integrator_are_compared_with_the_task(tmp_path):
+    model = (slips.ROOT / "own_project" / "arm.xml").read_text()
+    model = model.replace('<body name="upper">', '<body name="upper"><site name="tip"/>')
+    path = tmp_path / "model.xml"
+    for good, bad, message in (
+        ("RK4", "Euler", ": its <option> has integrator EULER, so Task.integrators cannot have rk4"),
+        ('joint="shoulder"/', 'site="tip"/', ": actuator 'shoulder' must drive a hinge or a slide joint"),
+        (
+            '<joint name="elbow" axis',
+            '<joint type="ball" name="elbow" axis',
+            " has 5 positions and 4 velocities, and slip",
+        ),
+        ("<worldbody>", "<worldbdy>", ": XML parse error"),
+    ):
+        path.write_text(model.replace(good, bad))
+        task = codrl_mj.register(slips.task(asset=str(path)))
+        refused(lambda task=task: gymnasium.make(task.env_id, actuator="ideal"), f"{path}{message}")
+    with pytest.raises(FileNotFoundError, match=r"no model file /nowhere/arm\.xml"):
+        slips.task(asset="/nowhere/arm.xml")
+
+
+def test_the_speeds_of_a_task_follow_from_its_model():
+    assert slips.task().speeds == (2,)
+    assert slips.task(motors=("elbow",)).speeds == (3,)
+    assert [task.speeds for task in codrl_mj.TASKS.values() if task.name == "acrobot"] == [(3,)]
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda: codrl_mj.motorise("arm.xml", {}),
+            r"spec = 'arm\.xml': must be .* mujoco\.MjSpec\.from_file\('arm\.xml'\)",
+        ),
+        (
+            lambda: codrl_mj.make("codrl_mj/Pendulum-v0", {}),
+            r"codrl_mj/Pendulum-v0: .* gymnasium\.make\('codrl_mj/Pend",
+        ),
+        (
+            lambda: reset("Pendulum", {"xinit": 0.1}),
+            r"unknown reset option xinit; did you mean x_init\? known: x_init, y_",
+        ),
+        (lambda: reset("CartPole", {"low": 0.0, "hgih": 0.1}), r"unknown reset option hgih; did you mean high\?"),
+    ],
+)
+def test_other_doors_say_what_they_want(call, message):
+    refused(call, message)
+
+
+def reset(task, options):
+    gymnasium.make(f"codrl_mj/{task}-v0", actuator="ideal").reset(options=options)
