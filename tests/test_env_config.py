@@ -30,7 +30,7 @@ from codrl_mj import (
     suite,
 )
 from codrl_mj.cli import main
-from codrl_mj.envs.config import EnvConfig, upgraded
+from codrl_mj.envs.config import EnvConfig
 
 PAGE = (Path(__file__).parent.parent / "docs" / "randomization.md").read_text()
 RANDOMIZE = {
@@ -275,40 +275,6 @@ def test_numpys_numbers_are_numbers():
 def test_what_is_no_configuration_is_named(mapping, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         EnvConfig.from_mapping(mapping)
-
-
-@pytest.mark.parametrize(
-    ("actuator", "expected"),
-    [
-        ({"controller": {"kp": 2.0}}, {"controller": {"kp": 2.0, "current_noise": 0.1}, "supply": {"resistance": 0.4}}),
-        ("weak", {"name": "weak", "controller": {"current_noise": 0.1}, "supply": {"resistance": 0.4}}),
-        (None, None),
-    ],
-)
-def test_what_were_disturbances_once_are_the_actuator_s_and_the_joint_s(actuator, expected):
-    old = {
-        "current_noise": 0.1,
-        "current_bias": 0.0,
-        "supply_resistance": 0.4,
-        "joint_friction": 0.2,
-        "joint_damping": 0.0,
-    }
-    env = {"disturbances": {"command_delay": 0.03, **old}, "center_radius": 0.1}
-    assert upgraded({"task": "cartpole", "actuator": actuator, "env": env, "seed": 4}) == {
-        "seed": 4,
-        "env": {
-            "task": "cartpole",
-            "actuator": expected,
-            "options": {"center_radius": 0.1},
-            "disturbances": {"command_delay": 0.03},
-            "joint": {"friction": 0.2},
-        },
-    }
-
-
-def test_what_is_written_now_stays_as_it_is():
-    written = {"seed": 4, "env": EnvConfig("cartpole", "weak", options={"center_radius": 0.1}).as_mapping()}
-    assert upgraded(written) == written
 
 
 # -- the command line ---------------------------------------------------------------------------------------

@@ -26,12 +26,10 @@ def make_run(folder, actuator="weaker", *, seed=3, task="cartpole", finished=Tru
     folder.mkdir(parents=True)
     motor = named_actuator(actuator, task) if isinstance(actuator, str) else actuator
     config = {
-        "task": task,
-        "actuator": mapping_of(motor),
         "agent": {"name": "ppo", "learning_rate": 1e-3, "hidden": [64, 64]},
         "seed": seed,
         "total_steps": 4000,
-        "env": {"center_radius": None, "disturbances": {"command_delay": 0.0}},
+        "env": {"task": task, "actuator": mapping_of(motor), "disturbances": {"command_delay": 0.0}},
     } | train
     (folder / "config.json").write_text(json.dumps({"train": config, "versions": {"torch": "2.13.0"}}))
     (folder / "progress.csv").write_text(
@@ -123,7 +121,7 @@ def test_motors_keep_their_names(tmp_path):
 def test_an_actuator_that_cannot_be_read_is_custom(tmp_path, actuator):
     folder = make_run(tmp_path / "mine")
     content = json.loads((folder / "config.json").read_text())
-    content["train"]["actuator"] = actuator
+    content["train"]["env"]["actuator"] = actuator
     (folder / "config.json").write_text(json.dumps(content))
     assert read_run(folder).actuator == "custom"
 

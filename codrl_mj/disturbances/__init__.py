@@ -1,7 +1,6 @@
 """What lies between the agent's command and the joint besides the actuator: pure functions, and their description."""
 
 from codrl_mj.disturbances.description import (
-    MOVED,
     OFF,
     PLAIN,
     Disturbances,
@@ -10,4 +9,4 @@ from codrl_mj.disturbances.description import (
     resolve_joint,
 )
 
-__all__ = ["MOVED", "OFF", "PLAIN", "Disturbances", "Joint", "resolve_disturbances", "resolve_joint"]
+__all__ = ["OFF", "PLAIN", "Disturbances", "Joint", "resolve_disturbances", "resolve_joint"]

@@ -82,20 +82,7 @@ def resolve_disturbances(disturbances: "Disturbances | Mapping[str, Any] | None"
         return disturbances
     if not isinstance(disturbances, Mapping):
         raise ValueError(f"disturbances = {disturbances!r}: must be a Disturbances or a mapping of its fields")
-    moved = [name for name in MOVED if name in disturbances]
-    if moved:
-        raise ValueError(f"disturbances.{moved[0]} is {MOVED[moved[0]]} now: give it there")
     return fields.build(Disturbances, disturbances, "field", "disturbances.")
-
-
-MOVED = {
-    "current_bias": "the actuator's controller.current_bias",
-    "current_noise": "the actuator's controller.current_noise",
-    "supply_resistance": "the actuator's supply.resistance",
-    "joint_damping": "the environment's joint.damping",
-    "joint_friction": "the environment's joint.friction",
-}
-"""Fields of earlier versions, and whose they are."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, mapping_of, names_of
-from codrl_mj.disturbances import MOVED, OFF, PLAIN, Disturbances, Joint, resolve_disturbances, resolve_joint
+from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint, resolve_disturbances, resolve_joint
 from codrl_mj.envs.distributions import Distribution, parse
 from codrl_mj.fields import check_names
 from codrl_mj.tasks import Task, find_task, reference_of, resolve_actuators
@@ -223,42 +223,6 @@ class EnvConfig:
             if isinstance(given.get(name), Mapping):
                 given[name] = {**there[name], **given[name]}
         return dataclasses.replace(base, **given)
-
-
-def upgraded(configuration: Mapping[str, Any]) -> dict[str, Any]:
-    """A training's configuration of any version, or a part of one, as the present version writes it.
-
-    Task and actuator are the environment's; they may also stand above it, as flags do, and win there. Sensor, supply
-    and joint were disturbances once; they are the actuator's and the joint's. Every task had a `center_radius` once.
-
-    Args:
-        configuration: as `TrainConfig.as_mapping` wrote it, or a user did.
-    """
-    given = dict(configuration)
-    above = {name: given.pop(name) for name in ("task", "actuator") if name in given}
-    if not isinstance(given.get("env", {}), Mapping):
-        return given
-    given["env"] = env = {**given.get("env", {}), **above}
-    if (radius := env.pop("center_radius", None)) is not None:
-        env["options"] = {**(env.get("options") or {}), "center_radius": radius}
-    old = env.get("disturbances")
-    if not isinstance(old, Mapping) or not old.keys() & MOVED.keys():
-        return given
-    moved = {name: old[name] for name in MOVED if old.get(name)}
-    env["disturbances"] = {name: value for name, value in old.items() if name not in MOVED}
-    if joint := {name: moved[f"joint_{name}"] for name in ("damping", "friction") if f"joint_{name}" in moved}:
-        env["joint"] = joint
-    actuator = env.get("actuator", "paper")
-    sensor = {name: moved[name] for name in ("current_bias", "current_noise") if name in moved}
-    supply = {"resistance": moved["supply_resistance"]} if "supply_resistance" in moved else {}
-    if (sensor or supply) and actuator not in (None, "ideal"):  # which has neither
-        described = dict(actuator) if isinstance(actuator, Mapping) else {"name": actuator}
-        for part, values in (("controller", sensor), ("supply", supply)):
-            if values:
-                inside = described.get(part)
-                described[part] = {**(inside if isinstance(inside, Mapping) else {}), **values}
-        env["actuator"] = described
-    return given
 
 
 def _options(task: Task, given: Mapping[str, Any]) -> Any:

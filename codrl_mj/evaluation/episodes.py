@@ -13,9 +13,8 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from codrl_mj.actuators import IDEAL, Actuator, actuator_from_mapping, mapping_of, trusting
+from codrl_mj.actuators import IDEAL, actuator_from_mapping, mapping_of, trusting
 from codrl_mj.envs.recording import PhysicsRecorder, Recorder
-from codrl_mj.physics import signal_names
 from codrl_mj.runs.files import writing
 from codrl_mj.runs.policies import Policy
 from codrl_mj.tasks import find_task
@@ -101,8 +100,6 @@ class RandomPolicy:
 
 
 _ARRAYS = ("time", "state", "observation", "action", "reward")
-_OLD_TRACE = ("desired_force", "actual_force", "current", "voltage", "speed", "saturated")
-"""Columns of the array `trace` in files of earlier versions."""
 
 
 def save_episode(episode: Episode, path: Path) -> None:
@@ -147,9 +144,6 @@ def load_episode(path: Path, trust: bool = False) -> Episode:
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-        if "trace" in arrays:  # of an earlier version
-            arrays |= {f"trace/{name}": column for name, column in zip(_OLD_TRACE, arrays["trace"].T, strict=True)}
-            arrays |= {f"signals/{name}": arrays[name] for name in signal_names(Actuator)}
         described = json.loads(str(arrays["actuator"]))
         several = isinstance(described, list)
         with trusting(trust):

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 from codrl_mj.actuators import actuator_from_mapping, name_of, trusting
-from codrl_mj.envs.config import upgraded
 from codrl_mj.runs.files import check_digest, read_json
 from codrl_mj.runs.layout import (
     BEST,
@@ -120,7 +119,6 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
     if not isinstance(config, Mapping):
         problems.append(f"{CONFIG} is not a run configuration: it has no 'train'")
         config = {}
-    config = upgraded(config)
     env = config.get("env")
     env = env if isinstance(env, Mapping) else {}
     progress = last_report(path / PROGRESS, problems)

@@ -12,10 +12,10 @@ from codrl_mj.actuators import trusting
 from codrl_mj.agents import AgentConfig, agent_from_mapping, check_fits
 from codrl_mj.agents.ppo import PPOConfig
 from codrl_mj.agents.presets import ELSEWHERE, find_preset
-from codrl_mj.envs.config import EnvConfig, upgraded
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import check_names
 from codrl_mj.foreign.config import ForeignConfig, environment_from, is_gymnasium_id
-from codrl_mj.tasks import find_task
+from codrl_mj.tasks import TASKS, find_task
 
 EVALUATION_SEED = 1_000_000
 """Seed of the first episode in which a trained policy is evaluated, away from those that trainings start from."""
@@ -147,7 +147,13 @@ class TrainConfig:
         """
         if not isinstance(mapping, Mapping):
             raise ValueError(f"not a training configuration: {mapping!r} is no mapping")
-        given = upgraded(mapping)
+        given = dict(mapping)
+        above = {name: given.pop(name) for name in ("task", "actuator") if name in given}
+        if isinstance(given.get("env", {}), Mapping):
+            given["env"] = env = {**given.get("env", {}), **above}
+            named = TASKS[env["task"]].options._fields if env.get("task") in TASKS else ()
+            if options := {name: env.pop(name) for name in named if name in env}:  # as the flags are called
+                env["options"] = {**(env.get("options") or {}), **options}
         names = [field.name for field in dataclasses.fields(cls)]
         check_names(given, [*names, "task", "actuator", "settings"], "key")
         missing = [name for name in names if name not in given] if whole else []

@@ -14,7 +14,7 @@ from codrl_mj.pages.report import replays, report
 from tests.browser.waiting import until
 
 pytestmark = pytest.mark.browser
-RUN = Path(__file__).parents[1] / "fixtures" / "earlier" / "pendulum"
+RUN = Path(__file__).parents[1] / "fixtures" / "runs" / "pendulum"
 AXE = Path(__file__).parents[2] / "node_modules" / "axe-core" / "axe.min.js"
 
 

@@ -9,7 +9,7 @@ import pytest
 
 import codrl_mj
 from codrl_mj.cli import main
-from codrl_mj.disturbances import MOVED, OFF, PLAIN, Disturbances, Joint, resolve_disturbances, resolve_joint
+from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint, resolve_disturbances, resolve_joint
 from codrl_mj.envs.config import EnvConfig
 from tests.disturbances.everything import MOST, RUBBED
 
@@ -60,19 +60,6 @@ def test_a_mapping_is_as_good_and_its_unknown_fields_are_refused():
         resolve_joint({"frictoin": 1})
     with pytest.raises(ValueError, match=r"'joint' = 3: must be a mapping of Joint's fields"):
         resolve_joint(3)
-
-
-@pytest.mark.parametrize("name", MOVED)
-def test_a_field_that_has_moved_says_where_it_is_now(name):
-    with pytest.raises(
-        ValueError, match=rf"disturbances\.{name} is the (actuator's|environment's) .* now: give it there"
-    ):
-        resolve_disturbances({name: 0.1})
-    place = MOVED[name].split()[-1]
-    at, field = place.split(".")
-    value = {at: {field: 0.1}}
-    arguments = {"joint": value["joint"]} if at == "joint" else {"actuator": value}
-    gymnasium.make("codrl_mj/Pendulum-v0", **arguments)
 
 
 REFUSED = {

@@ -28,7 +28,7 @@ from codrl_mj.runs.policies import load_policy
 from codrl_mj.training import load_config
 from tests.pages.parsed import Parsed, check_alone
 
-RUNS = Path(__file__).parents[1] / "fixtures" / "earlier"
+RUNS = Path(__file__).parents[1] / "fixtures" / "runs"
 
 
 def no_film(*_, **__):

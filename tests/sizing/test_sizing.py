@@ -401,12 +401,13 @@ def test_ones_own_motors_are_ranked_among_themselves(tmp_path, capsys, monkeypat
 
 
 def test_runs_count_where_they_were_trained_on_the_ideal_actuator(tmp_path, capsys):
-    earlier, run = Path(__file__).parents[1] / "fixtures" / "earlier" / "cartpole", tmp_path / "run"
-    assert main(["motor", "choose", str(earlier)]) == 2
+    there, run = Path(__file__).parents[1] / "fixtures" / "runs" / "cartpole", tmp_path / "run"
+    assert main(["motor", "choose", str(there)]) == 2
     assert "was trained on current_loop: must be ideal" in capsys.readouterr().err
-    shutil.copytree(earlier, run)
+    shutil.copytree(there, run)
     config = json.loads((run / "config.json").read_text())
-    config["train"]["actuator"] = None
+    config.pop("sha256")
+    config["train"]["env"]["actuator"] = None
     (run / "config.json").write_text(json.dumps(config))
     demand = demand_of(run, episodes=2)
     assert demand.source.startswith("the policy run of cartpole")

@@ -189,11 +189,11 @@ def test_the_command_line_offers_the_runs_policy_and_those_of_others(monkeypatch
             seen["closed"] = True
 
     monkeypatch.setattr("codrl_mj.cli.view._browser", lambda: Fake)
-    run = Path(__file__).parents[1] / "fixtures" / "earlier" / "cartpole"
+    run = Path(__file__).parents[1] / "fixtures" / "runs" / "cartpole"
     other = shutil.copytree(run, tmp_path / "other" / "cartpole")
     assert main(["view", str(run), "--policies", str(run), str(other), "--actuator", "weaker"]) == 0
     made = seen["session"]
-    names = ["last", "earlier/cartpole", "other/cartpole", "random"]  # none of its actions does nothing
+    names = ["last", "runs/cartpole", "other/cartpole", "random"]  # none of its actions does nothing
     assert list(made.policies) == names
     assert made.chosen == "last"
     made.choose("other/cartpole")
