@@ -195,7 +195,8 @@ def test_several_policies_have_a_row_each_in_the_environment_of_their_own_traini
     both = [str(trained), str(config.parent)]
     assert main(["evaluate", *both, "--episodes", "3", "--out", "both.json"]) == 0
     found = json.loads((tmp_path / "both.json").read_text())
-    assert list(found) == [f"{Path(one).parent.name}/{trained.name} on as-trained" for one in both]
+    names = zip(both, ("weaker", "paper"), strict=True)
+    assert list(found) == [f"{Path(one).parent.name}/{trained.name} on {motor}" for one, motor in names]
     for path, result in zip(both, found.values(), strict=True):
         assert main(["evaluate", path, "--episodes", "3", "--out", "one.json"]) == 0
         assert json.loads((tmp_path / "one.json").read_text()) == result
@@ -422,11 +423,11 @@ def test_a_certificate_that_is_stopped_exits_with_130_and_leaves_nothing(monkeyp
     [
         ("", "codrl-mj needs a verb, one of train, evaluate, runs,"),
         ("trian cartpole", "unknown verb 'trian': did you mean 'train'? verbs are train, evaluate,"),
-        ("motor", "codrl-mj motor needs a verb, one of list, show,"),
-        ("motor lst", "unknown verb 'lst': did you mean 'list'? verbs are list, show,"),
+        ("motor", "codrl-mj motor needs a verb, one of list, new, show,"),
+        ("motor lst", "unknown verb 'lst': did you mean 'list'? verbs are list, new, show,"),
         ("motor show", "codrl-mj motor show needs NAME;"),
         ("motor show maxon-ec45", "did you mean 'maxon-ec45-flat-339285' or 'maxon-ec45-flat-50w'?"),
-        ("motor list --sort stal", "--sort stal: did you mean 'stall_torque' or 'stall_current'? must be one of"),
+        ("motor list --sort stal", "--sort stal: did you mean 'stall_torque'? must be one of"),
         ("identify check", "codrl-mj identify check needs --columns;"),
         ("train", "codrl-mj train needs TASK; codrl-mj train --help says more"),
         (

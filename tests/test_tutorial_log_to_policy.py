@@ -29,7 +29,11 @@ def run(command, **short):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_the_commands_are_understood(command, monkeypatch):
+def test_the_commands_are_understood(command, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    Path("motor").mkdir()
+    for name, text in (FILES | {"motor/actuator.yaml": FILES["real.yaml"]}).items():
+        Path(name).write_text(text)
     parsed = []
     for verb in (*cli.VERBS.values(), Check, Simulate):
         monkeypatch.setattr(verb, "run", lambda self: parsed.append(self) or 0)

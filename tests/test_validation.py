@@ -540,10 +540,10 @@ def test_the_page_is_well_formed_self_contained_and_has_everything(certificate, 
 
 def test_a_failure_is_on_top_and_not_by_colour_alone():
     words = Parsed(page.html(SAMPLE)).text
-    assert words.index("✗ FAILED: 1 of 2 checks") < words.index("Checks of ")
+    assert words.index("✗ 1 of 2 checks FAILED") < words.index("Checks of ")
     assert "b <i>" in words
     assert "x < y & z" in words
-    assert words.count("✗ FAILED") == 2
+    assert words.count("✗ FAILED") == 1
 
 
 def test_plots_have_their_labels_with_units(certificate):
@@ -585,7 +585,7 @@ def test_the_command_prints_writes_and_exits_with_0(capsys, tmp_path):
     text = capsys.readouterr().out
     assert "steps: left" in text
     assert "not checked: dynamics" in text
-    assert "passed: 13 of 13 checks" in text
+    assert "passed: 13 checks" in text
     assert (out / "certificate.html").is_file()
     assert json.loads((out / "certificate.json").read_text())["verdict"] == "passed"
 
@@ -606,7 +606,7 @@ def test_the_command_exits_with_1_when_a_check_fails_and_still_writes(capsys, mo
     assert main(["validate", "cartpole", "--out", str(tmp_path)]) == 1
     text = capsys.readouterr().out
     assert "bad, against oracle: FAILED at theta" in text
-    assert "FAILED: 1 of 2 checks" in text
+    assert "1 of 2 checks FAILED" in text
     assert json.loads((tmp_path / "certificate.json").read_text())["verdict"] == "FAILED"
 
 

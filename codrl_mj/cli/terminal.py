@@ -147,12 +147,10 @@ def print_certificate(certificate: Certificate) -> None:
             print_checks([check for check in checks if check.task == task], title)
     for skip in certificate.skipped:
         console().print(f"not checked: {skip.group}, {skip.name}: {skip.reason}", markup=False, highlight=False)
-    passed = sum(check.passed for check in certificate.checks)
-    verdict = "[green]passed" if certificate.passed else "[red]FAILED"
+    colour = "green" if certificate.passed else "red"
     form = " (the quick form)" if certificate.quick else ""
     console().print(
-        f"{verdict}: {passed} of {len(certificate.checks)} checks of {certificate.subject}{form}, "
-        f"in {certificate.seconds:.0f} s",
+        f"[{colour}]{certificate.verdict}[/] of {certificate.subject}{form}, in {certificate.seconds:.0f} s",
         highlight=False,
     )
 

@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from codrl_mj.pages import page
 from codrl_mj.runs.files import check_writable, writing
-from codrl_mj.validation.certificate import GROUPS, Certificate, versions
+from codrl_mj.validation.certificate import GROUPS, Certificate, verdict, versions
 from codrl_mj.validation.mutations import Caught, margin, unfailed
 from codrl_mj.validation.outcome import Check
 
@@ -26,9 +26,7 @@ def html(certificate: Certificate, caught: Sequence[Caught] = ()) -> str:
         certificate: what was found.
         caught: what mutations did, if they were tried.
     """
-    passed, count = sum(check.passed for check in certificate.checks), len(certificate.checks)
-    word = "passed" if certificate.passed else "FAILED"
-    top = [page.verdict(certificate.passed, f"{word}: {passed} of {count} checks")]
+    top = [page.verdict(certificate.passed, certificate.verdict)]
     if certificate.quick:
         top.append(page.note("The quick form: fewer states, runs and step sizes than in the full one."))
     top.append(
@@ -112,7 +110,7 @@ def summary(content: Mapping[str, Any]) -> Markup:
         good = sum(check["passed"] for check in own)
         rows.append((name, GROUPS.get(name, ""), f"{good} of {len(own)}"))
     passed = content["verdict"] == "passed"
-    whole = f"{content['verdict']}: {sum(check['passed'] for check in checks)} of {len(checks)} checks"
+    whole = verdict([check["passed"] for check in checks])
     return page.joined(
         (
             page.verdict(passed, whole),

@@ -53,6 +53,11 @@ class Certificate:
         """Whether every check passed, and there was one."""
         return bool(self.checks) and all(check.passed for check in self.checks)
 
+    @property
+    def verdict(self) -> str:
+        """In a few words how many checks failed, or passed."""
+        return verdict([check.passed for check in self.checks])
+
     def as_mapping(self) -> dict[str, Any]:
         """Everything but the plots, for JSON; infinities and NaN as text."""
         return {
@@ -66,6 +71,12 @@ class Certificate:
             "checks": [_check_mapping(check) for check in self.checks],
             "skipped": [dataclasses.asdict(skip) for skip in self.skipped],
         }
+
+
+def verdict(passed: Sequence[bool]) -> str:
+    """In a few words how many of some checks failed, or passed."""
+    failed = passed.count(False)
+    return f"{failed} of {len(passed)} checks FAILED" if failed or not passed else f"passed: {len(passed)} checks"
 
 
 def _check_mapping(check: Check) -> dict[str, Any]:

@@ -91,7 +91,7 @@ def _order_check(
     families = []
     for label, kind in physics_of(task):
         errors = [_error(_states(kind, task, actuators, int(count), integrator), solution) for count in counts]
-        families.append(Family(label, task.step_duration / counts, np.array(errors)))
+        families.append(Family(label, task.step_duration / counts, np.array(errors), 1e-12))  # the solution's
     oracle = f"DOP853 at 1e-12 on {whose}"
     case = "motor in the loop" if motors else "ideal actuator"
     oracle += " and of the motor" if motors else ""

@@ -41,6 +41,8 @@ from codrl_mj.validation.worst import worst_of
 ACTUATORS = ("paper", "weak", "weaker", "open_loop")
 """Whose runs are balanced step by step."""
 
+_ROUNDING = 100 * float(np.finfo(float).eps)
+"""Of the energies of a run: that of some hundred steps, which add up."""
 _ENERGY = "MuJoCo's kinetic and potential energy (and Gymnasium's hill)"
 BALANCES = {
     "electrical": "integral of u i = copper loss + L i^2/2 + integral of kE omega i",
@@ -113,7 +115,9 @@ def _order_checks(task: Task, integrator: str, quick: bool) -> Iterator[Check]:
         families = []
         for label, of_steps in kept.items():
             residuals = [float(np.abs(getattr(ledger, f"{balance}_residual")).max()) for ledger in of_steps]
-            families.append(Family(label, task.step_duration / steps, np.array(residuals)))
+            sizes = [np.abs(one).max() for one in (of_steps[-1].shaft, of_steps[-1].mechanical)]
+            rounding = _ROUNDING * max(abs(Meter(task)(free_run(task)[0])), *sizes) if exact else 0.0
+            families.append(Family(label, task.step_duration / steps, np.array(residuals), float(rounding)))
         title = f"{task.name}, {integrator}: {balance} balance"
         plot = Plot(title, "integration step [s]", "largest residual of the run [J]", ())
         name = f"order, {balance} balance, {integrator}"

@@ -52,6 +52,22 @@ class Family(NamedTuple):
     """What is made smaller, or larger where the promised order is negative."""
     errors: np.ndarray
     """What was found at each."""
+    rounding: float = 0.0
+    """Size up to which an error is rounding, and says nothing of an order."""
+
+    def judged(self, promised: float) -> tuple[float, str]:
+        """How far it is from the promised order, and the finding in words; rounding is left out.
+
+        With fewer than three errors left there is no slope, and the largest may be what the promised order leaves over
+        rounding two steps before it, with as much again for rounding's scatter: `TOLERANCE` times its share in that.
+        """
+        clear = ~(self.errors <= self.rounding) | (self.rounding == 0.0)  # NaN is clear
+        spread = f"errors {self.errors[0]:.2g} to {self.errors[-1]:.2g}"
+        if clear.sum() >= 3 or not self.rounding:
+            slope = fit_slope(self.steps[clear], self.errors[clear])
+            return slope.distance(promised), f"{self.label}: slope {slope}, {spread}"
+        share = float(self.errors.max() / (2.0 * self.rounding * (self.steps[0] / self.steps[2]) ** promised))
+        return TOLERANCE * share, f"{self.label}: exact to rounding, {self.rounding:.2g}: {spread}"
 
 
 TOLERANCE = 0.1
@@ -73,12 +89,10 @@ def order_check(
         group: of the check.
         task: of the check.
     """
-    slopes = [fit_slope(family.steps, family.errors) for family in families]
-    distances = [slope.distance(promised) for slope in slopes]
+    found = [family.judged(promised) for family in families]
+    distances = [np.inf if np.isnan(distance) else distance for distance, _ in found]
     worst = int(np.argmax(distances))
-    family = families[worst]
-    where = f"{family.label}: slope {slopes[worst]}, errors {family.errors[0]:.2g} to {family.errors[-1]:.2g}"
-    curves = [Curve(f"{f.label}: {slope}", f.steps, f.errors) for f, slope in zip(families, slopes, strict=True)]
+    curves = [Curve(text.partition(", ")[0], f.steps, f.errors) for f, (_, text) in zip(families, found, strict=True)]
     first = families[0]
     guide = 0.5 * first.errors[-1] * (first.steps / first.steps[-1]) ** promised  # beside the errors, not upon them
     curves.append(Curve(f"slope {promised:g}, as promised", first.steps, guide, reference=True))
@@ -88,7 +102,7 @@ def order_check(
         sum(len(f.steps) for f in families),
         distances[worst],
         TOLERANCE,
-        where,
+        found[worst][1],
         group=group,
         task=task,
         unit="slope",

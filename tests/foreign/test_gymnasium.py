@@ -537,7 +537,7 @@ def test_what_does_not_go_with_a_model_is_said(arm_id):
         codrl_mj.make(arm_id, MAXON, action="current", allow_unstable=True)
     with pytest.raises(ValueError, match=r"motor: a command \[A\] needs a limit"):
         codrl_mj.make(arm_id, {"motor": "maxon-ec45-flat-50w"}, action="current", allow_unstable=True)
-    with pytest.raises(ValueError, match="no model was built inside"):
+    with pytest.raises(ValueError, match="has no MuJoCo model built from XML, and so no motors: take 'cartpole'"):
         codrl_mj.make("CartPole-v1", IDEAL)
     env = codrl_mj.make("HalfCheetah-v5", MAXON, action="current")
     env.reset()

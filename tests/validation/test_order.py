@@ -41,6 +41,24 @@ def test_what_is_not_of_the_promised_order_fails(errors):
     assert not check(errors, 1.0).passed
 
 
+@pytest.mark.parametrize(
+    ("errors", "passed", "said"),
+    [
+        ([1.2e-13, 7.5e-15, 2e-16, 1e-16, 3e-16], True, "exact to rounding"),  # two above it
+        ([0.0, 0.0, 0.0, 0.0, 0.0], True, "exact to rounding"),
+        ([1e-11, 7.5e-16, 2e-16, 1e-16, 3e-16], False, "exact to rounding"),  # more than the order leaves
+        ([math.nan, 1e-16, 1e-16, 1e-16, 1e-16], False, "exact to rounding"),
+        ([1.6e-10, 1e-11, 6.25e-13, 4e-14, 9e-16], True, "slope 3.99"),  # without the last
+        ([1e-13, 9e-14, 8e-14, 7e-14, 6e-14], False, "slope 0.18"),
+    ],
+)
+def test_an_order_is_not_fitted_to_rounding(errors, passed, said):
+    family = Family("family", STEPS, np.array(errors), 1e-15)
+    found = order_check("name", "oracle", [family], 4.0, PLOT, "group")
+    assert found.passed == passed
+    assert said in found.where
+
+
 def test_a_scattered_fit_fails_though_its_slope_is_right():
     errors = STEPS * np.array([1.0, 1.5, 0.6, 1.5, 1.0])
     assert fit_slope(STEPS, errors).value == pytest.approx(1.0, abs=0.1)
