@@ -106,7 +106,7 @@ def train(
 
 @contextlib.contextmanager
 def _taking(out: Path, exists: bool) -> Iterator[None]:
-    """Own a run folder while the block runs, and leave none in which nothing was learned when it raises.
+    """Own a run folder while the block runs, and leave no new one in which nothing was learned when it raises.
 
     Raises:
         RunInUseError: another process trains in it, or has in the meantime.
@@ -123,7 +123,7 @@ def _taking(out: Path, exists: bool) -> Iterator[None]:
         except TrainingStoppedError:
             raise
         except BaseException:
-            if folder.unused(out):
+            if not exists and folder.unused(out):
                 folder.clear(out)
                 (out / folder.LOCK).unlink()
                 for path in made:
