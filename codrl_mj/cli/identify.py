@@ -106,11 +106,7 @@ class Identify:
         return None if self.motor is None else find_drive(self.motor)
 
     def _check(self, logs: list[Any], held_out: list[Any], base: Any) -> list[Any]:
-        """Print what is wrong with the logs; returns those held out that have no errors.
-
-        Raises:
-            ValueError: one that is fitted has errors.
-        """
+        """Print what is wrong with the logs; returns those held out that have no errors."""
         from codrl_mj.cli.identify_tools import findings_table
         from codrl_mj.cli.terminal import console
         from codrl_mj.identify.checks import check
@@ -135,20 +131,12 @@ class Identify:
 
 
 def identify_verb(arguments: list[str]) -> Any:
-    """The verb's dataclass for a command line: the fit, or what is done before.
-
-    Args:
-        arguments: what follows `identify`.
-    """
+    """The verb's dataclass for a command line: the fit, or what is done before."""
     return IdentifyTools if arguments[:1] and arguments[0] in TOOLS else Identify
 
 
 def _numbers(texts: tuple[str, ...]) -> dict[str, float]:
-    """NAME=VALUE, each.
-
-    Raises:
-        ValueError: one is not that, or a name stands twice.
-    """
+    """NAME=VALUE, each."""
     found: dict[str, float] = {}
     for text in texts:
         name, _, value = text.partition("=")
@@ -167,6 +155,7 @@ def print_identified(found: Any) -> None:
 
     from codrl_mj.cli.look import titled_table
     from codrl_mj.cli.terminal import console
+    from codrl_mj.identify.log import SIGNALS
     from codrl_mj.identify.result import USABLE
 
     table = titled_table(f"Identified from {', '.join(found.logs)}")
@@ -178,7 +167,6 @@ def print_identified(found: Any) -> None:
         table.add_row(*map(escape, texts), style="" if one.status in USABLE else "yellow")
     console().print(table)
     if found.fitted or found.held_out:
-        units = {"position": "rad", "velocity": "rad/s"}
         table = titled_table("Errors of the simulation, mean absolute")
         for name in ("log", "", "of", "open loop, 0.5 s", "closed loop"):
             table.add_column(name, justify="right" if "loop" in name else "left")
@@ -186,7 +174,7 @@ def print_identified(found: Any) -> None:
             for one in several:
                 closed = "" if one.closed_loop is None else f"{one.closed_loop:.3g}"
                 table.add_row(
-                    escape(one.log), kind, f"{one.output} {units[one.output]}", f"{one.open_loop:.3g}", closed
+                    escape(one.log), kind, f"{one.output} {SIGNALS[one.output]}", f"{one.open_loop:.3g}", closed
                 )
         console().print(table)
     for part, rows in found.delays.items():

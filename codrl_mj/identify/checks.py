@@ -16,13 +16,7 @@ _MOST = {"voltage": 1e3, "bus": 1e3, "current": 1e3, "velocity": 2e4, "torque": 
 
 
 def check(log: Log, motor: Any = None, rig: str | None = None) -> list[Finding]:
-    """What is noteworthy about a log, errors first.
-
-    Args:
-        log: the log.
-        motor: what its datasheet says, a `GearMotor`, to be compared with; None: nothing is known.
-        rig: what the output moves, as `identify` takes it; None: it may be a pendulum.
-    """
+    """What is noteworthy about a log, errors first; beside a datasheet's `GearMotor` and on a rig, where given."""
     findings = [*log.findings, *_times(log)]
     for signal in log.signals:
         findings += _resolution(log, signal)

@@ -85,14 +85,7 @@ class Column:
         return {name for node, name in _names(tree) if id(node) not in calls and name != "pi"}
 
     def value(self, table: Mapping[str, Any]) -> Any:
-        """The signal in SI.
-
-        Args:
-            table: column -> its values, or the constant, by name.
-
-        Raises:
-            ValueError: it has no such column, and the nearest is suggested.
-        """
+        """The signal in SI, by a table of columns and constants."""
         check_names(self.names, table, "column")
         with np.errstate(divide="ignore", invalid="ignore"):
             return self._quantity(_evaluate(self._tree().body, {"pi": math.pi, **table}))
@@ -167,16 +160,7 @@ def _evaluate(node: ast.AST, table: Mapping[str, Any]) -> Any:
 
 
 def parse_columns(given: str | Mapping[str, str]) -> dict[str, Column]:
-    """Signal -> what it is made of.
-
-    Args:
-        given: `signal=formula:unit` separated by commas, or a mapping of signals to `formula:unit`. The voltage is what
-            holds from its row to the next, or `mean(formula)`: the mean in between. `only=formula` leaves out the rows
-            where it is 0.
-
-    Raises:
-        ValueError: unknown signal, unit or function; no unit; no time; nothing but time; a signal twice.
-    """
+    """Signal -> what it is made of."""
     if isinstance(given, str):
         pairs = [_split(entry, "=") for entry in _split(given, ",") if entry.strip()]
     else:

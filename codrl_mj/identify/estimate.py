@@ -229,11 +229,7 @@ def estimate(
     most: int = 40,
     scale: float | None = None,
 ) -> tuple[Fit, tuple[Fit, ...]]:
-    """Fit a model to segments.
-
-    Returns:
-        The best fit, and what each start led to.
-    """
+    """Fit a model to segments: the best fit, and what each start led to."""
     if len(starts) == 1:
         states = [settled_state(model, starts[0], one) for one in segments]
         best = _refined(model, segments, starts[0], states, most, scale)

@@ -9,14 +9,12 @@ import numpy as np
 
 from codrl_mj.fields import check_names
 from codrl_mj.identify import honesty
-from codrl_mj.identify.friction import chosen_friction
 from codrl_mj.identify.log import Log
 from codrl_mj.identify.parameters import DEFAULTS, ESTIMABLE, FRICTION, OF_RIG, PARAMETERS
-from codrl_mj.identify.prediction import Prediction, predict
+from codrl_mj.identify.prediction import Prediction, correlations, fitted_traces, predict
 from codrl_mj.identify.result import Estimate, Identified, Status, missing
 from codrl_mj.identify.segments import BLOCK, SEGMENT, moves, shifted
-from codrl_mj.identify.stages import PART, Fitted, Shaft, Winding, fitted
-from codrl_mj.identify.traces import correlations, fitted_traces
+from codrl_mj.identify.stages import PART, Fitted, Shaft, Winding, chosen_friction, fitted
 
 WIDEST = 0.3
 """An interval of more than this share of the value to either side is too wide; of the whole friction, for friction."""
@@ -150,11 +148,7 @@ def checked(
     segment: float = SEGMENT,
     base: Mapping[str, Any] | None = None,
 ) -> dict[str, float]:
-    """What is known, the gear of the base too, if the arguments of `identify` are such as it takes.
-
-    Raises:
-        ValueError: as `identify` does.
-    """
+    """What is known, the gear of the base too, if the arguments of `identify` are such as it takes."""
     known = _with_gear(known or {}, base)
     if not segment >= 0.05:
         raise ValueError(f"segment = {segment!r}: must be >= 0.05 s; {SEGMENT:g} is the default")

@@ -8,10 +8,9 @@ from typing import ClassVar
 import numpy as np
 
 from codrl_mj.identify import simulation
-from codrl_mj.identify.differentiation import speeds
 from codrl_mj.identify.estimate import Model, Simulate
 from codrl_mj.identify.parameters import DEFAULTS, ELECTRICAL, FRICTION, OF_FRICTION, OF_RIG, PARAMETERS
-from codrl_mj.identify.segments import Segment
+from codrl_mj.identify.segments import Segment, speeds
 
 
 class WindingModel(Model):

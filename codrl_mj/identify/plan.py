@@ -105,19 +105,7 @@ def plan(
     max_current: float = math.inf,
     continuous_current: float = math.inf,
 ) -> Plan:
-    """Compare excitations and sample rates for a motor whose parameters are about known.
-
-    Args:
-        drive: the motor, with its supply and its largest current.
-        load: what it moves meanwhile.
-        sensing: what is measured.
-        duration: of a log [s].
-        max_current: that the bench allows [A]; the drive's own counts too.
-        continuous_current: that the motor bears [A]; its root mean square stays below.
-
-    Raises:
-        ValueError: the motor has no inertia to turn; or a value is out of bounds.
-    """
+    """Compare excitations and sample rates for a motor that is about known, within what bench and motor bear [A]."""
     if not duration >= 4.0 * _SEGMENT:
         raise ValueError(f"duration = {duration!r}: must be at least {4.0 * _SEGMENT:g} s; log for longer")
     limit = min(max_current, drive.controller.max_current)

@@ -42,7 +42,9 @@ def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
             number under the names is of units. Decimal commas, times of day (ISO 8601) and Latin-1 are read.
             JSON is a list of rows, or an object with one such list, such as `entries`, and numbers beside it,
             which formulas can use, or an object of columns.
-        columns: see `codrl_mj.identify.columns.parse_columns`.
+        columns: `signal=formula:unit` separated by commas, or a mapping of signals to `formula:unit`. The voltage is
+            what holds from its row to the next, or `mean(formula)`: the mean in between. `only=formula` leaves out the
+            rows where it is 0.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -138,11 +140,7 @@ def _left_out(rows: np.ndarray, check: str, what: str) -> list[Finding]:
 
 
 def read_table(path: Path) -> Table:
-    """A file's columns as they stand there; see `read_log`, which says which files.
-
-    Raises:
-        ValueError: it is none of these.
-    """
+    """A file's columns as they stand there; see `read_log`, which says which files."""
     kind = Path(path.name.removesuffix(".gz")).suffix.lower()
     if kind == ".parquet":
         return _parquet(path)
@@ -239,11 +237,7 @@ def _numbers(table: Table, mapping: Mapping[str, Column]) -> tuple[dict[str, Any
 
 
 def number(name: str, line: int, one: Any, table: Table) -> float:
-    """A cell as a number: NaN where it is empty.
-
-    Raises:
-        ValueError: it is none; the message names column and line.
-    """
+    """A cell as a number: NaN where it is empty."""
     if isinstance(one, int | float):
         return float(one)
     text = "" if one is None else str(one).strip()
