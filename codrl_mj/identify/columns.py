@@ -12,7 +12,8 @@ import numpy as np
 from codrl_mj.fields import check_names
 from codrl_mj.identify.log import SIGNALS
 
-_KINDS: dict[str, str | None] = {"time": "s", **SIGNALS, "only": ""}
+KINDS: dict[str, str | None] = {"time": "s", **SIGNALS, "only": ""}
+"""What columns may be -> its SI unit; None: any."""
 _EXAMPLE = "time=t:s,voltage=duty*vbus:V,current=i:A,position=q:rad"
 
 
@@ -53,7 +54,7 @@ class Column:
 
     def __post_init__(self) -> None:
         """Validate, without a file."""
-        check_names([self.signal], _KINDS, "signal")
+        check_names([self.signal], KINDS, "signal")
         tree = self._tree()
         for node in ast.walk(tree):
             if not isinstance(node, _ALLOWED) or (isinstance(node, ast.BinOp) and type(node.op) not in _OPERATORS):
@@ -63,7 +64,7 @@ class Column:
                 )
         for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
             self._check_call(call)
-        kind = _KINDS[self.signal]
+        kind = KINDS[self.signal]
         if self.unit is not None:
             self._quantity(1.0)
         elif kind and isinstance(tree.body, ast.Name | ast.Constant):
@@ -110,7 +111,7 @@ class Column:
 
     def _quantity(self, value: Any) -> Any:
         """A value in SI."""
-        kind, unit = _KINDS[self.signal], self.unit
+        kind, unit = KINDS[self.signal], self.unit
         if unit is None or (not kind and unit in ("", "1")):
             return value
         from codrl_mj.catalogue.units import leaves_angle_open, respelled, unit_registry

@@ -16,8 +16,9 @@ import numpy as np
 from codrl_mj.actuators import Drive
 from codrl_mj.fields import check, check_names, real
 from codrl_mj.identify import simulation
+from codrl_mj.identify.columns import KINDS
 from codrl_mj.identify.excitations import Excitation
-from codrl_mj.identify.log import SIGNALS, Log
+from codrl_mj.identify.log import Log
 from codrl_mj.runs.files import writing
 
 
@@ -216,9 +217,8 @@ def write_log(path: Path, log: Log) -> str:
     table = np.column_stack([log.time, *log.signals.values()])
     with writing(path) as temporary:
         np.savetxt(temporary, table, fmt="%.9g", delimiter=",", header=",".join(names), comments="")
-    kinds = {"time": "s", **SIGNALS}
     texts = {name: f"mean({name})" if log.mean_voltage and name == "voltage" else name for name in names}
-    return ",".join(f"{name}={text}:{kinds[name] or '1'}" for name, text in texts.items())
+    return ",".join(f"{name}={text}:{KINDS[name] or '1'}" for name, text in texts.items())
 
 
 @functools.cache
