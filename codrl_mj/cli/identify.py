@@ -2,11 +2,11 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import tyro
 
-from codrl_mj.cli.identify_tools import TOOLS, Columns, IdentifyTools
+from codrl_mj.cli.identify_tools import TOOLS, Columns, IdentifyTools, Logs
 from codrl_mj.cli.motor import AsJson
 
 
@@ -23,9 +23,7 @@ class Identify:
     --rig pendulum --known mgl=2.81 --friction auto --holdout swing3.csv --out motor
     """
 
-    logs: Annotated[
-        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="LOG", help="CSV, JSON (or .gz), Parquet.")
-    ]
+    logs: Logs
     columns: Columns
     rig: Literal["pendulum", "free", "load"] | None = None
     """What the output moves: a pendulum that hangs at position 0, nothing but inertia, or inertia and a held load. A
@@ -56,9 +54,11 @@ class Identify:
         from codrl_mj.cli.terminal import console, progress_bar
         from codrl_mj.identify.identify import checked, foreseen, identify
         from codrl_mj.identify.reading import read_log
+        from codrl_mj.motor_design import find_drive
 
         logs, held_out = ([read_log(path, self.columns) for path in paths] for paths in (self.logs, self.holdout))
-        known, base = _numbers(self.known), self._base()
+        known = _numbers(self.known)
+        base: Any = None if self.motor is None else find_drive(self.motor)
         if base is not None and "gear_ratio" in known:
             base = base.replaced({"motor.gear_ratio": known["gear_ratio"]})
         mapping = base and base.as_mapping()
@@ -99,11 +99,6 @@ class Identify:
             told = f"no {path}: {error}; pages need the extra 'validate': pip install 'codrl-mj[validate]'"
         if not self.as_json:
             print(told)
-
-    def _base(self) -> Any:
-        from codrl_mj.motor_design import find_drive
-
-        return None if self.motor is None else find_drive(self.motor)
 
     def _check(self, logs: list[Any], held_out: list[Any], base: Any) -> list[Any]:
         """Print what is wrong with the logs; returns those held out that have no errors."""

@@ -105,7 +105,11 @@ def plan(
     max_current: float = math.inf,
     continuous_current: float = math.inf,
 ) -> Plan:
-    """Compare excitations and sample rates for a motor that is about known, within what bench and motor bear [A]."""
+    """Compare excitations and sample rates for a motor whose parameters are about known.
+
+    A log lasts `duration` [s]; the current stays below `max_current` [A] of the bench and below the drive's own, its
+    root mean square below `continuous_current` [A] of the motor.
+    """
     if not duration >= 4.0 * _SEGMENT:
         raise ValueError(f"duration = {duration!r}: must be at least {4.0 * _SEGMENT:g} s; log for longer")
     limit = min(max_current, drive.controller.max_current)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from codrl_mj.identify import honesty, simulation
+from codrl_mj.identify import simulation
 from codrl_mj.identify.estimate import settled_state
 from codrl_mj.identify.log import Log, usable
 from codrl_mj.identify.models import ShaftModel
@@ -110,12 +110,3 @@ def fitted_traces(name: str, part: Any) -> tuple[Trace, ...]:
         pieces.setdefault(segment.log, []).append((segment.times, segment.measured, simulated))
     output = "current" if name == "winding" else part.model.output
     return tuple(trace(part.logs[place].name, name, output, several) for place, several in pieces.items())
-
-
-def correlations(part: Any) -> dict[str, dict[str, float]]:
-    """Correlations of a `Fitted` part's parameters, by its Jacobian: near 1 or -1, one may stand for the other."""
-    if part is None or not part.fit.names:
-        return {}
-    names = part.fit.names
-    table = honesty.correlations(part.fit)
-    return {name: dict(zip(names, row.tolist(), strict=True)) for name, row in zip(names, table, strict=True)}

@@ -6,7 +6,7 @@ import gzip
 import importlib
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -95,7 +95,7 @@ def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
 
 
 def _log(
-    name: str, signals: dict[str, np.ndarray], mapping: Mapping[str, Column], table: Table, first: list[Finding]
+    name: str, signals: dict[str, np.ndarray], mapping: Mapping[str, Column], table: Table, first: Iterator[Finding]
 ) -> Log:
     time, only = signals.pop("time"), signals.pop("only", None)
     wanted = np.ones(len(time), bool) if only is None else only != 0.0
@@ -112,9 +112,8 @@ def _log(
             for one in mapping.values()
             if one.unit is None and SIGNALS.get(one.signal)
         ),
+        *_left_out(np.array(table.ragged, int) - 1, "missing", "are incomplete, and are left out"),
     ]
-    if table.ragged:
-        findings += _left_out(np.array(table.ragged) - 1, "missing", "are incomplete, and are left out")
     unusable = int((wanted & ~finite).sum() + (~forward).sum())
     rows = rows[forward]
     if rows.size < 2 or unusable > _MOST_UNUSABLE * max(int(wanted.sum()), 1):
@@ -137,9 +136,8 @@ def _log(
     )
 
 
-def _unsigned(values: Mapping[str, Any], mapping: Mapping[str, Column]) -> list[Finding]:
+def _unsigned(values: Mapping[str, Any], mapping: Mapping[str, Column]) -> Iterator[Finding]:
     """Columns that look like registers with a sign that is read without it: the highest and lowest quarter are used."""
-    found = []
     unsigned = (one for one in mapping.values() if "twos_complement" not in one.formula)
     for name in sorted(set().union(*(one.names for one in unsigned))):
         column = np.asarray(values[name] if values[name] is not None else 0.0, float)
@@ -150,17 +148,16 @@ def _unsigned(values: Mapping[str, Any], mapping: Mapping[str, Column]) -> list[
             if within and high.any() and low.any() and np.all(high | low):
                 row = int(np.flatnonzero(high)[0]) + 1
                 text = f"{name} is below {whole / 4:.0f} or above {3 * whole / 4:.0f}: has it {bits} bits and a sign?"
-                found.append(Finding("error", "register", row, text, f"write twos_complement({name}, {bits})"))
-    return found
+                yield Finding("error", "register", row, text, f"write twos_complement({name}, {bits})")
 
 
-def _left_out(rows: np.ndarray, check: str, what: str) -> list[Finding]:
+def _left_out(rows: np.ndarray, check: str, what: str) -> Iterator[Finding]:
     if not rows.size:
-        return []
+        return
     text = f"{rows.size} row{'s' if rows.size > 1 else ''}, the first one {rows[0] + 1}, {what}"
     severity = "error" if check == "stamps" else "warning"
     remedy = "find out why the logger wrote them; sort the file, or cut it, if its clock was set back"
-    return [Finding(severity, check, int(rows[0]) + 1, text, remedy if check == "stamps" else "")]
+    yield Finding(severity, check, int(rows[0]) + 1, text, remedy if check == "stamps" else "")
 
 
 def read_table(path: Path) -> Table:

@@ -162,7 +162,10 @@ def simulate(
     position: float = 0.0,
     name: str = "synthetic",
 ) -> Log:
-    """A log of a drive with all that can be logged: the voltage asked for, without sag, the torque as n*kT*i."""
+    """A log of a drive with all that can be logged, from a `position` [rad] on, under a voltage as `run` takes it.
+
+    Signals without a sensor show what is. The voltage is the one asked for, without sag; the torque n*kT*i.
+    """
     sensors = dict(sensors or {})
     signals = ("voltage", "current", "position", "velocity", "torque", "bus", "duty")
     check_names(sensors, signals, "signal")
