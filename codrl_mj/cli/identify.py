@@ -2,11 +2,11 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import tyro
 
-from codrl_mj.cli.identify_tools import TOOLS, Columns, IdentifyTools
+from codrl_mj.cli.identify_tools import TOOLS, Columns, IdentifyTools, Logs
 from codrl_mj.cli.motor import AsJson
 
 
@@ -23,9 +23,7 @@ class Identify:
     --rig pendulum --known mgl=2.81 --friction auto --holdout swing3.csv --out motor
     """
 
-    logs: Annotated[
-        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="LOG", help="CSV, JSON (or .gz), Parquet.")
-    ]
+    logs: Logs
     columns: Columns
     rig: Literal["pendulum", "free", "load"] | None = None
     """What the output moves: a pendulum that hangs at position 0, nothing but inertia, or inertia and a held load. A
@@ -56,9 +54,11 @@ class Identify:
         from codrl_mj.cli.terminal import console, progress_bar
         from codrl_mj.identify.identify import checked, foreseen, identify
         from codrl_mj.identify.reading import read_log
+        from codrl_mj.motor_design import find_drive
 
         logs, held_out = ([read_log(path, self.columns) for path in paths] for paths in (self.logs, self.holdout))
-        known, base = _numbers(self.known), self._base()
+        known = _numbers(self.known)
+        base: Any = None if self.motor is None else find_drive(self.motor)
         if base is not None and "gear_ratio" in known:
             base = base.replaced({"motor.gear_ratio": known["gear_ratio"]})
         mapping = base and base.as_mapping()
@@ -100,17 +100,8 @@ class Identify:
         if not self.as_json:
             print(told)
 
-    def _base(self) -> Any:
-        from codrl_mj.motor_design import find_drive
-
-        return None if self.motor is None else find_drive(self.motor)
-
     def _check(self, logs: list[Any], held_out: list[Any], base: Any) -> list[Any]:
-        """Print what is wrong with the logs; returns those held out that have no errors.
-
-        Raises:
-            ValueError: one that is fitted has errors.
-        """
+        """Print what is wrong with the logs; returns those held out that have no errors."""
         from codrl_mj.cli.identify_tools import findings_table
         from codrl_mj.cli.terminal import console
         from codrl_mj.identify.checks import check
@@ -135,20 +126,12 @@ class Identify:
 
 
 def identify_verb(arguments: list[str]) -> Any:
-    """The verb's dataclass for a command line: the fit, or what is done before.
-
-    Args:
-        arguments: what follows `identify`.
-    """
+    """The verb's dataclass for a command line: the fit, or what is done before."""
     return IdentifyTools if arguments[:1] and arguments[0] in TOOLS else Identify
 
 
 def _numbers(texts: tuple[str, ...]) -> dict[str, float]:
-    """NAME=VALUE, each.
-
-    Raises:
-        ValueError: one is not that, or a name stands twice.
-    """
+    """NAME=VALUE, each."""
     found: dict[str, float] = {}
     for text in texts:
         name, _, value = text.partition("=")
@@ -167,6 +150,7 @@ def print_identified(found: Any) -> None:
 
     from codrl_mj.cli.look import titled_table
     from codrl_mj.cli.terminal import console
+    from codrl_mj.identify.log import SIGNALS
     from codrl_mj.identify.result import USABLE
 
     table = titled_table(f"Identified from {', '.join(found.logs)}")
@@ -178,7 +162,6 @@ def print_identified(found: Any) -> None:
         table.add_row(*map(escape, texts), style="" if one.status in USABLE else "yellow")
     console().print(table)
     if found.fitted or found.held_out:
-        units = {"position": "rad", "velocity": "rad/s"}
         table = titled_table("Errors of the simulation, mean absolute")
         for name in ("log", "", "of", "open loop, 0.5 s", "closed loop"):
             table.add_column(name, justify="right" if "loop" in name else "left")
@@ -186,7 +169,7 @@ def print_identified(found: Any) -> None:
             for one in several:
                 closed = "" if one.closed_loop is None else f"{one.closed_loop:.3g}"
                 table.add_row(
-                    escape(one.log), kind, f"{one.output} {units[one.output]}", f"{one.open_loop:.3g}", closed
+                    escape(one.log), kind, f"{one.output} {SIGNALS[one.output]}", f"{one.open_loop:.3g}", closed
                 )
         console().print(table)
     for part, rows in found.delays.items():

@@ -22,6 +22,9 @@ Columns = Annotated[
     ),
 ]
 """Type of a verb's flag `--columns`."""
+_FILE = tyro.conf.arg(metavar="LOG", help="CSV, JSON (or .gz), Parquet.")
+Logs = Annotated[tyro.conf.Positional[tuple[Path, ...]], _FILE]
+"""Type of a verb's files."""
 _STYLES = {"error": "red", "warning": "yellow", "info": ""}
 
 
@@ -33,9 +36,7 @@ class Check:
     --columns time=t:s,voltage=u:V,current=i:A,position=q:rad
     """
 
-    logs: Annotated[
-        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="LOG", help="CSV, JSON (or .gz), Parquet.")
-    ]
+    logs: Logs
     columns: Columns
     motor: str | None = None
     """Motor of the catalogue, or a file with a datasheet, that resistance and back-EMF are compared with."""
@@ -266,7 +267,7 @@ class ProposeColumns:
     Example: codrl-mj identify columns log.csv
     """
 
-    log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="LOG", help="CSV, JSON (or .gz), Parquet.")]
+    log: Annotated[tyro.conf.Positional[Path], _FILE]
     as_json: AsJson = False
 
     def run(self) -> int:

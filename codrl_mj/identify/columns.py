@@ -12,7 +12,8 @@ import numpy as np
 from codrl_mj.fields import check_names
 from codrl_mj.identify.log import SIGNALS
 
-_KINDS: dict[str, str | None] = {"time": "s", **SIGNALS, "only": ""}
+KINDS: dict[str, str | None] = {"time": "s", **SIGNALS, "only": ""}
+"""What columns may be -> its SI unit; None: any."""
 _EXAMPLE = "time=t:s,voltage=duty*vbus:V,current=i:A,position=q:rad"
 
 
@@ -53,7 +54,7 @@ class Column:
 
     def __post_init__(self) -> None:
         """Validate, without a file."""
-        check_names([self.signal], _KINDS, "signal")
+        check_names([self.signal], KINDS, "signal")
         tree = self._tree()
         for node in ast.walk(tree):
             if not isinstance(node, _ALLOWED) or (isinstance(node, ast.BinOp) and type(node.op) not in _OPERATORS):
@@ -63,7 +64,7 @@ class Column:
                 )
         for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
             self._check_call(call)
-        kind = _KINDS[self.signal]
+        kind = KINDS[self.signal]
         if self.unit is not None:
             self._quantity(1.0)
         elif kind and isinstance(tree.body, ast.Name | ast.Constant):
@@ -85,14 +86,7 @@ class Column:
         return {name for node, name in _names(tree) if id(node) not in calls and name != "pi"}
 
     def value(self, table: Mapping[str, Any]) -> Any:
-        """The signal in SI.
-
-        Args:
-            table: column -> its values, or the constant, by name.
-
-        Raises:
-            ValueError: it has no such column, and the nearest is suggested.
-        """
+        """The signal in SI, by a table of columns and constants."""
         check_names(self.names, table, "column")
         with np.errstate(divide="ignore", invalid="ignore"):
             return self._quantity(_evaluate(self._tree().body, {"pi": math.pi, **table}))
@@ -117,7 +111,7 @@ class Column:
 
     def _quantity(self, value: Any) -> Any:
         """A value in SI."""
-        kind, unit = _KINDS[self.signal], self.unit
+        kind, unit = KINDS[self.signal], self.unit
         if unit is None or (not kind and unit in ("", "1")):
             return value
         from codrl_mj.catalogue.units import leaves_angle_open, respelled, unit_registry
@@ -167,16 +161,7 @@ def _evaluate(node: ast.AST, table: Mapping[str, Any]) -> Any:
 
 
 def parse_columns(given: str | Mapping[str, str]) -> dict[str, Column]:
-    """Signal -> what it is made of.
-
-    Args:
-        given: `signal=formula:unit` separated by commas, or a mapping of signals to `formula:unit`. The voltage is what
-            holds from its row to the next, or `mean(formula)`: the mean in between. `only=formula` leaves out the rows
-            where it is 0.
-
-    Raises:
-        ValueError: unknown signal, unit or function; no unit; no time; nothing but time; a signal twice.
-    """
+    """Signal -> what it is made of."""
     if isinstance(given, str):
         pairs = [_split(entry, "=") for entry in _split(given, ",") if entry.strip()]
     else:

@@ -42,24 +42,24 @@ def name_of_factor(ratio: float, angle: bool = True) -> str:
     return f"a factor of {math.exp(size):.4g}, " + " or ".join([*near, "a wrong scale, another motor, or a gear"])
 
 
-def contradictions(log: Log, motor: Any = None, rig: str | None = None) -> list[Finding]:
+def contradictions(log: Log, motor: Any = None, rig: str | None = None) -> Iterator[Finding]:
     """What contradicts what."""
     turns = moves(log)
     effort = next((name for name in ("torque", "current", "voltage") if log.has(name)), None)
-    found: list[Finding] = [*_degrees(log, effort if turns else None, rig)]
+    yield from _degrees(log, effort if turns else None, rig)
     if log.has("position", "velocity") and turns:
-        found += _velocity(log)
-    electrical = voltage_balance(log) if log.has("voltage", "current") else None
+        yield from _velocity(log)
+    electrical = None
     if log.has("voltage", "current"):
-        found += [*_electrical(electrical), *_delay(log), *_sag(log, electrical)]
+        electrical = voltage_balance(log)
+        yield from (*_electrical(electrical), *_delay(log), *_sag(log, electrical))
     if not turns and (log.has("position") or log.has("velocity")):
         text = "the shaft stands still, as if it were locked"
-        found.append(Finding("info", "excitation", None, text, "leave position and velocity out if it is"))
+        yield Finding("info", "excitation", None, text, "leave position and velocity out if it is")
     if turns and effort is not None:
-        found += [*_mechanical(log, effort, rig), *_motion(log)]
+        yield from (*_mechanical(log, effort, rig), *_motion(log))
     if electrical is not None:
-        found += [*_two_constants(log, electrical), *_datasheet(electrical, motor)]
-    return found
+        yield from (*_two_constants(log, electrical), *_datasheet(electrical, motor))
 
 
 def _degrees(log: Log, effort: str | None, rig: str | None) -> Iterator[Finding]:

@@ -105,7 +105,11 @@ def _settle(
     """The segment from the best state near one, by Gauss-Newton steps that are cut where they are too long."""
     here = _residuals(simulate, segment, state)
     for _ in range(most):
-        columns = _state_columns(simulate, segment, state, steps, here)
+        columns = np.empty((len(here), len(steps)))
+        for place, length in enumerate(steps):
+            moved = state.copy()
+            moved[place] += length
+            columns[:, place] = (_residuals(simulate, segment, moved) - here) / length
         root, cost = (1.0 + (here / scale) ** 2) ** -0.25, robust_cost(here, scale)
         step = np.linalg.lstsq(root[:, None] * columns, -root * here, rcond=1e-9)[0]
         if np.sum((root * (columns @ step)) ** 2) < 1e-6 * cost:  # all that it could gain
@@ -118,17 +122,6 @@ def _settle(
             break
         state, here = state + share * step, tried
     return _Settled(state, here, columns)
-
-
-def _state_columns(
-    simulate: Simulate, segment: Segment, state: np.ndarray, steps: np.ndarray, residuals: np.ndarray
-) -> np.ndarray:
-    columns = np.empty((len(residuals), len(steps)))
-    for place, step in enumerate(steps):
-        moved = state.copy()
-        moved[place] += step
-        columns[:, place] = (_residuals(simulate, segment, moved) - residuals) / step
-    return columns
 
 
 def settled_state(model: Model, values: np.ndarray, segment: Segment) -> np.ndarray:
@@ -229,11 +222,7 @@ def estimate(
     most: int = 40,
     scale: float | None = None,
 ) -> tuple[Fit, tuple[Fit, ...]]:
-    """Fit a model to segments.
-
-    Returns:
-        The best fit, and what each start led to.
-    """
+    """Fit a model to segments: the best fit, and what each start led to."""
     if len(starts) == 1:
         states = [settled_state(model, starts[0], one) for one in segments]
         best = _refined(model, segments, starts[0], states, most, scale)

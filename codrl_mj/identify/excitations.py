@@ -56,15 +56,6 @@ def _slow_sine(excitation: Excitation, time: np.ndarray) -> np.ndarray:
     return np.sin(2.0 * math.pi * excitation.frequency * time)
 
 
-def _square(excitation: Excitation, time: np.ndarray) -> np.ndarray:
-    return np.where((excitation.frequency * time) % 1.0 < 0.5, 1.0, -1.0)
-
-
-def _chirp(excitation: Excitation, time: np.ndarray) -> np.ndarray:
-    start, end = excitation.frequency, excitation.highest
-    return np.sin(2.0 * math.pi * (start + 0.5 * (end - start) * time / excitation.duration) * time)
-
-
 def _bits(excitation: Excitation, time: np.ndarray) -> np.ndarray:
     bits = _sequence()
     return bits[np.floor(time / excitation.clock + 1e-9).astype(int) % len(bits)]
@@ -72,9 +63,13 @@ def _bits(excitation: Excitation, time: np.ndarray) -> np.ndarray:
 
 KINDS: dict[str, Callable[[Excitation, np.ndarray], np.ndarray]] = {
     "slow_sine": _slow_sine,
-    "square": _square,  # reverses at once
-    "chirp": _chirp,  # its frequency grows in proportion to time
-    "prbs": lambda excitation, time: 0.5 * _bits(excitation, time) + 0.5 * _slow_sine(excitation, time),
+    # reverses at once
+    "square": lambda one, time: np.where((one.frequency * time) % 1.0 < 0.5, 1.0, -1.0),
+    # its frequency grows in proportion to time
+    "chirp": lambda one, time: np.sin(
+        2.0 * math.pi * (one.frequency + 0.5 * (one.highest - one.frequency) * time / one.duration) * time
+    ),
+    "prbs": lambda one, time: 0.5 * _bits(one, time) + 0.5 * _slow_sine(one, time),
     "locked_prbs": _bits,  # with the shaft held
 }
 """Kind -> function of amplitude 1."""

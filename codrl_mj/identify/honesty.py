@@ -93,12 +93,15 @@ def half_widths(
     return {"curvature": curvature, "resampling": resampling, "logs": logs}
 
 
-def correlations(fit: Fit) -> np.ndarray:
-    """Of the parameters, shape (p, p), by the Jacobian: near 1 or -1, one may stand for the other."""
+def correlations(fit: Fit) -> dict[str, dict[str, float]]:
+    """Of the parameters, each with each, by the Jacobian: near 1 or -1, one may stand for the other."""
+    if not fit.names:
+        return {}
     _, matrices = _sums(fit, [0] * len(fit.residuals))
     covariance = _inverse(matrices[0], np.ones(len(fit.values)))
     spread = np.sqrt(np.diag(covariance))
-    return np.asarray(np.clip(covariance / np.outer(spread, spread), -1.0, 1.0))
+    table = np.clip(covariance / np.outer(spread, spread), -1.0, 1.0).tolist()
+    return {name: dict(zip(fit.names, row, strict=True)) for name, row in zip(fit.names, table, strict=True)}
 
 
 def weakest_direction(fit: Fit, segments: Sequence[Segment], scales: np.ndarray) -> np.ndarray:

@@ -9,14 +9,12 @@ import numpy as np
 
 from codrl_mj.fields import check_names
 from codrl_mj.identify import honesty
-from codrl_mj.identify.friction import chosen_friction
 from codrl_mj.identify.log import Log
 from codrl_mj.identify.parameters import DEFAULTS, ESTIMABLE, FRICTION, OF_RIG, PARAMETERS
-from codrl_mj.identify.prediction import Prediction, predict
+from codrl_mj.identify.prediction import Prediction, fitted_traces, predict
 from codrl_mj.identify.result import Estimate, Identified, Status, missing
 from codrl_mj.identify.segments import BLOCK, SEGMENT, moves, shifted
-from codrl_mj.identify.stages import PART, Fitted, Shaft, Winding, fitted
-from codrl_mj.identify.traces import correlations, fitted_traces
+from codrl_mj.identify.stages import PART, Fitted, Shaft, Winding, chosen_friction, fitted
 
 WIDEST = 0.3
 """An interval of more than this share of the value to either side is too wide; of the whole friction, for friction."""
@@ -40,6 +38,10 @@ CAUSES = {
     "torque_constant": "the torque constant is not known better",
 }
 """What widens an interval, in words."""
+INPUTS = "torque", "current", "voltage"
+"""What drives the shaft: the nearest to it that all logs that move have."""
+OUTPUTS = "position", "velocity"
+"""What a simulation is compared with."""
 STEPS_OF_A_STAGE = 8 + 4
 AT_BOUND = 1e-3
 """Nearer to a bound, in the parameter's scale, a value is at it."""
@@ -85,9 +87,9 @@ def identify(
     """
     given = checked(logs, rig, known or {}, friction, estimated, segment, base)
     rig = rig or ("pendulum" if "mgl" in given else "free")
-    stages = 2 - (not _electrical(logs)) - (not any(moves(log) for log in logs))
-    folds = 4 * sum(moves(log) for log in logs) if friction == "auto" else 0
-    done, total = 0, STEPS_OF_A_STAGE * max(stages, 1) + folds
+    moving, electrical = [log for log in logs if moves(log)], _electrical(logs)
+    folds = 4 * len(moving) if friction == "auto" else 0
+    done, total = 0, STEPS_OF_A_STAGE * max(bool(electrical) + bool(moving), 1) + folds
 
     def step(what: str) -> Callable[[], None]:
         def one() -> None:
@@ -97,12 +99,11 @@ def identify(
 
         return one
 
-    winding = fitted(Winding(given), _electrical(logs), step("winding")) if _electrical(logs) else None
-    shaft, driven_by = None, _driven_by(logs)
+    winding = fitted(Winding(given), electrical, step("winding")) if electrical else None
+    shaft, driven_by = None, _common(moving, *INPUTS)
     if driven_by is not None:
-        moving = [log for log in logs if moves(log)]
         known = {**given, **_constant(given, winding, driven_by, estimated)}
-        stage = Shaft(rig, "coulomb", driven_by, known, tuple(estimated), segment, _output(moving) or "")
+        stage = Shaft(rig, "coulomb", driven_by, known, tuple(estimated), segment, _common(moving, *OUTPUTS) or "")
         stage = chosen_friction(stage, moving, friction, step("friction"))
         shaft = fitted(stage, moving, step("shaft"))
     estimates, warnings = [], []
@@ -119,20 +120,20 @@ def identify(
         own = next((one for one in estimates if one.name == "back_emf_constant"), None) if constant else None
         estimates += _with_constant(found, own, shaft.stage)
         warnings += _warnings(shaft, unlike)
-    estimates = _completed(estimates, given)
+    estimates, parts = _completed(estimates, given), {"winding": winding, "shaft": shaft}
     return Identified(
         tuple(log.name for log in logs),
         rig,
         friction if shaft is None else shaft.stage.friction,
         driven_by,
-        {name: part.delay for name, part in (("winding", winding), ("shaft", shaft)) if part is not None},
+        {name: part.delay for name, part in parts.items() if part is not None},
         tuple(estimates),
-        _predictions(shaft, [log for log in logs if moves(log)]),
+        _predictions(shaft, moving),
         _predictions(shaft, [log for log in held_out if moves(log)]),
         tuple(warnings),
         base,
-        (*fitted_traces("winding", winding), *fitted_traces("shaft", shaft)),
-        {"winding": correlations(winding), "shaft": correlations(shaft)},
+        tuple(one for name, part in parts.items() for one in fitted_traces(name, part)),
+        {name: {} if part is None else honesty.correlations(part.fit) for name, part in parts.items()},
         max(
             (float(np.abs(log.signals[name]).max()) for log in logs for name in {"voltage", "bus"} & {*log.signals}),
             default=None,
@@ -150,12 +151,15 @@ def checked(
     segment: float = SEGMENT,
     base: Mapping[str, Any] | None = None,
 ) -> dict[str, float]:
-    """What is known, the gear of the base too, if the arguments of `identify` are such as it takes.
+    """What is known, the gear of the base too, if the arguments of `identify` are such as it takes."""
+    from codrl_mj.actuators import Drive, actuator_from_mapping
 
-    Raises:
-        ValueError: as `identify` does.
-    """
-    known = _with_gear(known or {}, base)
+    drive = None if base is None else actuator_from_mapping(base)
+    # of a motor with a gear that too: otherwise its numbers would be those of the output
+    ratio = drive.motor.gear_ratio if isinstance(drive, Drive) else 1.0
+    known = {**({} if ratio == 1.0 else {"gear_ratio": ratio}), **(known or {})}
+    moving = [log for log in logs if moves(log)]
+    driven_by = _common(moving, *INPUTS)
     if not segment >= 0.05:
         raise ValueError(f"segment = {segment!r}: must be >= 0.05 s; {SEGMENT:g} is the default")
     if not logs:
@@ -171,7 +175,7 @@ def checked(
                 f"known {name} = {value!r}: must be from {parameter.least:g} to {parameter.most:g} "
                 f"{parameter.unit}; give {parameter.what}".strip()
             )
-    if not _electrical(logs) and _driven_by(logs) is None:
+    if not _electrical(logs) and driven_by is None:
         have = "; ".join(f"{log.name}: {', '.join(log.signals) or 'nothing'}" for log in logs)
         raise ValueError(
             f"logs tell nothing ({have}): give voltage and current for the winding, or torque, current or voltage with "
@@ -180,11 +184,10 @@ def checked(
     twice = sorted({*known} & {*estimated})
     if twice:
         raise ValueError(f"{', '.join(twice)}: both known and estimated, must be one of them; leave the other out")
-    driven_by, moving = _driven_by(logs), [log for log in logs if moves(log)]
     possible = [name for name, only in ESTIMABLE.items() if only is None or only == driven_by]
     if driven_by is not None or estimated:
         check_names(estimated, possible, f"parameter of a shaft under a {driven_by}", "estimated.")
-    if moving and _output(moving) is None:
+    if moving and _common(moving, *OUTPUTS) is None:
         have = "; ".join(f"{log.name}: {'position' if log.has('position') else 'velocity'}" for log in moving)
         raise ValueError(f"logs tell different things ({have}): give all that move a position, or all a velocity")
     rare = [log for log in moving if log.step > RAREST]
@@ -192,17 +195,18 @@ def checked(
         raise ValueError(
             f"log {rare[0].name}: a row every {rare[0].step:.3g} s, must be at most {RAREST:g} s; log more often"
         )
-    if rig is None and "mgl" not in known and _driven_by(logs) is not None:
+    if rig is None and "mgl" not in known and driven_by is not None:
         raise ValueError(
             "rig is not given (--rig on the command line, rig= in Python): what the output moves decides what is "
             "fitted, must be pendulum, free or load; a motor on its own is free, with load_inertia=0 known"
         )
-    return dict(known)
+    return known
 
 
 def foreseen(logs: Sequence[Log], known: Mapping[str, float], base: Mapping[str, Any] | None) -> str | None:
     """What will be missing for an actuator however well logs are fitted, by their signals; None: nothing."""
-    moving, driven_by = any(moves(log) for log in logs), _driven_by(logs)
+    moving = [log for log in logs if moves(log)]
+    driven_by = _common(moving, *INPUTS)
     names = {*known, *(("resistance", "inductance") if _electrical(logs) else ())}
     names |= {"resistance"} if driven_by == "voltage" else set()
     constants = {"torque_constant", "back_emf_constant"}
@@ -213,28 +217,8 @@ def foreseen(logs: Sequence[Log], known: Mapping[str, float], base: Mapping[str,
     return missing(names, base)
 
 
-def _with_gear(known: Mapping[str, float], base: Mapping[str, Any] | None) -> dict[str, float]:
-    """What is known, the gear of a motor with one too: otherwise its numbers would be those of the output."""
-    from codrl_mj.actuators import Drive, actuator_from_mapping
-
-    drive = None if base is None else actuator_from_mapping(base)
-    ratio = drive.motor.gear_ratio if isinstance(drive, Drive) else 1.0
-    return {**({} if ratio == 1.0 else {"gear_ratio": ratio}), **known}
-
-
 def _electrical(logs: Sequence[Log]) -> list[Log]:
     return [log for log in logs if log.has("voltage", "current")]
-
-
-def _driven_by(logs: Sequence[Log]) -> str | None:
-    """What drives the shaft: the nearest to it that all logs that move have."""
-    moving = [log for log in logs if moves(log)]
-    return _common(moving, "torque", "current", "voltage")
-
-
-def _output(logs: Sequence[Log]) -> str | None:
-    """What a simulation of logs that move is compared with."""
-    return _common(logs, "position", "velocity")
 
 
 def _common(logs: Sequence[Log], *names: str) -> str | None:

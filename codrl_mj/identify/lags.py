@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -49,7 +49,7 @@ def velocity_lag(log: Log) -> Lag | None:
         return float(np.linalg.norm(seen - gain * rate)) / max(float(np.linalg.norm(seen)), 1e-300), gain
 
     longest = min(0.1, 0.1 * float(time[-1]))
-    lag = _least(lambda lag: compare(lag)[0], log.step, longest, longest)
+    lag = _least(compare, log.step, longest, longest)
     (best, gain), (now, _) = compare(lag), compare(0.0)
     size, seen = (float(np.sqrt(np.mean(one**2))) for one in (rate, windows.mean("velocity")))
     noisy = sensor_deviation(log, "velocity") * math.sqrt(2.0 / windows.rows.shape[1])
@@ -64,16 +64,7 @@ def current_lag(log: Log) -> Lag | None:
     windows = Windows(log, most=_WINDOWS)
     if not len(windows) or not np.any(log.signals["voltage"]):
         return None
-    terms = voltage_terms(log, windows)
-
-    def compare(lag: float) -> tuple[float, float]:
-        balance = regress(windows.mean_held("voltage", lag), terms)
-        # of a nearly sinusoidal current a delay looks like more inductance, and too long a one like less than none
-        if balance is None or (lag > 0.0 and balance.certainty.get("inductance", 0.0) < -3.0):
-            return np.inf, 1.0
-        return balance.residual, balance.unexplained
-
-    return _compared(compare, log.step, 3.0 * log.step, 20.0 * log.step)
+    return _by_balance(log, windows, "voltage", voltage_terms(log, windows), 3.0 * log.step, 20.0 * log.step)
 
 
 def motion_lag(log: Log) -> Lag | None:
@@ -81,33 +72,37 @@ def motion_lag(log: Log) -> Lag | None:
     log = _beginning(log)
     windows = Windows(log, 0.3, _WINDOWS)
     terms = torque_terms(log, windows) if len(windows) else None
-    if terms is None:
-        return None
+    return None if terms is None else _by_balance(log, windows, "torque", terms, 0.06, 0.06)
+
+
+def _by_balance(
+    log: Log, windows: Windows, signal: str, terms: Mapping[str, np.ndarray], ahead: float, behind: float
+) -> Lag | None:
+    """How late the terms of a balance are against what they explain."""
 
     def compare(lag: float) -> tuple[float, float]:
-        balance = regress(windows.mean_held("torque", lag), terms)
-        return (np.inf, 1.0) if balance is None else (balance.residual, balance.unexplained)
+        balance = regress(windows.mean_held(signal, lag), terms)
+        # of a nearly sinusoidal current a delay looks like more inductance, and too long a one like less than none
+        if balance is None or (lag > 0.0 and balance.certainty.get("inductance", 0.0) < -3.0):
+            return np.inf, 1.0
+        return balance.residual, balance.unexplained
 
-    return _compared(compare, log.step, 0.06, 0.06)
-
-
-def _compared(compare: Callable[[float], tuple[float, float]], step: float, ahead: float, behind: float) -> Lag | None:
     now = compare(0.0)[0]
     if not np.isfinite(now):
         return None
-    lag = _least(lambda lag: compare(lag)[0], step, ahead, behind)
+    lag = _least(compare, log.step, ahead, behind)
     best, unexplained = compare(lag)
     return Lag(lag, best / max(now, 1e-300), 1.0, unexplained)
 
 
-def _least(residual: Callable[[float], float], step: float, ahead: float, behind: float) -> float:
+def _least(compare: Callable[[float], tuple[float, float]], step: float, ahead: float, behind: float) -> float:
     """The lag of the least residual, to a quarter of a step: by long steps, then by shorter ones beside the best."""
     shift = step
     while ahead + behind > 40.0 * shift:
         shift *= 2.0
     places = shift * np.arange(-max(round(ahead / shift), 4), max(round(behind / shift), 4) + 1)
     while True:
-        best = min((residual(place), abs(place), place) for place in places)[2]
+        best = min((compare(place)[0], abs(place), place) for place in places)[2]
         if shift <= 0.3 * step:
             return float(best)
         shift /= 2.0

@@ -8,10 +8,9 @@ from typing import ClassVar
 import numpy as np
 
 from codrl_mj.identify import simulation
-from codrl_mj.identify.differentiation import speeds
 from codrl_mj.identify.estimate import Model, Simulate
 from codrl_mj.identify.parameters import DEFAULTS, ELECTRICAL, FRICTION, OF_FRICTION, OF_RIG, PARAMETERS
-from codrl_mj.identify.segments import Segment
+from codrl_mj.identify.segments import Segment, speeds
 
 
 class WindingModel(Model):
@@ -131,18 +130,14 @@ def shaft_model(
     scales = np.array(
         [floors[name] if name in FRICTION else max(abs(start[name]), floors.get(name, 1e-9)) for name in free]
     )
-    starts = [_inside(np.array([one[name] for name in free]), free, scales) for one, _ in firsts]
+    positive = np.array([PARAMETERS[name].least >= 0.0 for name in free], bool)
+    starts = [np.array([one[name] for name in free]) for one, _ in firsts]
+    starts = [np.where(positive & ~(one > 0.02 * scales), 0.3 * scales, one) for one in starts]
     changes = np.random.default_rng(0).uniform(-0.7, 0.7, (2, len(free)))
     starts += [starts[0] * np.exp(change) for change in changes]
     fixed = {name: float(value) for name, value in given.items()}
     fixed |= {name: 0.0 for name in ("coulomb_friction", "viscous_friction") if name not in known}
     return ShaftModel(free, fixed, scales, driven_by, output), starts
-
-
-def _inside(start: np.ndarray, free: Sequence[str], scales: np.ndarray) -> np.ndarray:
-    """A start whose parameters are as positive as they must be."""
-    positive = np.array([PARAMETERS[name].least >= 0.0 for name in free], bool)
-    return np.where(positive & ~(start > 0.02 * scales), 0.3 * scales, start)
 
 
 def _shaft_start(

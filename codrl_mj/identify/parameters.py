@@ -1,11 +1,6 @@
 """What can be identified: names, units, bounds. Those of a motor are called as `GearMotor`'s fields, at its rotor."""
 
-from typing import Literal, NamedTuple
-
-Rig = Literal["pendulum", "free", "load"]
-"""What the output moves: a pendulum that hangs at position 0, nothing but inertia, or inertia and a held load."""
-Friction = Literal["coulomb", "stribeck", "load", "both"]
-"""Viscous and Coulomb friction, and Stribeck friction, what depends on the load, or both of these over it."""
+from typing import NamedTuple
 
 
 class Parameter(NamedTuple):

@@ -107,16 +107,8 @@ def plan(
 ) -> Plan:
     """Compare excitations and sample rates for a motor whose parameters are about known.
 
-    Args:
-        drive: the motor, with its supply and its largest current.
-        load: what it moves meanwhile.
-        sensing: what is measured.
-        duration: of a log [s].
-        max_current: that the bench allows [A]; the drive's own counts too.
-        continuous_current: that the motor bears [A]; its root mean square stays below.
-
-    Raises:
-        ValueError: the motor has no inertia to turn; or a value is out of bounds.
+    A log lasts `duration` [s]; the current stays below `max_current` [A] of the bench and below the drive's own, its
+    root mean square below `continuous_current` [A] of the motor.
     """
     if not duration >= 4.0 * _SEGMENT:
         raise ValueError(f"duration = {duration!r}: must be at least {4.0 * _SEGMENT:g} s; log for longer")

@@ -1,7 +1,8 @@
-"""How well a shaft's model foretells a log: from where it was, without looking again."""
+"""How well a shaft's model foretells a log, from where it was; what a fit made of its logs over time, to be seen."""
 
 import dataclasses
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -10,12 +11,36 @@ from codrl_mj.identify.estimate import settled_state
 from codrl_mj.identify.log import Log, usable
 from codrl_mj.identify.models import ShaftModel
 from codrl_mj.identify.segments import initial_state, shaft_segments
-from codrl_mj.identify.traces import Trace, trace
 
 HORIZON = 0.5
 """Time [s] that is foretold at once,"""
 KNOWN = 0.03
 """from where and how fast the shaft was in its first so many [s], five rows at least."""
+
+
+class Trace(NamedTuple):
+    """A simulation beside what was measured, in pieces that each begin from a state of their own."""
+
+    log: str
+    part: str
+    """`winding` or `shaft`."""
+    output: str
+    """What is compared: `current` [A], `position` [rad] or `velocity` [rad/s]."""
+    time: np.ndarray
+    """[s], shape (n,)."""
+    measured: np.ndarray
+    """Shape (n,)."""
+    simulated: np.ndarray
+    """Shape (n,)."""
+    starts: np.ndarray
+    """Rows at which pieces begin."""
+
+
+def trace(log: str, part: str, output: str, pieces: Any) -> Trace:
+    """A trace of some (times, measured, simulated), each of shape (m,)."""
+    times, measured, simulated = (np.concatenate(column) for column in zip(*pieces, strict=True))
+    starts = np.cumsum([0, *(len(piece[0]) for piece in pieces)])[:-1]
+    return Trace(log, part, output, times, measured, simulated, starts)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,3 +98,15 @@ def closed_loop_error(model: ShaftModel, values: np.ndarray, log: Log) -> float 
         found.append(np.abs(simulated - log.signals["position"][stretch]))
     total = float(np.concatenate(found).mean())
     return total if math.isfinite(total) else None
+
+
+def fitted_traces(name: str, part: Any) -> tuple[Trace, ...]:
+    """The fit of each log of a `Fitted` part; none where the part was not fitted."""
+    if part is None:
+        return ()
+    pieces: dict[int, list[Any]] = {}
+    for segment, residuals in zip(part.segments, part.fit.residuals, strict=True):
+        simulated = segment.measured + residuals * segment.deviation
+        pieces.setdefault(segment.log, []).append((segment.times, segment.measured, simulated))
+    output = "current" if name == "winding" else part.model.output
+    return tuple(trace(part.logs[place].name, name, output, several) for place, several in pieces.items())

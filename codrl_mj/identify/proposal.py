@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codrl_mj.identify.columns import Column
-from codrl_mj.identify.log import SIGNALS, find_resolution
-from codrl_mj.identify.reading import Table, number, read_table
+from codrl_mj.identify.columns import KINDS, Column
+from codrl_mj.identify.log import find_resolution
+from codrl_mj.identify.reading import Table, read_table
 
 _WORDS = {
     "only": "enable enabled armed",
@@ -27,6 +27,7 @@ _WORDS = {
 }
 """Signal -> words of its names; of a name with several the first signal counts."""
 _UNITS = {"°": "deg", "º": "deg", "degrees": "deg", "radians": "rad", "sec": "s", "seconds": "s", "%": "percent"}
+_LARGE = {"velocity": (1000.0, "rpm"), "current": (200.0, "mA"), "duty": (1.5, "percent")}  # above, in that unit
 
 
 class Proposal(NamedTuple):
@@ -88,9 +89,9 @@ def _valid(signal: str, unit: str) -> str | None:
 
 def _guessed(signal: str, name: str, table: Table) -> tuple[str, str]:
     """A unit by a column's values, and what is to be seen to."""
-    unit = {"time": "s", "duty": "1", "command": "1"}.get(signal, SIGNALS.get(signal) or "1")
+    unit = KINDS[signal] or "1"
     try:
-        found = np.array([number(name, line, one, table) for line, one in enumerate(table.columns[name], 1)])
+        found = table.numbers(name)
     except ValueError:
         return unit, "holds texts"
     found = found[np.isfinite(found)]
@@ -100,10 +101,6 @@ def _guessed(signal: str, name: str, table: Table) -> tuple[str, str]:
         unit = "us" if step > 50.0 else "ms"
     elif signal == "position" and largest > 40.0 and (grid := find_resolution(found)) > 0.0:
         unit = "deg" if abs(360.0 / grid - round(360.0 / grid)) < 1e-3 else unit  # else it may turn on
-    elif signal == "velocity" and largest > 1000.0:
-        unit = "rpm"
-    elif signal == "current" and largest > 200.0:
-        unit = "mA"
-    elif signal == "duty" and largest > 1.5:
-        unit = "percent"
+    elif signal in _LARGE and largest > _LARGE[signal][0]:
+        unit = _LARGE[signal][1]
     return unit, f"no unit is stated, {unit} is a guess (values up to {largest:.4g}): see to it"

@@ -6,7 +6,7 @@ import gzip
 import importlib
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +30,29 @@ class Table(NamedTuple):
     units: Mapping[str, str] = {}  # by column, where a line states them
     commas: bool = False  # whether a number may have a decimal comma
 
+    def numbers(self, name: str) -> np.ndarray:
+        """A column as numbers, NaN where it is empty."""
+        lines = self.lines or range(1, len(self.columns[name]) + 1)
+        pairs = zip(lines, self.columns[name], strict=True)
+        return np.array([self._number(name, line, one) for line, one in pairs])
+
+    def _number(self, name: str, line: int, one: Any) -> float:
+        if isinstance(one, int | float):
+            return float(one)
+        text = "" if one is None else str(one).strip()
+        try:
+            if text.lower() in _WORDS:
+                return _WORDS[text.lower()]
+            if _STAMP.match(text):
+                day = "" if "-" in text[:5] else "1970-01-01T"
+                stamp = datetime.datetime.fromisoformat(day + text.replace(",", "."))
+                return (stamp.replace(tzinfo=stamp.tzinfo or datetime.UTC)).timestamp()
+            return float(text.replace(",", ".") if self.commas else text)
+        except ValueError:
+            remedy = "write a decimal point" if "," in text else "leave such rows out, or map another column"
+            where = "line" if self.lines else "row"
+            raise ValueError(f"column {name} in {where} {line} is {text!r}, must be a number; {remedy}") from None
+
 
 def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
     """A log from a file; what could not be read of it is among the log's findings.
@@ -42,7 +65,9 @@ def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
             number under the names is of units. Decimal commas, times of day (ISO 8601) and Latin-1 are read.
             JSON is a list of rows, or an object with one such list, such as `entries`, and numbers beside it,
             which formulas can use, or an object of columns.
-        columns: see `codrl_mj.identify.columns.parse_columns`.
+        columns: `signal=formula:unit` separated by commas, or a mapping of signals to `formula:unit`. The voltage is
+            what holds from its row to the next, or `mean(formula)`: the mean in between. `only=formula` leaves out the
+            rows where it is 0.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -54,7 +79,13 @@ def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
         raise FileNotFoundError(f"no log at {path}")
     try:
         table = read_table(path)
-        values, count = _numbers(table, mapping)
+        count = len(next(iter(table.columns.values()), ()))
+        needed = set().union(*(one.names for one in mapping.values())) & table.columns.keys()
+        values: dict[str, Any] = {
+            **dict.fromkeys(table.columns),
+            **table.constants,
+            **{name: table.numbers(name) for name in needed},
+        }
         signals = {
             signal: np.broadcast_to(np.asarray(one.value(values), float), (count,)) for signal, one in mapping.items()
         }
@@ -64,7 +95,7 @@ def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
 
 
 def _log(
-    name: str, signals: dict[str, np.ndarray], mapping: Mapping[str, Column], table: Table, first: list[Finding]
+    name: str, signals: dict[str, np.ndarray], mapping: Mapping[str, Column], table: Table, first: Iterator[Finding]
 ) -> Log:
     time, only = signals.pop("time"), signals.pop("only", None)
     wanted = np.ones(len(time), bool) if only is None else only != 0.0
@@ -81,9 +112,8 @@ def _log(
             for one in mapping.values()
             if one.unit is None and SIGNALS.get(one.signal)
         ),
+        *_left_out(np.array(table.ragged, int) - 1, "missing", "are incomplete, and are left out"),
     ]
-    if table.ragged:
-        findings += _left_out(np.array(table.ragged) - 1, "missing", "are incomplete, and are left out")
     unusable = int((wanted & ~finite).sum() + (~forward).sum())
     rows = rows[forward]
     if rows.size < 2 or unusable > _MOST_UNUSABLE * max(int(wanted.sum()), 1):
@@ -93,7 +123,7 @@ def _log(
             + "; check the columns"
         )
     kept = {signal: np.ascontiguousarray(values[rows]) for signal, values in signals.items()}
-    numbers = _file_rows(len(time), table.ragged)[rows]
+    numbers = np.setdiff1d(np.arange(1, len(time) + len(table.ragged) + 1), table.ragged)[rows]
     return Log(
         name,
         time[rows] - time[rows[0]],
@@ -106,12 +136,10 @@ def _log(
     )
 
 
-def _unsigned(values: Mapping[str, Any], mapping: Mapping[str, Column]) -> list[Finding]:
+def _unsigned(values: Mapping[str, Any], mapping: Mapping[str, Column]) -> Iterator[Finding]:
     """Columns that look like registers with a sign that is read without it: the highest and lowest quarter are used."""
-    found = []
-    for name in sorted(
-        {name for one in mapping.values() for name in one.names if "twos_complement" not in one.formula}
-    ):
+    unsigned = (one for one in mapping.values() if "twos_complement" not in one.formula)
+    for name in sorted(set().union(*(one.names for one in unsigned))):
         column = np.asarray(values[name] if values[name] is not None else 0.0, float)
         for bits in (8, 16, 32):
             whole = 2.0**bits
@@ -120,32 +148,27 @@ def _unsigned(values: Mapping[str, Any], mapping: Mapping[str, Column]) -> list[
             if within and high.any() and low.any() and np.all(high | low):
                 row = int(np.flatnonzero(high)[0]) + 1
                 text = f"{name} is below {whole / 4:.0f} or above {3 * whole / 4:.0f}: has it {bits} bits and a sign?"
-                found.append(Finding("error", "register", row, text, f"write twos_complement({name}, {bits})"))
-    return found
+                yield Finding("error", "register", row, text, f"write twos_complement({name}, {bits})")
 
 
-def _file_rows(count: int, ragged: list[int]) -> np.ndarray:
-    return np.setdiff1d(np.arange(1, count + len(ragged) + 1), ragged)
-
-
-def _left_out(rows: np.ndarray, check: str, what: str) -> list[Finding]:
+def _left_out(rows: np.ndarray, check: str, what: str) -> Iterator[Finding]:
     if not rows.size:
-        return []
+        return
     text = f"{rows.size} row{'s' if rows.size > 1 else ''}, the first one {rows[0] + 1}, {what}"
     severity = "error" if check == "stamps" else "warning"
     remedy = "find out why the logger wrote them; sort the file, or cut it, if its clock was set back"
-    return [Finding(severity, check, int(rows[0]) + 1, text, remedy if check == "stamps" else "")]
+    yield Finding(severity, check, int(rows[0]) + 1, text, remedy if check == "stamps" else "")
 
 
 def read_table(path: Path) -> Table:
-    """A file's columns as they stand there; see `read_log`, which says which files.
-
-    Raises:
-        ValueError: it is none of these.
-    """
+    """A file's columns as they stand there; see `read_log`, which says which files."""
     kind = Path(path.name.removesuffix(".gz")).suffix.lower()
     if kind == ".parquet":
-        return _parquet(path)
+        try:
+            parquet = importlib.import_module("pyarrow.parquet")
+        except ModuleNotFoundError:
+            raise ValueError("reading Parquet needs pyarrow: pip install pyarrow, or save the log as .csv") from None
+        return Table(parquet.read_table(path).to_pydict(), {}, [])
     if kind not in (".csv", ".txt", ".dat", ".tsv", ".json"):
         raise ValueError(f"unknown kind of file {kind!r}, must be .csv, .txt, .dat, .tsv, .json (or .gz) or .parquet")
     content = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
@@ -216,46 +239,3 @@ def _json(content: Any) -> Table:
 def _by_column(rows: list[dict[str, Any]]) -> dict[str, list[Any]]:
     names = dict.fromkeys(name for row in rows for name in row)
     return {name: [row.get(name) for row in rows] for name in names}
-
-
-def _parquet(path: Path) -> Table:
-    try:
-        parquet = importlib.import_module("pyarrow.parquet")
-    except ModuleNotFoundError:
-        raise ValueError("reading Parquet needs pyarrow: pip install pyarrow, or save the log as .csv") from None
-    return Table(parquet.read_table(path).to_pydict(), {}, [])
-
-
-def _numbers(table: Table, mapping: Mapping[str, Column]) -> tuple[dict[str, Any], int]:
-    """The columns that are needed, as numbers, with the constants, and the number of rows."""
-    needed = set().union(*(one.names for one in mapping.values()))
-    count = len(next(iter(table.columns.values()), ()))
-    values: dict[str, Any] = {**dict.fromkeys(table.columns), **table.constants}
-    for name in needed & table.columns.keys():
-        lines = table.lines or range(1, count + 1)
-        pairs = zip(lines, table.columns[name], strict=True)
-        values[name] = np.array([number(name, line, one, table) for line, one in pairs])
-    return values, count
-
-
-def number(name: str, line: int, one: Any, table: Table) -> float:
-    """A cell as a number: NaN where it is empty.
-
-    Raises:
-        ValueError: it is none; the message names column and line.
-    """
-    if isinstance(one, int | float):
-        return float(one)
-    text = "" if one is None else str(one).strip()
-    try:
-        if text.lower() in _WORDS:
-            return _WORDS[text.lower()]
-        if _STAMP.match(text):
-            day = "" if "-" in text[:5] else "1970-01-01T"
-            stamp = datetime.datetime.fromisoformat(day + text.replace(",", "."))
-            return (stamp.replace(tzinfo=stamp.tzinfo or datetime.UTC)).timestamp()
-        return float(text.replace(",", ".") if table.commas else text)
-    except ValueError:
-        remedy = "write a decimal point" if "," in text else "leave such rows out, or map another column"
-        where = "line" if table.lines else "row"
-        raise ValueError(f"column {name} in {where} {line} is {text!r}, must be a number; {remedy}") from None

@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from codrl_mj.identify.parameters import PARAMETERS
-from codrl_mj.identify.prediction import Prediction
-from codrl_mj.identify.traces import Trace
+from codrl_mj.identify.prediction import Prediction, Trace
 from codrl_mj.runs.files import write_json, writing
 
 Status = Literal["identified", "rough", "given", "ratio", "unidentifiable", "refused"]

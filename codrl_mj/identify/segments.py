@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codrl_mj.identify.differentiation import speeds
 from codrl_mj.identify.log import Log, usable
 
 SEGMENT = 0.5
@@ -19,6 +18,8 @@ SHAFT_STEP = 5e-4
 """Rows that are nearer [s] are taken together for a shaft, which is slower: their mean input, their first position."""
 SPIKE = 50.0
 """A row is a spike where it sticks out by more than so many times what nine of ten rows do at most."""
+WINDOW = 4e-3
+"""Time [s] that positions are smoothed over: short beside what a shaft does, long beside an encoder's steps."""
 STILL = 10.0
 """A shaft that moves by no more than so many steps of its encoder is locked."""
 
@@ -99,6 +100,24 @@ def moves(log: Log) -> bool:
         return False
     velocity, rows = log.signals["velocity"], max(min(round(0.05 / log.step), len(log.time) // 4), 1)
     return float(np.std(np.convolve(velocity, np.full(rows, 1.0 / rows), "valid"))) > 0.3 * float(np.std(velocity))
+
+
+def speeds(times: np.ndarray, positions: np.ndarray, at: np.ndarray, window: float = WINDOW) -> np.ndarray:
+    """Slopes [rad/s] of straight lines through the positions within half a window of a time, at least three of them.
+
+    In the middle of a window that is also the slope of the parabola. Near the ends the window is what there is.
+    """
+    count = len(times)
+    first = np.searchsorted(times, at - 0.5 * window - 1e-9)
+    last = np.searchsorted(times, at + 0.5 * window + 1e-9)
+    near = np.clip(np.searchsorted(times, at), 1, count - 1)
+    first = np.clip(np.minimum(first, near - 1), 0, max(count - 2, 0))
+    last = np.clip(np.maximum(last, near + 1), first + 2, count)
+    shifted, moved = times - times[0], positions - positions[0]
+    sums = [np.concatenate([[0.0], np.cumsum(one)]) for one in (shifted, moved, shifted * moved, shifted**2)]
+    t, q, tq, tt = (one[last] - one[first] for one in sums)
+    number = last - first
+    return (number * tq - t * q) / (number * tt - t * t)
 
 
 def cut(log: Log, longest: float) -> list[slice]:

@@ -16,8 +16,9 @@ import numpy as np
 from codrl_mj.actuators import Drive
 from codrl_mj.fields import check, check_names, real
 from codrl_mj.identify import simulation
+from codrl_mj.identify.columns import KINDS
 from codrl_mj.identify.excitations import Excitation
-from codrl_mj.identify.log import SIGNALS, Log
+from codrl_mj.identify.log import Log
 from codrl_mj.runs.files import writing
 
 
@@ -115,19 +116,9 @@ class Course(NamedTuple):
 
 
 def run(drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, position: float = 0.0) -> Course:
-    """What a drive does under a voltage, from standstill.
+    """What a drive does, without its loop, under a voltage, or its values [V] in each sample, from standstill.
 
     A bridge makes the voltage u of a share d = u/V of the supply, which sags by its resistance times d*i.
-
-    Args:
-        drive: whose motor, supply, sample rate and dead band count; its loop is left out.
-        excitation: the voltage, or its values [V] in each of the drive's samples, shape (n + 1,); held over a sample,
-            limited to the supply's.
-        load: what it moves; held if the excitation wants that.
-        position: of the output at the beginning [rad].
-
-    Raises:
-        ValueError: the motor moves nothing that has an inertia.
     """
     period, limit, motor = 1.0 / drive.controller.sample_rate, drive.voltage_limit, drive.motor
     locked = load.locked
@@ -149,11 +140,7 @@ def sample_times(drive: Drive, duration: float) -> np.ndarray:
 
 
 def moved(drive: Drive, load: Load) -> simulation.Moved:
-    """The shaft under the motor's current.
-
-    Raises:
-        ValueError: it has no inertia.
-    """
+    """The shaft under the motor's current."""
     motor = drive.motor
     inertia = motor.rotor_inertia * motor.gear_ratio**2 + load.inertia
     if not inertia > 0.0 and not load.locked:
@@ -175,21 +162,9 @@ def simulate(
     position: float = 0.0,
     name: str = "synthetic",
 ) -> Log:
-    """A log of a drive of ours, with everything in it that can be logged.
+    """A log of a drive with all that can be logged, from a `position` [rad] on, under a voltage as `run` takes it.
 
-    Args:
-        drive: see `run`.
-        excitation: the voltage, see `run`.
-        load: what the output moves.
-        sensors: by signal; those that are not named show what is. The voltage is the one asked for, without the
-            supply's sag, and the torque n*kT*i.
-        sampler: when rows are written.
-        seed: of noise, jitter, outliers and lost rows.
-        position: of the output at the beginning [rad].
-        name: of the log.
-
-    Raises:
-        ValueError: a signal is unknown; or see `run`.
+    Signals without a sensor show what is. The voltage is the one asked for, without sag; the torque n*kT*i.
     """
     sensors = dict(sensors or {})
     signals = ("voltage", "current", "position", "velocity", "torque", "bus", "duty")
@@ -245,9 +220,8 @@ def write_log(path: Path, log: Log) -> str:
     table = np.column_stack([log.time, *log.signals.values()])
     with writing(path) as temporary:
         np.savetxt(temporary, table, fmt="%.9g", delimiter=",", header=",".join(names), comments="")
-    kinds = {"time": "s", **SIGNALS}
     texts = {name: f"mean({name})" if log.mean_voltage and name == "voltage" else name for name in names}
-    return ",".join(f"{name}={text}:{kinds[name] or '1'}" for name, text in texts.items())
+    return ",".join(f"{name}={text}:{KINDS[name] or '1'}" for name, text in texts.items())
 
 
 @functools.cache

@@ -8,12 +8,12 @@ import numpy as np
 from markupsafe import Markup
 
 from codrl_mj.identify.identify import CAUSES
+from codrl_mj.identify.log import SIGNALS
+from codrl_mj.identify.prediction import Trace
 from codrl_mj.identify.result import USABLE, Identified
-from codrl_mj.identify.traces import Trace
 from codrl_mj.pages import page
 from codrl_mj.pages.plots import Curve, Plot
 
-_UNITS = {"current": "A", "position": "rad", "velocity": "rad/s"}
 _LAGS = 400
 _STRONG = 0.9
 _ADVICE = {
@@ -36,18 +36,7 @@ _ADVICE = {
 
 
 def identification_page(found: Identified, out: Path) -> Path:
-    """Write the page of what identification found.
-
-    Args:
-        found: it.
-        out: the page, an .html file.
-
-    Returns:
-        `out`.
-
-    Raises:
-        ValueError: `out` is no .html file.
-    """
+    """Write the page of what identification found."""
     winding = [one for one in found.traces if one.part == "winding"]
     shaft = [one for one in found.traces if one.part == "shaft"]
     foretold = [one.trace for one in found.held_out if one.trace is not None]
@@ -142,7 +131,7 @@ def _errors(found: Identified) -> Markup:
     for kind, several in (("fitted", found.fitted), ("held out", found.held_out)):
         for one in several:
             errors = (page.number(error, 3) for error in (one.open_loop, one.closed_loop))
-            rows.append((one.log, kind, f"{one.output} [{_UNITS[one.output]}]", *errors))
+            rows.append((one.log, kind, f"{one.output} [{SIGNALS[one.output]}]", *errors))
     if not rows:
         return Markup()
     columns = ("log", "", "of", "open loop, half a second", "closed loop")
@@ -155,7 +144,7 @@ def _errors(found: Identified) -> Markup:
 
 def _looked_at(one: Trace) -> Markup:
     """Data and simulation of a log, residuals and their autocorrelation."""
-    unit = _UNITS[one.output]
+    unit = SIGNALS[one.output]
     gaps = one.starts[1:]
     time, simulated = (np.insert(values, gaps, np.nan) for values in (one.time, one.simulated))
     time = np.where(np.isnan(time), np.interp(np.arange(len(time)), np.flatnonzero(~np.isnan(time)), one.time), time)
