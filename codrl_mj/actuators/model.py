@@ -518,7 +518,8 @@ def load_module(text: str) -> Any:
             ) from None
         frames, package = traceback.extract_tb(error.__traceback__), Path(__file__).parents[1]
         ours = [Path(frame.filename).is_relative_to(package) for frame in frames]
-        where = next(frame for frame, own in zip(frames[::-1], ours[::-1], strict=True) if not own)
+        theirs = (frame for frame, own in zip(frames[::-1], ours[::-1], strict=True) if not own)
+        where = next(frame for frame in theirs if not frame.filename.startswith("<"))  # of what dataclasses make
         said = str(error) if ours[-1] else f"importing {module} failed: {type(error).__name__}: {error}"
         raise ValueError(f"{text!r}: {said} ({where.filename}, line {where.lineno})") from error
 
