@@ -47,15 +47,17 @@ def test_the_wheel_has_every_module_model_and_the_type_marker(wheel):
     modules = {path.relative_to(REPOSITORY).as_posix() for path in package.rglob("*.py")}
     models = {f"codrl_mj/_assets/{path.relative_to(assets).as_posix()}" for path in assets.rglob("*") if path.is_file()}
     settings = {path.relative_to(REPOSITORY).as_posix() for path in (package / "rl_zoo3").glob("*.yml")}
+    presets = {path.relative_to(REPOSITORY).as_posix() for path in (package / "agents" / "presets").glob("*.toml")}
     pages = {f"codrl_mj/pages/{name}" for name in ("page.html.jinja", "parts.html.jinja", "page.css", "page.js")}
     pages |= {f"codrl_mj/pages/uplot/{name}" for name in ("uPlot.iife.min.js", "uPlot.min.css", "LICENSE")}
     assert len(modules) > 30
     assert len(settings) == 5
+    assert len(presets) == 6
     assert len(models) >= 5
     replay = {f"codrl_mj/replay/{name}" for name in ("page.html", "replay.css", "replay.js")}
     three = {f"codrl_mj/replay/three/{name}" for name in ("three.min.js", "LICENSE", "README.md")}
     others = {"codrl_mj/py.typed", "codrl_mj/_assets/study/hypotheses.csv"}
-    assert names >= modules | models | settings | replay | three | pages | others
+    assert names >= modules | models | settings | presets | replay | three | pages | others
     assert not [name for name in names if name.startswith(("tests", "scripts", "assets", "docs"))]
 
 

@@ -1,21 +1,59 @@
 """Settings that suit an agent to a task, by name: `default`, the paper's own (`paper`), and those mended (`repaired`).
 
-One module an agent. What the numbers gave, in training and in test, is in docs/agents.md.
+One TOML file an agent beside this module: a table for each task and name with the fields of `Preset`, where `"none"`
+stands for None, and `like` names the settings above that it starts from. What the numbers gave, in training and in
+test, is in docs/agents.md.
 """
 
-from codrl_mj.agents import find_agent
-from codrl_mj.agents.presets import ddpg, dqn, ppo, sac, sarsa, td3
-from codrl_mj.agents.presets.preset import ELSEWHERE, Preset
+import dataclasses
+import tomllib
+from collections.abc import Mapping
+from importlib.resources import files
+from typing import Any
+
+from codrl_mj.agents import AGENTS, AgentConfig, find_agent
 
 __all__ = ["ELSEWHERE", "PRESETS", "SETTINGS", "Preset", "find_preset"]
 
 SETTINGS = ("default", "paper", "repaired")
 """Names that settings can have: ours, the paper's as printed, and the paper's with what makes it fail changed."""
+ELSEWHERE = "another's environment"
+"""Instead of a task: any environment that is none of ours."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Preset:
+    """How an agent learns a task: its settings, its budget and what it trains in."""
+
+    agent: AgentConfig
+    """The agent's settings."""
+    total_steps: int | None = None
+    """Environment steps in all; None where the episodes are counted."""
+    total_episodes: int | None = None
+    """Training episodes in all; None where the steps are counted."""
+    num_envs: int = 1
+    """Environments side by side."""
+    env: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Fields of the environment in training, and options of the task, that are not at their defaults."""
+    about: str = ""
+    """Where the settings come from; for `repaired`, every deviation from the paper and why."""
+
+
+def _read(agent: str) -> dict[str, dict[str, Preset]]:
+    """An agent's file: task -> name of the settings -> the settings."""
+    tasks = tomllib.loads(files(__name__).joinpath(f"{agent}.toml").read_text())
+    presets: dict[str, dict[str, Preset]] = {task: {} for task in tasks}
+    for task, named in tasks.items():
+        for name, table in named.items():
+            like = table.pop("like", None)
+            base = presets[task][like] if like else Preset(AGENTS[agent]())
+            fields = {key: None if value == "none" else value for key, value in table.pop("agent", {}).items()}
+            presets[task][name] = dataclasses.replace(base, agent=dataclasses.replace(base.agent, **fields), **table)
+    return presets
+
 
 PRESETS: dict[tuple[str, str], dict[str, Preset]] = {
-    (agent.__name__.rpartition(".")[2], task): named
-    for agent in (ppo, ddpg, dqn, td3, sac, sarsa)
-    for task, named in agent.PRESETS.items()
+    (agent, task): named for agent in AGENTS for task, named in _read(agent).items()
 }
 """(agent, task) -> name of the settings -> the settings."""
 
