@@ -100,9 +100,8 @@ class Advise:
         return {"name": self.actuator, **changed} if changed else self.actuator
 
     def _measured(self, actuator: Any, seeds: int) -> Any:
-        from codrl_mj.cli.look import titled_table
         from codrl_mj.cli.study import compute
-        from codrl_mj.cli.terminal import console
+        from codrl_mj.cli.terminal import print_table, say
         from codrl_mj.study.actuators.measured import measured, measured_grid
         from codrl_mj.study.parallel import Workers
 
@@ -113,45 +112,38 @@ class Advise:
             compute(grid, Workers(self.jobs))
         found = measured(actuator, self.task, grid.collect())
         if not self.as_json:
-            table = titled_table(f"Measured: {seeds} policies of either kind, 50 episodes each")
-            for head in ("what is done", "score on it", "95 %"):
-                table.add_column(head)
-            for name, (mean, low, high) in found.scores.items():
-                table.add_row(name, f"{mean:.2f}", f"{low:.2f} to {high:.2f}")
-            console().print(table)
-            console().print(f"measured: {found.verdict}", markup=False, highlight=False)
+            rows = [
+                (name, f"{mean:.2f}", f"{low:.2f} to {high:.2f}") for name, (mean, low, high) in found.scores.items()
+            ]
+            title = f"Measured: {seeds} policies of either kind, 50 episodes each"
+            print_table(title, ("what is done", "score on it", "95 %"), rows)
+            say(f"measured: {found.verdict}")
         return found
 
 
 def _print(name: str, found: Any) -> None:
-    from codrl_mj.cli.look import titled_table
-    from codrl_mj.cli.terminal import console
+    from codrl_mj.cli.terminal import print_table, say
     from codrl_mj.study.actuators.advice import LOOP
     from codrl_mj.study.actuators.levels import AXES
 
-    table = titled_table(f"{name} on {found.task}, on the bench")
-    table.add_column("what it does to the largest force")
-    table.add_column("value", justify="right")
-    table.add_column("unit")
-    for field, (title, unit, digits) in _DELIVERED.items():
-        table.add_row(title, format(getattr(found.found, field), digits), unit)
-    console().print(table)
+    columns = "what it does to the largest force", "value", "unit"
+    rows = [
+        (title, format(getattr(found.found, field), digits), unit)
+        for field, (title, unit, digits) in _DELIVERED.items()
+    ]
+    print_table(f"{name} on {found.task}, on the bench", columns, rows, right=("value",))
     if found.losses:
-        table = titled_table("What policies lose by it that were trained on ideal forces [shares of the task's span]")
-        for head in ("by", "dose", "unit", "loss", "95 %", "rows"):
-            table.add_column(head, justify="right" if head in ("dose", "loss") else "left")
+        rows = []
         for loss in found.losses:
-            least = "at least " if loss.beyond else ""
+            mean = f"{'at least ' if loss.beyond else ''}{loss.loss.mean:z.2f}"
             bounds = f"{loss.loss.low:z.2f} to {loss.loss.high:z.2f}"
-            row = (f"{loss.dose:.3g}", AXES[loss.axis].unit, f"{least}{loss.loss.mean:z.2f}", bounds)
-            table.add_row(loss.axis, *row, ", ".join(loss.rows))
-        console().print(table)
-    if found.redesigned is not None and found.redesigned.verdict is not None and found.verdict != LOOP:
-        better = found.redesigned
-        line = f"the same motor under a designed loop: {better.verdict}, {better.reason}"
-        console().print(line, markup=False, highlight=False)
-    verdict = f"{found.verdict}: {found.reason}" if found.verdict else f"no verdict: {found.reason} (--measure 5)"
-    console().print(verdict, markup=False, highlight=False)
+            rows.append((loss.axis, f"{loss.dose:.3g}", AXES[loss.axis].unit, mean, bounds, ", ".join(loss.rows)))
+        title = "What policies lose by it that were trained on ideal forces [shares of the task's span]"
+        print_table(title, ("by", "dose", "unit", "loss", "95 %", "rows"), rows, right=("dose", "loss"))
+    better = found.redesigned
+    if better is not None and better.verdict is not None and found.verdict != LOOP:
+        say(f"the same motor under a designed loop: {better.verdict}, {better.reason}")
+    say(f"{found.verdict}: {found.reason}" if found.verdict else f"no verdict: {found.reason} (--measure 5)")
 
 
 def _plain(value: Any) -> Any:

@@ -86,18 +86,16 @@ class List:
 
     def run(self) -> int:
         """Print the table."""
-        from codrl_mj.cli.terminal import console
+        from codrl_mj.cli.terminal import print_table
         from codrl_mj.motor_design import catalogue_rows
 
         rows = catalogue_rows(self.sort)
         if self.as_json:
             return _print_json(rows)
-        table = _table("Motors of the catalogue", *(f"{head}\n{unit}" for head, unit, _ in _LISTED.values()), left=1)
-        table.padding, table.columns[0].no_wrap = (0, 0), True
-        for row in rows:
-            texts = (_text(row[name] and row[name] * scale, 3) for name, (*_, scale) in list(_LISTED.items())[1:])
-            table.add_row(row["name"], *texts)
-        console().print(table)
+        columns = [f"{head}\n{unit}" for head, unit, _ in _LISTED.values()]
+        scales = [(name, scale) for name, (*_, scale) in _LISTED.items() if name != "name"]
+        cells = [(row["name"], *(_text(row[name] and row[name] * scale, 3) for name, scale in scales)) for row in rows]
+        print_table("Motors of the catalogue", columns, cells, right=columns[1:], whole=columns[:1], padding=(0, 0))
         print("V: nominal, –: not printed, and taken as 24 V. codrl-mj motor show NAME says where each number is from.")
         return 0
 
@@ -143,27 +141,26 @@ class Show:
 
 def _print_explained(title: str, volts: float, found: dict[str, Any]) -> None:
     """What it can do first, then its numbers, then what to know of them."""
-    from codrl_mj.cli.terminal import console, say
+    from codrl_mj.cli.terminal import print_table, say
     from codrl_mj.motor_design import unknown_in_words
 
     def show(title: str, part: str) -> None:
-        table = _table(title, "number", "value", "unit", left=1)
-        for row in found[part]:
-            table.add_row(row["name"], _text(row["value"]), row["unit"])
-        console().print(table)
+        rows = [(row["name"], _text(row["value"]), row["unit"]) for row in found[part]]
+        print_table(title, ("number", "value", "unit"), rows, right=("value",))
 
     sources: list[str] = []
     say(title)
     show(f"What it can do at its output, at {volts:g} V", "abilities")
     say(found["assumed"])
     if "numbers" in found:
-        table = _table("The motor, at its rotor", "number", "value", "unit", "how it came about", "source", left=1)
+        rows = []
         for row in found["numbers"]:
             sources += [source for source in row["sources"] if source not in sources]
             places = ", ".join(str(1 + sources.index(source)) for source in row["sources"])
             estimated = "" if row["name"] not in found["estimated"] else " (estimated)"
-            table.add_row(row["name"], _text(row["value"]), row["unit"], row["how"] + estimated, places)
-        console().print(table)
+            rows.append((row["name"], _text(row["value"]), row["unit"], row["how"] + estimated, places))
+        columns = "number", "value", "unit", "how it came about", "source"
+        print_table("The motor, at its rotor", columns, rows, right=("value",))
     show("As it is simulated", "drive")
     if "numbers" in found:
         for kind, texts in (
@@ -204,7 +201,7 @@ class Design:
 
     def run(self) -> int:
         """Print the table, draw Bode's diagram."""
-        from codrl_mj.cli.terminal import console, say
+        from codrl_mj.cli.terminal import print_table, say
         from codrl_mj.motor_design import LoopDesign, bode_diagram, design, designs, sampled_too_seldom
 
         drive = self.changes.drive(self.name)
@@ -216,7 +213,7 @@ class Design:
             return _save(figure, self.out, "bode.png", True)
         late = "a sample of delay" if own.delayed else "no delay"
         print(f"{self.name} at {own.sample_rate:g} Hz, {late}: kp = {own.kp:.6g} V/A, ki = {own.ki:.6g} V/(A*s)")
-        table = _table("The loop at other rates, with and without delay (*: as asked for)", *_DESIGNED, left=0)
+        rows = []
         for (rate, delayed), one in every.items():
             mark = "*" if (rate, delayed) == (own.sample_rate, own.delayed) else ""
             row = [f"{mark}{rate / 1e3:g}", "1" if delayed else "0"]
@@ -224,8 +221,8 @@ class Design:
                 margin = 20.0 * math.log10(one.gain_margin)
                 rest = one.kp, one.ki, margin, one.phase_margin, one.crossover, one.bandwidth
                 row += [_text(value) for value in (*rest, 1e3 * one.settling_time, 100.0 * one.overshoot)]
-            table.add_row(*row)
-        console().print(table)
+            rows.append(row)
+        print_table("The loop at other rates, with and without delay (*: as asked for)", _DESIGNED, rows, _DESIGNED)
         for why in dict.fromkeys(one for one in every.values() if isinstance(one, str)):
             print(f"not possible: {why}")
         say(sampled_too_seldom(drive), drive.assumed)
@@ -251,7 +248,7 @@ class Step:
 
     def run(self) -> int:
         """Print the table, draw the responses."""
-        from codrl_mj.cli.terminal import console, say
+        from codrl_mj.cli.terminal import print_table, say
         from codrl_mj.motor_design import sampled_too_seldom, step, step_diagram
 
         drive = self.changes.drive(self.name)
@@ -271,10 +268,11 @@ class Step:
         )
         asked_text = f"{steps.unreachable:.4g} A, out of reach, for 20 ms, then {steps.reachable:.4g} A"
         print(f"at {steps.speed:.4g} rad/s of the rotor it is asked for {asked_text}, which it reaches:")
-        table = _table("", "anti-windup", "within 5 %\nafter ms", "undershoot\n%", left=1)
-        for kind, one in recoveries.items():
-            table.add_row(kind, _text(1e3 * one["time"], 3), _text(100.0 * one["undershoot"], 2))
-        console().print(table)
+        columns = "anti-windup", "within 5 %\nafter ms", "undershoot\n%"
+        rows = [
+            (kind, _text(1e3 * one["time"], 3), _text(100.0 * one["undershoot"], 2)) for kind, one in recoveries.items()
+        ]
+        print_table("", columns, rows, right=columns[1:])
         say(sampled_too_seldom(drive), drive.assumed)
         return _save(figure, self.out, "step.png", False)
 
@@ -321,17 +319,6 @@ class Motor:
     def run(self) -> int:
         """Do it."""
         return self.verb.run()
-
-
-def _table(title: str, *columns: str, left: int) -> Any:
-    """A rich table whose first `left` columns, and those of words, are aligned to the left."""
-    from codrl_mj.cli.look import titled_table
-
-    table = titled_table(title)
-    for index, name in enumerate(columns):
-        words = index < left or name in ("unit", "how it came about", "source")
-        table.add_column(name, justify="left" if words else "right", overflow="fold")
-    return table
 
 
 def _text(value: Any, digits: int = 4) -> str:

@@ -48,21 +48,21 @@ class Feasible:
 
     def run(self) -> int:
         """Print the bounds, and the verdict last."""
-        from codrl_mj.cli.look import titled_table
-        from codrl_mj.cli.terminal import console, say
+        from rich.text import Text
+
+        from codrl_mj.cli.terminal import print_table, say
         from codrl_mj.sizing import HOPELESS, SURELY_NOT, catalogued, demand_of, feasibility, geared
 
         drive, continuous, unknown = catalogued(self.name, self.gear_ratio, self.voltage)
         demand = demand_of(self.asked, trust=self.trust, motor=self.motor)
         found = feasibility(drive, demand, continuous)
-        table = titled_table(f"{self.name}, {_gear(drive, demand)}, {drive.voltage_limit:g} V: {demand.source}")
-        for header in ("bound", "of", "needs", "has", "unit", "", "says"):
-            table.add_column(header, justify="right" if header in ("needs", "has") else "left")
+        title = f"{self.name}, {_gear(drive, demand)}, {drive.voltage_limit:g} V: {demand.source}"
+        rows: list[Any] = []
         for bound in found.bounds:
             numbers = f"{bound.needed:.4g}", f"{bound.available:.4g}"
-            mark = "[green]holds" if bound.holds else "[red]fails"
-            table.add_row(bound.name, bound.formula, *numbers, bound.unit, mark, bound.verdict)
-        console().print(table)
+            mark = Text("holds", "green") if bound.holds else Text("fails", "red")
+            rows.append((bound.name, bound.formula, *numbers, bound.unit, mark, bound.verdict))
+        print_table(title, ("bound", "of", "needs", "has", "unit", "", "says"), rows, right=("needs", "has"))
         asked, best = found.operation, geared(drive, demand, continuous)
         at_best = feasibility(best, demand, continuous)
         say(
@@ -187,25 +187,25 @@ def _share(drive: Any, asked: Any) -> str:
 
 def _ranking(choices: Sequence[tuple[str, Any]], demands: Mapping[str, Any], title: str) -> Any:
     """A row for each choice; of several motors, each with what it drives."""
+    from rich.text import Text
+
     from codrl_mj.cli.look import titled_table
 
-    table = titled_table(title)
-    several = len(demands) > 1
-    if several:
-        table.add_column("drives", overflow="fold")
     columns = ("motor", "gear", "supply\n[V]", "power\n[W]", "does\nit", "margin", "rotor's\nshare", "peak\n[A]")
-    for header in (*columns, "rms\n[A]", "drawn\n[J]", "heat\n[J]"):
-        table.add_column(header, justify="left" if header in ("motor", "does\nit") else "right", no_wrap=True)
+    columns += ("rms\n[A]", "drawn\n[J]", "heat\n[J]")
+    right, rows = [name for name in columns if name not in ("motor", "does\nit")], []
+    several = len(demands) > 1
     for name, choice in choices:
         asked = choice.feasibility.operation
         numbers = abs(asked.current).max(), asked.rms_current, asked.energy_drawn, asked.copper_loss
-        gear, does = _gear(choice.drive, demands[name]), "[red]no" if choice.lacks else "[green]yes"
-        table.add_row(
+        gear, does = _gear(choice.drive, demands[name]), Text("no", "red") if choice.lacks else Text("yes", "green")
+        row = (
             *((name, choice.name) if several else (choice.name,)),
             *(gear.removeprefix("gear "), f"{choice.drive.voltage_limit:g}", f"{choice.power:,.0f}", does),
             *(f"{choice.feasibility.margin:.0%}", _share(choice.drive, asked), *(f"{one:.3g}" for one in numbers)),
         )
-    return table
+        rows.append(row)
+    return titled_table(title, (*(("drives",) if several else ()), *columns), rows, right, whole=columns)
 
 
 def _draw(drive: Any, demand: Any, name: str, path: Path) -> None:

@@ -64,9 +64,9 @@ def _refuse(event: Any, verbs: Mapping[str, Any], arguments: Sequence[str]) -> N
 
 def _refuse_words(tokens: Sequence[str], text: str, shown: str) -> None:
     """Refuse words that the parser left over, by what the verb's help has."""
+    verbs = re.match(r"usage: [^\n]*\{([\w,]+)\}\n", text)
     flag = next((token.partition("=")[0] for token in tokens if token.startswith("-")), None)
-    if flag is None:
-        verbs = re.match(r"usage: [^\n]*\{([\w,]+)\}\n", text)
+    if flag is None or (verbs and not tokens[0].startswith("-")):
         choice = verbs[1].split(",") if verbs else []
         listed = f"verbs are {', '.join(choice)}" if choice else f"{shown} --help says what it takes"
         what = "unknown verb" if choice else "unexpected"

@@ -29,9 +29,7 @@ class Replay:
         """Run the episode and write it."""
         from codrl_mj.evaluation import run_episodes
         from codrl_mj.replay import motion_of_episode, write_replay
-        from codrl_mj.runs.files import check_page
 
-        check_page(self.out)
         policy, env = policy_and_environment(self)
         (episode,) = run_episodes(policy, env.make, 1, self.seed)
         title = f"{title_of(self.subject, env)}: return {episode.total:.0f}"

@@ -55,22 +55,19 @@ class Reproduce(Computed):
 
 def _print_verdicts(findings: Any) -> None:
     """Print a row for each claim."""
-    from rich import box
-    from rich.markup import escape
-    from rich.table import Table
+    from rich.text import Text
 
-    from codrl_mj.cli.terminal import console
+    from codrl_mj.cli.terminal import print_table
     from codrl_mj.study.reproduction.verdicts import COMPATIBLE, CONFIRMED, NOT_CONFIRMED, number
 
     colours = {CONFIRMED: "green", COMPATIBLE: "cyan", NOT_CONFIRMED: "red"}
+    columns = "said by", "what is reported", "ours [95 %]", "seeds", "verdict"
     for task in findings.plan.tasks:
-        table = Table(title=task, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
-        for header in ("said by", "what is reported", "ours [95 %]", "seeds", "verdict"):
-            table.add_column(header, justify="right" if header == "seeds" else "left", overflow="fold")
+        rows: list[Any] = []
         for claim, verdict in findings.claims:
             if claim.task == task:
                 found = "–" if verdict.measured is None else "{} [{}, {}]".format(*map(number, verdict.measured))
-                words = claim.source, f"{claim.statement} ({claim.physics})", found
-                colour = colours.get(verdict.outcome, "yellow")
-                table.add_row(*map(escape, words), str(verdict.samples), f"[{colour}]{verdict.outcome}")
-        console().print(table)
+                outcome = Text(str(verdict.outcome), colours.get(verdict.outcome, "yellow"))
+                statement = f"{claim.statement} ({claim.physics})"
+                rows.append((claim.source, statement, found, str(verdict.samples), outcome))
+        print_table(task, columns, rows, right=("seeds",), padding=(0, 1))

@@ -28,18 +28,22 @@ class Runs:
 
     def run(self) -> int:
         """List or compare."""
-        from codrl_mj.cli.terminal import print_comparison, print_runs
+        from codrl_mj.cli.tables import comparison_tables, run_table
+        from codrl_mj.cli.terminal import console, say
         from codrl_mj.runs.files import write_json
         from codrl_mj.runs.summaries import compare, find_runs, read_run, sort_runs
 
         content: Any
         if self.compare:
             comparison = compare([read_run(path, str(path)) for path in self.compare])
-            print_comparison(comparison)
+            for table in comparison_tables(comparison):
+                console().print(table)
             content = comparison.as_mapping()
         else:
             runs = sort_runs(find_runs(self.root), self.sort)
-            print_runs(runs)
+            console().print(run_table(runs))
+            for run in runs:
+                say("" if run.problem is None else f"{run.name}: damaged: {run.problem}", style="red")
             content = [run.as_mapping() for run in runs]
         if self.out is not None:
             write_json(self.out, content)

@@ -69,21 +69,16 @@ class Computed:
 
     def print_costs(self, grid: Any) -> float:
         """Print every arm, which of its trainings are finished, and what is left; the core hours left."""
-        from rich import box
-        from rich.table import Table
-
-        from codrl_mj.cli.terminal import console
+        from codrl_mj.cli.terminal import print_table
         from codrl_mj.study.trials import numbers_as_text
 
-        every = grid.costs()
-        table = Table("arm", "seeds\nfinished", "seeds\nto do", box=box.SIMPLE_HEAD, pad_edge=False)
-        for header in ("s each", "tests\nto do", "core hours\nleft"):
-            table.add_column(header, justify="right")
+        every, rows = grid.costs(), []
+        columns = "arm", "seeds\nfinished", "seeds\nto do", "s each", "tests\nto do", "core hours\nleft"
         for cost in every:
             each = f"{'' if cost.finished else 'about '}{cost.seconds:.0f}"
             seeds = numbers_as_text(cost.finished), numbers_as_text(cost.missing)
-            table.add_row(cost.arm.name, *seeds, each, str(cost.tests), f"{cost.left / 3600:.2f}")
-        console().print(table)
+            rows.append((cost.arm.name, *seeds, each, str(cost.tests), f"{cost.left / 3600:.2f}"))
+        print_table("", columns, rows, right=columns[3:], padding=(0, 1))
         return sum(cost.left for cost in every) / 3600
 
 

@@ -4,8 +4,8 @@ import datetime
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from codrl_mj.cli.look import titled_table
 from codrl_mj.evaluation import MEASURES, Evaluation
@@ -41,20 +41,18 @@ _SHOWN = ("returns", "failure")  # whole in the first table, or by what is in it
 def _compact(evaluations: Mapping[str, Evaluation]) -> Table:
     """A row for each evaluation; measures that none of them has are left out."""
     counts = sorted({evaluation.episodes for evaluation in evaluations.values()})
-    table = titled_table(f"{' or '.join(map(str, counts))} episodes a row: means [95 % bootstrap interval]")
-    table.add_column("policy", overflow="fold")
     shown = {
-        name: as_text
-        for name, (header, as_text) in _TELLING.items()
+        name: column
+        for name, column in _TELLING.items()
         if any(getattr(evaluation, name) is not None for evaluation in evaluations.values())
     }
-    for name in shown:
-        table.add_column(_TELLING[name][0], justify="right", no_wrap=True)
+    headers = [header for header, _ in shown.values()]
+    rows = []
     for title, evaluation in evaluations.items():
-        values = {name: getattr(evaluation, name) for name in shown}
-        texts = [_NOTHING if value is None else shown[name](value) for name, value in values.items()]
-        table.add_row(*map(escape, (title, *texts)))
-    return table
+        values = [(getattr(evaluation, name), as_text) for name, (_, as_text) in shown.items()]
+        rows.append((title, *(_NOTHING if value is None else as_text(value) for value, as_text in values)))
+    title = f"{' or '.join(map(str, counts))} episodes a row: means [95 % bootstrap interval]"
+    return titled_table(title, ("policy", *headers), rows, right=headers, whole=headers)
 
 
 _OF_MOTORS = {
@@ -75,23 +73,17 @@ _OF_MOTORS = {
 def _motors(title: str, evaluation: Evaluation) -> Table:
     """A row for each of several motors; measures that none of them has are left out."""
     shown = [name for name in _OF_MOTORS if any(one.get(name) is not None for one in evaluation.motors.values())]
-    table = titled_table(f"motors of {title}: energies of an episode")
-    table.add_column("motor", overflow="fold")
-    for name in shown:
-        table.add_column(_OF_MOTORS[name], justify="right", no_wrap=True)
-    for motor, measures in evaluation.motors.items():
-        table.add_row(*map(escape, (motor, *(_text(measures[name]) for name in shown))))
-    return table
+    headers = [_OF_MOTORS[name] for name in shown]
+    rows = [(motor, *(_text(found[name]) for name in shown)) for motor, found in evaluation.motors.items()]
+    return titled_table(
+        f"motors of {title}: energies of an episode", ("motor", *headers), rows, right=headers, whole=headers
+    )
 
 
 def _details(evaluations: Mapping[str, Evaluation]) -> Table:
     """A column for each evaluation, a row for each measure that one of them has and `_compact` does not show whole."""
-    table = titled_table("mean [95 % interval], or median [quartiles]")
-    table.add_column("measure", no_wrap=True)
-    for title in evaluations:
-        table.add_column(escape(title), justify="right", overflow="fold")
     ends = [f"{e.terminated} task, {e.episodes - e.terminated} time limit" for e in evaluations.values()]
-    table.add_row("episodes ended by", *ends)
+    rows = [("episodes ended by", *ends)]
     for name, field in MEASURES.items():
         values = [getattr(evaluation, name) for evaluation in evaluations.values()]
         spread = any(isinstance(value, Interval | Quartiles) for value in values)
@@ -99,8 +91,9 @@ def _details(evaluations: Mapping[str, Evaluation]) -> Table:
             continue
         scale, unit = (100.0, "%") if field.metadata["unit"] == "share" else (1.0, field.metadata["unit"])
         label = f"{field.metadata['label']} [{unit.replace('*', '·')}]"
-        table.add_row(*map(escape, (label, *(_text(value, scale) for value in values))))
-    return table
+        rows.append((label, *(_text(value, scale) for value in values)))
+    title = "mean [95 % interval], or median [quartiles]"
+    return titled_table(title, ("measure", *evaluations), rows, right=list(evaluations), whole=("measure",))
 
 
 def _text(value: Any, scale: float = 1.0) -> str:
@@ -112,51 +105,39 @@ def _text(value: Any, scale: float = 1.0) -> str:
     return f"{number:.3g}" if abs(number) < 1000 else f"{number:.0f}"
 
 
+_STATES = {"finished": "green", "unfinished": "yellow", "damaged": "red"}
+_OF_RUNS = "seed", "steps", "state", "training\nreturn", "evaluated\nreturn", "modified"
+
+
 def run_table(runs: Sequence[RunSummary]) -> Table:
     """A row for each run."""
-    table = titled_table(f"{len(runs)} run{'' if len(runs) == 1 else 's'}")
-    for header in ("run", "task", "agent", "actuator"):
-        table.add_column(header, overflow="fold")
-    for header in ("seed", "steps", "state", "training\nreturn", "evaluated\nreturn", "modified"):
-        table.add_column(header, justify="right", no_wrap=True)
+    rows: list[Any] = []
     for run in runs:
         known = [_NOTHING if value is None else str(value) for value in (run.task, run.agent, run.actuator, run.seed)]
         returns = [_NOTHING if value is None else f"{value:.1f}" for value in (run.mean_return, run.evaluation_return)]
-        table.add_row(
-            *map(escape, (run.name, *known, _steps(run))),
-            {"finished": "[green]finished", "unfinished": "[yellow]unfinished", "damaged": "[red]damaged"}[run.state],
-            *returns,
-            _NOTHING if run.modified is None else f"{datetime.datetime.fromtimestamp(run.modified):%m-%d %H:%M}",
+        share = (
+            f" ({run.steps / run.total_steps:.0%})"
+            if run.state == "unfinished" and run.steps is not None and run.total_steps
+            else ""
         )
-    return table
-
-
-def _steps(run: RunSummary) -> str:
-    if run.steps is None:
-        return _NOTHING
-    share = f" ({run.steps / run.total_steps:.0%})" if run.state == "unfinished" and run.total_steps else ""
-    return f"{run.steps:,}{share}"
+        steps = _NOTHING if run.steps is None else f"{run.steps:,}{share}"
+        time = _NOTHING if run.modified is None else f"{datetime.datetime.fromtimestamp(run.modified):%m-%d %H:%M}"
+        rows.append((run.name, *known, steps, Text(run.state, _STATES[run.state]), *returns, time))
+    title = f"{len(runs)} run{'' if len(runs) == 1 else 's'}"
+    return titled_table(title, ("run", "task", "agent", "actuator", *_OF_RUNS), rows, right=_OF_RUNS, whole=_OF_RUNS)
 
 
 def comparison_tables(comparison: Comparison) -> list[Table]:
     """What differs in the configuration, and the results: a column for each run, at most some at a time."""
-    count = len(comparison.names)
-    return [
-        _side_by_side(title, comparison.names, rows, range(begin, min(begin + _COLUMNS, count)))
-        for begin in range(0, count, _COLUMNS)
-        for title, rows in (("settings that differ", comparison.configuration), ("results", comparison.results))
-        if rows
-    ]
-
-
-def _side_by_side(title: str, names: Sequence[str], rows: Mapping[str, Sequence[Any]], columns: Sequence[int]) -> Table:
-    table = titled_table(title)
-    table.add_column("", overflow="fold")
-    for column in columns:
-        table.add_column(escape(names[column]), justify="right", overflow="fold")
-    for label, values in rows.items():
-        table.add_row(*map(escape, (label, *(_any_text(values[column]) for column in columns))))
-    return table
+    found = []
+    for begin in range(0, len(comparison.names), _COLUMNS):
+        chunk = slice(begin, begin + _COLUMNS)
+        names = comparison.names[chunk]
+        for title, content in (("settings that differ", comparison.configuration), ("results", comparison.results)):
+            if content:
+                rows = [(label, *map(_any_text, values[chunk])) for label, values in content.items()]
+                found.append(titled_table(title, ("", *names), rows, right=names))
+    return found
 
 
 def _any_text(value: Any) -> str:

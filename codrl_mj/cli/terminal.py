@@ -8,19 +8,23 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, Progress, Task, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Column, Table
+from rich.table import Column
 from rich.text import Text
 
-from codrl_mj.cli.tables import comparison_tables, evaluation_tables, run_table
+from codrl_mj.cli.look import titled_table
+from codrl_mj.cli.tables import evaluation_tables
 from codrl_mj.evaluation import Evaluation
 from codrl_mj.runs.layout import PROGRESS
-from codrl_mj.runs.summaries import Comparison, RunSummary, last_report
+from codrl_mj.runs.summaries import last_report
 from codrl_mj.training import TrainConfig
 from codrl_mj.training.history import REPORT_COLUMNS
 from codrl_mj.validation import GROUPS, Caught, Certificate, Check
 from codrl_mj.validation.mutations import margin
+
+_FRAMED: dict[str, Any] = {"box": box.HEAVY_HEAD, "pad_edge": True, "padding": (0, 1)}
 
 
 def console() -> Console:
@@ -28,10 +32,15 @@ def console() -> Console:
     return Console() if sys.stdout.isatty() else Console(width=110)
 
 
-def say(*texts: str) -> None:
+def say(*texts: str, style: str | None = None) -> None:
     """Print each text that is not empty, as wide as the terminal."""
     for text in filter(None, texts):
-        console().print(text, markup=False, highlight=False)
+        console().print(text, markup=False, highlight=False, style=style)
+
+
+def print_table(*content: Any, **look: Any) -> None:
+    """Print a `titled_table`."""
+    console().print(titled_table(*content, **look))
 
 
 class _Line(TextColumn):
@@ -107,35 +116,18 @@ def print_evaluations(evaluations: Mapping[str, Evaluation], details: bool = Tru
         console().print(table)
 
 
-def print_runs(runs: Sequence[RunSummary]) -> None:
-    """Print a table with a row for each run, and under it what is wrong with those that are damaged."""
-    console().print(run_table(runs))
-    for run in runs:
-        if run.problem is not None:
-            console().print(f"{run.name}: damaged: {run.problem}", style="red", markup=False, highlight=False)
-
-
-def print_comparison(comparison: Comparison) -> None:
-    """Print what differs between runs, and their results, with a column for each run."""
-    for table in comparison_tables(comparison):
-        console().print(table)
-
-
 def print_checks(checks: Sequence[Check], title: str = "MuJoCo against Gymnasium") -> None:
     """Print one table, a row for each check, and under it where those that failed did so."""
-    table = Table(title=title, title_justify="left")
-    for column in ("check", "samples", "worst", "allowed", "margin", "unit", "verdict"):
-        justify = "right" if column in ("samples", "worst", "allowed", "margin") else "left"
-        table.add_column(column, justify=justify, no_wrap=column in ("worst", "allowed", "verdict"))  # type: ignore[arg-type]
+    columns = "check", "samples", "worst", "allowed", "margin", "unit", "verdict"
+    rows: list[Any] = []
     for check in checks:
-        verdict = "[green]passed" if check.passed else "[red]FAILED"
         numbers = f"{check.samples:,}", f"{check.worst:.1e}", f"{check.tolerance:.0e}", check.margin
-        table.add_row(check.name, *numbers, check.unit, verdict)
-    console().print(table)
+        verdict = Text("passed", "green") if check.passed else Text("FAILED", "red")
+        rows.append((check.name, *numbers, check.unit, verdict))
+    print_table(title, columns, rows, right=columns[1:5], whole=("worst", "allowed", "verdict"), **_FRAMED)
     for check in checks:
         if not check.passed:
-            place = f"{check.name}, against {check.oracle}: FAILED at {check.where}"
-            console().print(place, style="red", markup=False, highlight=False)
+            say(f"{check.name}, against {check.oracle}: FAILED at {check.where}", style="red")
 
 
 def print_certificate(certificate: Certificate) -> None:
@@ -146,7 +138,7 @@ def print_certificate(certificate: Certificate) -> None:
             title = f"{group}, {task}" if task else f"{group}: {description}"
             print_checks([check for check in checks if check.task == task], title)
     for skip in certificate.skipped:
-        console().print(f"not checked: {skip.group}, {skip.name}: {skip.reason}", markup=False, highlight=False)
+        say(f"not checked: {skip.group}, {skip.name}: {skip.reason}")
     colour = "green" if certificate.passed else "red"
     form = " (the quick form)" if certificate.quick else ""
     console().print(
@@ -157,17 +149,16 @@ def print_certificate(certificate: Certificate) -> None:
 
 def print_mutations(caught: Sequence[Caught], blind: Sequence[Check]) -> None:
     """Print one table, a row for each fault made on purpose, and the checks that none of them fails."""
-    table = Table(title="Faults made on purpose", title_justify="left")
-    for column in ("fault", "in", "failed", "clearest check", "worst", "allowed", "beyond"):
-        justify = "right" if column in ("failed", "worst", "allowed", "beyond") else "left"
-        table.add_column(column, justify=justify)  # type: ignore[arg-type]
+    columns = "fault", "in", "failed", "clearest check", "worst", "allowed", "beyond"
+    rows: list[Any] = []
     for outcome in caught:
         check = outcome.clearest
-        shown = ["[red]MISSED", "", "", ""]
+        shown: list[Any] = [Text("MISSED", "red"), "", "", ""]
         if check is not None:
             numbers = f"{check.worst:.1e}", f"{check.tolerance:.0e}", f"{margin(check):.1e}"
             shown = [f"{check.group}: {check.name}", *numbers]
-        table.add_row(outcome.mutation, outcome.task or "the motor", f"{len(outcome.failed)} of {outcome.made}", *shown)
-    console().print(table)
+        failed = f"{len(outcome.failed)} of {outcome.made}"
+        rows.append((outcome.mutation, outcome.task or "the motor", failed, *shown))
+    print_table("Faults made on purpose", columns, rows, right=("failed", *columns[4:]), **_FRAMED)
     for check in blind:
-        console().print(f"no fault fails {check.group}, {check.task}: {check.name}", style="red", markup=False)
+        say(f"no fault fails {check.group}, {check.task}: {check.name}", style="red")
