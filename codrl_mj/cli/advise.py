@@ -127,7 +127,7 @@ def _print(name: str, found: Any) -> None:
     from codrl_mj.study.actuators.levels import AXES
 
     columns = "what it does to the largest force", "value", "unit"
-    rows = [
+    rows: list[tuple[Any, ...]] = [
         (title, format(getattr(found.found, field), digits), unit)
         for field, (title, unit, digits) in _DELIVERED.items()
     ]

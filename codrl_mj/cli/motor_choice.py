@@ -191,6 +191,7 @@ def _ranking(choices: Sequence[tuple[str, Any]], demands: Mapping[str, Any], tit
 
     from codrl_mj.cli.look import titled_table
 
+    columns: tuple[str, ...]
     columns = ("motor", "gear", "supply\n[V]", "power\n[W]", "does\nit", "margin", "rotor's\nshare", "peak\n[A]")
     columns += ("rms\n[A]", "drawn\n[J]", "heat\n[J]")
     right, rows = [name for name in columns if name not in ("motor", "does\nit")], []

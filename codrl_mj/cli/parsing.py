@@ -37,12 +37,12 @@ def parse(verbs: Mapping[str, Any], arguments: Sequence[str]) -> Any:
 
 def _refuse(event: Any, verbs: Mapping[str, Any], arguments: Sequence[str]) -> None:
     """Say in a sentence what the parser would in a box; of kinds of errors that are not known here its box remains."""
-    words = [word for word in arguments[:2] if re.fullmatch(r"[a-z]+", word)]
-    shown = "codrl-mj " + " ".join(words[: 2 if words[:1] in (["motor"], ["identify"]) else 1])
+    words = [word for word in arguments[:2] if re.fullmatch(r"[a-z]+", word)] if {*arguments[:1]} & {*verbs} else []
+    shown = " ".join(["codrl-mj", *words[: 2 if words[:1] in (["motor"], ["identify"]) else 1]])
     match type(event).__name__:
         case "MissingSubcommand":
             known = ", ".join(event.subcommand_spec.parser_from_name)
-            raise ValueError(f"{shown.strip()} needs a verb, one of {known}; {shown.strip()} --help says more")
+            raise ValueError(f"{shown} needs a verb, one of {known}; {shown} --help says more")
         case "MissingArgs":
             missing = [_called(one.arg) for one in event.missing_arguments]
             raise ValueError(f"{shown} needs {', '.join(missing)}; {shown} --help says more")
@@ -71,7 +71,7 @@ def _refuse_words(tokens: Sequence[str], text: str, shown: str) -> None:
         listed = f"verbs are {', '.join(choice)}" if choice else f"{shown} --help says what it takes"
         what = "unknown verb" if choice else "unexpected"
         raise ValueError(f"{what} {tokens[0]!r}: {did_you_mean(tokens[0], choice)}{listed}")
-    known = list(dict.fromkeys(re.findall(r"(?<![\w-])--[a-z][\w-]*(?:\.[\w-]+)*", text)))
+    known = [one for one in dict.fromkeys(re.findall(r"(?<![\w-])--[a-z][\w-]*(?:\.[\w-]+)*", text)) if one != flag]
     inner = [f"did you mean {one!r}? " for one in known if one.rpartition(".")[2] == flag.lstrip("-")]
     hint = "".join(inner[:1]) or did_you_mean(flag, known)
     if flag in _SHORT and "--actuator" in known:
