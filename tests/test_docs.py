@@ -73,11 +73,16 @@ def folder_of_a_reader(trained, tmp_path, monkeypatch):
     Path("car.yaml").write_text(re.search(r"```yaml\n(.*?)```", PAGES["docs/training.md"], re.DOTALL)[1])
     family = re.search(r"```python\n(import dataclasses\n.*?)```", PAGES["docs/actuators.md"], re.DOTALL)
     Path("my_gearbox.py").write_text(family[1])
+    for own in (ROOT / "examples/own_robot").glob("ball*"):
+        shutil.copy(own, ".")
+    Path("motor").mkdir()
+    Path("motor/actuator.yaml").write_text("family: lag")
     Path("runs").mkdir()
     for run in ("mine", "through"):
         Path("runs", run).symlink_to(trained)
     yield
-    sys.modules.pop("my_gearbox", None)
+    for own in ("my_gearbox", "ball_and_beam"):
+        sys.modules.pop(own, None)
 
 
 @pytest.mark.parametrize(
@@ -151,11 +156,11 @@ def shortened(command):
     return words + more.split()  # the last one of a flag counts
 
 
-RUN = {
+RUN_ALL = {
     page: [command for name, command in (one.values for one in COMMANDS) if name == page]
     for page in dict.fromkeys(one.values[0] for one in COMMANDS)
 }
-RUN = {page: [one for one in lines if not re.match(NEEDING_MORE, one)] for page, lines in RUN.items()}
+RUN = {page: [one for one in lines if not re.match(NEEDING_MORE, one)] for page, lines in RUN_ALL.items()}
 
 
 @pytest.mark.parametrize(
@@ -190,6 +195,27 @@ def test_the_commands_of_a_page_run_as_typed(page, trained, tmp_path):
         check=False,
     )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+
+
+@pytest.mark.matrix
+def test_the_first_page_identifies_a_motor_as_typed(tmp_path):
+    """From logs of a motor on its own, whose columns have the names of that line."""
+    program = [str(Path(sys.executable).with_name("codrl-mj"))]
+    simulate = shlex.split(
+        "identify simulate maxon-ec45-flat-50w --kind prbs --amplitude 4 --duration 2 --inertia 1e-5"
+    )
+    for number in ("1", "2"):
+        log = tmp_path / f"swing{number}.csv"
+        subprocess.run([*program, *simulate, "--seed", number, "--out", str(log)], check=True, capture_output=True)
+        header, rows = log.read_text().split("\n", 1)
+        for name, column in (("time", "t"), ("voltage", "u"), ("current", "i"), ("position", "q")):
+            header = re.sub(rf"\b{name}\b", column, header)
+        log.write_text(f"{header}\n{rows}")
+    (line,) = [command for command in RUN_ALL["README.md"] if command.startswith("identify")]
+    done = subprocess.run([*program, *shlex.split(line)], capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "not to be used" not in done.stdout
+    assert (tmp_path / "motor" / "actuator.yaml").is_file()
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -68,7 +68,7 @@ def test_every_arm_is_trained_tested_and_read(done):
 def test_what_failed_or_was_not_tried_is_said(done):
     _, findings, out, _, _ = done
     assert findings.missing[BLOCKED.name] == [0, 1]
-    assert "Not a directory" in findings.found.failures[f"{BLOCKED.name}, seed 0"]
+    assert "is not a folder" in findings.found.failures[f"{BLOCKED.name}, seed 0"]
     page = (out / PAGE).read_text()
     assert f"- {BLOCKED.name}: seeds 0 to 1\n" in page
     assert f"- {BLOCKED.name}, seed 0 failed: " in page
