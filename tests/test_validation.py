@@ -585,7 +585,7 @@ def test_the_command_prints_writes_and_exits_with_0(capsys, tmp_path):
     text = capsys.readouterr().out
     assert "steps: left" in text
     assert "not checked: dynamics" in text
-    assert "passed: 13 checks" in text
+    assert "passed: 13 of 13 checks" in text
     assert (out / "certificate.html").is_file()
     assert json.loads((out / "certificate.json").read_text())["verdict"] == "passed"
 

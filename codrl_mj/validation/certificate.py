@@ -76,7 +76,8 @@ class Certificate:
 def verdict(passed: Sequence[bool]) -> str:
     """In a few words how many of some checks failed, or passed."""
     failed = passed.count(False)
-    return f"{failed} of {len(passed)} checks FAILED" if failed or not passed else f"passed: {len(passed)} checks"
+    count = f"of {len(passed)} checks"
+    return f"{failed} {count} FAILED" if failed or not passed else f"passed: {len(passed)} {count}"
 
 
 def _check_mapping(check: Check) -> dict[str, Any]:
