@@ -471,9 +471,13 @@ def attempt(case: Case, folder: Path, patience: float) -> Outcome:
         os.killpg(child, signal.SIGKILL)
     status = os.waitstatus_to_exitcode(ended[1])
     after = digests(folder)
-    meant = set() if status else {"--resume"} & set(case.command)  # a training that goes on writes into its folder
+    resumed = "--resume" in case.command  # a training that goes on writes into its folder, its tables at once
     lost = [
-        name for name in before if after.get(name) != before[name] and not meant and name not in " ".join(case.command)
+        name
+        for name in before
+        if after.get(name) != before[name]
+        and name not in " ".join(case.command)
+        and not (resumed and (status == 0 or name.endswith(".csv")))
     ]
     halves = [str(path.relative_to(folder)) for place in [folder, *folder.rglob("*")] for path, _ in leftovers(place)]
     return Outcome(status, interrupted, output.read_text(errors="replace"), lost + halves)
