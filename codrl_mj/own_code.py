@@ -46,7 +46,8 @@ def check_form(function: Callable[..., Any], value: Any, form: Form, declared: s
 
 def _fits(value: Any, form: Form) -> bool:
     if isinstance(form, str):
-        return isinstance(value, numbers.Real | np.bool_)
+        scalar = isinstance(value, np.ndarray) and value.shape == () and value.dtype.kind in "biuf"  # of np.where
+        return scalar or isinstance(value, numbers.Real | np.bool_)
     return isinstance(value, tuple) and len(value) == len(form) and all(map(_fits, value, form))
 
 

@@ -463,7 +463,7 @@ def attempt(case: Case, folder: Path, patience: float) -> Outcome:
     end, interrupted, ended = time.monotonic() + patience, False, (0, 0)
     while ended[0] == 0:
         if time.monotonic() > end:
-            os.kill(child, signal.SIGKILL if interrupted else signal.SIGINT)
+            os.killpg(child, signal.SIGKILL if interrupted else signal.SIGINT)  # as a terminal does
             end, interrupted = time.monotonic() + GRACE, True
         time.sleep(0.01)
         ended = os.waitpid(child, os.WNOHANG)

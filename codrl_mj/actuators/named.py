@@ -1,5 +1,6 @@
 """Families and actuators by name, and whatever a user may write for an actuator."""
 
+import copy
 import dataclasses
 import functools
 import itertools
@@ -103,10 +104,14 @@ def label_of(actuator: ActuatorModel) -> str:
 
 
 def labelled(actuator: ActuatorModel, label: str) -> Any:
-    """The very actuator, called something from now on; but for the ideal one."""
+    """The very actuator, which must be nobody else's, called something from now on; but for the ideal one."""
     if label and actuator is not IDEAL:
         vars(actuator)["_label"] = str(label)
     return actuator
+
+
+def _unshared(actuator: ActuatorModel) -> ActuatorModel:
+    return actuator if actuator is IDEAL else copy.copy(actuator)
 
 
 @functools.cache
@@ -125,7 +130,7 @@ def _own_numbers(actuator: Any) -> Any:
 def named_mapping(actuator: ActuatorModel) -> Any:
     """A mapping for `resolve`: of a motor of the catalogue `name` and what is set over it; else `label` and fields."""
     name, whole = label_of(actuator), mapping_of(actuator) or {}
-    if name in _catalogue():
+    if name in _catalogue() and isinstance(actuator, Drive):
         there = resolve(name, None, "a motor").as_mapping()
         short = {
             part: {key: one for key, one in inner.items() if one != (there[part] or {}).get(key)}
@@ -157,7 +162,7 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
         return given
     if isinstance(given, Mapping) and "label" in given:
         rest = {name: value for name, value in given.items() if name != "label"}
-        return labelled(resolve(rest, paper, whose), given["label"])
+        return labelled(_unshared(resolve(rest, paper, whose)), given["label"])
     if isinstance(given, Mapping) and "name" in given:
         changes = {name: value for name, value in given.items() if name != "name"}
         return actuator_over(resolve(given["name"], paper, whose), changes)
@@ -190,7 +195,7 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
         check_family(found)  # type: ignore[arg-type]
         made = found()
     if isinstance(made, ActuatorModel):
-        return made if made is not found else labelled(made, given)
+        return made if made is not found else labelled(_unshared(made), given)
     raise ValueError(f"actuator = {given!r}: {found!r} is neither an actuator nor a family of them")
 
 
@@ -224,7 +229,7 @@ def actuator_from_file(path: Path, paper: Actuator | None, whose: str) -> Any:
     except (yaml.YAMLError, UnicodeDecodeError, ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
     stem = path.stem if path.stem not in ("actuator", "actuators") else path.absolute().parent.name
-    return made if label_of(made) else labelled(made, stem)
+    return made if label_of(made) else labelled(_unshared(made), stem)
 
 
 def actuator_over(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import itertools
 import os
 import re
 import sys
@@ -13,6 +14,7 @@ import tyro
 
 from codrl_mj.fields import did_you_mean
 
+_PATHS = ("--out", "--root", "--html", "--trajectory", "--config", "--resume", "--compare", "--policies")
 _SHORT = {"--gear-ratio": "gear ratio", "--voltage": "supply voltage"}
 
 
@@ -98,8 +100,11 @@ def understood(arguments: Sequence[str]) -> list[str]:
     says `--trust`: what a file names stays to be refused.
     """
     here, found = Path.cwd(), []
-    for word in arguments:
-        if number := re.fullmatch(r"(--[\w.-]+=)?(\d+(?:\.\d+)?)(?::1|(e\+?\d{1,2}))", word):
+    for before, word in itertools.pairwise(["", *arguments]):
+        flag = word if word.startswith("--") else before  # a folder may be called 1e5
+        counted = flag.startswith("--") and flag.partition("=")[0] not in _PATHS
+        number = re.fullmatch(r"(--[\w.-]+=)?(\d+(?:\.\d+)?)(?::1|(e\+?\d{1,2}))", word)
+        if counted and number:
             value = float(number[2] + (number[3] or ""))
             word = f"{number[1] or ''}{int(value) if value.is_integer() else value}"
         elif file := re.fullmatch(r"(.*=)?([^=:]+\.py):([\w.-]+)", word):

@@ -10,7 +10,7 @@ import numpy as np
 
 from codrl_mj.identify.columns import KINDS, Column
 from codrl_mj.identify.log import find_resolution
-from codrl_mj.identify.reading import Table, read_table
+from codrl_mj.identify.reading import STAMP, Table, read_table
 
 _WORDS = {
     "only": "enable enabled armed",
@@ -52,12 +52,14 @@ def propose_columns(path: Path | str) -> Proposal:
     table, entries, doubts = read_table(Path(path)), {}, []
     for name in table.columns:
         words = [one for one in re.split(r"[\W\d_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower()) if one]
-        signal = next((one for one, known in _WORDS.items() if {*known.split()} & {*words}), None)
-        if signal is None or signal in entries:
-            doubts.append(f"{name}: " + ("not known, left out" if signal is None else f"left out, {signal} is another"))
-            continue
         bracket = re.search(r"[\[(]\s*([^\])]*)\s*[\])]", name)
         stated = [table.units.get(name, "").strip("[]() "), *([bracket[1]] if bracket else []), *reversed(words[1:])]
+        named = [one for one, known in _WORDS.items() if {*known.split()} & {*words}]
+        fitting = [one for one in named if any(text and _valid(one, text) for text in stated[: 1 + bool(bracket)])]
+        signal = next((one for one in (*fitting, *named) if one not in entries), None)
+        if signal is None:
+            doubts.append(f"{name}: " + (f"left out, {named[0]} is another" if named else "not known, left out"))
+            continue
         unit = next((one for text in stated if text and (one := _valid(signal, text))), None)
         if unit is None:
             unit, doubt = _guessed(signal, name, table)
@@ -94,6 +96,8 @@ def _guessed(signal: str, name: str, table: Table) -> tuple[str, str]:
         found = table.numbers(name)
     except ValueError:
         return unit, "holds texts"
+    if signal == "time" and any(isinstance(one, str) and STAMP.match(one) for one in table.columns[name][:2]):
+        return "s", "clock stamps, read as seconds since the first"
     found = found[np.isfinite(found)]
     largest = float(np.abs(found).max(initial=0.0))
     step = float(np.median(np.diff(found))) if found.size > 1 else 0.0

@@ -1,5 +1,6 @@
 """Logs from files: CSV (also .gz), JSON and, where pyarrow is installed, Parquet."""
 
+import collections
 import csv
 import datetime
 import gzip
@@ -16,7 +17,7 @@ from codrl_mj.identify.columns import Column, parse_columns
 from codrl_mj.identify.log import SIGNALS, Finding, Log, find_resolution
 
 _WORDS = {"": np.nan, "nan": np.nan, "none": np.nan, "null": np.nan, "true": 1.0, "false": 0.0}
-_STAMP = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d")  # seconds since 1970, or since midnight
+STAMP = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d")  # seconds since 1970, or since midnight
 _MOST_UNUSABLE = 0.2  # share of rows that may be left out as unreadable or out of order
 
 
@@ -43,7 +44,7 @@ class Table(NamedTuple):
         try:
             if text.lower() in _WORDS:
                 return _WORDS[text.lower()]
-            if _STAMP.match(text):
+            if STAMP.match(text):
                 day = "" if "-" in text[:5] else "1970-01-01T"
                 stamp = datetime.datetime.fromisoformat(day + text.replace(",", "."))
                 return (stamp.replace(tzinfo=stamp.tzinfo or datetime.UTC)).timestamp()
@@ -184,18 +185,25 @@ def _csv(text: str) -> Table:
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
     bare = [(number, line) for number, line in lines if not line.startswith("#")]
     last = [line for _, line in bare[-20:]]
-    separator = next((one for one in ";\t," if 2 * sum(one in line for line in last) > len(last)), " ")
-    cells = [
-        (number, [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True))])
-        for number, line in bare
-    ]
-    first = next((place for place, (_, row) in enumerate(cells) if any(map(_is_number, row))), len(cells))
+    usual = [one for one in ";\t," if 2 * sum(one in line for line in last) > len(last)]
+    separator = next((one for _, line in bare for one in usual if one in line), " ")  # the names' own, not a note's
+    cells = []
+    for number, line in bare:
+        try:
+            row = next(
+                csv.reader([line.strip() if separator == " " else line], delimiter=separator, skipinitialspace=True)
+            )
+        except csv.Error as error:
+            raise ValueError(f"line {number} is no row of cells: {error}") from None
+        cells.append((number, [cell.strip() for cell in row]))
+    common = collections.Counter(len(row) for _, row in cells[-20:]).most_common(1)[0][0] if cells else 0
+    filled = (place for place, (_, row) in enumerate(cells) if len(row) == common and _is_filled(row))
+    first = next(filled, len(cells))
     above = [row for _, row in cells[:first] if len(row) > 1 or separator == " "]
     if first == 0 or not above:  # names behind a #, as numpy writes them
-        above = [
-            next(csv.reader([line.lstrip("# ")], delimiter=separator)) for _, line in lines if line.startswith("#")
-        ]
-        above = [[cell.strip() for cell in row] for row in above[-1:]]
+        comments = [line.lstrip("# ") for _, line in lines if line.startswith("#")]
+        above = [[cell.strip() for cell in row] for row in csv.reader(comments, delimiter=separator)]
+        above = [row for row in above if len(row) == common][-1:] or above[-1:]
     units: list[str] = []
     width = len(cells[first][1]) if first < len(cells) else 0
     if len(above) > 1 and len(above[-1]) == len(above[-2]) == width and all(len(one) < 12 for one in above[-1]):
@@ -211,11 +219,17 @@ def _csv(text: str) -> Table:
     return Table(columns, {}, ragged, kept, dict(zip(names, units, strict=False)), separator != ",")
 
 
+def _is_filled(row: Sequence[str]) -> bool:
+    """Whether a row is one of the table's: numbers for the most part, or nothing but what stands for a missing one."""
+    missing = sum(cell.lower() in ("", "null", "none", "na") for cell in row)
+    return missing == len(row) or 2 * sum(map(_is_number, row)) > len(row) - missing
+
+
 def _is_number(text: str) -> bool:
     try:
         float(text.replace(",", "."))
     except ValueError:
-        return bool(_STAMP.match(text))
+        return bool(STAMP.match(text))
     return True
 
 

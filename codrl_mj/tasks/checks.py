@@ -55,7 +55,7 @@ def check_layout(task: Any) -> None:
 def check_functions(task: Any) -> None:
     """Call each function on plain numbers, and compare what it returns with what is declared."""
     bounds = call("Task.initial_bounds", task.initial_bounds, None)
-    fine = isinstance(bounds, tuple) and len(bounds) == 2 and np.ndim(bounds[0]) == 1
+    fine = isinstance(bounds, tuple | list | np.ndarray) and len(bounds) == 2 and np.ndim(bounds[0]) == 1
     if not fine or not _are_numbers(bounds, (2, len(bounds[0]))) or (np.subtract(*bounds) > 0.0).any():
         what = "the lower and the upper bounds of what is drawn, two arrays (k,) of finite numbers"
         raise ValueError(f"{place(task.initial_bounds)}: returns {bounds!r}, must return {what}")
@@ -79,10 +79,11 @@ def check_functions(task: Any) -> None:
 
 
 def _returned(task: Any, name: str, names: str, *arguments: Any) -> Any:
-    """What a function returns: a number for each of the task's names, or a single one; finite."""
+    """What a function returns: a finite number for each of the task's names, or a single one."""
     function, form = getattr(task, name), getattr(task, names) if names else ""
     value = check_form(function, call(f"Task.{name}", function, *arguments), form, f"Task.{names or name}")
-    if not np.isfinite(np.array(value, dtype=np.float64)).all():
+    array = np.array(value, dtype=np.float64)
+    if (~np.isfinite(array) if names else np.isnan(array)).any():  # a start may have an infinite reward
         raise ValueError(f"{place(function)}: returns {value} where an episode may start: must be finite")
     return value
 

@@ -79,11 +79,8 @@ def admit(run: Path, config: TrainConfig, resume: bool, accept_changes: bool) ->
 
 
 def unused(run: Path) -> bool:
-    """Whether nothing was learned in a folder: it is empty, or has what is there before the first checkpoint."""
-    before = {LOCK} | ({CONFIG, PROGRESS, EPISODES, TENSORBOARD} if (run / CONFIG).exists() else set())
-    half = {path.name for path in _leftovers(run)}
-    empty = {name for name in (CHECKPOINTS, BEST) if {*_files_of(run / name)} <= {*_leftovers(run / name)}}
-    return {path.name for path in run.iterdir()} <= before | half | empty
+    """Whether no training has begun in a folder: it is empty, or who was to begin was killed before."""
+    return {path.name for path in run.iterdir()} <= {LOCK, *(path.name for path in _leftovers(run))}
 
 
 def _files_of(folder: Path) -> list[Path]:
@@ -97,12 +94,16 @@ def remove_leftovers(run: Path) -> None:
 
 
 def clear(run: Path) -> None:
-    """Empty a folder that is `unused`, but for the lock of who owns it."""
-    for path in _files_of(run):
-        if path.is_dir():
-            shutil.rmtree(path)
-        elif path.name != LOCK:
-            path.unlink()
+    """Delete what a training has written that failed before it kept anything; nothing once there is a policy of it."""
+    remove_leftovers(run)
+    if _files_of(run / CHECKPOINTS) or _files_of(run / BEST):
+        return
+    for name in (CONFIG, PROGRESS, EPISODES, LOCK):
+        (run / name).unlink(missing_ok=True)
+    shutil.rmtree(run / TENSORBOARD, ignore_errors=True)
+    for name in (CHECKPOINTS, BEST):
+        with contextlib.suppress(OSError):
+            (run / name).rmdir()
 
 
 def standing(run: Path) -> str:
@@ -201,7 +202,7 @@ def owned(run: Path) -> Iterator[None]:
         RunInUseError: another process trains in it.
     """
     run.mkdir(parents=True, exist_ok=True)
-    with (run / LOCK).open("w") as lock:
+    with (run / LOCK).open("a") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -116,18 +116,16 @@ def _taking(out: Path, exists: bool) -> Iterator[None]:
         if finished(out) or not ((out / folder.CONFIG).exists() if exists else folder.unused(out)):
             raise RunInUseError(f"{out}: another process trained in it in the meantime; start again")
         folder.remove_leftovers(out)
-        if not exists:
-            folder.clear(out)
         try:
             yield
         except TrainingStoppedError:
             raise
         except BaseException:
-            if not exists and folder.unused(out):
-                folder.clear(out)
-                (out / folder.LOCK).unlink()
-                for path in made:
-                    path.rmdir()
+            if not exists:  # so that all of it is this training's
+                with contextlib.suppress(OSError):  # a folder that others use by now stays
+                    folder.clear(out)
+                    for path in made:
+                        path.rmdir()
             raise
 
 

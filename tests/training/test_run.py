@@ -280,10 +280,19 @@ def test_a_training_that_breaks_off_before_it_learned_anything_does_not_block_th
             with pytest.raises(ZeroDivisionError):
                 train(TINY, path)
     assert (out.parent.exists(), list(kept.iterdir())) == (False, [])  # what was there stays
-    start_folder(out, within(integrator="semi-implicit"))  # and that of one that was killed
-    (out / "checkpoints").mkdir()
     assert json.loads((train(TINY, out) / "result.json").read_text())["steps"] == 1024
-    assert load_config(out) == TINY
+
+
+@pytest.mark.parametrize("theirs", ["config.json", ".lock", "best", "tensorboard/events"])
+def test_what_a_folder_holds_is_neither_used_nor_deleted(tmp_path, monkeypatch, theirs):
+    """Of somebody else's, and of a training that was killed, which --resume continues."""
+    path = tmp_path / "run" / theirs
+    path.parent.mkdir(parents=True)
+    path.write_text("mine")
+    (tmp_path / "run" / "notes.txt").touch()
+    with pytest.raises(FileExistsError, match="exists already"):
+        train(TINY, tmp_path / "run")
+    assert path.read_text() == "mine"
 
 
 def test_weights_that_are_no_numbers_are_named_and_not_kept(tmp_path, monkeypatch):
