@@ -37,6 +37,7 @@ _PUBLIC = {
     "TASKS": "codrl_mj.tasks",
     "EnvConfig": "codrl_mj.envs.config",
     "Task": "codrl_mj.tasks",
+    "World": "codrl_mj.envs.worlds",
     "register": "codrl_mj.tasks",
     "Uniform": "codrl_mj.envs.distributions",
     "LogUniform": "codrl_mj.envs.distributions",

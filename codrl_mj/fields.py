@@ -1,9 +1,14 @@
 """Fields of frozen dataclasses that know their own bounds and units: the one place where settings are checked."""
 
+import ast
 import dataclasses
 import difflib
+import functools
+import inspect
+import itertools
 import math
 import numbers
+import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -155,6 +160,23 @@ def _nearest(name: object, known: Iterable[str]) -> list[str]:
     text, spelt = str(name).lower(), {one.lower(): one for one in known}
     begun = [spelt[one] for one in spelt if len(text) > 2 and one.startswith(text)]
     return begun if 0 < len(begun) < 4 else [spelt[one] for one in difflib.get_close_matches(text, spelt, n=1)]
+
+
+@functools.cache
+def field_docs(kind: type) -> Mapping[str, str]:
+    """The docstring below each field of a class, inherited ones included; none of a class without a source file."""
+    docs: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        try:
+            body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0].body  # type: ignore[attr-defined]
+        except (OSError, TypeError):
+            continue
+        docs |= {
+            ast.unparse(field.target): " ".join(ast.literal_eval(doc.value).split())
+            for field, doc in itertools.pairwise(body)
+            if isinstance(field, ast.AnnAssign) and isinstance(doc, ast.Expr)
+        }
+    return docs
 
 
 def build(cls: type, mapping: object, what: str, prefix: str = "") -> Any:

@@ -28,7 +28,6 @@ from codrl_mj import Actuator, CurrentLoop, Ideal, Motor, Supply, Uniform, named
 from codrl_mj.agents import AGENTS
 from codrl_mj.agents.presets import SETTINGS
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.foreign.config import ForeignConfig
 from codrl_mj.identify import identify
 from codrl_mj.identify.excitations import Excitation
 from codrl_mj.identify.synthetic import Load, Sampler, Sensor, simulate
@@ -306,7 +305,7 @@ def environments_of_others() -> Entries:
             step = env.step(generator.uniform(-1.0, 1.0, 6))
             seen += [*step.observation.values(), step.reward]
         yield f"others/cheetah-run/{name}", digest([np.asarray(array, dtype=np.float64) for array in seen])
-    vector = ForeignConfig("Hopper-v5", {".*": "lag"}).make_sb3(2)
+    vector = EnvConfig("Hopper-v5", {".*": "lag"}).make_sb3(2)
     vector.seed(3)
     seen = [vector.reset()]
     for _ in range(60):

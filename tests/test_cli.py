@@ -23,7 +23,6 @@ from codrl_mj.agents.presets import ELSEWHERE, PRESETS
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import evaluate, run_episodes
-from codrl_mj.foreign.config import ForeignConfig
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.tasks import find_task
 from codrl_mj.training import TrainConfig, folder, load_config
@@ -383,7 +382,7 @@ def test_so_is_the_file_of_a_model_of_somebody_s_own(tmp_path):
     arm, path = find_task("tests.own_project.arm:TASK"), tmp_path / "arm.xml"
     path.touch()
     register(dataclasses.replace(arm, name="copied_arm", env_id="tests/CopiedArm-v0", asset=str(path)))
-    own, foreign = EnvConfig("copied_arm", "lag"), ForeignConfig("HalfCheetah-v5", options={"xml_file": str(path)})
+    own, foreign = EnvConfig("copied_arm", "lag"), EnvConfig("HalfCheetah-v5", options={"xml_file": str(path)})
     digests = []
     model = (Path(gymnasium.__file__).parent / "envs/mujoco/assets/half_cheetah.xml").read_text()
     for text in (model, f"{model}<!-- changed -->"):

@@ -43,7 +43,8 @@ def made_up(desired, actual, *, saturated=False, arm=1.0, steps=40, terminated=F
     signals = {name: np.full(steps, value) for name, value in zip(SIGNALS, values, strict=True)}
     states = np.zeros((steps + 1, 4)) if states is None else states
     actuator, trace, time = Actuator(Motor(arm_radius=arm)), {"speed": np.zeros(steps)}, 0.02 * np.arange(1, steps + 1)
-    episode = Episode(time, states, states, np.zeros(steps), np.ones(steps), trace, signals, terminated, actuator)
+    acted = np.zeros(steps), np.ones(steps), np.zeros(1)
+    episode = Episode(time, states, states, *acted, trace, signals, terminated, actuator)
     return Panel("made up", "cartpole", actuator, episode)
 
 

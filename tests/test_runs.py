@@ -11,7 +11,7 @@ import tyro
 from codrl_mj import Actuator, CurrentLoop, Motor, named_actuator
 from codrl_mj.actuators import actuator_over, mapping_of, resolve
 from codrl_mj.cli.runs import Runs
-from codrl_mj.foreign.config import ForeignConfig
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.pages import report
 from codrl_mj.runs.summaries import SORT_KEYS, compare, find_runs, read_run, sort_runs
 from codrl_mj.training.config import TrainConfig
@@ -108,7 +108,7 @@ def test_motors_keep_their_names(tmp_path):
     assert read_run(make_run(tmp_path / "two", own)).actuator == "drive"
     (tmp_path / "three").mkdir()
     patterns = {"a": "kraken-x60", "b": {"label": "drawer", **own.as_mapping()}, "c": None}
-    config = TrainConfig(ForeignConfig("HalfCheetah-v5", patterns))
+    config = TrainConfig(EnvConfig("HalfCheetah-v5", patterns))
     start_folder(tmp_path / "three", config)
     assert read_run(tmp_path / "three").actuator == "kraken-x60, drawer, ideal"
     assert load_config(tmp_path / "three").env.through == config.env.through == "kraken-x60, drawer, ideal"

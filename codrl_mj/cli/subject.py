@@ -8,10 +8,9 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from codrl_mj.cli.environments import environment
-from codrl_mj.cli.fields import is_task
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.envs.worlds import is_world
 from codrl_mj.fields import did_you_mean
-from codrl_mj.foreign.config import ForeignConfig, environment_from
 from codrl_mj.runs.layout import CONFIG, finished
 from codrl_mj.tasks import TASKS
 
@@ -31,12 +30,12 @@ class Subject:
 
     policy: Any
     """What chooses the actions."""
-    env: EnvConfig | ForeignConfig
+    env: EnvConfig
     """The environment it was trained in, as far as that is known."""
     run: Path | None = None
     """The run folder that says so; None if there is none."""
 
-    def check_interface(self, env: EnvConfig | ForeignConfig) -> None:
+    def check_interface(self, env: EnvConfig) -> None:
         """Refuse an environment in which the policy would command or observe something else than in its training."""
         for name, trained in self.env.interface.items() if self.run is not None else ():
             if (value := env.interface[name]) != trained:
@@ -98,15 +97,15 @@ class Source:
             raise ValueError(f"{path} does not say which algorithm made it: name it with --agent, such as --agent ppo")
         else:
             policy = load_sb3_zip(path, self.agent or "", self.trust)
-        return Subject(policy, environment_from({"task": self.task}))
+        return Subject(policy, EnvConfig(self.task))
 
 
-def policy_and_environment(verb: Any) -> tuple[Any, EnvConfig | ForeignConfig]:
+def policy_and_environment(verb: Any) -> tuple[Any, EnvConfig]:
     """What acts, and in what, by a verb's `subject` and its flags: of a task or an id random actions."""
-    if is_task(verb.subject):
+    if is_world(verb.subject):
         from codrl_mj.evaluation import RandomPolicy
 
-        known = environment_from({"task": verb.subject})
+        known = EnvConfig(verb.subject)
         env = environment(verb, known.task, verb.actuator_name, known)
         if env.action == "force":
             return RandomPolicy(env.action_space, verb.seed), env
@@ -121,6 +120,6 @@ def policy_and_environment(verb: Any) -> tuple[Any, EnvConfig | ForeignConfig]:
     return loaded.policy, env
 
 
-def title_of(policy: Path | str, env: EnvConfig | ForeignConfig) -> str:
+def title_of(policy: Path | str, env: EnvConfig) -> str:
     """What acts, and what its episode runs on."""
     return f"{Path(policy).name} on {env.through}"

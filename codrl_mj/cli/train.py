@@ -11,16 +11,15 @@ import tyro
 from codrl_mj.actuators.model import family_name
 from codrl_mj.agents import AGENTS
 from codrl_mj.agents.presets import SETTINGS
-from codrl_mj.cli.environments import default_actuator, environment, through
+from codrl_mj.cli.environments import environment, through
 from codrl_mj.cli.fields import (
     AS_CONFIGURED,
     ActuatorName,
     environment_fields,
     flags,
-    refuse_task,
     scan,
 )
-from codrl_mj.foreign.config import ForeignConfig, environment_from
+from codrl_mj.envs.worlds import find_world
 from codrl_mj.runs.layout import finished
 from codrl_mj.tasks import TASKS
 from codrl_mj.training.config import TrainConfig, default_agent, read_config
@@ -33,7 +32,11 @@ def train_verb(arguments: list[str]) -> Any:
     """The verb's dataclass for a command line, whose agent, task, settings and files decide on flags and defaults."""
     chosen = scan(arguments, "agent", "settings", "actuator", "config", "resume")
     if chosen.task is None and arguments and not arguments[0].startswith("-"):
-        refuse_task(arguments[0])
+        try:
+            find_world(arguments[0])
+        except ValueError as error:
+            others = "an environment of Gymnasium's goes by its id, such as HalfCheetah-v5"
+            raise ValueError(f"{error}; {others}") from None
     base = _base(chosen)
     resuming = chosen.resume is not None
     configured = resuming or chosen.config is not None
@@ -68,7 +71,7 @@ def train_verb(arguments: list[str]) -> Any:
             ],
             chosen.settings if chosen.settings in SETTINGS else "default",
         ),
-        ("actuator_name", ActuatorName, AS_CONFIGURED if configured else default_actuator(base.task)),
+        ("actuator_name", ActuatorName, AS_CONFIGURED if configured else base.env.world.default_actuator),
         *((field.name, field.type, field.default) for field in dataclasses.fields(rest)),
         ("agent", Annotated[agent_flags, tyro.conf.arg(help="The agent's settings.")], agent_flags()),
         *environment_fields(base.env, chosen.actuator, base.task),
@@ -129,8 +132,8 @@ class Train:
             },
         )
         parts = config.task, config.agent.name, through(self.actuators, self.actuator_name), str(config.seed)
-        actuators = config.env.actuator if isinstance(config.env, ForeignConfig) else config.env.actuators
-        own = any(":" in one for one in (*parts, *(family_name(type(each)) for each in actuators)))  # module:NAME
+        families = (family_name(type(each)) for each in config.env.actuators)
+        own = any(":" in one for one in (*parts, *families))  # module:NAME
         following = "next: codrl-mj evaluate" + (" --trust" if own else "")
         if self.resume is not None and finished(self.resume) and config == load_config(self.resume, self.trust):
             print(f"{self.resume} is finished already; {following} {self.resume}")
@@ -138,10 +141,8 @@ class Train:
         name = "-".join(re.sub(r"[^\w.]+", "_", part) for part in parts)
         out = self.resume or self.out or Path("runs") / name
         admit(out, config, self.resume is not None, self.accept_changes)
-        if isinstance(config.env, ForeignConfig):
-            config.env.make().close()  # what is wrong with it is said before there is a bar
-        driven = config.env.actuator if isinstance(config.env.actuator, tuple) else (config.env.actuator,)
-        say(*dict.fromkeys(one.assumed for one in driven))
+        config.env.make().close()  # what is wrong with it is said before there is a bar
+        say(*dict.fromkeys(one.assumed for one in config.env.actuators))
         with training_bars({f"{config.agent.name.upper()} on {config.task}": (config, out)}):
             train(
                 config,
@@ -171,9 +172,9 @@ def _base(chosen: argparse.Namespace) -> TrainConfig:
     task = chosen.task or "cartpole"
     agent = chosen.agent if chosen.agent in AGENTS or ":" in str(chosen.agent) else default_agent(task)
     settings = chosen.settings if chosen.settings in SETTINGS else "default"
-    return TrainConfig.preset(task, agent, settings, default_actuator(task))
+    return TrainConfig.preset(task, agent, settings, find_world(task).default_actuator)
 
 
 def _task(name: str) -> str:
     """A task's one name, whichever of its names is given."""
-    return environment_from({"task": name}).task
+    return find_world(name).reference

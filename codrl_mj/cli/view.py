@@ -8,8 +8,10 @@ from typing import Any
 
 import tyro
 
-from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, field_docs, is_task
+from codrl_mj.cli.fields import AS_TRAINED, ActuatorName
 from codrl_mj.cli.subject import Source, SubjectWord, policy_and_environment, title_of
+from codrl_mj.envs.worlds import is_world
+from codrl_mj.fields import field_docs
 from codrl_mj.runs.layout import told_apart
 
 
@@ -61,7 +63,7 @@ class View:
         """Name -> policy, made when it is chosen: what is watched, its other one, and other runs."""
         found: dict[str, Callable[[], Any]] = {}
         subject = Path(self.subject)
-        if not is_task(self.subject):
+        if not is_world(self.subject):
             found[self.source.which] = lambda: given
             if (subject / "best").is_dir():
                 other = "best" if self.source.which == "last" else "last"

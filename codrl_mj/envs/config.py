@@ -4,7 +4,8 @@ Light to import: nothing is compiled, and no engine loaded.
 """
 
 import dataclasses
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,31 +15,28 @@ import numpy as np
 from codrl_mj.actuators import ActuatorModel, mapping_of, names_of
 from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint, resolve_disturbances, resolve_joint
 from codrl_mj.envs.distributions import Distribution, parse
+from codrl_mj.envs.worlds import World, find_world
 from codrl_mj.fields import check_names
-from codrl_mj.tasks import Task, find_task, reference_of, resolve_actuators
-from codrl_mj.tasks.assets import asset_path
-
-
-class UnknownOptionError(ValueError, TypeError):
-    """A keyword that the environment does not have; a TypeError too, as Python's own is, and as TorchRL expects."""
 
 
 @dataclasses.dataclass(frozen=True)
 class EnvConfig:
-    """An environment but for its rendering; None leaves the task's default.
+    """An environment but for its rendering, of whatever world; None leaves the world's default.
 
     Raises:
-        ValueError: unknown task, actuator or option, or a value out of bounds. What depends on several fields at once
-            is checked when the environment is built.
+        ValueError: unknown task, actuator or option, a value out of bounds, or a field that the world does not have.
+            What depends on several fields at once is checked when the environment is built.
     """
 
     task: str
-    """Task name, such as `cartpole`; or `module:NAME` of one's own."""
+    """Task name, such as `cartpole`; the Gymnasium id of an environment of others, such as `HalfCheetah-v5`, for which
+    `package:ID` imports the package first; or `module:NAME` of a task or a world of one's own."""
     actuator: Any = "default"
     """What the force goes through: a name (`default`, the task's own: the paper's where there is one; `ideal`, `paper`,
     `weak`, `weaker`, `open_loop`, or a family's or a motor's), an `ActuatorModel`, a mapping of its fields (with a
-    `name`, over that actuator's), a file of them, `module:NAME`, or None (ideal). With several motors all get it, or it
-    is a list with one for each. Kept as an `ActuatorModel`, or as a tuple of several."""
+    `name`, over that actuator's), a file of them, `module:NAME`, or None (ideal). With several motors all get it; or it
+    is a mapping of patterns of their names to such, or of a task a list with one for each. Kept as an `ActuatorModel`,
+    as a tuple of a task's several, or as a mapping of the patterns in an environment of others."""
     physics: str = "mujoco"
     """`mujoco`; `analytic`: Gymnasium's own equations, Furuta's closed form; or one's own, as registered."""
     integrator: str | None = None
@@ -49,14 +47,15 @@ class EnvConfig:
     timestep: float | None = None
     """Instead of inner_steps, the integration step [s], which must divide the environment step."""
     action: str = "force"
-    """What the agent commands: the desired `force` (the paper), the reference `current`, or the raw terminal `voltage`
-    past the controller (end to end); or what else the actuator's family takes."""
+    """What the agent commands: the desired `force` (the paper; in an environment of others its own actions), the
+    reference `current`, or the raw terminal `voltage` past the controller (end to end); or what else the actuator's
+    family takes."""
     levels: tuple[float, ...] | None = None
     """Discrete tasks that command a current [A] or a voltage [V]: the levels that the actions choose from."""
     observe_actuator: bool = False
-    """Whether the agent also observes measured and reference current [A]."""
+    """Whether the agent also observes measured and reference current [A], or what else the motors' sensors say."""
     max_episode_steps: int | None = None
-    """Time limit [environment steps], >= 1; the default is Gymnasium's."""
+    """Time limit [environment steps], >= 1; the default is the environment's own."""
     allow_unstable: bool = False
     """Build the environment even if the current loop is unstable."""
     disturbances: Disturbances = OFF
@@ -65,29 +64,34 @@ class EnvConfig:
     """What is added to the actuated joints."""
     randomize: tuple[str, ...] | None = None
     """What to draw at every reset, as FIELD=DISTRIBUTION, such as 'motor.inductance=uniform(0.05, 0.2)'; distributions
-    are uniform(LOW, HIGH), loguniform(LOW, HIGH) and choice(VALUE, ...). Fields are the actuator's, and of the model
+    are uniform(LOW, HIGH), loguniform(LOW, HIGH) and choice(VALUE, ...). Fields are the actuator's, in an environment
+    of others with the pattern and a colon before it (leg.*:motor.inductance) those of some; and of the model
     model.mass.BODY, model.length.BODY, model.gravity and model.damping.JOINT. In Python and in files a mapping of
     fields to distributions will do as well. What was drawn is in the reset's info, `randomization`."""
     options: Any = None
-    """The task's own options, a mapping (CartPole: `center_radius`, `sutton_barto_reward`); kept as the task's
-    `NamedTuple`."""
+    """The task's own options, a mapping (CartPole: `center_radius`, `sutton_barto_reward`), kept as the task's
+    `NamedTuple`; of an environment of others the keyword arguments that make it, such as frame_skip."""
 
     def __post_init__(self) -> None:
         """Validate, and turn what files and users write into what it stands for, and numpy's values into Python's."""
         for field in dataclasses.fields(self):
             self._set(field.name, _plain(getattr(self, field.name)))
-        task = find_task(self.task)
-        self._set("task", reference_of(task))
-        actuators = resolve_actuators(self.actuator, task)
-        self._set("actuator", actuators[0] if len(actuators) == 1 else actuators)
-        if isinstance(self.levels, list | tuple):
-            self._set("levels", tuple(map(_plain, self.levels)))
+        world = find_world(self.task)
+        self._set("task", world.reference)
         self._set("disturbances", resolve_disturbances(self.disturbances))
         self._set("joint", resolve_joint(self.joint))
+        for field in dataclasses.fields(self):
+            if field.name not in world.fields and getattr(self, field.name) != field.default:
+                raise ValueError(f"{field.name} = {getattr(self, field.name)!r}: {world.name} has none: leave it out")
+        self._set("actuator", world.actuators(self.actuator))
+        if isinstance(self.levels, list | tuple):
+            self._set("levels", tuple(map(_plain, self.levels)))
         if self.randomize is not None:
             self._set("randomize", _written(self.randomize))
-        given = _changed(self.options) if isinstance(self.options, tuple) else self.options
-        self._set("options", _options(task, given or {}))
+        self._set("options", world.options(self.options))
+        for name in ("observe_actuator", "allow_unstable"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name} = {getattr(self, name)!r}: must be true or false")
         limit = self.max_episode_steps
         if limit is not None and (isinstance(limit, bool) or not isinstance(limit, int) or limit < 1):
             raise ValueError(f"max_episode_steps = {limit!r}: must be an integer >= 1")
@@ -100,9 +104,9 @@ class EnvConfig:
         """The configuration that the keyword arguments of a face describe.
 
         Args:
-            task: the task's name.
+            task: the world's name.
             actuator: as for the field.
-            arguments: other fields, and the task's own options; a time limit is the face's own matter.
+            arguments: other fields, and the world's own options; a time limit is the face's own matter.
 
         Raises:
             UnknownOptionError: neither has a name that is given.
@@ -114,14 +118,24 @@ class EnvConfig:
         return cls(task, actuator, options=options, **fields)
 
     @property
+    def world(self) -> World:
+        """What the environment is of."""
+        return find_world(self.task)
+
+    @property
+    def driven(self) -> dict[str, ActuatorModel]:
+        """Motor, or pattern of motors, -> actuator."""
+        return self.world.driven(self.actuator)
+
+    @property
     def actuators(self) -> tuple[ActuatorModel, ...]:
-        """The actuator of each motor."""
-        return self.actuator if isinstance(self.actuator, tuple) else (self.actuator,)
+        """The actuator of each motor, or pattern of motors."""
+        return tuple(self.driven.values())
 
     @property
     def through(self) -> str:
         """What to call the actuators."""
-        return names_of(self.actuators, find_task(self.task).paper)
+        return names_of(self.actuators, self.world.paper)
 
     @property
     def distributions(self) -> dict[str, Distribution] | None:
@@ -131,63 +145,73 @@ class EnvConfig:
     @property
     def time_limit(self) -> int | None:
         """The longest episode [environment steps]; None for any."""
-        return self.max_episode_steps or find_task(self.task).max_episode_steps
+        return self.max_episode_steps or self.world.time_limit
 
     @property
     def action_space(self) -> "gymnasium.spaces.Space[Any]":
-        """The task's actions; commands have others of the same kind."""
-        return find_task(self.task).action_space
+        """The world's own actions; commands have others of the same kind."""
+        return self.world.action_space(self)
 
     @property
     def as_posed(self) -> "EnvConfig":
         """The environment without changes of time limit and reward."""
-        return dataclasses.replace(self, max_episode_steps=None, options=None)
+        posed: dict[str, Any] = dict.fromkeys(self.world.posed)
+        return dataclasses.replace(self, **posed)
 
     @property
     def modules(self) -> set[str]:
-        """Names of the modules that decide on what it does."""
-        return {type(self.actuators[0]).__module__, find_task(self.task).reward.__module__}
+        """Names of the modules that decide on what it does: the world's and those of the actuators' families."""
+        return {type(one).__module__ for one in self.actuators} | self.world.modules
 
     @property
     def models(self) -> set[Path]:
         """Model files that decide on what it does."""
-        return {asset_path(find_task(self.task).asset).resolve()}
+        return self.world.models(self.options)
 
     @property
     def interface(self) -> dict[str, Any]:
         """The fields that say what a policy commands and observes: it can do nothing else once it is trained."""
         return {name: getattr(self, name) for name in ("action", "levels", "observe_actuator")}
 
-    def seen_as(self, trained: Any) -> "EnvConfig":
+    def seen_as(self, trained: "EnvConfig") -> "EnvConfig":
         """This environment with the actions and observations of another: those that a policy was trained with."""
         return dataclasses.replace(self, **trained.interface)
 
     def as_arguments(self) -> dict[str, Any]:
-        """The keyword arguments for `gymnasium.make` with the task's id, without those left at their defaults."""
-        arguments = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)[1:]}
-        del arguments["options"]
-        arguments["randomize"] = self.distributions
+        """The keyword arguments for `gymnasium.make` with a task's id, without those left at their defaults."""
+        names = [name for name in self.world.fields if name not in ("task", "options")]
+        arguments = {name: getattr(self, name) for name in names} | {"randomize": self.distributions}
         given = {name: value for name, value in arguments.items() if value is not None and value not in (OFF, PLAIN)}
-        return given | _changed(self.options)
+        return given | self.world.changed(self.options)
 
     def make(self, **view: Any) -> "gymnasium.Env[Any, Any]":
-        """The environment, made by Gymnasium.
+        """The environment.
 
         Args:
-            **view: `render_mode`, `width`, `height`, `camera` and `pretty`, as for `codrl_mj.envs.ActuatedEnv`.
+            **view: `render_mode`, and what else it takes for its rendering; of a task `width`, `height`, `camera` and
+                `pretty`, as for `codrl_mj.envs.ActuatedEnv`.
+
+        Raises:
+            ValueError: fields do not go with each other, or with the model.
         """
-        env_id = find_task(self.task).env_id
-        return gymnasium.make(env_id, disable_env_checker=True, **self.as_arguments(), **view)
+        return self.world.make(self, **view)
+
+    def make_sb3(self, num_envs: int) -> Any:
+        """Some of the environments as one Stable-Baselines3 `VecEnv`, for training.
+
+        Raises:
+            ValueError: as for `make`; or observations are no vector.
+        """
+        return self.world.make_sb3(self, num_envs)
 
     def as_mapping(self) -> dict[str, Any]:
         """The configuration as JSON-serialisable values; `from_mapping` reads it."""
-        described = [mapping_of(one) for one in self.actuators]
         return {
             **{field.name: getattr(self, field.name) for field in dataclasses.fields(self)},
-            "actuator": described if isinstance(self.actuator, tuple) else described[0],
+            "actuator": _described(self.actuator),
             "disturbances": self.disturbances.as_mapping(),
             "joint": dataclasses.asdict(self.joint),
-            "options": _changed(self.options),
+            "options": self.world.changed(self.options),
         }
 
     @classmethod
@@ -195,9 +219,9 @@ class EnvConfig:
         """The configuration that a mapping describes: `as_mapping`'s, or any part of it.
 
         Args:
-            mapping: the fields; the task's own options may stand among them.
+            mapping: the fields; a task's own options may stand among them.
             base: what is not given is this one's; disturbances, joint and options by their fields. Of a base of another
-                task, the actuator and whatever else has a default of the task's are the task's.
+                world, the actuator and whatever else has a default of the world's are the world's.
 
         Raises:
             ValueError: a key is unknown (the nearest known one is suggested), or a value out of bounds.
@@ -207,16 +231,16 @@ class EnvConfig:
         given = dict(mapping) if base is None else {"task": base.task, **mapping}
         if "task" not in given:
             raise ValueError("it has no task")
-        task = find_task(given["task"])
-        own = task.options._fields
+        world = find_world(given["task"])
+        own = world.option_names
         check_names(given, [*(field.name for field in dataclasses.fields(cls)), *own], "key", "env.")
         if options := {name: given.pop(name) for name in own if name in given}:
             given["options"] = {**(given.get("options") or {}), **options}
         if base is None:
             return cls(**given)
-        if reference_of(task) != base.task:
+        if world.reference != base.task:
             defaults: dict[str, Any] = {field.name: None for field in dataclasses.fields(cls) if field.default is None}
-            defaults |= {"task": given["task"], "actuator": task.default_actuator}
+            defaults |= {"task": given["task"], "actuator": world.default_actuator}
             base = dataclasses.replace(base, **defaults)
         there = base.as_mapping()
         for name in ("disturbances", "joint", "options"):
@@ -225,25 +249,11 @@ class EnvConfig:
         return dataclasses.replace(base, **given)
 
 
-def _options(task: Task, given: Mapping[str, Any]) -> Any:
-    """The task's options, checked.
-
-    Raises:
-        UnknownOptionError: unknown option.
-        ValueError: one that is not a number > 0, or not True or False where its default is either.
-    """
-    known = task.options._fields
-    plain = {name: _plain(value) for name, value in given.items()}
-    for name, value in plain.items():
-        if name not in known:
-            has = ", ".join(known) or "none"
-            raise UnknownOptionError(
-                f"unknown option {name!r} of {task.name}: it has {has} (unexpected keyword argument {name!r})"
-            )
-        flag = isinstance(task.options._field_defaults[name], bool)
-        if isinstance(value, bool) != flag or not isinstance(value, int | float) or not (flag or value > 0):
-            raise ValueError(f"{name} = {value!r}: must be {'True or False' if flag else 'a number > 0'}")
-    return task.options(**{name: value if isinstance(value, bool) else float(value) for name, value in plain.items()})
+def _described(actuator: Any) -> Any:
+    """Actuators, as a configuration keeps them, as JSON has them."""
+    if isinstance(actuator, Mapping):
+        return {pattern: mapping_of(one) for pattern, one in actuator.items()}
+    return [mapping_of(one) for one in actuator] if isinstance(actuator, tuple) else mapping_of(actuator)
 
 
 def _plain(value: Any) -> Any:
@@ -251,45 +261,50 @@ def _plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
 
 
-def _changed(options: Any) -> dict[str, Any]:
-    """Those of a task's options that are not at their defaults."""
-    return {name: value for name, value in options._asdict().items() if value != options._field_defaults[name]}
-
-
 def _written(randomize: Any) -> tuple[str, ...]:
-    """Fields and distributions as hashable, JSON-serialisable text, in the order in which they are drawn.
+    """What is drawn, where it is put, as hashable, JSON-serialisable text, in the order in which it is drawn.
 
     Args:
-        randomize: a mapping of fields to distributions or their text, or a sequence of 'FIELD=DISTRIBUTION'.
+        randomize: a mapping of paths to distributions or their text, of patterns to such mappings, or a sequence of
+            'PATH=DISTRIBUTION'; a path is FIELD, PATTERN:FIELD or model.FIELD.
 
     Raises:
-        ValueError: it is neither or empty, a field is named twice, or a distribution is none.
+        ValueError: it is neither or empty, a path is named twice, or a distribution is none.
     """
     if isinstance(randomize, str) or not isinstance(randomize, Mapping | list | tuple) or not randomize:
         raise ValueError(
             f"randomize = {randomize!r}: must be one or more of FIELD=DISTRIBUTION, or a mapping of fields to these"
         )
-    pairs = randomize.items() if isinstance(randomize, Mapping) else map(_split, randomize)
+    pairs = _flat(randomize) if isinstance(randomize, Mapping) else map(_split, randomize)
     written: dict[str, str] = {}
-    for name, distribution in pairs:
-        if name in written:
-            raise ValueError(f"randomize: {name} is named twice: give it one distribution")
+    for path, distribution in pairs:
+        if path in written:
+            raise ValueError(f"randomize: {path} is named twice: give it one distribution")
         try:
-            written[name] = str(distribution if isinstance(distribution, Distribution) else parse(distribution))
+            written[path] = str(distribution if isinstance(distribution, Distribution) else parse(distribution))
         except ValueError as error:
-            raise ValueError(f"randomize: {name}: {error}") from None
-    return tuple(f"{name}={text}" for name, text in written.items())
+            raise ValueError(f"randomize: {path}: {error}") from None
+    return tuple(f"{path}={text}" for path, text in written.items())
+
+
+def _flat(randomize: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Path and distribution of each, of mappings of patterns the pattern before the field."""
+    for name, one in randomize.items():
+        if isinstance(one, Mapping) and all(isinstance(text, str | Distribution) for text in one.values()):
+            yield from ((f"{name}:{field}", text) for field, text in one.items())
+        else:
+            yield name, one
 
 
 def _split(item: Any) -> tuple[str, str]:
-    """Field and distribution of 'FIELD=DISTRIBUTION'.
+    """Path and distribution of 'PATH=DISTRIBUTION'; a pattern may hold '=' itself.
 
     Raises:
-        ValueError: it has no field or no '='.
+        ValueError: it has no path or no '='.
     """
-    name, equals, text = item.partition("=") if isinstance(item, str) else ("", "", "")
-    if not equals or not name.strip():
+    match = re.fullmatch(r"\s*((?:.*:)?[^:=]+?)\s*=(.*)", item) if isinstance(item, str) else None
+    if match is None:
         raise ValueError(
             f"randomize: {item!r}: must be FIELD=DISTRIBUTION, such as 'motor.inductance=uniform(0.05, 0.2)'"
         )
-    return name.strip(), text
+    return match[1], match[2]

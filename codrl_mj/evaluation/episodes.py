@@ -14,10 +14,10 @@ import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.actuators import IDEAL, actuator_from_mapping, mapping_of, trusting
-from codrl_mj.envs.recording import PhysicsRecorder, Recorder
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.envs.recording import Recorder
 from codrl_mj.runs.files import writing
 from codrl_mj.runs.policies import Policy
-from codrl_mj.tasks import find_task
 
 MakeEnv = Callable[[], gymnasium.Env[Any, Any]]
 
@@ -36,6 +36,8 @@ class Episode:
     """What the agent did, shape (T, ...)."""
     reward: np.ndarray
     """Reward of each step, shape (T,)."""
+    first_speeds: np.ndarray
+    """Velocities at the motors' side of the model's gears before the first step [m/s or rad/s], shape (motors,)."""
     trace: dict[str, np.ndarray]
     """What the actuators did in each integration step, by the names of `codrl_mj.physics.trace_names`, each of shape
     (T*n,); with several motors (T*n, motors)."""
@@ -49,11 +51,8 @@ class Episode:
     """What the agent commanded: `force`, `current` or `voltage`."""
     motors: tuple[str, ...] = ()
     """Names of several motors."""
-    first_speeds: np.ndarray | None = None
-    """In environments of others: velocities at the motors' side of the model's gears before the first step [m/s or
-    rad/s], shape (motors,)."""
     succeeded: bool | None = None
-    """What an environment of others said of it in the end (`is_success` or `success` in its info), if anything."""
+    """What the environment said of it in the end (`is_success` or `success` in its info), if anything."""
 
     @property
     def total(self) -> float:
@@ -86,7 +85,7 @@ class RandomPolicy:
         """
         if seed < 0:
             raise ValueError(f"seed = {seed}: must be >= 0")
-        self._space = copy.deepcopy(find_task(actions).action_space if isinstance(actions, str) else actions)
+        self._space = copy.deepcopy(EnvConfig(actions).action_space if isinstance(actions, str) else actions)
         self._space.seed(seed)
 
     def predict(
@@ -99,7 +98,7 @@ class RandomPolicy:
         return np.array([self._space.sample() for _ in observation]), None
 
 
-_ARRAYS = ("time", "state", "observation", "action", "reward")
+_ARRAYS = ("time", "state", "observation", "action", "reward", "first_speeds")
 
 
 def save_episode(episode: Episode, path: Path) -> None:
@@ -118,8 +117,6 @@ def save_episode(episode: Episode, path: Path) -> None:
     arrays: dict[str, Any] = {field: getattr(episode, field) for field in (*_ARRAYS, "terminated", "command")}
     for field in ("trace", "signals"):
         arrays |= {f"{field}/{name}": values for name, values in getattr(episode, field).items()}
-    if episode.first_speeds is not None:
-        arrays["first_speeds"] = episode.first_speeds
     if episode.motors:
         arrays["motors"] = episode.motors
     if episode.succeeded is not None:
@@ -158,7 +155,6 @@ def load_episode(path: Path, trust: bool = False) -> Episode:
             actuator=tuple(actuators) if several else actuators[0],
             command=str(arrays["command"]),
             motors=tuple(arrays["motors"].tolist()) if "motors" in arrays else (),
-            first_speeds=arrays.get("first_speeds"),
             succeeded=bool(arrays["succeeded"]) if "succeeded" in arrays else None,
         )
     except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
@@ -198,7 +194,7 @@ class _Recording:
 
     def episode(self) -> Episode:
         """What has happened."""
-        recorder, of_others = self._recorder, not isinstance(self._recorder, PhysicsRecorder)
+        recorder = self._recorder
         said = self._signals[-1].get("is_success", self._signals[-1].get("success"))
         return Episode(
             time=recorder.step_duration * np.arange(1, len(self._rewards) + 1),
@@ -212,8 +208,8 @@ class _Recording:
             actuator=recorder.actuator,
             command=recorder.command,
             motors=recorder.motors if len(recorder.motors) > 1 else (),
-            first_speeds=self._first_speeds if of_others else None,
-            succeeded=bool(said) if of_others and said is not None else None,
+            first_speeds=self._first_speeds,
+            succeeded=None if said is None else bool(said),
         )
 
     def _trace(self) -> dict[str, np.ndarray]:

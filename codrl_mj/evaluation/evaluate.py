@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, Drive, Ideal, shaft
+from codrl_mj.envs.worlds import World, find_world
 from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.evaluation.measures import (
     Interval,
@@ -25,7 +26,6 @@ from codrl_mj.evaluation.measures import (
     wilson_rate,
 )
 from codrl_mj.runs.policies import Policy
-from codrl_mj.tasks import Task, find_task
 
 
 def _measure(label: str, unit: str) -> Any:
@@ -147,7 +147,7 @@ def evaluate(
 
     Args:
         policy: chooses actions.
-        env: an `EnvConfig` or a `ForeignConfig`: task, actuator and all else; what it randomises is drawn for every
+        env: an `EnvConfig`: task, actuator and all else; what it randomises is drawn for every
             episode.
         episodes: their number, >= 1.
         seed: of the first episode, the others counting up from it; and of the actions that are sampled.
@@ -167,22 +167,22 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
     """Reduce episodes to an `Evaluation`.
 
     Args:
-        task: the task's name, or the id of an environment of others.
+        task: the world's name: a task's, or the id of an environment of others.
         episodes: at least one, all of them with the same integration step.
 
     Raises:
         ValueError: unknown task.
     """
-    definition = find_task(task) if episodes[0].first_speeds is None else None
+    world = find_world(task)
     returns = np.array([episode.total for episode in episodes])
-    goals = [_time_to_goal(definition, episode) for episode in episodes]
+    goals = [_time_to_goal(world, episode) for episode in episodes]
     reached = np.array([time for time in goals if time is not None])
     success = None
-    if definition is not None or any(one.succeeded is not None for one in episodes):
+    if any(world.at_goal(episode) is not None for episode in episodes):
         success = wilson_rate(len(reached), len(episodes))
-    driven = [_driven(definition, episode) for episode in episodes]
+    driven = [_driven(episode) for episode in episodes]
     return Evaluation(
-        task=task if definition is None else definition.name,
+        task=world.name,
         episodes=len(episodes),
         terminated=sum(episode.terminated for episode in episodes),
         returns=bootstrap_mean(returns),
@@ -191,7 +191,7 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
         length=_mean_of(episodes, lambda episode: len(episode.reward)),
         success=success,
         failure=None if success is None else Interval(1 - success.mean, 1 - success.high, 1 - success.low),
-        time_to_goal=quartiles(reached) if definition is not None and definition.goal and len(reached) else None,
+        time_to_goal=quartiles(reached) if world.timed and len(reached) else None,
         mechanical_work=bootstrap_mean(np.array([sum(one.work for one in each) for each in driven])),
         **_wear(episodes, driven),
         episode_returns=tuple(returns.tolist()),
@@ -218,14 +218,13 @@ def _mean_of(episodes: Sequence[Episode], value: Callable[[Episode], float]) -> 
     return bootstrap_mean(np.array([value(episode) for episode in episodes], dtype=float))
 
 
-def _time_to_goal(task: Task | None, episode: Episode) -> float | None:
+def _time_to_goal(world: World, episode: Episode) -> float | None:
     """Time from which an episode that succeeded was at the goal [s]; None if it did not succeed."""
-    if task is None:
-        return 0.0 if episode.succeeded else None
-    if task.goal is None:
-        return None if episode.terminated else 0.0
-    since = holds_since(task.goal(episode.state.T)) * task.step_duration
-    succeeded = since + task.goal_hold < episode.time[-1] + 0.5 * task.step_duration  # half a step: rounding
+    step, at_goal = float(episode.time[0]), world.at_goal(episode)
+    if at_goal is None:
+        return None
+    since = holds_since(at_goal) * step
+    succeeded = since + world.goal_hold < episode.time[-1] + 0.5 * step  # half a step: rounding
     return since if succeeded else None
 
 
@@ -263,11 +262,9 @@ class _Driven:
         return np.append(0.0, self.signals["current"])
 
 
-def _driven(task: Task | None, episode: Episode) -> list[_Driven]:
+def _driven(episode: Episode) -> list[_Driven]:
     """What each motor did."""
     several = isinstance(episode.actuator, tuple)
-    first = episode.first_speeds if task is None else episode.state[0, list(task.speeds)]
-    assert first is not None
     made = []
     for number, actuator in enumerate(episode.actuator if several else (episode.actuator,)):
         own = {name: values[:, number] if several else values for name, values in episode.trace.items()}
@@ -281,7 +278,7 @@ def _driven(task: Task | None, episode: Episode) -> list[_Driven]:
                 episode.timestep,
                 arm * np.repeat(asked, episode.inner_steps),
                 arm * force,
-                np.append(first[number], speed),
+                np.append(episode.first_speeds[number], speed),
                 force,
                 shown,
             )

@@ -4,12 +4,9 @@ import zlib
 from typing import Any
 
 import gymnasium
-import mujoco
 import numpy as np
 
-from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation.episodes import Episode, run_episodes
-from codrl_mj.physics.offscreen import check_view
 
 
 class Frames:
@@ -83,7 +80,7 @@ def record(
 
     Args:
         policy: chooses the actions.
-        env: an `EnvConfig` or a `ForeignConfig`.
+        env: an `EnvConfig`.
         seed: of the episode.
         width: of the images [px].
         height: of the images [px].
@@ -96,11 +93,9 @@ def record(
     Raises:
         ValueError: the environment draws no images, or not by this camera.
     """
-    if isinstance(env, EnvConfig):
-        (file,) = env.models
-        check_view(mujoco.MjModel.from_xml_path(str(file)), width, height, camera)  # before anything is compiled
+    view, made = env.world.view(env, width, height, None if camera == "fixed" else camera), []
+    if view is None:
         return run_episodes(policy, env.make, 1, seed)[0], None
-    view, made = env.view(width, height, None if camera == "fixed" else camera), []
 
     def make() -> Any:
         made.append(Filmed(env.make(**view), pretty))

@@ -11,9 +11,11 @@ from codrl_mj.engine.plugin import PLUGIN_HEAD
 from codrl_mj.envs.distributions import Distribution, parse
 from codrl_mj.envs.randomization import LIMIT
 from codrl_mj.fields import check_names
-from codrl_mj.foreign.config import PREFIX
 from codrl_mj.foreign.model_fields import ModelFields
 from codrl_mj.specs import ON_JOINT
+
+PREFIX = "model."
+"""Of the fields that are the model's."""
 
 
 class Draws:

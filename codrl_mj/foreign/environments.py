@@ -4,7 +4,7 @@ import contextlib
 import copy
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import gymnasium
@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.mujoco import MujocoEnv
-from gymnasium.envs.registration import load_env_creator
+from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.utils import RecordConstructorArgs, seeding
 
 from codrl_mj.actuators import ActuatorModel, Command
@@ -21,6 +21,7 @@ from codrl_mj.engine.reading import bring_to_rest, motors, slots
 from codrl_mj.envs.snapshots import check_snapshot, elapsed_steps, set_elapsed_steps
 from codrl_mj.foreign.building import Building
 from codrl_mj.foreign.commands import command_of
+from codrl_mj.foreign.draws import PREFIX
 from codrl_mj.foreign.readings import Sensors, readings
 from codrl_mj.foreign.recording import MotorsRecorder
 from codrl_mj.foreign.simulated import Simulated
@@ -30,7 +31,7 @@ from codrl_mj.specs import resolve_patterns
 
 
 def make(
-    env_id: str,
+    env_id: str | Callable[..., Any],
     actuators: Mapping[str, Any],
     *,
     action: str = "force",
@@ -48,17 +49,17 @@ def make(
     functions that call this, such as `functools.partial(codrl_mj.make, "HalfCheetah-v5", {".*": "lag"})`.
 
     Args:
-        env_id: the id.
+        env_id: the id; or a function, or class, that makes an environment of one's own, which needs no id.
         actuators: what goes where, as for `codrl_mj.motorise`.
         action: `force`: the environment's own actions, whose forces are what is desired (a position servo stays one);
             or what the actuators take besides, such as `current` and `voltage`, with their limits as the action space.
             The environment still computes its costs from its own controls: from the torque that a current makes, or as
             many amperes as volts.
         observe_actuator: whether the observation ends with what the motors' sensors say, motor by motor.
-        randomize: pattern -> field -> distribution (or its text): what is drawn for the motors of a pattern at every
-            reset; and of the model `model.mass.BODY`, `model.gravity` and `model.damping.JOINT` -> distribution. What
-            was drawn is in the reset's info, `randomization`. The generator is not the environment's: its initial
-            states are the same as without.
+        randomize: path -> distribution (or its text): what is drawn at every reset: FIELD of all motors, PATTERN:FIELD
+            of those of a pattern, and of the model `model.mass.BODY`, `model.gravity` and `model.damping.JOINT`; or
+            pattern -> field -> distribution. What was drawn is in the reset's info, `randomization`. The generator is
+            not the environment's: its initial states are the same as without.
         disturbances: delay, quantum and rate of the commands, and load pulses, once an environment step: see
             `codrl_mj.Disturbances`. Of a plain motor in its force [N or N*m] before the gear, of others in what their
             control stands for.
@@ -70,13 +71,32 @@ def make(
         ValueError: see `codrl_mj.motorise`; a model is not built from XML; or an argument does not go with the
             actuators or the environment.
     """
-    entry = gymnasium.spec(env_id)
+    if isinstance(env_id, str):
+        entry = gymnasium.spec(env_id)
+    else:
+        entry = EnvSpec(getattr(env_id, "__name__", "environment"), env_id)
+        env_id = entry.id
     if str(entry.entry_point).startswith("codrl_mj.envs:"):
         raise ValueError(f"{env_id}: its actuators are its own: gymnasium.make({env_id!r}, actuator=...)")
     resolved = resolve_patterns(actuators, f"the environment {env_id}")
+    if isinstance(randomize, Mapping):
+        randomize = _by_pattern(randomize, resolved)
     spec = copy.copy(entry)
     spec.entry_point = Motorised(entry.entry_point, resolved, action, allow_unstable, env_id)
     return MotorisedEnv(gymnasium.make(spec, **options), observe_actuator, randomize, disturbances)
+
+
+def _by_pattern(randomize: Mapping[str, Any], patterns: Iterable[str]) -> dict[str, Any]:
+    """Pattern -> field -> distribution, and field of the model -> distribution; a path without a pattern is for all."""
+    found: dict[str, Any] = {}
+    for path, one in randomize.items():
+        pattern, colon, field = path.rpartition(":")
+        if isinstance(one, Mapping) or (not colon and path.startswith(PREFIX)):
+            found[path] = one
+            continue
+        for each in (pattern,) if colon else patterns:
+            found.setdefault(each, {})[field] = one
+    return found
 
 
 @dataclasses.dataclass(frozen=True)

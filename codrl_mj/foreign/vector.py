@@ -38,7 +38,7 @@ def make_sb3_vec_env(make: Callable[[], "gymnasium.Env[Any, Any]"], num_envs: in
     """Some motorised environments, stepped one by one, as one Stable-Baselines3 `VecEnv`.
 
     Args:
-        make: makes one, as `ForeignConfig.make` does.
+        make: makes one, as `EnvConfig.make` does.
         num_envs: how many, >= 1.
 
     Raises:

@@ -13,7 +13,6 @@ from codrl_mj.actuators import Drive, Ideal
 from codrl_mj.evaluation import Episode, run_episodes
 from codrl_mj.films.clip import Clip, clip
 from codrl_mj.films.record import record
-from codrl_mj.foreign.config import ForeignConfig
 from codrl_mj.pages import page
 from codrl_mj.pages.loop import limits, no_load_speed
 from codrl_mj.pages.plots import POINTS, Curve, Plot, Shade, spans
@@ -49,7 +48,7 @@ def show(name: str, env: Any, policy: Any, seed: int, filmed: bool = True) -> Sh
 
     Args:
         name: of the run.
-        env: an `EnvConfig` or a `ForeignConfig`.
+        env: an `EnvConfig`.
         policy: chooses the actions.
         seed: of the episode.
         filmed: whether to film it.
@@ -304,7 +303,7 @@ def _run_plots(shown: Sequence[Shown]) -> list[Plot]:
         own: Any = {"shared": place if several else None, "tags": (f"run:{place}",)}
         time = np.concatenate([[0.0], one.episode.time])
         counts: dict[str, int] = {}
-        for index, name in enumerate(_state_names(one)):
+        for index, name in enumerate(one.env.world.state_names(one.env)):
             unit = (re.search(r"\[(.*)\]", name) or [name, "1"])[1]
             count = counts[unit] = counts.get(unit, -1) + 1
             if count < _MOST_STATES:
@@ -323,35 +322,6 @@ def _run_plots(shown: Sequence[Shown]) -> list[Plot]:
         found.append(Plot(title, _TIME, f"state [{unit}]", tuple(curves), clock=True))
     found.append(Plot("Reward of each step", _TIME, "reward", tuple(rewards), clock=True))
     return found
-
-
-_UNITS = (
-    (("m",) * 3 + ("1",) * 4, ("m/s",) * 3 + ("rad/s",) * 3),  # free
-    (("1",) * 4, ("rad/s",) * 3),  # ball
-    (("m",), ("m/s",)),  # slide
-    (("rad",), ("rad/s",)),  # hinge
-)
-"""Of the entries of `qpos`, quaternions among them, and of `qvel`, by the kind of joint."""
-
-
-def _state_names(one: Shown) -> Sequence[str]:
-    """Of the state's entries, with units."""
-    from codrl_mj.tasks import find_task
-
-    if not isinstance(one.env, ForeignConfig):
-        return find_task(one.env.task).state_names
-    env: Any = one.env.make()
-    try:
-        model = env.unwrapped.model
-        names: list[str] = []
-        speeds: list[str] = []
-        for index, kind in enumerate(model.jnt_type.tolist()):
-            joint = model.joint(index).name or f"joint {index}"
-            for made, units in zip((names, speeds), _UNITS[kind], strict=True):
-                made += [f"{joint}{f' {k}' if len(units) > 1 else ''} [{one}]" for k, one in enumerate(units)]
-        return [*names, *speeds]
-    finally:
-        env.close()
 
 
 def torque_speed(lines: Sequence[_Line]) -> Plot | None:

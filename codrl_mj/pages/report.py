@@ -111,7 +111,7 @@ def _run(
     except (ValueError, OSError, ImportError) as error:
         return _Run(summary, name, None, str(error), {})
     env = config.evaluation_env
-    actuators = _actuators(env)
+    actuators = env.driven
     best = which == "best" or not finished(summary.path)
     policy = summary.path / BEST if best else summary.path
     if not (policy / "policy.json").is_file():
@@ -123,14 +123,6 @@ def _run(
     except Exception as error:  # environments and actuators of others raise what they like
         return _Run(summary, name, None, f"{type(error).__name__}: {error}", actuators)
     return _Run(summary, name, shown, None, actuators, best)
-
-
-def _actuators(env: Any) -> dict[str, ActuatorModel]:
-    if isinstance(env.actuators, Mapping):
-        return {pattern: one for pattern, one in env.actuators.items() if one is not None}
-    from codrl_mj.tasks import find_task
-
-    return dict(zip(find_task(env.task).motors, env.actuators, strict=True))
 
 
 def _top(runs: Sequence[_Run], shown: Sequence[Shown]) -> Markup:

@@ -7,8 +7,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.single import ActuatedEnv
 from codrl_mj.evaluation.episodes import Episode
 from codrl_mj.replay.shapes import Shape, shapes
 
@@ -75,23 +73,10 @@ def motion_of_episode(episode: Episode, env: Any) -> Motion:
 
     Args:
         episode: the episode.
-        env: the description of the environment that it was recorded in, an `EnvConfig` or a `ForeignConfig`.
+        env: the `EnvConfig` that it was recorded in.
     """
-    time = np.concatenate([[0.0], episode.time])
-    if isinstance(env, EnvConfig):
-        scene: Any = ActuatedEnv(env.task, "ideal")
-
-        def show(state: np.ndarray) -> mujoco.MjData:
-            scene.physics.show(state)
-            return scene.data
-
-        return motion(scene.model, episode.state, time, "fixed", show)
-    made = env.make()
-    try:
-        model: mujoco.MjModel = made.unwrapped.model
-    finally:
-        made.close()
-    return motion(model, episode.state, time)
+    model, show, camera = env.world.scene(env)
+    return motion(model, episode.state, np.concatenate([[0.0], episode.time]), camera, show)
 
 
 def _by_positions(model: mujoco.MjModel) -> Callable[[np.ndarray], mujoco.MjData]:

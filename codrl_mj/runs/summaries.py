@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from codrl_mj.actuators import actuator_from_mapping, name_of, trusting
+from codrl_mj.envs.worlds import patterns_of
 from codrl_mj.runs.files import check_digest, read_json
 from codrl_mj.runs.layout import (
     BEST,
@@ -239,12 +240,13 @@ def _first(one: Mapping[str, Any] | None, other: Mapping[str, Any] | None, name:
 
 def _actuator_of(env: Mapping[str, Any], task: str | None, labels: Any) -> str | None:
     """What to call an environment's actuators: those of motors, in environments of others those of patterns."""
-    if isinstance(patterns := env.get("actuators"), Mapping):
-        each = list(patterns.values())
-    elif "actuator" in env:
-        each = env["actuator"] if isinstance(env["actuator"], list) else [env["actuator"]]
-    else:
+    if "actuator" not in env:
         return None
+    each, patterns = env["actuator"], patterns_of(env["actuator"])
+    if patterns is not None:
+        each = list(patterns.values())
+    elif not isinstance(each, list):
+        each = [each]
     labels = labels if isinstance(labels, list) else []
     papers = TASKS[task].paper if task in TASKS else ()
     rows = itertools.zip_longest(each, labels[: len(each)], papers[: len(each)])

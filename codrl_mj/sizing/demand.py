@@ -1,5 +1,6 @@
 """What a task asks of an actuator: the joint's torque and speed at every integration step of runs on the ideal one."""
 
+import contextlib
 import dataclasses
 import zipfile
 from pathlib import Path
@@ -12,10 +13,8 @@ from codrl_mj.engine.reading import motors
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import Episode, run_episodes
 from codrl_mj.fields import did_you_mean
-from codrl_mj.foreign.config import ForeignConfig, is_gymnasium_id
 from codrl_mj.sizing.scripted import Scripted, StateObserved
 from codrl_mj.sizing.swing import Swing
-from codrl_mj.tasks import Task, find_task
 
 EPISODES = 10
 """Episodes that a demand is taken from unless told otherwise."""
@@ -90,20 +89,10 @@ def demands_of(what: str | Path, episodes: int = EPISODES, seed: int = 0, trust:
         return {"": _read(path)}
     if path.is_dir():
         return _of_run(path, episodes, seed, trust)
-    if is_gymnasium_id(what):
-        raise ValueError(
-            f"{what}: there is no scripted controller for it; train it with --actuator ideal and name the run"
-        )
-    task = find_task(str(what))
-    if len(task.motors) > 1:
-        raise ValueError(
-            f"task {task.name!r} has {len(task.motors)} motors: there is no scripted controller; train it with "
-            "--actuator ideal and name the run, or give time, torque and speed of each joint as .npz files"
-        )
-    env = _resolved(EnvConfig(str(what), "ideal"))
-    policy = Scripted(task)
+    env = EnvConfig(str(what), "ideal")
+    policy, env = Scripted(env.world.scripted), env.world.as_with_motors(env)
     ran = run_episodes(policy, lambda: StateObserved(env.make()), episodes, seed)
-    return _gathered(f"{policy.description} of {task.name}", env, ran)
+    return _gathered(f"{policy.description} of {env.world.name}", env, ran)
 
 
 def recorded(time: Any, torque: Any, speed: Any, source: str = "a recording") -> Demand:
@@ -147,53 +136,41 @@ def _of_run(path: Path, episodes: int, seed: int, trust: bool) -> dict[str, Dema
     from codrl_mj.training.folder import load_config
 
     env = load_config(path, trust).env
-    through = env.actuator if isinstance(env.actuator, tuple) else (env.actuator,)
-    others = [one.family for one in through if one != IDEAL]
+    others = [one.family for one in env.actuators if one != IDEAL]
     if others:
         raise ValueError(
             f"{path}: was trained on {others[0]}: must be ideal, whose torques are the task's and not a motor's; train "
             "it with --actuator ideal, or name the task instead"
         )
-    if isinstance(env, EnvConfig):
-        env = _resolved(env)
+    env = env.world.as_with_motors(env)
     ran = run_episodes(load_policy(path, trust), env.make, episodes, seed)
     return _gathered(f"the policy {path.name} of {env.task}", env, ran)
 
 
-def _resolved(env: EnvConfig) -> EnvConfig:
-    """The environment in the engine, with the integration steps that a motor would have."""
-    if env.inner_steps is None and env.timestep is None:
-        env = dataclasses.replace(env, inner_steps=find_task(env.task).motor_inner_steps)
-    return dataclasses.replace(env, physics="mujoco")
-
-
-def _gathered(source: str, env: EnvConfig | ForeignConfig, ran: list[Episode]) -> dict[str, Demand]:
+def _gathered(source: str, env: EnvConfig, ran: list[Episode]) -> dict[str, Demand]:
     """The demands on all motors, from episodes of one environment."""
     import mujoco
 
     from codrl_mj.specs import ON_JOINT
 
-    task, swing = find_task(env.task) if isinstance(env, EnvConfig) else None, None
-    ends = [_reaches(task, one) for one in ran]
-    if None not in ends:
-        source = f"{source}, {sum(map(bool, ends))} of {len(ran)} episodes at the goal"
-    made = env.make()
-    core: Any = made.unwrapped
-    if isinstance(env, EnvConfig) and env.task == "pendulum":
-        assert task is not None
-        length = core.l
-        inertia, gravity = core.m * length**2 / 3.0 + env.joint.armature, core.m * core.g * length / 2.0
-        swing = Swing(inertia, gravity, float(task.max_forces[0]), env.joint.damping, env.joint.friction)
-    model = core.model
-    outputs = list(motors(model)) if task is None else [model.actuator(name).id for name in task.motors]
-    made.close()
+    swing, ends = None, [env.world.at_goal(one) for one in ran]
+    if all(end is not None for end in ends):
+        source = f"{source}, {sum(bool(end[-1]) for end in ends if end is not None)} of {len(ran)} episodes at the goal"
+    with contextlib.closing(env.make()) as made:
+        core: Any = made.unwrapped
+        if env.task == "pendulum":
+            length = core.l
+            inertia, gravity = core.m * length**2 / 3.0 + env.joint.armature, core.m * core.g * length / 2.0
+            swing = Swing(inertia, gravity, float(core.task.max_forces[0]), env.joint.damping, env.joint.friction)
+        model = core.model
+        driven = list(motors(model)) or [model.actuator(name).id for name in made.get_wrapper_attr("recorder").motors]
     found = {}
-    for number, index in enumerate(outputs):
-        name = ran[0].motors[number] if len(outputs) > 1 else ""
-        before = [_speeds(task, one, number) for one in ran]
-        kind, driven = mujoco.mjtTrn(model.actuator_trntype[index]), model.actuator_trnid[index, 0]
-        sliding = kind in ON_JOINT and model.jnt_type[driven] == mujoco.mjtJoint.mjJNT_SLIDE
-        gear = 1.0 if task is not None else abs(float(model.actuator_gear[model.actuator_outadr[index], 0])) or 1.0
+    for number, index in enumerate(driven):
+        name = ran[0].motors[number] if ran[0].motors else ""
+        before = [np.append(one.first_speeds[number], _of_motor(one.trace["speed"], number)) for one in ran]
+        kind, joint = mujoco.mjtTrn(model.actuator_trntype[index]), model.actuator_trnid[index, 0]
+        sliding = kind in ON_JOINT and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
+        gear = abs(float(model.actuator_gear[model.actuator_outadr[index], 0])) or 1.0
         found[name] = Demand(
             source=f"{source}: {name}" if name else source,
             duration=np.full(sum(len(one) - 1 for one in before), ran[0].timestep),
@@ -210,17 +187,3 @@ def _gathered(source: str, env: EnvConfig | ForeignConfig, ran: list[Episode]) -
 
 def _of_motor(values: np.ndarray, number: int) -> np.ndarray:
     return values[:, number] if values.ndim > 1 else values
-
-
-def _speeds(task: Task | None, episode: Episode, number: int) -> np.ndarray:
-    """Of one motor's joint, before the first step and after each, shape (T*n+1,)."""
-    first = episode.first_speeds if task is None else episode.state[0, list(task.speeds)]
-    assert first is not None
-    return np.append(first[number], _of_motor(episode.trace["speed"], number))
-
-
-def _reaches(task: Task | None, episode: Episode) -> bool | None:
-    """Whether an episode ends at the goal; where that is to last, at the time limit. None where nobody knows."""
-    if task is None:
-        return episode.succeeded
-    return not episode.terminated if task.goal is None else bool(np.asarray(task.goal(episode.state[-1])))

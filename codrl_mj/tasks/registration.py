@@ -2,6 +2,7 @@
 
 import itertools
 import sys
+from typing import Any
 
 from gymnasium.envs.registration import register as register_with_gymnasium
 from gymnasium.envs.registration import registry
@@ -27,7 +28,7 @@ def register(task: Task) -> Task:
     Raises:
         ValueError: another task has its name, or another environment its id.
     """
-    if not isinstance(task, Task):
+    if not hasattr(task, "env_id"):
         raise ValueError(f"{task!r}: must be a codrl_mj.Task")
     if TASKS.get(task.name, task) is not task:
         raise ValueError(f"task {task.name!r} is registered already, of {reference_of(TASKS[task.name])}: rename one")
@@ -46,18 +47,22 @@ def register(task: Task) -> Task:
     return task
 
 
-def reference_of(task: Task) -> str:
-    """What `find_task` finds a task by in any process: the name of ours, `module:NAME` of somebody's.
+def reference_of(task: Any, home: str | None = None) -> str:
+    """What finds a task, or a world, by its name in any process: the name of ours, `module:NAME` of somebody's.
 
     Of one that stands in no module it is the name, which only processes know that have registered it.
+
+    Args:
+        task: the task or world.
+        home: the module to look for it first; that of a task's functions if none is named.
     """
-    home, script = task.reward.__module__, "__main__"  # the first and the last choice where several modules have it
+    home, script = home or task.reward.__module__, "__main__"  # the first and the last choice where several have it
     others = (module for module in list(sys.modules) if module not in (home, script, "__mp_main__"))
     for module in itertools.chain([home], others, [script]):
         for name, value in list(getattr(sys.modules.get(module), "__dict__", {}).items()):
             if value is task:
                 return task.name if module.startswith("codrl_mj.") else f"{module}:{name}"
-    return task.name
+    return str(task.name)
 
 
 def find_task(name: str) -> Task:

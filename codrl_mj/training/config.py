@@ -6,16 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gymnasium import spaces
-
 from codrl_mj.actuators import trusting
 from codrl_mj.agents import AgentConfig, agent_from_mapping, check_fits
 from codrl_mj.agents.ppo import PPOConfig
 from codrl_mj.agents.presets import ELSEWHERE, find_preset
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import check_names
-from codrl_mj.foreign.config import ForeignConfig, environment_from, is_gymnasium_id
-from codrl_mj.tasks import TASKS, find_task
 
 EVALUATION_SEED = 1_000_000
 """Seed of the first episode in which a trained policy is evaluated, away from those that trainings start from."""
@@ -29,7 +25,7 @@ class TrainConfig:
         ValueError: a field is out of bounds, or the agent cannot act in the task; the message says what would do.
     """
 
-    env: EnvConfig | ForeignConfig
+    env: EnvConfig
     """What to train in: task, actuator and all else."""
     agent: AgentConfig = PPOConfig()
     """The agent's settings."""
@@ -50,11 +46,9 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Validate."""
-        kinds: dict[str, tuple[type, ...]] = {"agent": (AgentConfig,), "env": (EnvConfig, ForeignConfig)}
-        for name, kind in kinds.items():
+        for name, kind in {"agent": AgentConfig, "env": EnvConfig}.items():
             if not isinstance(getattr(self, name), kind):
-                known = " or ".join(f"a {one.__name__}" for one in kind)
-                raise ValueError(f"TrainConfig.{name} = {getattr(self, name)!r}: must be {known}")
+                raise ValueError(f"TrainConfig.{name} = {getattr(self, name)!r}: must be a {kind.__name__}")
         check_fits(self.agent.known_as(), self.env)
         for name in ("num_envs", "checkpoint_interval", "evaluation_interval", "evaluation_episodes"):
             self._check_integer(name, 1)
@@ -87,7 +81,7 @@ class TrainConfig:
     @property
     def actuators(self) -> tuple[Any, ...]:
         """The same, always as a tuple."""
-        return self.actuator if isinstance(self.actuator, tuple) else (self.actuator,)
+        return self.env.actuators
 
     @classmethod
     def preset(
@@ -112,18 +106,16 @@ class TrainConfig:
         Raises:
             ValueError: there are no such settings, or a field is out of bounds.
         """
-        posed = environment_from({"task": task})
+        posed = EnvConfig(task)
         check_fits(agent, posed)
-        preset = find_preset(agent, ELSEWHERE if isinstance(posed, ForeignConfig) else posed.task, settings)
+        preset = find_preset(agent, posed.world.preset or ELSEWHERE, settings)
         names = {field.name for field in dataclasses.fields(cls)} - {"env"}
         chosen = {name: value for name, value in vars(preset).items() if name in names}
-        fields = {**preset.env, **(env or {}), "task": task}
-        if "actuators" not in fields:
-            fields["actuator"] = actuator
-        return cls(environment_from(fields), **(chosen | changes))
+        fields = {"actuator": actuator, **preset.env, **(env or {}), "task": task}
+        return cls(EnvConfig.from_mapping(fields), **(chosen | changes))
 
     @property
-    def evaluation_env(self) -> EnvConfig | ForeignConfig:
+    def evaluation_env(self) -> EnvConfig:
         """What policies are evaluated in: the environment without changes of time limit and reward."""
         return self.env.as_posed
 
@@ -150,10 +142,7 @@ class TrainConfig:
         given = dict(mapping)
         above = {name: given.pop(name) for name in ("task", "actuator") if name in given}
         if isinstance(given.get("env", {}), Mapping):
-            given["env"] = env = {**given.get("env", {}), **above}
-            named = TASKS[env["task"]].options._fields if env.get("task") in TASKS else ()
-            if options := {name: env.pop(name) for name in named if name in env}:  # as the flags are called
-                env["options"] = {**(env.get("options") or {}), **options}
+            given["env"] = {**given.get("env", {}), **above}
         names = [field.name for field in dataclasses.fields(cls)]
         check_names(given, [*names, "task", "actuator", "settings"], "key")
         missing = [name for name in names if name not in given] if whole else []
@@ -161,7 +150,7 @@ class TrainConfig:
             raise ValueError(f"not a training configuration: it has no {', '.join(missing)}")
         env, settings, agent = given.pop("env"), given.pop("settings", "default"), given.pop("agent", None)
         if whole:
-            return cls(environment_from(env), agent_from_mapping(agent), **given)
+            return cls(EnvConfig.from_mapping(env), agent_from_mapping(agent), **given)
         if not isinstance(env, Mapping):
             raise ValueError(f"env = {env!r}: must be a mapping of the environment's arguments")
         if "task" not in env:
@@ -174,7 +163,7 @@ class TrainConfig:
         base = cls.preset(task, agent["name"], settings, env.get("actuator", "default"))
         check_names(agent, base.agent.as_mapping(), "key", "agent.")
         agent = agent_from_mapping(base.agent.as_mapping() | dict(agent))
-        return dataclasses.replace(base, env=environment_from(env, base.env), agent=agent, **given)
+        return dataclasses.replace(base, env=EnvConfig.from_mapping(env, base.env), agent=agent, **given)
 
     def differences(self, other: "TrainConfig") -> list[str]:
         """What differs from another configuration, a line a field."""
@@ -192,10 +181,8 @@ def default_agent(task: str) -> str:
 
     In environments of others, SAC for continuous actions and PPO for others.
     """
-    if not is_gymnasium_id(task):
-        return str(find_task(task).agent)
-    continuous = isinstance(environment_from({"task": task}).action_space, spaces.Box)
-    return "sac" if continuous else "ppo"
+    posed = EnvConfig(task)
+    return posed.world.default_agent(posed)
 
 
 def read_config(path: Path, trust: bool = False, **overriding: Any) -> TrainConfig:

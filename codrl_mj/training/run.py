@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from codrl_mj.foreign.config import ForeignConfig
 from codrl_mj.runs.files import sealed, write_json
 from codrl_mj.runs.layout import finished
 from codrl_mj.training import folder
@@ -86,7 +85,7 @@ def train(
 
     torch.set_num_threads(1)  # networks this small run several times slower on two
     with _taking(out, exists), stopping(signal.SIGINT, signal.SIGTERM) as stop:
-        envs = _make_envs(config)
+        envs = config.env.make_sb3(config.num_envs)
         with contextlib.closing(envs), _reporting_to(wandb, out, config):
             model = config.agent.make_model(envs, config.seed)
             watcher = Watcher(config, out, stop, on_progress, tensorboard)
@@ -127,17 +126,6 @@ def _taking(out: Path, exists: bool) -> Iterator[None]:
                     for path in made:
                         path.rmdir()
             raise
-
-
-def _make_envs(config: TrainConfig) -> Any:
-    """The environments as one Stable-Baselines3 `VecEnv`."""
-    if isinstance(config.env, ForeignConfig):
-        return config.env.make_sb3(config.num_envs)
-    from codrl_mj.envs.sb3 import make_sb3_vec_env
-
-    # the engine's threads wait for each other in loops: so few simulations then take two to five times the processor
-    threads = {"num_threads": 1} if config.env.physics == "mujoco" else {}
-    return make_sb3_vec_env(config.env, config.num_envs, **threads)
 
 
 def _step_limit(config: TrainConfig) -> int:

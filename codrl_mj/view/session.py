@@ -11,7 +11,6 @@ import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.actuators import actuator_over
-from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy
 from codrl_mj.view.controls import nested
 
@@ -46,7 +45,7 @@ class Session:
         """Build the environment and start an episode.
 
         Args:
-            config: its description, an `EnvConfig` or a `ForeignConfig`.
+            config: its `EnvConfig`.
             policies: by name, made when they are chosen; `random`, and `zero` where an action does nothing, are there
                 besides. The first one acts.
             seed: of the first episode, and of random actions.
@@ -84,9 +83,7 @@ class Session:
     @property
     def patterns(self) -> dict[str, Any]:
         """The actuators by the motor, or by the pattern of motors, that they drive."""
-        if isinstance(self.config, EnvConfig):
-            return dict(zip(self._recorder.motors, self.config.actuators, strict=True))
-        return dict(self.config.actuators)
+        return dict(self.config.driven)
 
     @property
     def bodies(self) -> list[str]:
@@ -167,8 +164,7 @@ class Session:
         except ValueError as error:
             self.problem = str(error)
             return
-        named = list(changed.values()) if isinstance(self.config, EnvConfig) else changed
-        self._rebuild("actuator" if isinstance(self.config, EnvConfig) else "actuators", named)
+        self._rebuild("actuator", changed)
 
     def set_disturbance(self, path: tuple[str, ...], value: Any) -> None:
         """Set a field of the disturbances."""

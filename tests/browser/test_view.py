@@ -6,7 +6,7 @@ import threading
 import numpy as np
 import pytest
 
-from codrl_mj.foreign.config import environment_from
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.view.browser import Browser
 from codrl_mj.view.session import Session
 from tests.browser.waiting import until
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.browser
 @pytest.fixture(scope="module")
 def browser():
     """A pole on a motor, simulated in a thread of its own as in a terminal."""
-    config = environment_from({"task": "InvertedPendulum-v5", "actuators": {".*": "maxon-re65"}})
+    config = EnvConfig.from_mapping({"task": "InvertedPendulum-v5", "actuator": {".*": "maxon-re65"}})
     made = Browser(Session(config, {}), 0, "pole", lambda _: {})
     ended = threading.Event()
     thread = threading.Thread(target=lambda: made.run(ended.is_set))

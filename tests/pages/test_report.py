@@ -16,7 +16,6 @@ from codrl_mj.actuators import Drive, Lag, SampledLoop
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy, run_episodes
-from codrl_mj.foreign.config import ForeignConfig
 from codrl_mj.motor_design import find_drive
 from codrl_mj.pages import episode as episodes
 from codrl_mj.pages import report as reports
@@ -214,8 +213,8 @@ def test_states_of_every_kind_of_joint_have_units(monkeypatch):
     bodies += "<body><freejoint/><geom size='.1'/></body>"
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
     made = SimpleNamespace(unwrapped=SimpleNamespace(model=model), close=lambda: None)
-    monkeypatch.setattr(ForeignConfig, "make", lambda _: made)
-    names = episodes._state_names(Shown("robot", ForeignConfig("Ant-v5"), None, None, None, 0))
+    monkeypatch.setattr(EnvConfig, "make", lambda _: made)
+    names = EnvConfig("Ant-v5").world.state_names(EnvConfig("Ant-v5"))
     units = [re.search(r"\[(.*)\]", name)[1] for name in names]
     assert units[: model.nq] == ["1"] * 4 + ["m", "rad"] + ["m"] * 3 + ["1"] * 4
     assert units[model.nq :] == ["rad/s"] * 3 + ["m/s", "rad/s"] + ["m/s"] * 3 + ["rad/s"] * 3
@@ -235,7 +234,7 @@ def test_a_step_is_at_each_actuators_own_steps():
 
 @pytest.mark.matrix
 def test_motors_of_somebody_elses_robot_are_filmed():
-    env = ForeignConfig("Reacher-v5", {"joint0": "maxon-ec45-flat-50w", "joint1": "quanser-qube-servo-2"})
+    env = EnvConfig("Reacher-v5", {"joint0": "maxon-ec45-flat-50w", "joint1": "quanser-qube-servo-2"})
     shown = show("reacher", env, RandomPolicy(env.make().action_space), 0)
     assert shown.problem is None
     assert 1.0 / shown.episode.time[0] == pytest.approx(50.0)

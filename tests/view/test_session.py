@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from codrl_mj.cli import main
-from codrl_mj.foreign.config import environment_from
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.view.controls import controls, nested
 from codrl_mj.view.session import PUSH_DURATION, Session
 
@@ -17,7 +17,7 @@ POLE, MOTOR = "InvertedPendulum-v5", "maxon-re65"
 
 
 def session(motor=MOTOR, policies=(), **arguments):
-    made = Session(environment_from({"task": POLE, "actuators": {".*": motor}, **arguments}), dict(policies))
+    made = Session(EnvConfig.from_mapping({"task": POLE, "actuator": {".*": motor}, **arguments}), dict(policies))
     made.choose("zero")
     made.again = False
     return made

@@ -32,7 +32,6 @@ class PaperArm(Arm):
     @property
     def physics(self) -> str:
         """`mujoco`, or `analytic`: Gymnasium's own equations."""
-        assert isinstance(self.config.env, EnvConfig)
         return self.config.env.physics
 
     @property

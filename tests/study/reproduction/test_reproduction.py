@@ -243,6 +243,7 @@ def made_up(arm, steps=30, inner_steps=3):
         observation=np.zeros((steps + 1, 1)),
         action=np.zeros(steps),
         reward=np.zeros(steps),
+        first_speeds=np.zeros(1),
         trace={name: random.uniform(-1, 1, steps * inner_steps) for name in trace_names(Actuator)},
         signals={"desired_force": random.uniform(-1, 1, steps)},
         terminated=True,

@@ -1,0 +1,223 @@
+"""Tasks as worlds: what an `EnvConfig` of one can have besides, and how its environments are made."""
+
+import dataclasses
+import re
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from codrl_mj.actuators import ActuatorModel
+from codrl_mj.envs.worlds import COMMON, World, patterns_of, world_of
+from codrl_mj.fields import did_you_mean, field_docs
+from codrl_mj.tasks import TASKS, Task, find_task, reference_of, register, resolve_actuators
+from codrl_mj.tasks.assets import asset_path
+
+
+class UnknownOptionError(ValueError, TypeError):
+    """A keyword that the environment does not have; a TypeError too, as Python's own is, and as TorchRL expects."""
+
+
+class TaskWorld(World):
+    """The world of one task, ours or anybody's."""
+
+    fields = (*COMMON, "physics", "integrator", "inner_steps", "timestep", "levels", "joint")
+    posed = ("max_episode_steps", "options")
+
+    def __init__(self, task: Task) -> None:
+        """Take what the task says."""
+        self.task, self.name, self.preset = task, task.name, task.name
+        self.time_limit, self.paper = task.max_episode_steps, tuple(task.paper)
+        self.default_actuator = task.default_actuator
+        self.goal_hold, self.timed = task.goal_hold, task.goal is not None
+
+    def make(self, config: Any, **view: Any) -> Any:
+        """An environment, made by Gymnasium; `view` as for `codrl_mj.envs.ActuatedEnv`."""
+        return gymnasium.make(self.task.env_id, disable_env_checker=True, **config.as_arguments(), **view)
+
+    def make_sb3(self, config: Any, num_envs: int) -> Any:
+        """Some environments as one: stepped together by the engine, or one by one where another physics steps them."""
+        from codrl_mj.envs.sb3 import make_sb3_vec_env
+
+        # the engine's threads wait for each other in loops: for so few simulations that takes two to five times as long
+        threads = {"num_threads": 1} if config.physics == "mujoco" else {}
+        return make_sb3_vec_env(config, num_envs, **threads)
+
+    @property
+    def reference(self) -> str:
+        """The name of one of ours, `module:NAME` of somebody's."""
+        return reference_of(self.task)
+
+    @property
+    def modules(self) -> set[str]:
+        """The task's."""
+        return {self.task.reward.__module__}
+
+    def models(self, options: Any) -> set[Path]:  # noqa: ARG002 - no file is among them
+        """The task's MJCF file."""
+        return {asset_path(self.task.asset).resolve()}
+
+    def options(self, given: Any) -> Any:
+        """The task's options as its `NamedTuple`.
+
+        Raises:
+            UnknownOptionError: unknown option.
+            ValueError: one that is not a number > 0, or not True or False where its default is either.
+        """
+        known = self.task.options
+        plain = self.changed(given) if isinstance(given, tuple) else dict(given or {})
+        for name, value in plain.items():
+            if name not in known._fields:
+                has = ", ".join(known._fields) or "none"
+                raise UnknownOptionError(
+                    f"unknown option {name!r} of {self.name}: it has {has} (unexpected keyword argument {name!r})"
+                )
+            plain[name] = value = value.item() if isinstance(value, np.generic) else value
+            flag = isinstance(known._field_defaults[name], bool)
+            if isinstance(value, bool) != flag or not isinstance(value, int | float) or not (flag or value > 0):
+                raise ValueError(f"{name} = {value!r}: must be {'True or False' if flag else 'a number > 0'}")
+        return known(**{name: value if isinstance(value, bool) else float(value) for name, value in plain.items()})
+
+    def changed(self, options: Any) -> dict[str, Any]:
+        """Those of the options that are not at their defaults."""
+        return {name: value for name, value in options._asdict().items() if value != options._field_defaults[name]}
+
+    @property
+    def option_names(self) -> tuple[str, ...]:
+        """Of the task's options."""
+        return self.task.options._fields
+
+    def option_flags(self, config: Any) -> list[tuple[str, Any, str, Any]]:
+        """Those of all tasks: another's is refused by its name."""
+        kinds: dict[str, Any] = {name: task.options for name, task in TASKS.items()}
+        kept = self.changed(config.options)
+        return [
+            (option, hint | None, f"{task}: {field_docs(kind)[option]}", kept.get(option))
+            for task, kind in kinds.items()
+            for option, hint in typing.get_type_hints(kind).items()
+        ]
+
+    def options_of(self, flags: Mapping[str, Any]) -> dict[str, Any]:
+        """Those that were set."""
+        return {name: value for name, value in flags.items() if value is not None}
+
+    def actuators(self, given: Any) -> Any:
+        """One for each motor, in their order: of a single motor itself, of several a tuple."""
+        patterns = patterns_of(given)
+        if patterns is not None:
+            each = self._by_pattern(patterns)
+            given = [each.get(motor, "default") for motor in self.task.motors]
+        made = resolve_actuators(given, self.task)
+        return made[0] if len(made) == 1 else made
+
+    def _by_pattern(self, patterns: Mapping[str, Any]) -> dict[str, Any]:
+        """Motor -> what a pattern of the motors' names gives it, as a motor with several.
+
+        Raises:
+            ValueError: a pattern matches no motor, or two the same.
+        """
+        motors, found = self.task.motors, {}
+        for pattern, given in patterns.items():
+            try:
+                matched = [motor for motor in motors if motor == pattern or re.fullmatch(pattern, motor)]
+            except (re.error, TypeError) as error:
+                raise ValueError(f"{pattern!r}: must be a motor, or a regular expression of them ({error})") from None
+            if not matched:
+                raise ValueError(
+                    f"{pattern!r}: no motor of {self.name} has such a name; {did_you_mean(pattern, motors)}there are "
+                    f"{', '.join(motors)}"
+                )
+            for motor in matched:
+                if motor in found:
+                    raise ValueError(f"{motor}: {pattern!r} and another pattern match it")
+                found[motor] = given
+        return found
+
+    def driven(self, kept: Any) -> dict[str, ActuatorModel]:
+        """Motor -> actuator."""
+        return dict(zip(self.task.motors, kept if isinstance(kept, tuple) else (kept,), strict=True))
+
+    def overlaid(self, config: Any, patterns: Mapping[str, Any]) -> dict[str, Any]:
+        """Motor -> what drives it: `patterns`, and what a configuration has for others."""
+        return {**config.driven, **self._by_pattern(patterns)}
+
+    @property
+    def scripted(self) -> Task:
+        """The task, if it has one motor."""
+        if len(self.task.motors) > 1:
+            raise ValueError(
+                f"task {self.name!r} has {len(self.task.motors)} motors: there is no scripted controller; train it "
+                "with --actuator ideal and name the run, or give time, torque and speed of each joint as .npz files"
+            )
+        return self.task
+
+    def as_with_motors(self, config: Any) -> Any:
+        """In the engine, with the integration steps that a motor would have."""
+        steps = {} if config.inner_steps or config.timestep else {"inner_steps": self.task.motor_inner_steps}
+        return dataclasses.replace(config, physics="mujoco", **steps)
+
+    def action_space(self, config: Any) -> Any:  # noqa: ARG002 - the task's own, whatever it goes through
+        """The task's."""
+        return self.task.action_space
+
+    def default_agent(self, config: Any) -> str:  # noqa: ARG002
+        """The task's: of the five the paper's."""
+        return str(self.task.agent)
+
+    def view(self, config: Any, width: int, height: int, camera: str | None) -> None:  # noqa: ARG002
+        """None: images are drawn from an episode's states.
+
+        Raises:
+            ValueError: no such camera, or a size out of bounds.
+        """
+        import mujoco
+
+        from codrl_mj.physics.offscreen import check_view
+
+        model = mujoco.MjModel.from_xml_path(str(asset_path(self.task.asset)))
+        check_view(model, width, height, camera or "fixed")
+
+    def scene(self, config: Any) -> tuple[Any, Any, str | None]:  # noqa: ARG002 - its look depends on nothing
+        """The task's model, with bounds and hills."""
+        from codrl_mj.envs.single import ActuatedEnv
+
+        env = ActuatedEnv(self.reference, "ideal")
+
+        def show(state: np.ndarray) -> Any:
+            env.physics.show(state)
+            return env.data
+
+        return env.model, show, "fixed"
+
+    def state_names(self, config: Any) -> tuple[str, ...]:  # noqa: ARG002
+        """The task's."""
+        return self.task.state_names
+
+    def at_goal(self, episode: Any) -> np.ndarray | None:
+        """By the task's goal; where that is to last, the whole of an episode that is not terminated."""
+        if self.task.goal is None:
+            return np.full(len(episode.state), not episode.terminated)
+        return np.asarray(self.task.goal(episode.state.T), dtype=bool)
+
+
+def claims(name: str) -> bool:
+    """Whether a name is that of a task, as on the command line or as Gymnasium has it."""
+    return name in TASKS or any(name == task.env_id for task in TASKS.values())
+
+
+def find(name: Any) -> TaskWorld:
+    """The world of the task of that name.
+
+    Raises:
+        ValueError: unknown name; the nearest known one is suggested.
+    """
+    ours = {task.env_id: task for task in TASKS.values()}
+    return TaskWorld(ours[name] if name in ours else find_task(name))
+
+
+@world_of.register
+def _(task: Task) -> TaskWorld:
+    return TaskWorld(register(task))

@@ -1,0 +1,87 @@
+"""A world of somebody's own: everything that a task or an environment of Gymnasium's can, without an edit of ours."""
+
+import json
+
+import numpy as np
+import pytest
+
+from codrl_mj import EnvConfig
+from codrl_mj.__main__ import main
+from codrl_mj.envs.worlds import find_world
+from codrl_mj.training import TrainConfig
+from tests.envs.rig import RIG
+
+NAME, MOTOR = "tests.envs.rig:RIG", "maxon-re65"
+QUICK = "--agent sac --total-steps 60 --agent.learning-starts 20 --num-envs 1 --evaluation-episodes 1"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    out = tmp_path_factory.mktemp("rig") / "run"
+    assert main(["train", NAME, "--actuator", "ideal", *QUICK.split(), "--out", str(out)]) == 0
+    return out
+
+
+def test_a_configuration_of_it_survives_json_and_makes_environments():
+    config = EnvConfig(
+        NAME,
+        {"drive": MOTOR},
+        randomize={"motor.resistance": "uniform(0.1, 0.2)", "model.gravity": "uniform(0.9, 1.1)"},
+        disturbances={"command_delay": 0.02},
+        options={"target": 0.5},
+    )
+    assert find_world(NAME) is config.world is RIG
+    assert EnvConfig.from_mapping(json.loads(json.dumps(config.as_mapping()))) == config
+    with config.make() as env:
+        _, info = env.reset(seed=1)
+        assert 0.1 <= info["randomization"]["drive"]["motor.resistance"] <= 0.2
+        env.step(np.ones(1))  # delayed by a step
+        *_, info = env.step(np.ones(1))
+        assert info["current"] != 0.0
+    assert TrainConfig.preset(NAME, "sac", actuator="lag").env.through == "lag"
+
+
+def test_what_it_does_not_have_is_refused_by_the_configuration():
+    with pytest.raises(ValueError, match="integrator = 'rk4': rig has none: leave it out"):
+        EnvConfig(NAME, integrator="rk4")
+    with pytest.raises(ValueError, match="rk4_of_nobody"):
+        EnvConfig("tests.envs.rig:rk4_of_nobody")
+    with pytest.raises(ValueError, match=r"must be a codrl_mj.Task or a codrl_mj.World"):
+        EnvConfig("tests.envs.rig:XML")
+
+
+def test_ideal_motors_change_nothing():
+    from tests.envs.rig import RigEnv
+
+    plain, made = RigEnv(), EnvConfig(NAME).make()
+    np.testing.assert_array_equal(plain.reset(seed=3)[0], made.reset(seed=3)[0])
+    for action in np.random.default_rng(0).uniform(-1, 1, (20, 1)):
+        np.testing.assert_array_equal(plain.step(action)[0], made.step(action)[0])
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "evaluate {run} --trust --episodes 2",
+        f"evaluate {{run}} --trust --actuator {MOTOR} --episodes 1",
+        f"render {NAME} --actuators dr.*=lag --seconds 0.2 --out {{run}}/random.mp4",
+        "runs {runs}",
+        "render {run} --trust --out {run}/film.mp4",
+        "replay {run} --trust --out {run}/replay.html",
+        "report {run} --trust --no-film --out {run}/report.html",
+        "motor choose {run} --trust",
+        "train --resume {run} --trust",
+    ],
+)
+def test_every_verb_takes_it(run, line):
+    assert main(line.format(run=run, runs=run.parent).split()) == 0
+
+
+def test_a_live_session_runs_it():
+    from codrl_mj.view.session import Session
+
+    session = Session(EnvConfig(NAME, {"drive": MOTOR}), {})
+    session.set_actuator("drive", ("motor", "resistance"), 0.3)
+    assert session.problem is None
+    assert session.step()
+    assert session.config.driven["drive"].motor.resistance == 0.3
