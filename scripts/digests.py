@@ -11,6 +11,7 @@ import argparse
 import dataclasses
 import hashlib
 import json
+import subprocess
 import sys
 import tempfile
 import time
@@ -28,15 +29,16 @@ from codrl_mj import Actuator, CurrentLoop, Ideal, Motor, Supply, Uniform, named
 from codrl_mj.agents import AGENTS
 from codrl_mj.agents.presets import SETTINGS
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.identify import identify
+from codrl_mj.identify import identify, read_log
 from codrl_mj.identify.excitations import Excitation
 from codrl_mj.identify.synthetic import Load, Sampler, Sensor, simulate
 from codrl_mj.motor_design import find_drive
 from codrl_mj.runs.files import read_json, write_json
-from codrl_mj.tasks import OURS
+from codrl_mj.tasks import OURS, find_task
 from codrl_mj.training import TrainConfig, train
 
 TASKS = {task.name: task for task in OURS}
+EVERY = TASKS | {"furuta": find_task("furuta")}
 
 _COMMAND = {"command_delay": 0.027, "command_quantum": 0.3, "command_rate": 1.5}
 _PULSE = {"pulse_force": 0.7, "pulse_duration": 0.13, "pulse_interval": 0.4}
@@ -117,10 +119,10 @@ def trajectory(
     env: Any
     if num_envs is None:
         single = {"max_episode_steps": LIMIT, "disable_env_checker": True} | arguments
-        env = gymnasium.make(TASKS[task].env_id, **single)
+        env = gymnasium.make(EVERY[task].env_id, **single)
     else:
         vector = {"max_episode_steps": LIMIT, "num_threads": 1} | arguments
-        env = gymnasium.make_vec(TASKS[task].env_id, num_envs, "vector_entry_point", **vector)
+        env = gymnasium.make_vec(EVERY[task].env_id, num_envs, "vector_entry_point", **vector)
     space = env.action_space if num_envs is None else env.single_action_space
     generator, options = np.random.default_rng(1), STARTS.get(task)
     observation, _ = env.reset(seed=2, options=options)
@@ -305,16 +307,53 @@ def environments_of_others() -> Entries:
             step = env.step(generator.uniform(-1.0, 1.0, 6))
             seen += [*step.observation.values(), step.reward]
         yield f"others/cheetah-run/{name}", digest([np.asarray(array, dtype=np.float64) for array in seen])
-    vector = EnvConfig("Hopper-v5", {".*": "lag"}).make_sb3(2)
-    vector.seed(3)
-    seen = [vector.reset()]
-    for _ in range(60):
-        seen += vector.step(np.full((2, 3), 0.1, dtype=np.float32))[:2]
-    yield "others/Hopper-v5/vector", digest([np.asarray(array, dtype=np.float64) for array in seen])
+    for name, fields in ("vector", {}), ("vector, observed and delayed", SEEN):
+        vector = EnvConfig("Hopper-v5", {".*": drive if fields else "lag"}, allow_unstable=True, **fields).make_sb3(2)
+        vector.seed(3)
+        seen = [vector.reset()]
+        for _ in range(60):
+            seen += vector.step(np.full((2, 3), 0.1, dtype=np.float32))[:2]
+        yield f"others/Hopper-v5/{name}", digest([np.asarray(array, dtype=np.float64) for array in seen])
+
+
+SEEN: dict[str, Any] = {"observe_actuator": True, "disturbances": {"command_delay": 0.02}}
+
+
+def furuta() -> Entries:
+    """Names and digests of Furuta's trajectories, which Gymnasium does not have."""
+    kinds: dict[str, dict[str, Any]] = {
+        **{name: {"actuator": actuator, "allow_unstable": True} for name, actuator in MOTORS.items() if name not in ("warm", "servo")},
+        "default": {"observe_actuator": True},
+        "analytic": {"physics": "analytic", "actuator": "ideal"},
+        "current": {"action": "current"},
+        "voltage": {"action": "voltage"},
+        "delayed": {"disturbances": _COMMAND | _PULSE},
+        "drawn": {"randomize": {"motor.resistance": Uniform(7.0, 9.0), "model.gravity": Uniform(0.9, 1.1)}},
+    }
+    for name, arguments in kinds.items():
+        for num_envs in (None, 4) if name != "analytic" else (None,):
+            digested = trajectory("furuta", num_envs, arguments, SIGNALS[:5], 120)
+            yield f"furuta/{'single' if num_envs is None else 'vector'}/{name}", digested
+
+
+def helps() -> Entries:
+    """What every verb says with `--help`, and of every task and an environment of others `train`'s."""
+    verbs = [
+        [verb] for verb in ("train", "evaluate", "runs", "render", "replay", "view", "report", "advise", "validate")
+    ]
+    verbs += [["train", task] for task in (*TASKS, "furuta", "HalfCheetah-v5")] + [
+        ["reproduce"],
+        ["study"],
+        ["identify"],
+    ]
+    verbs += [["motor", verb] for verb in ("list", "show", "feasible", "choose", "design", "step", "new")]
+    for words in ([], *verbs):
+        out = subprocess.run([sys.executable, "-m", "codrl_mj", *words, "--help"], capture_output=True, check=False)
+        yield f"help/{' '.join(words) or 'codrl-mj'}", digest([np.frombuffer(out.stdout, dtype=np.uint8)])
 
 
 def identified() -> Entries:
-    """What is identified from logs that are simulated, as the numbers themselves."""
+    """What is identified from logs that are simulated, and from real ones, as the numbers themselves."""
     drive = find_drive("maxon-ec45-flat-50w")
     prbs = Excitation("prbs", amplitude=4.0, duration=2.0)
     sensors = {"current": Sensor(noise=0.02), "position": Sensor(resolution=0.0015)}
@@ -327,6 +366,11 @@ def identified() -> Entries:
         logs = [dataclasses.replace(log, signals={name: log.signals[name] for name in USED}) for log in made]
         for one in identify(logs, rig, {"gear_ratio": 1.0, **known}).estimates:
             yield f"identified/{rig}/{one.name}", f"{one.value!r} {one.low!r} {one.high!r} {one.status}"
+
+    columns, here = "time=time:s,position=position:rad,torque=torque:N*m", Path(__file__).parents[1] / "examples"
+    real = [read_log(here / "bench_logs" / "dfki_pendulum" / f"{name}.csv.gz", columns) for name in ("ddp", "ilqr")]
+    for one in identify(real, "pendulum").estimates:
+        yield f"identified/real pendulum/{one.name}", f"{one.value!r} {one.low!r} {one.high!r} {one.status}"
 
 
 USED = ("voltage", "current", "position")
@@ -350,9 +394,11 @@ PARTS = {
     "weights": trainings,
     "certificate": certificate,
     "motors": behind_motors,
+    "furuta": furuta,
     "others": environments_of_others,
     "identified": identified,
     "configuration": configurations,
+    "help": helps,
 }
 
 
