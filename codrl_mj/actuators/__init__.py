@@ -7,6 +7,8 @@ from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.identified import identified_ranges
 from codrl_mj.actuators.lag import Lag
 from codrl_mj.actuators.model import (
+    BUILT_IN,
+    FAMILIES,
     ActuatorModel,
     Command,
     Family,
@@ -26,8 +28,6 @@ from codrl_mj.actuators.model import (
     unchecked,
 )
 from codrl_mj.actuators.named import (
-    BUILT_IN,
-    FAMILIES,
     NAMED,
     actuator_from_mapping,
     actuator_over,

@@ -233,6 +233,7 @@ class Actuator(ActuatorModel):
     """A motor and the current loop that drives it: what stands between a desired force and the force delivered."""
 
     family: ClassVar[str] = "current_loop"
+    electrical_step: ClassVar = staticmethod(electrical_step)
     State: ClassVar[type] = State
     Signals: ClassVar[type] = Signals
     SIGNAL_UNITS: ClassVar[Mapping[str, str]] = {"current": "A", "reference_current": "A", "voltage": "V"}

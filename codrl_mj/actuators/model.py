@@ -81,6 +81,12 @@ Family = Any
 """A subclass of `ActuatorModel`: `type[ActuatorModel]`, which mypy takes for unhashable."""
 
 
+FAMILIES: dict[str, Any] = {}
+"""Our families by name, as they are defined; anybody else's is found as `module:Class`."""
+BUILT_IN: list[Any] = []
+"""They, and what their commands leave of them."""
+
+
 @dataclasses.dataclass(frozen=True)
 class ActuatorModel:
     """Base of every family of actuators: a frozen dataclass whose fields are made with `codrl_mj.fields`.
@@ -114,6 +120,14 @@ class ActuatorModel:
     """Whether it is told the inertia at its shaft, which takes the engine some time to find."""
     MOTION: ClassVar[bool] = False
     """Whether what is asked of it is a position or a speed of the shaft, in [rad] or [rad/s], in place of a torque."""
+
+    def __init_subclass__(cls, **named: Any) -> None:
+        """Know a family of ours by its name; anybody else's is found as `module:Class`."""
+        super().__init_subclass__(**named)
+        if cls.__module__.startswith("codrl_mj.actuators."):
+            BUILT_IN.append(cls)
+            if name := vars(cls).get("family"):
+                FAMILIES[name] = cls
 
     def __post_init__(self) -> None:
         """Validate."""
@@ -477,8 +491,6 @@ def family_number(cls: type) -> int:
 
 def family_name(cls: Family) -> str:
     """The name that `find_family` finds it by."""
-    from codrl_mj.actuators.named import FAMILIES
-
     name: str = cls.family
     return name if FAMILIES.get(name) is cls else reference(cls)
 

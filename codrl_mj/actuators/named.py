@@ -8,20 +8,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from codrl_mj.actuators.current_loop import Actuator, CurrentLoop, VoltageDriven
-from codrl_mj.actuators.drive import Drive, VoltageDrive
+from codrl_mj.actuators.current_loop import Actuator, CurrentLoop
+from codrl_mj.actuators.drive import Drive
 from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.identified import usable_fields
-from codrl_mj.actuators.lag import Lag
-from codrl_mj.actuators.model import ActuatorModel, Family, check_family, family_name, look_up
-from codrl_mj.actuators.servo import Servo
-from codrl_mj.actuators.torque_speed import TorqueSpeed
-
-FAMILIES: dict[str, Family] = {kind.family: kind for kind in (Actuator, Drive, Servo, Ideal, Lag, TorqueSpeed)}
-"""Our families by name; anybody else's is found as `module:Class`."""
-BUILT_IN: tuple[Family, ...] = (*FAMILIES.values(), VoltageDriven, VoltageDrive)
-"""They, and what their commands leave of them."""
+from codrl_mj.actuators.model import FAMILIES, ActuatorModel, Family, check_family, family_name, look_up
 
 
 def _with_loop(paper: Actuator, **gains: float) -> Actuator:

@@ -37,15 +37,12 @@ def spectral_radii(family: Any, numbers: np.ndarray, timestep: float) -> np.ndar
     Returns:
         Shape (m,); the radius of each does not depend on the others, to the last bit.
     """
-    from codrl_mj.actuators.current_loop import electrical_step
-
     parameters = columns(family, numbers)
     substeps = parameters.substeps
     current, integral, error = np.eye(3)[:, :, np.newaxis]  # all states of all actuators at once: (state, actuator)
     with np.errstate(all="ignore"):
-        after = electrical_step(parameters, timestep / substeps, current, integral, error, 0.0, 0.0, 0.0, _Unlimited())[
-            :3
-        ]
+        dt = timestep / substeps
+        after = family.electrical_step(parameters, dt, current, integral, error, 0.0, 0.0, 0.0, _Unlimited())[:3]
         matrices = np.stack([np.broadcast_to(entry, (3, len(numbers))) for entry in after])  # (to, from, actuator)
         # what no gain reads is no part of the loop: 0 instead of the eigenvalue of a state of its own
         read = np.stack([np.ones(len(numbers), dtype=bool), parameters.ki > 0, parameters.kd > 0])
@@ -72,14 +69,12 @@ def stability_radii(family: Any, numbers: np.ndarray, timestep: float) -> np.nda
     Returns:
         Shape (m,): below 1 exactly where the spectral radii are.
     """
-    from codrl_mj.actuators.current_loop import electrical_step
-
     parameters = columns(family, numbers)
     nothing, one = np.zeros(len(numbers)), np.ones(len(numbers))
     units = (one, nothing, nothing), (nothing, one, nothing), (nothing, nothing, one)
     dt = timestep / parameters.substeps
     with np.errstate(all="ignore"):
-        after = [electrical_step(parameters, dt, *unit, 0.0, 0.0, 0.0, _Unlimited())[:3] for unit in units]
+        after = [family.electrical_step(parameters, dt, *unit, 0.0, 0.0, 0.0, _Unlimited())[:3] for unit in units]
         read = (np.ones(len(numbers), dtype=bool), parameters.ki > 0.0, parameters.kd > 0.0)
         (a, b, c), (d, e, f), (g, h, i) = (
             [np.where(read[to] & read[source], after[source][to], 0.0) for source in range(3)] for to in range(3)
