@@ -72,6 +72,5 @@ def not_compiled(function: Callable[..., Any], error: Exception) -> str:
     lines = [line.strip() for line in text.splitlines() if line.strip() and not line.strip().startswith("Failed in")]
     causes = [cause for cause in re.findall(r"\w*Error: (.+)", text) if not cause.startswith("Failed in")]
     said = causes[-1] if causes else " ".join(lines[:2] if lines[0].endswith(":") else lines[:1])
-    hint = "; name it in `helpers`" if "<class 'function'>" in said else ""
     line = re.search(r'(?m)^\s*File ".+", line (\d+):', text)
-    return f"{place(function, int(line[1]) if line else None)}: numba does not compile it: {said.strip()}{hint}"
+    return f"{place(function, int(line[1]) if line else None)}: numba does not compile it: {said.strip()}"

@@ -76,8 +76,14 @@ def test_the_message_has_what_numba_says_of_it_and_where():
     task = slips.task(reward="x = next_state[0]\n    return float(np.linalg.norm(x))")
     told = refused(lambda: compiled_outcomes(task))
     assert told == "slip.py:3, in reward: numba does not compile it: np.linalg.norm() only supported for array types"
+
+
+def test_functions_that_a_function_calls_are_found():
     task = slips.task(terminated="plain(state)")
-    assert "name it in `helpers`" in refused(lambda: compiled_outcomes(task))
+    compiled = compiled_outcomes(task).terminated_all
+    ended = np.empty(2, dtype=bool)
+    compiled(np.array([[0.5, 0.0, 0.0], [1.5, 0.0, 0.0]]), ended)
+    assert ended.tolist() == [False, True]
 
 
 @pytest.mark.parametrize("face", but(["vector"], ["single", "vector", "training"]))

@@ -239,7 +239,6 @@ class Actuator(ActuatorModel):
     SIGNAL_UNITS: ClassVar[Mapping[str, str]] = {"current": "A", "reference_current": "A", "voltage": "V"}
     OBSERVED: ClassVar[tuple[str, ...]] = ("current", "reference_current")
     RANDOM: ClassVar[tuple[str, ...]] = ("controller.current_noise",)
-    helpers: ClassVar[tuple[Any, ...]] = (noise.philox, noise.unit, noise.standard_normal, electrical_step)
     advance: ClassVar = staticmethod(advance)
     observe: ClassVar = staticmethod(observe)
 
@@ -342,7 +341,6 @@ class VoltageDriven(Actuator):
     """
 
     family: ClassVar[str] = ""
-    helpers: ClassVar[tuple[Any, ...]] = (*Actuator.helpers, advance, observe)
     tracks: ClassVar[bool] = False
     advance: ClassVar = staticmethod(_advance_driven)
     observe: ClassVar = staticmethod(_observe_driven)

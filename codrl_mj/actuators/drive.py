@@ -178,7 +178,6 @@ class Drive(ActuatorModel):
     INERTIA: ClassVar[bool] = True
     CLOSED: ClassVar[bool] = True
     """Whether a current loop is closed around the winding."""
-    helpers: ClassVar[tuple[Any, ...]] = (*shaft.HELPERS, limited, begin, end, _advance)
     advance: ClassVar[Callable[..., Any]] = staticmethod(advance)
     observe: ClassVar = staticmethod(observe)
 

@@ -110,8 +110,6 @@ class ActuatorModel:
     """Units of the signals, for tables and figures."""
     OBSERVED: ClassVar[tuple[str, ...]] = ()
     """Names of what `observe` returns: what `observe_actuator=True` appends to an observation."""
-    helpers: ClassVar[tuple[Callable[..., Any], ...]] = ()
-    """Plain Python functions that `advance` and `observe` call, innermost first, to be compiled with them."""
     RANDOM: ClassVar[tuple[str, ...]] = ()
     """Dotted paths of the fields that need the episode's key of random numbers where they are not 0."""
     tracks: ClassVar[bool] = True

@@ -206,7 +206,6 @@ class Servo(Drive):
     SIGNAL_UNITS: ClassVar[Mapping[str, str]] = {**Drive.SIGNAL_UNITS, "error": "rad or rad/s"}
     tracks: ClassVar[bool] = False
     MOTION: ClassVar[bool] = True
-    helpers: ClassVar[tuple[Any, ...]] = (*Drive.helpers, demand)
     advance: ClassVar = staticmethod(advance)
 
     loop: ServoLoop = ServoLoop()

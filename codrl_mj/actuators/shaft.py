@@ -263,23 +263,3 @@ def turn(
         changed = delivered - viscous * (speed - shaft.speed)
         speed += share * duration * (changed / shaft.inertia + shaft.others)
     return winding, speed, Means(amperes, volts, torque, float(saturated), power, heat)
-
-
-HELPERS = (
-    sampled.until,
-    sampled.jump,
-    sampled.run_samples,
-    sampled.designed_gains,
-    temperature_of,
-    resistance_at,
-    warmer,
-    heated,
-    thermal_limit,
-    is_warming,
-    inertia_of,
-    others_after,
-    friction,
-    run_over,
-    turn,
-)
-"""What a family whose `advance` calls these has to name, innermost first."""

@@ -7,7 +7,9 @@ written later. Compiling one takes a fraction of a second, once a process.
 import contextlib
 import ctypes
 import functools
+import sys
 from collections.abc import Callable, Iterator
+from types import CodeType, FunctionType, ModuleType
 from typing import Any, NamedTuple
 
 import numba
@@ -139,15 +141,29 @@ def replaced(family: Family, other: Family) -> Iterator[None]:
         _ADDRESSES[number] = right
 
 
-def jitable(owner: Any) -> None:
-    """Make the functions that a family's, or a task's, call known to numba; they stay what they are."""
-    for helper in owner.helpers:
-        _register(helper)
+_OTHERS = sys.stdlib_module_names | {"numba", "numpy", "scipy"}
+"""Packages whose functions numba knows, or does not, by itself."""
 
 
-@functools.cache
-def _register(helper: Callable[..., Any]) -> None:
-    register_jitable(helper)
+_KNOWN: set[FunctionType] = set()
+
+
+def _make_known(function: FunctionType) -> None:
+    """Make the plain functions that a function calls, and these call, known to numba; they stay what they are."""
+    codes, names = [function.__code__], set[str]()
+    for code in codes:
+        names |= {*code.co_names, *code.co_freevars}
+        codes += [one for one in code.co_consts if isinstance(one, CodeType)]
+    closed = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
+    scope = function.__globals__ | {name: cell.cell_contents for name, cell in closed}
+    found = [scope[name] for name in names & scope.keys()]
+    found += [getattr(one, name, None) for one in found if isinstance(one, ModuleType) for name in names]
+    for called in found:
+        ours = isinstance(called, FunctionType) and called.__module__.partition(".")[0] not in _OTHERS
+        if ours and called not in _KNOWN:
+            _KNOWN.add(called)
+            register_jitable(called)
+            _make_known(called)
 
 
 @functools.cache
@@ -159,6 +175,7 @@ def compiled_function(function: Callable[..., Any], form: Form, declared: str, *
     """
     compiled = internal(function)
     try:
+        _make_known(function)
         compiled.compile(kinds)
     except Exception as error:
         raise ValueError(not_compiled(function, error)) from error
@@ -175,7 +192,6 @@ def _example(kind: Any) -> Any:
 
 @functools.cache
 def _compile(family: Any) -> Any:
-    jitable(family)
     parameters_of, state_of = parameters_type(family), family.State
     kinds = tuple_of(parameters_of), _F64, tuple_of(state_of), tuple_of(Inputs)
     advance = compiled_function(family.advance, *advance_form(family), *kinds)

@@ -6,7 +6,7 @@ from typing import Any
 from numba import types
 
 from codrl_mj.actuators import Family, Inputs, parameters_type
-from codrl_mj.engine.families import HEAD, compiled_function, jitable
+from codrl_mj.engine.families import HEAD, compiled_function
 from codrl_mj.engine.layout import offset
 from codrl_mj.engine.memory import array, i64, internal, read, tuple_of, write
 
@@ -17,7 +17,6 @@ def compiled_observe(family: Family) -> Any:
 
     Vectors go by their addresses.
     """
-    jitable(family)
     parameters_of, signals_of = parameters_type(family), family.Signals
     kinds = tuple_of(parameters_of), types.float64, tuple_of(signals_of), tuple_of(Inputs)
     observe = compiled_function(family.observe, family.OBSERVED, f"{family.__name__}.OBSERVED", *kinds)

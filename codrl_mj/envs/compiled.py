@@ -32,7 +32,7 @@ import numpy as np
 from numba import types
 
 from codrl_mj.actuators.noise import LARGEST_KEY
-from codrl_mj.engine.families import compiled_function, jitable
+from codrl_mj.engine.families import compiled_function
 from codrl_mj.engine.memory import floats, internal
 from codrl_mj.envs.outcomes import Outcomes, compiled_outcomes
 from codrl_mj.envs.setup import Setup
@@ -113,7 +113,6 @@ def arguments(setup: Setup, physics: Any) -> tuple[Any, ...]:
 def compiled_kernels(setup: Setup, physics: Any) -> Kernels:
     """The functions for environments of one kind, whose simulation's steps are compiled; compiled once a process."""
     task = setup.task
-    jitable(task)
     sensors = len(setup.family.OBSERVED) if setup.view.sensors else 0
     single, size = len(task.motors) == 1, len(task.state_names)
     return _kernels(physics.compiled.stepping, compiled_outcomes(task), task.initial_state, size, single, sensors)

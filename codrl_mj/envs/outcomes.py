@@ -13,7 +13,7 @@ import numpy as np
 from numba import types
 from numba.np.unsafe.ndarray import to_fixed_tuple
 
-from codrl_mj.engine.families import compiled_function, jitable
+from codrl_mj.engine.families import compiled_function
 from codrl_mj.engine.memory import entries_type, floats, internal, read, tuple_of
 from codrl_mj.physics.constrain import Compiled, is_fine
 from codrl_mj.tasks import Task
@@ -51,7 +51,6 @@ def compiled_outcomes(task: Task) -> Outcomes:
     Raises:
         ValueError: one of its own is not what numba compiles.
     """
-    jitable(task)
     size, several = len(task.state_names), len(task.motors) > 1
     functions = task.observation, task.reward, task.terminated
     return _compiled(*functions, task.options, size, task.observation_names, several)  # type: ignore[arg-type]

@@ -11,7 +11,7 @@ import numba
 import numpy as np
 from numba import types
 
-from codrl_mj.engine.families import compiled_function, jitable
+from codrl_mj.engine.families import compiled_function
 from codrl_mj.engine.memory import entries_type, f64, floats, internal, read, tuple_of
 from codrl_mj.physics.base import LARGEST
 from codrl_mj.tasks import Task
@@ -33,7 +33,6 @@ def compiled_constrain(task: Task) -> Compiled | None:
     Raises:
         ValueError: `constrain` is not what numba compiles.
     """
-    jitable(task)
     return None if task.constrain is None else _keeper(task.constrain, task.state_names, task.qpos, task.qvel)
 
 

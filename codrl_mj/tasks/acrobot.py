@@ -163,7 +163,6 @@ TASK = Task(
     terminated=terminated,
     constrain=constrain,
     goal=terminated,
-    helpers=(_rounded, _wrapped, terminated),
     # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
     paper=(Actuator(Motor(), CurrentLoop(kp=1.0, ki=10.0, kd=1e-6)),),
     wrapped=(0, 1),

@@ -45,7 +45,7 @@ class Task:
     A function of a state takes the state's entries, in Gymnasium's own order: `state[0]`, `state[1]` and so on, each a
     number, or an array with a number for each of N states (`states.T` of states (N, n)). What is the same for all
     states may be returned as a single number. These functions are plain Python that numba compiles as it stands
-    (`codrl_mj.envs.outcomes`); every face runs the compiled form. Helpers of theirs are named in `helpers`.
+    (`codrl_mj.envs.outcomes`); every face runs the compiled form.
 
     Raises:
         ValueError: a field is out of bounds, or a function, called once on plain numbers, does not return what others
@@ -114,8 +114,6 @@ class Task:
     motors: tuple[str, ...] = ("motor",)
     """Names of the MJCF model's actuators that the task drives, in the order of actions and forces. With several of
     them, forces and signals are arrays (n,) wherever they are numbers otherwise."""
-    helpers: tuple[Callable[..., Any], ...] = ()
-    """Plain functions that those above call, innermost first, to be compiled with them."""
     reward_threshold: float | None = fields.real(None)
     """Mean return at which the task counts as solved."""
     agent: str = "ppo"

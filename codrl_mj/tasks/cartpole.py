@@ -144,7 +144,6 @@ TASK = Task(
     observation=observation,
     reward=reward,
     terminated=terminated,
-    helpers=(terminated,),
     # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
     paper=(Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=4.3, ki=1.0, kd=1e-6, kff=0.6)),),
     attributes={

@@ -1,6 +1,5 @@
 """What a task declares against what its functions return, once, when it is made: compiled code relies on it."""
 
-import inspect
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ def check_fields(task: Any) -> None:
     """Refuse fields that are not what a task is made of."""
     for name in _TEXTS:
         _require(task, name, isinstance(getattr(task, name), str | Path), "a text")
-    for name in (*_NAMES, "qpos", "qvel", "wrapped", "helpers", "paper", "forces"):
+    for name in (*_NAMES, "qpos", "qvel", "wrapped", "paper", "forces"):
         _require(task, name, isinstance(getattr(task, name) or (), tuple), "a tuple")
     for name in _NAMES:
         names = getattr(task, name)
@@ -26,7 +25,6 @@ def check_fields(task: Any) -> None:
     motors, forces, defaults = len(task.motors), task.forces, getattr(task.options, "_field_defaults", {"": None})
     fine = all(isinstance(one, int | float) for one in defaults.values()) and len(defaults) == len(task.options._fields)
     _require(task, "options", fine, "a typing.NamedTuple of numbers and flags that have defaults")
-    _require(task, "helpers", all(map(inspect.isfunction, task.helpers)), "functions in plain Python")
     _require(task, "paper", len(task.paper) in (0, motors), f"empty, or of {motors}: `motors`")
     fine = _are_numbers(task.max_force, (), (motors,)) and np.min(task.max_force) > 0.0
     _require(task, "max_force", fine, "a finite number > 0" + f", or {motors} of them" * (motors > 1))

@@ -96,7 +96,6 @@ TASK = dataclasses.replace(
     reward=reward,
     terminated=terminated,
     goal=terminated,
-    helpers=(terminated,),
     # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
     paper=(Actuator(Motor(), CurrentLoop(kp=0.1, ki=10.0, kd=1e-3)),),
     attributes={

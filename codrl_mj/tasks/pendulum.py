@@ -150,7 +150,6 @@ TASK = Task(
     constrain=constrain,
     goal=goal,
     goal_hold=GOAL_HOLD,
-    helpers=(upright_angle,),
     # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
     paper=(Actuator(Motor(), CurrentLoop(kp=1.0, ki=20.0, kd=1e-6)),),
     attributes={

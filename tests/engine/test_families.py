@@ -25,7 +25,7 @@ from codrl_mj.actuators import (
     family_number,
     parameters_type,
 )
-from codrl_mj.actuators.noise import philox, standard_normal, unit
+from codrl_mj.actuators.noise import standard_normal
 from codrl_mj.engine.families import HEAD, SLOT, Slot, loaded_families, signals_at, slot_size, user_head
 from codrl_mj.fields import flag, integer, part, real
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, install_callbacks, motors
@@ -91,7 +91,6 @@ class Spring(ActuatorModel):
     family = "spring"
     State = Memory
     Signals = Seen
-    helpers = (philox, unit, standard_normal, _softened)
     advance = staticmethod(_advance)
 
     coil: Coil = Coil()

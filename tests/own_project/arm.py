@@ -73,7 +73,6 @@ TASK = Task(
     observation=observation,
     reward=reward,
     terminated=terminated,
-    helpers=(error,),
     motors=("shoulder", "elbow"),
     attributes={"gravity": GRAVITY, "upper_mass": mass("upper"), "most": Setting.LARGEST_FORCE, "reach": Fixed(0.9)},
 )
