@@ -236,7 +236,7 @@ class ForeignConfig:
         Raises:
             ValueError: see `codrl_mj.make`; or observations are no vector.
         """
-        from codrl_mj.foreign.vector import make_sb3_vec_env
+        from codrl_mj.envs.sb3 import make_sb3_vec_env
 
         return make_sb3_vec_env(self.make, num_envs)
 

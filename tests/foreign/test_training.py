@@ -236,7 +236,7 @@ def test_draws_of_the_model_survive_files_and_flags():
     envs = other.make_sb3(2)
     envs.reset()
     drawn = envs.randomization
-    assert set(drawn) == {"model.gravity", ".*:time_constant"}
+    assert set(drawn) == {"model.gravity", ".*:time_constant", "rejected"}
     assert drawn["model.gravity"].shape == (2,)
     train(dataclasses.replace(config(other), total_steps=50), Path("run"), tensorboard=False)
     assert main(["evaluate", "run", "--episodes", "1"]) == 0
