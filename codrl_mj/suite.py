@@ -132,8 +132,11 @@ class DmEnvironment(dm_env.Environment):
         own: dict[str, np.ndarray] = self.env.get_wrapper_attr("snapshot")()
         return own | {"elapsed": elapsed_steps(self.env), "ended": np.array(self._ended)}
 
-    def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
+    def restore(self, snapshot: Mapping[str, np.ndarray]) -> dict[str, np.ndarray] | None:
         """Continue from what `snapshot` returned, bit for bit, in an environment made with the same arguments.
+
+        Returns:
+            None; or the first observation of an episode, where the environment could only start one anew.
 
         Raises:
             ValueError: the snapshot is of another environment or other arguments; nothing was changed.
@@ -141,9 +144,12 @@ class DmEnvironment(dm_env.Environment):
         check_snapshot(snapshot, self.snapshot())
         self.env.reset()  # which Gymnasium's wrappers insist on
         own = {name: values for name, values in snapshot.items() if name not in ("elapsed", "ended")}
-        self.env.get_wrapper_attr("restore")(own)
+        begun = self.env.get_wrapper_attr("restore")(own)
+        self._ended = begun is None and bool(snapshot["ended"])
+        if begun is not None:
+            return self._entries(begun)
         set_elapsed_steps(self.env, snapshot["elapsed"])
-        self._ended = bool(snapshot["ended"])
+        return None
 
     def close(self) -> None:
         """Free what the environment holds."""
