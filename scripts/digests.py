@@ -308,7 +308,8 @@ def environments_of_others() -> Entries:
             seen += [*step.observation.values(), step.reward]
         yield f"others/cheetah-run/{name}", digest([np.asarray(array, dtype=np.float64) for array in seen])
     for name, fields in ("vector", {}), ("vector, observed and delayed", SEEN):
-        vector = EnvConfig("Hopper-v5", {".*": drive if fields else "lag"}, allow_unstable=True, **fields).make_sb3(2)
+        config = EnvConfig("Hopper-v5", {".*": drive if fields else "lag"}, allow_unstable=True, **fields)
+        vector = codrl_mj.make_sb3_vec_env(config, 2)
         vector.seed(3)
         seen = [vector.reset()]
         for _ in range(60):
@@ -322,7 +323,11 @@ SEEN: dict[str, Any] = {"observe_actuator": True, "disturbances": {"command_dela
 def furuta() -> Entries:
     """Names and digests of Furuta's trajectories, which Gymnasium does not have."""
     kinds: dict[str, dict[str, Any]] = {
-        **{name: {"actuator": actuator, "allow_unstable": True} for name, actuator in MOTORS.items() if name not in ("warm", "servo")},
+        **{
+            name: {"actuator": one, "allow_unstable": True}
+            for name, one in MOTORS.items()
+            if name not in ("warm", "servo")
+        },
         "default": {"observe_actuator": True},
         "analytic": {"physics": "analytic", "actuator": "ideal"},
         "current": {"action": "current"},

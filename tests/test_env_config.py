@@ -172,7 +172,7 @@ def test_every_face_is_built_from_it():
         options={"center_radius": 0.02},
     )
     single, many, theirs = config.make(), make_sb3_vec_env(config, 2), suite.load(config)
-    for setup in (single.unwrapped.setup, many.env.setup, theirs.task.setup):
+    for setup in (single.unwrapped.setup, many.env.setup, theirs.setup):
         assert (setup.actuators, setup.inner_steps) == (config.actuators, 2)
         assert (setup.disturbances, setup.joint) == (config.disturbances, config.joint)
         assert setup.view.options == (0.02, False)

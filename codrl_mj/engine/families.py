@@ -148,7 +148,7 @@ _OTHERS = sys.stdlib_module_names | {"numba", "numpy", "scipy"}
 _KNOWN: set[FunctionType] = set()
 
 
-def _make_known(function: FunctionType) -> None:
+def _make_known(function: Any) -> None:
     """Make the plain functions that a function calls, and these call, known to numba; they stay what they are."""
     codes, names = [function.__code__], set[str]()
     for code in codes:

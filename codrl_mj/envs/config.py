@@ -159,14 +159,9 @@ class EnvConfig:
         return dataclasses.replace(self, **posed)
 
     @property
-    def modules(self) -> set[str]:
-        """Names of the modules that decide on what it does: the world's and those of the actuators' families."""
-        return {type(one).__module__ for one in self.actuators} | self.world.modules
-
-    @property
-    def models(self) -> set[Path]:
-        """Model files that decide on what it does."""
-        return self.world.models(self.options)
+    def code(self) -> set[str | Path]:
+        """Modules, by name, and files that decide on what it does: the world's and those of the actuators' families."""
+        return {type(one).__module__ for one in self.actuators} | self.world.code(self.options)
 
     @property
     def interface(self) -> dict[str, Any]:
@@ -195,14 +190,6 @@ class EnvConfig:
             ValueError: fields do not go with each other, or with the model.
         """
         return self.world.make(self, **view)
-
-    def make_sb3(self, num_envs: int) -> Any:
-        """Some of the environments as one Stable-Baselines3 `VecEnv`, for training.
-
-        Raises:
-            ValueError: as for `make`; or observations are no vector.
-        """
-        return self.world.make_sb3(self, num_envs)
 
     def as_mapping(self) -> dict[str, Any]:
         """The configuration as JSON-serialisable values; `from_mapping` reads it."""

@@ -5,16 +5,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import AutoresetMode
+from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.serial import SerialVectorEnv
 from codrl_mj.envs.snapshots import check_snapshot
-from codrl_mj.envs.stepped import SteppedVectorEnv
 from codrl_mj.envs.vector import ActuatedVectorEnv
 from codrl_mj.physics import Signals
-from codrl_mj.tasks import TASKS, find_task
+from codrl_mj.tasks import TASKS
 
 
 class ActuatedVecEnv(VecEnv):
@@ -25,7 +24,7 @@ class ActuatedVecEnv(VecEnv):
     step is in `signals`, as arrays.
     """
 
-    def __init__(self, env: ActuatedVectorEnv | SteppedVectorEnv) -> None:
+    def __init__(self, env: ActuatedVectorEnv | SerialVectorEnv) -> None:
         """Wrap a vector environment in `SAME_STEP` mode."""
         self.env = env
         self._actions: np.ndarray | None = None
@@ -172,7 +171,7 @@ class ActuatedVecEnv(VecEnv):
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise ValueError(f"set_attr({attr_name!r}): the environments share it; it can only be set for all of them")
         owners: list[Any] = [self.env]
-        if isinstance(self.env, SteppedVectorEnv) and not hasattr(self.env, attr_name):
+        if isinstance(self.env, SerialVectorEnv) and not hasattr(self.env, attr_name):
             owners = [one.unwrapped for one in self.env.envs]
         for owner in owners:
             setattr(owner, attr_name, value)
@@ -189,26 +188,47 @@ class ActuatedVecEnv(VecEnv):
         return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]
 
 
-def make_sb3_vec_env(env_id: str | EnvConfig, num_envs: int = 64, **arguments: Any) -> ActuatedVecEnv:
+def make_sb3_vec_env(env_id: Any, num_envs: int = 64, **arguments: Any) -> ActuatedVecEnv:
     """Many environments as one Stable-Baselines3 `VecEnv`.
 
     Args:
-        env_id: Gymnasium id, such as `codrl_mj/Pendulum-v0`; or an environment's whole configuration.
+        env_id: Gymnasium id, such as `codrl_mj/Pendulum-v0`; an environment's whole configuration; or a function that
+            makes an environment with motors, such as `functools.partial(codrl_mj.make, "Hopper-v5", {".*": "lag"})`.
         num_envs: how many, >= 1.
-        **arguments: as for `codrl_mj.envs.ActuatedVectorEnv`; the time limit is Gymnasium's unless given. On another
-            physics than `mujoco` the environments are stepped one by one: a `SerialVectorEnv`.
+        **arguments: as for `codrl_mj.envs.ActuatedVectorEnv`; the time limit is Gymnasium's unless given. Whatever is
+            no task of ours on `mujoco` is stepped one by one: a `SerialVectorEnv`.
 
     Raises:
-        ValueError: unknown id, or an argument out of bounds.
+        ValueError: unknown id, or an argument out of bounds; more than memory holds; observations are no vector, or
+            actions neither a vector nor a choice.
     """
-    known = {one.env_id: name for name, one in TASKS.items()}
-    if isinstance(env_id, EnvConfig):
-        task, arguments = env_id.task, env_id.as_arguments() | arguments
-    elif env_id in known:
-        task = known[env_id]
+    if callable(env_id):
+        envs: Any = SerialVectorEnv(num_envs, env_id, **arguments)
     else:
+        config = env_id if isinstance(env_id, EnvConfig) else EnvConfig(_task_of(env_id))
+        envs = config.world.vector(config, num_envs, **arguments)
+    try:
+        _check_spaces(envs.single_observation_space, envs.single_action_space)
+    except ValueError:
+        envs.close()
+        raise
+    return ActuatedVecEnv(envs)
+
+
+def _task_of(env_id: Any) -> str:
+    """The name of the task that Gymnasium has by an id."""
+    known = {one.env_id: name for name, one in TASKS.items()}
+    if env_id not in known:
         raise ValueError(f"env_id = {env_id!r}: must be one of {', '.join(known)}")
-    arguments = {"max_episode_steps": find_task(task).max_episode_steps} | arguments
-    if arguments.get("physics", "mujoco") != "mujoco":
-        return ActuatedVecEnv(SerialVectorEnv(num_envs, task, **arguments))
-    return ActuatedVecEnv(ActuatedVectorEnv(num_envs, task, autoreset_mode=AutoresetMode.SAME_STEP, **arguments))
+    return known[env_id]
+
+
+def _check_spaces(observed: Any, acted: Any) -> None:
+    """Refuse observations and actions that agents' networks do not take."""
+    if not isinstance(observed, spaces.Box) or len(observed.shape) != 1:
+        raise ValueError(
+            f"observations are {observed}: must be a vector, which our agents' networks take: flatten them with a "
+            "wrapper of Gymnasium's (FlattenObservation), and register that environment"
+        )
+    if not isinstance(acted, spaces.Box | spaces.Discrete):
+        raise ValueError(f"actions are {acted}: must be a vector (Box) or a choice (Discrete)")

@@ -1,29 +1,32 @@
-"""Single environments stepped one by one as one: a `VectorEnv` for the physics that cannot be batched."""
+"""Single environments stepped one by one as one: a `VectorEnv` for whatever cannot be batched."""
 
 import functools
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
 
-from codrl_mj.envs.setup import Setup
 from codrl_mj.envs.single import ActuatedEnv
-from codrl_mj.envs.stepped import SteppedVectorEnv
+from codrl_mj.envs.snapshots import check_snapshot, elapsed_steps, set_elapsed_steps
 from codrl_mj.envs.vector import check_counts, one_for_each
-from codrl_mj.tasks import Task
+from codrl_mj.physics import Signals
 
 Array = np.ndarray
 
 
-class SerialVectorEnv(SteppedVectorEnv):
-    """A `SteppedVectorEnv` of `ActuatedEnv`s with time limits."""
+class SerialVectorEnv(SyncVectorEnv[Array, Array]):
+    """Gymnasium's `SyncVectorEnv` in `SAME_STEP` mode, with what Stable-Baselines3's face needs of an environment.
+
+    Of each it asks for `motors`, `signal_names`, `randomization`, `snapshot` and `restore`, as an `ActuatedEnv` and
+    what `codrl_mj.make` makes have them.
+    """
 
     def __init__(
         self,
         num_envs: int,
-        task: str,
+        task: str | Callable[..., Any],
         actuator: Any = "default",
         max_episode_steps: int | None = None,
         **arguments: Any,
@@ -32,53 +35,113 @@ class SerialVectorEnv(SteppedVectorEnv):
 
         Args:
             num_envs: how many, >= 1.
-            task: the task's name.
+            task: the task's name; or a function that makes an environment which has its actuators, a picklable one
+                for processes.
             actuator: as for `ActuatedEnv`; or a sequence of N actuators, one for each environment.
             max_episode_steps: time limit of each environment [steps]; None for none.
-            **arguments: the other arguments of `ActuatedEnv`, `physics` among them.
+            **arguments: the other arguments of `ActuatedEnv`, `physics` among them; or the function's.
 
         Raises:
             ValueError: an argument is unknown or out of bounds, or a current loop is unstable; the message names it.
             CallbackInUseError: another library's MuJoCo callback is installed.
         """
-        check_counts(num_envs, max_episode_steps, 20_000)
-        each: Sequence[Any] = actuator if one_for_each(actuator, task) else [actuator] * num_envs
+        check_counts(num_envs, max_episode_steps, 20_000 if isinstance(task, str) else 200_000)
+        make: Any = task
+        each = [{} if actuator == "default" else {"actuator": actuator}] * num_envs
+        if isinstance(task, str):
+            make = functools.partial(ActuatedEnv, task)
+            if one_for_each(actuator, task):
+                each = [{"actuator": one} for one in actuator]
         if len(each) != num_envs:
             raise ValueError(f"actuator: {len(each)} actuators for {num_envs} environments: there must be one for each")
+        makers = [functools.partial(_limited, max_episode_steps, make, {**arguments, **one}) for one in each]
+        super().__init__(makers, autoreset_mode=AutoresetMode.SAME_STEP)
         self.max_episode_steps = max_episode_steps
-        limit = sys.maxsize if max_episode_steps is None else int(max_episode_steps)
-        makers = [functools.partial(_limited, limit, task, one, arguments) for one in each]  # unlike lambdas, picklable
-        super().__init__(makers)
+        self.signals: Signals | None = None  # of the last step, each an array of shape (N,) or (N, motors)
+        self._signal_names = self._of_each("signal_names")[0]
+        self.arm_radii = np.array([one.arm_radius for one in self._of_each("motors")[0].values()])
 
     @property
-    def setup(self) -> Setup:
-        """The set-up of the first environment."""
-        return self._singles[0].setup
-
-    @property
-    def arm_radii(self) -> Array:
-        """See `SteppedVectorEnv`."""
-        return self.setup.arm_radii
-
-    @property
-    def task(self) -> Task:
-        """The task."""
-        return self.setup.task
+    def task(self) -> Any:
+        """The task of the first environment."""
+        return self._of_each("task")[0]
 
     @property
     def randomization(self) -> dict[str, Array]:
-        """See `SteppedVectorEnv`; and how many sets were `rejected`."""
-        if self.setup.randomization is None:
-            return {}
-        snapshot = self.snapshot()
-        columns = zip(self.setup.randomization.names, snapshot["drawn"].T.copy(), strict=True)
-        return dict(columns) | {"rejected": snapshot["rejected"]}
+        """What the present episodes were drawn with, fields of several motors as PATTERN:FIELD: each of shape (N,).
 
-    @property
-    def _singles(self) -> list[ActuatedEnv]:
-        return [env.unwrapped for env in self.envs]  # type: ignore[misc]
+        Also how many sets were `rejected`; empty if nothing is drawn.
+        """
+        drawn = [_flat(one) for one in self._of_each("randomization")]
+        kinds = {name: np.int64 if name == "rejected" else np.float64 for name in drawn[0]}
+        return {name: np.array([one[name] for one in drawn], kind) for name, kind in kinds.items()}
+
+    def _of_each(self, name: str) -> list[Any]:
+        """An attribute of every environment, wherever among its wrappers that is."""
+        return [env.get_wrapper_attr(name) for env in self.envs]
+
+    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        """Advance every environment by one step; those whose episode ends start another at once."""
+        observations, rewards, terminated, truncated, infos = super().step(actions)
+        ended = terminated | truncated
+        last = infos.get("final_info", infos)  # of those that ended
+        others = last if ended.all() else infos
+        self.signals = {
+            name: np.where(ended.reshape(-1, *[1] * (last[name].ndim - 1)), last[name], others[name])
+            for name in self._signal_names
+        }
+        return observations, rewards, terminated, truncated, infos
+
+    def image(self, row: int = 0) -> Array | None:
+        """One environment as an image, shape (height, width, 3), uint8; None if there is no render mode."""
+        image: Any = self.envs[row].render()
+        return image
+
+    def snapshot(self) -> dict[str, Array]:
+        """Everything that the future depends on, as plain arrays: the environments' own, and their bookkeeping."""
+        each = [snapshot() for snapshot in self._of_each("snapshot")]
+        return {
+            **{name: np.stack([one[name] for one in each]) for name in each[0]},
+            "elapsed": np.stack([elapsed_steps(env) for env in self.envs]),
+            "observations": self._observations.copy(),
+        }
+
+    def restore(self, snapshot: Mapping[str, Array]) -> Array | None:
+        """Continue from what `snapshot` returned, bit for bit, in environments made with the same arguments.
+
+        Returns:
+            None; or the first observations (N, k), where the environments could only start an episode anew.
+
+        Raises:
+            ValueError: the snapshot is of another number of environments, another task or other arguments.
+        """
+        check_snapshot(snapshot, self.snapshot())
+        own = {name: values for name, values in snapshot.items() if name not in ("elapsed", "observations")}
+        begun = [
+            restore({name: values[row] for name, values in own.items()})
+            for row, restore in enumerate(self._of_each("restore"))
+        ]
+        self.signals = None  # of a step that was not this one's past
+        if begun[0] is not None:
+            self._keep(np.stack(begun))
+            return self._observations.copy()
+        for env, elapsed in zip(self.envs, snapshot["elapsed"], strict=True):
+            set_elapsed_steps(env, elapsed)
+        self._keep(snapshot["observations"])
+        return None
+
+    def _keep(self, observations: Array) -> None:
+        self._observations[:] = observations
+        self._env_obs = list(observations.copy())
 
 
-def _limited(limit: int, task: str, actuator: Any, arguments: Mapping[str, Any]) -> "TimeLimit[Any, Any]":
-    # quoted: rl-zoo3 puts a class of its own in the place of Gymnasium's, and that one is not generic
-    return TimeLimit(ActuatedEnv(task, actuator, **arguments), limit)
+def _limited(limit: int | None, make: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
+    """One environment, with a time limit [steps] if one is given."""
+    env = make(**arguments)
+    return env if limit is None else TimeLimit(env, int(limit))
+
+
+def _flat(drawn: Mapping[str, Any]) -> dict[str, Any]:
+    """What an episode was drawn with, the fields of a pattern's motors beside those of the model."""
+    nested = {name: one if isinstance(one, Mapping) else {"": one} for name, one in drawn.items()}
+    return {f"{name}:{field}".rstrip(":"): value for name, one in nested.items() for field, value in one.items()}

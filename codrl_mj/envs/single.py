@@ -103,6 +103,11 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         return self._actuator
 
     @property
+    def motors(self) -> dict[int, Any]:
+        """The actuators of the present episode, by the number of the task's motor."""
+        return dict(enumerate(self._actuator if isinstance(self._actuator, tuple) else [self._actuator]))
+
+    @property
     def model(self) -> Any:
         """The `mujoco.MjModel` (MuJoCo physics only); one `mj_step` of it is one integration step."""
         return self._engine()[0]
@@ -210,8 +215,9 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
 
     @property
     def randomization(self) -> dict[str, Any]:
-        """What the present episode was drawn with, as in the reset's info; empty if nothing was drawn."""
-        return dict(self._randomization)
+        """What the present episode was drawn with, as in the reset's info: NaN before it, empty without draws."""
+        names = () if self.setup.randomization is None else (*self.setup.randomization.names, "rejected")
+        return {name: 0 if name == "rejected" else np.nan for name in names} | self._randomization
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Everything that the future depends on, as plain arrays: simulation, motor, generator, what was drawn.

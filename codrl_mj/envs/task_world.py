@@ -9,6 +9,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.vector import AutoresetMode
 
 from codrl_mj.actuators import ActuatorModel
 from codrl_mj.envs.worlds import COMMON, World, patterns_of, world_of
@@ -38,27 +39,24 @@ class TaskWorld(World):
         """An environment, made by Gymnasium; `view` as for `codrl_mj.envs.ActuatedEnv`."""
         return gymnasium.make(self.task.env_id, disable_env_checker=True, **config.as_arguments(), **view)
 
-    def make_sb3(self, config: Any, num_envs: int) -> Any:
+    def vector(self, config: Any, num_envs: int, **arguments: Any) -> Any:
         """Some environments as one: stepped together by the engine, or one by one where another physics steps them."""
-        from codrl_mj.envs.sb3 import make_sb3_vec_env
+        from codrl_mj.envs.serial import SerialVectorEnv
+        from codrl_mj.envs.vector import ActuatedVectorEnv
 
-        # the engine's threads wait for each other in loops: for so few simulations that takes two to five times as long
-        threads = {"num_threads": 1} if config.physics == "mujoco" else {}
-        return make_sb3_vec_env(config, num_envs, **threads)
+        arguments = {"max_episode_steps": config.time_limit} | config.as_arguments() | arguments
+        if arguments["physics"] != "mujoco":
+            return SerialVectorEnv(num_envs, config.task, **arguments)
+        return ActuatedVectorEnv(num_envs, config.task, autoreset_mode=AutoresetMode.SAME_STEP, **arguments)
 
     @property
     def reference(self) -> str:
         """The name of one of ours, `module:NAME` of somebody's."""
         return reference_of(self.task)
 
-    @property
-    def modules(self) -> set[str]:
-        """The task's."""
-        return {self.task.reward.__module__}
-
-    def models(self, options: Any) -> set[Path]:  # noqa: ARG002 - no file is among them
-        """The task's MJCF file."""
-        return {asset_path(self.task.asset).resolve()}
+    def code(self, options: Any) -> set[str | Path]:  # noqa: ARG002 - no file is among them
+        """The task's module and MJCF file."""
+        return {self.task.reward.__module__, asset_path(self.task.asset).resolve()}
 
     def options(self, given: Any) -> Any:
         """The task's options as its `NamedTuple`.

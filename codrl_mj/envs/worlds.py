@@ -78,14 +78,19 @@ class World(abc.ABC):
             ValueError: the configuration does not go with the model.
         """
 
-    def make_sb3(self, config: Any, num_envs: int) -> Any:
-        """Some environments as one Stable-Baselines3 `VecEnv`: stepped one by one.
+    def vector(self, config: Any, num_envs: int, **arguments: Any) -> Any:
+        """Some environments as one vector of Gymnasium's in `SAME_STEP` mode, here stepped one by one.
+
+        Args:
+            config: their `EnvConfig`.
+            num_envs: how many, >= 1.
+            **arguments: what else the vector takes, such as `max_episode_steps`.
 
         Raises:
-            ValueError: see `make`; or observations are no vector.
+            ValueError: see `make`.
         """
-        stepped = importlib.import_module("codrl_mj.foreign.vector")
-        return stepped.make_sb3_vec_env(functools.partial(self.make, config), num_envs)
+        serial = importlib.import_module("codrl_mj.envs.serial")
+        return serial.SerialVectorEnv(num_envs, functools.partial(self.make, config), **arguments)
 
     # -- what is known without making one --------------------------------------------------------------------
 
@@ -94,15 +99,10 @@ class World(abc.ABC):
         """What `find_world` finds it by in any process."""
         return reference_of(self, type(self).__module__)
 
-    @property
-    def modules(self) -> set[str]:
-        """Names of the modules that decide on what it does."""
-        return {type(self).__module__}
-
-    def models(self, options: Any) -> set[Path]:
-        """Model files that decide on what it does: those among its options; what else it reads is not known."""
+    def code(self, options: Any) -> set[str | Path]:
+        """Modules, by name, and files that decide on what it does: those among its options; others are not known."""
         given = (Path(value) for value in self.changed(options).values() if isinstance(value, str))
-        return {path.resolve() for path in given if path.is_file()}
+        return {type(self).__module__, *(path.resolve() for path in given if path.is_file())}
 
     def options(self, given: Any) -> Any:
         """Options of its own, as a configuration keeps them: here keyword arguments that JSON can hold.

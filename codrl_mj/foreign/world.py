@@ -3,6 +3,7 @@
 import functools
 import json
 import re
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -53,10 +54,10 @@ class GymnasiumWorld(World):
         """Its own time limit, if it has one."""
         return () if self.time_limit is None else ("max_episode_steps",)
 
-    @property
-    def modules(self) -> set[str]:
-        """Of what makes it, and the one that registers it."""
-        return {name for name in (getattr(self._creator, "__module__", ""), self.name.rpartition(":")[0]) if name}
+    def code(self, options: Any) -> set[str | Path]:
+        """Modules of what makes it, and the one that registers it; files among its options."""
+        modules = getattr(self._creator, "__module__", ""), self.name.rpartition(":")[0]
+        return super().code(options) | {name for name in modules if name}
 
     @property
     def _creator(self) -> Any:

@@ -169,11 +169,10 @@ def provenance(config: TrainConfig) -> dict[str, Any]:
 
     The code is ours, and the files of task, model, agent and family of actuators where these are somebody's own.
     """
-    modules = {*config.env.modules, type(config.agent).__module__}
     versions = {package: importlib.metadata.version(package) for package in _PACKAGES}
     return {
         "versions": {"python": platform.python_version(), **versions},
-        "code": _code_digest(*sorted(modules), *sorted(config.env.models)),
+        "code": _code_digest(*sorted(config.env.code | {type(config.agent).__module__}, key=str)),
     }
 
 

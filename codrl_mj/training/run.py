@@ -80,12 +80,13 @@ def train(
         raise ValueError(f"wandb = {wandb!r}: Weights & Biases is not installed: pip install wandb")
     import torch
 
+    from codrl_mj.envs.sb3 import make_sb3_vec_env
     from codrl_mj.training import curve  # noqa: F401 - what is missing is missed now and not in the end
     from codrl_mj.training.watcher import LearningEnded, Watcher
 
     torch.set_num_threads(1)  # networks this small run several times slower on two
     with _taking(out, exists), stopping(signal.SIGINT, signal.SIGTERM) as stop:
-        envs = config.env.make_sb3(config.num_envs)
+        envs = make_sb3_vec_env(config.env, config.num_envs)
         with contextlib.closing(envs), _reporting_to(wandb, out, config):
             model = config.agent.make_model(envs, config.seed)
             watcher = Watcher(config, out, stop, on_progress, tensorboard)

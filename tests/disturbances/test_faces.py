@@ -108,13 +108,14 @@ def test_dm_control_saves_commands_and_loads_with_the_state():
     actions = np.random.default_rng(0).uniform(-2, 2, (20, 1)).astype(np.float32)
     for action in actions[:9]:
         env.step(action)
-    other.physics.set_state(env.physics.get_state())
+    other.restore(env.snapshot())
     for action in actions[9:]:
         ours, theirs = env.step(action), other.step(action)
         for name, value in ours.observation.items():
             np.testing.assert_array_equal(theirs.observation[name], value)
-    with pytest.raises(ValueError, match="physics_state has shape"):
-        env.physics.set_state(env.physics.get_state()[:-1])
+    saved = env.snapshot()
+    with pytest.raises(ValueError, match=r"snapshot\['disturbances'\] is of shape"):
+        env.restore(saved | {"disturbances": saved["disturbances"][:-1]})
 
 
 def test_stable_baselines_gets_them_too():
