@@ -27,7 +27,8 @@ ALLOWED = {
     "envs.distributions": {"fields"},
     "envs.config": {"actuators", "disturbances", "envs.distributions", "fields", "tasks", "tasks.assets"},
     "envs": {
-        *("actuators", "disturbances", "engine", "envs.config", "envs.distributions", "fields", "physics", "tasks"),
+        *("actuators", "disturbances", "engine", "envs.config", "envs.distributions", "fields", "physics", "specs"),
+        "tasks",
     },
     "foreign": {
         *("actuators", "disturbances", "engine", "envs", "envs.config", "envs.distributions", "fields", "physics"),

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.actuators import IDEAL, actuator_from_mapping, mapping_of, trusting
-from codrl_mj.envs.recording import PhysicsRecorder, Recorder
+from codrl_mj.envs.recording import Recorder
 from codrl_mj.runs.files import writing
 from codrl_mj.runs.policies import Policy
 from codrl_mj.tasks import find_task
@@ -178,7 +178,7 @@ class _Recording:
         self._recorder: Recorder = env.get_wrapper_attr("recorder")
         self.observations = [env.reset(seed=seed)[0]]
         self._states = [self._recorder.state()]
-        self._first_speeds = self._recorder.speeds()
+        self._first_speeds = None if self._recorder.speeds is None else self._recorder.speeds()
         self._actions: list[Any] = []
         self._rewards: list[float] = []
         self._traces: list[np.ndarray] = []
@@ -198,7 +198,7 @@ class _Recording:
 
     def episode(self) -> Episode:
         """What has happened."""
-        recorder, of_others = self._recorder, not isinstance(self._recorder, PhysicsRecorder)
+        recorder, of_others = self._recorder, self._first_speeds is not None
         said = self._signals[-1].get("is_success", self._signals[-1].get("success"))
         return Episode(
             time=recorder.step_duration * np.arange(1, len(self._rewards) + 1),
@@ -212,7 +212,7 @@ class _Recording:
             actuator=recorder.actuator,
             command=recorder.command,
             motors=recorder.motors if len(recorder.motors) > 1 else (),
-            first_speeds=self._first_speeds if of_others else None,
+            first_speeds=self._first_speeds,
             succeeded=bool(said) if of_others and said is not None else None,
         )
 

@@ -20,7 +20,7 @@ from codrl_mj.physics.disturber import disturber
 from codrl_mj.physics.mjcf import flags_with_friction, needed_callbacks, task_model
 from codrl_mj.physics.mujoco_single import wiring
 from codrl_mj.physics.stepping import NOISE_KEY, TORQUE
-from codrl_mj.physics.variation import Variation, additions_of, write_fields
+from codrl_mj.physics.variation import Variation, additions_of, bare_model, write_fields
 from codrl_mj.tasks import Task
 
 
@@ -73,7 +73,8 @@ class MujocoBatchPhysics:
         every, additions = np.arange(self.num_envs), additions_of(actuators)
         self.set_actuators(every, actuators)
         if (additions != additions[0]).any():
-            mounting = Variation(task.name, (), joint=joint, mounting=True)
+            motors = [int(one.actuator) for one in self._wiring]
+            mounting = Variation(bare_model(task.name, joint), motors=motors, mounting=True)
             self.set_model(every, mounting.fields(np.empty((self.num_envs, 0)), additions))
 
     def _make_batch(self) -> None:
