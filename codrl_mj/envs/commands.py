@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel, Command, Ideal
-from codrl_mj.disturbances import Disturbances
+from codrl_mj.disturbances import OFF, Disturbances
 from codrl_mj.physics.disturber import Disturber
 from codrl_mj.specs import ON_JOINT
 from codrl_mj.tasks import Task
@@ -210,35 +210,70 @@ class TaskCommands:
 
 
 class ControlCommands:
-    """Actions in the units of the motors' commands, with their limits; actions of other actuators are as they were."""
+    """From actions to the controls of anybody's model: units and limits of commands, and disturbances on their way.
 
-    def __init__(self, model: mujoco.MjModel, space: spaces.Space, commands: Mapping[int, Command]) -> None:
-        """Let the motors' controls, the model's `actuator_ctrlrange`, reach as far as the commands do.
+    Actions that are not of our motors are as they were. Disturbances act once an environment step, which has the place
+    of the integration step; of a plain motor on its force [N or N*m] before the gear, of others on the control itself.
+    """
 
-        `space` has the environment's own actions, `commands` what one means to an actuator, by its index.
+    def __init__(
+        self,
+        data: mujoco.MjData,
+        actions: spaces.Space,
+        motors: Mapping[int, Command | None],
+        disturbances: Disturbances,
+        step_duration: float | None,
+    ) -> None:
+        """Let the motors' controls, the model's `actuator_ctrlrange`, reach as far as their commands do.
+
+        `actions` has the environment's own, `motors` what one means to an actuator, by its index: None where it is the
+        environment's own. An environment step takes `step_duration` [s], if that is known.
 
         Raises:
-            ValueError: actions are not the model's controls, an actuator is not a plain motor, or has no limit.
+            ValueError: actions are not the model's controls, an actuator is not a plain motor, or has no limit; or
+                disturbances need a duration, or a joint to act on.
         """
-        if not isinstance(space, spaces.Box) or space.shape != (model.nu,):
-            raise ValueError(
-                f"action: the environment's actions are {space}, not the {model.nu} controls of its model; use "
-                "action='force', its own"
-            )
+        self.action_space, model, indices = actions, data.model, list(motors)
+        self._scales: np.ndarray | None = None
+        self._disturber: Disturber | None = None
+        meant = {index: command for index, command in motors.items() if command is not None}
+        remedies = {"action": "use action='force', its own"} if meant else {}
+        remedies |= {} if disturbances == OFF else {"disturbances": "they are what can be disturbed"}
+        for name, remedy in remedies.items():
+            if not isinstance(actions, spaces.Box) or actions.shape != (model.nu,):
+                raise ValueError(
+                    f"{name}: the environment's actions are {actions}, not the {model.nu} controls of its "
+                    f"model; {remedy}"
+                )
+        if meant:
+            self._command(model, meant)
+        if disturbances == OFF:
+            return
+        if step_duration is None:
+            raise ValueError("disturbances: the environment has no dt, the duration of its steps [s]; give it one")
+        self._data, self._pulses = data, disturbances.random
+        self._controls = places = model.actuator_ctrladr[indices]
+        limited = model.actuator_ctrllimited[places].astype(bool)
+        largest = np.where(limited, np.abs(model.actuator_ctrlrange[places]).max(axis=1), np.inf)
+        self._gains = np.array([_plain_gain(model, index) or 1.0 for index in indices])
+        self._disturber = Disturber(disturbances, step_duration, largest * np.abs(self._gains), 1)
+        self._dofs = [_dof(model, index) for index in indices] if self._pulses else []
+
+    def _command(self, model: mujoco.MjModel, meant: Mapping[int, Command]) -> None:
+        """Take units and limits of commands."""
+        space: Any = self.action_space
         self._scales = np.ones(model.nu)
         low, high = space.low.astype(np.float64), space.high.astype(np.float64)
-        for index, command in commands.items():
-            control, gain = model.actuator_ctrladr[index], plain_gain(model, index)
-            name = model.actuator(index).name or f"actuator {index}"
+        for index, command in meant.items():
+            control, gain = model.actuator_ctrladr[index], _plain_gain(model, index)
+            name, arm = model.actuator(index).name or f"actuator {index}", command.actuator.arm_radius
             if gain is None:
                 raise ValueError(
                     f"{name}: is no plain motor, whose force is its control times a gain: use action='force', the "
                     "environment's own"
                 )
-            actuator, torque = command.actuator, command.torque_per_unit
-            arm = actuator.arm_radius
-            self._scales[control] = scale = torque * arm if actuator.MOTION else torque / (arm * gain)
-            limit = command.limit
+            torque, limit = command.torque_per_unit, command.limit
+            self._scales[control] = scale = torque * arm if command.actuator.MOTION else torque / (arm * gain)
             if limit is None and model.actuator_ctrllimited[control]:
                 limit = np.abs(model.actuator_ctrlrange[control]).max() / abs(scale)
             if limit is None or not np.isfinite(limit):
@@ -250,62 +285,30 @@ class ControlCommands:
             model.actuator_ctrllimited[control] = True
             model.actuator_ctrlrange[control] = -limit * abs(scale), limit * abs(scale)
         self.action_space = spaces.Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype.type)
-        """Per motor +- the largest command."""
-
-    def controls(self, action: np.ndarray) -> np.ndarray:
-        """The environment's own action for one of `action_space`, float64."""
-        if np.shape(action) != self.action_space.shape:
-            raise ValueError(f"action has shape {np.shape(action)}: must be {self.action_space.shape}")
-        return np.asarray(action, dtype=np.float64) * self._scales
-
-
-class CommandsWay:
-    """Disturbances of the motors, once an environment step, which has the place of the integration step."""
-
-    def __init__(
-        self,
-        data: mujoco.MjData,
-        motors: Sequence[int],
-        actions: spaces.Space,
-        disturbances: Disturbances,
-        step_duration: float | None,
-    ) -> None:
-        """Take the units: of a plain motor its force [N or N*m] before the gear, of others the control's own.
-
-        `motors` are the indices of their actuators, `actions` the environment's own, `step_duration` [s].
-
-        Raises:
-            ValueError: there is no duration, actions are not the model's controls, or there are load pulses, and a motor
-                drives no joint.
-        """
-        if step_duration is None:
-            raise ValueError("disturbances: the environment has no dt, the duration of its steps [s]; give it one")
-        model, indices = data.model, list(motors)
-        if not isinstance(actions, spaces.Box) or actions.shape != (model.nu,):
-            raise ValueError(
-                f"disturbances: the environment's actions are {actions}, not the {model.nu} controls of its model, "
-                "which are what can be disturbed"
-            )
-        self._data, self._pulses = data, disturbances.random
-        self._controls = controls = model.actuator_ctrladr[indices]
-        limited = model.actuator_ctrllimited[controls].astype(bool)
-        largest = np.where(limited, np.abs(model.actuator_ctrlrange[controls]).max(axis=1), np.inf)
-        self._gains = np.array([plain_gain(model, index) or 1.0 for index in indices])
-        self._disturber = Disturber(disturbances, step_duration, largest * np.abs(self._gains), 1)
-        self._dofs = [_dof(model, index) for index in indices] if self._pulses else []
 
     @property
-    def memory(self) -> np.ndarray:
-        """The commands on their way and the pulses to come, a live array."""
-        return self._disturber.memory
+    def memory(self) -> dict[str, np.ndarray]:
+        """The commands on their way and the pulses to come, a live array, if there are disturbances."""
+        return {} if self._disturber is None else {"disturbances": self._disturber.memory}
 
     def begin(self, key: float) -> None:
         """Forget everything at the start of an episode with this key of random numbers."""
-        self._disturber.reset(np.zeros(1, dtype=int), key)
-        self._data.qfrc_applied[self._dofs] = 0.0
+        if self._disturber is not None:
+            self._disturber.reset(np.zeros(1, dtype=int), key)
+            self._data.qfrc_applied[self._dofs] = 0.0
 
-    def controls(self, action: np.ndarray) -> np.ndarray:
-        """What arrives of an action in this step, float64; the loads of the step go to the joints."""
+    def controls(self, action: Any) -> Any:
+        """The environment's own action for one of `action_space`, as it arrives in this step; loads go to the joints.
+
+        Raises:
+            ValueError: the action has not the shape of the action space.
+        """
+        if self._scales is not None:
+            if np.shape(action) != self.action_space.shape:
+                raise ValueError(f"action has shape {np.shape(action)}: must be {self.action_space.shape}")
+            action = np.asarray(action, dtype=np.float64) * self._scales
+        if self._disturber is None:
+            return action
         arrived = np.array(action, dtype=np.float64)
         wanted = arrived[self._controls] * self._gains
         arrived[self._controls] = self._disturber.commands(wanted[np.newaxis])[0] / self._gains
@@ -325,7 +328,7 @@ def _dof(model: mujoco.MjModel, index: int) -> int:
     return int(model.jnt_dofadr[model.actuator_trnid[index, 0]])
 
 
-def plain_gain(model: mujoco.MjModel, index: int) -> float | None:
+def _plain_gain(model: mujoco.MjModel, index: int) -> float | None:
     """The gain of an actuator whose force is gain*control; None where it is more than that."""
     kinds = (model.actuator_gaintype[index], model.actuator_biastype[index], model.actuator_dyntype[index])
     plain = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtDyn.mjDYN_NONE)

@@ -10,11 +10,11 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel, Command, Family, Inputs, parameters_type
 from codrl_mj.actuators.noise import LARGEST_KEY
-from codrl_mj.disturbances import OFF, Disturbances
+from codrl_mj.disturbances import Disturbances
 from codrl_mj.engine.families import signals_at
 from codrl_mj.engine.plugin import PLUGIN_HEAD
 from codrl_mj.engine.reading import Readout, bring_to_rest, slots
-from codrl_mj.envs.commands import CommandsWay, ControlCommands, fixed_by
+from codrl_mj.envs.commands import ControlCommands, fixed_by
 from codrl_mj.envs.distributions import flat
 from codrl_mj.envs.randomization import Draws, Randomization, put_into
 from codrl_mj.envs.views import named_signals, sensor_names
@@ -63,11 +63,11 @@ class Motors:
         meant = {index: one for pattern, one in commands.items() for index in matched_by(pattern, names)}
         nominal = {index: meant[index].actuator if index in meant else one for index, one in self.present.items()}
         self._slots = list(slots(data, self.present).values())
-        self._commands = ControlCommands(model, actions, meant) if action != "force" else None
-        self.action_space = self._commands.action_space if self._commands else actions
-        self._way = None
-        if disturbances != OFF:
-            self._way = CommandsWay(data, list(self.present), actions, disturbances, step_duration)
+        asked = {index: meant.get(index) if action != "force" else None for index in self.present}
+        self._commands = ControlCommands(data, actions, asked, disturbances, step_duration)
+        self.action_space = self._commands.action_space
+        self.controls = self._commands.controls
+        """(one of `action_space`) -> the environment's own action, as it arrives."""
         self.draws: Draws | None = None
         if randomize is not None:
             fixed = [fixed_by(meant[index], action) if index in meant else {} for index in nominal]
@@ -117,18 +117,7 @@ class Motors:
         key = generator.random() * LARGEST_KEY if self._random else 0.0  # a whole number, exactly
         for at, (slot, motor) in enumerate(zip(self._slots, self.present.values(), strict=True)):
             bring_to_rest(slot, self.data.time, key + at if motor.random else 0.0)
-        if self._way is not None:
-            self._way.begin(key)
-
-    def controls(self, action: Any) -> Any:
-        """The environment's own action for one of `action_space`, as it arrives.
-
-        Raises:
-            ValueError: the action has not the shape of the action space.
-        """
-        if self._commands is not None:
-            action = self._commands.controls(action)
-        return action if self._way is None else self._way.controls(action)
+        self._commands.begin(key)
 
     def signals(self) -> dict[str, Any]:
         """The motors' signals after the last step, as `info` has them, units as `Readout` has them."""
@@ -178,15 +167,15 @@ class Motors:
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """What it remembers besides the simulation's state: commands on their way, and draws."""
-        found = {} if self._way is None else {"disturbances": self._way.memory.copy()}
+        found = {name: memory.copy() for name, memory in self._commands.memory.items()}
         return found | ({} if self.draws is None else self.draws.snapshot())
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
         """Bring that back, motors and model too; to be followed by a restoring of the simulation."""
         if self.draws is not None:
             self.draws.restore(snapshot)
-        if self._way is not None:
-            self._way.memory[:] = snapshot["disturbances"]
+        for name, memory in self._commands.memory.items():
+            memory[:] = snapshot[name]
 
 
 def motor_names(model: mujoco.MjModel, motors: Iterable[int]) -> tuple[str, ...]:

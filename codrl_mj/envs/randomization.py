@@ -87,38 +87,40 @@ class Randomization:
             ValueError: an unknown field (the nearest is suggested), one that cannot be drawn here, or impossible
                 bounds; the message names field, value and bound.
         """
-        simulated, indices = list(motors.values()), list(motors)
-        kinds = [Kind(family, _places(simulated, family), {}) for family in dict.fromkeys(map(_family, simulated))]
-        types: dict[str, type] = {}
-        turned, added = [], []
-        for column, (path, distribution) in enumerate(distributions.items()):
+        indices, simulated = list(motors), list(motors.values())
+        matched: dict[str, list[int]] = {}
+        for path, distribution in distributions.items():
             pattern, field = split_path(path)
-            matched = _matched(pattern, field, model, indices)
-            label = f"randomize[{pattern!r}][{field!r}]" if pattern else f"randomize[{field!r}]"
             try:
-                _check_known(field, [simulated[at] for at in matched], model, whose)
-                if not matched:
+                own = _matched(pattern, field, model, indices)
+                _check_known(field, [simulated[at] for at in own], model, whose)
+                if any(split_path(other)[1] == field and {*own} & {*those} for other, those in matched.items()):
+                    raise ValueError("it is drawn by another pattern, too")
+                if not own:
                     _check_factor(field, distribution)
-                for at in matched:
+                for at in own:
                     _check(field, distribution, simulated[at], fixed[at])
-                    if _follows(lambda one: one.additions.friction, simulated[at], field):
-                        _check_friction(model, indices[at])
+                    _check_friction(field, simulated[at], model, indices[at])
             except ValueError as error:
-                raise ValueError(f"{label} = {distribution}: {error}") from None
-            types[path] = _kind(_family(simulated[matched[0]]), field) if matched else float
-            for kind in kinds if matched else ():
-                place, own = field_paths(kind.family).index(field), np.flatnonzero(np.isin(kind.motors, matched))
-                if any(place == other and np.isin(own, those).any() for other, those in kind.drawn.values()):
-                    raise ValueError(f"{label} = {distribution}: it is drawn by another pattern, too")
-                if len(own):
-                    kind.drawn[column] = place, own
-            turned += [path for at in matched if _follows(lambda one: one.arm_radius, simulated[at], field)]
-            added += [path for at in matched if _follows(lambda one: one.additions, simulated[at], field)]
-        of_model = [path for path in distributions if path.startswith(MODEL)]
-        in_model = (*of_model, *dict.fromkeys(added))
-        variation = Variation(model, of_model, indices, mounting=bool(added)) if in_model else None
-        mounting = bool(turned or added)
-        return cls(distributions, types, tuple(kinds), timestep, allow_unstable, variation, in_model, mounting)
+                label = f"[{pattern!r}]" * bool(pattern) + f"[{field!r}]"
+                raise ValueError(f"randomize{label} = {distribution}: {error}") from None
+            matched[path] = own
+        turned, added = (
+            [path for path, own in matched.items() if any(_follows(of, simulated[at], path) for at in own)]
+            for of in (lambda one: one.arm_radius, lambda one: one.additions)
+        )
+        of_model = [path for path, own in matched.items() if not own]
+        in_model = (*of_model, *added)
+        return cls(
+            distributions,
+            {path: _kind(type(simulated[own[0]]), path) if own else float for path, own in matched.items()},
+            _kinds(matched, simulated),
+            timestep,
+            allow_unstable,
+            Variation(model, of_model, indices, mounting=bool(added)) if in_model else None,
+            in_model,
+            bool(turned or added),
+        )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -347,12 +349,19 @@ def numbers_of(family: Family, fields: np.ndarray) -> np.ndarray:
     return fields[:, :, [paths.index(path) for path in parameter_paths(family).values()]]
 
 
-def _family(motor: ActuatorModel) -> Family:
-    return type(motor)
-
-
-def _places(motors: Sequence[ActuatorModel], family: Family) -> np.ndarray:
-    return np.array([at for at, one in enumerate(motors) if type(one) is family])
+def _kinds(matched: Mapping[str, Sequence[int]], motors: Sequence[ActuatorModel]) -> tuple[Kind, ...]:
+    """The motors by their families, of which each path is of those that it matched."""
+    kinds: list[Kind] = []
+    families: list[Family] = [type(one) for one in motors]
+    for family in dict.fromkeys(families):
+        own = np.array([at for at, one in enumerate(families) if one is family])
+        drawn = {
+            column: (field_paths(family).index(split_path(path)[1]), np.flatnonzero(np.isin(own, those)))
+            for column, (path, those) in enumerate(matched.items())
+            if {*own.tolist()} & {*those}
+        }
+        kinds.append(Kind(family, own, drawn))
+    return tuple(kinds)
 
 
 def _matched(pattern: str, field: str, model: mujoco.MjModel, indices: Sequence[int]) -> list[int]:
@@ -366,7 +375,8 @@ def _matched(pattern: str, field: str, model: mujoco.MjModel, indices: Sequence[
 
 def _check_known(field: str, motors: Sequence[ActuatorModel], model: mujoco.MjModel, whose: str) -> None:
     """Refuse a name that is no field of all these motors, nor of the model."""
-    of_each = [field_paths(Actuator if isinstance(one, Ideal) else _family(one)) for one in motors]
+    families: list[Family] = [Actuator if isinstance(one, Ideal) else type(one) for one in motors]
+    of_each = [field_paths(family) for family in families]
     known = [path for path in (of_each[0] if of_each else ()) if all(path in paths for paths in of_each)]
     known += variable(model)
     if field not in known:
@@ -387,7 +397,7 @@ def _check(field: str, distribution: Distribution, motor: ActuatorModel, fixed: 
         raise ValueError("the ideal actuator has no motor and no controller to draw; choose another actuator")
     if field in fixed:
         raise ValueError(f"{fixed[field]}; draw it with action='force'")
-    kind, words = _kind(_family(motor), field), options_of(type(motor), field)
+    kind, words = _kind(type(motor), field), options_of(type(motor), field)
     if words:
         if not isinstance(distribution, Choice) or any(value not in range(len(words)) for value in distribution.values):
             numbered = ", ".join(f"{place} for {word}" for place, word in enumerate(words))
@@ -401,29 +411,29 @@ def _check(field: str, distribution: Distribution, motor: ActuatorModel, fixed: 
         motor.replaced({field: value})  # the field's own bounds
 
 
-def _check_friction(model: mujoco.MjModel, index: int) -> None:
+def _check_friction(field: str, motor: ActuatorModel, model: mujoco.MjModel, index: int) -> None:
     """Refuse friction of a motor that drives nothing which could have it."""
-    if mounts_of(model, index)[2] is None:
+    if mounts_of(model, index)[2] is None and _follows(lambda one: one.additions.friction, motor, field):
         raise ValueError(
             f"{model.actuator(index).name or f'actuator {index}'} drives neither a joint nor a tendon, which the "
             "friction that is drawn for its motor would need; draw other fields"
         )
 
 
-def _kind(family: Family, field: str) -> type:
+def _kind(family: Family, path: str) -> type:
     """What a field of a family holds: float, int or bool."""
     value: Any = family()
-    for part in field.split("."):
+    for part in split_path(path)[1].split("."):
         value = getattr(value, part, None)
     return type(value) if isinstance(value, int) else float
 
 
-def _follows(of: Callable[[ActuatorModel], Any], motor: ActuatorModel, field: str) -> bool:
+def _follows(of: Callable[[ActuatorModel], Any], motor: ActuatorModel, path: str) -> bool:
     """Whether something of a motor depends on a field: at the motor's values, or where no other field is 0."""
-    family = _family(motor)
-    paths = field_paths(family)
-    for values in (field_values(motor), (2.0,) * len(paths)):
-        other = [value + (path == field) for path, value in zip(paths, values, strict=True)]
+    family: Family = type(motor)
+    fields, field = field_paths(family), split_path(path)[1]
+    for values in (field_values(motor), (2.0,) * len(fields)):
+        other = [value + (name == field) for name, value in zip(fields, values, strict=True)]
         if of(unchecked(family, values)) != of(unchecked(family, other)):
             return True
     return False

@@ -389,6 +389,19 @@ def test_a_drawn_motor_is_the_motor_that_it_would_be_from_the_first():
         np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=0.0, err_msg=field)
 
 
+def test_motors_of_several_families_are_drawn_each_by_its_fields():
+    actuators = {"b.*": MAXON[".*"], "f.*": "lag"}
+    draws = {"b.*": {"motor.resistance": "uniform(0.6, 1.2)"}, "f.*": {"time_constant": "uniform(0.01, 0.02)"}}
+    env = codrl_mj.make("HalfCheetah-v5", actuators, randomize=draws)
+    drawn = env.reset(seed=0)[1]["randomization"]
+    motors = list(env.motors.values())
+    assert {one.motor.resistance for one in motors[:3]} == {*drawn["b.*"].values()}
+    assert {one.time_constant for one in motors[3:]} == {*drawn["f.*"].values()}
+    assert list(codrl_mj.motors(env.unwrapped.model).values())[3:] == motors[3:]
+    with pytest.raises(ValueError, match=r"unknown field 'motor\.resistance'"):  # not of every motor
+        codrl_mj.make("HalfCheetah-v5", actuators, randomize={"motor.resistance": "uniform(0.6, 1.2)"})
+
+
 def test_paths_draw_what_patterns_with_their_fields_do():
     fields = {"time_constant": "uniform(0.01, 0.02)"}
     nested = codrl_mj.make("Hopper-v5", {".*": "lag"}, randomize={".*": fields, "model.gravity": "uniform(0.9, 1.1)"})
