@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -29,17 +29,6 @@ Uniforms = Callable[[np.ndarray, int], np.ndarray]
 """(simulations (m,), count) -> the next `count` numbers in [0, 1) of each of their generators, shape (m, count)."""
 
 
-class Kind(NamedTuple):
-    """The motors of one family, and what is drawn of them."""
-
-    family: Family
-    """Theirs."""
-    motors: np.ndarray
-    """Which of a simulation's motors they are."""
-    drawn: dict[int, tuple[int, np.ndarray]]
-    """Column of the drawn values -> the column of `field_paths` that it is, and for which of these motors."""
-
-
 @dataclasses.dataclass(frozen=True)
 class Randomization:
     """What is drawn at a reset, and what it does to motors and model; made by `build`."""
@@ -48,8 +37,10 @@ class Randomization:
     """Path, as `split_path` takes it apart -> what it is drawn from, in this order."""
     types: Mapping[str, type]
     """Path -> float, int or bool."""
-    kinds: tuple[Kind, ...]
-    """The motors by their families."""
+    families: tuple[Family, ...]
+    """Of each motor of a simulation."""
+    columns: tuple[Mapping[int, str], ...]
+    """Of each motor: column of the drawn values -> the field that it is."""
     timestep: float
     """Integration step [s], at which drawn motors must be stable."""
     allow_unstable: bool
@@ -114,7 +105,11 @@ class Randomization:
         return cls(
             distributions,
             {path: _kind(type(simulated[own[0]]), path) if own else float for path, own in matched.items()},
-            _kinds(matched, simulated),
+            tuple(map(type, simulated)),
+            tuple(
+                {column: split_path(path)[1] for column, (path, own) in enumerate(matched.items()) if at in own}
+                for at in range(len(simulated))
+            ),
             timestep,
             allow_unstable,
             Variation(model, of_model, indices, mounting=bool(added)) if in_model else None,
@@ -130,13 +125,14 @@ class Randomization:
     @property
     def draws_actuator(self) -> bool:
         """Whether a field of a motor is drawn, and so its stability must be checked at every draw."""
-        return any(kind.drawn for kind in self.kinds)
+        return any(self.columns)
 
     @property
     def random(self) -> bool:
         """Whether motors may need an episode's key of random numbers for what is drawn of them."""
-        drawn = ((kind.family, field) for kind in self.kinds for field, _ in kind.drawn.values())
-        return any(field_paths(family)[field] in family.RANDOM for family, field in drawn)
+        return any(
+            {*columns.values()} & {*one.RANDOM} for one, columns in zip(self.families, self.columns, strict=True)
+        )
 
     def draw(self, random: Uniforms, nominal: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Draw for m simulations; whole sets are redrawn until their motors are stable.
@@ -164,7 +160,7 @@ class Randomization:
             rejected[pending] += 1
             if rejected[pending[0]] == LIMIT:
                 last = dict(zip(self.names, values[pending[0]].tolist(), strict=True))
-                reason = self._reason([each[unstable][0] for each in fields])
+                reason = self._reason([each[unstable] for each in fields])
                 raise ValueError(
                     f"randomize: {LIMIT} draws in a row have an unstable current loop at a step of "
                     f"{self.timestep:g} s; the last was {last}{reason}. Narrow the bounds, shorten the step, or pass "
@@ -173,63 +169,43 @@ class Randomization:
 
     def _unstable(self, fields: Sequence[np.ndarray]) -> np.ndarray:
         """Which simulations have a motor that is unstable, shape (m,)."""
-        found = np.zeros(len(fields[0]), dtype=bool)
-        for kind, each in zip(self.kinds, fields, strict=True):
-            if kind.drawn:
-                numbers = numbers_of(kind.family, each)
-                radii = kind.family.instability(numbers.reshape(-1, numbers.shape[-1]), self.timestep)
-                found |= (~(radii < 1.0)).reshape(numbers.shape[:2]).any(axis=1)
-        return found
+        unstable = np.zeros(len(fields[0]), dtype=bool)
+        for family, columns, each in zip(self.families, self.columns, fields, strict=True):
+            if columns:
+                unstable |= ~(family.instability(numbers_of(family, each), self.timestep) < 1.0)
+        return unstable
 
     def _reason(self, fields: Sequence[np.ndarray]) -> str:
-        """What the first refused motor of a simulation says of itself."""
-        for kind, each in zip(self.kinds, fields, strict=True):
-            for numbers in numbers_of(kind.family, each[np.newaxis])[0]:
-                try:
-                    kind.family.from_numbers(numbers).check(self.timestep)
-                except ValueError as error:
-                    return f": {error}"
+        """What the first refused motor of the first simulation says of itself."""
+        for family, each in zip(self.families, fields, strict=True):
+            try:
+                family.from_numbers(numbers_of(family, each)[0]).check(self.timestep)
+            except ValueError as error:
+                return f": {error}"
         return ""
 
     def fields_of(self, motors: Sequence[Sequence[ActuatorModel]]) -> list[np.ndarray]:
-        """The fields of the motors of m simulations, of each family (m, n, f), columns as in `field_paths`."""
-        return [np.array([[field_values(each[at]) for at in kind.motors] for each in motors]) for kind in self.kinds]
+        """The fields of the motors of m simulations, for each motor (m, f), columns as in `field_paths`."""
+        return [np.array(list(map(field_values, each))) for each in zip(*motors, strict=True)]
 
     def drawn(self, nominal: Sequence[np.ndarray], values: np.ndarray) -> list[np.ndarray]:
         """Motors' fields, as `fields_of` has them, with drawn values (m, k) in place of theirs; NaN leaves them."""
         fields = [each.copy() for each in nominal]
-        for kind, each in zip(self.kinds, fields, strict=True):
-            for column, (field, own) in kind.drawn.items():
-                new = values[:, column, np.newaxis]
-                each[:, own, field] = np.where(np.isnan(new), each[:, own, field], new)
+        for family, columns, each in zip(self.families, self.columns, fields, strict=True):
+            for column, field in columns.items():
+                place, new = field_paths(family).index(field), values[:, column]
+                each[:, place] = np.where(np.isnan(new), each[:, place], new)
         return fields
 
     def replaced(self, motors: Sequence[ActuatorModel], values: np.ndarray) -> tuple[ActuatorModel, ...]:
         """The motors of one simulation with its drawn values (k,) in place of theirs."""
-        changes: list[dict[str, float]] = [{} for _ in motors]
-        for kind in self.kinds:
-            for column, (field, own) in kind.drawn.items():
-                for at in kind.motors[own]:
-                    changes[at][field_paths(kind.family)[field]] = float(values[column])
+        changes = ({field: float(values[column]) for column, field in columns.items()} for columns in self.columns)
         return tuple(one.replaced(new) for one, new in zip(motors, changes, strict=True))
 
     def mounted(self, fields: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """The arms [m] of motors with these fields, shape (m, n), and what they add to the model, (m, n, 3)."""
-        count = sum(len(kind.motors) for kind in self.kinds)
-        motors: list[list[Any]] = [[None] * count for _ in fields[0]]
-        for kind, each in zip(self.kinds, fields, strict=True):
-            for row, own in zip(motors, each.tolist(), strict=True):
-                for at, values in zip(kind.motors, own, strict=True):
-                    row[at] = unchecked(kind.family, values)
-        return mounting_of(motors)
-
-    def report(self, values: np.ndarray, rejected: int) -> dict[str, Any]:
-        """What `info` says of a draw: the values (k,) by field, those of a pattern together, and the rejections."""
-        found: dict[str, Any] = {}
-        for path, value in zip(self.names, values, strict=True):
-            pattern, field = split_path(path)
-            (found.setdefault(pattern, {}) if pattern else found)[field] = self.types[path](value)
-        return found | {"rejected": int(rejected)}
+        rows = zip(*(each.tolist() for each in fields), strict=True)
+        return mounting_of([list(map(unchecked, self.families, each)) for each in rows])
 
 
 class Draws:
@@ -270,13 +246,12 @@ class Draws:
         return tuple(nominal) if undrawn else self.randomization.replaced(nominal, self._values[row])
 
     def parameters(self, rows: np.ndarray) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-        """Of some simulations' motors: numbers, of each family (m, n, p), arms [m] (m, n), additions (m, n, 3)."""
+        """Of some simulations' motors: the numbers of each (m, p), arms [m] (m, n), and additions (m, n, 3)."""
         fields = self.randomization.drawn([each[rows] for each in self._nominal], self._values[rows])
         arms, additions = (each[rows] for each in self._mounting)
         if self.randomization.mounting:
             arms, additions = self.randomization.mounted(fields)
-        numbers = [numbers_of(kind.family, each) for kind, each in zip(self.randomization.kinds, fields, strict=True)]
-        return numbers, arms, additions
+        return list(map(numbers_of, self.randomization.families, fields)), arms, additions
 
     def model_fields(
         self, rows: np.ndarray, additions: np.ndarray | None = None, drawn: bool = False
@@ -290,9 +265,14 @@ class Draws:
         return variation.fields(self._values[np.ix_(rows, columns)], additions, drawn)
 
     def report(self, row: int = 0) -> dict[str, Any]:
-        """What `info` says of a simulation's draw; nothing before its first."""
-        values = self._values[row]
-        return {} if np.isnan(values).any() else self.randomization.report(values, self._rejected[row])
+        """What `info` says of a simulation's draw: values by field, those of a pattern together; nothing before one."""
+        found: dict[str, Any] = {}
+        for (path, kind), value in zip(self.randomization.types.items(), self._values[row], strict=True):
+            pattern, field = split_path(path)
+            if np.isnan(value):
+                return {}
+            (found.setdefault(pattern, {}) if pattern else found)[field] = kind(value)
+        return found | {"rejected": int(self._rejected[row])}
 
     def infos(self, rows: np.ndarray) -> dict[str, Any]:
         """The same of a vector environment's simulations, as Gymnasium's vector infos: nested, with masks."""
@@ -331,9 +311,9 @@ def put_into(simulation: Any, draws: Draws, rows: np.ndarray) -> None:
 
 def put_into_batch(physics: Any, draws: Draws, rows: np.ndarray) -> None:
     """Give simulations of a `MujocoBatchPhysics`, whose motors are of one family, what they were drawn with."""
-    (numbers, *_), arms, additions = draws.parameters(rows)
+    numbers, arms, additions = draws.parameters(rows)
     if draws.randomization.draws_actuator:
-        physics.set_parameters(rows, numbers, arms)
+        physics.set_parameters(rows, np.stack(numbers, axis=1), arms)
     if draws.randomization.variation is not None:
         physics.set_model(rows, draws.model_fields(rows, additions))
 
@@ -344,24 +324,9 @@ def mounting_of(motors: Sequence[Sequence[ActuatorModel]]) -> tuple[np.ndarray, 
 
 
 def numbers_of(family: Family, fields: np.ndarray) -> np.ndarray:
-    """The numbers, shape (m, n, p), of motors with the given fields (m, n, f)."""
+    """The numbers, shape (m, p), of motors with the given fields (m, f)."""
     paths = field_paths(family)
-    return fields[:, :, [paths.index(path) for path in parameter_paths(family).values()]]
-
-
-def _kinds(matched: Mapping[str, Sequence[int]], motors: Sequence[ActuatorModel]) -> tuple[Kind, ...]:
-    """The motors by their families, of which each path is of those that it matched."""
-    kinds: list[Kind] = []
-    families: list[Family] = [type(one) for one in motors]
-    for family in dict.fromkeys(families):
-        own = np.array([at for at, one in enumerate(families) if one is family])
-        drawn = {
-            column: (field_paths(family).index(split_path(path)[1]), np.flatnonzero(np.isin(own, those)))
-            for column, (path, those) in enumerate(matched.items())
-            if {*own.tolist()} & {*those}
-        }
-        kinds.append(Kind(family, own, drawn))
-    return tuple(kinds)
+    return fields[:, [paths.index(path) for path in parameter_paths(family).values()]]
 
 
 def _matched(pattern: str, field: str, model: mujoco.MjModel, indices: Sequence[int]) -> list[int]:
