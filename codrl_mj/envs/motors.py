@@ -40,17 +40,11 @@ class Motors:
         step_duration: float | None,
         allow_unstable: bool,
     ) -> None:
-        """Find the motors.
+        """Find the motors of a simulation.
 
-        Args:
-            data: the simulation.
-            commands: pattern -> what an action means to its motors, and which these are.
-            action: what the agent commands, by its name.
-            actions: the environment's own action space.
-            randomize: as for `codrl_mj.make`.
-            disturbances: what happens to commands, once an environment step, and loads on the joints.
-            step_duration: of an environment step [s]; None where that is not known.
-            allow_unstable: as for `codrl_mj.motorise`.
+        `commands` say what an action of a name, `action`, means to the motors of a pattern, `actions` are the
+        environment's own. An environment step takes `step_duration` [s], if that is known. What else is given is as for
+        `codrl_mj.make`.
 
         Raises:
             ValueError: an argument does not go with the actuators or the environment.
@@ -138,12 +132,8 @@ class Motors:
     def check_finite(self, who: str, time: float) -> None:
         """Raise if the engine met what is no number, or too large a one; it starts anew then, and the episode goes on.
 
-        Args:
-            who: the environment.
-            time: before the step [s].
-
         Raises:
-            SimulationDivergedError: as it says.
+            SimulationDivergedError: as it says, of the environment `who`, at the `time` [s] before the step.
         """
         counts, model = self.data.warning.number, self.data.model
         if not counts[_POSITION:].any():  # since the reset

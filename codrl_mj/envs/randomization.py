@@ -65,14 +65,8 @@ class Randomization:
     ) -> "Randomization":
         """Check the distributions against the fields that they are for.
 
-        Args:
-            distributions: path -> distribution.
-            model: without what its motors add to it.
-            motors: those, by the indices of their actuators.
-            fixed: fields that cannot be drawn of each motor -> why.
-            timestep: integration step [s].
-            allow_unstable: keep unstable motors.
-            whose: what messages call the model.
+        The `model` is without what its `motors`, by the indices of their actuators, add; `fixed` are the fields of
+        each that cannot be drawn, with the reason; the `timestep` is in [s]; messages call the model `whose`.
 
         Raises:
             ValueError: an unknown field (the nearest is suggested), one that cannot be drawn here, or impossible

@@ -116,11 +116,7 @@ def sensor_names(motors: Mapping[str, Family]) -> tuple[str, ...]:
 
 
 def check_observed(sensors: tuple[str, ...], motors: Mapping[str, Family]) -> None:
-    """Refuse to observe motors that have no sensors.
-
-    Raises:
-        ValueError: as it says.
-    """
+    """Refuse to observe motors that have no sensors."""
     if not sensors:
         kinds = ", ".join(sorted({one.family or one.__name__ for one in motors.values()}))
         raise ValueError(
@@ -129,11 +125,7 @@ def check_observed(sensors: tuple[str, ...], motors: Mapping[str, Family]) -> No
 
 
 def longer(space: spaces.Space, count: int) -> spaces.Box:
-    """An observation space with some unbounded entries more.
-
-    Raises:
-        ValueError: it is no vector.
-    """
+    """An observation space, which must be of vectors, with some unbounded entries more."""
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         raise ValueError(f"observe_actuator=True: observations are {space}, and only to vectors can be appended")
     low, high = (
