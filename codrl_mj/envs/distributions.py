@@ -10,7 +10,7 @@ import math
 import numbers
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -29,13 +29,12 @@ class _Range:
     high: float
     """Largest value, >= low."""
 
-    def __post_init__(self) -> None:
-        """Validate."""
-        self._check_bounds(None)
+    _LEAST: ClassVar[float | None] = None
+    """Bounds are larger."""
 
-    def _check_bounds(self, least: float | None) -> None:
-        """Store the bounds as floats, or raise `ValueError` naming value and bound."""
-        kind = type(self).__name__
+    def __post_init__(self) -> None:
+        """Validate, and store the bounds as floats."""
+        kind, least = type(self).__name__, self._LEAST
         for field in ("low", "high"):
             value = getattr(self, field)
             fine = isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
@@ -81,9 +80,7 @@ class LogUniform(_Range):
         ValueError: a bound is not a finite number > 0, or high < low.
     """
 
-    def __post_init__(self) -> None:
-        """Validate."""
-        self._check_bounds(0.0)
+    _LEAST = 0.0
 
     def transform(self, draws: np.ndarray) -> np.ndarray:
         """The values exp(log(low) + (log(high) - log(low)) u), within the bounds.

@@ -17,8 +17,8 @@ from codrl_mj.engine.reading import Readout, bring_to_rest, slots
 from codrl_mj.envs.commands import ControlCommands, fixed_by
 from codrl_mj.envs.distributions import flat
 from codrl_mj.envs.randomization import Draws, Randomization, put_into
-from codrl_mj.envs.views import named_signals, sensor_names
-from codrl_mj.physics.base import diverged
+from codrl_mj.envs.views import sensor_names
+from codrl_mj.physics.base import diverged, named_signals
 from codrl_mj.physics.variation import without_motors, write_fields
 from codrl_mj.specs import matched_by, names_of
 

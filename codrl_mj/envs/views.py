@@ -11,6 +11,7 @@ from gymnasium import spaces
 from codrl_mj.actuators import Family
 from codrl_mj.envs.outcomes import Outcomes, compiled_outcomes
 from codrl_mj.physics import Signals
+from codrl_mj.physics.base import named_signals
 from codrl_mj.tasks import Task
 
 
@@ -97,16 +98,6 @@ def signals_of(row: np.ndarray, family: Family, desired: Any, tracks: bool) -> S
     names = ("desired_force", "actual_force", *family.Signals._fields)
     signals = named_signals(names, row.T.copy() if len(row) > 1 else row[0].tolist())
     signals["desired_force"] = desired if tracks else signals["actual_force"]
-    return signals
-
-
-def named_signals(names: tuple[str, ...], columns: Any) -> Signals:
-    """Numbers of one motor, or arrays (n,) of several, by the names of the first of them; `saturated` is a flag."""
-    signals = dict(zip(names, columns, strict=False))
-    saturated = signals.pop("saturated", None)
-    if saturated is None:
-        saturated = 0.0 if isinstance(columns, list) else np.zeros(len(columns[0]))
-    signals["saturated"] = saturated > 0.0  # which NaN is not
     return signals
 
 
