@@ -29,7 +29,7 @@ ALLOWED = {
     "envs.config": {"actuators", "disturbances", "envs.distributions", "envs.worlds", "fields"},
     "envs": {
         *("actuators", "disturbances", "engine", "envs.config", "envs.distributions", "envs.worlds", "fields"),
-        *("physics", "tasks", "tasks.assets"),
+        *("physics", "specs", "tasks", "tasks.assets"),
     },
     "foreign": {
         *("actuators", "disturbances", "engine", "envs", "envs.config", "envs.distributions", "fields", "physics"),

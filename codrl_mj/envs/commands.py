@@ -1,19 +1,48 @@
-"""What an agent's actions stand for: forces, or what its actuator takes besides, such as currents and voltages."""
+"""What an agent's actions stand for: forces, or what its actuators take besides, such as currents and voltages."""
 
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import mujoco
 import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel, Command, Ideal
+from codrl_mj.disturbances import OFF, Disturbances
+from codrl_mj.physics.disturber import Disturber
+from codrl_mj.specs import ON_JOINT
 from codrl_mj.tasks import Task
 
 
+def command_of(actuator: ActuatorModel, name: str, whose: str = "") -> Command:
+    """What an action means to an actuator, that of a pattern `whose`; a force is one of the actuator as it is.
+
+    Raises:
+        ValueError: the actuator takes no such command.
+    """
+    if name == "force":
+        return Command("N or N*m", actuator, actuator.arm_radius, None, {})
+    known = actuator.commands()
+    if name not in known:
+        kind = f"{actuator.family or type(actuator).__name__} actuator{whose and f' of {whose!r}'}"
+        if isinstance(actuator, Ideal) and name in ("current", "voltage"):
+            raise ValueError(f"action = {name!r}: the {kind} has no {name} to command; choose another actuator")
+        names = ", ".join(["force", *known])
+        raise ValueError(
+            f"action = {name!r}: must be one of {names}, which the {kind} takes; or choose another actuator"
+        )
+    return known[name]
+
+
+def fixed_by(command: Command, name: str) -> dict[str, str]:
+    """Fields of an actuator that cannot be drawn under the command of a name -> why."""
+    return {field: f"with action={name!r} {why}" for field, why in command.fixed.items()}
+
+
 @dataclasses.dataclass(frozen=True)
-class Commands:
+class TaskCommands:
     """The way from an action to the forces that the physics is asked for; made by `build`."""
 
     task: Task
@@ -34,37 +63,27 @@ class Commands:
     @classmethod
     def build(
         cls, task: Task, actuators: tuple[ActuatorModel, ...], name: str, levels: Sequence[float] | None
-    ) -> "Commands":
+    ) -> "TaskCommands":
         """Resolve a command by its name; `levels` are for discrete tasks and other commands than `force`.
 
         Raises:
             ValueError: an unknown command, one that the actuator or the task cannot take, or a missing or invalid
             table.
         """
-        count = len(actuators)
-        if name == "force":
-            if actuators[0].MOTION:
-                raise ValueError(
-                    f"action = 'force': a {type(actuators[0]).__name__} is not asked for forces; must be one of "
-                    f"{', '.join(actuators[0].commands())}"
-                )
-            if levels is not None:
-                raise ValueError(f"levels = {levels!r}: only for action='current' and action='voltage'")
-            return cls(task, name, actuators, np.ones(count), task.max_forces, {}, None)
-        possible = [actuator.commands() for actuator in actuators]
-        if name not in possible[0]:
-            if isinstance(actuators[0], Ideal) and name in ("current", "voltage"):
-                raise ValueError(
-                    f"action = {name!r}: the ideal actuator has no {name} to command; choose another actuator"
-                )
-            raise ValueError(f"action = {name!r}: must be one of {', '.join(['force', *possible[0]])}")
+        if name == "force" and actuators[0].MOTION:
+            raise ValueError(
+                f"action = 'force': a {type(actuators[0]).__name__} is not asked for forces; must be one of "
+                f"{', '.join(actuators[0].commands())}"
+            )
+        if name == "force" and levels is not None:
+            raise ValueError(f"levels = {levels!r}: only for action='current' and action='voltage'")
+        chosen = [command_of(actuator, name) for actuator in actuators]
         wrapped = [task.state_names[at] for at in task.wrapped if actuators[0].MOTION and name == "position"]
         if wrapped:
             raise ValueError(
                 f"action = 'position': {task.name} wraps {', '.join(wrapped)}, and a position that jumps by a turn "
                 "cannot be held; use a velocity servo, or another actuator"
             )
-        chosen = [commands[name] for commands in possible]
         scales = np.array([command.torque_per_unit / command.actuator.arm_radius for command in chosen])
         limits = [command.limit for command in chosen]
         if not all(limit is None or np.isfinite(limit) for limit in limits):
@@ -73,9 +92,9 @@ class Commands:
             most if limit is None else limit * scale
             for limit, scale, most in zip(limits, scales, task.max_forces, strict=True)
         ]
-        simulated = tuple(command.actuator for command in chosen)
-        made = cls(task, name, simulated, scales, np.array(forces), chosen[0].fixed, None)
-        return dataclasses.replace(made, levels=made._table(levels, chosen[0]))
+        simulated, fixed = tuple(command.actuator for command in chosen), fixed_by(chosen[0], name)
+        made = cls(task, name, simulated, scales, np.array(forces), fixed, None)
+        return made if name == "force" else dataclasses.replace(made, levels=made._table(levels, chosen[0]))
 
     def _table(self, levels: Sequence[float] | None, command: Command) -> np.ndarray | None:
         """The table of levels, checked against the task's action space."""
@@ -188,3 +207,130 @@ class Commands:
         limit, scale, count = self._box
         commands = array[:, 0] if count == 1 else array
         return np.clip(commands.astype(np.float64), -limit, limit) * scale
+
+
+class ControlCommands:
+    """From actions to the controls of anybody's model: units and limits of commands, and disturbances on their way.
+
+    Actions that are not of our motors are as they were. Disturbances act once an environment step, which has the place
+    of the integration step; of a plain motor on its force [N or N*m] before the gear, of others on the control itself.
+    """
+
+    def __init__(
+        self,
+        data: mujoco.MjData,
+        actions: spaces.Space,
+        motors: Mapping[int, Command | None],
+        disturbances: Disturbances,
+        step_duration: float | None,
+    ) -> None:
+        """Let the motors' controls, the model's `actuator_ctrlrange`, reach as far as their commands do.
+
+        `actions` has the environment's own, `motors` what one means to an actuator, by its index: None where it is the
+        environment's own. An environment step takes `step_duration` [s], if that is known.
+
+        Raises:
+            ValueError: actions are not the model's controls, an actuator is not a plain motor, or has no limit; or
+                disturbances need a duration, or a joint to act on.
+        """
+        self.action_space, model, indices = actions, data.model, list(motors)
+        self._scales: np.ndarray | None = None
+        self._disturber: Disturber | None = None
+        meant = {index: command for index, command in motors.items() if command is not None}
+        remedies = {"action": "use action='force', its own"} if meant else {}
+        remedies |= {} if disturbances == OFF else {"disturbances": "they are what can be disturbed"}
+        for name, remedy in remedies.items():
+            if not isinstance(actions, spaces.Box) or actions.shape != (model.nu,):
+                raise ValueError(
+                    f"{name}: the environment's actions are {actions}, not the {model.nu} controls of its "
+                    f"model; {remedy}"
+                )
+        if meant:
+            self._command(model, meant)
+        if disturbances == OFF:
+            return
+        if step_duration is None:
+            raise ValueError("disturbances: the environment has no dt, the duration of its steps [s]; give it one")
+        self._data, self._pulses = data, disturbances.random
+        self._controls = places = model.actuator_ctrladr[indices]
+        limited = model.actuator_ctrllimited[places].astype(bool)
+        largest = np.where(limited, np.abs(model.actuator_ctrlrange[places]).max(axis=1), np.inf)
+        self._gains = np.array([_plain_gain(model, index) or 1.0 for index in indices])
+        self._disturber = Disturber(disturbances, step_duration, largest * np.abs(self._gains), 1)
+        self._dofs = [_dof(model, index) for index in indices] if self._pulses else []
+
+    def _command(self, model: mujoco.MjModel, meant: Mapping[int, Command]) -> None:
+        """Take units and limits of commands."""
+        space: Any = self.action_space
+        self._scales = np.ones(model.nu)
+        low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+        for index, command in meant.items():
+            control, gain = model.actuator_ctrladr[index], _plain_gain(model, index)
+            name, arm = model.actuator(index).name or f"actuator {index}", command.actuator.arm_radius
+            if gain is None:
+                raise ValueError(
+                    f"{name}: is no plain motor, whose force is its control times a gain: use action='force', the "
+                    "environment's own"
+                )
+            torque, limit = command.torque_per_unit, command.limit
+            self._scales[control] = scale = torque * arm if command.actuator.MOTION else torque / (arm * gain)
+            if limit is None and model.actuator_ctrllimited[control]:
+                limit = np.abs(model.actuator_ctrlrange[control]).max() / abs(scale)
+            if limit is None or not np.isfinite(limit):
+                raise ValueError(
+                    f"{name}: a command [{command.unit}] needs a limit, and neither the motor nor the environment's "
+                    "control has one: give the motor's controller one"
+                )
+            low[control], high[control] = -limit, limit
+            model.actuator_ctrllimited[control] = True
+            model.actuator_ctrlrange[control] = -limit * abs(scale), limit * abs(scale)
+        self.action_space = spaces.Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype.type)
+
+    @property
+    def memory(self) -> dict[str, np.ndarray]:
+        """The commands on their way and the pulses to come, a live array, if there are disturbances."""
+        return {} if self._disturber is None else {"disturbances": self._disturber.memory}
+
+    def begin(self, key: float) -> None:
+        """Forget everything at the start of an episode with this key of random numbers."""
+        if self._disturber is not None:
+            self._disturber.reset(np.zeros(1, dtype=int), key)
+            self._data.qfrc_applied[self._dofs] = 0.0
+
+    def controls(self, action: Any) -> Any:
+        """The environment's own action for one of `action_space`, as it arrives in this step; loads go to the joints.
+
+        Raises:
+            ValueError: the action has not the shape of the action space.
+        """
+        if self._scales is not None:
+            if np.shape(action) != self.action_space.shape:
+                raise ValueError(f"action has shape {np.shape(action)}: must be {self.action_space.shape}")
+            action = np.asarray(action, dtype=np.float64) * self._scales
+        if self._disturber is None:
+            return action
+        arrived = np.array(action, dtype=np.float64)
+        wanted = arrived[self._controls] * self._gains
+        arrived[self._controls] = self._disturber.commands(wanted[np.newaxis])[0] / self._gains
+        if self._pulses:
+            self._data.qfrc_applied[self._dofs] = 0.0
+            np.add.at(self._data.qfrc_applied, self._dofs, self._disturber.loads()[0])
+        return arrived
+
+
+def _dof(model: mujoco.MjModel, index: int) -> int:
+    """The degree of freedom that a motor drives; refused where it drives no joint."""
+    if mujoco.mjtTrn(model.actuator_trntype[index]) not in ON_JOINT:
+        raise ValueError(
+            f"disturbances.pulse_force: {model.actuator(index).name or f'actuator {index}'} drives no joint on which a "
+            "load could act; give only command_delay, command_quantum and command_rate"
+        )
+    return int(model.jnt_dofadr[model.actuator_trnid[index, 0]])
+
+
+def _plain_gain(model: mujoco.MjModel, index: int) -> float | None:
+    """The gain of an actuator whose force is gain*control; None where it is more than that."""
+    kinds = (model.actuator_gaintype[index], model.actuator_biastype[index], model.actuator_dyntype[index])
+    plain = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtDyn.mjDYN_NONE)
+    gain = float(model.actuator_gainprm[index, 0])
+    return gain if kinds == plain and gain != 0.0 else None

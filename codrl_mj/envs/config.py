@@ -4,8 +4,7 @@ Light to import: nothing is compiled, and no engine loaded.
 """
 
 import dataclasses
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, mapping_of, names_of
 from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint, resolve_disturbances, resolve_joint
-from codrl_mj.envs.distributions import Distribution, parse
+from codrl_mj.envs.distributions import Distribution, paths_of
 from codrl_mj.envs.worlds import World, find_world
 from codrl_mj.fields import check_names
 
@@ -87,7 +86,7 @@ class EnvConfig:
         if isinstance(self.levels, list | tuple):
             self._set("levels", tuple(map(_plain, self.levels)))
         if self.randomize is not None:
-            self._set("randomize", _written(self.randomize))
+            self._set("randomize", tuple(f"{path}={one}" for path, one in paths_of(self.randomize).items()))
         self._set("options", world.options(self.options))
         for name in ("observe_actuator", "allow_unstable"):
             if not isinstance(getattr(self, name), bool):
@@ -140,7 +139,7 @@ class EnvConfig:
     @property
     def distributions(self) -> dict[str, Distribution] | None:
         """What is drawn at every reset, in this order; None if nothing is."""
-        return None if self.randomize is None else {name: parse(text) for name, text in map(_split, self.randomize)}
+        return None if self.randomize is None else paths_of(self.randomize)
 
     @property
     def time_limit(self) -> int | None:
@@ -246,52 +245,3 @@ def _described(actuator: Any) -> Any:
 def _plain(value: Any) -> Any:
     """A number or an array of numpy's as Python's own number or list."""
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
-
-
-def _written(randomize: Any) -> tuple[str, ...]:
-    """What is drawn, where it is put, as hashable, JSON-serialisable text, in the order in which it is drawn.
-
-    Args:
-        randomize: a mapping of paths to distributions or their text, of patterns to such mappings, or a sequence of
-            'PATH=DISTRIBUTION'; a path is FIELD, PATTERN:FIELD or model.FIELD.
-
-    Raises:
-        ValueError: it is neither or empty, a path is named twice, or a distribution is none.
-    """
-    if isinstance(randomize, str) or not isinstance(randomize, Mapping | list | tuple) or not randomize:
-        raise ValueError(
-            f"randomize = {randomize!r}: must be one or more of FIELD=DISTRIBUTION, or a mapping of fields to these"
-        )
-    pairs = _flat(randomize) if isinstance(randomize, Mapping) else map(_split, randomize)
-    written: dict[str, str] = {}
-    for path, distribution in pairs:
-        if path in written:
-            raise ValueError(f"randomize: {path} is named twice: give it one distribution")
-        try:
-            written[path] = str(distribution if isinstance(distribution, Distribution) else parse(distribution))
-        except ValueError as error:
-            raise ValueError(f"randomize: {path}: {error}") from None
-    return tuple(f"{path}={text}" for path, text in written.items())
-
-
-def _flat(randomize: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Path and distribution of each, of mappings of patterns the pattern before the field."""
-    for name, one in randomize.items():
-        if isinstance(one, Mapping) and all(isinstance(text, str | Distribution) for text in one.values()):
-            yield from ((f"{name}:{field}", text) for field, text in one.items())
-        else:
-            yield name, one
-
-
-def _split(item: Any) -> tuple[str, str]:
-    """Path and distribution of 'PATH=DISTRIBUTION'; a pattern may hold '=' itself.
-
-    Raises:
-        ValueError: it has no path or no '='.
-    """
-    match = re.fullmatch(r"\s*((?:.*:)?[^:=]+?)\s*=(.*)", item) if isinstance(item, str) else None
-    if match is None:
-        raise ValueError(
-            f"randomize: {item!r}: must be FIELD=DISTRIBUTION, such as 'motor.inductance=uniform(0.05, 0.2)'"
-        )
-    return match[1], match[2]

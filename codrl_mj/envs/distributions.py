@@ -1,61 +1,67 @@
-"""Distributions of a number, as pure functions of draws in [0, 1): a draw gives the same value wherever it is made.
+"""What can be drawn, and from what: a mapping of paths to distributions, in the order in which they are drawn.
 
-`str` writes a distribution as `parse` reads it, exactly: `uniform(0.05, 0.2)`, `loguniform(0.1, 10.0)`, `choice(1, 2)`.
+A path is `[PATTERN:]FIELD` of actuators (without a pattern, of all) or `model.FIELD`. A distribution is a pure function
+of draws in [0, 1): a draw gives the same value wherever it is made. `str` writes it as `parse` reads it, exactly:
+`uniform(0.05, 0.2)`, `loguniform(0.1, 10.0)`, `choice(1, 2)`.
 """
 
 import dataclasses
 import math
 import numbers
 import re
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 
 from codrl_mj.fields import did_you_mean
 
-
-def _plain(number: Any) -> bool | int | float:
-    """A real number as Python's own bool, int or float."""
-    if isinstance(number, bool | np.bool_):
-        return bool(number)
-    return int(number) if isinstance(number, numbers.Integral) else float(number)
-
-
-def _check_bounds(distribution: Any, least: float | None) -> None:
-    """Store `low` and `high` of a frozen distribution as floats, or raise `ValueError` naming value and bound."""
-    kind = type(distribution).__name__
-    for field in ("low", "high"):
-        value = getattr(distribution, field)
-        fine = isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
-        if not fine or (least is not None and not value > least):
-            bound = "" if least is None else f" > {least:g}"
-            raise ValueError(f"{kind}.{field} = {value!r}: must be a finite number{bound}")
-        object.__setattr__(distribution, field, float(value))
-    if not distribution.low <= distribution.high:
-        raise ValueError(f"{kind}.high = {distribution.high:g}: must be >= low = {distribution.low:g}")
+MODEL = "model."
+"""What paths of the model's fields begin with."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Uniform:
-    """Every number from `low` to `high` alike.
-
-    Raises:
-        ValueError: a bound is not a finite number, or high < low.
-    """
+class _Range:
+    """Numbers from `low` to `high`."""
 
     low: float
     """Smallest value, in the field's unit."""
     high: float
     """Largest value, >= low."""
 
+    _LEAST: ClassVar[float | None] = None
+    """Bounds are larger."""
+
     def __post_init__(self) -> None:
-        """Validate."""
-        _check_bounds(self, None)
+        """Validate, and store the bounds as floats."""
+        kind, least = type(self).__name__, self._LEAST
+        for field in ("low", "high"):
+            value = getattr(self, field)
+            fine = isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+            if not fine or (least is not None and not value > least):
+                bound = "" if least is None else f" > {least:g}"
+                raise ValueError(f"{kind}.{field} = {value!r}: must be a finite number{bound}")
+            object.__setattr__(self, field, float(value))
+        if not self.low <= self.high:
+            raise ValueError(f"{kind}.high = {self.high:g}: must be >= low = {self.low:g}")
 
     def __str__(self) -> str:
         """As `parse` reads it."""
-        return f"uniform({self.low!r}, {self.high!r})"
+        return f"{type(self).__name__.lower()}({self.low!r}, {self.high!r})"
+
+    @property
+    def extremes(self) -> tuple[float, ...]:
+        """Values whose being allowed means that all are."""
+        return self.low, self.high
+
+
+@dataclasses.dataclass(frozen=True)
+class Uniform(_Range):
+    """Every number from `low` to `high` alike.
+
+    Raises:
+        ValueError: a bound is not a finite number, or high < low.
+    """
 
     def transform(self, draws: np.ndarray) -> np.ndarray:
         """The values low + (high - low) u.
@@ -65,32 +71,16 @@ class Uniform:
         """
         return np.minimum(self.low + (self.high - self.low) * draws, self.high)
 
-    @property
-    def extremes(self) -> tuple[float, ...]:
-        """Values whose being allowed means that all are."""
-        return self.low, self.high
-
 
 @dataclasses.dataclass(frozen=True)
-class LogUniform:
+class LogUniform(_Range):
     """Every ratio alike: the logarithm is uniform from that of `low` to that of `high`.
 
     Raises:
         ValueError: a bound is not a finite number > 0, or high < low.
     """
 
-    low: float
-    """Smallest value, > 0, in the field's unit."""
-    high: float
-    """Largest value, >= low."""
-
-    def __post_init__(self) -> None:
-        """Validate."""
-        _check_bounds(self, 0.0)
-
-    def __str__(self) -> str:
-        """As `parse` reads it."""
-        return f"loguniform({self.low!r}, {self.high!r})"
+    _LEAST = 0.0
 
     def transform(self, draws: np.ndarray) -> np.ndarray:
         """The values exp(log(low) + (log(high) - log(low)) u), within the bounds.
@@ -100,11 +90,6 @@ class LogUniform:
         """
         low, high = math.log(self.low), math.log(self.high)
         return np.clip(np.exp(low + (high - low) * draws), self.low, self.high)
-
-    @property
-    def extremes(self) -> tuple[float, ...]:
-        """Values whose being allowed means that all are."""
-        return self.low, self.high
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,7 +111,9 @@ class Choice:
         for value in given:
             if not isinstance(value, numbers.Real | np.bool_) or math.isnan(value):
                 raise ValueError(f"Choice.values = {given!r}: {value!r} must be a number")
-        object.__setattr__(self, "values", tuple(map(_plain, given)))
+        plain = (value.item() if isinstance(value, np.generic) else value for value in given)
+        kept = (one if isinstance(one, bool | int) else float(one) for one in plain)
+        object.__setattr__(self, "values", tuple(kept))
 
     def __str__(self) -> str:
         """As `parse` reads it."""
@@ -165,11 +152,13 @@ def parse(text: str) -> Distribution:
             number, or impossible bounds; the message has the text.
     """
     match = re.fullmatch(r"\s*(\w+)\s*\(([^()]*)\)\s*", text) if isinstance(text, str) else None
+    *others, last = _FORMS.values()
+    expected = f"{', '.join(others)} or {last}"
     if match is None:
-        raise ValueError(f"{text!r} is no distribution: must be {_expected()}")
+        raise ValueError(f"{text!r} is no distribution: must be {expected}")
     kind, inside = match.groups()
     if kind not in _FORMS:
-        raise ValueError(f"{text!r} is no distribution: {did_you_mean(kind, _FORMS)}it must be {_expected()}")
+        raise ValueError(f"{text!r} is no distribution: {did_you_mean(kind, _FORMS)}it must be {expected}")
     values = [_number(text, word.strip()) for word in inside.split(",")] if inside.strip() else []
     if len(values) != 2 and kind != "choice":
         raise ValueError(f"{text!r} has {len(values)} values: must be {_FORMS[kind]}")
@@ -181,11 +170,6 @@ def parse(text: str) -> Distribution:
         raise ValueError(f"{text!r}: {error}") from None
 
 
-def _expected() -> str:
-    *others, last = _FORMS.values()
-    return f"{', '.join(others)} or {last}"
-
-
 def _number(text: str, word: str) -> bool | int | float:
     if word in ("True", "False"):
         return word == "True"
@@ -193,3 +177,57 @@ def _number(text: str, word: str) -> bool | int | float:
         return int(word) if re.fullmatch(r"[+-]?\d+", word) else float(word)
     except ValueError:
         raise ValueError(f"{text!r}: {word!r} must be a number") from None
+
+
+def split_path(path: str) -> tuple[str, str]:
+    """Pattern and field of a path; the pattern is empty where there is none."""
+    pattern, _, field = ("", "", path) if path.startswith(MODEL) else path.rpartition(":")
+    return pattern, field
+
+
+def paths_of(randomize: Any) -> dict[str, Distribution]:
+    """Path -> distribution, in the order in which they are drawn.
+
+    Args:
+        randomize: a mapping of paths to distributions or their text, of patterns to such mappings, or a sequence of
+            'PATH=DISTRIBUTION'; a path is FIELD, PATTERN:FIELD or model.FIELD.
+
+    Raises:
+        ValueError: it is neither or empty, a path is named twice, or a distribution is none.
+    """
+    if isinstance(randomize, str) or not isinstance(randomize, Mapping | list | tuple) or not randomize:
+        raise ValueError(
+            f"randomize = {randomize!r}: must be one or more of FIELD=DISTRIBUTION, or a mapping of fields to these"
+        )
+    found: dict[str, Distribution] = {}
+    for path, one in _flat(randomize) if isinstance(randomize, Mapping) else map(_split, randomize):
+        if path in found:
+            raise ValueError(f"randomize: {path} is named twice: give it one distribution")
+        try:
+            found[path] = one if isinstance(one, Distribution) else parse(one)
+        except ValueError as error:
+            raise ValueError(f"randomize: {path}: {error}") from None
+    return found
+
+
+def _flat(randomize: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Path and distribution of each, of mappings of patterns the pattern before the field."""
+    for name, one in randomize.items():
+        if isinstance(one, Mapping) and one:
+            yield from ((f"{name}:{field}", text) for field, text in one.items())
+        else:
+            yield str(name), one
+
+
+def _split(item: Any) -> tuple[str, str]:
+    """Path and distribution of 'PATH=DISTRIBUTION'; a pattern may hold '=' itself.
+
+    Raises:
+        ValueError: it has no path or no '='.
+    """
+    match = re.fullmatch(r"\s*((?:.*:)?[^:=]+?)\s*=(.*)", item) if isinstance(item, str) else None
+    if match is None:
+        raise ValueError(
+            f"randomize: {item!r}: must be FIELD=DISTRIBUTION, such as 'motor.inductance=uniform(0.05, 0.2)'"
+        )
+    return match[1], match[2]

@@ -1,9 +1,10 @@
-"""Actuators and models drawn at every reset, from the environment's own generator."""
+"""Motors and models drawn at every reset: what is drawn of them, and what present episodes were drawn with."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from codrl_mj.actuators import (
@@ -17,271 +18,379 @@ from codrl_mj.actuators import (
     parameter_paths,
     unchecked,
 )
-from codrl_mj.disturbances import Joint
-from codrl_mj.envs.commands import Commands
-from codrl_mj.envs.distributions import Choice, Distribution
+from codrl_mj.envs.distributions import MODEL, Choice, Distribution, split_path
 from codrl_mj.fields import did_you_mean
-from codrl_mj.physics.variation import Variation, additions_of, variable
+from codrl_mj.physics.variation import Variation, additions_of, mounts_of, variable
+from codrl_mj.specs import matched_by, names_of, refuse_unmatched
 
 LIMIT = 1000
 """Draws of an unstable loop in a row after which a reset gives up."""
+Uniforms = Callable[[np.ndarray, int], np.ndarray]
+"""(simulations (m,), count) -> the next `count` numbers in [0, 1) of each of their generators, shape (m, count)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Randomization:
-    """What is drawn at a reset, and what it does to actuators and model; made by `build`."""
+    """What is drawn at a reset, and what it does to motors and model; made by `build`."""
 
-    distributions: dict[str, Distribution]
-    """Name of a field -> what it is drawn from."""
-    family: Family
-    """Of what is simulated."""
-    kinds: dict[str, type]
-    """Name of a field -> float, int or bool."""
+    distributions: Mapping[str, Distribution]
+    """Path, as `split_path` takes it apart -> what it is drawn from, in this order."""
+    types: Mapping[str, type]
+    """Path -> float, int or bool."""
+    families: tuple[Family, ...]
+    """Of each motor of a simulation."""
+    columns: tuple[Mapping[int, str], ...]
+    """Of each motor: column of the drawn values -> the field that it is."""
     timestep: float
-    """Integration step [s], at which a drawn loop must be stable."""
+    """Integration step [s], at which drawn motors must be stable."""
     allow_unstable: bool
-    """Whether unstable loops are kept."""
+    """Whether unstable ones are kept."""
     variation: Variation | None
     """What drawn fields do to the model; None if they do nothing."""
-    mounted: tuple[str, ...]
-    """The fields that the actuator's arm and additions to its joint depend on."""
     in_model: tuple[str, ...]
-    """The fields that the model, besides its actuators, depends on."""
+    """The paths that the model, besides its motors' parameters, depends on."""
+    mounting: bool
+    """Whether motors' arms, or what they add to the model, depend on what is drawn."""
 
     @classmethod
     def build(
         cls,
-        randomize: Mapping[str, Distribution],
-        task: str,
-        actuator: ActuatorModel,
-        commands: Commands,
+        distributions: Mapping[str, Distribution],
+        model: mujoco.MjModel,
+        motors: Mapping[int, ActuatorModel],
+        fixed: Sequence[Mapping[str, str]],
         timestep: float,
         allow_unstable: bool,
-        joint: Joint,
+        whose: str,
     ) -> "Randomization":
         """Check the distributions against the fields that they are for.
 
-        Args:
-            randomize: name of a field -> distribution; at least one. All actuators of a task get what is drawn.
-            task: the task's name.
-            actuator: the nominal one.
-            commands: what an action stands for.
-            timestep: integration step [s].
-            allow_unstable: keep unstable loops.
-            joint: what is added to the actuated joints.
+        The `model` is without what its `motors`, by the indices of their actuators, add; `fixed` are the fields of
+        each that cannot be drawn, with the reason; the `timestep` is in [s]; messages call the model `whose`.
 
         Raises:
             ValueError: an unknown field (the nearest is suggested), one that cannot be drawn here, or impossible
                 bounds; the message names field, value and bound.
         """
-        if not isinstance(randomize, Mapping) or not randomize:
-            raise ValueError(f"randomize = {randomize!r}: must be a mapping of one or more fields to distributions")
-        family: Any = Actuator if isinstance(actuator, Ideal) else type(actuator)
-        known = (*field_paths(family), *variable(task))
-        for name, distribution in randomize.items():
-            if name not in known:
-                hint = did_you_mean(name, known)
-                raise ValueError(f"randomize: unknown field {name!r}: {hint}{task} has {', '.join(known)}")
-            if not isinstance(distribution, Distribution):
-                raise ValueError(f"randomize[{name!r}] = {distribution!r}: must be a Uniform, LogUniform or Choice")
+        indices, simulated = list(motors), list(motors.values())
+        matched: dict[str, list[int]] = {}
+        for path, distribution in distributions.items():
+            pattern, field = split_path(path)
             try:
-                _check(name, distribution, actuator, commands)
+                own = _matched(pattern, field, model, indices)
+                _check_known(field, [simulated[at] for at in own], model, whose)
+                if any(split_path(other)[1] == field and {*own} & {*those} for other, those in matched.items()):
+                    raise ValueError("it is drawn by another pattern, too")
+                if not own:
+                    _check_factor(field, distribution)
+                for at in own:
+                    _check(field, distribution, simulated[at], fixed[at])
+                    _check_friction(field, simulated[at], model, indices[at])
             except ValueError as error:
-                raise ValueError(f"randomize[{name!r}] = {distribution}: {error}") from None
-        model = [name for name in randomize if name.startswith("model.")]
-        simulated = commands.simulated[0]
+                label = f"[{pattern!r}]" * bool(pattern) + f"[{field!r}]"
+                raise ValueError(f"randomize{label} = {distribution}: {error}") from None
+            matched[path] = own
         turned, added = (
-            [name for name in randomize if name not in model and _follows(of, simulated, name)] for of in _MOUNTING
+            [path for path, own in matched.items() if any(_follows(of, simulated[at], path) for at in own)]
+            for of in (lambda one: one.arm_radius, lambda one: one.additions)
         )
-        in_model = (*model, *added)
-        variation = Variation(task, model, joint=joint, mounting=bool(added)) if in_model else None
-        kinds = {name: _kind(family, name) for name in randomize}
+        of_model = [path for path, own in matched.items() if not own]
+        in_model = (*of_model, *added)
         return cls(
-            dict(randomize),
-            type(simulated),
-            kinds,
+            distributions,
+            {path: _kind(type(simulated[own[0]]), path) if own else float for path, own in matched.items()},
+            tuple(map(type, simulated)),
+            tuple(
+                {column: split_path(path)[1] for column, (path, own) in enumerate(matched.items()) if at in own}
+                for at in range(len(simulated))
+            ),
             timestep,
             allow_unstable,
-            variation,
-            tuple(turned + added),
+            Variation(model, of_model, indices, mounting=bool(added)) if in_model else None,
             in_model,
+            bool(turned or added),
         )
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The fields, in the order in which they are drawn."""
+        """The paths, in the order in which they are drawn."""
         return tuple(self.distributions)
 
     @property
     def draws_actuator(self) -> bool:
-        """Whether a field of the actuator is drawn, and so its stability must be checked at every draw."""
-        return any(not name.startswith("model.") for name in self.distributions)
+        """Whether a field of a motor is drawn, and so its stability must be checked at every draw."""
+        return any(self.columns)
 
-    def draw(
-        self, random: Callable[[np.ndarray, int], np.ndarray], nominal: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Draw the fields of m environments; whole sets are redrawn until their actuators are stable.
+    @property
+    def random(self) -> bool:
+        """Whether motors may need an episode's key of random numbers for what is drawn of them."""
+        return any(
+            {*columns.values()} & {*one.RANDOM} for one, columns in zip(self.families, self.columns, strict=True)
+        )
 
-        `random` takes (positions in `nominal`, count), and returns the next `count` numbers in [0, 1) of each of their
-        generators; `nominal` is of what is simulated, as `nominal_fields` has it. Returned are the values (m, k), and
-        how many sets were rejected before, (m,).
+    def draw(self, random: Uniforms, nominal: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Draw for m simulations; whole sets are redrawn until their motors are stable.
+
+        `random` is asked for positions in `nominal`, which is as `fields_of` has it. Returned are the values (m, k),
+        and how many sets were rejected before, (m,).
 
         Raises:
             ValueError: `LIMIT` sets in a row were unstable.
         """
-        values = np.empty((len(nominal), len(self.distributions)))
-        rejected = np.zeros(len(nominal), dtype=np.int64)
-        pending = np.arange(len(nominal))
+        count = len(nominal[0])
+        values, rejected = np.empty((count, len(self.distributions))), np.zeros(count, dtype=np.int64)
+        pending = np.arange(count)
         while True:
             draws = random(pending, len(self.distributions))
             for column, distribution in enumerate(self.distributions.values()):
                 values[pending, column] = distribution.transform(draws[:, column].copy())
             if self.allow_unstable or not self.draws_actuator:
                 return values, rejected
-            drawn = self.numbers(self.drawn(nominal[pending], values[pending]))
-            flat = drawn.reshape(-1, drawn.shape[-1])
-            unstable = ~(self.family.instability(flat, self.timestep) < 1.0)
-            unstable = unstable.reshape(drawn.shape[:2]).any(axis=1)
+            fields = self.drawn([each[pending] for each in nominal], values[pending])
+            unstable = self._unstable(fields)
             if not unstable.any():
                 return values, rejected
             pending = pending[unstable]
             rejected[pending] += 1
             if rejected[pending[0]] == LIMIT:
-                last = {name: float(value) for name, value in zip(self.names, values[pending[0]], strict=True)}
+                last = dict(zip(self.names, values[pending[0]].tolist(), strict=True))
+                reason = self._reason([each[unstable] for each in fields])
                 raise ValueError(
                     f"randomize: {LIMIT} draws in a row have an unstable current loop at a step of "
-                    f"{self.timestep:g} s; the last was {last}{_reason(self.family, drawn[unstable][0], self.timestep)}"
-                    ". Narrow the bounds, shorten the step, or pass allow_unstable=True"
+                    f"{self.timestep:g} s; the last was {last}{reason}. Narrow the bounds, shorten the step, or pass "
+                    "allow_unstable=True"
                 )
 
-    def drawn(self, nominal: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """The fields of actuators, as `nominal_fields` has them, with the drawn values (m, k) in place of theirs."""
-        fields, paths = nominal.copy(), field_paths(self.family)
-        for name, column in zip(self.names, values.T, strict=True):
-            if not name.startswith("model."):
-                fields[:, :, paths.index(name)] = column[:, np.newaxis]
+    def _unstable(self, fields: Sequence[np.ndarray]) -> np.ndarray:
+        """Which simulations have a motor that is unstable, shape (m,)."""
+        unstable = np.zeros(len(fields[0]), dtype=bool)
+        for family, columns, each in zip(self.families, self.columns, fields, strict=True):
+            if columns:
+                unstable |= ~(family.instability(numbers_of(family, each), self.timestep) < 1.0)
+        return unstable
+
+    def _reason(self, fields: Sequence[np.ndarray]) -> str:
+        """What the first refused motor of the first simulation says of itself."""
+        for family, each in zip(self.families, fields, strict=True):
+            try:
+                family.from_numbers(numbers_of(family, each)[0]).check(self.timestep)
+            except ValueError as error:
+                return f": {error}"
+        return ""
+
+    def fields_of(self, motors: Sequence[Sequence[ActuatorModel]]) -> list[np.ndarray]:
+        """The fields of the motors of m simulations, for each motor (m, f), columns as in `field_paths`."""
+        return [np.array(list(map(field_values, each))) for each in zip(*motors, strict=True)]
+
+    def drawn(self, nominal: Sequence[np.ndarray], values: np.ndarray) -> list[np.ndarray]:
+        """Motors' fields, as `fields_of` has them, with drawn values (m, k) in place of theirs; NaN leaves them."""
+        fields = [each.copy() for each in nominal]
+        for family, columns, each in zip(self.families, self.columns, fields, strict=True):
+            for column, field in columns.items():
+                place, new = field_paths(family).index(field), values[:, column]
+                each[:, place] = np.where(np.isnan(new), each[:, place], new)
         return fields
 
-    def numbers(self, fields: np.ndarray) -> np.ndarray:
-        """The numbers, shape (m, n, p), of actuators with the given fields (m, n, f)."""
-        paths = field_paths(self.family)
-        return fields[:, :, [paths.index(path) for path in parameter_paths(self.family).values()]]
+    def replaced(self, motors: Sequence[ActuatorModel], values: np.ndarray) -> tuple[ActuatorModel, ...]:
+        """The motors of one simulation with its drawn values (k,) in place of theirs."""
+        changes = ({field: float(values[column]) for column, field in columns.items()} for columns in self.columns)
+        return tuple(one.replaced(new) for one, new in zip(motors, changes, strict=True))
 
-    def mounting(self, fields: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The arms [m], shape (m, n), of actuators with the given fields (m, n, f), and their additions, (m, n, 3)."""
-        return mounting_of([[unchecked(self.family, one) for one in each] for each in fields.tolist()])
+    def mounted(self, fields: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """The arms [m] of motors with these fields, shape (m, n), and what they add to the model, (m, n, 3)."""
+        rows = zip(*(each.tolist() for each in fields), strict=True)
+        return mounting_of([list(map(unchecked, self.families, each)) for each in rows])
 
-    def nominal_values(self, simulated: Sequence[ActuatorModel]) -> np.ndarray:
-        """The values, shape (k,), with which actuator and model are as they are before the first draw."""
-        fields = dict(zip(field_paths(self.family), field_values(simulated[0]), strict=True))
-        model = {name: float(not name.startswith("model.damping.")) for name in self.names if name.startswith("model.")}
-        return np.array([(fields | model)[name] for name in self.names])
+
+class Draws:
+    """The drawn values of N simulations, as arrays, and their way into these; a single environment has one."""
+
+    def __init__(
+        self,
+        randomization: Randomization,
+        motors: Sequence[Sequence[ActuatorModel]],
+        put: "Callable[[Draws, np.ndarray], None]",
+    ) -> None:
+        """Begin with nothing drawn for simulations with these nominal motors.
+
+        `put` gives some simulations (m,) what they were drawn with, before they are reset or restored.
+        """
+        self.randomization, self._put = randomization, put
+        self._motors = motors
+        self._nominal = randomization.fields_of(motors)
+        self._mounting = mounting_of(motors)
+        self._values = np.full((len(motors), len(randomization.names)), np.nan)
+        self._rejected = np.zeros(len(motors), dtype=np.int64)
+
+    def draw(self, random: Uniforms, rows: np.ndarray) -> None:
+        """Draw anew for the simulations `rows` (m,), which are to be reset afterwards.
+
+        Raises:
+            ValueError: nothing stable was drawn.
+        """
+        self._values[rows], self._rejected[rows] = self.randomization.draw(
+            lambda pending, count: random(rows[pending], count), [each[rows] for each in self._nominal]
+        )
+        self._put(self, rows)
+
+    def motors(self, row: int = 0, nominal: Sequence[ActuatorModel] | None = None) -> tuple[ActuatorModel, ...]:
+        """What is drawn of a simulation's motors, or of others in their place."""
+        nominal = self._motors[row] if nominal is None else nominal
+        undrawn = np.isnan(self._values[row]).any()
+        return tuple(nominal) if undrawn else self.randomization.replaced(nominal, self._values[row])
+
+    def parameters(self, rows: np.ndarray) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+        """Of some simulations' motors: the numbers of each (m, p), arms [m] (m, n), and additions (m, n, 3)."""
+        fields = self.randomization.drawn([each[rows] for each in self._nominal], self._values[rows])
+        arms, additions = (each[rows] for each in self._mounting)
+        if self.randomization.mounting:
+            arms, additions = self.randomization.mounted(fields)
+        return list(map(numbers_of, self.randomization.families, fields)), arms, additions
 
     def model_fields(
-        self, values: np.ndarray, additions: np.ndarray | None = None, drawn: bool = False
+        self, rows: np.ndarray, additions: np.ndarray | None = None, drawn: bool = False
     ) -> dict[str, np.ndarray]:
-        """The drawn fields of the model; see `Variation.fields`."""
-        if self.variation is None:
+        """The drawn fields of some simulations' models; see `Variation.fields`."""
+        variation = self.randomization.variation
+        if variation is None:
             return {}
-        columns = [self.names.index(name) for name in self.variation.names]
-        return self.variation.fields(values[:, columns], additions, drawn)
+        additions = self.parameters(rows)[2] if additions is None else additions
+        columns = np.array([self.randomization.names.index(name) for name in variation.names], dtype=int)
+        return variation.fields(self._values[np.ix_(rows, columns)], additions, drawn)
 
-    def actuator(self, nominal: ActuatorModel, values: np.ndarray) -> Any:
-        """The nominal actuator with one environment's drawn values, shape (k,)."""
-        drawn = self.report(values, 0)
-        return nominal.replaced({name: drawn[name] for name in self.names if not name.startswith("model.")})
+    def report(self, row: int = 0) -> dict[str, Any]:
+        """What `info` says of a simulation's draw: values by field, those of a pattern together; NaN before one."""
+        found: dict[str, Any] = {}
+        for (path, kind), value in zip(self.randomization.types.items(), self._values[row], strict=True):
+            pattern, field = split_path(path)
+            (found.setdefault(pattern, {}) if pattern else found)[field] = value if np.isnan(value) else kind(value)
+        return found | {"rejected": int(self._rejected[row])}
 
-    def report(self, values: np.ndarray, rejected: int) -> dict[str, Any]:
-        """What one environment's `info` says of its draw: the values (k,) by name, and the number of rejected sets."""
-        drawn = {name: self.kinds[name](value) for name, value in zip(self.names, values, strict=True)}
-        return drawn | {"rejected": int(rejected)}
-
-    def reports(self, rows: np.ndarray, values: np.ndarray, rejected: np.ndarray) -> dict[str, Any]:
-        """The same for rows of a vector environment, as Gymnasium's vector infos: nested, with masks.
-
-        `values` (N, k) and `rejected` (N,) are of all environments.
-        """
-        mask = np.zeros(len(values), dtype=bool)
+    def infos(self, rows: np.ndarray) -> dict[str, Any]:
+        """The same of a vector environment's simulations, as Gymnasium's vector infos: nested, with masks."""
+        mask = np.zeros(len(self._values), dtype=bool)
         mask[rows] = True
-        columns = {name: values[:, column] for column, name in enumerate(self.names)} | {"rejected": rejected}
         report: dict[str, Any] = {}
-        for name, column in columns.items():
-            report[name] = np.zeros(len(values), dtype=int if name == "rejected" else self.kinds[name])
+        for name, column in self.present().items():
+            kind = self.randomization.types.get(name, int)
+            report[name] = np.zeros(len(mask), dtype=kind)
             report[name][rows] = column[rows]
             report[f"_{name}"] = mask.copy()
         return {"randomization": report, "_randomization": mask}
 
+    def present(self) -> dict[str, np.ndarray]:
+        """The values in use by path, and the number of rejected sets, each of shape (N,); NaN before a reset."""
+        columns = dict(zip(self.randomization.names, self._values.T.copy(), strict=True))
+        return columns | {"rejected": self._rejected.copy()}
 
-def nominal_fields(actuators: Sequence[Sequence[ActuatorModel]]) -> np.ndarray:
-    """The fields of the actuators of m environments, shape (m, n, f), columns as in `field_paths`."""
-    return np.array([[field_values(one) for one in each] for each in actuators])
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """What `restore` needs."""
+        return {"drawn": self._values.copy(), "rejected": self._rejected.copy()}
+
+    def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
+        """Bring back the values, and the simulations to them; to be followed by a restoring of the simulations."""
+        self._values[:], self._rejected[:] = snapshot["drawn"], snapshot["rejected"]
+        self._put(self, np.arange(len(self._values)))
 
 
-def mounting_of(actuators: Sequence[Sequence[ActuatorModel]]) -> tuple[np.ndarray, np.ndarray]:
-    """The arms [m] of the actuators of m environments, shape (m, n), and what they add to their joints, (m, n, 3)."""
-    return np.array([[one.arm_radius for one in each] for each in actuators]), additions_of(actuators)
+def put_into(simulation: Any, draws: Draws, rows: np.ndarray) -> None:
+    """Give the only simulation, of a `Physics` or of `Motors`, what was drawn."""
+    if draws.randomization.draws_actuator:
+        simulation.set_actuators(draws.motors())
+    if draws.randomization.variation is not None:
+        simulation.set_model(draws.model_fields(rows, drawn=True))
 
 
-_MOUNTING: tuple[Callable[[ActuatorModel], Any], ...] = (lambda one: one.arm_radius, lambda one: one.additions)
+def put_into_batch(physics: Any, draws: Draws, rows: np.ndarray) -> None:
+    """Give simulations of a `MujocoBatchPhysics`, whose motors are of one family, what they were drawn with."""
+    numbers, arms, additions = draws.parameters(rows)
+    if draws.randomization.draws_actuator:
+        physics.set_parameters(rows, np.stack(numbers, axis=1), arms)
+    if draws.randomization.variation is not None:
+        physics.set_model(rows, draws.model_fields(rows, additions))
 
 
-def _follows(of: Callable[[ActuatorModel], Any], actuator: ActuatorModel, name: str) -> bool:
-    """Whether something of an actuator depends on a field: at the actuator's values, or where no other field is 0."""
-    family: Family = type(actuator)
+def mounting_of(motors: Sequence[Sequence[ActuatorModel]]) -> tuple[np.ndarray, np.ndarray]:
+    """The arms [m] of the motors of m simulations, shape (m, n), and what they add to the model, (m, n, 3)."""
+    return np.array([[one.arm_radius for one in each] for each in motors]), additions_of(motors)
+
+
+def numbers_of(family: Family, fields: np.ndarray) -> np.ndarray:
+    """The numbers, shape (m, p), of motors with the given fields (m, f)."""
     paths = field_paths(family)
-    for values in (field_values(actuator), (2.0,) * len(paths)):
-        other = [value + (path == name) for path, value in zip(paths, values, strict=True)]
-        if of(unchecked(family, values)) != of(unchecked(family, other)):
-            return True
-    return False
+    return fields[:, [paths.index(path) for path in parameter_paths(family).values()]]
 
 
-def _kind(family: Family, name: str) -> type:
-    """What a field holds: float, int or bool."""
-    if name.startswith("model."):
-        return float
+def _matched(pattern: str, field: str, model: mujoco.MjModel, indices: Sequence[int]) -> list[int]:
+    """Which motors, by the indices of their actuators, a path is of; none if it is the model's."""
+    if field.startswith(MODEL):
+        return []
+    names = names_of(model)
+    matched = [at for at, index in enumerate(indices) if not pattern or matched_by(pattern, [names[index]])]
+    return matched or refuse_unmatched(pattern, [names[index] for index in indices])
+
+
+def _check_known(field: str, motors: Sequence[ActuatorModel], model: mujoco.MjModel, whose: str) -> None:
+    """Refuse a name that is no field of all these motors, nor of the model."""
+    families: list[Family] = [Actuator if isinstance(one, Ideal) else type(one) for one in motors]
+    of_each = [field_paths(family) for family in families]
+    known = [path for path in (of_each[0] if of_each else ()) if all(path in paths for paths in of_each)]
+    known += variable(model)
+    if field not in known:
+        raise ValueError(f"unknown field {field!r}: {did_you_mean(field, known)}{whose} has {', '.join(known)}")
+
+
+def _check_factor(field: str, distribution: Distribution) -> None:
+    """Refuse what the model cannot be multiplied by, or have added to it."""
+    low, kind = min(distribution.extremes), field.split(".")[1]
+    allowed_zero = kind in ("gravity", "damping")
+    if not np.isfinite(distribution.extremes).all() or low < 0.0 or (low == 0.0 and not allowed_zero):
+        raise ValueError(f"{field} = {low:g}: must be a finite number {'>=' if allowed_zero else '>'} 0")
+
+
+def _check(field: str, distribution: Distribution, motor: ActuatorModel, fixed: Mapping[str, str]) -> None:
+    """Refuse what cannot be drawn of a motor."""
+    if isinstance(motor, Ideal):
+        raise ValueError("the ideal actuator has no motor and no controller to draw; choose another actuator")
+    if field in fixed:
+        raise ValueError(f"{fixed[field]}; draw it with action='force'")
+    kind, words = _kind(type(motor), field), options_of(type(motor), field)
+    if words:
+        if not isinstance(distribution, Choice) or any(value not in range(len(words)) for value in distribution.values):
+            numbered = ", ".join(f"{place} for {word}" for place, word in enumerate(words))
+            raise ValueError(f"{field} is a word: draw it from a Choice of {numbered}")
+    elif kind is not float:
+        if not isinstance(distribution, Choice) or any(type(value) is not kind for value in distribution.values):
+            raise ValueError(f"{field} must be drawn from a Choice of {kind.__name__} values")
+    elif any(isinstance(value, bool) for value in distribution.extremes):
+        raise ValueError(f"{field} must be a number")
+    for value in distribution.extremes:
+        motor.replaced({field: value})  # the field's own bounds
+
+
+def _check_friction(field: str, motor: ActuatorModel, model: mujoco.MjModel, index: int) -> None:
+    """Refuse friction of a motor that drives nothing which could have it."""
+    if mounts_of(model, index)[2] is None and _follows(lambda one: one.additions.friction, motor, field):
+        raise ValueError(
+            f"{model.actuator(index).name or f'actuator {index}'} drives neither a joint nor a tendon, which the "
+            "friction that is drawn for its motor would need; draw other fields"
+        )
+
+
+def _kind(family: Family, path: str) -> type:
+    """What a field of a family holds: float, int or bool."""
     value: Any = family()
-    for part in name.split("."):
+    for part in split_path(path)[1].split("."):
         value = getattr(value, part, None)
     return type(value) if isinstance(value, int) else float
 
 
-def _reason(family: Family, numbers: np.ndarray, timestep: float) -> str:
-    """What an actuator that was drawn says of itself."""
-    try:
-        family.from_numbers(numbers[0]).check(timestep)
-    except ValueError as error:
-        return f": {error}"
-    return ""
-
-
-def _check(name: str, distribution: Distribution, actuator: ActuatorModel, commands: Commands) -> None:
-    """Refuse what cannot be drawn.
-
-    Raises:
-        ValueError: the reason.
-    """
-    part, _, field = name.partition(".")
-    if part == "model":
-        low = min(distribution.extremes)
-        allowed_zero = field == "gravity" or field.startswith("damping.")
-        if not np.isfinite(distribution.extremes).all() or low < 0.0 or (low == 0.0 and not allowed_zero):
-            raise ValueError(f"{name} = {low:g}: must be a finite number {'>=' if allowed_zero else '>'} 0")
-        return
-    if isinstance(actuator, Ideal):
-        raise ValueError("the ideal actuator has no motor and no controller to draw; choose another actuator")
-    if name in commands.fixed:
-        raise ValueError(f"with action={commands.name!r} {commands.fixed[name]}; draw it with action='force'")
-    kind = _kind(type(actuator), name)
-    words = options_of(type(actuator), name)
-    if words:
-        if not isinstance(distribution, Choice) or any(value not in range(len(words)) for value in distribution.values):
-            numbered = ", ".join(f"{place} for {word}" for place, word in enumerate(words))
-            raise ValueError(f"{name} is a word: draw it from a Choice of {numbered}")
-    elif kind is not float:
-        if not isinstance(distribution, Choice) or any(type(value) is not kind for value in distribution.values):
-            raise ValueError(f"{name} must be drawn from a Choice of {kind.__name__} values")
-    elif any(isinstance(value, bool) for value in distribution.extremes):
-        raise ValueError(f"{name} must be a number")
-    for value in distribution.extremes:
-        actuator.replaced({name: value})  # the field's own bounds
+def _follows(of: Callable[[ActuatorModel], Any], motor: ActuatorModel, path: str) -> bool:
+    """Whether something of a motor depends on a field: at the motor's values, or where no other field is 0."""
+    family: Family = type(motor)
+    fields, field = field_paths(family), split_path(path)[1]
+    for values in (field_values(motor), (2.0,) * len(fields)):
+        other = [value + (name == field) for name, value in zip(fields, values, strict=True)]
+        if of(unchecked(family, values)) != of(unchecked(family, other)):
+            return True
+    return False

@@ -11,15 +11,15 @@ from codrl_mj.actuators import ActuatorModel, Family
 from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint
 from codrl_mj.engine.reading import check_shafts
-from codrl_mj.envs.commands import Commands
+from codrl_mj.envs.commands import TaskCommands
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.randomization import Randomization, nominal_fields
+from codrl_mj.envs.randomization import Draws, Randomization, put_into
 from codrl_mj.envs.views import View
 from codrl_mj.physics import Physics, Signals
 from codrl_mj.physics.base import check_integrator, inner_step_count
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.registry import find_physics
-from codrl_mj.physics.variation import additions_of
+from codrl_mj.physics.variation import bare_model
 from codrl_mj.tasks import Task, find_task
 
 
@@ -35,7 +35,7 @@ class Setup:
     """Integration steps per environment step."""
     integrator: str
     """One of the task's integrators."""
-    commands: Commands
+    commands: TaskCommands
     """What actions stand for."""
     view: View
     """What the agent gets of states."""
@@ -55,15 +55,18 @@ class Setup:
         """
         definition, actuators = find_task(config.task), config.actuators
         count = inner_step_count(definition, actuators[0], config.inner_steps, config.timestep)
-        timestep, randomize = definition.step_duration / count, config.distributions
-        commands = Commands.build(definition, actuators, config.action, config.levels)
+        timestep, drawn = definition.step_duration / count, config.distributions
+        commands = TaskCommands.build(definition, actuators, config.action, config.levels)
         randomization = None
-        if randomize is not None:
-            randomization = Randomization.build(
-                randomize, definition.name, actuators[0], commands, timestep, config.allow_unstable, config.joint
-            )
-        drawn = randomization is not None and randomization.draws_actuator  # then every draw is checked
-        for one in commands.simulated if not drawn else ():
+        if drawn is not None:
+            bare, name = bare_model(definition.name, config.joint), definition.name
+            motors = {
+                bare.actuator(motor).id: one for motor, one in zip(definition.motors, commands.simulated, strict=True)
+            }
+            fixed = [commands.fixed] * len(motors)
+            randomization = Randomization.build(drawn, bare, motors, fixed, timestep, config.allow_unstable, name)
+        checked = randomization is not None and randomization.draws_actuator  # then every draw is
+        for one in commands.simulated if not checked else ():
             one.check_at(timestep, config.allow_unstable)
         if any(one.INERTIA for one in commands.simulated):
             model = task_model(definition, commands.simulated, timestep, commands.max_forces, joint=config.joint)
@@ -119,41 +122,33 @@ class Setup:
             )
         return made
 
+    def draws(self, physics: Physics) -> Draws | None:
+        """What a simulation is to be drawn with; None if nothing is."""
+        put = functools.partial(put_into, physics)
+        return None if self.randomization is None else Draws(self.randomization, [self.commands.simulated], put)
+
     def start(
-        self, physics: Physics, generator: np.random.Generator, options: dict[str, Any] | None
+        self,
+        physics: Physics,
+        generator: np.random.Generator,
+        options: dict[str, Any] | None,
+        draws: Draws | None = None,
     ) -> tuple[Any, dict[str, Any]]:
         """Start an episode: draw the initial state and then, if anything is randomised, actuator and model.
 
         Disturbances and sensors that are random draw the key of their numbers last. The episode's actuator is returned,
-        and what `info` says of the draw.
+        and what `info` says of the draw; `draws` remembers it.
 
         Raises:
             ValueError: no stable current loop was drawn.
         """
         initial = self.task.initial(generator, options)
-        actuator, info = self.actuator, {}
-        if self.randomization is not None:
-            values, rejected = self.randomization.draw(
-                lambda rows, count: generator.random((len(rows), count)), nominal_fields([self.commands.simulated])
-            )
-            actuator = self.vary(physics, values[0])
-            info = {"randomization": self.randomization.report(values[0], rejected[0])}
+        actuator, info, draws = self.actuator, {}, draws or self.draws(physics)
+        if draws is not None:
+            draws.draw(lambda rows, count: generator.random((len(rows), count)), np.zeros(1, dtype=int))
+            actuator, info = alone(draws.motors(0, self.actuators)), {"randomization": draws.report()}
         physics.reset(initial, float(self.keys(lambda count: generator.random((1, count)))[0]))
         return actuator, info
-
-    def vary(self, physics: Physics, values: np.ndarray) -> Any:
-        """Give a simulation what was drawn, shape (k,), before it is reset or restored; the actuator that has it."""
-        randomization, actuators, simulated = self.randomization, self.actuators, self.commands.simulated
-        assert randomization is not None
-        if randomization.draws_actuator:
-            actuators, simulated = (
-                tuple(randomization.actuator(one, values) for one in nominal) for nominal in (actuators, simulated)
-            )
-            physics.set_actuators(simulated)
-        if randomization.variation is not None:
-            fields = randomization.model_fields(values[np.newaxis], additions_of([simulated]), drawn=True)
-            physics.set_model(fields)
-        return alone(actuators)
 
     @functools.cached_property
     def initial_bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -163,9 +158,8 @@ class Setup:
     @functools.cached_property
     def random(self) -> bool:
         """Whether an episode's disturbances or sensors need a key."""
-        drawn = () if self.randomization is None else self.randomization.names
-        noisy = any(one.random for one in self.commands.simulated) or any(name in self.family.RANDOM for name in drawn)
-        return self.disturbances.random or noisy
+        drawn = self.randomization is not None and self.randomization.random
+        return self.disturbances.random or drawn or any(one.random for one in self.commands.simulated)
 
     def keys(self, random: Callable[[int], np.ndarray]) -> np.ndarray:
         """Keys of the random numbers of m episodes' disturbances and sensors, shape (m,); 0 where none is needed.

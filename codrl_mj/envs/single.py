@@ -5,20 +5,19 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.utils import seeding
 
 from codrl_mj.actuators import IDEAL
 from codrl_mj.envs.attributes import GymnasiumAttributes, checked_states, read, written
 from codrl_mj.envs.compiled import arguments, compiled_kernels
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.recording import PhysicsRecorder
-from codrl_mj.envs.setup import Setup
-from codrl_mj.envs.snapshots import check_snapshot
+from codrl_mj.envs.recording import Recorder
+from codrl_mj.envs.setup import Setup, alone
+from codrl_mj.envs.snapshots import check_snapshot, generator_of, letters
 from codrl_mj.envs.views import signals_of
 from codrl_mj.envs.window import Window
-from codrl_mj.physics import MujocoPhysics, signal_names
+from codrl_mj.physics import MujocoPhysics, signal_names, trace_names
 from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
-from codrl_mj.physics.streams import set_words, words_of
+from codrl_mj.physics.streams import words_of
 from codrl_mj.tasks import Task
 
 
@@ -75,7 +74,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         self.setup = Setup.build(EnvConfig.of(task, actuator, arguments))
         self.physics = self.setup.simulate(physics)
         self._actuator = self.setup.actuator
-        self._randomization: dict[str, Any] = {}
+        self._draws = self.setup.draws(self.physics)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.setup.task.render_fps}
         self._view = {"width": width, "height": height, "camera": camera, "pretty": pretty}
@@ -127,9 +126,20 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         self.physics.state = checked_states(state, self.physics.state.shape)
 
     @property
-    def recorder(self) -> PhysicsRecorder:
+    def recorder(self) -> Recorder:
         """Reads the environment between its steps."""
-        return PhysicsRecorder(self)
+        family, physics = self.setup.family, self.physics
+        return Recorder(
+            signal_names(family),
+            trace_names(family),
+            self.setup.commands.name,
+            self.task.motors,
+            present=lambda: self.actuator,
+            state=lambda: physics.state,
+            speeds=lambda: physics.state[list(self.task.speeds)],
+            trace=lambda: physics.trace.copy(),
+            duration=lambda: self.task.step_duration,
+        )
 
     @property
     def signal_names(self) -> tuple[str, ...]:
@@ -165,8 +175,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
             options: Gymnasium's reset options for the task (CartPole: the bounds `low` and `high`).
         """
         super().reset(seed=seed)
-        self._actuator, info = self.setup.start(self.physics, self.np_random, options)
-        self._randomization = info.get("randomization", {})
+        self._actuator, info = self.setup.start(self.physics, self.np_random, options, self._draws)
         seen = self.physics.observed(np.zeros_like(self.physics.trace[-1])) if self.setup.view.sensors else None
         if self.render_mode == "human":
             self.render()
@@ -216,8 +225,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     @property
     def randomization(self) -> dict[str, Any]:
         """What the present episode was drawn with, as in the reset's info: NaN before it, empty without draws."""
-        names = () if self.setup.randomization is None else (*self.setup.randomization.names, "rejected")
-        return {name: 0 if name == "rejected" else np.nan for name in names} | self._randomization
+        return {} if self._draws is None else self._draws.report()
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Everything that the future depends on, as plain arrays: simulation, motor, generator, what was drawn.
@@ -225,16 +233,14 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         The generators of the spaces, and what wrappers count, are theirs.
         """
         everything = {
-            "task": np.frombuffer(self.task.name.encode(), dtype=np.uint8).copy(),
+            "task": letters(self.task.name),
             "physics": self.physics.snapshot(),
             "generator": words_of(self.np_random),
         }
         if self.physics.memory.size:
             everything["disturbances"] = self.physics.memory.copy()
-        if self.setup.randomization is not None:
-            drawn = [self._randomization.get(name, np.nan) for name in self.setup.randomization.names]
-            everything["drawn"] = np.array(drawn, dtype=np.float64)
-            everything["rejected"] = np.array(self._randomization.get("rejected", 0))
+        if self._draws is not None:
+            everything |= {name: np.array(rows[0]) for name, rows in self._draws.snapshot().items()}
         return everything
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
@@ -244,22 +250,13 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
             ValueError: the snapshot is of another task, or of arguments that need other entries or shapes; nothing was
                 changed.
         """
-        expected = self.snapshot()
-        check_snapshot(snapshot, expected)
-        if not np.array_equal(snapshot["task"], expected["task"]):
-            raise ValueError(f"snapshot['task'] is of {bytes(snapshot['task'])!r}: must be of {self.task.name!r}")
-        randomization = self.setup.randomization
-        if randomization is not None:
-            values, drawn = snapshot["drawn"], not np.isnan(snapshot["drawn"]).any()
-            self._randomization = randomization.report(values, int(snapshot["rejected"])) if drawn else {}
-            self._actuator = self.setup.vary(
-                self.physics, values if drawn else randomization.nominal_values(self.setup.commands.simulated)
-            )
+        check_snapshot(snapshot, self.snapshot(), "task")
+        if self._draws is not None:
+            self._draws.restore(snapshot)
+            self._actuator = alone(self._draws.motors(0, self.setup.actuators))
         self.physics.restore(snapshot["physics"])
         self.physics.memory[:] = snapshot.get("disturbances", 0.0)
-        generator, _ = seeding.np_random(0)
-        set_words(generator, snapshot["generator"])
-        self.np_random = generator
+        self.np_random = generator_of(snapshot["generator"])
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """The present state as an image, shape (height, width, 3), uint8; None in a window or without a render mode.

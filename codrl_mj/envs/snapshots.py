@@ -1,10 +1,17 @@
-"""What snapshots of environments have in common: whether one fits, and the time limits that they have to remember."""
+"""What snapshots of environments are made of: generators, time limits, MuJoCo's state; and whether one fits."""
 
 from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
+import mujoco
 import numpy as np
+from gymnasium.utils import seeding
+from mujoco.introspect.structs import STRUCTS
+
+from codrl_mj.physics.streams import set_words
+
+_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
 def time_limits(env: "gymnasium.Env[Any, Any]") -> list[Any]:
@@ -29,24 +36,72 @@ def set_elapsed_steps(env: "gymnasium.Env[Any, Any]", elapsed: np.ndarray) -> No
         limit._elapsed_steps = None if steps < 0 else steps
 
 
-def check_snapshot(snapshot: Mapping[str, np.ndarray], expected: Mapping[str, np.ndarray]) -> None:
-    """Refuse a snapshot of other entries, shapes or types than those of the environment's own.
+def letters(name: str) -> np.ndarray:
+    """What an environment is called, as an array."""
+    return np.frombuffer(name.encode(), dtype=np.uint8).copy()
 
-    Args:
-        snapshot: what is to be restored.
-        expected: what the environment's `snapshot` returns now.
+
+def generator_of(words: np.ndarray) -> np.random.Generator:
+    """A generator that goes on from what `codrl_mj.physics.streams.words_of` returned."""
+    generator, _ = seeding.np_random(0)
+    set_words(generator, words)
+    return generator
+
+
+def check_snapshot(snapshot: Mapping[str, np.ndarray], expected: Mapping[str, np.ndarray], name: str = "") -> None:
+    """Refuse a snapshot of other entries, shapes or types than those of the environment's own, `expected`.
+
+    The entry of a `name`, if there is one, has the `letters` of what it is of.
 
     Raises:
-        ValueError: an entry is missing, unknown, or of another shape or type.
+        ValueError: an entry is missing, unknown, or of another shape or type; or it is of something else.
     """
-    for name in [*expected, *(name for name in snapshot if name not in expected)]:
-        found, wanted = (_description(arrays.get(name)) for arrays in (snapshot, expected))
+    for entry in [*expected, *(one for one in snapshot if one not in expected)]:
+        found, wanted = (_description(arrays.get(entry)) for arrays in (snapshot, expected))
         if found != wanted:
             raise ValueError(
-                f"snapshot[{name!r}] is {found}: must be {wanted}; it is of another task, other arguments or another "
+                f"snapshot[{entry!r}] is {found}: must be {wanted}; it is of another task, other arguments or another "
                 "number of environments"
             )
+    if name and not np.array_equal(snapshot[name], expected[name]):
+        whose = bytes(expected[name]).decode()
+        raise ValueError(f"snapshot[{name!r}] is of {bytes(snapshot[name])!r}: must be of {whose!r}")
 
 
 def _description(array: np.ndarray | None) -> str:
     return "missing" if array is None else f"of shape {array.shape} and type {array.dtype}"
+
+
+def _computed() -> tuple[str, ...]:
+    """The arrays of numbers in `MjData` whose sizes do not depend on contacts; in MuJoCo's order they come first."""
+    names = []
+    for field in STRUCTS["mjData"].fields:
+        if field.name == "contact":
+            break
+        if getattr(getattr(field.type, "inner_type", None), "name", "") == "mjtNum":
+            names.append(field.name)
+    return tuple(names)
+
+
+_COMPUTED = _computed()
+
+
+def state_of(data: mujoco.MjData) -> dict[str, np.ndarray]:
+    """MuJoCo's state vector (`mjSTATE_INTEGRATION`), motors included, and what was computed from it, by name.
+
+    A step leaves poses and forces where its last integration step began, and environments take observations and rewards
+    from them: the state alone would not continue bit for bit.
+    """
+    state = np.empty(mujoco.mj_stateSize(data.model, _STATE))
+    mujoco.mj_getState(data.model, data, state, _STATE)
+    return {"state": state, "computed": np.concatenate([getattr(data, name).ravel() for name in _COMPUTED])}
+
+
+def set_state_of(data: mujoco.MjData, state: np.ndarray, computed: np.ndarray) -> None:
+    """Continue from what `state_of` returned, of the same model."""
+    mujoco.mj_setState(data.model, data, state, _STATE)
+    start = 0
+    for name in _COMPUTED:
+        view = getattr(data, name)
+        view[...] = computed[start : start + view.size].reshape(view.shape)
+        start += view.size

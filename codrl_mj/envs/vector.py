@@ -1,6 +1,7 @@
 """Thousands of environments as one, on MuJoCo's batched simulation: Gymnasium's `VectorEnv`."""
 
 import dataclasses
+import functools
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,7 +16,7 @@ from gymnasium.vector.utils import batch_space
 from codrl_mj.actuators import ActuatorModel, Ideal, check_same_family
 from codrl_mj.envs.attributes import GymnasiumAttributes, checked_states, read, shared, written
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.draws import Draws
+from codrl_mj.envs.randomization import Draws, put_into_batch
 from codrl_mj.envs.setup import Setup
 from codrl_mj.envs.snapshots import check_snapshot
 from codrl_mj.physics import Signals
@@ -121,7 +122,8 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         self._streams = Streams(self.num_envs)
         self._draws = None
         if self.setup.randomization is not None:
-            self._draws = Draws(self.setup.randomization, self.physics, actuators)
+            put = functools.partial(put_into_batch, self.physics)
+            self._draws = Draws(self.setup.randomization, actuators, put)
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
         self._ended = np.zeros(self.num_envs, dtype=bool)
         self._observations: Array = np.zeros(self.observation_space.shape or (), dtype=np.float32)
@@ -248,7 +250,10 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         low, high = self.setup.task.bounds(options) if options else self.setup.initial_bounds
         draws = low + (high - low) * self._streams.random(rows, len(low))
         states = self.setup.task.initial_states(draws)
-        infos = {} if self._draws is None else self._draws.draw(self._streams, rows)
+        infos: dict[str, Any] = {}
+        if self._draws is not None:
+            self._draws.draw(self._streams.random, rows)
+            infos = self._draws.infos(rows)
         self.physics.reset(rows, states, self.setup.keys(lambda count: self._streams.random(rows, count)))
         seen = self.physics.observed(None, rows) if self.setup.view.sensors else None
         self._observations[rows] = self.setup.view.observation(states, seen)
@@ -389,7 +394,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             self._renderer = OffscreenRenderer(self.physics.model, **self._view)  # type: ignore[arg-type]
             self._data = mujoco.MjData(self.physics.model)
         if self._draws is not None:
-            self._draws.show(row)
+            write_fields(self.physics.model, self._draws.model_fields(np.array([row]), drawn=True))
         write_fields(self.physics.model, self._looks, row)
         self.physics.show(row, self._data)
         return self._renderer.render(self._data)

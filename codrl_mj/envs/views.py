@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from gymnasium import spaces
 from codrl_mj.actuators import Family
 from codrl_mj.envs.outcomes import Outcomes, compiled_outcomes
 from codrl_mj.physics import Signals
+from codrl_mj.physics.base import named_signals
 from codrl_mj.tasks import Task
 
 
@@ -31,15 +33,11 @@ class View:
         Raises:
             ValueError: they have none.
         """
-        if observe_actuator and not family.OBSERVED:
-            raise ValueError(
-                f"observe_actuator=True: the {family.family or family.__name__} actuator has no current to observe, "
-                "and nothing else; choose another"
-            )
-        motors = task.motors if observe_actuator else ()
-        single = len(task.motors) == 1
-        names = tuple(name if single else f"{motor}.{name}" for motor in motors for name in family.OBSERVED)
-        return cls(task, options, names)
+        motors = dict.fromkeys(task.motors if len(task.motors) > 1 else ("",), family)
+        sensors = sensor_names(motors)
+        if observe_actuator:
+            check_observed(sensors, motors)
+        return cls(task, options, sensors if observe_actuator else ())
 
     @functools.cached_property
     def outcomes(self) -> Outcomes:
@@ -55,11 +53,7 @@ class View:
     def observation_space(self) -> spaces.Box:
         """The task's observation space, with unbounded entries for the sensors."""
         space = self.task.observation_space
-        if not self.sensors:
-            return space
-        inf = np.full(len(self.sensors), np.inf)
-        low, high = np.append(space.low, -inf), np.append(space.high, inf)
-        return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+        return longer(space, len(self.sensors)) if self.sensors else space
 
     @property
     def observation_names(self) -> tuple[str, ...]:
@@ -102,13 +96,33 @@ def signals_of(row: np.ndarray, family: Family, desired: Any, tracks: bool) -> S
     The force [N or N*m] that was asked for counts as `desired` if the actuator `tracks` it; else what was delivered.
     """
     names = ("desired_force", "actual_force", *family.Signals._fields)
-    several = len(row) > 1
-    values = row.T.copy() if several else row[0].tolist()
-    signals = dict(zip(names, values, strict=False))
+    signals = named_signals(names, row.T.copy() if len(row) > 1 else row[0].tolist())
     signals["desired_force"] = desired if tracks else signals["actual_force"]
-    saturated = signals.pop("saturated", np.zeros(len(row)) if several else 0.0)
-    signals["saturated"] = saturated != 0.0
     return signals
+
+
+def sensor_names(motors: Mapping[str, Family]) -> tuple[str, ...]:
+    """Names of what the sensors of motors, by theirs, say; a motor without a name needs none."""
+    return tuple(f"{motor}.{name}" if motor else name for motor, one in motors.items() for name in one.OBSERVED)
+
+
+def check_observed(sensors: tuple[str, ...], motors: Mapping[str, Family]) -> None:
+    """Refuse to observe motors that have no sensors."""
+    if not sensors:
+        kinds = ", ".join(sorted({one.family or one.__name__ for one in motors.values()}))
+        raise ValueError(
+            f"observe_actuator=True: the {kinds} actuator has no current to observe, and nothing else; choose another"
+        )
+
+
+def longer(space: spaces.Space, count: int) -> spaces.Box:
+    """An observation space, which must be of vectors, with some unbounded entries more."""
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        raise ValueError(f"observe_actuator=True: observations are {space}, and only to vectors can be appended")
+    low, high = (
+        np.append(bound, np.full(count, value)) for bound, value in ((space.low, -np.inf), (space.high, np.inf))
+    )
+    return spaces.Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype.type)
 
 
 def _rows(array: np.ndarray) -> np.ndarray:

@@ -13,11 +13,10 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel
 from codrl_mj.disturbances import resolve_disturbances
+from codrl_mj.envs.commands import command_of
+from codrl_mj.envs.motors import Motors
 from codrl_mj.fields import did_you_mean
 from codrl_mj.foreign.building import Building
-from codrl_mj.foreign.commands import command_of
-from codrl_mj.foreign.readings import readings
-from codrl_mj.foreign.simulated import Simulated
 from codrl_mj.specs import resolve_patterns
 
 
@@ -52,12 +51,9 @@ class MotorisedEnvironment(dm_env.Environment):
         Raises:
             ValueError: see `make_dm_control`.
         """
-        self._meanings = {pattern: command_of(one, action, pattern) for pattern, one in actuators.items()}
-        self._actuators = {
-            pattern: actuators[pattern] if command is None else command.actuator
-            for pattern, command in self._meanings.items()
-        }
-        self._building = Building(self._actuators, allow_unstable)
+        self._action, self._commands = action, {name: command_of(one, action, name) for name, one in actuators.items()}
+        simulated = {pattern: command.actuator for pattern, command in self._commands.items()}
+        self._building = Building(simulated, allow_unstable)
         self._randomize, self._disturbances = randomize, resolve_disturbances(disturbances)
         self._allow_unstable = allow_unstable
         with self._building.motorising():
@@ -70,17 +66,17 @@ class MotorisedEnvironment(dm_env.Environment):
             )
         self._generator = np.random.default_rng(noise_seed)
         self._ended = True
-        self._bound: tuple[mujoco.MjModel, Simulated] | None = None
-        _ = self._simulated  # what is wrong is said here
+        self._bound: tuple[mujoco.MjModel, Motors] | None = None
+        _ = self._motors  # what is wrong is said here
 
     def reset(self) -> dm_env.TimeStep:
         """Start an episode, the motors at rest; composer environments build their model anew."""
         if self._randomize is not None:
-            self._simulated.draw(self._generator)
+            self._motors.draw(self._generator)
         with self._building.motorising():
             timestep = self._environment.reset()
         self._ended = False
-        self._simulated.begin(self._generator)
+        self._motors.begin(self._generator)
         return timestep
 
     def step(self, action: Any) -> dm_env.TimeStep:
@@ -92,45 +88,45 @@ class MotorisedEnvironment(dm_env.Environment):
         """
         if self._ended:
             return self.reset()
-        simulated, time = self._simulated, self.mujoco[1].time
+        motors, time = self._motors, self.mujoco[1].time
         try:
             with self._building.motorising():
-                timestep = self._environment.step(simulated.controls(action))
+                timestep = self._environment.step(motors.controls(action))
         except control.PhysicsError:  # or whatever else ends its simulation
-            simulated.check_finite(type(self._environment).__name__, time)
+            motors.check_finite(type(self._environment).__name__, time)
             raise
         self._ended = timestep.last()
         return timestep
 
     @property
-    def _simulated(self) -> Simulated:
+    def _motors(self) -> Motors:
         """The motors in the present model."""
         model, data = self.mujoco
         if self._bound is None or self._bound[0] is not model:
             spec = self._environment.action_spec()
             low, high = (np.broadcast_to(bound, spec.shape) for bound in (spec.minimum, spec.maximum))
-            simulated = Simulated(
+            motors = Motors(
                 data,
-                self._actuators,
-                self._meanings,
+                self._commands,
+                self._action,
                 spaces.Box(low, high, dtype=np.float64),
                 randomize=self._randomize,
                 disturbances=self._disturbances,
                 step_duration=self._environment.control_timestep(),
                 allow_unstable=self._allow_unstable,
             )
-            self._bound = model, simulated
+            self._bound = model, motors
         return self._bound[1]
 
     @property
     def motors(self) -> dict[int, ActuatorModel]:
         """The motors of the present episode, by the index of the actuator in the model."""
-        return dict(self._simulated.motors)
+        return dict(self._motors.present)
 
     @property
     def randomization(self) -> dict[str, Any]:
         """What the present episode was drawn with; empty if nothing was drawn."""
-        return self._simulated.report
+        return self._motors.randomization
 
     def signals(self) -> dict[str, Any]:
         """The motors' signals after the last step, as in `info` of `codrl_mj.make`.
@@ -138,7 +134,7 @@ class MotorisedEnvironment(dm_env.Environment):
         `desired_force` and `actual_force` [N or N*m], the signals of the families and `saturated`; of several motors
         arrays (n_motors,) in the model's order.
         """
-        return readings(self._simulated.readout, self.mujoco[1])
+        return self._motors.signals()
 
     @property
     def mujoco(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -153,9 +149,9 @@ class MotorisedEnvironment(dm_env.Environment):
     def action_spec(self) -> Any:
         """The environment's, with the limits of the motors' commands where these are what an action stands for."""
         spec = self._environment.action_spec()
-        if not any(self._meanings.values()):
+        if self._action == "force":
             return spec
-        space: Any = self._simulated.action_space
+        space: Any = self._motors.action_space
         return specs.BoundedArray(spec.shape, spec.dtype, space.low, space.high, spec.name)
 
     def reward_spec(self) -> Any:

@@ -4,29 +4,34 @@ import contextlib
 import copy
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium
 import mujoco
 import numpy as np
-from gymnasium import spaces
 from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.envs.registration import EnvSpec, load_env_creator
-from gymnasium.utils import RecordConstructorArgs, seeding
+from gymnasium.utils import RecordConstructorArgs
 
 from codrl_mj.actuators import ActuatorModel, Command
 from codrl_mj.disturbances import resolve_disturbances
 from codrl_mj.engine.reading import bring_to_rest, motors, slots
-from codrl_mj.envs.snapshots import check_snapshot, elapsed_steps, set_elapsed_steps
+from codrl_mj.envs.commands import command_of
+from codrl_mj.envs.motors import Motors
+from codrl_mj.envs.recording import Recorder, StepWatch
+from codrl_mj.envs.snapshots import (
+    check_snapshot,
+    elapsed_steps,
+    generator_of,
+    letters,
+    set_elapsed_steps,
+    set_state_of,
+    state_of,
+)
+from codrl_mj.envs.views import check_observed, longer
 from codrl_mj.foreign.building import Building
-from codrl_mj.foreign.commands import command_of
-from codrl_mj.foreign.draws import PREFIX
-from codrl_mj.foreign.readings import Sensors, readings
-from codrl_mj.foreign.recording import MotorsRecorder
-from codrl_mj.foreign.simulated import Simulated
-from codrl_mj.foreign.state import set_state_of, state_of
-from codrl_mj.physics.streams import set_words, words_of
+from codrl_mj.physics.streams import words_of
 from codrl_mj.specs import resolve_patterns
 
 
@@ -79,24 +84,9 @@ def make(
     if str(entry.entry_point).startswith("codrl_mj.envs:"):
         raise ValueError(f"{env_id}: its actuators are its own: gymnasium.make({env_id!r}, actuator=...)")
     resolved = resolve_patterns(actuators, f"the environment {env_id}")
-    if isinstance(randomize, Mapping):
-        randomize = _by_pattern(randomize, resolved)
     spec = copy.copy(entry)
     spec.entry_point = Motorised(entry.entry_point, resolved, action, allow_unstable, env_id)
     return MotorisedEnv(gymnasium.make(spec, **options), observe_actuator, randomize, disturbances)
-
-
-def _by_pattern(randomize: Mapping[str, Any], patterns: Iterable[str]) -> dict[str, Any]:
-    """Pattern -> field -> distribution, and field of the model -> distribution; a path without a pattern is for all."""
-    found: dict[str, Any] = {}
-    for path, one in randomize.items():
-        pattern, colon, field = path.rpartition(":")
-        if isinstance(one, Mapping) or (not colon and path.startswith(PREFIX)):
-            found[path] = one
-            continue
-        for each in (pattern,) if colon else patterns:
-            found.setdefault(each, {})[field] = one
-    return found
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,21 +105,13 @@ class Motorised:
     """The environment's, for messages."""
 
     @functools.cached_property
-    def commands(self) -> dict[str, Command | None]:
-        """Pattern -> what an action means to its motors; None where it is the environment's own.
+    def commands(self) -> dict[str, Command]:
+        """Pattern -> what an action means to its motors.
 
         Raises:
             ValueError: an actuator takes no such command.
         """
         return {pattern: command_of(one, self.action, pattern) for pattern, one in self.actuators.items()}
-
-    @property
-    def simulated(self) -> dict[str, ActuatorModel]:
-        """Pattern -> what is simulated: the actuator, or what a command leaves of it."""
-        return {
-            pattern: self.actuators[pattern] if command is None else command.actuator
-            for pattern, command in self.commands.items()
-        }
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -146,7 +128,8 @@ class Motorised:
         Raises:
             ValueError: see `codrl_mj.motorised`.
         """
-        creator, building = self._creator, Building(self.simulated, self.allow_unstable)
+        simulated = {pattern: command.actuator for pattern, command in self.commands.items()}
+        creator, building = self._creator, Building(simulated, self.allow_unstable)
         ours = isinstance(creator, type) and issubclass(creator, MujocoEnv)
         with building.motorising():
             env = _with_motors(creator)(**options) if ours else creator(**options)
@@ -235,64 +218,56 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
             ValueError: see `make`.
         """
         base: Any = self.unwrapped
-        self._recorder: MotorsRecorder | None = None
-        self._data, motorised = base.data, self._motorised
-        self._simulated = Simulated(
+        motorised = self._motorised
+        self._watch: StepWatch | None = None
+        self._motors = Motors(
             base.data,
-            motorised.simulated,
             motorised.commands,
+            motorised.action,
             self.env.action_space,
             randomize=self._randomize,
             disturbances=self._disturbances,
             step_duration=getattr(base, "dt", None),
             allow_unstable=motorised.allow_unstable,
         )
-        if self._simulated.action_space is not self.env.action_space:
-            self.action_space = self._simulated.action_space
-        self._sensors: Sensors | None = None
-        self._look()
+        if self._motors.action_space is not self.env.action_space:
+            self.action_space = self._motors.action_space
         if self._observes:
-            self.observation_space = _longer(self.env.observation_space, len(self.sensor_names))
-
-    def _look(self) -> None:
-        """Have the sensors of the present motors."""
-        if self._observes:
-            self._sensors = Sensors(self._data, self._simulated.motors)
+            check_observed(self._motors.sensors, self._motors.families)
+            self.observation_space = longer(self.env.observation_space, len(self._motors.sensors))
 
     @property
     def motors(self) -> dict[int, ActuatorModel]:
         """The motors of the present episode, by the index of the actuator in the model."""
-        return dict(self._simulated.motors)
+        return dict(self._motors.present)
 
     @property
     def signal_names(self) -> tuple[str, ...]:
         """Of the motors' signals in `info`."""
-        return tuple(readings(self._simulated.readout, self._data))
+        return tuple(self._motors.signals())
 
     @property
-    def recorder(self) -> MotorsRecorder:
+    def recorder(self) -> Recorder:
         """Reads the environment between its steps; from now on every integration step is looked at."""
-        if self._recorder is None:
-            readout, command = self._simulated.readout, self._motorised.action
-            self._recorder = MotorsRecorder(self._data, readout, command, lambda: self.motors)
-        return self._recorder
+        self._watch = self._watch or StepWatch(self._motors)
+        return self._watch.recorder(self._motorised.action)
 
     @property
     def sensor_names(self) -> tuple[str, ...]:
         """Names of what `observe_actuator` appends to the observation."""
-        return () if self._sensors is None else self._sensors.names
+        return self._motors.sensors if self._observes else ()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode, the motors at rest; a seed starts the generator of their draws too."""
         if seed is not None:
             own = np.random.SeedSequence(seed, spawn_key=(1,))  # independent of the environment's
             self._generator = np.random.Generator(np.random.PCG64(own))
-        self._simulated.draw(self._generator)
-        self._look()
+        self._motors.draw(self._generator)
         observation, info = self.env.reset(seed=seed, options=options)
         self._begun = True
-        self._simulated.begin(self._generator)
-        return self._observed(observation), info | self._drawn()
+        self._motors.begin(self._generator)
+        drawn = self.randomization
+        return self._observed(observation), info | ({"randomization": drawn} if drawn else {})
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Advance by one environment step.
@@ -301,25 +276,22 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
             ValueError: the action has not the shape of the action space.
             SimulationDivergedError: the simulation left the finite numbers.
         """
-        time = self._data.time
-        with contextlib.nullcontext() if self._recorder is None else self._recorder.watching():
-            observation, reward, terminated, truncated, info = self.env.step(self._simulated.controls(action))
-        self._simulated.check_finite(self._motorised_id, time)
-        seen = readings(self._simulated.readout, self._data)
-        return self._observed(observation), reward, terminated, truncated, info | seen
+        motors = self._motors
+        time = motors.data.time
+        with contextlib.nullcontext() if self._watch is None else self._watch.watching():
+            observation, reward, terminated, truncated, info = self.env.step(motors.controls(action))
+        motors.check_finite(self._id, time)
+        return self._observed(observation), reward, terminated, truncated, info | motors.signals()
 
     def _observed(self, observation: Any) -> Any:
-        if self._sensors is None:
+        if not self._observes:
             return observation
-        return np.concatenate([observation, self._sensors.seen()]).astype(observation.dtype)
-
-    def _drawn(self) -> dict[str, Any]:
-        return {"randomization": self.randomization} if self.randomization else {}
+        return np.concatenate([observation, self._motors.seen()]).astype(observation.dtype)
 
     @property
     def randomization(self) -> dict[str, Any]:
         """What the present episode was drawn with, as in the reset's info; empty if nothing was drawn."""
-        return self._simulated.report
+        return self._motors.randomization
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Everything that the future depends on, as plain arrays: simulation, motors, generators, draws, time limit.
@@ -329,14 +301,14 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         are no `MujocoEnv` of Gymnasium's nobody knows where their state is: the snapshot has the generators, and
         `restore` starts an episode.
         """
-        found = {
-            "environment": np.frombuffer(self._motorised_id.encode(), dtype=np.uint8).copy(),
-            **(state_of(self._data) if self._whole else {}),
+        return {
+            "environment": letters(self._id),
+            **(state_of(self._motors.data) if self._whole else {}),
             "generator": words_of(self.unwrapped.np_random),
             "motors_generator": words_of(self._generator),
             "elapsed_steps": elapsed_steps(self.env),
+            **self._motors.snapshot(),
         }
-        return found | {name: array.copy() for name, array in self._simulated.memory.items()}
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> Any:
         """Continue from what `snapshot` returned, bit for bit, in an environment made with the same arguments.
@@ -348,33 +320,21 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
             ValueError: the snapshot is of another environment, or of arguments that need other entries or shapes;
                 nothing was changed.
         """
-        expected = self.snapshot()
-        check_snapshot(snapshot, expected)
-        if not np.array_equal(snapshot["environment"], expected["environment"]):
-            raise ValueError(
-                f"snapshot['environment'] is of {bytes(snapshot['environment'])!r}: must be of {self._motorised_id!r}"
-            )
+        check_snapshot(snapshot, self.snapshot(), "environment")
         if not self._begun:  # which Gymnasium's wrappers insist on
             self.env.reset()
             self._begun = True
-        if "drawn" in expected:
-            self._simulated.restore(snapshot["drawn"].copy())
-            self._look()
-        generator, _ = seeding.np_random(0)
-        set_words(generator, snapshot["generator"])
-        self.unwrapped.np_random = generator
-        self._generator, _ = seeding.np_random(0)
-        set_words(self._generator, snapshot["motors_generator"])
+        self._motors.restore(snapshot)
+        self.unwrapped.np_random = generator_of(snapshot["generator"])
+        self._generator = generator_of(snapshot["motors_generator"])
         if not self._whole:
             return self.reset()[0]
-        set_state_of(self._data, snapshot["state"], snapshot["computed"])
-        if "disturbances" in expected:
-            self._simulated.memory["disturbances"][:] = snapshot["disturbances"]
+        set_state_of(self._motors.data, snapshot["state"], snapshot["computed"])
         set_elapsed_steps(self.env, snapshot["elapsed_steps"])
         return None
 
     @property
-    def _motorised_id(self) -> str:
+    def _id(self) -> str:
         return "" if self.env.spec is None else self.env.spec.id
 
     @property
@@ -384,26 +344,9 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but what belongs to the model, which a copied environment makes again."""
-        return {name: value for name, value in self.__dict__.items() if name not in _OF_THE_MODEL}
+        return {name: value for name, value in self.__dict__.items() if name not in ("_motors", "_watch")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore, in this or another process; as with all of Gymnasium's, the copy has to be reset."""
         self.__dict__.update(state, _begun=False)
         self._bind()
-
-
-_OF_THE_MODEL = ("_data", "_simulated", "_sensors", "_recorder")
-
-
-def _longer(space: gymnasium.Space, count: int) -> spaces.Box:
-    """An observation space with some unbounded entries more.
-
-    Raises:
-        ValueError: it is no vector.
-    """
-    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-        raise ValueError(f"observe_actuator=True: observations are {space}, and only to vectors can be appended")
-    low, high = (
-        np.append(bound, np.full(count, value)) for bound, value in ((space.low, -np.inf), (space.high, np.inf))
-    )
-    return spaces.Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype.type)

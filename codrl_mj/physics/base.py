@@ -31,6 +31,16 @@ def signal_names(family: Family) -> tuple[str, ...]:
     return (*(name for name in trace_names(family)[:-1] if name != "saturated"), "saturated")
 
 
+def named_signals(names: tuple[str, ...], columns: Any) -> Signals:
+    """Numbers of one actuator, or arrays of several, by the names of the first of them; `saturated` is a flag."""
+    signals = dict(zip(names, columns, strict=False))
+    saturated = signals.pop("saturated", None)
+    if saturated is None:
+        saturated = 0.0 if isinstance(columns, list) else np.zeros_like(columns[0])
+    signals["saturated"] = saturated > 0.0  # which NaN is not
+    return signals
+
+
 class Physics(Protocol):
     """One simulation of one task.
 

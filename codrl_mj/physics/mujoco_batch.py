@@ -14,13 +14,13 @@ from codrl_mj.actuators import ActuatorModel, Ideal, check_same_family
 from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint
 from codrl_mj.engine.families import HEAD, load_family, signals_at
 from codrl_mj.engine.sensors import compiled_observe
-from codrl_mj.physics.base import LARGEST, Signals, SimulationDivergedError
+from codrl_mj.physics.base import LARGEST, Signals, SimulationDivergedError, named_signals
 from codrl_mj.physics.constrain import compiled_batch
 from codrl_mj.physics.disturber import disturber
 from codrl_mj.physics.mjcf import flags_with_friction, needed_callbacks, task_model
 from codrl_mj.physics.mujoco_single import wiring
 from codrl_mj.physics.stepping import NOISE_KEY, TORQUE
-from codrl_mj.physics.variation import Variation, additions_of, write_fields
+from codrl_mj.physics.variation import Variation, additions_of, bare_model, write_fields
 from codrl_mj.tasks import Task
 
 
@@ -73,7 +73,8 @@ class MujocoBatchPhysics:
         every, additions = np.arange(self.num_envs), additions_of(actuators)
         self.set_actuators(every, actuators)
         if (additions != additions[0]).any():
-            mounting = Variation(task.name, (), joint=joint, mounting=True)
+            motors = [int(one.actuator) for one in self._wiring]
+            mounting = Variation(bare_model(task.name, joint), motors=motors, mounting=True)
             self.set_model(every, mounting.fields(np.empty((self.num_envs, 0)), additions))
 
     def _make_batch(self) -> None:
@@ -197,10 +198,8 @@ class MujocoBatchPhysics:
             _read_signals(self._act, self._slots, signals_at(self.family), self._arms, shown)
         else:
             shown[0] = command
-        shape = desired_force.shape
-        signals = dict(zip(("actual_force", *names), shown.reshape(-1, *shape), strict=True))
-        saturated = signals.pop("saturated", np.zeros(shape)) != 0.0
-        return {"desired_force": desired_force, **signals, "saturated": saturated}
+        shown = shown.reshape(-1, *desired_force.shape)
+        return {"desired_force": desired_force, **named_signals(("actual_force", *names), shown)}
 
     def _integrate(self, steps: int) -> None:
         """Take integration steps."""

@@ -1,7 +1,9 @@
-"""Variations of a task's model, of many simulations at once: masses, lengths, gravity, damping, rotors on joints."""
+"""Variations of a model, of many simulations at once: masses, lengths, gravity, damping, and what motors add to it."""
 
+import copy
 import functools
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -9,48 +11,96 @@ import numpy as np
 from codrl_mj.actuators import IDEAL, ActuatorModel
 from codrl_mj.disturbances import PLAIN, Joint
 from codrl_mj.engine.hill import GRAVITY
-from codrl_mj.fields import did_you_mean
 from codrl_mj.physics.mjcf import hills, task_model
 from codrl_mj.tasks import TASKS
 
 DRAWN = ("geom_pos", "geom_size")
 """Fields that only what is drawn depends on."""
-ADDED = ("dof_armature", "dof_damping", "dof_frictionloss")
-"""What an actuator adds to the degree of freedom of its joint: entries as in `JointAdditions`."""
+_FIELDS = {
+    "mass": ("body_mass", "body_inertia"),
+    "length": ("body_ipos", "body_inertia", "body_pos", *DRAWN),
+    "damping": ("dof_damping",),
+    "gravity": ("opt.gravity", "jnt_user"),
+}
+VARIED = tuple(dict.fromkeys(name for names in _FIELDS.values() for name in names if name not in DRAWN))
+"""Fields that the dynamics depend on."""
+
+
+class Mount(NamedTuple):
+    """Where a motor's share of one entry of its `JointAdditions` is in a model."""
+
+    field: str
+    """Of the model."""
+    place: int
+    """In it."""
+    scale: float
+    """The model's number is that many times the motor's."""
+
+
+def mounts_of(model: mujoco.MjModel, index: int) -> tuple[Mount | None, ...]:
+    """Where an actuator's additions go, entries as in `JointAdditions`; None where the model has no place for them.
+
+    Those of a motor in the control callback are its joint's; a plugin keeps gear, inertia and damping to itself.
+    """
+    kind, driven = mujoco.mjtTrn(model.actuator_trntype[index]), int(model.actuator_trnid[index, 0])
+    rubs: Mount | None = None
+    scale = abs(float(model.actuator_gear[model.actuator_outadr[index], 0]))
+    if kind in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
+        dof = int(model.jnt_dofadr[driven])
+        if model.actuator_plugin[index] < 0:
+            return tuple(Mount(f"dof_{name}", dof, 1.0) for name in ("armature", "damping", "frictionloss"))
+        rubs = Mount("dof_frictionloss", dof, scale)
+    elif kind == mujoco.mjtTrn.mjTRN_TENDON:
+        rubs = Mount("tendon_frictionloss", driven, scale)
+    return Mount("actuator_armature", index, 1.0), Mount("actuator_damping", index, 1.0), rubs
 
 
 @functools.cache
-def _nominal_model(task: str, joint: Joint = PLAIN) -> mujoco.MjModel:
-    """A task's model with ideal actuators, read only."""
+def bare_model(task: str, joint: Joint = PLAIN) -> mujoco.MjModel:
+    """The model of the task of a name, with nothing on its actuated joints but what is given; read only."""
     return task_model(TASKS[task], (IDEAL,) * len(TASKS[task].motors), TASKS[task].step_duration, joint=joint)
 
 
-def additions_of(actuators: Sequence[Sequence[ActuatorModel]]) -> np.ndarray:
-    """What the actuators of m environments add to their joints, shape (m, n, 3), entries as in `JointAdditions`."""
-    return np.array([[one.additions for one in each] for each in actuators])
+def without_motors(model: mujoco.MjModel, motors: Mapping[int, ActuatorModel]) -> mujoco.MjModel:
+    """A copy of a model without what its motors, by the indices of their actuators, add to it."""
+    bare = copy.copy(model)
+    for index, motor in motors.items():
+        for mount, added in zip(mounts_of(model, index), motor.additions, strict=True):
+            if mount is not None:
+                getattr(bare, mount.field)[mount.place] -= added * mount.scale
+    return bare
 
 
-def variable(task: str) -> tuple[str, ...]:
-    """Names of what can be varied of the model of the task of a name."""
-    model = _nominal_model(task)
-    names = [f"model.mass.{model.body(body).name}" for body in range(1, model.nbody)]
-    names += [f"model.length.{model.body(body).name}" for body in range(1, model.nbody) if _has_length(model, body)]
-    names += [f"model.damping.{model.joint(joint).name}" for joint in range(model.njnt)]
+def additions_of(motors: Sequence[Sequence[ActuatorModel]]) -> np.ndarray:
+    """What the motors of m simulations add to their joints, shape (m, n, 3), entries as in `JointAdditions`."""
+    return np.array([[one.additions for one in each] for each in motors])
+
+
+def variable(model: mujoco.MjModel) -> tuple[str, ...]:
+    """Names of what can be varied of a model."""
+    bodies = {body: model.body(body).name for body in range(1, model.nbody) if model.body(body).name}
+    joints = [model.joint(joint).name for joint in range(model.njnt)]
+    names = [f"model.mass.{name}" for name in bodies.values()]
+    names += [f"model.length.{name}" for body, name in bodies.items() if _has_length(model, body)]
+    names += [f"model.damping.{name}" for name in joints if name]
     return (*names, "model.gravity")
 
 
 def _has_length(model: mujoco.MjModel, body: int) -> bool:
-    """Whether a body turns about its joint and has its centre of mass on the z axis from there."""
+    """Whether a body turns about its joint, has its centre of mass on the z axis from there, and touches nothing."""
     joints = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
     turns = all(
         model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE and not model.jnt_pos[joint].any() for joint in joints
     )
+    flags = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
+    touches = (model.geom_contype | model.geom_conaffinity).any() and not model.opt.disableflags & flags
+    held = touches or model.ntendon or model.neq
     x, y, z = model.body_ipos[body]
-    return turns and bool(z) and x == y == 0.0 and list(model.body_iquat[body]) == [1.0, 0.0, 0.0, 0.0]
+    return turns and bool(z) and x == y == 0.0 and list(model.body_iquat[body]) == [1.0, 0.0, 0.0, 0.0] and not held
 
 
 class Variation:
-    """How numbers change the fields of a task's compiled model.
+    """How numbers change the fields of a compiled model.
 
     `model.mass.BODY` multiplies a body's mass and inertia, `model.length.BODY` all distances along it (its centre of
     mass, what hangs on it, what is drawn of it) and, squared, its inertia about the axes across it, `model.gravity`
@@ -58,52 +108,39 @@ class Variation:
     """
 
     def __init__(
-        self,
-        task: str,
-        names: Sequence[str],
-        model: mujoco.MjModel | None = None,
-        joint: Joint = PLAIN,
-        mounting: bool = False,
+        self, model: mujoco.MjModel, names: Sequence[str] = (), motors: Sequence[int] = (), mounting: bool = False
     ) -> None:
-        """Find the fields of what is varied, of `variable(task)`, in a model of the task: its own, or one given.
+        """Find the fields of what is varied, names of `variable(model)`.
 
-        That has `joint` on its actuated joints; `mounting` varies what actuators add to their joints, too.
-
-        Raises:
-            ValueError: an unknown name; the nearest known one is suggested.
+        `motors` are the indices of actuators whose additions are not in the model; `mounting` varies these, too.
         """
-        model = _nominal_model(task, joint) if model is None else model
-        known = variable(task)
         self.names = tuple(names)
-        self._nominal: dict[str, np.ndarray] = {}
-        for name in names:
-            if name not in known:
-                raise ValueError(f"unknown {name!r}: {did_you_mean(name, known)}{task} has {', '.join(known)}")
-            for field in _FIELDS[name.split(".")[1]]:
-                self._nominal[field] = field_of(model, field).copy()
-        self._nominal |= {field: field_of(model, field).copy() for field in ADDED if mounting}
+        self._mounts = [mounts_of(model, index) for index in motors]
+        fields = [field for name in names for field in _FIELDS[name.split(".")[1]]]
+        fields += [mount.field for mounts in self._mounts for mount in mounts if mount is not None] * mounting
+        self._nominal = {field: field_of(model, field).copy() for field in fields}
+        self._neutral = np.array([float(not name.startswith("model.damping.")) for name in names])
         self._bodies = {model.body(body).name: body for body in range(model.nbody)}
-        self._dofs = {model.joint(joint).name: int(model.jnt_dofadr[joint]) for joint in range(model.njnt)}
+        self._dofs = {model.joint(joint).name: model.dof_jntid == joint for joint in range(model.njnt)}
         self._parents = model.body_parentid.copy()
         self._geom_bodies = model.geom_bodyid.copy()
         self._geoms_along = _along(model)
         self._hills = hills(model)
-        self._driven = [model.jnt_dofadr[model.actuator(name).trnid[0]] for name in TASKS[task].motors]
 
     def fields(
         self, values: np.ndarray, additions: np.ndarray | None = None, drawn: bool = False
     ) -> dict[str, np.ndarray]:
         """The varied fields of the model, by name (`opt.` before an option's), shape (m, ...).
 
-        `values`, shape (m, k), has a column for each of `names`; `additions` are as `additions_of` has them; `drawn`
-        includes the fields that only what is drawn depends on.
+        `values`, shape (m, k), has a column for each of `names`, NaN where it is as it was; `additions` are as
+        `additions_of` has them; `drawn` includes the fields that only what is drawn depends on.
         """
         fields = {
             field: np.repeat(nominal[np.newaxis], len(values), axis=0)
             for field, nominal in self._nominal.items()
             if drawn or field not in DRAWN
         }
-        for name, column in zip(self.names, values.T, strict=True):
+        for name, column in zip(self.names, np.where(np.isnan(values), self._neutral, values).T, strict=True):
             kind, _, target = name.removeprefix("model.").partition(".")
             if kind == "mass":
                 body = self._bodies[target]
@@ -112,15 +149,15 @@ class Variation:
             elif kind == "length":
                 self._stretch(fields, self._bodies[target], column)
             elif kind == "damping":
-                fields["dof_damping"][:, self._dofs[target]] += column
+                fields["dof_damping"][:, self._dofs[target]] += column[:, np.newaxis]
             else:
                 fields["opt.gravity"] *= column[:, np.newaxis]
                 for joint in self._hills:
                     fields["jnt_user"][:, joint, GRAVITY] *= column
-        for entry, field in enumerate(ADDED):
-            if field in fields and additions is not None:
-                for motor, dof in enumerate(self._driven):
-                    fields[field][:, dof] += additions[:, motor, entry]
+        for motor, mounts in enumerate(self._mounts if additions is not None else ()):
+            for entry, mount in enumerate(mounts):
+                if mount is not None and mount.field in fields:
+                    fields[mount.field][:, mount.place] += additions[:, motor, entry] * mount.scale  # type: ignore[index]
         return fields
 
     def _stretch(self, fields: dict[str, np.ndarray], body: int, factor: np.ndarray) -> None:
@@ -134,16 +171,6 @@ class Variation:
                 fields["geom_pos"][:, geom, 2] *= factor
                 if geom in self._geoms_along:
                     fields["geom_size"][:, geom, self._geoms_along[geom]] *= factor
-
-
-_FIELDS = {
-    "mass": ("body_mass", "body_inertia"),
-    "length": ("body_ipos", "body_inertia", "body_pos", *DRAWN),
-    "damping": ("dof_damping",),
-    "gravity": ("opt.gravity", "jnt_user"),
-}
-VARIED = tuple(dict.fromkeys(name for names in _FIELDS.values() for name in names if name not in DRAWN))
-"""Fields that the dynamics depend on."""
 
 
 def _along(model: mujoco.MjModel) -> dict[int, int]:

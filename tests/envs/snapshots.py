@@ -8,7 +8,7 @@ from safetensors.numpy import load_file, save_file
 
 from codrl_mj import Choice, LogUniform, Uniform, make_sb3_vec_env
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.physics.variation import variable
+from codrl_mj.physics.variation import bare_model, variable
 from codrl_mj.tasks import TASKS, named_actuator
 from tests.disturbances.everything import MOST, RUBBED, imperfect
 from tests.envs.vectors import random_actions
@@ -28,7 +28,7 @@ DRIVE = {
 
 def everything(task, physics):
     """Arguments with every disturbance, and every field drawn, that the physics has."""
-    model = {} if physics == "analytic" else dict.fromkeys(variable(task), Uniform(0.6, 1.7))
+    model = {} if physics == "analytic" else dict.fromkeys(variable(bare_model(task)), Uniform(0.6, 1.7))
     model = {name: drawn for name, drawn in model.items() if "damping" not in name}  # the joint has it
     return {
         "actuator": imperfect(named_actuator("paper", task).as_mapping()),

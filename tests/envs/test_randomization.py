@@ -326,6 +326,17 @@ def test_cartpoles_explicit_euler_takes_the_damping_explicitly():
     np.testing.assert_array_equal(explicit.state[[0, 2]], (state + step * state[[1, 1, 3, 3]])[[0, 2]])
 
 
+def test_a_pattern_names_the_motors_that_are_drawn():
+    every, matched = ({path: Uniform(0.05, 0.2)} for path in ("motor.inductance", "slid.*:motor.inductance"))
+    plain, ours = (ActuatedEnv("cartpole", randomize=one).reset(seed=3)[1]["randomization"] for one in (every, matched))
+    assert ours == {"slid.*": {"motor.inductance": plain["motor.inductance"]}, "rejected": 0}
+    many = batched("cartpole", 2, randomize=matched)
+    drawn = many.reset(seed=3)[1]["randomization"]
+    assert drawn["slid.*:motor.inductance"][0] == plain["motor.inductance"]
+    with pytest.raises(ValueError, match=r"'hing\.\*': no actuator has such a name"):
+        ActuatedEnv("cartpole", randomize={"hing.*:motor.inductance": Uniform(0.05, 0.2)})
+
+
 def test_joint_friction_is_not_offered_because_the_models_switch_constraints_off():
     with pytest.raises(ValueError, match=re.escape("unknown field 'model.friction.slider'")):
         ActuatedEnv("cartpole", randomize={"model.friction.slider": Uniform(0.0, 1.0)})

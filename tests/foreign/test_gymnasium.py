@@ -16,7 +16,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 import codrl_mj
-from codrl_mj.actuators import Actuator, CurrentLoop, Drive, Motor, Servo, TorqueSpeed, VoltageDrive
+from codrl_mj.actuators import Actuator, CurrentLoop, Drive, Lag, Motor, Servo, TorqueSpeed, VoltageDrive
 from codrl_mj.catalogue import motor_entry
 from codrl_mj.engine.reading import slots
 from tests.foreign.models import ARM, V5, ArmEnv, BareEnv, actions, assert_same, run
@@ -389,6 +389,35 @@ def test_a_drawn_motor_is_the_motor_that_it_would_be_from_the_first():
         np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=0.0, err_msg=field)
 
 
+def test_motors_of_several_families_are_drawn_each_by_its_fields():
+    actuators = {"b.*": MAXON[".*"], "f.*": "lag"}
+    draws = {"b.*": {"motor.resistance": "uniform(0.6, 1.2)"}, "f.*": {"time_constant": "uniform(0.01, 0.02)"}}
+    env = codrl_mj.make("HalfCheetah-v5", actuators, randomize=draws)
+    drawn = env.reset(seed=0)[1]["randomization"]
+    motors = list(env.motors.values())
+    assert {one.motor.resistance for one in motors[:3]} == {*drawn["b.*"].values()}
+    assert {one.time_constant for one in motors[3:]} == {*drawn["f.*"].values()}
+    assert list(codrl_mj.motors(env.unwrapped.model).values())[3:] == motors[3:]
+    with pytest.raises(ValueError, match=r"unknown field 'motor\.resistance'"):  # not of every motor
+        codrl_mj.make("HalfCheetah-v5", actuators, randomize={"motor.resistance": "uniform(0.6, 1.2)"})
+
+
+def test_paths_draw_what_patterns_with_their_fields_do():
+    fields = {"time_constant": "uniform(0.01, 0.02)"}
+    nested = codrl_mj.make("Hopper-v5", {".*": "lag"}, randomize={".*": fields, "model.gravity": "uniform(0.9, 1.1)"})
+    flat = codrl_mj.make(
+        "Hopper-v5",
+        {".*": "lag"},
+        randomize={"time_constant": codrl_mj.Uniform(0.01, 0.02), "model.gravity": "uniform(0.9, 1.1)"},
+    )
+    one = codrl_mj.make("Hopper-v5", {".*": "lag"}, randomize={f"thigh_joint:{name}": fields[name] for name in fields})
+    drawn, same, alone = (env.reset(seed=1)[1]["randomization"] for env in (nested, flat, one))
+    assert drawn == {".*": {"time_constant": same.pop("time_constant")}, **same}
+    assert alone["thigh_joint"] == drawn[".*"]
+    assert list(flat.motors.values()) == list(nested.motors.values())
+    assert [motor.time_constant == Lag().time_constant for motor in one.motors.values()] == [False, True, True]
+
+
 def _of_the_model(mass, gravity, damping):
     return {"model.mass.pole": mass, "model.gravity": gravity, "model.damping.hinge": damping}
 
@@ -515,21 +544,38 @@ def test_stable_baselines3s_processes_too(context):
         ({"actuators": {"knee": "lag"}}, "'knee': no actuator has such a name"),
         ({"actuators": {".*": "lagg"}}, "did you mean 'lag'"),
         ({"actuators": {"b.*": "lag", "bfoot": "lag"}}, "both 'b.*' and 'bfoot' match it"),
-        ({"action": "voltage"}, r"action = 'voltage': the lag actuator of '\.\*' takes force; choose"),
-        ({"observe_actuator": True}, "nothing to observe of lag; choose another"),
-        ({"randomize": {"knee": {}}}, "unknown pattern randomize: knee"),
-        ({"randomize": {"time_constant": "uniform(0, 1)"}}, "must be a mapping of the actuators' patterns"),
+        (
+            {"action": "voltage"},
+            r"action = 'voltage': must be one of force, which the lag actuator of '\.\*' takes; or",
+        ),
+        ({"observe_actuator": True}, "the lag actuator has no current to observe, and nothing else; choose another"),
+        ({"randomize": {"knee": {}}}, "randomize: knee: {} is no distribution"),
+        ({"randomize": ["time_constant"]}, "must be FIELD=DISTRIBUTION"),
+        ({"randomize": {"knee:time_constant": "uniform(0, 1)"}}, "'knee': no actuator has such a name"),
+        (
+            {"randomize": {"time_constant": "uniform(0, 1)", "bfoot:time_constant": "choice(1)"}},
+            "drawn by another pattern, too",
+        ),
         ({"randomize": {".*": {"time_constnt": "uniform(0, 1)"}}}, "did you mean .*time_constant"),
         ({"randomize": {".*": {"time_constant": "uniform(-1, 1)"}}}, r"'\.\*'\]\['time_constant'\].*must be.*>= 0"),
-        ({"randomize": {"model.mass.trso": "uniform(0.5, 2)"}}, "did you mean randomize: model.mass.torso"),
-        ({"randomize": {"model.mass.torso": "uniform(0, 2)"}}, r"mass.torso'\] = uniform\(0.*: 0 must be .* > 0"),
+        ({"randomize": {"model.mass.trso": "uniform(0.5, 2)"}}, "did you mean 'model.mass.torso'"),
+        ({"randomize": {"model.mass.torso": "uniform(0, 2)"}}, r"mass.torso'\] = uniform\(0.*= 0: must be .* > 0"),
+        ({"randomize": {"model.length.torso": "uniform(0.5, 2)"}}, "unknown field 'model.length.torso'"),
+        (
+            {"actuators": {".*": NOISY}, "randomize": {".*": {"controller.substeps": "uniform(1, 4)"}}},
+            "controller.substeps must be drawn from a Choice of int values",
+        ),
+        (
+            {"actuators": MAXON, "action": "current", "randomize": {"motor.torque_constant": "uniform(0.01, 0.02)"}},
+            "with action='current' it would change what an action means; draw it with action='force'",
+        ),
         ({"randomize": {"model.gravity": "uniform(0)"}}, r"randomize\['model.gravity'\] = uniform\(0\)"),
         ({"disturbances": {"comand_delay": 1}}, "did you mean disturbances.command_delay"),
     ],
 )
 def test_what_is_wrong_is_said(arguments, text):
     with pytest.raises(ValueError, match=text):
-        codrl_mj.make("HalfCheetah-v5", **{"actuators": {".*": "lag"}, **arguments})
+        codrl_mj.make("HalfCheetah-v5", **{"actuators": {".*": "lag"}, "allow_unstable": True, **arguments})
 
 
 def test_what_does_not_go_with_a_model_is_said(arm_id):
