@@ -31,6 +31,8 @@ class Engine(NamedTuple):
     """(model, data): MuJoCo's `mj_step`."""
     reset: Any
     """(model, data): MuJoCo's `mj_resetData`."""
+    set_const: Any
+    """(model, data): MuJoCo's `mj_setConst`."""
     timestep: Any
     """(model) -> integration step [s]."""
     time: Any
@@ -63,10 +65,11 @@ def engine() -> Engine:
         return f64(data + time_at)[0]
 
     mujoco_library = library()
-    for function in (mujoco_library.mj_step, mujoco_library.mj_resetData):
+    functions = mujoco_library.mj_step, mujoco_library.mj_resetData, mujoco_library.mj_setConst
+    for function in functions:
         function.argtypes, function.restype = (ctypes.c_void_p, ctypes.c_void_p), None
     arrays = (_array_of(name) for name in ("qpos", "qvel", "ctrl", "act", "qfrc_applied"))
-    return Engine(mujoco_library.mj_step, mujoco_library.mj_resetData, timestep, time, *arrays)
+    return Engine(*functions, timestep, time, *arrays)
 
 
 def _array_of(name: str) -> Any:

@@ -98,6 +98,31 @@ def on_stack(typing_context: Any, count: Any) -> Any:  # noqa: ARG001 - numba fi
 
 
 @intrinsic
+def copy_bytes(typing_context: Any, target: Any, source: Any, count: Any) -> Any:  # noqa: ARG001 - numba fixes them
+    """Copy so many bytes from address `source` to address `target`."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
+        kind = ir.IntType(8).as_pointer()
+        function = builder.module.declare_intrinsic("llvm.memcpy", [kind, kind, ir.IntType(64)])
+        to, start = (builder.inttoptr(address, kind) for address in arguments[:2])
+        builder.call(function, [to, start, arguments[2], ir.IntType(1)(0)])
+        return context.get_dummy_value()
+
+    return types.void(types.uintp, types.uintp, types.int64), codegen
+
+
+@intrinsic
+def count_on(typing_context: Any, address: Any, number: Any) -> Any:  # noqa: ARG001 - numba fixes the arguments
+    """Add a number to the int64 at an address, in one piece among threads; returns what was there before."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
+        pointer = builder.inttoptr(arguments[0], ir.IntType(64).as_pointer())
+        return builder.atomic_rmw("add", pointer, arguments[1], "seq_cst")
+
+    return types.int64(types.uintp, types.int64), codegen
+
+
+@intrinsic
 def read(typing_context: Any, address: Any, kind: Any) -> Any:  # noqa: ARG001 - numba fixes the arguments
     """The named tuple of class `kind` whose entries are the float64 numbers from an address on."""
     made = tuple_of(kind.instance_class)

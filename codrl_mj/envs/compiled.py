@@ -33,10 +33,11 @@ from numba import types
 
 from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.engine.families import compiled_function
-from codrl_mj.engine.memory import floats, internal
+from codrl_mj.engine.memory import floats, internal, on_stack
 from codrl_mj.envs.outcomes import Outcomes, compiled_outcomes
 from codrl_mj.envs.setup import Setup
 from codrl_mj.physics.constrain import Compiled
+from codrl_mj.physics.rows import Lane, Rows, claim, complain, finish, load, store
 from codrl_mj.physics.stepping import Stepping
 
 
@@ -52,6 +53,29 @@ class Interface(NamedTuple):
 OPTIONS, RANDOM = len(Interface._fields), Interface._fields.index("random")
 
 
+class Steps(NamedTuple):
+    """One environment step of many environments: what it is given, and what it fills."""
+
+    forces: np.ndarray
+    """Desired [N or N*m], shape (N,) or (N, motors)."""
+    stepping: np.ndarray
+    """Rows that earn and may end, shape (N,), bool; the others are about to be reset."""
+    observations: np.ndarray
+    """Shape (N, k), float32."""
+    rewards: np.ndarray
+    """Shape (N,)."""
+    terminated: np.ndarray
+    """Shape (N,), bool."""
+    truncated: np.ndarray
+    """Shape (N,), bool."""
+    elapsed: np.ndarray
+    """Steps of the present episodes, shape (N,)."""
+    limit: float
+    """Steps after which an episode is truncated."""
+    signals: np.ndarray
+    """The last row of the trace but for its ends, shape (columns, N, motors)."""
+
+
 class Kernels(NamedTuple):
     """Compiled functions; `arguments` are (interface, *those of `codrl_mj.physics.stepping`)."""
 
@@ -63,6 +87,11 @@ class Kernels(NamedTuple):
     reset: Compiled
     """(generator, low, high, observation, *arguments) -> nothing: starts an episode from a state that the numpy
     `Generator` draws between `low` and `high` (see `Task.bounds`), and fills the observation."""
+    step_rows: Compiled
+    """(tally, rows at once, lane, rows, interface, `Steps`) -> nothing: `step` for every row; see
+    `codrl_mj.physics.rows.share`."""
+    observe_rows: Compiled
+    """(which (m,), lane, rows, observations (N, k)) -> nothing: observes rows where episodes start."""
 
 
 class CompiledEnv(NamedTuple):
@@ -144,21 +173,25 @@ def _kernels(
     delivered = _only if single else _each
 
     @internal
-    def observe_actuators(
+    def look(
         row: np.ndarray,
         observation: np.ndarray,
+        state: np.ndarray,
         model: int,
         data: int,
         settings: np.ndarray,
         memory: np.ndarray,
         trace: np.ndarray,
     ) -> None:
-        seen = np.empty((len(row), sensors))
-        observed(row, seen, model, data, settings, memory, trace)
-        first = len(observation) - seen.size
-        for motor in range(len(row)):
-            for entry in range(sensors):
-                observation[first + motor * sensors + entry] = seen[motor, entry]
+        read(state, model, data, settings, memory, trace)
+        observe(state, observation)
+        if sensors > 0:
+            seen = numba.carray(on_stack(len(row) * sensors), (len(row), sensors))
+            observed(row, seen, model, data, settings, memory, trace)
+            first = len(observation) - seen.size
+            for motor in range(len(row)):
+                for entry in range(sensors):
+                    observation[first + motor * sensors + entry] = seen[motor, entry]
 
     @compiled
     def step(
@@ -171,14 +204,11 @@ def _kernels(
         memory: np.ndarray,
         trace: np.ndarray,
     ) -> tuple[float, bool, bool]:
-        before, after = np.empty(size), np.empty(size)
+        before, after = numba.carray(on_stack(size), size), numba.carray(on_stack(size), size)
         read(before, model, data, settings, memory, trace)
         fine = advance(force, model, data, settings, memory, trace)
-        read(after, model, data, settings, memory, trace)
-        observe(after, observation)
         last = trace[len(trace) - 1]
-        if sensors > 0:
-            observe_actuators(last, observation, model, data, settings, memory, trace)
+        look(last, observation, after, model, data, settings, memory, trace)
         reward = rewarded(before, delivered(last[:, 1]), after, interface[OPTIONS:])
         return reward, ended(after), fine
 
@@ -203,9 +233,43 @@ def _kernels(
             state[entry] = entries[entry]
         key = generator.random() * LARGEST_KEY if interface[RANDOM] != 0.0 else 0.0
         start(state, key, model, data, settings, memory, trace)
-        observe(state, observation)
-        if sensors > 0:
-            nothing = np.zeros((trace.shape[1], trace.shape[2]))
-            observe_actuators(nothing, observation, model, data, settings, memory, trace)
+        nothing = np.zeros((trace.shape[1], trace.shape[2]))
+        look(nothing, observation, state, model, data, settings, memory, trace)
 
-    return Kernels(step, reset)
+    @compiled
+    def step_rows(tally: np.ndarray, at_once: int, lane: Any, rows: Any, interface: np.ndarray, steps: Any) -> None:
+        steps, lane, rows = Steps(*steps), Lane(*lane), Rows(*rows)
+        stepping, observations, signals, elapsed = steps.stepping, steps.observations, steps.signals, steps.elapsed
+        model, data, settings, trace = lane.model, lane.data, lane.settings, lane.trace
+        last, count = trace[len(trace) - 1], len(stepping)
+        first = claim(tally, at_once)
+        while first < count:
+            end = min(first + at_once, count)
+            for row in range(first, end):
+                load(rows, row, lane)
+                reward, over, fine = step(
+                    steps.forces[row], observations[row], interface, model, data, settings, rows.memory[row], trace
+                )
+                store(rows, row, lane)
+                elapsed[row] += 1
+                steps.rewards[row] = reward if stepping[row] else 0.0
+                steps.terminated[row] = over and stepping[row]
+                steps.truncated[row] = elapsed[row] >= steps.limit and stepping[row]
+                if not fine:
+                    complain(tally)
+                for motor in range(len(last)):
+                    for column in range(len(signals)):
+                        signals[column, row, motor] = last[motor, 1 + column]
+            finish(tally, end - first)
+            first = claim(tally, at_once)
+
+    @compiled
+    def observe_rows(which: np.ndarray, lane: Any, rows: Any, observations: np.ndarray) -> None:
+        lane, rows = Lane(*lane), Rows(*rows)
+        _, _, model, data, settings, _, trace = lane
+        nothing, state = np.zeros((trace.shape[1], trace.shape[2])), np.empty(size)
+        for row in which:
+            load(rows, row, lane)
+            look(nothing, observations[row], state, model, data, settings, rows.memory[row], trace)
+
+    return Kernels(step, reset, step_rows, observe_rows)

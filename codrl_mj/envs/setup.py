@@ -15,7 +15,7 @@ from codrl_mj.envs.commands import TaskCommands
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.randomization import Draws, Randomization, put_into
 from codrl_mj.envs.views import View
-from codrl_mj.physics import Physics, Signals
+from codrl_mj.physics import Physics
 from codrl_mj.physics.base import check_integrator, inner_step_count
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.registry import find_physics
@@ -169,10 +169,6 @@ class Setup:
         if not self.random:
             return np.zeros(1)
         return random(1)[:, 0] * LARGEST_KEY  # a multiple of 2**-53 times 2**53: a whole number, exactly
-
-    def signals(self, signals: Signals) -> Signals:
-        """A batch's signals as the command defines them: where no force is asked for, what is delivered is desired."""
-        return signals if self.commands.tracks else signals | {"desired_force": signals["actual_force"]}
 
 
 def alone(several: Sequence[Any]) -> Any:

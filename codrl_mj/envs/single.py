@@ -220,7 +220,9 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
 
     def _info(self, force: Any) -> dict[str, Any]:
         """What the actuators did in the last step, which asked for a force."""
-        return signals_of(self.physics.trace[-1], self.setup.family, force, self.setup.commands.tracks)
+        row = self.physics.trace[-1][:, 1:]
+        columns = row.T.copy() if len(row) > 1 else row[0].tolist()
+        return signals_of(columns, self.setup.family, force, self.setup.commands.tracks)
 
     @property
     def randomization(self) -> dict[str, Any]:

@@ -8,17 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-import mujoco
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from codrl_mj.actuators import ActuatorModel, Ideal, check_same_family
 from codrl_mj.envs.attributes import GymnasiumAttributes, checked_states, read, shared, written
+from codrl_mj.envs.compiled import Kernels, Steps, arguments, compiled_kernels
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.randomization import Draws, put_into_batch
 from codrl_mj.envs.setup import Setup
 from codrl_mj.envs.snapshots import check_snapshot
+from codrl_mj.envs.views import signals_of
 from codrl_mj.physics import Signals
 from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
 from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
@@ -132,7 +133,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         if render_mode is not None:
             check_view(self.physics.model, width, height, camera)
         self._renderer: OffscreenRenderer | None = None
-        self._data: mujoco.MjData | None = None  # what is drawn
+        self._kernels: tuple[Kernels, Array] | None = None
         self._looks: dict[str, Array] = {}  # fields of the models, where attributes were written
         self._offer_attributes(self.task)
 
@@ -255,8 +256,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             self._draws.draw(self._streams.random, rows)
             infos = self._draws.infos(rows)
         self.physics.reset(rows, states, self.setup.keys(lambda count: self._streams.random(rows, count)))
-        seen = self.physics.observed(None, rows) if self.setup.view.sensors else None
-        self._observations[rows] = self.setup.view.observation(states, seen)
+        self.physics.observe(self._compiled()[0].observe_rows, rows, self._observations)
         self._elapsed[rows] = 0
         self._ended[rows] = False
         return infos
@@ -289,31 +289,15 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
                 "call reset(options={'reset_mask': terminated | truncated})"
             )
         stepping = ~self._ended  # in NEXT_STEP mode, environments that ended are reset instead
-        before = self.physics.state
-        signals = self.setup.signals(self.physics.step(forces))
-        after = self.physics.state
-        rewards = np.empty(self.num_envs)
-        terminated, truncated = np.empty(self.num_envs, dtype=bool), np.empty(self.num_envs, dtype=bool)
-        broken = self.setup.view.outcomes.judge(
-            before,
-            np.ascontiguousarray(signals["actual_force"]),
-            after,
-            self.setup.view.option_values,
-            self._elapsed,
-            np.inf if self.max_episode_steps is None else float(self.max_episode_steps),
-            stepping,
-            self._observations,
-            rewards,
-            terminated,
-            truncated,
-        )
-        if self.setup.view.sensors:
-            seen = self.physics.observed(signals)
-            self._observations[:, -len(self.setup.view.sensors) :] = seen.reshape(self.num_envs, -1)
-        self.signals = signals
-        if broken >= 0:
+        steps = self._steps(forces, stepping)
+        kernels, interface = self._compiled()
+        broken = self.physics.step(kernels.step_rows, interface, steps)
+        rewards, terminated, truncated = steps.rewards, steps.terminated, steps.truncated
+        columns = steps.signals.reshape(-1, *forces.shape)
+        self.signals = signals = signals_of(columns, self.setup.family, forces, self.setup.commands.tracks)
+        if broken:
             self._ended |= terminated | truncated  # what is to be reset still is
-            self.physics.check_finite(after, stepping)
+            self.physics.check_finite(self.physics.state, stepping)
         infos = _infos(signals, stepping)
         if not stepping.all():
             infos |= self._restart(np.flatnonzero(~stepping), None)
@@ -321,6 +305,29 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         if self.autoreset_mode == AutoresetMode.SAME_STEP and self._ended.any():
             infos = self._finish(infos)
         return self._observations.copy(), rewards, terminated, truncated, infos
+
+    def _steps(self, forces: Array, stepping: Array) -> Steps:
+        """Where a step of all environments goes to."""
+        count, columns = self.num_envs, 1 + len(self.setup.family.Signals._fields)
+        limit = np.inf if self.max_episode_steps is None else float(self.max_episode_steps)
+        return Steps(
+            forces,
+            stepping,
+            self._observations,
+            np.empty(count),
+            np.empty(count, dtype=bool),
+            np.empty(count, dtype=bool),
+            self._elapsed,
+            limit,
+            np.empty((columns, count, len(self.task.motors))),
+        )
+
+    def _compiled(self) -> tuple[Kernels, Array]:
+        """The compiled functions, and the interface to the agent that they are given."""
+        if self._kernels is None:
+            interface, *_ = arguments(self.setup, self.physics)
+            self._kernels = compiled_kernels(self.setup, self.physics), interface
+        return self._kernels
 
     def _finish(self, infos: dict[str, Any]) -> dict[str, Any]:
         """Reset the environments that ended; what they saw last goes into the infos, as in Gymnasium."""
@@ -377,8 +384,8 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             self.physics.memory[:] = snapshot["disturbances"]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but the renderer, which a copy makes anew."""
-        return self.__dict__ | {"_renderer": None, "_data": None}
+        """Everything but the renderer and the compiled step, which a copy makes anew."""
+        return self.__dict__ | {"_renderer": None, "_kernels": None}
 
     def render(self) -> tuple[Array, ...] | None:  # type: ignore[override]
         """Images of the environments, shape (height, width, 3), uint8; None if there is no render mode."""
@@ -392,12 +399,11 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             return None
         if self._renderer is None:
             self._renderer = OffscreenRenderer(self.physics.model, **self._view)  # type: ignore[arg-type]
-            self._data = mujoco.MjData(self.physics.model)
         if self._draws is not None:
             write_fields(self.physics.model, self._draws.model_fields(np.array([row]), drawn=True))
         write_fields(self.physics.model, self._looks, row)
-        self.physics.show(row, self._data)
-        return self._renderer.render(self._data)
+        self.physics.show(row)
+        return self._renderer.render(self.physics.data)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the OpenGL context."""

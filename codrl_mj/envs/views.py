@@ -17,7 +17,7 @@ from codrl_mj.tasks import Task
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """A task's observations and rewards, of one state or of many."""
+    """A task's observations and rewards."""
 
     task: Task
     """The task."""
@@ -61,44 +61,35 @@ class View:
         return (*self.task.observation_names, *self.sensors)
 
     def observation(self, state: np.ndarray, seen: np.ndarray | None) -> np.ndarray:
-        """What the agent sees in a mechanical state (n,), or in N (N, n): shape (k,), or (N, k), float32.
+        """What the agent sees in a mechanical state (n,): shape (k,), float32.
 
-        `seen` is what the sensors say, as many numbers for each state as there are `sensors`; None if there are none.
+        `seen` is what the sensors say, as many numbers as there are `sensors`; None if there are none.
         """
         size = len(self.task.observation_names)
-        rows = np.empty((*state.shape[:-1], size + len(self.sensors)), np.float32)
-        self.outcomes.observe_all(_rows(state), _rows(rows))
+        observation = np.empty(size + len(self.sensors), np.float32)
+        self.outcomes.observe(np.ascontiguousarray(state), observation)
         if seen is not None:
-            rows[..., size:] = seen.reshape(rows[..., size:].shape)
-        return rows
+            observation[size:] = seen.reshape(-1)
+        return observation
 
     def reward(self, before: np.ndarray, force: Any, after: np.ndarray) -> float:
-        """The task's reward of a step that led from one state to another under a force [N or N*m]."""
-        return float(self.rewards(before[np.newaxis], np.asarray(force)[np.newaxis], after[np.newaxis])[0])
-
-    def rewards(self, before: np.ndarray, forces: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """The same for a batch: states (N, n), forces (N,) or (N, motors), and rewards (N,)."""
-        rewards = np.empty(len(after))
-        forces = np.ascontiguousarray(forces, dtype=np.float64)
-        self.outcomes.reward_all(_rows(before), forces, _rows(after), self.option_values, rewards)
-        return rewards
+        """The task's reward of a step that led from one state to another under a force [N or N*m], or several."""
+        before, after = np.ascontiguousarray(before), np.ascontiguousarray(after)
+        forces = np.ascontiguousarray(force, dtype=np.float64).reshape(-1)
+        return float(self.outcomes.reward(before, forces if len(forces) > 1 else forces[0], after, self.option_values))
 
     def terminated(self, state: np.ndarray) -> bool:
         """Whether the task ends the episode in this state."""
-        ended = np.empty(1, dtype=bool)
-        self.outcomes.terminated_all(_rows(state), ended)
-        return bool(ended[0])
+        return bool(self.outcomes.terminated(np.ascontiguousarray(state)))
 
 
-def signals_of(row: np.ndarray, family: Family, desired: Any, tracks: bool) -> Signals:
-    """The last row of a simulation's trace, shape (motors, columns), as signals.
+def signals_of(columns: Any, family: Family, desired: Any, tracks: bool) -> Signals:
+    """Delivered forces [N or N*m], and a family's own signals: numbers, or arrays of several, by their names.
 
-    The force [N or N*m] that was asked for counts as `desired` if the actuator `tracks` it; else what was delivered.
+    The force that was asked for counts as `desired` if the actuator `tracks` it; else what was delivered.
     """
-    names = ("desired_force", "actual_force", *family.Signals._fields)
-    signals = named_signals(names, row.T.copy() if len(row) > 1 else row[0].tolist())
-    signals["desired_force"] = desired if tracks else signals["actual_force"]
-    return signals
+    signals = named_signals(("actual_force", *family.Signals._fields), columns)
+    return {"desired_force": desired if tracks else signals["actual_force"], **signals}
 
 
 def sensor_names(motors: Mapping[str, Family]) -> tuple[str, ...]:
@@ -123,8 +114,3 @@ def longer(space: spaces.Space, count: int) -> spaces.Box:
         np.append(bound, np.full(count, value)) for bound, value in ((space.low, -np.inf), (space.high, np.inf))
     )
     return spaces.Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype.type)
-
-
-def _rows(array: np.ndarray) -> np.ndarray:
-    """An array (n,) or (N, n) as rows (N, n), in the one memory layout that the compiled functions are compiled for."""
-    return np.ascontiguousarray(array.reshape(-1, array.shape[-1]))

@@ -1,27 +1,30 @@
-"""Many simulations of a task in MuJoCo at once, on the engine's own thread pool."""
+"""Many simulations of a task in MuJoCo at once: rows of arrays, stepped by threads."""
 
 import copy
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import mujoco
-import numba
 import numpy as np
-from mujoco.batch import Batch
 
-from codrl_mj import engine
 from codrl_mj.actuators import ActuatorModel, Ideal, check_same_family
 from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint
-from codrl_mj.engine.families import HEAD, load_family, signals_at
-from codrl_mj.engine.sensors import compiled_observe
-from codrl_mj.physics.base import LARGEST, Signals, SimulationDivergedError, named_signals
-from codrl_mj.physics.constrain import compiled_batch
+from codrl_mj.engine.families import HEAD
+from codrl_mj.physics.base import LARGEST, SimulationDivergedError
 from codrl_mj.physics.disturber import disturber
-from codrl_mj.physics.mjcf import flags_with_friction, needed_callbacks, task_model
-from codrl_mj.physics.mujoco_single import wiring
-from codrl_mj.physics.stepping import NOISE_KEY, TORQUE
-from codrl_mj.physics.variation import Variation, additions_of, bare_model, write_fields
+from codrl_mj.physics.mjcf import flags_with_friction
+from codrl_mj.physics.mujoco_single import MujocoPhysics, wiring
+from codrl_mj.physics.rows import Rows, compiled_set_const, lane, part, share
+from codrl_mj.physics.stepping import NOISE_KEY
+from codrl_mj.physics.variation import Variation, additions_of, bare_model, field_of, write_fields
 from codrl_mj.tasks import Task
+
+DERIVED = (
+    *("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "dof_length"),
+    *("tendon_length0", "tendon_invweight0", "actuator_acc0", "actuator_length0"),
+)
+"""Fields of a model that MuJoCo derives from masses and lengths."""
 
 
 class MujocoBatchPhysics:
@@ -41,78 +44,74 @@ class MujocoBatchPhysics:
         disturbances: Disturbances = OFF,
         joint: Joint = PLAIN,
     ) -> None:
-        """Compile the model and make the batch; arguments as for `MujocoPhysics`.
+        """Compile the model and make the rows; arguments as for `MujocoPhysics`.
 
-        But for `actuators`, which have one for each motor for each of N simulations, and `num_threads` of the engine; 0
-        uses every CPU.
+        But for `actuators`, which have one for each motor for each of N simulations, and `num_threads`; 0 uses every
+        CPU.
         """
         self.task = task
         self.family = check_same_family([one for each in actuators for one in each])
         self.motorised = not issubclass(self.family, Ideal)
-        if self.motorised:
-            load_family(self.family)
         self.inner_steps = inner_steps
         self.max_forces = task.max_forces if max_forces is None else max_forces
-        self._explicit = integrator == "euler"
-        self._corrected = self._explicit or task.constrain is not None
-        timestep = task.step_duration / inner_steps
-        self.num_envs = len(actuators)
-        self.model = task_model(task, tuple(actuators[0]), timestep, max_forces, self._explicit, joint)
+        self.num_envs, self._num_threads = len(actuators), num_threads
+        self._nominal = MujocoPhysics(task, actuators[0], inner_steps, integrator, max_forces, disturbances, joint)
+        timestep = self._nominal.model.opt.timestep
         self._disturber = disturber(disturbances, timestep, self.max_forces, self.num_envs)
-        self._wiring = [wiring(self.model, name, one) for name, one in zip(task.motors, actuators[0], strict=True)]
-        self._dofs = np.array([int(one.dof) for one in self._wiring])
-        self._slots = np.array([int(one.act) for one in self._wiring])
-        self._controls = np.array([int(one.ctrl) for one in self._wiring])
+        motors = zip(task.motors, actuators[0], strict=True)
+        self._wiring = [wiring(self._nominal.model, name, one) for name, one in motors]
         self._positions, self._velocities = np.array(task.qpos), np.array(task.qvel)
-        self._size = self.num_envs, num_threads
-        self._varied = False  # whether the models differ in more than their actuators
         self._fields: dict[str, np.ndarray] = {}
-        self._make_batch()
-        self._rest = self._batch.state[0].copy()  # a simulation just reset, motor at rest
+        self._rest = self._nominal.snapshot()  # a simulation just reset, motor at rest
+        self._states = np.repeat(self._rest[np.newaxis], self.num_envs, axis=0)
         self._arms = np.ones((self.num_envs, len(task.motors)))
+        self._bind()
         every, additions = np.arange(self.num_envs), additions_of(actuators)
         self.set_actuators(every, actuators)
         if (additions != additions[0]).any():
-            motors = [int(one.actuator) for one in self._wiring]
-            mounting = Variation(bare_model(task.name, joint), motors=motors, mounting=True)
+            indices = [int(one.actuator) for one in self._wiring]
+            mounting = Variation(bare_model(task.name, joint), motors=indices, mounting=True)
             self.set_model(every, mounting.fields(np.empty((self.num_envs, 0)), additions))
 
-    def _make_batch(self) -> None:
-        """Make the engine's batch, and take the views that a step uses."""
-        self._callbacks = needed_callbacks(self.model)
-        self._install()
-        self._batch = Batch(self.model, *self._size)
-        self._kernels = compiled_batch(self.task, self._explicit)
-        self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
-        self._ctrl, self._act = self._batch.bind("ctrl"), self._batch.bind("act")
-        self._load, self._time = self._batch.bind("qfrc_applied"), self._batch.bind("time")
+    def _bind(self) -> None:
+        """Make data for each thread, and the views that a step uses."""
+        threads = min(self._num_threads or os.cpu_count() or 1, self.num_envs)
+        self._data = [mujoco.MjData(copy.copy(self._nominal.model)) for _ in range(threads)]
+        self.model, self.data = self._nominal.model, self._nominal.data
+        self._lanes: list[tuple[Any, ...]] = []
+        parts = {name: part(self.model, name) for name in ("time", "qpos", "qvel", "act")}
+        self._time, self._qpos, self._qvel, self._act = (self._states[:, one] for one in parts.values())
+        length = 0 if self._disturber is None else self._disturber.memory.shape[1]
+        self._rows = tuple(Rows(self._states, self._arms, self.memory.reshape(*self._arms.shape, length)))
 
-    def _install(self) -> None:
-        if self._callbacks:
-            engine.install(*self._callbacks)
+    def _lane(self, thread: int = 0) -> tuple[Any, ...]:
+        """A thread's lane, for the fields of the models that differ at present."""
+        if not self._lanes:
+            self._lanes = [tuple(lane(self._nominal, data, self._fields)) for data in self._data]
+        return self._lanes[thread]
+
+    @property
+    def compiled(self) -> Any:
+        """What compiles of a simulation, see `MujocoPhysics`."""
+        return self._nominal.compiled
 
     def field(self, name: str) -> np.ndarray:
         """A field of the model with a value for each simulation, shape (N, ...): live, to be written to."""
         if name not in self._fields:
-            self._fields[name] = self._batch.expand(name)
+            nominal = np.asarray(field_of(self.model, name))
+            nominal = nominal.astype(np.int32) if nominal.dtype.kind == "i" else nominal
+            self._fields[name] = np.repeat(nominal[np.newaxis], self.num_envs, axis=0)
+            self._lanes = []
         return self._fields[name]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but the engine's batch, of which a copy needs the rows and fields."""
-        kept = {name: value for name, value in self.__dict__.items() if name not in _ENGINE}
-        return kept | {"rows": self.snapshot(), "_fields": {name: field.copy() for name, field in self._fields.items()}}
+        """Everything but the simulations that threads step, and views."""
+        return {name: value for name, value in self.__dict__.items() if name not in _BOUND}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore, in this or another process."""
-        kept = dict(state)
-        rows, fields = kept.pop("rows"), kept.pop("_fields")
-        self.__dict__.update(kept, _fields={})
-        self._make_batch()
-        for name, values in fields.items():
-            self.field(name)[:] = values
-        if self._varied:
-            self._batch.set_const()
-        self.restore(rows)
+        self.__dict__.update(state)
+        self._bind()
 
     def set_actuators(self, rows: np.ndarray, actuators: Sequence[Sequence[ActuatorModel]]) -> None:
         """Give some simulations other actuators of the family; to be followed by a reset of them.
@@ -141,14 +140,16 @@ class MujocoBatchPhysics:
         if "dof_frictionloss" in fields:
             rub, flags = fields["dof_frictionloss"].any(axis=1), self.model.opt.disableflags
             self.field("opt.disableflags")[rows] = np.where(rub, flags_with_friction(flags), flags)
-        self._varied = True
-        self._batch.set_const(rows)
+        for name in DERIVED:
+            self.field(name)
+        derived = np.array([list(self._fields).index(name) for name in DERIVED])
+        compiled_set_const()(rows, self._lane(), derived)
 
     @property
     def state(self) -> np.ndarray:
         """Mechanical states in the task's order, shape (N, n), float64; a new array."""
-        state = np.empty((len(self._qpos), len(self.task.state_names)))
-        self._kernels.read(self._qpos, self._qvel, state)
+        state = np.empty((self.num_envs, len(self.task.state_names)))
+        state[:, self._positions], state[:, self._velocities] = self._qpos, self._qvel
         return state
 
     @state.setter
@@ -171,67 +172,26 @@ class MujocoBatchPhysics:
         Raises:
             CallbackInUseError: another library's MuJoCo callback was installed in the meantime.
         """
-        self._install()  # raises if somebody replaced ours since the last episodes
-        self._batch.state[rows] = self._rest
+        self._nominal.install()  # raises if somebody replaced ours since the last episodes
+        self._states[rows] = self._rest
         self._place(rows, states)
         if self.motorised:
-            for at, slot in enumerate(self._slots):
-                self._act[rows, slot + NOISE_KEY] = keys + at
+            for at, one in enumerate(self._wiring):
+                self._act[rows, int(one.act) + NOISE_KEY] = keys + at
         if self._disturber is not None:
             self._disturber.reset(rows, keys)
 
-    def step(self, desired_force: np.ndarray) -> Signals:
-        """Advance every simulation by one environment step, under forces (N,) or (N, n); the signals, of that shape."""
-        given = command = desired_force.reshape(self.num_envs, -1)
-        if self._disturber is None:
-            _write_columns(self._ctrl, self._controls, command, self._arms)
-            self._integrate(self.inner_steps)
-        else:
-            for _ in range(self.inner_steps):
-                command = self._disturber.commands(given)
-                self._load[:, self._dofs] = self._disturber.loads()
-                _write_columns(self._ctrl, self._controls, command, self._arms)
-                self._integrate(1)
-        names = self.family.Signals._fields  # type: ignore[attr-defined]
-        shown = np.zeros((1 + len(names), *command.shape))
-        if self.motorised:
-            _read_signals(self._act, self._slots, signals_at(self.family), self._arms, shown)
-        else:
-            shown[0] = command
-        shown = shown.reshape(-1, *desired_force.shape)
-        return {"desired_force": desired_force, **named_signals(("actual_force", *names), shown)}
+    def step(self, kernel: Any, interface: np.ndarray, steps: Any) -> bool:
+        """Take an environment step of every simulation; `kernel` is `Kernels.step_rows` of `codrl_mj.envs.compiled`.
 
-    def _integrate(self, steps: int) -> None:
-        """Take integration steps."""
-        timestep = self.model.opt.timestep
-        if not self._corrected:
-            self._batch.step(nstep=steps)
-            return
-        moved = np.empty(self._qpos.shape)
-        for _ in range(steps):
-            if self._explicit:
-                self._kernels.move(self._qpos, self._qvel, moved, timestep)
-            self._batch.step()
-            self._kernels.correct(self._qpos, self._qvel, moved, timestep)
+        Returns whether one of them is no longer one of numbers.
+        """
+        self._lane()
+        return share(kernel, self._lanes, self.num_envs, self.inner_steps, self._rows, interface, tuple(steps))
 
-    def observed(self, signals: Signals | None, rows: np.ndarray | None = None) -> np.ndarray:
-        """What the sensors say at present, shape (m, n, k); without signals of a last step, as episodes start."""
-        rows = np.arange(self.num_envs) if rows is None else rows
-        names = self.family.Signals._fields  # type: ignore[attr-defined]
-        shown = np.zeros((len(rows), len(self._wiring), len(names)))
-        for at, name in enumerate(names if signals is not None else ()):
-            shown[:, :, at] = signals[name].reshape(self.num_envs, -1)[rows]  # type: ignore[index]
-        seen = np.empty((len(rows), len(self._wiring), len(self.family.OBSERVED)))
-        user, fill = self.field("actuator_user"), compiled_observe(self.family)
-        timestep, times = self.model.opt.timestep, self._time.reshape(-1)
-        _observe_all(
-            fill,
-            rows,
-            np.array([int(one.actuator) for one in self._wiring]),
-            self._slots + NOISE_KEY,
-            *(user, self._act, timestep, times, shown, seen),
-        )
-        return seen
+    def observe(self, kernel: Any, rows: np.ndarray, observations: np.ndarray) -> None:
+        """Observe simulations where episodes start; `kernel` is `Kernels.observe_rows`."""
+        kernel(rows, self._lane(), self._rows, observations)
 
     @property
     def memory(self) -> np.ndarray:
@@ -247,8 +207,6 @@ class MujocoBatchPhysics:
             SimulationDivergedError: as it says.
         """
         fine = np.abs(states) <= LARGEST
-        if fine.all():
-            return
         broken = np.flatnonzero(~fine.all(axis=1) & rows)
         if len(broken) == 0:
             return
@@ -257,61 +215,21 @@ class MujocoBatchPhysics:
         value = states[first][np.argmin(fine[first])]
         raise SimulationDivergedError(
             f"{self.task.name}: {len(broken)} of {len(states)} simulations diverged; environment {first} at "
-            f"t = {self._time.reshape(-1)[first]:g} s: {entry} = {value:g}. Reset them; if this repeats, shorten the "
+            f"t = {self._time[first, 0]:g} s: {entry} = {value:g}. Reset them; if this repeats, shorten the "
             "integration step (inner_steps) or lower the gains"
         )
 
     def snapshot(self) -> np.ndarray:
         """The whole state of every simulation, motor included, shape (N, k), float64."""
-        return self._batch.state.copy()
+        return self._states.copy()
 
     def restore(self, snapshot: np.ndarray) -> None:
         """Continue from what `snapshot` returned."""
-        self._batch.state[:] = snapshot
+        self._states[:] = snapshot
 
-    def show(self, index: int, data: mujoco.MjData) -> None:
-        """Bring `data`, of this model, to the pose of one simulation, for drawing."""
-        data.qpos[:] = self._qpos[index]
-        mujoco.mj_kinematics(self.model, data)
-        mujoco.mj_comPos(self.model, data)
-        mujoco.mj_camlight(self.model, data)
-        mujoco.mj_passive(self.model, data)
+    def show(self, index: int) -> None:
+        """Bring `data` to the pose of one simulation, for drawing."""
+        self._nominal.show(self.state[index])
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def _observe_all(
-    fill: Any,
-    rows: np.ndarray,
-    actuators: np.ndarray,
-    keys: np.ndarray,
-    user: np.ndarray,
-    act: np.ndarray,
-    timestep: float,
-    times: np.ndarray,
-    shown: np.ndarray,
-    seen: np.ndarray,
-) -> None:
-    for at in range(len(rows)):
-        row = rows[at]
-        for motor in range(len(actuators)):
-            numbers, signals = user[row, actuators[motor], HEAD:].ctypes.data, shown[at, motor].ctypes.data
-            fill(numbers, signals, timestep, times[row], act[row, keys[motor]], seen[at, motor].ctypes.data)
-
-
-@numba.njit(nogil=True, error_model="numpy")
-def _write_columns(array: np.ndarray, columns: np.ndarray, values: np.ndarray, scales: np.ndarray) -> None:
-    for row in range(len(values)):
-        for at in range(len(columns)):
-            array[row, columns[at]] = values[row, at] * scales[row, at]
-
-
-@numba.njit(nogil=True, error_model="numpy")
-def _read_signals(act: np.ndarray, slots: np.ndarray, first: int, arms: np.ndarray, shown: np.ndarray) -> None:
-    for row in range(len(act)):
-        for at in range(len(slots)):
-            shown[0, row, at] = act[row, slots[at] + TORQUE] / arms[row, at]
-            for signal in range(1, len(shown)):
-                shown[signal, row, at] = act[row, slots[at] + first + signal - 1]
-
-
-_ENGINE = ("_batch", "_kernels", "_qpos", "_qvel", "_ctrl", "_act", "_load", "_time")
+_BOUND = ("model", "data", "_data", "_lanes", "_time", "_qpos", "_qvel", "_act", "_rows")

@@ -85,9 +85,10 @@ class MujocoPhysics:
         self.compiled = Compiled(stepping, (*addresses(self.data), self._settings, memory, self.trace))
         self.scene: tuple[Any, Any] | None = (self.model, self.data)
         self._callbacks = needed_callbacks(self.model)
-        self._install()
+        self.install()
 
-    def _install(self) -> None:
+    def install(self) -> None:
+        """Make sure that the callbacks are there; raises if somebody replaced them."""
         if self._callbacks:
             engine.install(*self._callbacks)
 
@@ -115,7 +116,7 @@ class MujocoPhysics:
 
     def reset(self, state: np.ndarray, key: float = 0.0) -> None:
         """See `Physics.reset`."""
-        self._install()  # raises if somebody replaced ours since the last episode
+        self.install()  # raises if somebody replaced ours since the last episode
         stepping, arguments = self.compiled
         stepping.start(np.asarray(state, dtype=np.float64), float(key), *arguments)
 

@@ -17,7 +17,7 @@ from numba.extending import overload
 from codrl_mj.actuators import Family, Ideal
 from codrl_mj.engine.families import Slot, load_family, signals_at
 from codrl_mj.engine.library import engine
-from codrl_mj.engine.memory import internal, read
+from codrl_mj.engine.memory import internal, on_stack, read
 from codrl_mj.engine.sensors import compiled_observe, compiled_parameters
 from codrl_mj.physics.constrain import Compiled, compiled_constrain, compiled_reader, is_fine
 from codrl_mj.physics.disturber import KEY_COLUMN, compiled_disturbance, numbers_of
@@ -110,7 +110,7 @@ def _stepping(
     def step(force: Any, model: int, data: int, settings: np.ndarray, memory: np.ndarray, trace: np.ndarray) -> bool:
         timestep = engine_timestep(model)
         qpos, qvel, ctrl, act = qpos_of(data), qvel_of(data), ctrl_of(data), act_of(data)
-        state = np.empty(size)
+        state = numba.carray(on_stack(size), size)
         for inner in range(len(trace)):
             for actuator in range(len(settings)):
                 wiring = wiring_of(settings[actuator])

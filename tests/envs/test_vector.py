@@ -12,11 +12,10 @@ from codrl_mj.actuators import Actuator, CurrentLoop, Motor
 from codrl_mj.envs import ActuatedEnv, ActuatedVectorEnv
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.sb3 import make_sb3_vec_env
-from codrl_mj.envs.setup import Setup
 from codrl_mj.tasks import TASKS
 from tests.engine.models import FULL, changed
 from tests.envs.vectors import MODES, assert_equal_episodes, assert_same, batched, looped, random_actions
-from tests.tasks.faces import every_rebuilt, random_states
+from tests.tasks.faces import every_rebuilt
 
 every_task = pytest.mark.parametrize("task", TASKS)
 every_mode = pytest.mark.parametrize("mode", MODES)
@@ -389,17 +388,3 @@ def test_an_actuator_in_any_form_is_the_same():
     single = ActuatedEnv("pendulum", motor)
     single.reset(seed=0)
     assert single.step(np.array([1.0], np.float32))[4]["current"] == runs[0][0][4]["current"][0]
-
-
-@every_rebuilt
-def test_observation_reward_and_end_of_one_state_are_those_of_a_batch_to_the_last_bit(task):
-    setup = Setup.build(EnvConfig(task))
-    before, after = (random_states(task, seed, 3000) for seed in (0, 1))
-    forces = np.random.default_rng(2).uniform(-1, 1, 3000) * setup.commands.max_forces
-    view = setup.view
-    observations, rewards = view.observation(after, None), view.rewards(before, forces, after)
-    terminated = np.broadcast_to(setup.task.terminated(after.T), 3000)
-    for row in range(3000):
-        assert np.array_equal(view.observation(after[row], None), observations[row]), row
-        assert view.reward(before[row], float(forces[row]), after[row]) == rewards[row], row
-        assert view.terminated(after[row]) == terminated[row], row
