@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from codrl_mj.actuators import Drive, GearMotor, SampledLoop, Supply
-from codrl_mj.identify.checks import check
-from codrl_mj.identify.contradictions import FACTORS, name_of_factor
+from codrl_mj.identify.checks import FACTORS, check, name_of_factor
 from codrl_mj.identify.excitations import Excitation
 from codrl_mj.identify.log import Log
 from codrl_mj.identify.simulation import Moved, moving
