@@ -19,9 +19,9 @@ from codrl_mj.fields import check, check_names, real
 from codrl_mj.identify.estimate import Model, estimate
 from codrl_mj.identify.excitations import KINDS, Excitation
 from codrl_mj.identify.log import Log
-from codrl_mj.identify.models import shaft_model, winding_model
+from codrl_mj.identify.models import ShaftStage, WindingStage
 from codrl_mj.identify.parameters import ELECTRICAL, PARAMETERS
-from codrl_mj.identify.segments import Segment, shaft_segments, winding_segments
+from codrl_mj.identify.segments import Segment, winding_segments
 from codrl_mj.identify.synthetic import FREE, Load, Sampler, run, sample_times, simulate
 from codrl_mj.runs.files import writing
 
@@ -178,17 +178,18 @@ def _electrical(drive: Drive, log: Log, noise: float) -> dict[str, float]:
     """Relative errors of a winding by the current, at the speed that is: see `Winding` for how it is found."""
     turned = np.append(np.diff(log.signals["position"]) / np.diff(log.time), 0.0)
     segments = winding_segments([log], [turned])
-    model, _ = winding_model(segments, {"gear_ratio": drive.motor.gear_ratio})
+    model, _ = WindingStage({"gear_ratio": drive.motor.gear_ratio}).model(segments)
     return _errors(drive, FREE, model, segments, noise * float(np.abs(log.signals["current"]).max()), True)
 
 
 def _mechanical(drive: Drive, log: Log, load: Load, encoder: float) -> dict[str, float]:
     """Relative errors of a shaft by the position; what the datasheet leaves at 0 is left out."""
-    segments = shaft_segments([log], "current", "position", _SEGMENT)
     known = {name: value for name, value in vars(drive.motor).items() if name in PARAMETERS and name != "rotor_inertia"}
     known |= {"mgl": load.gravity, "constant_torque": load.torque}
     known = {name: value for name, value in known.items() if name not in GOALS or value == 0.0}
-    model, _ = shaft_model(segments, "free", "coulomb", "current", "position", known)
+    stage = ShaftStage("free", "coulomb", "current", known, segment=_SEGMENT)
+    segments = stage.segments([log])
+    model, _ = stage.model(segments)
     return _errors(drive, load, model, segments, 2.0 * math.pi / encoder / math.sqrt(12.0), False)
 
 
