@@ -56,11 +56,8 @@ def judged(
     unlike: dict[str, float] = {}
     for name, part in parts.items():
         constant = next((one for one in estimates if by_constant and one.name == "back_emf_constant"), None)
-        estimates += (
-            _of_part(part, seed, step(name))
-            if constant is None
-            else _with_constant(_of_part(part, seed, step(name)), constant, part.stage)
-        )
+        found = _of_part(part, seed, step(name))
+        estimates += found if constant is None else _with_constant(found, constant, part.stage)
         warnings += _warnings(part, unlike)
     return _completed(estimates, given), warnings, max(unlike.values(), default=0.0)
 
@@ -70,7 +67,7 @@ def _of_part(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estim
     fit, model = part.fit, part.model
     if not fit.names:
         return []
-    friction = _Friction.of(part)
+    friction, electrical = _Friction.of(part), isinstance(part.stage, WindingStage)
     # what a change is measured by: the value itself or, of friction, what would be all of it
     scales = [
         friction.all_of(name) if name in FRICTION else abs(value)
@@ -84,16 +81,7 @@ def _of_part(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estim
         names, of = (*names, "friction_torque"), np.vstack([of, slopes])
         values = np.append(values, friction.torque)
         sizes, units = (np.append(one, friction.all_of("friction_torque")) for one in (sizes, units))
-    causes = honesty.half_widths(fit, part.segments, scales, of, seed)
-    on_step()
-    tested = values + of @ (part.self_test() - fit.values)
-    on_step()
-    # an error that goes with a row's time is half as large at the rate of the logs, one with its root more than that
-    electrical = isinstance(part.stage, WindingStage)
-    causes["half_rate"] = (2.0 if electrical else 1.0) * np.abs(of @ (part.half_rate() - fit.values))
-    on_step()
-    causes["self_test"] = np.abs(tested - values)
-    causes["unexplained"] = np.abs(values) * (honesty.unexplained(fit, part.segments) if electrical else 0.0)
+    causes, tested = _causes(part, values, scales, of, seed, on_step)
     directions = part.unknown_directions(scales)
     on_step()
     together = [
@@ -139,6 +127,23 @@ def _of_part(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estim
             why += ", and more of itself" if name != "friction_torque" else ""
         made.append(Estimate(name, value, max(value - half, least), min(value + half, most), status, why, by_cause))
     return made
+
+
+def _causes(
+    part: Fitted, values: np.ndarray, scales: np.ndarray, of: np.ndarray, seed: int, on_step: Callable[[], None]
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Half-widths by cause of `values`, which are `of` @ the parameters, and what the self-test finds for them."""
+    fit, electrical = part.fit, isinstance(part.stage, WindingStage)
+    causes = honesty.half_widths(fit, part.segments, scales, of, seed)
+    on_step()
+    tested = values + of @ (part.self_test() - fit.values)
+    on_step()
+    # an error that goes with a row's time is half as large at the rate of the logs, one with its root more than that
+    causes["half_rate"] = (2.0 if electrical else 1.0) * np.abs(of @ (part.half_rate() - fit.values))
+    on_step()
+    causes["self_test"] = np.abs(tested - values)
+    causes["unexplained"] = np.abs(values) * (honesty.unexplained(fit, part.segments) if electrical else 0.0)
+    return causes, tested
 
 
 def _with_constant(found: list[Estimate], constant: Estimate, stage: ShaftStage) -> list[Estimate]:
@@ -221,7 +226,8 @@ def _completed(estimates: list[Estimate], given: Mapping[str, float]) -> list[Es
         status, why = whole.status, whole.why
         if status == "identified" and not high - value <= WIDEST * value:
             status = "refused"
-            why = f"of an inertia of {whole.value:.4g} kg*m^2 in all, {load:.4g} is said to be the load's: too little is left"
+            why = f"of an inertia of {whole.value:.4g} kg*m^2 in all, {load:.4g} is said to be the load's"
+            why += ": too little is left"
         ends = max(low, 0.0), max(high, 0.0)
         named["rotor_inertia"] = Estimate("rotor_inertia", max(value, 0.0), *ends, status, why)
     return [named[name] for name in PARAMETERS if name in named]
