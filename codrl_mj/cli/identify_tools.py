@@ -29,7 +29,7 @@ _STYLES = {"error": "red", "warning": "yellow", "info": ""}
 
 
 @dataclasses.dataclass(frozen=True)
-class Check:
+class CheckLogs:
     """Check bench logs before anything is fitted to them: rows, sensors, lags, signs, units, what does not show.
 
     Exit status 1 if a log has errors, with which a fit would be wrong. Example: codrl-mj identify check log.csv
@@ -104,7 +104,7 @@ class Turned:
 
 
 @dataclasses.dataclass(frozen=True)
-class Plan:
+class PlanExperiment:
     """Plan an experiment: which excitation, sample rate and amplitude a motor needs, and what each would tell.
 
     The errors are those to be expected at best, of a motor that is about as its datasheet says; of a drive at the bench
@@ -184,7 +184,7 @@ _SHORT = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Simulate:
+class SimulateLog:
     """Simulate a bench log of a motor, through sensors and a sampler, with faults to order.
 
     Prints the --columns that read the file. Example: codrl-mj identify simulate maxon-ec45-flat-50w --out log.csv.gz
@@ -223,8 +223,7 @@ class Simulate:
     def run(self) -> int:
         """Write the log."""
         from codrl_mj.actuators import Supply
-        from codrl_mj.identify.excitations import Excitation
-        from codrl_mj.identify.synthetic import Sampler, simulate, write_log
+        from codrl_mj.identify.synthetic import Excitation, Sampler, simulate, write_log
         from codrl_mj.motor_design import find_drive
 
         if not self.out.name.endswith((".csv", ".csv.gz")):
@@ -287,7 +286,7 @@ class ProposeColumns:
 
 
 _MOTION = "position", "velocity"
-TOOLS: dict[str, Any] = {"check": Check, "columns": ProposeColumns, "plan": Plan, "simulate": Simulate}
+TOOLS: dict[str, Any] = {"check": CheckLogs, "columns": ProposeColumns, "plan": PlanExperiment, "simulate": SimulateLog}
 """What `codrl-mj identify` does besides fitting, by its word."""
 
 
@@ -296,10 +295,10 @@ class IdentifyTools:
     """Motors from bench logs: check logs, plan experiments, simulate logs. docs/identify_logs.md has more."""
 
     verb: tyro.conf.OmitSubcommandPrefixes[
-        Annotated[Check, tyro.conf.subcommand("check")]
+        Annotated[CheckLogs, tyro.conf.subcommand("check")]
         | Annotated[ProposeColumns, tyro.conf.subcommand("columns")]
-        | Annotated[Plan, tyro.conf.subcommand("plan")]
-        | Annotated[Simulate, tyro.conf.subcommand("simulate")]
+        | Annotated[PlanExperiment, tyro.conf.subcommand("plan")]
+        | Annotated[SimulateLog, tyro.conf.subcommand("simulate")]
     ]
     """What to do; each has its own --help."""
 

@@ -1,16 +1,26 @@
-"""A winding and a shaft as models that the estimator fits, with the starts that regression gives."""
+"""A winding and a shaft: segments of their logs, models that the estimator fits, starts that regression gives."""
 
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from codrl_mj.identify import simulation
-from codrl_mj.identify.estimate import Model, Simulate
+from codrl_mj.identify.estimate import Model, Simulate, settled
+from codrl_mj.identify.log import Log
 from codrl_mj.identify.parameters import DEFAULTS, ELECTRICAL, FRICTION, OF_FRICTION, OF_RIG, PARAMETERS
-from codrl_mj.identify.segments import Segment, speeds
+from codrl_mj.identify.segments import (
+    SEGMENT,
+    Segment,
+    moves,
+    shaft_segments,
+    shifted,
+    speeds,
+    turning,
+    winding_segments,
+)
 
 
 class WindingModel(Model):
@@ -63,26 +73,60 @@ class ShaftModel(Model):
         return motion
 
 
-def winding_model(segments: Sequence[Segment], known: Mapping[str, float]) -> tuple[WindingModel, list[np.ndarray]]:
-    """A winding, and starts: regressions of the voltage's integral over windows of several lengths.
+@dataclasses.dataclass(frozen=True)
+class WindingStage:
+    """Voltage and speed drive the current."""
 
-    The integral over a window is R times that of the current, L times its change and kE times the turn.
-    """
-    moving = any(np.any(segment.speeds) for segment in segments)
-    free = tuple(name for name in ELECTRICAL if name not in known and (moving or name != "back_emf_constant"))
-    given = {**DEFAULTS, "back_emf_constant": 0.0, **known}
-    starts = []
-    for count in (2, 8, 32):
-        rows = np.concatenate([_winding_rows(one, count, given["gear_ratio"]) for one in segments])
-        starts.append(_regressed(rows[:, :3], rows[:, 3], ELECTRICAL, free, given))
-    magnitudes = np.abs(np.median(starts, axis=0))
-    volts = np.concatenate([one.inputs for one in segments])
-    amperes = np.concatenate([one.measured for one in segments])
-    fallback = {"resistance": np.std(volts) / max(np.std(amperes), 1e-9) + 1e-6, "inductance": 1e-4}
-    floor = np.array([fallback.get(name, 1e-3) for name in free])
-    scales = np.maximum(magnitudes, 0.03 * floor)
-    starts = [np.where(one > 0.02 * scales, one, scales) for one in starts]
-    return WindingModel(free, {name: float(value) for name, value in given.items()}, scales), starts
+    driven_by: ClassVar = "voltage"
+    output: ClassVar = "current"
+
+    known: Mapping[str, float]
+    shaft: Any = None
+    """The fitted shaft under the current, where it is known: what an encoder does not see between its rows."""
+
+    def segments(self, logs: Sequence[Log]) -> list[Segment]:
+        """The logs, cut."""
+        return winding_segments(logs, [self._turning(log) for log in logs])
+
+    def model(self, segments: Sequence[Segment]) -> tuple[WindingModel, list[np.ndarray]]:
+        """A winding, and starts: regressions of the voltage's integral over windows of several lengths.
+
+        The integral over a window is R times that of the current, L times its change and kE times the turn.
+        """
+        moving = any(np.any(segment.speeds) for segment in segments)
+        free = tuple(name for name in ELECTRICAL if name not in self.known and (moving or name != "back_emf_constant"))
+        given = {**DEFAULTS, "back_emf_constant": 0.0, **self.known}
+        starts = []
+        for count in (2, 8, 32):
+            rows = np.concatenate([_winding_rows(one, count, given["gear_ratio"]) for one in segments])
+            starts.append(_regressed(rows[:, :3], rows[:, 3], ELECTRICAL, free, given))
+        magnitudes = np.abs(np.median(starts, axis=0))
+        volts = np.concatenate([one.inputs for one in segments])
+        amperes = np.concatenate([one.measured for one in segments])
+        fallback = {"resistance": np.std(volts) / max(np.std(amperes), 1e-9) + 1e-6, "inductance": 1e-4}
+        floor = np.array([fallback.get(name, 1e-3) for name in free])
+        scales = np.maximum(magnitudes, 0.03 * floor)
+        starts = [np.where(one > 0.02 * scales, one, scales) for one in starts]
+        return WindingModel(free, {name: float(value) for name, value in given.items()}, scales), starts
+
+    def _turning(self, log: Log) -> np.ndarray:
+        """Mean speeds till the next row: of positions, smoothed; or what the shaft does, and what it leaves, smoothed.
+
+        A smoothed speed lags behind a light rotor, and the back-EMF that it misses would be taken for inductance.
+        """
+        found = turning(log)
+        part = self.shaft
+        if part is None or not moves(log) or not log.has("position", part.stage.driven_by):
+            return found
+        stage = part.stage
+        late = shifted(log, stage.driven_by, part.delay)
+        segments = shaft_segments([late], stage.driven_by, "position", stage.segment, 0.0)
+        for segment, positions in zip(segments, settled(part.model, part.fit.values, segments), strict=True):
+            left = log.signals["position"][segment.rows] - positions
+            middles = 0.5 * (segment.times[1:] + segment.times[:-1])
+            rest = speeds(segment.times, left, middles)
+            found[segment.rows][:-1] = np.diff(positions) / np.diff(segment.times) + rest
+        return found
 
 
 def _winding_rows(segment: Segment, count: int, ratio: float) -> np.ndarray:
@@ -105,39 +149,50 @@ def _regressed(
     return np.asarray(found / norms)
 
 
-def shaft_model(
-    segments: Sequence[Segment],
-    rig: str,
-    friction: str,
-    driven_by: str,
-    output: str,
-    known: Mapping[str, float],
-    estimated: Sequence[str] = (),
-) -> tuple[ShaftModel, list[np.ndarray]]:
-    """A shaft, and starts: a regression of the input's integral, and changes of it."""
-    wanted = [*OF_RIG[rig], *OF_FRICTION[friction], *estimated]
-    if driven_by != "torque":
-        wanted.insert(0, "torque_constant")
-    if driven_by == "voltage":
-        wanted.insert(0, "resistance")
-    free = tuple(name for name in dict.fromkeys(wanted) if name not in known)
-    given = {**DEFAULTS, **known}
-    firsts = []
-    for window in (0.02, 0.004):
-        factors, drive, speed = _shaft_regression(segments, rig, output, window)
-        firsts.append(_shaft_start(factors, drive, speed, driven_by, given, known))
-    start, floors = firsts[0]
-    scales = np.array(
-        [floors[name] if name in FRICTION else max(abs(start[name]), floors.get(name, 1e-9)) for name in free]
-    )
-    positive = np.array([PARAMETERS[name].least >= 0.0 for name in free], bool)
-    starts = [np.array([one[name] for name in free]) for one, _ in firsts]
-    starts = [np.where(positive & ~(one > 0.02 * scales), 0.3 * scales, one) for one in starts]
-    changes = np.random.default_rng(0).uniform(-0.7, 0.7, (2, len(free)))
-    starts += [starts[0] * np.exp(change) for change in changes]
-    fixed = {name: float(value) for name, value in given.items()}
-    fixed |= {name: 0.0 for name in ("coulomb_friction", "viscous_friction") if name not in known}
-    return ShaftModel(free, fixed, scales, driven_by, output), starts
+@dataclasses.dataclass(frozen=True)
+class ShaftStage:
+    """A torque, a current or a voltage drives the shaft."""
+
+    rig: str
+    friction: str
+    driven_by: str
+    known: Mapping[str, float]
+    estimated: tuple[str, ...] = ()
+    segment: float = SEGMENT
+    """Time [s] that is simulated at once."""
+    output: str = "position"
+    """What is compared: `position` or `velocity`."""
+
+    def segments(self, logs: Sequence[Log]) -> list[Segment]:
+        """The logs, cut."""
+        return shaft_segments(logs, self.driven_by, self.output, self.segment)
+
+    def model(self, segments: Sequence[Segment]) -> tuple[ShaftModel, list[np.ndarray]]:
+        """A shaft, and starts: a regression of the input's integral, and changes of it."""
+        driven_by, known = self.driven_by, self.known
+        wanted = [*OF_RIG[self.rig], *OF_FRICTION[self.friction], *self.estimated]
+        if driven_by != "torque":
+            wanted.insert(0, "torque_constant")
+        if driven_by == "voltage":
+            wanted.insert(0, "resistance")
+        free = tuple(name for name in dict.fromkeys(wanted) if name not in known)
+        given = {**DEFAULTS, **known}
+        firsts = []
+        for window in (0.02, 0.004):
+            factors, drive, speed = _shaft_regression(segments, self.rig, self.output, window)
+            firsts.append(_shaft_start(factors, drive, speed, driven_by, given, known))
+        start, floors = firsts[0]
+        scales = np.array(
+            [floors[name] if name in FRICTION else max(abs(start[name]), floors.get(name, 1e-9)) for name in free]
+        )
+        positive = np.array([PARAMETERS[name].least >= 0.0 for name in free], bool)
+        starts = [np.array([one[name] for name in free]) for one, _ in firsts]
+        starts = [np.where(positive & ~(one > 0.02 * scales), 0.3 * scales, one) for one in starts]
+        changes = np.random.default_rng(0).uniform(-0.7, 0.7, (2, len(free)))
+        starts += [starts[0] * np.exp(change) for change in changes]
+        fixed = {name: float(value) for name, value in given.items()}
+        fixed |= {name: 0.0 for name in ("coulomb_friction", "viscous_friction") if name not in known}
+        return ShaftModel(free, fixed, scales, driven_by, self.output), starts
 
 
 def _shaft_start(

@@ -17,12 +17,11 @@ import numpy as np
 from codrl_mj.actuators import Drive
 from codrl_mj.fields import check, check_names, real
 from codrl_mj.identify.estimate import Model, estimate
-from codrl_mj.identify.excitations import KINDS, Excitation
 from codrl_mj.identify.log import Log
-from codrl_mj.identify.models import shaft_model, winding_model
+from codrl_mj.identify.models import ShaftStage, WindingStage
 from codrl_mj.identify.parameters import ELECTRICAL, PARAMETERS
-from codrl_mj.identify.segments import Segment, shaft_segments, winding_segments
-from codrl_mj.identify.synthetic import FREE, Load, Sampler, run, sample_times, simulate
+from codrl_mj.identify.segments import Segment, winding_segments
+from codrl_mj.identify.synthetic import EXCITATIONS, FREE, Excitation, Load, Sampler, logged, run, sample_times
 from codrl_mj.runs.files import writing
 
 GOALS = {
@@ -44,11 +43,7 @@ _PHASE = 0.37  # of a row, by which the rows miss the excitation's clock
 
 @dataclasses.dataclass(frozen=True)
 class Sensing:
-    """What is measured, how well.
-
-    Raises:
-        ValueError: a field is out of bounds.
-    """
+    """What is measured, how well."""
 
     current_noise: float = real(0.01, above=0.0, unit="")
     """Standard deviation of the current's noise as a share of the largest current, > 0."""
@@ -117,7 +112,7 @@ def plan(
         if not value > 0.0:
             raise ValueError(f"{name} = {value!r}: must be above 0 A; leave it out if there is no limit")
     options = []
-    for kind in KINDS:
+    for kind in EXCITATIONS:
         options += _options(drive, kind, duration, load, sensing or Sensing(), (limit, continuous_current))
     reached = [option for option in options if option.worst <= 1.0 / MARGIN]
     best = min(reached, key=lambda one: (one.rate, one.worst)) if reached else min(options, key=lambda one: one.worst)
@@ -164,7 +159,9 @@ def _options(
             if excess <= 1.0:
                 break
             amplitude *= 0.98 / excess
-        log = simulate(drive, amplitude * shape, held, sampler=Sampler(rate, mean_voltage=sensing.voltage == "mean"))
+        else:
+            course = run(drive, amplitude * shape, held)
+        log = logged(drive, course, sampler=Sampler(rate, mean_voltage=sensing.voltage == "mean"))
         errors = _electrical(drive, log, sensing.current_noise)
         if not held.locked:
             constant_error = errors.get("back_emf_constant", 0.0)  # which the torque is known by
@@ -178,17 +175,18 @@ def _electrical(drive: Drive, log: Log, noise: float) -> dict[str, float]:
     """Relative errors of a winding by the current, at the speed that is: see `Winding` for how it is found."""
     turned = np.append(np.diff(log.signals["position"]) / np.diff(log.time), 0.0)
     segments = winding_segments([log], [turned])
-    model, _ = winding_model(segments, {"gear_ratio": drive.motor.gear_ratio})
+    model, _ = WindingStage({"gear_ratio": drive.motor.gear_ratio}).model(segments)
     return _errors(drive, FREE, model, segments, noise * float(np.abs(log.signals["current"]).max()), True)
 
 
 def _mechanical(drive: Drive, log: Log, load: Load, encoder: float) -> dict[str, float]:
     """Relative errors of a shaft by the position; what the datasheet leaves at 0 is left out."""
-    segments = shaft_segments([log], "current", "position", _SEGMENT)
     known = {name: value for name, value in vars(drive.motor).items() if name in PARAMETERS and name != "rotor_inertia"}
     known |= {"mgl": load.gravity, "constant_torque": load.torque}
     known = {name: value for name, value in known.items() if name not in GOALS or value == 0.0}
-    model, _ = shaft_model(segments, "free", "coulomb", "current", "position", known)
+    stage = ShaftStage("free", "coulomb", "current", known, segment=_SEGMENT)
+    segments = stage.segments([log])
+    model, _ = stage.model(segments)
     return _errors(drive, load, model, segments, 2.0 * math.pi / encoder / math.sqrt(12.0), False)
 
 

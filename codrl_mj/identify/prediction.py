@@ -101,9 +101,7 @@ def closed_loop_error(model: ShaftModel, values: np.ndarray, log: Log) -> float 
 
 
 def fitted_traces(name: str, part: Any) -> tuple[Trace, ...]:
-    """The fit of each log of a `Fitted` part; none where the part was not fitted."""
-    if part is None:
-        return ()
+    """The fit of each log of a `Fitted` part."""
     pieces: dict[int, list[Any]] = {}
     for segment, residuals in zip(part.segments, part.fit.residuals, strict=True):
         simulated = segment.measured + residuals * segment.deviation

@@ -10,7 +10,7 @@ import numpy as np
 
 from codrl_mj.identify.columns import KINDS, Column
 from codrl_mj.identify.log import find_resolution
-from codrl_mj.identify.reading import STAMP, Table, read_table
+from codrl_mj.identify.reading import STAMP, Cells, read_table
 
 _WORDS = {
     "only": "enable enabled armed",
@@ -89,7 +89,7 @@ def _valid(signal: str, unit: str) -> str | None:
     return None
 
 
-def _guessed(signal: str, name: str, table: Table) -> tuple[str, str]:
+def _guessed(signal: str, name: str, table: Cells) -> tuple[str, str]:
     """A unit by a column's values, and what is to be seen to."""
     unit = KINDS[signal] or "1"
     try:

@@ -21,7 +21,7 @@ STAMP = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d")  # seconds since 197
 _MOST_UNUSABLE = 0.2  # share of rows that may be left out as unreadable or out of order
 
 
-class Table(NamedTuple):
+class Cells(NamedTuple):
     """What a file holds."""
 
     columns: Mapping[str, Any]  # texts or numbers, each of the same length
@@ -96,7 +96,7 @@ def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
 
 
 def _log(
-    name: str, signals: dict[str, np.ndarray], mapping: Mapping[str, Column], table: Table, first: Iterator[Finding]
+    name: str, signals: dict[str, np.ndarray], mapping: Mapping[str, Column], table: Cells, first: Iterator[Finding]
 ) -> Log:
     time, only = signals.pop("time"), signals.pop("only", None)
     wanted = np.ones(len(time), bool) if only is None else only != 0.0
@@ -161,7 +161,7 @@ def _left_out(rows: np.ndarray, check: str, what: str) -> Iterator[Finding]:
     yield Finding(severity, check, int(rows[0]) + 1, text, remedy if check == "stamps" else "")
 
 
-def read_table(path: Path) -> Table:
+def read_table(path: Path) -> Cells:
     """A file's columns as they stand there; see `read_log`, which says which files."""
     kind = Path(path.name.removesuffix(".gz")).suffix.lower()
     if kind == ".parquet":
@@ -169,7 +169,7 @@ def read_table(path: Path) -> Table:
             parquet = importlib.import_module("pyarrow.parquet")
         except ModuleNotFoundError:
             raise ValueError("reading Parquet needs pyarrow: pip install pyarrow, or save the log as .csv") from None
-        return Table(parquet.read_table(path).to_pydict(), {}, [])
+        return Cells(parquet.read_table(path).to_pydict(), {}, [])
     if kind not in (".csv", ".txt", ".dat", ".tsv", ".json"):
         raise ValueError(f"unknown kind of file {kind!r}, must be .csv, .txt, .dat, .tsv, .json (or .gz) or .parquet")
     content = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
@@ -180,7 +180,7 @@ def read_table(path: Path) -> Table:
     return _json(json.loads(text)) if kind == ".json" else _csv(text)
 
 
-def _csv(text: str) -> Table:
+def _csv(text: str) -> Cells:
     """A table after whatever comments: names are in the last line before the numbers, or above units."""
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
     bare = [(number, line) for number, line in lines if not line.startswith("#")]
@@ -216,7 +216,7 @@ def _csv(text: str) -> Table:
     whole = [row for _, row in rows if len(row) == len(names)]
     columns = dict(zip(names, zip(*whole, strict=True), strict=True)) if whole else dict.fromkeys(names, ())
     kept = [number for number, row in rows if len(row) == len(names)]
-    return Table(columns, {}, ragged, kept, dict(zip(names, units, strict=False)), separator != ",")
+    return Cells(columns, {}, ragged, kept, dict(zip(names, units, strict=False)), separator != ",")
 
 
 def _is_filled(row: Sequence[str]) -> bool:
@@ -233,17 +233,17 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _json(content: Any) -> Table:
+def _json(content: Any) -> Cells:
     if isinstance(content, dict):
         constants = {name: float(one) for name, one in content.items() if isinstance(one, int | float)}
         lists = {name: one for name, one in content.items() if isinstance(one, list) and one}
         tables = [one for one in lists.values() if isinstance(one[0], dict)]
         if len(tables) == 1:
-            return Table(_by_column(tables[0]), constants, [])
+            return Cells(_by_column(tables[0]), constants, [])
         if not tables and lists and len({len(one) for one in lists.values()}) == 1:
-            return Table(lists, constants, [])
+            return Cells(lists, constants, [])
     elif isinstance(content, list) and content and all(isinstance(row, dict) for row in content):
-        return Table(_by_column(content), {}, [])
+        return Cells(_by_column(content), {}, [])
     raise ValueError(
         "JSON must be a list of rows, an object with one such list and numbers beside it, or an object of columns of "
         "the same length"

@@ -1,28 +1,17 @@
 """The two parts of a motor that are fitted one after the other: the winding, then the shaft under its current."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
 from codrl_mj.identify import honesty
-from codrl_mj.identify.estimate import Fit, estimate, robust_cost, settled
+from codrl_mj.identify.estimate import Fit, estimate, robust_cost
 from codrl_mj.identify.log import Log
-from codrl_mj.identify.models import ShaftModel, shaft_model, winding_model
+from codrl_mj.identify.models import ShaftStage, WindingStage
 from codrl_mj.identify.prediction import predict
-from codrl_mj.identify.segments import (
-    SEGMENT,
-    Segment,
-    halved,
-    moves,
-    replaced,
-    shaft_segments,
-    shifted,
-    speeds,
-    turning,
-    winding_segments,
-)
+from codrl_mj.identify.segments import Segment, halved, moves, replaced, shifted
 
 DELAYS = (-1, 1, 2, 3)
 """Rows that the input is tried to be late by, besides 0;"""
@@ -38,65 +27,7 @@ SURE = 3.0
 """lowers that of the segments by more, in the mean, than so many standard deviations of that mean."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Winding:
-    """Voltage and speed drive the current."""
-
-    driven_by: ClassVar = "voltage"
-    output: ClassVar = "current"
-
-    known: Mapping[str, float]
-    shaft: "Fitted | None" = None
-    """The shaft under the current, where it is known: what an encoder does not see of the speed between its rows."""
-
-    def build(self, logs: Sequence[Log]) -> tuple[list[Segment], Any, list[np.ndarray]]:
-        """Segments, model, starts."""
-        segments = winding_segments(logs, [self._turning(log) for log in logs])
-        return segments, *winding_model(segments, self.known)
-
-    def _turning(self, log: Log) -> np.ndarray:
-        """Mean speeds till the next row: of positions, smoothed; or what the shaft does, and what it leaves, smoothed.
-
-        A smoothed speed lags behind a light rotor, and the back-EMF that it misses would be taken for inductance.
-        """
-        found = turning(log)
-        part = self.shaft
-        if part is None or not moves(log) or not log.has("position", part.stage.driven_by):
-            return found
-        stage = part.stage
-        late = shifted(log, stage.driven_by, part.delay)
-        segments = shaft_segments([late], stage.driven_by, "position", stage.segment, 0.0)
-        for segment, positions in zip(segments, settled(part.model, part.fit.values, segments), strict=True):
-            left = log.signals["position"][segment.rows] - positions
-            middles = 0.5 * (segment.times[1:] + segment.times[:-1])
-            rest = speeds(segment.times, left, middles)
-            found[segment.rows][:-1] = np.diff(positions) / np.diff(segment.times) + rest
-        return found
-
-
-@dataclasses.dataclass(frozen=True)
-class Shaft:
-    """A torque, a current or a voltage drives the shaft."""
-
-    rig: str
-    friction: str
-    driven_by: str
-    known: Mapping[str, float]
-    estimated: tuple[str, ...] = ()
-    segment: float = SEGMENT
-    """Time [s] that is simulated at once."""
-
-    output: str = "position"
-    """What is compared: `position` or `velocity`."""
-
-    def build(self, logs: Sequence[Log]) -> tuple[list[Segment], ShaftModel, list[np.ndarray]]:
-        """Segments, model, starts."""
-        segments = shaft_segments(logs, self.driven_by, self.output, self.segment)
-        friction, driven_by = self.friction, self.driven_by
-        return segments, *shaft_model(segments, self.rig, friction, driven_by, self.output, self.known, self.estimated)
-
-
-Stage = Winding | Shaft
+Stage = WindingStage | ShaftStage
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -104,7 +35,7 @@ class Fitted:
     """A stage with its logs, and what came of it."""
 
     stage: Any
-    """A `Winding` or a `Shaft`."""
+    """A `WindingStage` or a `ShaftStage`."""
     logs: tuple[Log, ...]
     """With the input in time."""
     delay: float
@@ -117,11 +48,12 @@ class Fitted:
 
     def again(self, logs: Sequence[Log]) -> np.ndarray:
         """The parameters that other logs give, from where these ended."""
-        return estimate(self.model, self.stage.build(logs)[0], [self.fit.values], most=20)[0].values
+        return estimate(self.model, self.stage.segments(logs), [self.fit.values], most=20)[0].values
 
     def refitted(self, stage: Stage) -> "Fitted":
         """Of the same logs with another stage, from where this ended."""
-        segments, model, _ = stage.build(self.logs)
+        segments = stage.segments(self.logs)
+        model, _ = stage.model(segments)
         fit, _ = estimate(model, segments, [self.fit.values])
         return dataclasses.replace(self, stage=stage, segments=tuple(segments), model=model, fit=fit)
 
@@ -193,7 +125,7 @@ class Fitted:
         made = []
         for log, values, speed in zip(self.logs, signals, speeds, strict=True):
             made.append(_with(log, self.stage.output, values))
-            if isinstance(self.stage, Winding) and log.has("position") and moves(log):
+            if isinstance(self.stage, WindingStage) and log.has("position") and moves(log):
                 turns = np.append(0.0, np.cumsum(speed[:-1] * np.diff(log.time)))
                 made[-1] = _with(made[-1], "position", log.signals["position"][0] + turns)
         return made
@@ -211,7 +143,8 @@ def fitted(stage: Stage, logs: Sequence[Log], on_step: Callable[[], None] = lamb
     A voltage whose mean between two rows fits worse than itself is shown to hold from row to row: then it is also the
     mean, which fewer rows can be given. One that fits better is that of the rows' times, and taken half a row later.
     """
-    segments, model, several = stage.build(logs)
+    segments = stage.segments(logs)
+    model, several = stage.model(segments)
     fit, tried = estimate(model, segments, several[: starts if model.names else 1], on_step)
     if not model.names:
         return Fitted(stage, tuple(logs), 0, tuple(segments), model, fit, tried)
@@ -223,7 +156,7 @@ def fitted(stage: Stage, logs: Sequence[Log], on_step: Callable[[], None] = lamb
     def measure(*delays: float) -> float:
         """Their costs; returns the best delay that is believed."""
         for one in delays:
-            segments = stage.build(late(one))[0]
+            segments = stage.segments(late(one))
             costs[one] = _costs(estimate(model, segments, [fit.values], on_step, 20, fit.scale)[0], fit.scale)
         best = min(costs, key=lambda one: costs[one].sum())
         return best if _better(costs[best], costs[0]) else 0
@@ -232,7 +165,7 @@ def fitted(stage: Stage, logs: Sequence[Log], on_step: Callable[[], None] = lamb
     while delay != 0 and delay in (min(costs), max(costs)) and abs(delay) < LONGEST:
         delay = measure(delay + (1 if delay > 0 else -1))
     told = late(delay)
-    if isinstance(stage, Winding) and not all(log.mean_voltage for log in logs):
+    if isinstance(stage, WindingStage) and not all(log.mean_voltage for log in logs):
         whole = costs[delay]
         measure(delay - 0.5, delay + 0.5)
         half = min(delay - 0.5, delay + 0.5, key=lambda one: costs[one].sum())
@@ -240,7 +173,8 @@ def fitted(stage: Stage, logs: Sequence[Log], on_step: Callable[[], None] = lamb
         if delay == half or _better(whole, costs[half]):
             told = [dataclasses.replace(log, mean_voltage=True) for log in late(delay)]
     if delay != 0:
-        segments, model, several = stage.build(told)
+        segments = stage.segments(told)
+        model, several = stage.model(segments)
         fit, tried = estimate(model, segments, [fit.values, several[0]])
     return Fitted(stage, tuple(told), delay, tuple(segments), model, fit, tried)
 
@@ -256,20 +190,21 @@ def _better(these: np.ndarray, those: np.ndarray) -> bool:
     return bool(these.sum() < BETTER * those.sum() and gained.mean() > SURE * error)
 
 
-def foretold(stage: Shaft, logs: Sequence[Log], on_step: Callable[[], None]) -> np.ndarray:
+def foretold(stage: ShaftStage, logs: Sequence[Log], on_step: Callable[[], None]) -> np.ndarray:
     """Mean absolute error on each log of the fit to all others, from that to all, shape (n,)."""
-    segments, model, starts = stage.build(logs)
+    segments = stage.segments(logs)
+    model, starts = stage.model(segments)
     whole, errors = estimate(model, segments, starts[:2])[0].values, []
     for place, log in enumerate(logs):
         others = [other for index, other in enumerate(logs) if index != place]
-        best, _ = estimate(model, stage.build(others)[0], [whole], most=12)
+        best, _ = estimate(model, stage.segments(others), [whole], most=12)
         found = predict(model, best.values, log)
         errors.append(found.open_loop if found.closed_loop is None else found.closed_loop)
         on_step()
     return np.array(errors)
 
 
-def chosen_friction(stage: Shaft, logs: Sequence[Log], wanted: str, on_step: Callable[[], None]) -> Shaft:
+def chosen_friction(stage: ShaftStage, logs: Sequence[Log], wanted: str, on_step: Callable[[], None]) -> ShaftStage:
     """The stage with the friction that is wanted or, for `auto`, with what leaving out one log at a time speaks for.
 
     More than viscous and Coulomb friction is kept where the errors on the logs left out fall by more, in the mean, than

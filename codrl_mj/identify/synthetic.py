@@ -2,6 +2,10 @@
 
 The winding is exact between the drive's samples, at the speed in their middle; the shaft moves half a sample before and
 half a sample after it (Strang's splitting, of second order).
+
+Voltages are pure functions of time. Slow turning shows resistance, back-EMF and friction; only what changes within the
+winding's time constant L/R shows the inductance. PRBS: a pseudo-random binary sequence, white up to its clock. Source:
+Ljung, *System Identification* (2nd ed. 1999), sec. 13.3.
 """
 
 import dataclasses
@@ -17,18 +21,77 @@ from codrl_mj.actuators import Drive
 from codrl_mj.fields import check, check_names, real
 from codrl_mj.identify import simulation
 from codrl_mj.identify.columns import KINDS
-from codrl_mj.identify.excitations import Excitation
 from codrl_mj.identify.log import Log
 from codrl_mj.runs.files import writing
 
 
 @dataclasses.dataclass(frozen=True)
-class Load:
-    """What the output shaft moves.
+class Excitation:
+    """A voltage over time."""
 
-    Raises:
-        ValueError: a field is out of bounds.
-    """
+    kind: str = "prbs"
+    """One of `EXCITATIONS`."""
+    amplitude: float = real(1.0, above=0.0, unit="V")
+    """The largest voltage [V], > 0."""
+    duration: float = real(4.0, above=0.0, unit="s")
+    """[s], > 0."""
+    frequency: float = real(0.5, above=0.0, unit="Hz")
+    """Of the slow sine, and of the square [Hz], > 0."""
+    highest: float = real(200.0, above=0.0, unit="Hz")
+    """Where the chirp ends [Hz], > 0; it begins at `frequency`."""
+    clock: float = real(2.0e-3, above=0.0, unit="s")
+    """Least time [s] between the changes of a PRBS, > 0; about 4 L/R."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        check(self)
+        check_names([self.kind], EXCITATIONS, "excitation")
+
+    @property
+    def locked(self) -> bool:
+        """Whether the shaft is to be held."""
+        return self.kind == "locked_prbs"
+
+    def voltage(self, time: np.ndarray) -> np.ndarray:
+        """[V], of the shape of time [s]; 0 after the duration."""
+        time = np.asarray(time, dtype=float)
+        return self.amplitude * np.where(time < self.duration, EXCITATIONS[self.kind](self, time), 0.0)
+
+
+def _slow_sine(excitation: Excitation, time: np.ndarray) -> np.ndarray:
+    return np.sin(2.0 * math.pi * excitation.frequency * time)
+
+
+def _bits(excitation: Excitation, time: np.ndarray) -> np.ndarray:
+    bits = _sequence()
+    return bits[np.floor(time / excitation.clock + 1e-9).astype(int) % len(bits)]
+
+
+EXCITATIONS: dict[str, Callable[[Excitation, np.ndarray], np.ndarray]] = {
+    "slow_sine": _slow_sine,
+    # reverses at once
+    "square": lambda one, time: np.where((one.frequency * time) % 1.0 < 0.5, 1.0, -1.0),
+    # its frequency grows in proportion to time
+    "chirp": lambda one, time: np.sin(
+        2.0 * math.pi * (one.frequency + 0.5 * (one.highest - one.frequency) * time / one.duration) * time
+    ),
+    "prbs": lambda one, time: 0.5 * _bits(one, time) + 0.5 * _slow_sine(one, time),
+    "locked_prbs": _bits,  # with the shaft held
+}
+"""Kind -> function of amplitude 1."""
+
+
+@functools.cache
+def _sequence() -> np.ndarray:
+    """-1 and 1 in a sequence of 2^13 - 1 by a shift register, shape (8191,)."""
+    from scipy.signal import max_len_seq
+
+    return 2.0 * max_len_seq(13)[0].astype(float) - 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Load:
+    """What the output shaft moves."""
 
     inertia: float = real(0.0, least=0.0, unit="kg*m^2")
     """[kg*m^2], >= 0, besides the rotor's."""
@@ -50,11 +113,7 @@ FREE = Load()
 
 @dataclasses.dataclass(frozen=True)
 class Sensor:
-    """How a signal is read: value -> gain * value(time - delay) + bias + noise, then rounded.
-
-    Raises:
-        ValueError: a field is out of bounds.
-    """
+    """How a signal is read: value -> gain * value(time - delay) + bias + noise, then rounded."""
 
     noise: float = real(0.0, least=0.0, unit="")
     """Standard deviation of white noise, >= 0, in the signal's unit."""
@@ -76,11 +135,7 @@ class Sensor:
 
 @dataclasses.dataclass(frozen=True)
 class Sampler:
-    """When rows are written.
-
-    Raises:
-        ValueError: a field is out of bounds.
-    """
+    """When rows are written."""
 
     rate: float = real(5000.0, above=0.0, unit="Hz")
     """Rows a second [Hz], > 0."""
@@ -162,14 +217,26 @@ def simulate(
     position: float = 0.0,
     name: str = "synthetic",
 ) -> Log:
-    """A log of a drive with all that can be logged, from a `position` [rad] on, under a voltage as `run` takes it.
+    """A log of a drive with all that can be logged, from a `position` [rad] on, under a voltage as `run` takes it."""
+    return logged(drive, run(drive, excitation, load, position), sensors, sampler, seed, name)
+
+
+def logged(
+    drive: Drive,
+    course: Course,
+    sensors: Mapping[str, Sensor] | None = None,
+    sampler: Sampler = Sampler(),
+    seed: int = 0,
+    name: str = "synthetic",
+) -> Log:
+    """What is logged of a drive's course.
 
     Signals without a sensor show what is. The voltage is the one asked for, without sag; the torque n*kT*i.
     """
     sensors = dict(sensors or {})
     signals = ("voltage", "current", "position", "velocity", "torque", "bus", "duty")
     check_names(sensors, signals, "signal")
-    course, random = run(drive, excitation, load, position), np.random.default_rng(seed)
+    random = np.random.default_rng(seed)
     period = 1.0 / sampler.rate
     time = period * np.arange(math.floor(course.time[-1] / period + 1e-9) + 1)
     time[1:-1] += period * sampler.jitter * np.clip(random.standard_normal(max(len(time) - 2, 0)), -3.0, 3.0)

@@ -16,8 +16,7 @@ import numpy as np
 from codrl_mj.actuators import Drive, GearMotor, SampledLoop, Supply
 from codrl_mj.identify import identify
 from codrl_mj.identify.checks import check
-from codrl_mj.identify.excitations import Excitation
-from codrl_mj.identify.synthetic import Sampler, Sensor, run, simulate
+from codrl_mj.identify.synthetic import Excitation, Sampler, Sensor, run, simulate
 
 VOLTS = 12.0
 NAMES = {

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 
 from codrl_mj.actuators import Drive, GearMotor, SampledLoop, Supply
-from codrl_mj.identify.checks import check
-from codrl_mj.identify.contradictions import FACTORS, name_of_factor
-from codrl_mj.identify.excitations import Excitation
+from codrl_mj.identify.checks import FACTORS, check, name_of_factor
 from codrl_mj.identify.log import Log
 from codrl_mj.identify.simulation import Moved, moving
-from codrl_mj.identify.synthetic import Load, Sampler, Sensor, run, simulate
+from codrl_mj.identify.synthetic import Excitation, Load, Sampler, Sensor, run, simulate
 
 MOTORS = {
     "small": GearMotor(0.94, 3.6e-4, 0.036, 0.036, 1.35e-5, coulomb_friction=5e-3, viscous_friction=1e-6),

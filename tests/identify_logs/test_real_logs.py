@@ -4,9 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from codrl_mj.identify.balances import torque_balance
+from codrl_mj.identify.balances import torque_balance, velocity_lag
 from codrl_mj.identify.checks import check
-from codrl_mj.identify.lags import velocity_lag
 from codrl_mj.identify.reading import read_log
 
 LOGS = Path(__file__).parent / "logs"

@@ -7,8 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from codrl_mj.actuators import Drive, GearMotor, SampledLoop, Supply
-from codrl_mj.identify.excitations import KINDS, Excitation
-from codrl_mj.identify.synthetic import Load, Sampler, Sensor, run, simulate
+from codrl_mj.identify.synthetic import EXCITATIONS, Excitation, Load, Sampler, Sensor, run, simulate
 
 MOTOR = GearMotor(0.9, 4e-4, 0.036, 0.036, 1.35e-5, gear_ratio=5.0, coulomb_friction=3e-3, viscous_friction=2e-5)
 DRIVE = Drive(MOTOR, SampledLoop(), Supply(24.0))
@@ -125,7 +124,7 @@ def test_a_shaft_needs_an_inertia():
         run(changed(rotor_inertia=0.0), Excitation())
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", EXCITATIONS)
 def test_excitations_keep_to_their_amplitude_and_end(kind):
     excitation = Excitation(kind, 3.0, 2.0)
     voltage = excitation.voltage(np.linspace(0.0, 3.0, 3001))

@@ -1,0 +1,269 @@
+"""What may be trusted of a fit: every number's interval by its causes, its status, and what is wrong with the logs."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from codrl_mj.identify import honesty
+from codrl_mj.identify.models import ShaftStage, WindingStage
+from codrl_mj.identify.parameters import DEFAULTS, FRICTION, PARAMETERS
+from codrl_mj.identify.result import Estimate, Status
+from codrl_mj.identify.segments import BLOCK
+from codrl_mj.identify.stages import PART, Fitted
+
+WIDEST = 0.3
+"""An interval of more than this share of the value to either side is too wide; of the whole friction, for friction."""
+WIDEST_OF = {"resistance": 0.05, "back_emf_constant": 0.05, "inductance": 0.15}
+"""For what a current sensor tells."""
+NARROWEST = 0.002
+"""No interval is narrower than this share of the value to either side: nobody's sensors are better calibrated."""
+NARROWEST_OF = {"inductance": 0.02}
+"""What comes of a fifth of a row's time: neither stamps nor a held back-EMF are better."""
+NARROW = 0.1
+"""Friction whose interval is a larger share of itself is a rough number: what is sure is how much of all it may be."""
+BIASED = 0.5
+"""The self-test fails where it is off by more than this share of the widest interval."""
+CAUSES = {
+    "curvature": "the logs hardly depend on it",
+    "resampling": "parts of the logs disagree",
+    "logs": "the logs disagree",
+    "half_rate": "every second row tells another value",
+    "self_test": "a fit to its own simulation does not find it again",
+    "unexplained": "the current is not explained",
+    "torque_constant": "the torque constant is not known better",
+}
+"""What widens an interval, in words."""
+AT_BOUND = 1e-3
+"""Nearer to a bound, in the parameter's scale, a value is at it."""
+UNEXPLAINED = 8.0
+"""Residuals of more standard deviations of the sensor in the mean are no noise,"""
+UNLIKE = 0.02
+"""and more than this share of what moves within a segment is not explained: the log is bad, or the model is."""
+
+
+def judged(
+    parts: Mapping[str, Fitted], given: Mapping[str, float], by_constant: bool, seed: int, step: Callable[[str], Any]
+) -> tuple[list[Estimate], list[str], float]:
+    """Every number that was found, given or follows, warnings, and the largest share of a log that is not explained.
+
+    `by_constant`: the shaft's torque constant is the back-EMF constant.
+    """
+    estimates: list[Estimate] = []
+    warnings: list[str] = []
+    unlike: dict[str, float] = {}
+    for name, part in parts.items():
+        constant = next((one for one in estimates if by_constant and one.name == "back_emf_constant"), None)
+        found = _of_part(part, seed, step(name))
+        estimates += found if constant is None else _with_constant(found, constant, part.stage)
+        warnings += _warnings(part, unlike)
+    return _completed(estimates, given), warnings, max(unlike.values(), default=0.0)
+
+
+def _of_part(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estimate]:
+    """Every free parameter of a stage with its interval and status, and their sum where they are friction."""
+    fit, model = part.fit, part.model
+    if not fit.names:
+        return []
+    friction, electrical = _Friction.of(part), isinstance(part.stage, WindingStage)
+    # what a change is measured by: the value itself or, of friction, what would be all of it
+    scales = [
+        friction.all_of(name) if name in FRICTION else abs(value)
+        for name, value in zip(fit.names, fit.values, strict=True)
+    ]
+    scales = np.maximum(scales, 1e-6 * model.scales)
+    slopes = np.array([friction.slopes.get(name, 0.0) for name in fit.names])
+    names, of = fit.names, np.eye(len(fit.names))
+    values, sizes, units = fit.values, scales, model.scales
+    if any(slopes):
+        names, of = (*names, "friction_torque"), np.vstack([of, slopes])
+        values = np.append(values, friction.torque)
+        sizes, units = (np.append(one, friction.all_of("friction_torque")) for one in (sizes, units))
+    causes, tested = _causes(part, values, scales, of, seed, on_step)
+    directions = part.unknown_directions(scales)
+    on_step()
+    together = [
+        {**one, "friction_torque": change}
+        for one in directions
+        if abs(change := float(slopes * scales @ [one.get(name, 0.0) for name in fit.names] / sizes[-1])) > PART
+    ]
+    made = []
+    halves = np.hypot(honesty.total(causes), [NARROWEST_OF.get(name, NARROWEST) for name in names] * values)
+    summed = any(slopes) and bool(halves[-1] <= NARROW * values[-1])
+    for place, (name, value, half) in enumerate(zip(names, map(float, values), map(float, halves), strict=True)):
+        widest = WIDEST_OF.get(name, WIDEST) if electrical else WIDEST
+        if name in FRICTION and summed:  # what one takes too little of, the other takes
+            widest = 1.0
+        least, most = PARAMETERS[name].least, PARAMETERS[name].most
+        by_cause = {cause: float(several[place]) for cause, several in causes.items()}
+        share = half / sizes[place]
+        own = together if name == "friction_torque" else [one for one in directions if name in one]
+        none = most if name == "gear_efficiency" else least
+        nothing = name in FRICTION and abs(value - none) <= AT_BOUND * units[place]
+        at_bound = min(value - least, most - value) <= AT_BOUND * units[place]
+        worst = CAUSES[max(by_cause, key=lambda cause: by_cause[cause])]
+        status: Status = "identified"
+        why = ""
+        if own and (len(own[0]) > 1):
+            status, why = "ratio", _text(own[0])
+        elif own:
+            status, why = "unidentifiable", "the logs are as likely whatever it is"
+        elif at_bound and not nothing:
+            status, why = "refused", f"it ended at its bound, {value:g} {PARAMETERS[name].unit}".strip()
+        elif math.isinf(by_cause["resampling"]):
+            status, why = "refused", f"there are no two stretches of {BLOCK:g} s to resample: give a longer log"
+        elif not by_cause["self_test"] <= BIASED * widest * sizes[place]:
+            status = "refused"
+            why = f"the self-test finds {tested[place]:.4g} where the fit that it simulates has {value:.4g}"
+        elif not share <= widest:
+            status = "refused"
+            whole = "all friction" if name in FRICTION else "it"
+            why = f"its interval is {100.0 * share:.3g} % of {whole} to either side, mostly because {worst}"
+        elif name in FRICTION and not half <= NARROW * abs(value - none):
+            status = "rough"
+            why = f"its interval is {100.0 * share:.3g} % of all friction to either side"
+            why += ", and more of itself" if name != "friction_torque" else ""
+        made.append(Estimate(name, value, max(value - half, least), min(value + half, most), status, why, by_cause))
+    return made
+
+
+def _causes(
+    part: Fitted, values: np.ndarray, scales: np.ndarray, of: np.ndarray, seed: int, on_step: Callable[[], None]
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Half-widths by cause of `values`, which are `of` @ the parameters, and what the self-test finds for them."""
+    fit, electrical = part.fit, isinstance(part.stage, WindingStage)
+    causes = honesty.half_widths(fit, part.segments, scales, of, seed)
+    on_step()
+    tested = values + of @ (part.self_test() - fit.values)
+    on_step()
+    # an error that goes with a row's time is half as large at the rate of the logs, one with its root more than that
+    causes["half_rate"] = (2.0 if electrical else 1.0) * np.abs(of @ (part.half_rate() - fit.values))
+    on_step()
+    causes["self_test"] = np.abs(tested - values)
+    causes["unexplained"] = np.abs(values) * (honesty.unexplained(fit, part.segments) if electrical else 0.0)
+    return causes, tested
+
+
+def _with_constant(found: list[Estimate], constant: Estimate, stage: ShaftStage) -> list[Estimate]:
+    """Estimates of a shaft under a current whose torque constant was itself found: they are no better than that."""
+    made = [
+        Estimate("torque_constant", constant.value, constant.low, constant.high, constant.status,
+                 f"taken as the back-EMF constant{': ' + constant.why if constant.why else ''}", constant.causes)
+    ]  # fmt: skip
+    relative = max(constant.high - constant.value, constant.value - constant.low) / max(constant.value, 1e-12)
+    anchored = "mgl" in stage.known or "inertia" in stage.known
+    for one in found:
+        own = one.value * relative if one.name not in ("gear_efficiency", "stribeck_speed") and not anchored else 0.0
+        low, high = one.value - math.hypot(one.value - one.low, own), one.value + math.hypot(one.high - one.value, own)
+        status, why = one.status, one.why
+        if status in ("identified", "rough") and constant.status not in ("identified", "given"):
+            status, why = "refused", f"the torque constant that it is in proportion to is {constant.status}"
+        ends = max(low, PARAMETERS[one.name].least), min(high, PARAMETERS[one.name].most)
+        made.append(Estimate(one.name, one.value, *ends, status, why, {**one.causes, "torque_constant": own}))
+    return made
+
+
+class _Friction(NamedTuple):
+    """All friction at the root mean square of a shaft's speeds and torques, at the rotor."""
+
+    torque: float
+    """[N*m]"""
+    slopes: Mapping[str, float]
+    """How it changes with each kind of friction."""
+    least: float
+    """Torque [N*m] that is little beside what drives: less friction is as good as none."""
+
+    def all_of(self, name: str) -> float:
+        """How much of one kind would be all of it."""
+        found = (self.torque + self.least) / abs(self.slopes.get(name, 1.0))
+        return min(found, 1.0) if name == "gear_efficiency" else found
+
+    @classmethod
+    def of(cls, part: Fitted) -> "_Friction":
+        """That of what was fitted; of a winding none."""
+        if isinstance(part.stage, WindingStage):
+            return cls(0.0, {}, 0.0)
+        model, number = part.model, part.model.all_values(part.fit.values)
+        every = [slice(None, None, max(len(one.times) // 20, 1)) for one in part.segments]
+        speeds = np.concatenate(
+            [
+                one.measured if model.output == "velocity" else np.diff(one.measured[rows]) / np.diff(one.times[rows])
+                for one, rows in zip(part.segments, every, strict=True)
+            ]
+        )
+        speed = max(float(np.sqrt(np.mean(speeds**2))), 1e-9) * number["gear_ratio"]
+        inputs = np.concatenate([one.inputs for one in part.segments])
+        torque = float(np.sqrt(np.mean(inputs**2))) * model.moved(part.fit.values).gain / number["gear_ratio"]
+        slopes = {"coulomb_friction": 1.0, "viscous_friction": speed, "gear_efficiency": -torque}
+        lost = slopes["gear_efficiency"] * (number["gear_efficiency"] - 1.0)
+        return cls(number["coulomb_friction"] + number["viscous_friction"] * speed + lost, slopes, 1e-2 * torque)
+
+
+def _text(direction: Mapping[str, float]) -> str:
+    moves = ", ".join(
+        f"{name} by {100.0 * share:+.0f} %{' of all friction' if name in FRICTION else ''}"
+        for name, share in direction.items()
+    )
+    return f"only their relation is known: the fit stays as good if all change together, {moves}"
+
+
+def _completed(estimates: list[Estimate], given: Mapping[str, float]) -> list[Estimate]:
+    """With what was given, and what follows of both."""
+    named = {one.name: one for one in estimates}
+    for name, value in given.items():
+        named[name] = Estimate(name, value, value, value, "given")
+    constants = {"torque_constant": "torque constant", "back_emf_constant": "back-EMF constant"}
+    for name, other in zip(constants, reversed(constants), strict=True):
+        if name not in named and other in named:
+            why = f"taken as the {constants[other]}{': ' + named[other].why if named[other].why else ''}"
+            named[name] = dataclasses.replace(named[other], name=name, why=why)
+    ratio = given.get("gear_ratio", DEFAULTS["gear_ratio"])
+    if "inertia" in named and "load_inertia" in given and "rotor_inertia" not in given:
+        whole, load = named["inertia"], given["load_inertia"]
+        value, low, high = ((one - load) / ratio**2 for one in (whole.value, whole.low, whole.high))
+        status, why = whole.status, whole.why
+        if status == "identified" and not high - value <= WIDEST * value:
+            status = "refused"
+            why = f"of an inertia of {whole.value:.4g} kg*m^2 in all, {load:.4g} is said to be the load's"
+            why += ": too little is left"
+        ends = max(low, 0.0), max(high, 0.0)
+        named["rotor_inertia"] = Estimate("rotor_inertia", max(value, 0.0), *ends, status, why)
+    return [named[name] for name in PARAMETERS if name in named]
+
+
+def _warnings(part: Fitted, shares: dict[str, float]) -> list[str]:
+    """What is wrong with logs, or with the model of them; `shares` gets what is unexplained of each such log."""
+    unlike = {}
+    for place, log in enumerate(part.logs):
+        own = [index for index, segment in enumerate(part.segments) if segment.log == place]
+        sizes = np.concatenate([np.abs(part.fit.residuals[index]) for index in own])
+        rest = np.concatenate([part.fit.residuals[i] * part.segments[i].deviation for i in own])
+        swing = np.concatenate([part.segments[i].measured - part.segments[i].measured.mean() for i in own])
+        share = float(np.std(rest) / max(np.std(swing), 1e-12))
+        if sizes.mean() / 0.8 > UNEXPLAINED and share > UNLIKE:
+            shares[log.name] = max(share, shares.get(log.name, 0.0))
+            unlike[log.name] = (
+                f"{sizes.mean() / 0.8:.1f} standard deviations of the sensor, {100.0 * share:.2g} % of what moves"
+            )
+    found = []
+    if 1 < len(unlike) == len(part.logs):
+        found.append(
+            "the model does not explain any of the logs within what their sensors see: of the first, residuals are "
+            f"{next(iter(unlike.values()))}. Fit more friction, or find out what else moved"
+        )
+    else:
+        found += [
+            f"log {name}: residuals are {text} in the mean: the model does not explain it. Leave it out, find out what "
+            "else moved, or fit more friction"
+            for name, text in unlike.items()
+        ]
+    values = np.array([one.values for one in part.tried])
+    costs = np.array([np.mean(np.abs(np.concatenate(one.residuals))) for one in part.tried])
+    near = costs < 1.1 * costs.min()
+    apart = np.ptp(values[near], axis=0) / np.maximum(np.abs(part.fit.values), part.model.scales)
+    if np.any(apart > 0.2):
+        names = ", ".join(name for name, one in zip(part.fit.names, apart, strict=True) if one > 0.2)
+        found.append(f"several minima: starts ended within 10 % of the best cost, but apart in {names}")
+    return found
