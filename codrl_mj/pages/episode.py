@@ -15,6 +15,7 @@ from codrl_mj.films.clip import Clip, clip
 from codrl_mj.films.record import record
 from codrl_mj.foreign.config import ForeignConfig
 from codrl_mj.pages import page
+from codrl_mj.pages.diagrams import TORQUE_SPEED, envelope
 from codrl_mj.pages.loop import limits, no_load_speed
 from codrl_mj.pages.plots import POINTS, Curve, Plot, Shade, spans
 
@@ -369,15 +370,15 @@ def torque_speed(lines: Sequence[_Line]) -> Plot | None:
         grid = np.linspace(-width, width, 401)
         ends = limits(line.actuator, grid)
         highest = max(highest, min(3.0 * most, 1.1 * float(np.abs(ends[1]).max()) if ends else most))
-        for bound, label in zip(ends or (), ("lowest", "highest"), strict=False):
-            more: Any = {"colour": 0, "shared": line.place, "filled": label == "highest", "tags": line.tags}
-            curves.append(Curve(f"{line.before}{label} possible", grid, bound, dashed=True, **more))
+        if ends is not None:
+            labels = f"{line.before}lowest possible", f"{line.before}highest possible"
+            curves += envelope(labels, grid, ends, colour=0, shared=line.place, tags=line.tags, dashed=True)
         stride = max(line.stride, len(speed) // 3000, 1)
         times = line.timestep * np.arange(len(speed))[::stride]
         trail: Any = {"style": "trail", "colour": 1, "shared": line.place, "tags": line.tags, "times": times}
         curves.append(Curve(f"{line.before}episode", speed[::stride], torque[::stride], **trail))
     title = "Torque and speed, within what the motor can do"
-    return Plot(title, "speed of the output [rad/s]", "torque of the output [N·m]", tuple(curves), y_most=highest)
+    return Plot(title, *TORQUE_SPEED, tuple(curves), y_most=highest)
 
 
 def _finite(value: float) -> float:

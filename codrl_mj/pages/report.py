@@ -23,9 +23,8 @@ from codrl_mj.runs.layout import PROGRESS, finished, told_apart
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.runs.summaries import RunSummary, compare, read_run
 from codrl_mj.training.folder import BEST, EPISODES, load_config
-from codrl_mj.training.history import WINDOW, read_episodes
+from codrl_mj.training.history import learning_curves, read_episodes
 
-_DOTS = 4000
 _MOST_LOOPS = 4
 
 
@@ -194,48 +193,31 @@ def _value(value: Any) -> str:
 
 
 def _learning(runs: Sequence[_Run]) -> Markup:
-    """Curves from the runs' tables."""
+    """Curves from the runs' tables; beside others a run has one colour and no dots."""
     notes: list[Markup] = []
     returns: list[Curve] = []
-    errors: list[Curve] = []
     evaluations: list[Curve] = []
+    errors: list[Curve] = []
     for place, run in enumerate(runs):
-        before, colour = (f"{run.name}: ", place) if len(runs) > 1 else ("", None)
         reports = _reports(run.summary.path / PROGRESS)
+        steps = reports.get("steps", np.empty(0))
+        evaluated, off = (
+            reports.get(name, np.full(len(steps), np.nan)) for name in ("evaluation_return", "torque_error")
+        )
         try:
             episodes = read_episodes(run.summary.path / EPISODES)
         except (ValueError, OSError) as error:
             episodes = np.empty((0, 4))
             notes.append(page.note(f"No curve of {run.name}'s training episodes: {error}"))
-        if len(episodes):
-            steps, values = episodes[:, 1], episodes[:, 2]
-            stride = max(1, len(steps) // _DOTS)
+        known = np.isfinite(off)
+        off_torque = [Curve("torque error", steps[known], off[known], colour=4)] if known.any() else []
+        for curve in (*learning_curves(episodes, steps, evaluated), *off_torque):
+            into = {"evaluations": evaluations, "torque error": errors}.get(curve.label, returns)
             if len(runs) == 1:
-                dots = steps[::stride], values[::stride]
-                returns.append(Curve("training episodes", *dots, style="dots", colour=5))
-            sums = np.cumsum(np.concatenate([[0.0], values]))
-            ends = np.arange(1, len(values) + 1)
-            starts = np.maximum(0, ends - WINDOW)
-            means = (sums[ends] - sums[starts]) / (ends - starts)
-            returns.append(
-                Curve(f"{before}mean of {WINDOW} episodes", steps, means, colour=0 if colour is None else colour)
-            )
-        steps = reports.get("steps", np.empty(0))
-        for column, label, into, own in (
-            ("evaluation_return", "evaluations", evaluations, 1),
-            ("torque_error", "torque error", errors, 4),
-        ):
-            good = np.isfinite(reports.get(column, np.empty(0)))
-            if good.any():
-                values = reports[column][good]
-                curve = Curve(
-                    before + label,
-                    steps[good],
-                    values,
-                    colour=own if colour is None else colour,
-                    dashed=colour is not None,
-                )
                 into.append(curve)
+            elif curve.style != "dots":
+                label, dashed = f"{run.name}: {curve.label}", into is not returns
+                into.append(dataclasses.replace(curve, label=label, colour=place, dashed=dashed))
     found = []
     if returns or evaluations:
         found.append(Plot("Return while learning", "environment steps", "return", (*returns, *evaluations)))
