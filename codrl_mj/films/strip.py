@@ -18,12 +18,18 @@ _LIMITS = {"voltage_saturated": SATURATED, "current_saturated": "#E69F00", "temp
 """Signals of families with several limits, and their colours."""
 
 
-def draw_text(text: str, width: int, height: int, colour: str = "#22313F") -> np.ndarray:
-    """One line of bold text, centred.
+def of_motor(episode: Episode, motor: int) -> Episode:
+    """An episode as that of one of its motors alone: its actuator, its columns of signals and trace."""
+    signals, trace = (
+        {name: values if values.ndim == 1 else values[:, motor] for name, values in table.items()}
+        for table in (episode.signals, episode.trace)
+    )
+    actuator = episode.actuator[motor] if isinstance(episode.actuator, tuple) else episode.actuator
+    return dataclasses.replace(episode, signals=signals, trace=trace, actuator=actuator)
 
-    Returns:
-        Image, shape (height, width, 3), uint8.
-    """
+
+def draw_text(text: str, width: int, height: int, colour: str = "#22313F") -> np.ndarray:
+    """One line of bold text, centred: an image, shape (height, width, 3), uint8."""
     figure = _figure(width, height)
     figure.text(0.5, 0.5, text, ha="center", va="center", fontsize=12, color=colour, weight="bold")
     return _pixels(figure)
@@ -48,8 +54,7 @@ def draw_strip(
     length = round(pixels_per_second(width, window) * end)
     content = _figure(length + MARGIN, body)
     if isinstance(actuator, tuple):
-        episode = dataclasses.replace(episode, signals={name: v[:, motor] for name, v in episode.signals.items()})
-        actuator = actuator[motor]
+        episode, actuator = of_motor(episode, motor), actuator[motor]
     lines = []
     for bottom, height, plot, label in (
         (TIME_HEIGHT + VOLTAGE_HEIGHT + GAP, TORQUE_HEIGHT, _plot_torque, torque_label(task, actuator, motor)),

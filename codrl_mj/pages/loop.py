@@ -72,19 +72,15 @@ def rates_table(drive: Drive) -> Markup:
 def held_step(steps: Mapping[str, tuple[ActuatorModel, float, float]]) -> Plot | None:
     """The torque after a step of what is asked for, the shaft held; None where nothing is of interest.
 
-    Args:
-        steps: name -> actuator, torque that is asked of it [N*m], mechanical step [s].
+    By name: the actuator, the torque that is asked of it [N*m], the mechanical step [s].
     """
     curves = []
     for name, (actuator, asked, timestep) in steps.items():
         kind: Any = type(actuator)
         if not actuator.tracks or actuator.MOTION or not kind.State._fields or asked == 0.0:
             continue
-        parameters, state, share = (
-            parameters_type(kind)(*actuator.numbers),
-            kind.State(*[0.0] * len(kind.State._fields)),
-            [0.0],
-        )
+        parameters, state = parameters_type(kind)(*actuator.numbers), kind.State(*[0.0] * len(kind.State._fields))
+        share = [0.0]
         for tick in range(100):
             inputs = Inputs(asked, 0.0, 0.0, tick * timestep, 0.0)
             state, torque, _ = kind.advance(parameters, timestep, state, inputs)

@@ -15,11 +15,7 @@ from codrl_mj.pages.loop import loop_section, rates_table
 
 
 def motor_page(name: str, drive: Drive, entry: MotorEntry | None, out: Path) -> Path:
-    """Write the page of a motor with its drive, and its datasheet where it has one, to an .html file, which it returns.
-
-    Raises:
-        ValueError: `out` is no .html file.
-    """
+    """Write the page of a motor with its drive, and its datasheet where it has one, to an .html file; return that."""
     known = explain(drive, entry)
     sections = [
         page.Section("abilities", "What it can do", _abilities(known, drive, entry)),

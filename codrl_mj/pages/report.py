@@ -29,7 +29,7 @@ _MOST_LOOPS = 4
 
 
 @dataclasses.dataclass(frozen=True)
-class _Run:
+class _Reported:
     summary: RunSummary
     name: str
     shown: Shown | None
@@ -103,25 +103,25 @@ def report(
 
 def _run(
     summary: RunSummary, name: str, which: str, seed: int, trust: bool, filmed: bool, on_part: Callable[[str], None]
-) -> _Run:
+) -> _Reported:
     """A run with an episode, as far as there is one."""
     try:
         config = load_config(summary.path, trust)
     except (ValueError, OSError, ImportError) as error:
-        return _Run(summary, name, None, str(error), {})
+        return _Reported(summary, name, None, str(error), {})
     env = config.evaluation_env
     actuators = _actuators(env)
     best = which == "best" or not finished(summary.path)
     policy = summary.path / BEST if best else summary.path
     if not (policy / "policy.json").is_file():
         yet = "best policy" if finished(summary.path) else "policy yet"
-        return _Run(summary, name, None, f"the run has no {yet}: none was evaluated so far", actuators)
+        return _Reported(summary, name, None, f"the run has no {yet}: none was evaluated so far", actuators)
     try:
         on_part(f"{name}: episode")
         shown = show(name, env, load_policy(policy, trust), seed, filmed)
     except Exception as error:  # environments and actuators of others raise what they like
-        return _Run(summary, name, None, f"{type(error).__name__}: {error}", actuators)
-    return _Run(summary, name, shown, None, actuators, best)
+        return _Reported(summary, name, None, f"{type(error).__name__}: {error}", actuators)
+    return _Reported(summary, name, shown, None, actuators, best)
 
 
 def _actuators(env: Any) -> dict[str, ActuatorModel]:
@@ -132,7 +132,7 @@ def _actuators(env: Any) -> dict[str, ActuatorModel]:
     return dict(zip(find_task(env.task).motors, env.actuators, strict=True))
 
 
-def _top(runs: Sequence[_Run], shown: Sequence[Shown]) -> Markup:
+def _top(runs: Sequence[_Reported], shown: Sequence[Shown]) -> Markup:
     """What it is, in sentences and a picture."""
     told: list[Markup] = []
     for run in runs:
@@ -164,9 +164,8 @@ def _sentence(run: RunSummary) -> str:
     actuator = named.get(run.actuator or "", f"the actuator{'s' * (', ' in (run.actuator or ''))} {run.actuator}")
     text = f"{agent} on {run.task or 'an unknown task'} through {actuator}{steps}, seed {run.seed}."
     if run.evaluation is not None and run.evaluation_return is not None:
-        text += (
-            f" Its policy returns {_value(run.evaluation['returns'])} over {run.evaluation.get('episodes')} episodes"
-        )
+        returns, episodes = page.number(run.evaluation["returns"]), run.evaluation.get("episodes")
+        text += f" Its policy returns {returns} over {episodes} episodes"
         if isinstance(success := run.evaluation.get("success"), Mapping):
             text += f" and succeeds in {100 * success['mean']:.3g} % of them"
         text += "."
@@ -184,15 +183,7 @@ def _about(task: str) -> str:
     return text.strip().partition("\n")[0]
 
 
-def _value(value: Any) -> str:
-    """A measure as text: a number, a mean or a median with its interval."""
-    if isinstance(value, Mapping):
-        middle = value.get("mean", value.get("median"))
-        return f"{page.number(middle)} [{page.number(value.get('low'))}, {page.number(value.get('high'))}]"
-    return page.number(value)
-
-
-def _learning(runs: Sequence[_Run]) -> Markup:
+def _learning(runs: Sequence[_Reported]) -> Markup:
     """Curves from the runs' tables; beside others a run has one colour and no dots."""
     notes: list[Markup] = []
     returns: list[Curve] = []
@@ -241,7 +232,7 @@ def _reports(path: Path) -> dict[str, np.ndarray]:
         return {}
 
 
-def _evaluation(runs: Sequence[_Run]) -> Markup:
+def _evaluation(runs: Sequence[_Reported]) -> Markup:
     """Measures with their intervals."""
     known = [run for run in runs if run.summary.evaluation is not None]
     notes = [
@@ -252,15 +243,11 @@ def _evaluation(runs: Sequence[_Run]) -> Markup:
     if not known:
         return page.joined(notes)
     every = [dict(run.summary.evaluation or {}) for run in known]
-    rows = []
-    for name, field in MEASURES.items():
-        values = [one.get(name) for one in every]
-        if any(value is not None for value in values):
-            rows.append((field.metadata["label"], *map(_value, values), page.unit(field.metadata["unit"])))
     count = " and ".join(dict.fromkeys(str(one.get("episodes")) for one in every))
-    caption = f"Last policy, {count} episodes; 95 % intervals in brackets"
     names = [run.name if len(known) > 1 else "value" for run in known]
-    table = page.table(caption, ("measure", *names, "unit"), rows, numbers=range(1, 1 + len(known)))
+    table = _measures(
+        f"Last policy, {count} episodes; 95 % intervals in brackets", dict(zip(names, every, strict=True))
+    )
     curves = []
     for place, (run, one) in enumerate(zip(known, every, strict=True)):
         returns = np.sort(np.array(one.get("episode_returns") or [], dtype=float))
@@ -270,30 +257,27 @@ def _evaluation(runs: Sequence[_Run]) -> Markup:
     title = "Returns of the evaluation's episodes, in order"
     beside = page.plots([Plot(title, "share of episodes below [%]", "return", tuple(curves))] if curves else [])
     layout = '<div class="beside">{}{}</div>' if len(known) == 1 else "{}{}"  # a table of several needs the width
-    parts = [Markup(layout).format(table, beside)]
-    for run, one in zip(known, every, strict=True):
-        parts.append(_motors(run.name, one.get("motors")))
-    return page.joined((*notes, *parts))
+    of_motors = [(f"{run.name}: motor by motor", one.get("motors")) for run, one in zip(known, every, strict=True)]
+    folded = [
+        page.folded(about, _measures(about, motors))
+        for about, motors in of_motors
+        if isinstance(motors, Mapping) and motors
+    ]
+    return page.joined((*notes, Markup(layout).format(table, beside), *folded))
 
 
-def _motors(name: str, motors: Any) -> Markup:
-    """What each of several motors did."""
-    if not isinstance(motors, Mapping) or not motors:
-        return Markup()
-    measures = list(dict.fromkeys(measure for one in motors.values() for measure in one))
+def _measures(caption: str, columns: Mapping[str, Mapping[str, Any]]) -> Markup:
+    """A row for each measure that one of the columns has."""
     rows = []
-    for measure in measures:
-        values = [one.get(measure) for one in motors.values()]
-        if any(value is not None for value in values) and measure in MEASURES:
-            about = MEASURES[measure].metadata
-            rows.append((about["label"], *map(_value, values), page.unit(about["unit"])))
-    columns = ("measure", *motors, "unit")
-    table = page.table(f"{name}: motor by motor", columns, rows, numbers=range(1, 1 + len(motors)))
-    return page.folded(f"{name}: motor by motor", table)
+    for name, field in MEASURES.items():
+        values = [column.get(name) for column in columns.values()]
+        if any(value is not None for value in values):
+            rows.append((field.metadata["label"], *map(page.number, values), page.unit(field.metadata["unit"])))
+    return page.table(caption, ("measure", *columns, "unit"), rows, numbers=range(1, 1 + len(columns)))
 
 
 def _episodes(
-    runs: Sequence[_Run], shown: Sequence[Shown], joined: Callable[[Sequence[Shown]], Sequence[Markup]]
+    runs: Sequence[_Reported], shown: Sequence[Shown], joined: Callable[[Sequence[Shown]], Sequence[Markup]]
 ) -> Markup:
     notes = [page.note(f"No episode of {run.name}: {run.problem}", bad=True) for run in runs if run.shown is None]
     notes += [page.note(f"{run.name}: the policy of its best evaluation acts.") for run in runs if run.best]
@@ -309,18 +293,15 @@ def replays(shown: Sequence[Shown]) -> list[Markup]:
     return [page.replay(one, f"Replay: {of.name}", place == 0) for place, (one, of) in enumerate(named)]
 
 
-def _loop(runs: Sequence[_Run]) -> Markup:
+def _loop(runs: Sequence[_Reported]) -> Markup:
     """Current loops, and steps of actuators without one; each different one once."""
     loops: dict[str, tuple[Looped, float | None]] = {}
     others: dict[str, tuple[ActuatorModel, float, float]] = {}
     without: dict[str, None] = {}
     for run in runs:
         for motor, actuator in run.actuators.items():
-            alone = len(run.actuators) == 1
-            name = (
-                (motor if len(runs) == 1 else run.name) if alone else f"{run.name}, {motor}" if len(runs) > 1 else motor
-            )
-            name = "motor" if name in (".*", "motor") else name
+            name = motor if len(runs) == 1 else run.name if len(run.actuators) == 1 else f"{run.name}, {motor}"
+            name = "motor" if name == ".*" else name
             timestep = run.shown.episode.timestep if run.shown is not None else None
             if actuator.assumed:
                 without[f"{name}: {actuator.assumed}."] = None
@@ -385,7 +366,7 @@ def _certificate(runs: Sequence[Path], given: Path | None) -> Markup:
     return Markup()
 
 
-def _settings(runs: Sequence[_Run]) -> Markup:
+def _settings(runs: Sequence[_Reported]) -> Markup:
     """What differs between the runs, and all that they were made with."""
     parts = []
     if len(runs) > 1:

@@ -90,7 +90,7 @@ def save_learning_curve(path: Path, title: str, episodes: np.ndarray, reports: n
     save(Plot(title, "environment steps", "return", curves), path, (6.0, 3.5))
 
 
-class Table:
+class GrowingTable:
     """A CSV file of numbers that grows row by row, and the rows in memory."""
 
     def __init__(self, path: Path, columns: Sequence[str], rows: np.ndarray | None = None) -> None:
