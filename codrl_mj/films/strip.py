@@ -58,7 +58,7 @@ def draw_strip(
     lines = []
     for bottom, height, plot, label in (
         (TIME_HEIGHT + VOLTAGE_HEIGHT + GAP, TORQUE_HEIGHT, _plot_torque, torque_label(task, actuator, motor)),
-        (TIME_HEIGHT, VOLTAGE_HEIGHT, _plot_signal, _signal_label(actuator)),
+        (TIME_HEIGHT, VOLTAGE_HEIGHT, _plot_signal, _signal(actuator)[1]),
     ):
         total = HEADER_HEIGHT + body
         axis = frame.add_axes((AXIS_WIDTH / width, bottom / total, 1e-6, height / total))
@@ -139,22 +139,18 @@ def torque_label(task: str, actuator: ActuatorModel, motor: int) -> str:
     return "joint force [N]" if slides else "joint torque [N·m]"
 
 
-def _signal(actuator: ActuatorModel) -> str | None:
-    """The signal that the second plot shows: the voltage, or the family's first with a unit; None if there is none."""
+def _signal(actuator: ActuatorModel) -> tuple[str | None, str]:
+    """The second plot's signal and its label: the voltage, or the family's first with a unit; None if there is none."""
     names = [name for name in actuator.SIGNAL_UNITS if name in actuator.Signals._fields]  # type: ignore[attr-defined]
-    return "voltage" if "voltage" in names else next(iter(names), None)
-
-
-def _signal_label(actuator: ActuatorModel) -> str:
-    name = _signal(actuator)
-    if name is None or name == "voltage":
-        return "u [V]" if name or isinstance(actuator, Ideal) else ""
-    return f"{name} [{actuator.SIGNAL_UNITS[name]}]"
+    if not names:
+        return None, "u [V]" if isinstance(actuator, Ideal) else ""
+    name = "voltage" if "voltage" in names else names[0]
+    return name, "u [V]" if name == "voltage" else f"{name} [{actuator.SIGNAL_UNITS[name]}]"
 
 
 def _plot_signal(episode: Episode, actuator: ActuatorModel, axes: Any) -> list[Any]:
     """Plot the voltage, and its limit where it comes near; of a family without one its first signal."""
-    name = _signal(actuator)
+    name, _ = _signal(actuator)
     if name is None:
         axes.set_ylim(-1, 1)
         kind = "an ideal" if isinstance(actuator, Ideal) else f"a {type(actuator).__name__}"

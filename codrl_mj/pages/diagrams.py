@@ -134,20 +134,23 @@ def step_diagram(drive: Drive, steps: Steps) -> list[Plot]:
 
 
 def small_steps(loops: Loops) -> list[Plot]:
-    """Small steps of the current, the shaft held: of one with its voltage, of several as shares of the demands."""
-    title, curves = "A small step of the current, the shaft held", []
+    """Small steps of the current, the shaft held, as shares of what is asked for; of one alone with its voltage."""
+    curves = []
     for place, (name, loop) in enumerate(loops.items()):
         step = small_step(*loop)
-        settled = step.settling_time()
-        if len(loops) == 1:
-            within = f"within 2 % in {1e3 * settled:.3g} ms" if math.isfinite(settled) else "not settled"
-            end = max(3e3 * settled, 1e3 * float(step.time[19])) if settled > 0.0 else math.inf
-            return _responses(loop[0], title, {f"current: {within}": step}, (0.0, end))
+        settled, asked = step.settling_time(), float(step.reference[-1])
         shown = slice(0, max(int(3.0 * np.searchsorted(step.time, settled)), 20))
-        time, asked = 1e3 * step.time[shown], step.reference[-1]
-        curves.append(Curve(f"{name}: current", time, step.current[shown] / asked, colour=place))
+        time, share = 1e3 * step.time[shown], step.current[shown] / asked
+        if len(loops) > 1:
+            curves.append(Curve(f"{name}: current", time, share, colour=place))
+    title, scaled, voltage = "A small step of the current, the shaft held", None, []
+    if len(loops) == 1:
+        within = f"within 2 % in {1e3 * settled:.3g} ms" if math.isfinite(settled) else "not settled"
+        torque = f"{loop[0].motor.torque_constant * asked:.3g} N·m at the rotor"
+        curves = [Curve(f"current, of {asked:.3g} A, {torque}: {within}", time, share, colour=1)]
+        scaled, voltage = ("current [A]", asked), [_voltages(loop[0], {"voltage": step}, (0.0, float(time[-1])))]
     curves.append(Curve("asked for", time, np.ones(len(time)), reference=True))
-    return [Plot(title, "time [ms]", "share of what is asked for", tuple(curves))]
+    return [Plot(title, "time [ms]", "share of what is asked for", tuple(curves), scaled=scaled), *voltage]
 
 
 def recoveries(drive: Drive, steps: Steps) -> list[Plot]:
@@ -161,22 +164,32 @@ def recoveries(drive: Drive, steps: Steps) -> list[Plot]:
     return [*_responses(drive, title, told, _SHOWN), *_responses(drive, "The same, close", told, _CLOSE)]
 
 
-def _responses(loop: Looped, title: str, responses: Mapping[str, Response], span: tuple[float, float]) -> list[Plot]:
+def _responses(drive: Drive, title: str, responses: Mapping[str, Response], span: tuple[float, float]) -> list[Plot]:
     """Current, with the rotor's torque, and voltage of responses to one reference, within a span [ms]."""
-    currents, volts = [], []
+    currents = []
     for label, one in responses.items():
-        shown = (1e3 * one.time >= span[0]) & (1e3 * one.time <= span[1])
-        time, asked = 1e3 * one.time[shown], one.reference[shown]
-        colour = None if len(responses) > 1 else 1
-        currents.append(Curve(label, time, one.current[shown], colour=colour))
-        kind = label.partition(":")[0] if len(responses) > 1 else "voltage"
-        volts.append(Curve(kind, time, one.voltage[shown], style="step", colour=colour))
-    currents.append(Curve("asked for", time, asked, reference=True, style="step"))
-    if (limit := loop.voltage_limit) is not None:
-        ends = time[[0, -1]]
-        volts += [Curve("supply", ends, np.full(2, side * limit), reference=True) for side in (1.0, -1.0)]
-    torque = "torque of the rotor [N·m]", loop.motor.torque_constant
+        shown = _within(one, span)
+        currents.append(Curve(label, 1e3 * one.time[shown], one.current[shown]))
+    asked = Curve("asked for", 1e3 * one.time[shown], one.reference[shown], reference=True, style="step")
+    torque = "torque of the rotor [N·m]", drive.motor.torque_constant
     return [
-        Plot(title, "time [ms]", "current [A]", tuple(currents), scaled=torque),
-        Plot("Its voltage", "time [ms]", "voltage [V]", tuple(volts)),
+        Plot(title, "time [ms]", "current [A]", (*currents, asked), scaled=torque),
+        _voltages(drive, {label.partition(":")[0]: one for label, one in responses.items()}, span),
     ]
+
+
+def _voltages(loop: Looped, responses: Mapping[str, Response], span: tuple[float, float]) -> Plot:
+    """Voltage of responses, within a span [ms] and a supply."""
+    curves = []
+    for label, one in responses.items():
+        shown = _within(one, span)
+        colour = None if len(responses) > 1 else 1
+        curves.append(Curve(label, 1e3 * one.time[shown], one.voltage[shown], style="step", colour=colour))
+    if (limit := loop.voltage_limit) is not None:
+        ends = curves[0].x[[0, -1]]
+        curves += [Curve("supply", ends, np.full(2, side * limit), reference=True) for side in (1.0, -1.0)]
+    return Plot("Its voltage", "time [ms]", "voltage [V]", tuple(curves))
+
+
+def _within(one: Response, span: tuple[float, float]) -> np.ndarray:
+    return (1e3 * one.time >= span[0]) & (1e3 * one.time <= span[1])

@@ -59,7 +59,7 @@ def show(name: str, env: Any, policy: Any, seed: int, filmed: bool = True) -> Sh
 
 
 @dataclasses.dataclass(frozen=True)
-class _Driven:
+class _MotorLine:
     """One motor of one run: what its curves are called, and when they are shown."""
 
     before: str
@@ -169,7 +169,7 @@ def _motors(shown: Sequence[Shown]) -> list[str]:
     return list(dict.fromkeys(name for one in shown for name in one.episode.motors or ("motor",)))
 
 
-def _lines(shown: Sequence[Shown]) -> list[_Driven]:
+def _lines(shown: Sequence[Shown]) -> list[_MotorLine]:
     """Every motor of every run."""
     motors, pairs = _motors(shown), [(one, k) for one in shown for k in range(max(len(one.episode.motors), 1))]
     most = max(POINTS // 4, _BUDGET // (10 * len(pairs)))
@@ -180,14 +180,14 @@ def _lines(shown: Sequence[Shown]) -> list[_Driven]:
         words = [one.name] * (len(shown) > 1) + [names[motor]] * (len(names) > 1)
         tags = f"run:{shown.index(one)}", f"motor:{motors.index(names[motor])}"
         before = f"{', '.join(words)}: " if words else ""
-        made.append(_Driven(before, place if len(pairs) > 1 else None, tags, of_motor(one.episode, motor), stride))
+        made.append(_MotorLine(before, place if len(pairs) > 1 else None, tags, of_motor(one.episode, motor), stride))
     return made
 
 
 _TIME = "time [s]"
 
 
-def _motor_plots(lines: Sequence[_Driven]) -> list[Plot]:
+def _motor_plots(lines: Sequence[_MotorLine]) -> list[Plot]:
     """What the motors did."""
     ideal = [isinstance(line.actuator, Ideal) for line in lines]
     force, unit = all(ideal), "torque [N·m]"
@@ -235,7 +235,7 @@ def _motor_plots(lines: Sequence[_Driven]) -> list[Plot]:
     return found
 
 
-def _shades(lines: Sequence[_Driven], *names: str) -> tuple[Shade, ...]:
+def _shades(lines: Sequence[_MotorLine], *names: str) -> tuple[Shade, ...]:
     """Where the limits by these names were met."""
     found = []
     for line, name in itertools.product(lines, names):
@@ -245,7 +245,7 @@ def _shades(lines: Sequence[_Driven], *names: str) -> tuple[Shade, ...]:
     return tuple(found)
 
 
-def _voltage_limits(lines: Sequence[_Driven], drawn: Sequence[Curve]) -> list[Curve]:
+def _voltage_limits(lines: Sequence[_MotorLine], drawn: Sequence[Curve]) -> list[Curve]:
     """The supply's voltages, where they come near: a limit far off would press the curve flat."""
     highest = max(float(np.nanmax(np.abs(curve.y))) for curve in drawn)
     each = {line.actuator.voltage_limit: line.tags for line in lines if line.has("voltage")}
@@ -266,7 +266,7 @@ _KNOWN = (
 )
 
 
-def _other_signals(lines: Sequence[_Driven]) -> list[Plot]:
+def _other_signals(lines: Sequence[_MotorLine]) -> list[Plot]:
     """Signals that only some families have."""
     names = dict.fromkeys(name for line in lines for name in line.actuator.Signals._fields if name not in _KNOWN)
     found = []
@@ -341,7 +341,7 @@ def _state_names(one: Shown) -> Sequence[str]:
         env.close()
 
 
-def torque_speed(lines: Sequence[_Driven]) -> Plot | None:
+def torque_speed(lines: Sequence[_MotorLine]) -> Plot | None:
     """The points of episodes in the plane of speed and torque, within what the motors can do."""
     curves: list[Curve] = []
     highest = 0.0

@@ -350,12 +350,10 @@ def _loop_of(one: Looped, timestep: float | None) -> Any:
 
 def _certificate(runs: Sequence[Path], given: Path | None) -> Markup:
     """What the certificate says, if there is one."""
-    places = [path / certificates.JSON_NAME for path in runs]
+    known = [place for path in runs if (place := path / certificates.JSON_NAME).is_file()]
     if given is not None:
-        places = [given / certificates.JSON_NAME if given.is_dir() else given]
-    for place in places:
-        if given is None and not place.is_file():
-            continue
+        known = [given / certificates.JSON_NAME if given.is_dir() else given]
+    for place in known[:1]:
         try:
             return certificates.summary(read_json(place, "certificate"))
         except (KeyError, TypeError, ValueError) as error:
