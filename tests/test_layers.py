@@ -52,20 +52,20 @@ ALLOWED = {
     "view": {"actuators", "envs.config", "evaluation", "fields", "replay"},
     "training": {
         *("actuators", "agents", "disturbances", "envs", "envs.config", "evaluation", "runs.files", "runs.layout"),
-        *("runs.policies", "tasks", "tasks.assets", "fields", "foreign"),
+        *("runs.policies", "tasks", "tasks.assets", "fields", "foreign", "pages.plots"),
     },
     "sizing": {
         *("actuators", "catalogue", "engine", "envs.config", "evaluation", "fields", "foreign", "motor_design"),
         *("runs.policies", "specs", "tasks", "training"),
     },
-    "pages.plots": set(),
+    "pages.plots": {"runs.files"},
     "validation": {"actuators", "catalogue", "engine", "pages.plots", "physics", "runs.files", "tasks", "tasks.assets"},
     "study": {
         *("actuators", "disturbances", "envs.config", "evaluation", "evaluation.measures", "fields", "films"),
         *("runs.files", "runs.policies", "sizing", "tasks", "training"),
     },
     "rl_zoo3": set(),
-    "motor_design": {"actuators", "catalogue", "fields", "runs.files"},
+    "motor_design": {"actuators", "catalogue", "fields"},
     "identify": {"actuators", "catalogue", "fields", "runs.files"},
     "pages": {
         *("__init__", "actuators", "catalogue", "evaluation", "films", "foreign", "identify", "motor_design"),
@@ -80,6 +80,7 @@ ALLOWED = {
             "identify",
             "motor_design",
             "pages",
+            "pages.plots",
             "replay",
             "runs.files",
             "runs.layout",

@@ -121,7 +121,8 @@ class Show:
 
     def run(self) -> int:
         """Print the tables, draw the diagram."""
-        from codrl_mj.motor_design import explain, find_entry, torque_speed_diagram
+        from codrl_mj.motor_design import explain, find_entry
+        from codrl_mj.pages.diagrams import torque_speed_diagram
 
         drive, entry = self.changes.drive(self.name), find_entry(self.name)
         found = explain(drive, entry)
@@ -202,7 +203,8 @@ class Design:
     def run(self) -> int:
         """Print the table, draw Bode's diagram."""
         from codrl_mj.cli.terminal import print_table, say
-        from codrl_mj.motor_design import LoopDesign, bode_diagram, design, designs, sampled_too_seldom
+        from codrl_mj.motor_design import LoopDesign, design, designs, sampled_too_seldom
+        from codrl_mj.pages.diagrams import bode_diagram
 
         drive = self.changes.drive(self.name)
         own, every = design(drive), designs(drive)
@@ -249,7 +251,8 @@ class Step:
     def run(self) -> int:
         """Print the table, draw the responses."""
         from codrl_mj.cli.terminal import print_table, say
-        from codrl_mj.motor_design import sampled_too_seldom, step, step_diagram
+        from codrl_mj.motor_design import sampled_too_seldom, step
+        from codrl_mj.pages.diagrams import step_diagram
 
         drive = self.changes.drive(self.name)
         steps = step(drive)
@@ -348,7 +351,7 @@ def _finite(content: Any) -> Any:
 def _save(figure: Any, folder: Path | None, name: str, quiet: bool) -> int:
     """Write a figure into a folder, if there is one, and say so."""
     if folder is not None:
-        from codrl_mj.motor_design.figures import save
+        from codrl_mj.pages.plots import save
 
         save(figure, folder / name)
         if not quiet:

@@ -214,7 +214,8 @@ def _draw(drive: Any, demand: Any, name: str, path: Path) -> None:
     import numpy as np
 
     from codrl_mj.motor_design.drives import find_entry
-    from codrl_mj.motor_design.figures import save, torque_speed_diagram
+    from codrl_mj.pages.diagrams import torque_speed_diagram
+    from codrl_mj.pages.plots import save
 
     radius, entry = drive.motor.arm_radius, find_entry(name)
     torque = radius * (demand.torque + drive.additions.armature * demand.acceleration)

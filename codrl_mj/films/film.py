@@ -1,20 +1,23 @@
-"""Films of episodes: the scene, and under it a strip of desired and actual torque and the voltage.
+"""Films of episodes: as a file, with a strip of torque and voltage under the scene; as a clip, the scene alone.
 
 Episodes of tasks are recorded first and drawn afterwards from their states, so that drawing never disturbs a
 simulation; an environment of somebody else's draws itself while it runs.
 """
 
+import contextlib
 import dataclasses
-from collections.abc import Callable, Sequence
+import io
+import itertools
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from codrl_mj.evaluation.episodes import Episode
-from codrl_mj.films.encode import FORMATS, encoding
-from codrl_mj.films.record import Frames
-from codrl_mj.films.scene import Scene
+from codrl_mj.films.record import Frames, scene
 from codrl_mj.films.strip import (
     AXIS_WIDTH,
     HEADER_HEIGHT,
@@ -24,11 +27,18 @@ from codrl_mj.films.strip import (
     draw_text,
     pixels_per_second,
 )
+from codrl_mj.runs.files import writing, writing_folder
 
+_FORMATS = (".mp4", ".gif", "")
+_FINE = ("-preset", "veryfast", "-crf", "18")
+"""For files: half the time of ffmpeg's default, and a smaller file."""
+_SOUGHT = ("-preset", "veryfast", "-crf", "26", "-g", "15", "-movflags", "+faststart")
+"""For pages: a key frame every half second, for it is sought in; up to date players need no more than this."""
 _TITLE_HEIGHT = 40  # px
 _MIN_WIDTH, _MIN_HEIGHT = 160, 80  # px
 _WINDOW_STEPS = 150  # environment steps that the strip shows at a time
-_MAX_FPS = 30
+_MAX_FPS, _MOST_FRAMES = 30, 600
+"""Frames a second, and in a clip."""
 _FELL, _LASTED = "#B03A2E", "#1E8449"
 
 
@@ -82,25 +92,25 @@ def film(
     check_film(out, width, height)
     if not panels:
         raise ValueError("panels: there must be at least one episode to show")
-    drawn: list[_DrawnPanel] = []
-    try:
-        for panel in panels:
-            drawn.append(_DrawnPanel(panel, width, height, camera, pretty, _end(panels)))  # noqa: PERF401 - may raise
-        stride = max(1, round(drawn[0].rate / _MAX_FPS))
-        last = max(len(panel.episode.reward) for panel in panels)
+    end = max(float(panel.episode.time[-1]) for panel in panels)
+    with contextlib.ExitStack() as stack:
+        scenes = [
+            stack.enter_context(scene(one.task, one.episode, one.frames, (width, height), camera, pretty))
+            for one in panels
+        ]
+        drawn = [_DrawnPanel(one, image, width, height, end) for one, (_, image) in zip(panels, scenes, strict=True)]
+        rate, last = scenes[0][0], max(len(panel.episode.reward) for panel in panels)
+        stride = max(1, round(rate / _MAX_FPS))
         instants = [*range(0, last, stride), last]
         blank = np.hstack([drawing.blank for drawing in drawn])
-        with encoding(out, drawn[0].rate / stride) as add:
-            for count, instant in enumerate(instants, 1):
-                frame = blank.copy()
-                for drawing, part in zip(drawn, np.hsplit(frame, len(drawn)), strict=True):
-                    drawing.draw(instant, part)
-                add(frame)
-                if on_frame is not None:
-                    on_frame(count, len(instants))
-    finally:
-        for drawing in drawn:
-            drawing.close()
+        add = stack.enter_context(_encoding(out, rate / stride))
+        for count, instant in enumerate(instants, 1):
+            frame = blank.copy()
+            for drawing, part in zip(drawn, np.hsplit(frame, len(drawn)), strict=True):
+                drawing.draw(instant, part)
+            add(frame)
+            if on_frame is not None:
+                on_frame(count, len(instants))
     return out
 
 
@@ -111,9 +121,9 @@ def check_film(out: Path, width: int, height: int) -> None:
         FileExistsError: the folder for the frames exists.
         ValueError: unknown format, odd or too small a size.
     """
-    if out.suffix not in FORMATS:
+    if out.suffix not in _FORMATS:
         raise ValueError(
-            f"film {out}: unknown format {out.suffix!r}: the suffix must be one of {', '.join(FORMATS[:-1])}, or none "
+            f"film {out}: unknown format {out.suffix!r}: the suffix must be one of {', '.join(_FORMATS[:-1])}, or none "
             "for a folder of PNG frames"
         )
     if out.suffix == "" and out.exists():
@@ -126,24 +136,84 @@ def check_film(out: Path, width: int, height: int) -> None:
             raise ValueError(f"{name} = {size}: must be >= {least} [px], for the title and the strip")
 
 
-def _end(panels: Sequence[Panel]) -> float:
-    """Time at which the longest episode ends [s]."""
-    return max(float(panel.episode.time[-1]) for panel in panels)
+class Clip(NamedTuple):
+    """A film whose frame k shows the time k/rate of its episode, until the next."""
+
+    video: bytes
+    """H.264 in an MP4 file."""
+    rate: float
+    """Frames a second of the episode."""
+    still: bytes
+    """An image of it, a JPEG file."""
+
+
+def clip(task: str, episode: Episode, taken: Frames | None, width: int, height: int) -> Clip:
+    """The scene of a task's episode in memory, even sizes [px]; `taken` is what `record` returned beside the episode.
+
+    Raises:
+        RenderingUnavailableError: no OpenGL context can be made here; the message has the remedy.
+    """
+    from PIL import Image
+
+    steps, duration = len(episode.time), float(episode.time[0])
+    stride = max(1, round(1.0 / (duration * _MAX_FPS)), -(-steps // _MOST_FRAMES))
+    instants = [*range(0, steps, stride), steps]
+    rate, still = 1.0 / (stride * duration), io.BytesIO()
+    with scene(task, episode, taken, (width, height)) as (_, draw), tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "film.mp4"
+        with _encoding(path, rate, _SOUGHT) as add:
+            for place, instant in enumerate(instants):
+                image = draw(instant)
+                if place == len(instants) // 3:
+                    Image.fromarray(image).save(still, "jpeg", quality=85)
+                add(image)
+        return Clip(path.read_bytes(), rate, still.getvalue())
+
+
+@contextlib.contextmanager
+def _encoding(out: Path, fps: float, h264: Sequence[str] = _FINE) -> Iterator[Callable[[np.ndarray], None]]:
+    """A function that appends a frame, encoded while the next one is drawn, to a film that appears when all is well."""
+    import imageio
+
+    options: dict[str, Any] = {"duration": 1000 / fps, "loop": 0}  # ms
+    if out.suffix == ".mp4":
+        options = {"fps": fps, "codec": "libx264", "quality": None, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+        options["output_params"] = [*h264]
+    with contextlib.ExitStack() as stack:
+        if out.suffix == "":
+            folder, counter = stack.enter_context(writing_folder(out)), itertools.count()
+
+            def write(frame: np.ndarray) -> None:
+                imageio.imwrite(folder / f"frame_{next(counter):05d}.png", frame)
+        else:
+            temporary = stack.enter_context(writing(out))
+            write = stack.enter_context(imageio.get_writer(temporary, **options)).append_data
+        beside = stack.enter_context(ThreadPoolExecutor(1))
+        last: list[Future[None]] = []
+
+        def add(frame: np.ndarray) -> None:
+            if last:
+                last.pop().result()
+            last.append(beside.submit(write, frame))
+
+        yield add
+        for one in last:
+            one.result()
 
 
 class _DrawnPanel:
     """A panel with its title and its strip drawn once; frames slide a window over the strip."""
 
-    def __init__(self, panel: Panel, width: int, height: int, camera: str, pretty: bool, end: float) -> None:
+    def __init__(self, panel: Panel, image: Callable[[int], np.ndarray], width: int, height: int, end: float) -> None:
+        """Draw them; `image` draws the scene after so many steps, and `end` [s] is where the longest episode ends."""
         episode = panel.episode
         self._panel, self._top, self._bottom = panel, _TITLE_HEIGHT, _TITLE_HEIGHT + height
-        self._scene = Scene(panel.task, episode, panel.frames, width, height, camera, pretty)
-        self.rate = self._scene.rate
+        self._image = image
         self._window = min(end, _WINDOW_STEPS * float(episode.time[0]))
         self._scale = pixels_per_second(width, self._window)
         self._axis, self._strip = draw_strip(panel.task, episode, panel.actuator, width, self._window, end, panel.motor)
-        scene = np.zeros((height, width, 3), np.uint8)
-        self.blank = np.vstack([draw_text(panel.title, width, _TITLE_HEIGHT), scene, self._axis])
+        empty = np.zeros((height, width, 3), np.uint8)
+        self.blank = np.vstack([draw_text(panel.title, width, _TITLE_HEIGHT), empty, self._axis])
         self._last = len(episode.reward)
         fell, over = episode.terminated, episode.time[-1]
         ending = f"ended at {over:.2f} s" if fell else f"time limit, {over:.2f} s"
@@ -152,12 +222,12 @@ class _DrawnPanel:
     def draw(self, instant: int, frame: np.ndarray) -> None:
         """Draw the panel after `instant` steps over its `blank` one, shape (height, width, 3), uint8."""
         episode, now = self._panel.episode, min(instant, self._last)
-        scene = frame[self._top : self._bottom]
-        scene[:] = self._scene.image(now)
+        view = frame[self._top : self._bottom]
+        view[:] = self._image(now)
         if now == self._last:
-            scene[-_TITLE_HEIGHT:] = self._over
+            view[-_TITLE_HEIGHT:] = self._over
             if episode.terminated:
-                scene[:-_TITLE_HEIGHT] = scene[:-_TITLE_HEIGHT] // 2 + 90  # faded
+                view[:-_TITLE_HEIGHT] = view[:-_TITLE_HEIGHT] // 2 + 90  # faded
         time = float(episode.time[now - 1]) if now else 0.0
         begin = round(self._scale * max(0.0, time - self._window))
         size = round(self._scale * self._window)
@@ -167,7 +237,3 @@ class _DrawnPanel:
         strip[PLOT_HEIGHT:] = shown[PLOT_HEIGHT:]
         strip[:PLOT_HEIGHT, :cursor] = shown[:PLOT_HEIGHT, :cursor]  # and nothing of what has not happened yet
         strip[:PLOT_HEIGHT, cursor] = 120
-
-    def close(self) -> None:
-        """Free the OpenGL context."""
-        self._scene.close()

@@ -1,23 +1,26 @@
-"""Episodes that can be filmed: what an environment of somebody else's draws is taken while it runs."""
+"""Episodes that can be filmed, and what is seen of them at each instant.
 
+What an environment of somebody else's draws is taken while it runs; our tasks are drawn afterwards.
+"""
+
+import contextlib
 import zlib
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import gymnasium
 import numpy as np
 
+from codrl_mj.envs.single import ActuatedEnv
 from codrl_mj.evaluation.episodes import Episode, run_episodes
+from codrl_mj.physics.offscreen import OffscreenRenderer
 
 
 class Frames:
     """Images of an episode's instants, packed: they would fill a gigabyte."""
 
     def __init__(self, rate: float) -> None:
-        """Begin with none.
-
-        Args:
-            rate: images a second; 0: as many as the episode has steps.
-        """
+        """Begin with none; images a second, 0: as many as the episode has steps."""
         self.rate = rate
         self._packed: list[tuple[tuple[int, ...], bytes]] = []
 
@@ -39,15 +42,7 @@ class Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Keeps an image of every instant of an episode: `frames`."""
 
     def __init__(self, env: "gymnasium.Env[Any, Any]", pretty: bool = False) -> None:
-        """Film an environment.
-
-        Args:
-            env: with `render_mode="rgb_array"`.
-            pretty: shadows and multisampling, where its model has them; on a CPU they cost ten times the rest.
-
-        Raises:
-            ValueError: it draws no images.
-        """
+        """Film an environment; pretty are shadows and multisampling, which on a CPU cost ten times the rest."""
         if env.render_mode != "rgb_array":
             raise ValueError(f"render_mode = {env.render_mode!r}: must be 'rgb_array' for a film")
         super().__init__(env)
@@ -76,22 +71,10 @@ class Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
 def record(
     policy: Any, env: Any, seed: int, width: int, height: int, camera: str = "fixed", pretty: bool = False
 ) -> tuple[Episode, Frames | None]:
-    """Run an episode to be filmed.
+    """Run an episode, in an `EnvConfig`, to be filmed in images of a size [px].
 
-    Args:
-        policy: chooses the actions.
-        env: an `EnvConfig`.
-        seed: of the episode.
-        width: of the images [px].
-        height: of the images [px].
-        camera: of the model; `fixed` is, in environments of others, their own.
-        pretty: see `Filmed`.
-
-    Returns:
-        The episode; and in environments of others its images: our tasks are drawn from the episode's states.
-
-    Raises:
-        ValueError: the environment draws no images, or not by this camera.
+    In environments of others the camera `fixed` is their own, and their images are found beside the episode; our tasks
+    are drawn from its states.
     """
     view, made = env.world.view(env, width, height, None if camera == "fixed" else camera), []
     if view is None:
@@ -103,3 +86,39 @@ def record(
 
     (episode,) = run_episodes(policy, make, 1, seed)
     return episode, made[0].frames
+
+
+@contextlib.contextmanager
+def scene(
+    task: str,
+    episode: Episode,
+    taken: Frames | None,
+    size: tuple[int, int],
+    camera: str = "fixed",
+    pretty: bool = False,
+) -> Iterator[tuple[float, Callable[[int], np.ndarray]]]:
+    """Frames a second of an episode, and what draws its scene after so many steps: (height, width, 3), uint8, new.
+
+    `taken` is what `record` returned beside the episode; of a task it is None, and an OpenGL context is held meanwhile.
+
+    Raises:
+        ValueError: unknown camera, or a size [px] out of bounds.
+        RenderingUnavailableError: no OpenGL context can be made here; the message has the remedy.
+    """
+    if taken is not None:
+        from PIL import Image
+
+        def sized(instant: int) -> np.ndarray:
+            image = Image.fromarray(taken[instant])
+            return np.array(image if image.size == size else image.resize(size))
+
+        yield taken.rate or 1.0 / float(episode.time[0]), sized
+        return
+    env: Any = ActuatedEnv(task, "ideal")
+    with contextlib.closing(OffscreenRenderer(env.model, *size, camera, pretty)) as renderer:
+
+        def drawn(instant: int) -> np.ndarray:
+            env.physics.show(episode.state[instant])
+            return renderer.render(env.data)
+
+        yield env.metadata["render_fps"], drawn

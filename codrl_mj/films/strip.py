@@ -18,12 +18,18 @@ _LIMITS = {"voltage_saturated": SATURATED, "current_saturated": "#E69F00", "temp
 """Signals of families with several limits, and their colours."""
 
 
-def draw_text(text: str, width: int, height: int, colour: str = "#22313F") -> np.ndarray:
-    """One line of bold text, centred.
+def of_motor(episode: Episode, motor: int) -> Episode:
+    """An episode as that of one of its motors alone: its actuator, its columns of signals and trace."""
+    signals, trace = (
+        {name: values if values.ndim == 1 else values[:, motor] for name, values in table.items()}
+        for table in (episode.signals, episode.trace)
+    )
+    actuator = episode.actuator[motor] if isinstance(episode.actuator, tuple) else episode.actuator
+    return dataclasses.replace(episode, signals=signals, trace=trace, actuator=actuator)
 
-    Returns:
-        Image, shape (height, width, 3), uint8.
-    """
+
+def draw_text(text: str, width: int, height: int, colour: str = "#22313F") -> np.ndarray:
+    """One line of bold text, centred: an image, shape (height, width, 3), uint8."""
     figure = _figure(width, height)
     figure.text(0.5, 0.5, text, ha="center", va="center", fontsize=12, color=colour, weight="bold")
     return _pixels(figure)
@@ -48,12 +54,11 @@ def draw_strip(
     length = round(pixels_per_second(width, window) * end)
     content = _figure(length + MARGIN, body)
     if isinstance(actuator, tuple):
-        episode = dataclasses.replace(episode, signals={name: v[:, motor] for name, v in episode.signals.items()})
-        actuator = actuator[motor]
+        episode, actuator = of_motor(episode, motor), actuator[motor]
     lines = []
     for bottom, height, plot, label in (
         (TIME_HEIGHT + VOLTAGE_HEIGHT + GAP, TORQUE_HEIGHT, _plot_torque, torque_label(task, actuator, motor)),
-        (TIME_HEIGHT, VOLTAGE_HEIGHT, _plot_signal, _signal_label(actuator)),
+        (TIME_HEIGHT, VOLTAGE_HEIGHT, _plot_signal, _signal(actuator)[1]),
     ):
         total = HEADER_HEIGHT + body
         axis = frame.add_axes((AXIS_WIDTH / width, bottom / total, 1e-6, height / total))
@@ -134,22 +139,18 @@ def torque_label(task: str, actuator: ActuatorModel, motor: int) -> str:
     return "joint force [N]" if slides else "joint torque [N·m]"
 
 
-def _signal(actuator: ActuatorModel) -> str | None:
-    """The signal that the second plot shows: the voltage, or the family's first with a unit; None if there is none."""
+def _signal(actuator: ActuatorModel) -> tuple[str | None, str]:
+    """The second plot's signal and its label: the voltage, or the family's first with a unit; None if there is none."""
     names = [name for name in actuator.SIGNAL_UNITS if name in actuator.Signals._fields]  # type: ignore[attr-defined]
-    return "voltage" if "voltage" in names else next(iter(names), None)
-
-
-def _signal_label(actuator: ActuatorModel) -> str:
-    name = _signal(actuator)
-    if name is None or name == "voltage":
-        return "u [V]" if name or isinstance(actuator, Ideal) else ""
-    return f"{name} [{actuator.SIGNAL_UNITS[name]}]"
+    if not names:
+        return None, "u [V]" if isinstance(actuator, Ideal) else ""
+    name = "voltage" if "voltage" in names else names[0]
+    return name, "u [V]" if name == "voltage" else f"{name} [{actuator.SIGNAL_UNITS[name]}]"
 
 
 def _plot_signal(episode: Episode, actuator: ActuatorModel, axes: Any) -> list[Any]:
     """Plot the voltage, and its limit where it comes near; of a family without one its first signal."""
-    name = _signal(actuator)
+    name, _ = _signal(actuator)
     if name is None:
         axes.set_ylim(-1, 1)
         kind = "an ideal" if isinstance(actuator, Ideal) else f"a {type(actuator).__name__}"

@@ -1,7 +1,6 @@
-"""Motors on paper: what a drive can do, its current loop's gains and margins, step responses, and pictures of all."""
+"""Motors on paper: what a drive can do, its current loop's gains and margins, and its step responses."""
 
 from codrl_mj.motor_design.drives import Abilities, abilities, find_drive, find_entry, torque_limits
-from codrl_mj.motor_design.figures import bode_diagram, step_diagram, torque_speed_diagram
 from codrl_mj.motor_design.loop import (
     LoopDesign,
     Looped,
@@ -43,7 +42,4 @@ __all__ = [
     "Steps",
     "Recovery",
     "step",
-    "torque_speed_diagram",
-    "bode_diagram",
-    "step_diagram",
 ]

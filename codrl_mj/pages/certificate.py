@@ -16,16 +16,10 @@ from codrl_mj.validation.outcome import Check
 
 JSON_NAME, HTML_NAME = "certificate.json", "certificate.html"
 _CHECKS = ("check", "oracle", "samples", "worst", "allowed", "margin", "unit", "where", "verdict")
-_PASSED, _FAILED = Markup('<strong class="good">✓ passed</strong>'), Markup('<strong class="bad">✗ FAILED</strong>')
 
 
 def html(certificate: Certificate, caught: Sequence[Caught] = ()) -> str:
-    """The page.
-
-    Args:
-        certificate: what was found.
-        caught: what mutations did, if they were tried.
-    """
+    """The page of what was found, and of what mutations did, if they were tried."""
     top = [page.verdict(certificate.passed, certificate.verdict)]
     if certificate.quick:
         top.append(page.note("The quick form: fewer states, runs and step sizes than in the full one."))
@@ -54,16 +48,17 @@ def _group(name: str, title: str, certificate: Certificate) -> page.Section:
         body.append(page.table(caption, _CHECKS, map(_row, own), numbers=range(2, 6), cards=True))
         body.append(page.plots(plot for check in own for plot in check.plots))
     good = sum(check.passed for check in checks)
-    mark = Markup('<span class="{}">({} {} of {})</span>').format(
-        *(("good", "✓") if good == len(checks) else ("bad", "✗")), good, len(checks)
-    )
+    sign = ("good", "✓") if good == len(checks) else ("bad", "✗")
+    mark = Markup('<span class="{}">({} {} of {})</span>').format(*sign, good, len(checks))
     return page.Section(name, name.capitalize(), page.joined(body), mark)
 
 
 def _row(check: Check) -> page.Row:
     worst, allowed = (f"{value:.2g}" for value in (check.worst, check.tolerance))
     cells = check.name, check.oracle, f"{check.samples:,}", worst, allowed, check.margin, check.unit, check.where
-    return page.Row((*cells, _PASSED if check.passed else _FAILED), "" if check.passed else "failed")
+    return page.Row(
+        (*cells, page.mark(check.passed, "passed" if check.passed else "FAILED")), "" if check.passed else "failed"
+    )
 
 
 def _mutations(certificate: Certificate, caught: Sequence[Caught]) -> page.Section:
@@ -72,13 +67,12 @@ def _mutations(certificate: Certificate, caught: Sequence[Caught]) -> page.Secti
     rows = []
     for one in caught:
         clearest, cells = one.clearest, [one.mutation, one.task or "the motor", f"{len(one.failed)} of {one.made}"]
-        if clearest is None:
-            missed = Markup('<strong class="bad">✗ MISSED</strong>')
-            rows.append(page.Row((*cells, "none", "", "", "", missed), "failed"))
-        else:
-            values = (f"{value:.2g}" for value in (clearest.worst, clearest.tolerance, margin(clearest)))
-            found = Markup('<strong class="good">✓ caught</strong>')
-            rows.append(page.Row((*cells, f"{clearest.group}: {clearest.name}", *values, found)))
+        found = ["none", "", "", ""]
+        if clearest is not None:
+            values = (clearest.worst, clearest.tolerance, margin(clearest))
+            found = [f"{clearest.group}: {clearest.name}", *(f"{value:.2g}" for value in values)]
+        said = page.mark(clearest is not None, "MISSED" if clearest is None else "caught")
+        rows.append(page.Row((*cells, *found, said), "failed" if clearest is None else ""))
     columns = "fault", "in", "failed", "clearest check", "worst", "allowed", "beyond", "verdict"
     blind = unfailed(certificate.checks, caught)
     told = "; ".join(f"{check.group}, {check.task}: {check.name}" for check in blind)
@@ -135,14 +129,7 @@ def caught_mapping(caught: Sequence[Caught]) -> list[dict[str, Any]]:
 
 
 def write(certificate: Certificate, folder: Path, caught: Sequence[Caught] = ()) -> tuple[Path, Path]:
-    """Write `certificate.json` and `certificate.html` into a folder, whole or not at all; older ones are replaced.
-
-    Returns:
-        The two files.
-
-    Raises:
-        OSError: the folder cannot be written to.
-    """
+    """Write `certificate.json` and `certificate.html` into a folder, whole or not at all; older ones are replaced."""
     content = certificate.as_mapping()
     if caught:
         content |= {

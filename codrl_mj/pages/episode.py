@@ -11,9 +11,11 @@ from markupsafe import Markup
 
 from codrl_mj.actuators import Drive, Ideal
 from codrl_mj.evaluation import Episode, run_episodes
-from codrl_mj.films.clip import Clip, clip
+from codrl_mj.films.film import Clip, clip
 from codrl_mj.films.record import record
+from codrl_mj.films.strip import of_motor
 from codrl_mj.pages import page
+from codrl_mj.pages.diagrams import TORQUE_SPEED, envelope
 from codrl_mj.pages.loop import limits, no_load_speed
 from codrl_mj.pages.plots import POINTS, Curve, Plot, Shade, spans
 
@@ -44,28 +46,19 @@ class Shown(NamedTuple):
 
 
 def show(name: str, env: Any, policy: Any, seed: int, filmed: bool = True) -> Shown:
-    """Run an episode and film it; where nothing can be drawn, without a film.
-
-    Args:
-        name: of the run.
-        env: an `EnvConfig`.
-        policy: chooses the actions.
-        seed: of the episode.
-        filmed: whether to film it.
-    """
-    if not filmed:
-        return Shown(name, env, run_episodes(policy, env.make, 1, seed)[0], None, "none was asked for", seed)
-    episode = None
-    try:
-        episode, taken = record(policy, env, seed, *_SIZE)
-        return Shown(name, env, episode, clip(env.task, episode, taken, *_SIZE), None, seed)
-    except Exception as error:  # each renderer raises its own kind, and so do libraries that are not installed
-        problem = f"{type(error).__name__}: {error}"
-    return Shown(name, env, episode or run_episodes(policy, env.make, 1, seed)[0], None, problem, seed)
+    """Run an episode in a run's environment, an `EnvConfig`, and film it where that works."""
+    episode, film, problem = None, None, None if filmed else "none was asked for"
+    if filmed:
+        try:
+            episode, taken = record(policy, env, seed, *_SIZE)
+            film = clip(env.task, episode, taken, *_SIZE)
+        except Exception as error:  # each renderer raises its own kind, and so do libraries that are not installed
+            problem = f"{type(error).__name__}: {error}"
+    return Shown(name, env, episode or run_episodes(policy, env.make, 1, seed)[0], film, problem, seed)
 
 
 @dataclasses.dataclass(frozen=True)
-class _Line:
+class _MotorLine:
     """One motor of one run: what its curves are called, and when they are shown."""
 
     before: str
@@ -73,27 +66,20 @@ class _Line:
     place: int | None
     """Among all of them; None where it is the only one. Its colour beside others."""
     tags: tuple[str, ...]
-    actuator: Any
     episode: Episode
-    motor: int
+    """Of this motor alone."""
     stride: int
     """Every so many integration steps are drawn."""
 
     @property
-    def timestep(self) -> float:
-        return self.episode.timestep
-
-    def trace(self, name: str) -> np.ndarray:
-        """A column of the trace."""
-        values = self.episode.trace[name]
-        return np.asarray(values if values.ndim == 1 else values[:, self.motor], dtype=float)
+    def actuator(self) -> Any:
+        return self.episode.actuator
 
     @property
     def desired(self) -> np.ndarray:
         """Torque asked for at the shaft in each integration step [N*m]."""
-        asked = self.episode.signals["desired_force"]
-        asked = asked if asked.ndim == 1 else asked[:, self.motor]
-        return np.repeat(np.asarray(asked, dtype=float), self.episode.inner_steps) * self.actuator.arm_radius
+        asked = np.asarray(self.episode.signals["desired_force"], dtype=float)
+        return np.repeat(asked, self.episode.inner_steps) * self.actuator.arm_radius
 
     @property
     def actual(self) -> np.ndarray:
@@ -105,6 +91,10 @@ class _Line:
         """Of the shaft at the end of each [rad/s]."""
         return self.trace("speed") / self.actuator.arm_radius
 
+    def trace(self, name: str) -> np.ndarray:
+        """A column of the trace."""
+        return np.asarray(self.episode.trace[name], dtype=float)
+
     def has(self, *names: str) -> bool:
         """Whether its family has these signals."""
         return not isinstance(self.actuator, Ideal) and set(names) <= set(self.actuator.Signals._fields)
@@ -113,14 +103,13 @@ class _Line:
         """A curve over the integration steps; what is held begins with them, what is not is at their ends."""
         kept = slice(None, None, self.stride)
         values = np.asarray(values, dtype=float)
-        time = self.timestep * (np.arange(len(values)) + (not held))
+        time = self.episode.timestep * (np.arange(len(values)) + (not held))
         if held:
-            time, values = np.append(time[kept], time[-1] + self.timestep), np.append(values[kept], values[-1])
+            time, values = np.append(time[kept], time[-1] + self.episode.timestep), np.append(values[kept], values[-1])
         else:
             time, values = time[kept], values[kept]
-        style: Any = "step" if held else "line"
-        more: Any = {"style": style, "colour": colour, "shared": self.place, "dashed": dashed, "tags": self.tags}
-        return Curve(self.before + label, time, values, **more)
+        style: Any = {"style": "step" if held else "line", "colour": colour, "dashed": dashed}
+        return Curve(self.before + label, time, values, shared=self.place, tags=self.tags, **style)
 
 
 def episode_section(shown: Sequence[Shown], joined: Iterable[Markup] = ()) -> Markup:
@@ -179,7 +168,7 @@ def _motors(shown: Sequence[Shown]) -> list[str]:
     return list(dict.fromkeys(name for one in shown for name in one.episode.motors or ("motor",)))
 
 
-def _lines(shown: Sequence[Shown]) -> list[_Line]:
+def _lines(shown: Sequence[Shown]) -> list[_MotorLine]:
     """Every motor of every run."""
     motors, pairs = _motors(shown), [(one, k) for one in shown for k in range(max(len(one.episode.motors), 1))]
     most = max(POINTS // 4, _BUDGET // (10 * len(pairs)))
@@ -189,14 +178,15 @@ def _lines(shown: Sequence[Shown]) -> list[_Line]:
         names = one.episode.motors or ("motor",)
         words = [one.name] * (len(shown) > 1) + [names[motor]] * (len(names) > 1)
         tags = f"run:{shown.index(one)}", f"motor:{motors.index(names[motor])}"
-        several = isinstance(one.episode.actuator, tuple)
-        actuator = one.episode.actuator[motor] if several else one.episode.actuator
         before = f"{', '.join(words)}: " if words else ""
-        made.append(_Line(before, place if len(pairs) > 1 else None, tags, actuator, one.episode, motor, stride))
+        made.append(_MotorLine(before, place if len(pairs) > 1 else None, tags, of_motor(one.episode, motor), stride))
     return made
 
 
-def _motor_plots(lines: Sequence[_Line]) -> list[Plot]:
+_TIME = "time [s]"
+
+
+def _motor_plots(lines: Sequence[_MotorLine]) -> list[Plot]:
     """What the motors did."""
     ideal = [isinstance(line.actuator, Ideal) for line in lines]
     force, unit = all(ideal), "torque [N·m]"
@@ -244,20 +234,17 @@ def _motor_plots(lines: Sequence[_Line]) -> list[Plot]:
     return found
 
 
-_TIME = "time [s]"
-
-
-def _shades(lines: Sequence[_Line], *names: str) -> tuple[Shade, ...]:
+def _shades(lines: Sequence[_MotorLine], *names: str) -> tuple[Shade, ...]:
     """Where the limits by these names were met."""
     found = []
     for line, name in itertools.product(lines, names):
         if line.has(name):
-            times = line.timestep * np.arange(len(line.trace(name)) + 1)
+            times = line.episode.timestep * np.arange(len(line.trace(name)) + 1)
             found.append(Shade(line.before + name.replace("_", " "), spans(times, line.trace(name)), line.tags))
     return tuple(found)
 
 
-def _voltage_limits(lines: Sequence[_Line], drawn: Sequence[Curve]) -> list[Curve]:
+def _voltage_limits(lines: Sequence[_MotorLine], drawn: Sequence[Curve]) -> list[Curve]:
     """The supply's voltages, where they come near: a limit far off would press the curve flat."""
     highest = max(float(np.nanmax(np.abs(curve.y))) for curve in drawn)
     each = {line.actuator.voltage_limit: line.tags for line in lines if line.has("voltage")}
@@ -278,7 +265,7 @@ _KNOWN = (
 )
 
 
-def _other_signals(lines: Sequence[_Line]) -> list[Plot]:
+def _other_signals(lines: Sequence[_MotorLine]) -> list[Plot]:
     """Signals that only some families have."""
     names = dict.fromkeys(name for line in lines for name in line.actuator.Signals._fields if name not in _KNOWN)
     found = []
@@ -324,7 +311,7 @@ def _run_plots(shown: Sequence[Shown]) -> list[Plot]:
     return found
 
 
-def torque_speed(lines: Sequence[_Line]) -> Plot | None:
+def torque_speed(lines: Sequence[_MotorLine]) -> Plot | None:
     """The points of episodes in the plane of speed and torque, within what the motors can do."""
     curves: list[Curve] = []
     highest = 0.0
@@ -334,21 +321,19 @@ def torque_speed(lines: Sequence[_Line]) -> Plot | None:
     for line in own:
         ratio = line.actuator.motor.gear_ratio if isinstance(line.actuator, Drive) else 1.0
         speed, torque = line.speed / ratio, line.actual * ratio
-        width = max(1.15 * _finite(no_load_speed(line.actuator)), 1.1 * float(np.abs(speed).max()), 1e-6)
+        free = no_load_speed(line.actuator)
+        width = max(1.15 * free if np.isfinite(free) else 0.0, 1.1 * float(np.abs(speed).max()), 1e-6)
         most = max(float(np.abs(torque).max()), float(np.abs(line.desired).max()) * ratio, 1e-9)
         grid = np.linspace(-width, width, 401)
         ends = limits(line.actuator, grid)
         highest = max(highest, min(3.0 * most, 1.1 * float(np.abs(ends[1]).max()) if ends else most))
-        for bound, label in zip(ends or (), ("lowest", "highest"), strict=False):
-            more: Any = {"colour": 0, "shared": line.place, "filled": label == "highest", "tags": line.tags}
-            curves.append(Curve(f"{line.before}{label} possible", grid, bound, dashed=True, **more))
-        stride = max(line.stride, len(speed) // 3000, 1)
-        times = line.timestep * np.arange(len(speed))[::stride]
-        trail: Any = {"style": "trail", "colour": 1, "shared": line.place, "tags": line.tags, "times": times}
-        curves.append(Curve(f"{line.before}episode", speed[::stride], torque[::stride], **trail))
+        belongs: Any = {"shared": line.place, "tags": line.tags}
+        if ends is not None:
+            labels = f"{line.before}lowest possible", f"{line.before}highest possible"
+            curves += envelope(labels, grid, ends, colour=0, dashed=True, **belongs)
+        kept = slice(None, None, max(line.stride, len(speed) // 3000, 1))
+        times = line.episode.timestep * np.arange(len(speed))[kept]
+        label = f"{line.before}episode"
+        curves.append(Curve(label, speed[kept], torque[kept], style="trail", colour=1, times=times, **belongs))
     title = "Torque and speed, within what the motor can do"
-    return Plot(title, "speed of the output [rad/s]", "torque of the output [N·m]", tuple(curves), y_most=highest)
-
-
-def _finite(value: float) -> float:
-    return value if np.isfinite(value) else 0.0
+    return Plot(title, *TORQUE_SPEED, tuple(curves), y_most=highest)

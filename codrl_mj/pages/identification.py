@@ -40,14 +40,8 @@ def identification_page(found: Identified, out: Path) -> Path:
     winding = [one for one in found.traces if one.part == "winding"]
     shaft = [one for one in found.traces if one.part == "shaft"]
     foretold = [one.trace for one in found.held_out if one.trace is not None]
-    fits = (
-        *(
-            [page.heading("Winding: the current under the logged voltage"), *map(_looked_at, winding)]
-            if winding
-            else ()
-        ),
-        *([page.heading("Shaft, piece by piece"), *map(_looked_at, shaft)] if shaft else ()),
-    )
+    fits = [page.heading("Winding: the current under the logged voltage"), *map(_looked_at, winding)] if winding else []
+    fits += [page.heading("Shaft, piece by piece"), *map(_looked_at, shaft)] if shaft else []
     sections = [
         page.Section("parameters", "Parameters", _parameters(found)),
         page.Section("better", "What to do better on the bench", _advice(found)),
@@ -86,12 +80,18 @@ def _parameters(found: Identified) -> Markup:
         half = 50.0 * (one.high - one.low) / abs(one.value) if one.value else math.nan
         worst = max(one.causes, key=lambda cause: one.causes[cause]) if one.causes else ""
         good = one.status in USABLE
-        status = Markup('<strong class="{}">{} {}</strong>').format(
-            *(("good", "✓") if good else ("bad", "✗")), one.status
-        )
         share = f"{half:.2g} %" if interval and math.isfinite(half) else ""
         unit, name = page.unit(one.unit), one.name.replace("_", " ")
-        cells = name, page.number(one.value), interval, share, unit, status, one.why, CAUSES.get(worst, "")
+        cells = (
+            name,
+            page.number(one.value),
+            interval,
+            share,
+            unit,
+            page.mark(good, one.status),
+            one.why,
+            CAUSES.get(worst, ""),
+        )
         rows.append(page.Row(cells, "" if good else "failed"))
     columns = ("parameter", "value", "95 % interval", "half of it", "unit", "status", "why", "mostly because")
     return page.table("Parameters with 95 % intervals", columns, rows, numbers=(1, 2, 3), cards=True)
@@ -150,20 +150,11 @@ def _looked_at(one: Trace) -> Markup:
     time = np.where(np.isnan(time), np.interp(np.arange(len(time)), np.flatnonzero(~np.isnan(time)), one.time), time)
     residuals = one.measured - one.simulated
     curves = Curve("measured", one.time, one.measured, colour=0), Curve("simulated", time, simulated, colour=1)
-    off = np.insert(residuals, gaps, np.nan)
+    off = Curve("residual", time, np.insert(residuals, gaps, np.nan), colour=4)
     what = f"{one.log}: {one.output}"
-    return page.plots(
-        (
-            Plot(what, "time [s]", f"{one.output} [{unit}]", curves),
-            Plot(
-                f"{what}, residuals",
-                "time [s]",
-                f"measured less simulated [{unit}]",
-                (Curve("residual", time, off, colour=4),),
-            ),
-            _autocorrelation(what, one.time, residuals),
-        )
-    )
+    fit = Plot(what, "time [s]", f"{one.output} [{unit}]", curves)
+    left = Plot(f"{what}, residuals", "time [s]", f"measured less simulated [{unit}]", (off,))
+    return page.plots((fit, left, _autocorrelation(what, one.time, residuals)))
 
 
 def _autocorrelation(what: str, time: np.ndarray, residuals: np.ndarray) -> Plot:

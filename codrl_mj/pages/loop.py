@@ -8,9 +8,9 @@ import numpy as np
 from markupsafe import Markup
 
 from codrl_mj.actuators import Actuator, ActuatorModel, Drive, Inputs, TorqueSpeed, parameters_type
-from codrl_mj.motor_design import LoopDesign, Looped, closed_loop, design, designs, open_loop, small_step, torque_limits
-from codrl_mj.motor_design import step as all_steps
+from codrl_mj.motor_design import LoopDesign, design, designs, torque_limits
 from codrl_mj.pages import page
+from codrl_mj.pages.diagrams import Loops, bode, small_steps
 from codrl_mj.pages.plots import Curve, Plot
 
 _RIGHTS = (
@@ -25,10 +25,6 @@ _RIGHTS = (
     ("overshoot", "overshoot", "%"),
 )
 _SCALES = {"settling_time": 1e3, "overshoot": 100.0}
-
-
-Loops = Mapping[str, tuple[Looped, float | None]]
-"""By their names, with the mechanical step [s] of those that are no drives."""
 
 
 def loop_section(loops: Loops) -> Markup:
@@ -51,77 +47,12 @@ def loop_section(loops: Loops) -> Markup:
     if any(math.isnan(_right(one, field)) for one in found.values() for field, _, _ in _RIGHTS):
         notes.append(page.paragraph("–: not below half the sample rate, or not within sight.", "soft"))
     known = {name: loops[name] for name in found}
-    return page.joined((table, *notes, page.plots((*_bode(known, found), *_small_steps(known)))))
+    return page.joined((table, *notes, page.plots((*bode(known, found), *small_steps(known)))))
 
 
 def _right(one: LoopDesign, field: str) -> float:
     value = getattr(one, field)
     return 20.0 * math.log10(value) if field == "gain_margin" else value * _SCALES.get(field, 1.0)
-
-
-def _bode(loops: Loops, designed: Mapping[str, LoopDesign]) -> list[Plot]:
-    gains, phases = [], []
-    for place, (name, loop) in enumerate(loops.items()):
-        one = designed[name]
-        rate = one.sample_rate
-        frequencies = np.geomspace(np.nanmin([1e-3 * rate, 0.02 * one.crossover]), 0.49999 * rate, 500)
-        before = f"{name}: " if len(loops) > 1 else ""
-        for label, function, dashed in (("open loop", open_loop, True), ("closed loop", closed_loop, False)):
-            values = function(*loop)(np.exp(2j * math.pi * frequencies / rate))
-            more: dict[str, Any] = {"colour": place if len(loops) > 1 else int(not dashed), "dashed": dashed}
-            decibels, degrees = 20.0 * np.log10(np.abs(values)), np.degrees(np.unwrap(np.angle(values)))
-            gains.append(Curve(before + label, frequencies, decibels, **more))
-            phases.append(Curve(before + label, frequencies, degrees, **more))
-        if len(loops) == 1:
-            margin = 20.0 * math.log10(one.gain_margin)
-            gains.append(_upright(f"gain margin {margin:.1f} dB", one.phase_crossover, -margin, 0.0))
-            if math.isfinite(one.phase_margin):
-                label = f"phase margin {one.phase_margin:.1f}°"
-                phases.append(_upright(label, one.crossover, -180.0, one.phase_margin - 180.0))
-    return [
-        Plot("Bode: gain", "frequency [Hz]", "gain [dB]", tuple(gains), x_log=True),
-        Plot("Bode: phase", "frequency [Hz]", "phase [°]", tuple(phases), x_log=True),
-    ]
-
-
-def _upright(label: str, x: float, low: float, high: float) -> Curve:
-    return Curve(label, np.array([x, x * (1.0 + 1e-6)]), np.array([low, high]), colour=3)
-
-
-def _small_steps(loops: Loops) -> list[Plot]:
-    curves = []
-    for place, (name, loop) in enumerate(loops.items()):
-        step, before = small_step(*loop), f"{name}: " if len(loops) > 1 else ""
-        shown = slice(0, max(int(3.0 * np.searchsorted(step.time, step.settling_time())), 20))
-        time, asked = 1e3 * step.time[shown], step.reference[-1]
-        curves.append(
-            Curve(f"{before}current", time, step.current[shown] / asked, colour=place if len(loops) > 1 else 1)
-        )
-    curves.append(Curve("asked for", time, np.ones(len(time)), reference=True))
-    return [
-        Plot("A small step of the current, the shaft held", "time [ms]", "share of what is asked for", tuple(curves))
-    ]
-
-
-def step_plots(drive: Drive) -> list[Plot]:
-    """Current and voltage out of a demand that the voltage cannot meet, by kind of anti-windup."""
-    steps = all_steps(drive)
-    currents, volts = [], []
-    for kind, one in steps.recoveries.items():
-        shown = one.response.time <= 0.06
-        time = 1e3 * one.response.time[shown]
-        took = f"{1e3 * one.time:.2g} ms" if math.isfinite(one.time) else "over 100 ms"
-        currents.append(Curve(f"{kind.replace('_', ' ')}: back in {took}", time, one.response.current[shown]))
-        volts.append(Curve(kind.replace("_", " "), time, one.response.voltage[shown], style="step"))
-        asked = Curve("asked for", time, one.response.reference[shown], reference=True)
-    limit = drive.voltage_limit
-    ends = [Curve("supply", time[[0, -1]], np.full(2, side * limit), reference=True) for side in (1.0, -1.0)]
-    at = f"at {steps.speed:.4g} rad/s of the rotor"
-    return [
-        Plot(f"{steps.unreachable:.3g} A, out of reach, then {steps.reachable:.3g} A, {at}", "time [ms]", "current [A]",
-             (*currents, asked)),
-        Plot("Its voltage", "time [ms]", "voltage [V]", (*volts, *ends)),
-    ]  # fmt: skip
 
 
 def rates_table(drive: Drive) -> Markup:
@@ -141,19 +72,15 @@ def rates_table(drive: Drive) -> Markup:
 def held_step(steps: Mapping[str, tuple[ActuatorModel, float, float]]) -> Plot | None:
     """The torque after a step of what is asked for, the shaft held; None where nothing is of interest.
 
-    Args:
-        steps: name -> actuator, torque that is asked of it [N*m], mechanical step [s].
+    By name: the actuator, the torque that is asked of it [N*m], the mechanical step [s].
     """
     curves = []
     for name, (actuator, asked, timestep) in steps.items():
         kind: Any = type(actuator)
         if not actuator.tracks or actuator.MOTION or not kind.State._fields or asked == 0.0:
             continue
-        parameters, state, share = (
-            parameters_type(kind)(*actuator.numbers),
-            kind.State(*[0.0] * len(kind.State._fields)),
-            [0.0],
-        )
+        parameters, state = parameters_type(kind)(*actuator.numbers), kind.State(*[0.0] * len(kind.State._fields))
+        share = [0.0]
         for tick in range(100):
             inputs = Inputs(asked, 0.0, 0.0, tick * timestep, 0.0)
             state, torque, _ = kind.advance(parameters, timestep, state, inputs)

@@ -4,24 +4,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from markupsafe import Markup
 
 from codrl_mj.actuators import Drive
 from codrl_mj.catalogue import MotorEntry
-from codrl_mj.motor_design import abilities, explain, torque_limits, unknown_in_words
-from codrl_mj.motor_design.drives import diagram_limits
+from codrl_mj.motor_design import explain, step, unknown_in_words
 from codrl_mj.pages import page
-from codrl_mj.pages.loop import loop_section, rates_table, step_plots
-from codrl_mj.pages.plots import Curve, Plot
+from codrl_mj.pages.diagrams import recoveries, torque_speed_diagram
+from codrl_mj.pages.loop import loop_section, rates_table
 
 
 def motor_page(name: str, drive: Drive, entry: MotorEntry | None, out: Path) -> Path:
-    """Write the page of a motor with its drive, and its datasheet where it has one, to an .html file, which it returns.
-
-    Raises:
-        ValueError: `out` is no .html file.
-    """
+    """Write the page of a motor with its drive, and its datasheet where it has one, to an .html file; return that."""
     known = explain(drive, entry)
     sections = [
         page.Section("abilities", "What it can do", _abilities(known, drive, entry)),
@@ -50,42 +44,16 @@ def _abilities(known: Mapping[str, Any], drive: Drive, entry: MotorEntry | None)
     if known["assumed"]:
         table += page.paragraph(f"{known['assumed']}.", "soft")
     try:
-        plots = page.plots([torque_speed(drive, entry)])
+        plots = page.plots([torque_speed_diagram(drive, entry and entry.numbers)])
     except ValueError as error:
         plots = page.note(str(error))
     return Markup('<div class="beside">{}{}</div>').format(plots, table)
 
 
-def torque_speed(drive: Drive, entry: MotorEntry | None = None) -> Plot:
-    """What a drive can do at the output of its gear, past friction, in all four quadrants.
-
-    Raises:
-        ValueError: it has no no-load speed to end the diagram at.
-    """
-    can, lines = abilities(drive), diagram_limits(drive, entry and entry.numbers)
-    half = np.linspace(0.0, 1.15 * can.no_load_speed, 300)[1:]
-    speeds = np.concatenate([-half[::-1], half])  # friction changes sign at standstill
-    curves = []
-    for label, current, place in lines:
-        low, high = torque_limits(drive, speeds, current)
-        more: Any = {"colour": place, "dashed": place == 2}
-        curves += [Curve(f"{label}, lowest", speeds, low, **more), Curve(f"{label}, highest", speeds, high, **more)]
-    drawn = [*curves[:-1], Curve(**{**vars(curves[-1]), "filled": True})]
-    ratio = drive.motor.gear_ratio
-    gear = f"behind a gear of {ratio:g}:1" if ratio != 1.0 else "without a gear"
-    return Plot(
-        f"Torque and speed {gear}, friction taken off",
-        "speed of the output [rad/s]",
-        "torque of the output [N·m]",
-        tuple(drawn),
-        y_most=1.25 * min(can.stall_torque, 3.0 * can.peak_torque),
-    )
-
-
 def _loop(name: str, drive: Drive) -> Markup:
     parts = [loop_section({name: (drive, None)})]
     try:
-        parts += [page.heading("Out of saturation, by kind of anti-windup"), page.plots(step_plots(drive))]
+        parts += [page.heading("Out of saturation, by kind of anti-windup"), page.plots(recoveries(drive, step(drive)))]
     except ValueError as error:
         parts = [parts[0], page.note(str(error))]
     return page.joined((*parts, rates_table(drive)))

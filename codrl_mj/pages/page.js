@@ -270,7 +270,8 @@ const codrl = (() => {
           y: { distr: this.spec.y.log ? 3 : 1, range: (u, low, high) => this.up(low, high) },
         },
         axes: [{ ...axis("x"), space: 56, size: 28, ...(this.clock ? {} : { label: this.spec.x.label, labelSize: 20, labelGap: 0, labelFont: "12px system-ui, sans-serif" }) },
-          { ...axis("y"), space: 24, size: (u, values) => this.clock ? 66 : 14 + 7 * Math.max(2, ...(values ?? []).map((text) => (text ?? "").length)) }],
+          { ...axis("y"), space: 24, size: (u, values) => this.clock ? 66 : 14 + 7 * Math.max(2, ...(values ?? []).map((text) => (text ?? "").length)) },
+          ...(this.spec.scaled ? [this.beside(axis("y"), ...this.spec.scaled)] : [])],
         bands: order.filter((curve) => curve.filled).map((curve) => ({ series: [curve.index, curve.index - 1], fill: () => css("--filled"), show: true })),
         series: [{}, ...order.map((curve) => this.series(curve))],
         hooks: {
@@ -281,6 +282,9 @@ const codrl = (() => {
       }, data, this.box);
       this.line = make("div", { class: "now" });
       this.u.over.append(this.line);
+      for (const [place, text] of (this.spec.corners ?? []).entries()) {
+        this.u.over.append(make("span", { class: `corner ${place > 1 ? "right" : "left"} ${place % 2 ? "low" : "high"}` }, text));
+      }
       for (const trail of this.trails) if (trail.times) {
         trail.dot = make("div", { class: `dot ${this.kind(trail)}` });
         this.u.over.append(trail.dot);
@@ -289,6 +293,12 @@ const codrl = (() => {
       this.select();
       if (this.clock && clock.window) this.u.setScale("x", { min: clock.window[0], max: clock.window[1] });
       this.ready = true;
+    }
+
+    /** A second vertical axis, whose values are those of the first times a scale. */
+    beside(axis, label, scale) {
+      return { ...axis, side: 1, scale: "y", grid: { show: false }, space: 24, size: 56, label, labelSize: 20, labelGap: 0,
+        labelFont: "12px system-ui, sans-serif", values: (u, ticks) => ticks.map((value) => tick(scale * value)) };
     }
 
     size() { return { width: Math.max(this.box.clientWidth, 120), height: this.box.clientHeight }; }
@@ -371,7 +381,7 @@ const codrl = (() => {
         u.ctx.clip();
         u.ctx.fillStyle = this.colour(trail);
         u.ctx.globalAlpha = clamp(300 / trail.xs.length, 0.15, 0.6);
-        const size = 3 * devicePixelRatio;
+        const size = (trail.xs.length <= 25 ? 7 : 3) * devicePixelRatio;
         trail.xs.forEach((x, index) => {
           if (trail.ys[index] == null) return;
           u.ctx.fillRect(u.valToPos(x, "x", true) - size / 2, u.valToPos(trail.ys[index], "y", true) - size / 2, size, size);

@@ -7,7 +7,7 @@ import base64
 import functools
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -45,59 +45,42 @@ class Row(NamedTuple):
 
 
 @functools.cache
-def _templates() -> jinja2.Environment:
-    return jinja2.Environment(
-        loader=jinja2.FileSystemLoader(_HERE),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+def _template(name: str) -> jinja2.Template:
+    options: Any = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
+    return jinja2.Environment(loader=jinja2.FileSystemLoader(_HERE), **options).get_template(name)
 
 
-@functools.cache
-def _parts() -> Any:
-    return _templates().get_template("parts.html.jinja").module
+def _part(name: str, *arguments: Any) -> Markup:
+    """A macro of `parts.html.jinja`, filled in."""
+    return Markup(getattr(_template("parts.html.jinja").module, name)(*arguments))
 
 
 def _text(name: str) -> Markup:
     return Markup((_HERE / name).read_text(encoding="utf-8"))
 
 
-def page(title: str, kicker: str, top: Markup, sections: Sequence[Section]) -> str:
-    """A page.
+def _data(kind: str, content: bytes) -> Markup:
+    return Markup("data:{};base64,{}").format(kind, base64.b64encode(content).decode())
 
-    Args:
-        title: its heading.
-        kicker: a line above it: what kind of page this is.
-        top: what comes before the first section.
-        sections: the rest; those without a body are left out.
-    """
-    licence = (_HERE / "uplot" / "LICENSE").read_text(encoding="utf-8").strip()
-    return (
-        _templates()
-        .get_template("page.html.jinja")
-        .render(
-            title=title,
-            kicker=kicker,
-            top=top,
-            sections=[section for section in sections if section.body],
-            policy=Markup(_POLICY),
-            style=_text("uplot/uPlot.min.css") + _text("page.css"),
-            uplot=Markup("/* uPlot. {} */\n").format(Markup(licence)) + _text("uplot/uPlot.iife.min.js"),
-            script=_text("page.js"),
-            version=__version__,
-            made=time.strftime("%Y-%m-%d, %H:%M UTC", time.gmtime()),
-        )
+
+def page(title: str, kicker: str, top: Markup, sections: Sequence[Section]) -> str:
+    """A page: above its heading what kind it is, `top` before the first section; those without a body are left out."""
+    return _template("page.html.jinja").render(
+        title=title,
+        kicker=kicker,
+        top=top,
+        sections=[section for section in sections if section.body],
+        policy=Markup(_POLICY),
+        style=_text("uplot/uPlot.min.css") + _text("page.css"),
+        uplot=Markup("/* uPlot. {} */\n").format(_text("uplot/LICENSE").strip()) + _text("uplot/uPlot.iife.min.js"),
+        script=_text("page.js"),
+        version=__version__,
+        made=time.strftime("%Y-%m-%d, %H:%M UTC", time.gmtime()),
     )
 
 
 def write(path: Path, text: str) -> Path:
-    """Write a page, whole or not at all.
-
-    Raises:
-        ValueError: the suffix is none of a page.
-    """
+    """Write a page, whole or not at all, to a file with the suffix of one."""
     check_page(path)
     with writing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -139,6 +122,11 @@ def folded(summary: Any, body: Markup) -> Markup:
     return Markup("<details><summary>{}</summary>{}</details>").format(summary, body)
 
 
+def mark(good: bool, text: Any) -> Markup:
+    """A word in a table, said to be good or bad not by colour alone."""
+    return Markup('<strong class="{}">{} {}</strong>').format(*(("good", "✓") if good else ("bad", "✗")), text)
+
+
 def verdict(good: bool, text: Any) -> Markup:
     """Whether something is as it should be, not by colour alone."""
     return Markup('<p class="verdict {}">{} {}</p>').format(*(("good", "✓") if good else ("bad", "✗")), text)
@@ -147,30 +135,19 @@ def verdict(good: bool, text: Any) -> Markup:
 def table(
     caption: str, columns: Sequence[Any], rows: Iterable[Any], numbers: Iterable[int] = (), cards: bool = False
 ) -> Markup:
-    """A table; the first column names its rows.
+    """A table of rows (each a `Row` or a sequence of cells), which the first column names.
 
-    Args:
-        caption: what it is.
-        columns: their headings.
-        rows: each a `Row`, or a sequence of cells.
-        numbers: places of the columns of numbers.
-        cards: whether a phone shows each row as a card; otherwise the table scrolls by itself.
+    Columns at the places `numbers` hold numbers. With `cards` a phone shows each row as a card; otherwise it scrolls.
     """
     made = [row if isinstance(row, Row) else Row(row) for row in rows]
-    return Markup(_parts().table(caption, columns, made, cards, set(numbers)))
+    return _part("table", caption, columns, made, cards, set(numbers))
 
 
 def plot(what: Plot, low: bool = False) -> Markup:
-    """A plot.
-
-    Args:
-        what: its curves.
-        low: whether it is drawn less high.
-    """
-    picture = base64.b64encode(still(what, height=2.2 if low else 3.2).encode()).decode()
+    """A plot; less high where it is `low`."""
+    picture = _data("image/svg+xml", still(what, height=2.2 if low else 3.2).encode())
     axes = f"{what.y_label} over {what.x_label}" if what.clock else what.y_label
-    data, about = Markup(as_json(what)), description(what)
-    return Markup(_parts().plot(what.title, axes, about, data, picture, what.clock, low))
+    return _part("plot", what.title, axes, description(what), Markup(as_json(what)), picture, what.clock, low)
 
 
 def plots(several: Iterable[Plot]) -> Markup:
@@ -180,49 +157,28 @@ def plots(several: Iterable[Plot]) -> Markup:
 
 
 def image(picture: bytes, about: str) -> Markup:
-    """A picture.
-
-    Args:
-        picture: a JPEG file's content.
-        about: what is seen, for those who do not see it.
-    """
-    return Markup('<img src="data:image/jpeg;base64,{}" alt="{}">').format(base64.b64encode(picture).decode(), about)
+    """A JPEG file's content, and what is seen for those who do not see it."""
+    return Markup('<img src="{}" alt="{}">').format(_data("image/jpeg", picture), about)
 
 
 def film(caption: str, video: bytes, rate: float, poster: bytes | None = None) -> Markup:
-    """A film, which follows the page's clock and leads it while it plays.
+    """A film (MP4, H.264, frames a second), which follows the page's clock and leads it while it plays.
 
-    Args:
-        caption: what is seen.
-        video: H.264 in an MP4 file.
-        rate: frames a second.
-        poster: a JPEG file for as long as nothing is seen.
+    The poster, a JPEG file's content, is for as long as nothing is seen.
     """
-    encoded = (base64.b64encode(one).decode() if one else "" for one in (video, poster))
-    return Markup(_parts().film(caption, *encoded, f"{1.0 / rate:.6g}"))
+    before = poster and _data("image/jpeg", poster)
+    return _part("film", caption, _data("video/mp4", video), before, f"{1.0 / rate:.6g}")
 
 
 def transport(end: float, step: float) -> Markup:
-    """The controls of the page's clock: play, time, speed, zoom. There may be one in a page.
-
-    Args:
-        end: of the clock [s].
-        step: by which it is moved [s].
-    """
-    return Markup(_parts().transport(f"{end:.6g}", f"{step:.6g}"))
+    """The controls of the page's clock (its end [s], and by what it is moved [s]); there may be one in a page."""
+    return _part("transport", f"{end:.6g}", f"{step:.6g}")
 
 
 def selector(legend: str, kind: str, names: Sequence[str], shown: int | None = None) -> Markup:
-    """Chooses what the curves with a tag `KIND:PLACE` show.
-
-    Args:
-        legend: what is chosen.
-        kind: of the tags.
-        names: of what may be chosen, by its place.
-        shown: what alone is shown at first; None: all.
-    """
+    """Chooses by name what the curves with a tag `KIND:PLACE` show, at first the place `shown` alone, or all."""
     entries = [(f"{kind}:{place}", name, shown in (None, place)) for place, name in enumerate(names)]
-    return Markup(_parts().selector(legend, kind, entries))
+    return _part("selector", legend, kind, entries)
 
 
 def clocked(label: str, fragment: str, script: str) -> Markup:
@@ -234,7 +190,7 @@ def clocked(label: str, fragment: str, script: str) -> Markup:
         script: JavaScript that defines a function `setTime(seconds)`, which shows that instant. It sees `element`, the
             fragment's parent, and `seek(seconds)`, to be called when the fragment itself is scrubbed.
     """
-    return Markup(_parts().clocked(label, Markup(fragment), Markup(script)))
+    return _part("clocked", label, Markup(fragment), Markup(script))
 
 
 def unit(text: str) -> str:
@@ -243,13 +199,18 @@ def unit(text: str) -> str:
 
 
 def replay(what: Any, label: str, first: bool) -> Markup:
-    """A `codrl_mj.replay.Replay` on the page's clock; the first of a page brings the library along."""
+    """A `codrl_mj.replay.ReplayPart` on the page's clock; the first of a page brings the library along."""
     library = Markup("<script>{}</script>").format(Markup(what.library)) if first else Markup()
     return library + Markup("<figure>{}</figure>").format(clocked(label, what.fragment, what.script))
 
 
 def number(value: Any, digits: int = 4) -> str:
-    """A number as text; a dash where there is none."""
+    """A number as text, or a mean or a median with its interval; a dash where there is none."""
+    if isinstance(value, Mapping):
+        middle, low, high = (
+            number(one, digits) for one in (value.get("mean", value.get("median")), value.get("low"), value.get("high"))
+        )
+        return f"{middle} [{low}, {high}]"
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "–"
     if isinstance(value, bool) or not isinstance(value, float | int):

@@ -1,18 +1,25 @@
-"""Plots as data: what a page draws with uPlot, and the still picture that stands in where no script may run."""
+"""Plots as data: a page draws them with uPlot, a still picture stands in where no script may run, a file is a PNG."""
 
 import base64
 import dataclasses
 import io
+import itertools
 import json
 import math
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from codrl_mj.runs.files import writing
+
 POINTS = 6000
 """Most points of a line: more than there are pixels on a zoomed screen show nothing."""
 _STILL = 240
-"""Points of a line in the still picture."""
+"""Points of a line in a still picture."""
+_FEW = 25
+"""Up to so many points of a curve are marked each."""
 _PALETTE = ("#2b7de0", "#d2691e", "#2e9e62", "#a24fc0", "#d1456b", "#6d78d8")
 """Of the still picture, legible on white and on black; the page's own colours are in page.css."""
 
@@ -78,18 +85,14 @@ class Plot:
     """Whether the horizontal axis is the page's clock, which films share."""
     shades: tuple[Shade, ...] = ()
     """What is shaded behind them."""
+    corners: tuple[str, ...] = ()
+    """What the corners are: above and below at the left, above and below at the right."""
+    scaled: tuple[str, float] | None = None
+    """Of a second vertical axis, at the right: its label with its unit, and its values over those of the first."""
 
 
 def spans(times: np.ndarray, flags: np.ndarray) -> np.ndarray:
-    """Stretches in which a flag is set.
-
-    Args:
-        times: edges of the intervals, shape (n+1,).
-        flags: of each interval, shape (n,).
-
-    Returns:
-        Beginnings and ends, shape (m, 2).
-    """
+    """Beginnings and ends, shape (m, 2), of the intervals with a flag; `times` are the edges of all, shape (n+1,)."""
     edges = np.diff(np.concatenate([[0], np.asarray(flags, dtype=int) != 0, [0]]).astype(int))
     return np.column_stack([times[np.flatnonzero(edges == 1)], times[np.flatnonzero(edges == -1)]])
 
@@ -145,6 +148,8 @@ def as_json(plot: Plot) -> str:
             {"label": shade.label, "spans": stored(shade.spans.ravel()), "tags": shade.tags} for shade in plot.shades
         ],
     }
+    content |= {"corners": plot.corners} if plot.corners else {}
+    content |= {"scaled": plot.scaled} if plot.scaled is not None else {}
     content["arrays"] = [base64.b64encode(values).decode() for values in arrays]
     return json.dumps(content, allow_nan=False).replace("<", "\\u003c")
 
@@ -168,8 +173,7 @@ def description(plot: Plot) -> str:
     """What the plot shows, in words: the range of each of its curves."""
     told = []
     for curve in plot.curves:
-        values = np.asarray(curve.y, dtype=float)
-        values = values[np.isfinite(values)]
+        values = np.asarray(curve.y, dtype=float)[np.isfinite(curve.y)]
         if not len(values):
             told.append(f"{curve.label}: nothing")
         elif np.ptp(values) == 0.0:
@@ -180,54 +184,93 @@ def description(plot: Plot) -> str:
 
 
 def still(plot: Plot, width: float = 6.4, height: float = 3.2) -> str:
-    """The plot as the text of an SVG file, without a background and small.
-
-    Args:
-        plot: what to draw, its first twelve curves.
-        width: of the picture [in].
-        height: of the picture [in].
-    """
+    """The plot, its first twelve curves, as the text of an SVG file of this size [in], transparent and small."""
     import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
-    ink = "#767c84"
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "codrl_mj", "path.simplify_threshold": 0.5}):
         figure = Figure(figsize=(width, height))
-        figure.subplots_adjust(0.13, 0.17, 0.985, 0.97)
+        figure.subplots_adjust(0.13, 0.17, 0.985 if plot.scaled is None else 0.87, 0.97)
         FigureCanvasSVG(figure)
         axes = figure.subplots()
-        for index, curve in enumerate(plot.curves[:12]):
-            x, y = thinned(curve.x, _drawable(curve.y, plot.y_log), _STILL)
-            colour = ink if curve.reference else _PALETTE[(index if curve.colour is None else curve.colour) % 6]
-            dots = curve.style in ("dots", "trail")
-            line = "none" if dots else "--" if curve.dashed or curve.reference else "-"
-            axes.plot(x, y, line, color=colour, linewidth=1.3, label=curve.label, marker="." if dots else "",
-                      markersize=3, drawstyle="steps-post" if curve.style == "step" else "default")  # fmt: skip
-            if curve.filled:
-                other = thinned(curve.x, _drawable(plot.curves[index - 1].y, plot.y_log), _STILL)[1]
-                axes.fill_between(x, y, other, color=colour, alpha=0.12, linewidth=0) if len(other) == len(y) else None
-        for shade in plot.shades[:1]:
-            for begin, end in shade.spans[:60]:
-                axes.axvspan(begin, end, color=_PALETTE[4], alpha=0.2, linewidth=0)
-        if plot.x_log and any(np.any(np.asarray(curve.x) > 0) for curve in plot.curves):
-            axes.set_xscale("log")
-        if plot.y_log and any(np.isfinite(_drawable(curve.y, True)).any() for curve in plot.curves):
-            axes.set_yscale("log")
-            axes.set_ylim(top=min(axes.get_ylim()[1], _ceiling(plot) or math.inf))
-        if plot.y_most is not None:
-            axes.set_ylim(-plot.y_most, plot.y_most)
-        axes.set_xlabel(plot.x_label, color=ink)
-        axes.set_ylabel(plot.y_label, color=ink)
-        axes.tick_params(colors=ink, which="both")
-        axes.spines[:].set_color(ink)
-        axes.grid(color=ink, alpha=0.25)
-        if axes.get_xscale() == "linear":
-            axes.locator_params(axis="x", nbins=5)
-        if axes.get_yscale() == "linear":
-            axes.locator_params(axis="y", nbins=5)
+        _draw(plot, axes, "#767c84", _STILL)
         if len(plot.curves) > 1:
-            axes.legend(fontsize=8, frameon=False, labelcolor=ink)
+            axes.legend(fontsize=8, frameon=False, labelcolor="#767c84")
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
     return buffer.getvalue()
+
+
+def save(several: Plot | Sequence[Plot], path: Path, size: tuple[float, float] | None = None) -> None:
+    """Write a plot, or some in two rows, column by column, as a PNG file on white, whole or not at all.
+
+    Args:
+        several: what to draw, the first twelve curves of each.
+        path: the file.
+        size: width and height of the picture [in]; None: what they need.
+    """
+    from matplotlib.figure import Figure
+
+    drawn = [several] if isinstance(several, Plot) else several
+    rows = min(2, len(drawn))
+    columns = math.ceil(len(drawn) / rows)
+    figure = Figure(figsize=size or (8.0 if columns == 1 else 4.8 * columns, 2.0 + 3.2 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False)
+    for plot, axes in zip(drawn, panels.T.flat, strict=True):
+        _draw(plot, axes, "#22313f", POINTS)
+        axes.set_title(plot.title, fontsize="medium", color="#22313f")
+        beside = min(len(plot.curves), 3 if columns == 1 else 2)
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=beside, fontsize="small", frameon=False)
+    with writing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=150)
+
+
+def _draw(plot: Plot, axes: Any, ink: str, points: int) -> None:
+    """Draw a plot's first twelve curves, each of at most so many points, on matplotlib's axes."""
+    for index, curve in enumerate(plot.curves[:12]):
+        colour = ink if curve.reference else _PALETTE[(index if curve.colour is None else curve.colour) % 6]
+        x, y = thinned(curve.x, _drawable(curve.y, plot.y_log), points)
+        dots = curve.style in ("dots", "trail")
+        few = len(curve.x) <= _FEW and not curve.reference
+        axes.plot(
+            x,
+            y,
+            linestyle="none" if dots else "--" if curve.dashed or curve.reference else "-",
+            linewidth=1.3,
+            color=colour,
+            marker="." if dots or few else "",
+            markersize=9.0 if dots and few else 5.0 if few else 3.0,
+            drawstyle="steps-post" if curve.style == "step" else "default",
+            label=curve.label if curve.label not in axes.get_legend_handles_labels()[1] else None,
+        )
+        if curve.filled:
+            other = thinned(curve.x, _drawable(plot.curves[index - 1].y, plot.y_log), points)[1]
+            axes.fill_between(x, y, other, color=colour, alpha=0.12, linewidth=0) if len(other) == len(y) else None
+    for shade in plot.shades[:1]:
+        for begin, end in shade.spans[:60]:
+            axes.axvspan(begin, end, color=_PALETTE[4], alpha=0.2, linewidth=0)
+    if plot.x_log and any(np.any(np.asarray(curve.x) > 0) for curve in plot.curves):
+        axes.set_xscale("log")
+    if plot.y_log and any(np.isfinite(_drawable(curve.y, True)).any() for curve in plot.curves):
+        axes.set_yscale("log")
+        axes.set_ylim(top=min(axes.get_ylim()[1], _ceiling(plot) or math.inf))
+    if plot.y_most is not None:
+        axes.set_ylim(-plot.y_most, plot.y_most)
+    axes.margins(x=0.0)
+    axes.set_xlabel(plot.x_label, color=ink)
+    axes.set_ylabel(plot.y_label, color=ink)
+    axes.tick_params(colors=ink, which="both")
+    axes.spines[:].set_color(ink)
+    axes.grid(color=ink, alpha=0.25)
+    for axis in "xy":
+        if getattr(axes, f"get_{axis}scale")() == "linear":
+            axes.locator_params(axis=axis, nbins=5)
+    for place, text in zip(itertools.product((0.015, 0.985), (0.985, 0.015)), plot.corners, strict=False):
+        along, up = ("left", "right")[place[0] > 0.5], ("bottom", "top")[place[1] > 0.5]
+        axes.text(*place, text, transform=axes.transAxes, color=ink, alpha=0.8, ha=along, va=up)
+    if plot.scaled is not None:
+        label, scale = plot.scaled
+        right = axes.secondary_yaxis("right", functions=(lambda value: scale * value, lambda value: value / scale))
+        right.set_ylabel(label, color=ink)
+        right.tick_params(colors=ink)

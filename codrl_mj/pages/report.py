@@ -23,14 +23,13 @@ from codrl_mj.runs.layout import PROGRESS, finished, told_apart
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.runs.summaries import RunSummary, compare, read_run
 from codrl_mj.training.folder import BEST, EPISODES, load_config
-from codrl_mj.training.history import WINDOW, read_episodes
+from codrl_mj.training.history import learning_curves, read_episodes
 
-_DOTS = 4000
 _MOST_LOOPS = 4
 
 
 @dataclasses.dataclass(frozen=True)
-class _Run:
+class _Reported:
     summary: RunSummary
     name: str
     shown: Shown | None
@@ -104,28 +103,28 @@ def report(
 
 def _run(
     summary: RunSummary, name: str, which: str, seed: int, trust: bool, filmed: bool, on_part: Callable[[str], None]
-) -> _Run:
+) -> _Reported:
     """A run with an episode, as far as there is one."""
     try:
         config = load_config(summary.path, trust)
     except (ValueError, OSError, ImportError) as error:
-        return _Run(summary, name, None, str(error), {})
+        return _Reported(summary, name, None, str(error), {})
     env = config.evaluation_env
     actuators = env.driven
     best = which == "best" or not finished(summary.path)
     policy = summary.path / BEST if best else summary.path
     if not (policy / "policy.json").is_file():
         yet = "best policy" if finished(summary.path) else "policy yet"
-        return _Run(summary, name, None, f"the run has no {yet}: none was evaluated so far", actuators)
+        return _Reported(summary, name, None, f"the run has no {yet}: none was evaluated so far", actuators)
     try:
         on_part(f"{name}: episode")
         shown = show(name, env, load_policy(policy, trust), seed, filmed)
     except Exception as error:  # environments and actuators of others raise what they like
-        return _Run(summary, name, None, f"{type(error).__name__}: {error}", actuators)
-    return _Run(summary, name, shown, None, actuators, best)
+        return _Reported(summary, name, None, f"{type(error).__name__}: {error}", actuators)
+    return _Reported(summary, name, shown, None, actuators, best)
 
 
-def _top(runs: Sequence[_Run], shown: Sequence[Shown]) -> Markup:
+def _top(runs: Sequence[_Reported], shown: Sequence[Shown]) -> Markup:
     """What it is, in sentences and a picture."""
     told: list[Markup] = []
     for run in runs:
@@ -157,9 +156,8 @@ def _sentence(run: RunSummary) -> str:
     actuator = named.get(run.actuator or "", f"the actuator{'s' * (', ' in (run.actuator or ''))} {run.actuator}")
     text = f"{agent} on {run.task or 'an unknown task'} through {actuator}{steps}, seed {run.seed}."
     if run.evaluation is not None and run.evaluation_return is not None:
-        text += (
-            f" Its policy returns {_value(run.evaluation['returns'])} over {run.evaluation.get('episodes')} episodes"
-        )
+        returns, episodes = page.number(run.evaluation["returns"]), run.evaluation.get("episodes")
+        text += f" Its policy returns {returns} over {episodes} episodes"
         if isinstance(success := run.evaluation.get("success"), Mapping):
             text += f" and succeeds in {100 * success['mean']:.3g} % of them"
         text += "."
@@ -177,57 +175,32 @@ def _about(task: str) -> str:
     return text.strip().partition("\n")[0]
 
 
-def _value(value: Any) -> str:
-    """A measure as text: a number, a mean or a median with its interval."""
-    if isinstance(value, Mapping):
-        middle = value.get("mean", value.get("median"))
-        return f"{page.number(middle)} [{page.number(value.get('low'))}, {page.number(value.get('high'))}]"
-    return page.number(value)
-
-
-def _learning(runs: Sequence[_Run]) -> Markup:
-    """Curves from the runs' tables."""
+def _learning(runs: Sequence[_Reported]) -> Markup:
+    """Curves from the runs' tables; beside others a run has one colour and no dots."""
     notes: list[Markup] = []
     returns: list[Curve] = []
-    errors: list[Curve] = []
     evaluations: list[Curve] = []
+    errors: list[Curve] = []
     for place, run in enumerate(runs):
-        before, colour = (f"{run.name}: ", place) if len(runs) > 1 else ("", None)
         reports = _reports(run.summary.path / PROGRESS)
+        steps = reports.get("steps", np.empty(0))
+        evaluated, off = (
+            reports.get(name, np.full(len(steps), np.nan)) for name in ("evaluation_return", "torque_error")
+        )
         try:
             episodes = read_episodes(run.summary.path / EPISODES)
         except (ValueError, OSError) as error:
             episodes = np.empty((0, 4))
             notes.append(page.note(f"No curve of {run.name}'s training episodes: {error}"))
-        if len(episodes):
-            steps, values = episodes[:, 1], episodes[:, 2]
-            stride = max(1, len(steps) // _DOTS)
+        known = np.isfinite(off)
+        off_torque = [Curve("torque error", steps[known], off[known], colour=4)] if known.any() else []
+        for curve in (*learning_curves(episodes, steps, evaluated), *off_torque):
+            into = {"evaluations": evaluations, "torque error": errors}.get(curve.label, returns)
             if len(runs) == 1:
-                dots = steps[::stride], values[::stride]
-                returns.append(Curve("training episodes", *dots, style="dots", colour=5))
-            sums = np.cumsum(np.concatenate([[0.0], values]))
-            ends = np.arange(1, len(values) + 1)
-            starts = np.maximum(0, ends - WINDOW)
-            means = (sums[ends] - sums[starts]) / (ends - starts)
-            returns.append(
-                Curve(f"{before}mean of {WINDOW} episodes", steps, means, colour=0 if colour is None else colour)
-            )
-        steps = reports.get("steps", np.empty(0))
-        for column, label, into, own in (
-            ("evaluation_return", "evaluations", evaluations, 1),
-            ("torque_error", "torque error", errors, 4),
-        ):
-            good = np.isfinite(reports.get(column, np.empty(0)))
-            if good.any():
-                values = reports[column][good]
-                curve = Curve(
-                    before + label,
-                    steps[good],
-                    values,
-                    colour=own if colour is None else colour,
-                    dashed=colour is not None,
-                )
                 into.append(curve)
+            elif curve.style != "dots":
+                label, dashed = f"{run.name}: {curve.label}", into is not returns
+                into.append(dataclasses.replace(curve, label=label, colour=place, dashed=dashed))
     found = []
     if returns or evaluations:
         found.append(Plot("Return while learning", "environment steps", "return", (*returns, *evaluations)))
@@ -251,7 +224,7 @@ def _reports(path: Path) -> dict[str, np.ndarray]:
         return {}
 
 
-def _evaluation(runs: Sequence[_Run]) -> Markup:
+def _evaluation(runs: Sequence[_Reported]) -> Markup:
     """Measures with their intervals."""
     known = [run for run in runs if run.summary.evaluation is not None]
     notes = [
@@ -262,15 +235,11 @@ def _evaluation(runs: Sequence[_Run]) -> Markup:
     if not known:
         return page.joined(notes)
     every = [dict(run.summary.evaluation or {}) for run in known]
-    rows = []
-    for name, field in MEASURES.items():
-        values = [one.get(name) for one in every]
-        if any(value is not None for value in values):
-            rows.append((field.metadata["label"], *map(_value, values), page.unit(field.metadata["unit"])))
     count = " and ".join(dict.fromkeys(str(one.get("episodes")) for one in every))
-    caption = f"Last policy, {count} episodes; 95 % intervals in brackets"
     names = [run.name if len(known) > 1 else "value" for run in known]
-    table = page.table(caption, ("measure", *names, "unit"), rows, numbers=range(1, 1 + len(known)))
+    table = _measures(
+        f"Last policy, {count} episodes; 95 % intervals in brackets", dict(zip(names, every, strict=True))
+    )
     curves = []
     for place, (run, one) in enumerate(zip(known, every, strict=True)):
         returns = np.sort(np.array(one.get("episode_returns") or [], dtype=float))
@@ -280,30 +249,27 @@ def _evaluation(runs: Sequence[_Run]) -> Markup:
     title = "Returns of the evaluation's episodes, in order"
     beside = page.plots([Plot(title, "share of episodes below [%]", "return", tuple(curves))] if curves else [])
     layout = '<div class="beside">{}{}</div>' if len(known) == 1 else "{}{}"  # a table of several needs the width
-    parts = [Markup(layout).format(table, beside)]
-    for run, one in zip(known, every, strict=True):
-        parts.append(_motors(run.name, one.get("motors")))
-    return page.joined((*notes, *parts))
+    of_motors = [(f"{run.name}: motor by motor", one.get("motors")) for run, one in zip(known, every, strict=True)]
+    folded = [
+        page.folded(about, _measures(about, motors))
+        for about, motors in of_motors
+        if isinstance(motors, Mapping) and motors
+    ]
+    return page.joined((*notes, Markup(layout).format(table, beside), *folded))
 
 
-def _motors(name: str, motors: Any) -> Markup:
-    """What each of several motors did."""
-    if not isinstance(motors, Mapping) or not motors:
-        return Markup()
-    measures = list(dict.fromkeys(measure for one in motors.values() for measure in one))
+def _measures(caption: str, columns: Mapping[str, Mapping[str, Any]]) -> Markup:
+    """A row for each measure that one of the columns has."""
     rows = []
-    for measure in measures:
-        values = [one.get(measure) for one in motors.values()]
-        if any(value is not None for value in values) and measure in MEASURES:
-            about = MEASURES[measure].metadata
-            rows.append((about["label"], *map(_value, values), page.unit(about["unit"])))
-    columns = ("measure", *motors, "unit")
-    table = page.table(f"{name}: motor by motor", columns, rows, numbers=range(1, 1 + len(motors)))
-    return page.folded(f"{name}: motor by motor", table)
+    for name, field in MEASURES.items():
+        values = [column.get(name) for column in columns.values()]
+        if any(value is not None for value in values):
+            rows.append((field.metadata["label"], *map(page.number, values), page.unit(field.metadata["unit"])))
+    return page.table(caption, ("measure", *columns, "unit"), rows, numbers=range(1, 1 + len(columns)))
 
 
 def _episodes(
-    runs: Sequence[_Run], shown: Sequence[Shown], joined: Callable[[Sequence[Shown]], Sequence[Markup]]
+    runs: Sequence[_Reported], shown: Sequence[Shown], joined: Callable[[Sequence[Shown]], Sequence[Markup]]
 ) -> Markup:
     notes = [page.note(f"No episode of {run.name}: {run.problem}", bad=True) for run in runs if run.shown is None]
     notes += [page.note(f"{run.name}: the policy of its best evaluation acts.") for run in runs if run.best]
@@ -319,18 +285,15 @@ def replays(shown: Sequence[Shown]) -> list[Markup]:
     return [page.replay(one, f"Replay: {of.name}", place == 0) for place, (one, of) in enumerate(named)]
 
 
-def _loop(runs: Sequence[_Run]) -> Markup:
+def _loop(runs: Sequence[_Reported]) -> Markup:
     """Current loops, and steps of actuators without one; each different one once."""
     loops: dict[str, tuple[Looped, float | None]] = {}
     others: dict[str, tuple[ActuatorModel, float, float]] = {}
     without: dict[str, None] = {}
     for run in runs:
         for motor, actuator in run.actuators.items():
-            alone = len(run.actuators) == 1
-            name = (
-                (motor if len(runs) == 1 else run.name) if alone else f"{run.name}, {motor}" if len(runs) > 1 else motor
-            )
-            name = "motor" if name in (".*", "motor") else name
+            name = motor if len(runs) == 1 else run.name if len(run.actuators) == 1 else f"{run.name}, {motor}"
+            name = "motor" if name == ".*" else name
             timestep = run.shown.episode.timestep if run.shown is not None else None
             if actuator.assumed:
                 without[f"{name}: {actuator.assumed}."] = None
@@ -379,12 +342,10 @@ def _loop_of(one: Looped, timestep: float | None) -> Any:
 
 def _certificate(runs: Sequence[Path], given: Path | None) -> Markup:
     """What the certificate says, if there is one."""
-    places = [path / certificates.JSON_NAME for path in runs]
+    known = [place for path in runs if (place := path / certificates.JSON_NAME).is_file()]
     if given is not None:
-        places = [given / certificates.JSON_NAME if given.is_dir() else given]
-    for place in places:
-        if given is None and not place.is_file():
-            continue
+        known = [given / certificates.JSON_NAME if given.is_dir() else given]
+    for place in known[:1]:
         try:
             return certificates.summary(read_json(place, "certificate"))
         except (KeyError, TypeError, ValueError) as error:
@@ -395,7 +356,7 @@ def _certificate(runs: Sequence[Path], given: Path | None) -> Markup:
     return Markup()
 
 
-def _settings(runs: Sequence[_Run]) -> Markup:
+def _settings(runs: Sequence[_Reported]) -> Markup:
     """What differs between the runs, and all that they were made with."""
     parts = []
     if len(runs) > 1:

@@ -12,7 +12,7 @@ _MUJOCO_ELEVATION, _ELEVATION = -45.0, -20.0
 """Of a free camera [degrees]: MuJoCo's, of models that say nothing, which looks down on a robot; ours for these."""
 
 
-class View(NamedTuple):
+class Viewpoint(NamedTuple):
     """A camera that looks at something."""
 
     eye: np.ndarray
@@ -27,15 +27,10 @@ class View(NamedTuple):
 
 def first_view(
     model: mujoco.MjModel, shapes: list[Shape], poses: np.ndarray, moving: Collection[int], camera: str | None
-) -> View:
-    """A named camera of the model; else MuJoCo's free one, near enough to what moves.
+) -> Viewpoint:
+    """A named camera of the model; else MuJoCo's free one, near enough to the bodies that move.
 
-    Args:
-        model: the model.
-        shapes: what is seen.
-        poses: of all bodies, position and quaternion, shape (bodies, 7).
-        moving: the bodies that move.
-        camera: the name; None for the free one.
+    Poses are of all bodies, position and quaternion, shape (bodies, 7).
     """
     centre, extent = _reach(model, shapes, poses, moving)
     if camera is not None:
@@ -45,12 +40,12 @@ def first_view(
         index = model.camera(camera).id
         eye, forward = data.cam_xpos[index].copy(), -data.cam_xmat[index].reshape(3, 3)[:, 2]
         ahead = max(float((centre - eye) @ forward), 0.5 * extent)
-        return View(eye, eye + ahead * forward, float(model.cam_fovy[index]), extent)
+        return Viewpoint(eye, eye + ahead * forward, float(model.cam_fovy[index]), extent)
     free = model.vis.global_
     down = _ELEVATION if free.elevation == _MUJOCO_ELEVATION else free.elevation
     azimuth, elevation = np.radians([free.azimuth, down])
     forward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-    return View(centre - 2.6 * extent * forward, centre, 45.0, extent)
+    return Viewpoint(centre - 2.6 * extent * forward, centre, 45.0, extent)
 
 
 def _reach(

@@ -100,12 +100,9 @@ def _instants(time: np.ndarray) -> np.ndarray:
 
 
 def read_poses(data: mujoco.MjData, seen: list[Shape], poses: np.ndarray) -> None:
-    """Read where the bodies are; where geoms were moved along a hill, from one of their geoms.
+    """Fill `poses` (positions and quaternions, shape (bodies, 7)) with where the bodies that are seen are.
 
-    Args:
-        data: the simulation, its kinematics up to date.
-        seen: its shapes.
-        poses: filled with positions and quaternions, shape (bodies, 7).
+    The kinematics are up to date; where geoms were moved along a hill, the pose is that of one of the body's geoms.
     """
     poses[:, :3], poses[:, 3:] = data.xpos, data.xquat
     done = set()

@@ -23,7 +23,7 @@ _POLICY = (
 
 
 @dataclasses.dataclass(frozen=True)
-class Replay:
+class ReplayPart:
     """A replay to be put into a page."""
 
     fragment: str
@@ -37,7 +37,7 @@ class Replay:
     """The last instant [s]."""
 
 
-def replay(what: Motion, label: str) -> Replay:
+def replay(what: Motion, label: str) -> ReplayPart:
     """A replay.
 
     Args:
@@ -55,7 +55,7 @@ def replay(what: Motion, label: str) -> Replay:
         f'<script type="application/json">{data}</script></div>'
     )
     library = f"/* three.js\n{_text('three/LICENSE').strip()}\n*/\n{_text('three/three.min.js')}\n{_text('replay.js')}"
-    return Replay(fragment, "const setTime = codrlReplay(element);", library, float(what.time[-1]))
+    return ReplayPart(fragment, "const setTime = codrlReplay(element);", library, float(what.time[-1]))
 
 
 def write_replay(what: Motion, path: Path, title: str) -> Path:

@@ -118,11 +118,6 @@ def thinned(vertices: np.ndarray, triangles: np.ndarray, most: int) -> tuple[np.
     """A mesh of at most some number of triangles: vertices that share a cell of a grid become one, in their midst.
 
     (Rossignac and Borrel, Multi-resolution 3D approximations for rendering complex scenes, 1993.)
-
-    Args:
-        vertices: shape (n, 3).
-        triangles: shape (m, 3).
-        most: triangles, >= 1.
     """
     cells = 512
     while len(triangles) > most and cells > 2:

@@ -1,4 +1,4 @@
-"""What happened in a training: a table of episodes and a table of reports."""
+"""What happened in a training: a table of episodes, a table of reports, and the learning curve that they make."""
 
 import csv
 import dataclasses
@@ -9,10 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from codrl_mj.pages.plots import Curve, Plot, save
 from codrl_mj.runs.files import writing
 
 WINDOW = 100
 """Training episodes that means are taken over."""
+_DOTS = 4000
+"""Most training episodes of a learning curve that are drawn one by one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +62,35 @@ def read_episodes(path: Path) -> np.ndarray:
         raise ValueError(f"{path}: not a table of episodes: {error}") from None
 
 
-class Table:
+def learning_curves(episodes: np.ndarray, steps: np.ndarray, evaluations: np.ndarray) -> list[Curve]:
+    """Returns over environment steps: of the training episodes, their running mean, and of the evaluations.
+
+    Args:
+        episodes: rows of `EPISODE_COLUMNS`.
+        steps: environment steps of the reports, shape (n,).
+        evaluations: returns of the evaluations then, NaN where there was none, shape (n,).
+    """
+    curves = []
+    if len(episodes):
+        ends, returns = episodes[:, 1], episodes[:, 2]
+        stride = max(1, len(returns) // _DOTS)
+        sums, last = np.cumsum(np.concatenate([[0.0], returns])), np.arange(1, len(returns) + 1)
+        first = np.maximum(0, last - WINDOW)
+        means = (sums[last] - sums[first]) / (last - first)
+        curves.append(Curve("training episodes", ends[::stride], returns[::stride], style="dots", colour=5))
+        curves.append(Curve(f"mean of {WINDOW} episodes", ends, means, colour=0))
+    known = np.isfinite(evaluations)
+    return [*curves, Curve("evaluations", steps[known], evaluations[known], colour=1)] if known.any() else curves
+
+
+def save_learning_curve(path: Path, title: str, episodes: np.ndarray, reports: np.ndarray) -> None:
+    """Write the learning curve of a run as a PNG file, from rows of `EPISODE_COLUMNS` and of `REPORT_COLUMNS`."""
+    steps, evaluations = (reports[:, REPORT_COLUMNS.index(name)] for name in ("steps", "evaluation_return"))
+    curves = tuple(learning_curves(episodes, steps, evaluations))
+    save(Plot(title, "environment steps", "return", curves), path, (6.0, 3.5))
+
+
+class GrowingTable:
     """A CSV file of numbers that grows row by row, and the rows in memory."""
 
     def __init__(self, path: Path, columns: Sequence[str], rows: np.ndarray | None = None) -> None:

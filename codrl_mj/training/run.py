@@ -80,8 +80,8 @@ def train(
         raise ValueError(f"wandb = {wandb!r}: Weights & Biases is not installed: pip install wandb")
     import torch
 
+    importlib.import_module("matplotlib.figure")  # what is missing is missed now and not in the end
     from codrl_mj.envs.sb3 import make_sb3_vec_env
-    from codrl_mj.training import curve  # noqa: F401 - what is missing is missed now and not in the end
     from codrl_mj.training.watcher import LearningEnded, Watcher
 
     torch.set_num_threads(1)  # networks this small run several times slower on two
@@ -140,12 +140,13 @@ def _step_limit(config: TrainConfig) -> int:
 
 def _finish(config: TrainConfig, out: Path, model: Any, watcher: Any) -> None:
     from codrl_mj.runs.policies import save_policy
-    from codrl_mj.training.curve import draw_learning_curve
+    from codrl_mj.training import history
 
     watcher.boundary(last=True)
     save_policy(model.policy, config.agent, out)
     write_json(out / folder.EVALUATION, sealed(watcher.evaluation.as_mapping()))
-    draw_learning_curve(out / folder.CURVE, config, watcher.episodes.array(), watcher.reports.array())
+    title = f"{config.agent.name.upper()} on {config.task}"
+    history.save_learning_curve(out / folder.CURVE, title, watcher.episodes.array(), watcher.reports.array())
     folder.write_result(out, watcher.result())
 
 

@@ -18,7 +18,7 @@ from codrl_mj.runs.policies import save_policy
 from codrl_mj.training import folder
 from codrl_mj.training.checkpoint import load_checkpoint, save_checkpoint
 from codrl_mj.training.config import EVALUATION_SEED, TrainConfig
-from codrl_mj.training.history import EPISODE_COLUMNS, REPORT_COLUMNS, Progress, Table
+from codrl_mj.training.history import EPISODE_COLUMNS, REPORT_COLUMNS, GrowingTable, Progress
 from codrl_mj.training.state import State, capture, restore
 
 REPORT_INTERVAL = 1000
@@ -77,8 +77,8 @@ class Watcher(BaseCallback):
                 setattr(self, f"_{name}", state.facts["watch"][name])
             self.saved_steps = self._steps_before = self.model.num_timesteps
             self.num_timesteps = self.model.num_timesteps
-        self.episodes = Table(self._out / folder.EPISODES, EPISODE_COLUMNS, rows["episodes"])
-        self.reports = Table(self._out / folder.PROGRESS, REPORT_COLUMNS, rows["reports"])
+        self.episodes = GrowingTable(self._out / folder.EPISODES, EPISODE_COLUMNS, rows["episodes"])
+        self.reports = GrowingTable(self._out / folder.PROGRESS, REPORT_COLUMNS, rows["reports"])
         self.model.set_logger(Logger(str(self._out), self._writers()))
         self._start = time.perf_counter()
 

@@ -29,14 +29,9 @@ class Browser:
     """Serves a session until it is closed."""
 
     def __init__(self, session: Session, port: int, title: str, docs: Docs, supply: float = 48.0) -> None:
-        """Begin to serve.
+        """Begin to serve a session, which from now on this alone touches, at a port or the next free one.
 
-        Args:
-            session: the simulation; from now on this alone touches it.
-            port: to listen at, on the loopback interface; where it is taken, the next free one.
-            title: what is seen.
-            docs: the description of each field of a class.
-            supply: where the slider of an unlimited voltage ends [V].
+        `docs` describes each field of a class; the slider of an unlimited voltage ends at `supply` [V].
         """
         self.session, self._docs, self._supply = session, docs, supply
         self.playing, self._speed, self._budget, self._real = True, 1.0, 0.0, 1.0

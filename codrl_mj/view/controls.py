@@ -41,12 +41,10 @@ class Control:
 def controls(
     settings: Any, scale: float | None = None, ends: Mapping[str, float] = MappingProxyType({})
 ) -> list[Control]:
-    """Numbers, words and flags in a frozen dataclass made with `codrl_mj.fields`, and in its parts.
+    """Numbers, words and flags in an actuator or disturbances, and in its parts.
 
-    Args:
-        settings: an actuator, or disturbances.
-        scale: where the slider of an infinite voltage ends [V]; None: infinite fields are left out.
-        ends: name of a field that is 0 -> where its slider ends.
+    The slider of an infinite voltage ends at `scale` [V], without which infinite fields are left out; that of a field
+    that is 0 where `ends` says so by its name.
     """
     found = [
         dataclasses.replace(one, high=ends[one.path[-1]]) if one.value == 0 and one.path[-1] in ends else one

@@ -31,14 +31,7 @@ class LocalServer(viser.ViserServer):
     """Listens on the loopback interface, answers pages of its own origin, and shares nothing through other hosts."""
 
     def __init__(self, port: int) -> None:
-        """Begin to listen.
-
-        Args:
-            port: to listen at; where it is taken, the next free one.
-
-        Raises:
-            ValueError: there is no such port.
-        """
+        """Begin to listen at a port or, where it is taken, the next free one."""
         if not 0 <= port < 65536:
             raise ValueError(f"port = {port}: must be 0 to 65535; 8080 is the default, 0 any that is free")
         with _checked_requests(), contextlib.redirect_stdout(io.StringIO()):  # viser prints a table of addresses

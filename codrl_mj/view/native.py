@@ -8,11 +8,7 @@ from codrl_mj.view.session import Session
 
 
 def check_display() -> None:
-    """Refuse where there is no display.
-
-    Raises:
-        RuntimeError: there is none.
-    """
+    """Refuse where there is no display."""
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise RuntimeError(
             "--native needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set: leave it out to see the "

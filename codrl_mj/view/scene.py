@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 import viser
 
-from codrl_mj.replay.camera import View, first_view
+from codrl_mj.replay.camera import Viewpoint, first_view
 from codrl_mj.replay.motion import read_poses
 from codrl_mj.replay.shapes import TRIANGLES, Shape, mesh, shapes, thinned
 from codrl_mj.view.session import Session
@@ -63,7 +63,7 @@ class Scene:
                 frame.position, frame.wxyz = self._poses[body, :3], self._poses[body, 3:]
 
 
-def _triangles(one: Shape, view: View) -> tuple[np.ndarray, np.ndarray]:
+def _triangles(one: Shape, view: Viewpoint) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and triangles of a shape that is no mesh of the model's."""
     size = one.size
     if one.kind == "plane":

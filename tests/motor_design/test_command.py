@@ -10,7 +10,8 @@ import pytest
 
 from codrl_mj.catalogue import motor_names
 from codrl_mj.cli import main
-from codrl_mj.motor_design import Abilities, find_drive, find_entry, torque_speed_diagram
+from codrl_mj.motor_design import Abilities, find_drive, find_entry
+from codrl_mj.pages.diagrams import torque_speed_diagram
 
 OWN = """
 manufacturer = "we"
@@ -176,14 +177,14 @@ def test_bad_input_costs_one_line_and_leaves_nothing(capsys, arguments, message)
 def test_operating_points_are_laid_over_the_diagram():
     points = np.array([[800.0, 0.1], [-20.0, 2.0]])
     drive, entry = find_drive("maxon-ec45-flat-50w"), find_entry("maxon-ec45-flat-50w")
-    axes = torque_speed_diagram(drive, entry.numbers, points).axes[0]
-    lines = {line.get_label(): line.get_xydata() for line in axes.lines}
-    np.testing.assert_array_equal(lines["operating points"], points)
-    assert "continuous current, 2.52 A" in lines
-    assert axes.get_xlim()[1] > 800.0
-    assert axes.get_ylim()[1] > 2.0
-    assert "rad/s" in axes.get_xlabel()
-    assert "N·m" in axes.get_ylabel()
+    plot = torque_speed_diagram(drive, entry.numbers, points)
+    curves = {curve.label: curve for curve in plot.curves}
+    np.testing.assert_array_equal(np.column_stack([curves["operating points"].x, curves["operating points"].y]), points)
+    limit = curves["continuous current, 2.52 A, highest"]
+    assert limit.x.max() > 800.0
+    assert plot.y_most > 2.0
+    assert "rad/s" in plot.x_label
+    assert "N·m" in plot.y_label
     with pytest.raises(ValueError, match=r"points: shape \(3,\), must be \(n, 2\)"):
         torque_speed_diagram(drive, points=[1.0, 2.0, 3.0])
 

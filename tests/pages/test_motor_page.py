@@ -6,8 +6,9 @@ import numpy as np
 
 from codrl_mj.cli import main
 from codrl_mj.motor_design import abilities, explain, find_drive
+from codrl_mj.pages.diagrams import torque_speed_diagram
 from codrl_mj.pages.loop import limits, no_load_speed
-from codrl_mj.pages.motor import _abilities, torque_speed
+from codrl_mj.pages.motor import _abilities
 from tests.pages.parsed import check_alone
 
 
@@ -30,7 +31,7 @@ def test_what_is_assumed_stands_below_what_it_can_do():
 
 def test_the_diagram_goes_through_stall_and_no_load():
     drive = find_drive("maxon-ec45-flat-50w", gear_ratio=12.0)
-    can, plot = abilities(drive), torque_speed(drive)
+    can, plot = abilities(drive), torque_speed_diagram(drive)
     highest = next(curve for curve in plot.curves if re.match("voltage.*highest", curve.label))
     assert abs(np.interp(can.no_load_speed, highest.x, highest.y)) < 1e-3 * can.stall_torque
     assert highest.y.max() > can.stall_torque  # braking

@@ -89,7 +89,7 @@ def test_the_papers_current_loop_has_its_margins_and_its_step(text):
 
 def test_it_says_which_loops_it_leaves_out_and_why_there_is_none():
     def run(actuators):
-        return reports._Run(None, "run", None, None, actuators)
+        return reports._Reported(None, "run", None, None, actuators)
 
     drives = {f"m{place}": find_drive("maxon-dcx22l", bandwidth=300.0 + place) for place in range(6)}
     assert "The first 4 of 6 different loops are shown; not those of m4, m5" in str(reports._loop([run(drives)]))

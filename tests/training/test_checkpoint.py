@@ -15,7 +15,7 @@ from safetensors.numpy import save
 
 from codrl_mj.cli import main
 from codrl_mj.runs.files import writing
-from codrl_mj.training import TrainConfig, curve, watcher
+from codrl_mj.training import TrainConfig, history, watcher
 from codrl_mj.training.checkpoint import load_checkpoint, save_checkpoint
 from codrl_mj.training.state import State
 from tests.damage import damage
@@ -28,7 +28,7 @@ CONFIG = CASES["ppo, one optimiser"]
 def quick(monkeypatch):
     monkeypatch.setattr(watcher, "REPORT_INTERVAL", 40)
     monkeypatch.setattr(TrainConfig, "evaluation_env", property(lambda config: config.env))
-    monkeypatch.setattr(curve, "draw_learning_curve", lambda *_: None)
+    monkeypatch.setattr(history, "save_learning_curve", lambda *_: None)
 
 
 @pytest.fixture(scope="module")

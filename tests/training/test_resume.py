@@ -8,7 +8,7 @@ import pytest
 from codrl_mj.envs.sb3 import ActuatedVecEnv
 from codrl_mj.runs.files import write_json
 from codrl_mj.runs.summaries import read_run
-from codrl_mj.training import TrainConfig, TrainingStoppedError, curve, finished, watcher
+from codrl_mj.training import TrainConfig, TrainingStoppedError, finished, history, watcher
 from codrl_mj.training.checkpoint import load_checkpoint, save_checkpoint
 from codrl_mj.training.state import State
 from tests.matrix import but
@@ -35,7 +35,7 @@ def quick(monkeypatch):
     """Reports as often as checkpoints, evaluations of short episodes, and no picture at the end."""
     monkeypatch.setattr(TrainConfig, "evaluation_env", property(lambda config: config.env))
     monkeypatch.setattr(watcher, "REPORT_INTERVAL", 40)
-    monkeypatch.setattr(curve, "draw_learning_curve", lambda *_: None)
+    monkeypatch.setattr(history, "save_learning_curve", lambda *_: None)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def test_a_run_of_interruptions_changes_nothing(tmp_path, uninterrupted, name):
     interrupt(config, out, 1, TERMINATE)  # twice in a row
     interrupt(config, out, 40, INTERRUPT)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(curve, "draw_learning_curve", crash)  # after the last checkpoint, before result.json
+        patch.setattr(history, "save_learning_curve", crash)  # after the last checkpoint, before result.json
         with pytest.raises(Crash):
             resume(config, out)
     assert not finished(out)
@@ -84,7 +84,7 @@ def test_between_the_final_files_a_run_is_not_finished_for_anybody(tmp_path, uni
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "replace", crash_behind)
-        patch.setattr(curve, "draw_learning_curve", lambda path, *_: write_json(path, "no picture"))
+        patch.setattr(history, "save_learning_curve", lambda path, *_: write_json(path, "no picture"))
         with pytest.raises(Crash):
             resume(CASES[name], out)
     done = written == len(FINAL)

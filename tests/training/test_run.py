@@ -23,7 +23,7 @@ from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy, evaluate, run_episodes
 from codrl_mj.runs.policies import load_policy
-from codrl_mj.training import EVALUATION_SEED, TrainConfig, curve, load_config, train, watcher
+from codrl_mj.training import EVALUATION_SEED, TrainConfig, history, load_config, train, watcher
 from codrl_mj.training.folder import owned, start_folder
 from codrl_mj.training.watcher import Watcher
 
@@ -163,7 +163,7 @@ def test_the_result_and_the_evaluation_agree_with_an_evaluation_of_the_saved_pol
 
 def test_a_report_has_the_evaluation_that_took_place_then_and_no_other(tmp_path, monkeypatch):
     monkeypatch.setattr(watcher, "REPORT_INTERVAL", 2500)
-    monkeypatch.setattr(curve, "draw_learning_curve", lambda *_: None)
+    monkeypatch.setattr(history, "save_learning_curve", lambda *_: None)
     config = dataclasses.replace(TINY, total_steps=5000, evaluation_interval=2000, evaluation_episodes=2)
     rows = read_csv(train(config, tmp_path / "run") / "progress.csv")
     found = {int(row["steps"]): math.isfinite(float(row["evaluation_return"])) for row in rows}

@@ -27,7 +27,7 @@ _WIDTH = 8.0  # in
 
 
 @dataclasses.dataclass(frozen=True)
-class Curve:
+class StateCurve:
     """Something that is drawn over the time of an episode."""
 
     label: str
@@ -38,32 +38,32 @@ class Curve:
     """Values to mark: goals and limits."""
 
 
-def _entry(label: str, index: int, *marks: float) -> Curve:
-    return Curve(label, lambda state: state[index], marks)
+def _entry(label: str, index: int, *marks: float) -> StateCurve:
+    return StateCurve(label, lambda state: state[index], marks)
 
 
-def _entries(task: str, marks: Mapping[int, tuple[float, ...]]) -> list[Curve]:
+def _entries(task: str, marks: Mapping[int, tuple[float, ...]]) -> list[StateCurve]:
     """Every entry of a task's state."""
     return [_entry(name, index, *marks.get(index, ())) for index, name in enumerate(find_task(task).state_names)]
 
 
-CURVES: dict[str, list[Curve]] = {
+CURVES: dict[str, list[StateCurve]] = {
     "pendulum": [
-        Curve("height x = cos θ [m]", lambda state: np.cos(state[0]), (1.0,)),
-        Curve("y = sin θ [m]", lambda state: np.sin(state[0]), (0.0,)),
-        Curve("θ [rad], wrapped", lambda state: _unbroken(pendulum.upright_angle(state)), (0.0,)),
+        StateCurve("height x = cos θ [m]", lambda state: np.cos(state[0]), (1.0,)),
+        StateCurve("y = sin θ [m]", lambda state: np.sin(state[0]), (0.0,)),
+        StateCurve("θ [rad], wrapped", lambda state: _unbroken(pendulum.upright_angle(state)), (0.0,)),
         _entry("θ_dot [rad/s]", 1, 0.0),
     ],
     "mountain_car": _entries("mountain_car", {0: (mountain_car.GOAL,)}),
     "mountain_car_continuous": _entries("mountain_car_continuous", {0: (mountain_car_continuous.GOAL,)}),
     "acrobot": [
-        Curve(
+        StateCurve(
             "-cos θ1\n- cos(θ1 + θ2) [m]",
             lambda state: -np.cos(state[0]) - np.cos(state[0] + state[1]),
             (acrobot.GOAL_HEIGHT,),
         ),
-        Curve("θ1 [rad], wrapped", lambda state: _unbroken(state[0])),
-        Curve("θ2 [rad], wrapped", lambda state: _unbroken(state[1])),
+        StateCurve("θ1 [rad], wrapped", lambda state: _unbroken(state[0])),
+        StateCurve("θ2 [rad], wrapped", lambda state: _unbroken(state[1])),
         _entry("θ1_dot [rad/s]", 2),
         _entry("θ2_dot [rad/s]", 3),
     ],
