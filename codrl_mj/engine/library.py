@@ -80,3 +80,8 @@ def _array_of(name: str) -> Any:
         return f64(array(data, at))
 
     return pointer
+
+
+def address_of(owner: Any, name: str) -> int:
+    """Of a field of an `MjModel` or `MjData` that is a single number, such as `opt.timestep`."""
+    return int(owner._address) + offset("mjModel" if isinstance(owner, mujoco.MjModel) else "mjData", name)

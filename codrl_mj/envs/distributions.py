@@ -213,7 +213,7 @@ def paths_of(randomize: Any) -> dict[str, Distribution]:
 def _flat(randomize: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     """Path and distribution of each, of mappings of patterns the pattern before the field."""
     for name, one in randomize.items():
-        if isinstance(one, Mapping) and one:
+        if isinstance(one, Mapping) and one and all(isinstance(text, str | Distribution) for text in one.values()):
             yield from ((f"{name}:{field}", text) for field, text in one.items())
         else:
             yield str(name), one

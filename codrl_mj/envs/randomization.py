@@ -263,7 +263,7 @@ class Draws:
         found: dict[str, Any] = {}
         for (path, kind), value in zip(self.randomization.types.items(), self._values[row], strict=True):
             pattern, field = split_path(path)
-            (found.setdefault(pattern, {}) if pattern else found)[field] = value if np.isnan(value) else kind(value)
+            (found.setdefault(pattern, {}) if pattern else found)[field] = np.nan if np.isnan(value) else kind(value)
         return found | {"rejected": int(self._rejected[row])}
 
     def infos(self, rows: np.ndarray) -> dict[str, Any]:

@@ -15,8 +15,7 @@ import mujoco
 import numba
 import numpy as np
 
-from codrl_mj.engine.layout import offset
-from codrl_mj.engine.library import addresses, engine
+from codrl_mj.engine.library import address_of, addresses, engine
 from codrl_mj.engine.memory import copy_bytes, count_on, f64, internal
 from codrl_mj.physics.mujoco_single import ARM, MujocoPhysics
 from codrl_mj.physics.variation import field_of
@@ -81,7 +80,7 @@ def lane(physics: MujocoPhysics, data: mujoco.MjData, fields: Mapping[str, np.nd
     ]
     parts = [(name, part(data.model, name)) for name in _MOVING]
     live = [
-        (data._address + offset("mjData", name), one.start, 1)
+        (address_of(data, name), one.start, 1)
         if name == "time"
         else (getattr(data, name).ctypes.data, one.start, one.stop - one.start)
         for name, one in parts
@@ -92,7 +91,7 @@ def lane(physics: MujocoPhysics, data: mujoco.MjData, fields: Mapping[str, np.nd
 
 def _address(model: mujoco.MjModel, name: str) -> int:
     """Address of a field of a model."""
-    return model._address + offset("mjModel", name) if name.startswith("opt.") else field_of(model, name).ctypes.data
+    return address_of(model, name) if name.startswith("opt.") else field_of(model, name).ctypes.data
 
 
 @internal
