@@ -10,7 +10,8 @@ from codrl_mj.agents.tile_coding import TileCoder
 from codrl_mj.envs import ActuatedVectorEnv
 from codrl_mj.envs.compiled import arguments, compiled_kernels
 from codrl_mj.envs.sb3 import ActuatedVecEnv
-from codrl_mj.physics import Signals, signal_names, trace_names
+from codrl_mj.envs.views import signals_of
+from codrl_mj.physics import Signals
 
 
 class Ended(NamedTuple):
@@ -93,10 +94,8 @@ class CompiledEpisodes:
         )
         if not fine:
             self._physics.check_finite()
-        setup = vector.setup
-        columns = dict(zip(trace_names(setup.family), self._record[:length].T.copy(), strict=True))
-        columns["saturated"] = columns.get("saturated", np.zeros(length)) != 0.0
-        signals = setup.signals({name: columns[name] for name in signal_names(setup.family)})
+        setup, columns = vector.setup, self._record[:length].T.copy()
+        signals = signals_of(columns[1:], setup.family, columns[0], setup.commands.tracks)
         observations, infos = self.env.conclude(observation, total, length, not terminated, signals)
         return Ended(length, observations, infos, total, signals)
 
