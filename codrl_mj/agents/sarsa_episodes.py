@@ -56,7 +56,7 @@ class CompiledEpisodes:
             type(env) is ActuatedVecEnv
             and isinstance(env.env, ActuatedVectorEnv)
             and env.num_envs == 1
-            and env.env.setup.randomization is None
+            and not env.env.setup.randomization.names
             and len(env.env.task.motors) == 1
             and env.env.max_episode_steps is not None
         )

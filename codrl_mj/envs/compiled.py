@@ -125,7 +125,7 @@ def compiled_env(env: Any) -> CompiledEnv | None:
         ValueError: a function of the task's is not what numba compiles.
     """
     setup, physics = env.setup, env.physics
-    if physics.compiled is None or setup.randomization is not None:
+    if physics.compiled is None or setup.randomization.names:
         return None
     kernels, task = compiled_kernels(setup, physics), setup.task
     compiled_function(task.initial_state, task.state_names, "Task.state_names", types.float64[::1])

@@ -137,9 +137,9 @@ class EnvConfig:
         return names_of(self.actuators, self.world.paper)
 
     @property
-    def distributions(self) -> dict[str, Distribution] | None:
-        """What is drawn at every reset, in this order; None if nothing is."""
-        return None if self.randomize is None else paths_of(self.randomize)
+    def distributions(self) -> dict[str, Distribution]:
+        """What is drawn at every reset, in this order."""
+        return paths_of(self.randomize)
 
     @property
     def time_limit(self) -> int | None:
@@ -174,7 +174,7 @@ class EnvConfig:
     def as_arguments(self) -> dict[str, Any]:
         """The keyword arguments for `gymnasium.make` with a task's id, without those left at their defaults."""
         names = [name for name in self.world.fields if name not in ("task", "options")]
-        arguments = {name: getattr(self, name) for name in names} | {"randomize": self.distributions}
+        arguments = {name: getattr(self, name) for name in names} | {"randomize": self.distributions or None}
         given = {name: value for name, value in arguments.items() if value is not None and value not in (OFF, PLAIN)}
         return given | self.world.changed(self.options)
 

@@ -190,11 +190,13 @@ def paths_of(randomize: Any) -> dict[str, Distribution]:
 
     Args:
         randomize: a mapping of paths to distributions or their text, of patterns to such mappings, or a sequence of
-            'PATH=DISTRIBUTION'; a path is FIELD, PATTERN:FIELD or model.FIELD.
+            'PATH=DISTRIBUTION'; a path is FIELD, PATTERN:FIELD or model.FIELD. None is for nothing.
 
     Raises:
         ValueError: it is neither or empty, a path is named twice, or a distribution is none.
     """
+    if randomize is None:
+        return {}
     if isinstance(randomize, str) or not isinstance(randomize, Mapping | list | tuple) or not randomize:
         raise ValueError(
             f"randomize = {randomize!r}: must be one or more of FIELD=DISTRIBUTION, or a mapping of fields to these"

@@ -62,19 +62,13 @@ class Motors:
         self.action_space = self._commands.action_space
         self.controls = self._commands.controls
         """(one of `action_space`) -> the environment's own action, as it arrives."""
-        self.draws: Draws | None = None
-        if randomize is not None:
-            fixed = [fixed_by(meant[index], action) if index in meant else {} for index in nominal]
-            bare, distributions = without_motors(model, nominal), paths_of(randomize)
-            self.draws = Draws(
-                Randomization.build(
-                    distributions, bare, nominal, fixed, model.opt.timestep, allow_unstable, "the model"
-                ),
-                [list(nominal.values())],
-                functools.partial(put_into, self),
-            )
-        drawn = self.draws is not None and self.draws.randomization.random
-        self._random = disturbances.random or drawn or any(one.random for one in nominal.values())
+        fixed = [fixed_by(meant[index], action) if index in meant else {} for index in nominal]
+        bare, timestep = without_motors(model, nominal) if randomize else model, model.opt.timestep
+        randomization = Randomization.build(
+            paths_of(randomize), bare, nominal, fixed, timestep, allow_unstable, "the model"
+        )
+        self.draws = Draws(randomization, [list(nominal.values())], functools.partial(put_into, self))
+        self._random = disturbances.random or randomization.random or any(one.random for one in nominal.values())
         self.names = motor_names(model, self.present)
         """What the motors are called."""
         self.families = {name: _family(one) for name, one in zip(self.names, self.present.values(), strict=True)}
@@ -102,8 +96,7 @@ class Motors:
         Raises:
             ValueError: nothing stable was drawn.
         """
-        if self.draws is not None:
-            self.draws.draw(lambda rows, count: generator.random((len(rows), count)), np.zeros(1, dtype=int))
+        self.draws.draw(lambda rows, count: generator.random((len(rows), count)), np.zeros(1, dtype=int))
 
     def begin(self, generator: np.random.Generator) -> None:
         """Bring all to rest after a reset: motors, with keys of their own for noise, and commands on their way."""
@@ -153,17 +146,16 @@ class Motors:
     @property
     def randomization(self) -> dict[str, Any]:
         """What the present episode was drawn with, as `info` says; empty if nothing was."""
-        return {} if self.draws is None else self.draws.report()
+        return self.draws.report()
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """What it remembers besides the simulation's state: commands on their way, and draws."""
         found = {name: memory.copy() for name, memory in self._commands.memory.items()}
-        return found | ({} if self.draws is None else self.draws.snapshot())
+        return found | self.draws.snapshot()
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
         """Bring that back, motors and model too; to be followed by a restoring of the simulation."""
-        if self.draws is not None:
-            self.draws.restore(snapshot)
+        self.draws.restore(snapshot)
         for name, memory in self._commands.memory.items():
             memory[:] = snapshot[name]
 

@@ -203,7 +203,10 @@ class Randomization:
 
 
 class Draws:
-    """The drawn values of N simulations, as arrays, and their way into these; a single environment has one."""
+    """The drawn values of N simulations, as arrays, and their way into these; a single environment has one.
+
+    Where nothing is drawn, it has nothing to say and nothing to keep.
+    """
 
     def __init__(
         self,
@@ -228,6 +231,8 @@ class Draws:
         Raises:
             ValueError: nothing stable was drawn.
         """
+        if not self.randomization.names:
+            return
         self._values[rows], self._rejected[rows] = self.randomization.draw(
             lambda pending, count: random(rows[pending], count), [each[rows] for each in self._nominal]
         )
@@ -235,9 +240,9 @@ class Draws:
 
     def motors(self, row: int = 0, nominal: Sequence[ActuatorModel] | None = None) -> tuple[ActuatorModel, ...]:
         """What is drawn of a simulation's motors, or of others in their place."""
-        nominal = self._motors[row] if nominal is None else nominal
-        undrawn = np.isnan(self._values[row]).any()
-        return tuple(nominal) if undrawn else self.randomization.replaced(nominal, self._values[row])
+        nominal, values = self._motors[row] if nominal is None else nominal, self._values[row]
+        drawn = len(values) and not np.isnan(values).any()
+        return self.randomization.replaced(nominal, values) if drawn else tuple(nominal)
 
     def parameters(self, rows: np.ndarray) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
         """Of some simulations' motors: the numbers of each (m, p), arms [m] (m, n), and additions (m, n, 3)."""
@@ -264,10 +269,12 @@ class Draws:
         for (path, kind), value in zip(self.randomization.types.items(), self._values[row], strict=True):
             pattern, field = split_path(path)
             (found.setdefault(pattern, {}) if pattern else found)[field] = np.nan if np.isnan(value) else kind(value)
-        return found | {"rejected": int(self._rejected[row])}
+        return found | {"rejected": int(self._rejected[row])} if found else {}
 
     def infos(self, rows: np.ndarray) -> dict[str, Any]:
         """The same of a vector environment's simulations, as Gymnasium's vector infos: nested, with masks."""
+        if not self.randomization.names:
+            return {}
         mask = np.zeros(len(self._values), dtype=bool)
         mask[rows] = True
         report: dict[str, Any] = {}
@@ -281,16 +288,18 @@ class Draws:
     def present(self) -> dict[str, np.ndarray]:
         """The values in use by path, and the number of rejected sets, each of shape (N,); NaN before a reset."""
         columns = dict(zip(self.randomization.names, self._values.T.copy(), strict=True))
-        return columns | {"rejected": self._rejected.copy()}
+        return columns | {"rejected": self._rejected.copy()} if columns else {}
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """What `restore` needs."""
-        return {"drawn": self._values.copy(), "rejected": self._rejected.copy()}
+        kept = {"drawn": self._values.copy(), "rejected": self._rejected.copy()}
+        return kept if self.randomization.names else {}
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
         """Bring back the values, and the simulations to them; to be followed by a restoring of the simulations."""
-        self._values[:], self._rejected[:] = snapshot["drawn"], snapshot["rejected"]
-        self._put(self, np.arange(len(self._values)))
+        if self.randomization.names:
+            self._values[:], self._rejected[:] = snapshot["drawn"], snapshot["rejected"]
+            self._put(self, np.arange(len(self._values)))
 
 
 def put_into(simulation: Any, draws: Draws, rows: np.ndarray) -> None:

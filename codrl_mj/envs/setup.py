@@ -9,14 +9,13 @@ import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, Family
 from codrl_mj.actuators.noise import LARGEST_KEY
-from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint
+from codrl_mj.disturbances import Disturbances, Joint
 from codrl_mj.engine.reading import check_shafts
 from codrl_mj.envs.commands import TaskCommands
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.randomization import Draws, Randomization, put_into
 from codrl_mj.envs.views import View
 from codrl_mj.physics import Physics
-from codrl_mj.physics.base import check_integrator, inner_step_count
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.registry import find_physics
 from codrl_mj.physics.variation import bare_model
@@ -39,11 +38,11 @@ class Setup:
     """What actions stand for."""
     view: View
     """What the agent gets of states."""
-    randomization: Randomization | None = None
-    """What is drawn at every reset; None if nothing is."""
-    disturbances: Disturbances = OFF
+    randomization: Randomization
+    """What is drawn at every reset."""
+    disturbances: Disturbances
     """Imperfections of the commands' way, and load pulses."""
-    joint: Joint = PLAIN
+    joint: Joint
     """What is added to the actuated joints."""
 
     @classmethod
@@ -53,35 +52,26 @@ class Setup:
         Raises:
             ValueError: fields do not go with each other; or the loop is unstable.
         """
-        definition, actuators = find_task(config.task), config.actuators
-        count = inner_step_count(definition, actuators[0], config.inner_steps, config.timestep)
-        timestep, drawn = definition.step_duration / count, config.distributions
-        commands = TaskCommands.build(definition, actuators, config.action, config.levels)
-        randomization = None
-        if drawn is not None:
-            bare, name = bare_model(definition.name, config.joint), definition.name
-            motors = {
-                bare.actuator(motor).id: one for motor, one in zip(definition.motors, commands.simulated, strict=True)
-            }
-            fixed = [commands.fixed] * len(motors)
-            randomization = Randomization.build(drawn, bare, motors, fixed, timestep, config.allow_unstable, name)
-        checked = randomization is not None and randomization.draws_actuator  # then every draw is
-        for one in commands.simulated if not checked else ():
-            one.check_at(timestep, config.allow_unstable)
-        if any(one.INERTIA for one in commands.simulated):
-            model = task_model(definition, commands.simulated, timestep, commands.max_forces, joint=config.joint)
+        task = find_task(config.task)
+        steps = task.steps_within(config.actuators[0], config.inner_steps, config.timestep)
+        timestep, integrator = task.step_duration / steps, task.integrator(config.integrator)
+        commands = TaskCommands.build(task, config.actuators, config.action, config.levels)
+        simulated = commands.simulated
+        view = View.build(task, config.options, type(simulated[0]), config.observe_actuator)
+
+        bare = bare_model(task.name, config.joint)
+        motors = {bare.actuator(name).id: one for name, one in zip(task.motors, simulated, strict=True)}
+        drawn, fixed = config.distributions, [commands.fixed] * len(motors)
+        randomization = Randomization.build(drawn, bare, motors, fixed, timestep, config.allow_unstable, task.name)
+
+        if not randomization.draws_actuator:  # else every draw is checked
+            for one in simulated:
+                one.check_at(timestep, config.allow_unstable)
+        if any(one.INERTIA for one in simulated):
+            model = task_model(task, simulated, timestep, commands.max_forces, joint=config.joint)
             check_shafts(model, config.allow_unstable, held=config.physics == "analytic")
-        return cls(
-            task=definition,
-            actuators=actuators,
-            inner_steps=count,
-            integrator=check_integrator(definition, config.integrator),
-            commands=commands,
-            view=View.build(definition, config.options, type(commands.simulated[0]), config.observe_actuator),
-            randomization=randomization,
-            disturbances=config.disturbances,
-            joint=config.joint,
-        )
+        rest = config.disturbances, config.joint
+        return cls(task, config.actuators, steps, integrator, commands, view, randomization, *rest)
 
     @property
     def arm_radii(self) -> np.ndarray:
@@ -114,7 +104,7 @@ class Setup:
             disturbances=self.disturbances,
             joint=self.joint,
         )
-        if made.scene is None and self.randomization is not None and self.randomization.variation is not None:
+        if made.scene is None and self.randomization.variation is not None:
             names = ", ".join(self.randomization.in_model)
             raise ValueError(
                 f"physics = {physics!r}: cannot draw {names}: Gymnasium's environments share no names for masses, "
@@ -122,33 +112,23 @@ class Setup:
             )
         return made
 
-    def draws(self, physics: Physics) -> Draws | None:
-        """What a simulation is to be drawn with; None if nothing is."""
-        put = functools.partial(put_into, physics)
-        return None if self.randomization is None else Draws(self.randomization, [self.commands.simulated], put)
+    def draws(self, physics: Physics) -> Draws:
+        """What a simulation is drawn with."""
+        return Draws(self.randomization, [self.commands.simulated], functools.partial(put_into, physics))
 
     def start(
-        self,
-        physics: Physics,
-        generator: np.random.Generator,
-        options: dict[str, Any] | None,
-        draws: Draws | None = None,
-    ) -> tuple[Any, dict[str, Any]]:
+        self, physics: Physics, generator: np.random.Generator, options: dict[str, Any] | None, draws: Draws
+    ) -> None:
         """Start an episode: draw the initial state and then, if anything is randomised, actuator and model.
 
-        Disturbances and sensors that are random draw the key of their numbers last. The episode's actuator is returned,
-        and what `info` says of the draw; `draws` remembers it.
+        Disturbances and sensors that are random draw the key of their numbers last.
 
         Raises:
             ValueError: no stable current loop was drawn.
         """
         initial = self.task.initial(generator, options)
-        actuator, info, draws = self.actuator, {}, draws or self.draws(physics)
-        if draws is not None:
-            draws.draw(lambda rows, count: generator.random((len(rows), count)), np.zeros(1, dtype=int))
-            actuator, info = alone(draws.motors(0, self.actuators)), {"randomization": draws.report()}
+        draws.draw(lambda rows, count: generator.random((len(rows), count)), np.zeros(1, dtype=int))
         physics.reset(initial, float(self.keys(lambda count: generator.random((1, count)))[0]))
-        return actuator, info
 
     @functools.cached_property
     def initial_bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -158,7 +138,7 @@ class Setup:
     @functools.cached_property
     def random(self) -> bool:
         """Whether an episode's disturbances or sensors need a key."""
-        drawn = self.randomization is not None and self.randomization.random
+        drawn = self.randomization.random
         return self.disturbances.random or drawn or any(one.random for one in self.commands.simulated)
 
     def keys(self, random: Callable[[int], np.ndarray]) -> np.ndarray:

@@ -73,7 +73,6 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         """
         self.setup = Setup.build(EnvConfig.of(task, actuator, arguments))
         self.physics = self.setup.simulate(physics)
-        self._actuator = self.setup.actuator
         self._draws = self.setup.draws(self.physics)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.setup.task.render_fps}
@@ -99,12 +98,12 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     @property
     def actuator(self) -> Any:
         """The actuator, of the present episode where it is drawn; with several motors a tuple of them."""
-        return self._actuator
+        return alone(self._draws.motors(0, self.setup.actuators))
 
     @property
     def motors(self) -> dict[int, Any]:
         """The actuators of the present episode, by the number of the task's motor."""
-        return dict(enumerate(self._actuator if isinstance(self._actuator, tuple) else [self._actuator]))
+        return dict(enumerate(self._draws.motors(0, self.setup.actuators)))
 
     @property
     def model(self) -> Any:
@@ -175,11 +174,12 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
             options: Gymnasium's reset options for the task (CartPole: the bounds `low` and `high`).
         """
         super().reset(seed=seed)
-        self._actuator, info = self.setup.start(self.physics, self.np_random, options, self._draws)
+        self.setup.start(self.physics, self.np_random, options, self._draws)
         seen = self.physics.observed(np.zeros_like(self.physics.trace[-1])) if self.setup.view.sensors else None
         if self.render_mode == "human":
             self.render()
-        return self.setup.view.observation(self.physics.state, seen), info
+        drawn = self.randomization
+        return self.setup.view.observation(self.physics.state, seen), {"randomization": drawn} if drawn else {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advance by one environment step.
@@ -227,7 +227,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     @property
     def randomization(self) -> dict[str, Any]:
         """What the present episode was drawn with, as in the reset's info: NaN before it, empty without draws."""
-        return {} if self._draws is None else self._draws.report()
+        return self._draws.report()
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Everything that the future depends on, as plain arrays: simulation, motor, generator, what was drawn.
@@ -241,9 +241,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         }
         if self.physics.memory.size:
             everything["disturbances"] = self.physics.memory.copy()
-        if self._draws is not None:
-            everything |= {name: np.array(rows[0]) for name, rows in self._draws.snapshot().items()}
-        return everything
+        return everything | {name: np.array(rows[0]) for name, rows in self._draws.snapshot().items()}
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
         """Continue from what `snapshot` returned, bit for bit, in an environment made with the same arguments.
@@ -253,9 +251,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
                 changed.
         """
         check_snapshot(snapshot, self.snapshot(), "task")
-        if self._draws is not None:
-            self._draws.restore(snapshot)
-            self._actuator = alone(self._draws.motors(0, self.setup.actuators))
+        self._draws.restore(snapshot)
         self.physics.restore(snapshot["physics"])
         self.physics.memory[:] = snapshot.get("disturbances", 0.0)
         self.np_random = generator_of(snapshot["generator"])

@@ -121,10 +121,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._streams = Streams(self.num_envs)
-        self._draws = None
-        if self.setup.randomization is not None:
-            put = functools.partial(put_into_batch, self.physics)
-            self._draws = Draws(self.setup.randomization, actuators, put)
+        self._draws = Draws(self.setup.randomization, actuators, functools.partial(put_into_batch, self.physics))
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
         self._ended = np.zeros(self.num_envs, dtype=bool)
         self._observations: Array = np.zeros(self.observation_space.shape or (), dtype=np.float32)
@@ -203,7 +200,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
     @property
     def randomization(self) -> dict[str, Array]:
         """What the present episodes were drawn with: shape (N,) for every field, and how many sets were `rejected`."""
-        return {} if self._draws is None else self._draws.present()
+        return self._draws.present()
 
     @property  # type: ignore[misc]
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
@@ -251,15 +248,12 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         low, high = self.setup.task.bounds(options) if options else self.setup.initial_bounds
         draws = low + (high - low) * self._streams.random(rows, len(low))
         states = self.setup.task.initial_states(draws)
-        infos: dict[str, Any] = {}
-        if self._draws is not None:
-            self._draws.draw(self._streams.random, rows)
-            infos = self._draws.infos(rows)
+        self._draws.draw(self._streams.random, rows)
         self.physics.reset(rows, states, self.setup.keys(lambda count: self._streams.random(rows, count)))
         self.physics.observe(self._compiled()[0].observe_rows, rows, self._observations)
         self._elapsed[rows] = 0
         self._ended[rows] = False
-        return infos
+        return self._draws.infos(rows)
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Advance every environment by one step.
@@ -364,7 +358,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         }
         if self.physics.memory.size:
             everything["disturbances"] = self.physics.memory.copy()
-        return everything | ({} if self._draws is None else self._draws.snapshot())
+        return everything | self._draws.snapshot()
 
     def restore(self, snapshot: Mapping[str, Array]) -> None:
         """Continue from what `snapshot` returned, bit for bit.
@@ -373,8 +367,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             ValueError: the snapshot is of another number of environments, or of another task.
         """
         check_snapshot(snapshot, self.snapshot())
-        if self._draws is not None:
-            self._draws.restore(snapshot)
+        self._draws.restore(snapshot)
         self.physics.restore(snapshot["physics"])
         self._streams.set_state(snapshot["streams"])
         self._elapsed[:], self._ended[:] = snapshot["elapsed"], snapshot["ended"]
@@ -399,8 +392,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             return None
         if self._renderer is None:
             self._renderer = OffscreenRenderer(self.physics.model, **self._view)  # type: ignore[arg-type]
-        if self._draws is not None:
-            write_fields(self.physics.model, self._draws.model_fields(np.array([row]), drawn=True))
+        write_fields(self.physics.model, self._draws.model_fields(np.array([row]), drawn=True))
         write_fields(self.physics.model, self._looks, row)
         self.physics.show(row)
         return self._renderer.render(self.physics.data)

@@ -1,13 +1,11 @@
 """The small interface behind which a task is simulated."""
 
-import math
-import numbers
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 
-from codrl_mj.actuators import ActuatorModel, Family, Ideal
+from codrl_mj.actuators import ActuatorModel, Family
 from codrl_mj.tasks import Task
 
 Signals = dict[str, Any]
@@ -148,41 +146,3 @@ def diverged(who: str, time: float, broken: str, step: str = "inner_steps") -> S
         f"{who}: the simulation diverged at t = {time:g} s: {broken}. Reset the environment; if this repeats, "
         f"shorten the integration step ({step}) or lower the gains"
     )
-
-
-def inner_step_count(task: Task, actuator: ActuatorModel, inner_steps: int | None, timestep: float | None) -> int:
-    """Integration steps in one environment step: their number, by the step [s], or the task's default for an actuator.
-
-    Raises:
-        ValueError: both were given, the number is below 1, or the timestep does not divide the environment step.
-    """
-    if inner_steps is not None and timestep is not None:
-        raise ValueError(f"inner_steps = {inner_steps} and timestep = {timestep:g}: give one of them, not both")
-    if timestep is not None:
-        if not (math.isfinite(timestep) and timestep > 0):
-            raise ValueError(f"timestep = {timestep}: must be a finite number > 0 [s]")
-        count = round(task.step_duration / timestep)
-        if count < 1 or not math.isclose(count * timestep, task.step_duration, rel_tol=1e-9):
-            raise ValueError(
-                f"timestep = {timestep:g} s does not divide {task.name}'s environment step of "
-                f"{task.step_duration:g} s: the ratio is {task.step_duration / timestep:.6g}, must be an integer >= 1"
-            )
-        return count
-    if inner_steps is None:
-        return task.ideal_inner_steps if isinstance(actuator, Ideal) else task.motor_inner_steps
-    if isinstance(inner_steps, bool) or not isinstance(inner_steps, numbers.Integral) or inner_steps < 1:
-        raise ValueError(f"inner_steps = {inner_steps!r}: must be an integer >= 1")
-    return int(inner_steps)
-
-
-def check_integrator(task: Task, integrator: str | None) -> str:
-    """The integrator's name, defaulting to Gymnasium's.
-
-    Raises:
-        ValueError: the task has no such integrator.
-    """
-    if integrator is None:
-        return task.integrators[0]
-    if integrator not in task.integrators:
-        raise ValueError(f"integrator = {integrator!r}: {task.name} has {', '.join(task.integrators)}")
-    return integrator

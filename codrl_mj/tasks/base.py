@@ -1,6 +1,8 @@
 """What a task is: a model file, a few numbers, and pure functions of a state's entries."""
 
 import functools
+import math
+import numbers
 from collections import UserDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -11,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 
 from codrl_mj import fields
-from codrl_mj.actuators import Actuator
+from codrl_mj.actuators import Actuator, ActuatorModel, Ideal
 from codrl_mj.tasks.assets import asset_path
 from codrl_mj.tasks.attributes import Attribute
 from codrl_mj.tasks.checks import check_fields, check_functions, check_layout
@@ -173,6 +175,41 @@ class Task:
     def max_forces(self) -> np.ndarray:
         """Largest desired forces [N] or torques [N*m], shape (n,)."""
         return np.broadcast_to(np.array(self.max_force, dtype=np.float64), (len(self.motors),)).copy()
+
+    def steps_within(self, actuator: ActuatorModel, inner_steps: int | None, timestep: float | None) -> int:
+        """Integration steps in an environment step: their number, by the step [s], or the default for an actuator.
+
+        Raises:
+            ValueError: both were given, the number is below 1, or the timestep does not divide the environment step.
+        """
+        if inner_steps is not None and timestep is not None:
+            raise ValueError(f"inner_steps = {inner_steps} and timestep = {timestep:g}: give one of them, not both")
+        if timestep is not None:
+            if not (math.isfinite(timestep) and timestep > 0):
+                raise ValueError(f"timestep = {timestep}: must be a finite number > 0 [s]")
+            count = round(self.step_duration / timestep)
+            if count < 1 or not math.isclose(count * timestep, self.step_duration, rel_tol=1e-9):
+                raise ValueError(
+                    f"timestep = {timestep:g} s does not divide {self.name}'s environment step of "
+                    f"{self.step_duration:g} s: the ratio is {self.step_duration / timestep:.6g}, must be an "
+                    "integer >= 1"
+                )
+            return count
+        if inner_steps is None:
+            return self.ideal_inner_steps if isinstance(actuator, Ideal) else self.motor_inner_steps
+        if isinstance(inner_steps, bool) or not isinstance(inner_steps, numbers.Integral) or inner_steps < 1:
+            raise ValueError(f"inner_steps = {inner_steps!r}: must be an integer >= 1")
+        return int(inner_steps)
+
+    def integrator(self, name: str | None) -> str:
+        """An integrator's name; Gymnasium's if none is given.
+
+        Raises:
+            ValueError: the task has no such integrator.
+        """
+        if name is not None and name not in self.integrators:
+            raise ValueError(f"integrator = {name!r}: {self.name} has {', '.join(self.integrators)}")
+        return name or self.integrators[0]
 
     @functools.cached_property
     def speeds(self) -> tuple[int, ...]:

@@ -7,7 +7,6 @@ import numpy as np
 
 from codrl_mj.actuators import Actuator, ActuatorModel, CurrentLoop, spectral_radius
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, trace_names
-from codrl_mj.physics.base import inner_step_count
 from codrl_mj.tasks import Task, resolve_actuators
 from codrl_mj.tasks.trials import Trials
 
@@ -62,7 +61,7 @@ def both(
     task: Task, actuator: ActuatorModel, integrator: str, max_force: float | None = None
 ) -> tuple[MujocoPhysics, AnalyticPhysics]:
     """The task in MuJoCo, and on Gymnasium's equations; `max_force` changes MuJoCo's limit of the desired force."""
-    steps = inner_step_count(task, actuator, None, None)
+    steps = task.steps_within(actuator, None, None)
     limits = None if max_force is None else np.array([max_force])
     return (
         MujocoPhysics(task, [actuator], steps, integrator, limits),

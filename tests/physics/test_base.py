@@ -5,22 +5,22 @@ import pytest
 
 from codrl_mj.actuators import IDEAL, Actuator, Inputs
 from codrl_mj.physics import SimulationDivergedError
-from codrl_mj.physics.base import check_finite, check_integrator, inner_step_count
+from codrl_mj.physics.base import check_finite
 from codrl_mj.physics.registry import PHYSICS
 from codrl_mj.tasks import TASKS
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_the_default_is_the_papers_inner_loop_with_a_motor_and_gymnasiums_step_without(task):
-    assert inner_step_count(task, Actuator(), None, None) == task.motor_inner_steps
-    assert inner_step_count(task, IDEAL, None, None) == (10 if task.name == "furuta" else 1)
+    assert task.steps_within(Actuator(), None, None) == task.motor_inner_steps
+    assert task.steps_within(IDEAL, None, None) == (10 if task.name == "furuta" else 1)
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 10, 1000])
 def test_a_timestep_that_divides_the_environment_step_gives_their_ratio(task, count):
-    assert inner_step_count(task, IDEAL, None, task.step_duration / count) == count
-    assert inner_step_count(task, IDEAL, count, None) == count
+    assert task.steps_within(IDEAL, None, task.step_duration / count) == count
+    assert task.steps_within(IDEAL, count, None) == count
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
@@ -28,7 +28,7 @@ def test_a_timestep_that_divides_the_environment_step_gives_their_ratio(task, co
 def test_a_timestep_that_does_not_divide_is_refused_with_both_numbers(task, ratio):
     timestep = task.step_duration / ratio
     with pytest.raises(ValueError, match="does not divide") as refused:
-        inner_step_count(task, IDEAL, None, timestep)
+        task.steps_within(IDEAL, None, timestep)
     for number in (timestep, task.step_duration):
         assert f"{number:g} s" in str(refused.value)
     assert f"the ratio is {ratio:.6g}, must be an integer >= 1" in str(refused.value)
@@ -37,28 +37,28 @@ def test_a_timestep_that_does_not_divide_is_refused_with_both_numbers(task, rati
 @pytest.mark.parametrize("timestep", [0.0, -0.01, np.nan, np.inf])
 def test_a_timestep_that_is_no_duration_is_refused(timestep):
     with pytest.raises(ValueError, match=f"timestep = {timestep}: must be a finite number > 0"):
-        inner_step_count(TASKS["cartpole"], IDEAL, None, timestep)
+        TASKS["cartpole"].steps_within(IDEAL, None, timestep)
 
 
 @pytest.mark.parametrize("inner_steps", [0, -1, 1.5, 2.0, True, "2", np.nan])
 def test_inner_steps_that_are_no_count_are_refused(inner_steps):
     with pytest.raises(ValueError, match=r"inner_steps = .*: must be an integer >= 1") as refused:
-        inner_step_count(TASKS["cartpole"], IDEAL, inner_steps, None)
+        TASKS["cartpole"].steps_within(IDEAL, inner_steps, None)
     assert repr(inner_steps) in str(refused.value)
 
 
 def test_both_at_once_are_refused_with_both_numbers():
     with pytest.raises(ValueError, match=r"inner_steps = 2 and timestep = 0\.01: give one of them"):
-        inner_step_count(TASKS["cartpole"], IDEAL, 2, 0.01)
+        TASKS["cartpole"].steps_within(IDEAL, 2, 0.01)
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_the_default_integrator_is_the_first_and_others_are_refused_with_the_choice(task):
-    assert check_integrator(task, None) == task.integrators[0]
+    assert task.integrator(None) == task.integrators[0]
     for name in task.integrators:
-        assert check_integrator(task, name) == name
+        assert task.integrator(name) == name
     with pytest.raises(ValueError, match=f"integrator = 'leapfrog': {task.name} has {', '.join(task.integrators)}"):
-        check_integrator(task, "leapfrog")
+        task.integrator("leapfrog")
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1.1e10, -1e39])
