@@ -80,10 +80,8 @@ def test_the_message_has_what_numba_says_of_it_and_where():
 
 def test_functions_that_a_function_calls_are_found():
     task = slips.task(terminated="plain(state)")
-    compiled = compiled_outcomes(task).terminated_all
-    ended = np.empty(2, dtype=bool)
-    compiled(np.array([[0.5, 0.0, 0.0], [1.5, 0.0, 0.0]]), ended)
-    assert ended.tolist() == [False, True]
+    terminated = compiled_outcomes(task).terminated
+    assert [terminated(np.array([position, 0.0, 0.0])) for position in (0.5, 1.5)] == [False, True]
 
 
 @pytest.mark.parametrize("face", but(["vector"], ["single", "vector", "training"]))

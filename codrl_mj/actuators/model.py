@@ -120,9 +120,9 @@ class ActuatorModel:
     """Whether what is asked of it is a position or a speed of the shaft, in [rad] or [rad/s], in place of a torque."""
 
     def __init_subclass__(cls, **named: Any) -> None:
-        """Know a family of ours by its name; anybody else's is found as `module:Class`."""
+        """Know a family of ours by its name, once; anybody else's is found as `module:Class`."""
         super().__init_subclass__(**named)
-        if cls.__module__.startswith("codrl_mj.actuators."):
+        if cls.__module__.startswith("codrl_mj.actuators.") and reference(cls) not in map(reference, BUILT_IN):
             BUILT_IN.append(cls)
             if name := vars(cls).get("family"):
                 FAMILIES[name] = cls

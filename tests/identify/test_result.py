@@ -12,6 +12,7 @@ from codrl_mj.actuators import Drive, identified_ranges, resolve
 from codrl_mj.cli import main
 from codrl_mj.cli.environments import environment
 from codrl_mj.cli.train import train_verb
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.identify.identify import checked, foreseen, identify
 from codrl_mj.identify.result import Estimate, Identified
 from codrl_mj.identify.segments import replaced
@@ -147,12 +148,12 @@ def test_the_command_line_identifies_and_draws_within_the_intervals(tmp_path, ca
     assert low < bench.RESISTANCE < high
     words = ["pendulum", "--actuator", actuator, "--env.randomize", "identified", "motor.inductance=uniform(1e-4,1e-3)"]
     verb = tyro.cli(train_verb(words), args=words)
-    config = environment(verb, "pendulum", verb.actuator_name)
+    config = environment(verb, "pendulum", verb.actuator_name, EnvConfig("pendulum"))
     assert config.randomize[0] == "motor.inductance=uniform(0.0001, 0.001)"
     assert f"motor.resistance=loguniform({low!r}, {high!r})" in config.randomize
     words[2] = "weak"
     verb = tyro.cli(train_verb(words), args=words)
     with pytest.raises(ValueError, match="identified: draws within the intervals of a file"):
-        environment(verb, "pendulum", verb.actuator_name)
+        environment(verb, "pendulum", verb.actuator_name, EnvConfig("pendulum"))
     assert main(["identify", log, "--columns", columns, "--known", "mgl"]) == 2
     assert "must be NAME=NUMBER" in capsys.readouterr().err
