@@ -23,7 +23,7 @@ sys.path.insert(0, str(ROOT / "examples"))  # where servo_arm is
 from codrl_mj.evaluation import evaluate  # noqa: E402
 from codrl_mj.runs.files import writing  # noqa: E402
 from codrl_mj.runs.policies import load_policy  # noqa: E402
-from codrl_mj.sizing import Choice, actuators_of, choose, demands_of  # noqa: E402
+from codrl_mj.sizing import Candidate, actuators_of, choose, demands_of  # noqa: E402
 from codrl_mj.training import TrainConfig, train  # noqa: E402
 
 SAC: dict[str, Any] = {"hidden": [64, 64], "batch_size": 128, "learning_starts": 2000, "learning_rate": 1e-3}
@@ -70,7 +70,7 @@ def _example(name: str, options: Any) -> None:
         agent = {**SAC, "learning_starts": min(SAC["learning_starts"], budget // 3), "name": "sac"}
         config = TrainConfig.from_mapping(
             {
-                "env": {"task": env_id, "actuators": actuators},
+                "env": {"task": env_id, "actuator": actuators},
                 "agent": agent,
                 "seed": seed,
                 "total_steps": budget,
@@ -90,7 +90,7 @@ def _example(name: str, options: Any) -> None:
     for (through, seed), path in runs.items():
         config = TrainConfig.from_mapping(json.loads((path / "config.json").read_text())["train"], whole=True)
         for tested in THROUGH:
-            env = dataclasses.replace(config.env, actuators=motors[tested])
+            env = dataclasses.replace(config.env, actuator=motors[tested])
             found = evaluate(load_policy(path), env, EPISODES, TEST_SEED)
             success = "" if found.success is None else found.success.mean
             heat = "" if found.copper_loss is None else round(found.copper_loss.mean, 2)
@@ -119,7 +119,7 @@ def _motors(folder: Path, ideal: Path) -> dict[str, Any]:
     return {name: yaml.safe_load(path.read_text()) for name, path in files.items()}
 
 
-def _smaller(ranked: list[Choice]) -> Choice:
+def _smaller(ranked: list[Candidate]) -> Candidate:
     """The strongest motor of less power than the first that lacks a third of the voltage or the current for it."""
     weaker = [one for one in ranked[1:] if one.power < ranked[0].power and one.feasibility.margin < -1 / 3]
     return max(weaker, key=lambda one: one.power) if weaker else ranked[-1]

@@ -21,7 +21,7 @@ from codrl_mj.cli.advise import Advise
 from codrl_mj.cli.evaluate import Evaluate
 from codrl_mj.cli.fields import with_environment
 from codrl_mj.cli.identify import Identify, identify_verb
-from codrl_mj.cli.motor import Motor
+from codrl_mj.cli.motor import MotorTools
 from codrl_mj.cli.parsing import parse, understood
 from codrl_mj.cli.render import Render
 from codrl_mj.cli.replay import Replay
@@ -31,7 +31,7 @@ from codrl_mj.cli.runs import Runs
 from codrl_mj.cli.study import Computed, Study
 from codrl_mj.cli.train import Train, train_verb
 from codrl_mj.cli.validate import Validate
-from codrl_mj.cli.view import View
+from codrl_mj.cli.view import LiveView
 from codrl_mj.runs.files import check_file, check_page, check_writable
 from codrl_mj.training import TrainingStoppedError
 
@@ -41,9 +41,9 @@ VERBS: dict[str, Any] = {
     "runs": Runs,
     "render": Render,
     "replay": Replay,
-    "view": View,
+    "view": LiveView,
     "report": Report,
-    "motor": Motor,
+    "motor": MotorTools,
     "advise": Advise,
     "identify": Identify,
     "validate": Validate,
@@ -57,7 +57,7 @@ _MADE: dict[str, Callable[[list[str]], Any]] = {
     "evaluate": functools.partial(with_environment, Evaluate),
     "render": functools.partial(with_environment, Render),
     "replay": functools.partial(with_environment, Replay),
-    "view": functools.partial(with_environment, View),
+    "view": functools.partial(with_environment, LiveView),
 }
 """Those whose flags depend on the rest of the command line."""
 

@@ -300,7 +300,7 @@ class New:
 
 
 @dataclasses.dataclass(frozen=True)
-class Motor:
+class MotorTools:
     """Motors that one can buy: list them, look at one, design its current loop, and see it step; or write one down.
 
     New writes a file to fill in with a datasheet, show says what the motor is and can do, design what its drive makes

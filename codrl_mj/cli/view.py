@@ -16,7 +16,7 @@ from codrl_mj.runs.layout import told_apart
 
 
 @dataclasses.dataclass(frozen=True)
-class View:
+class LiveView:
     """Watch a simulation live in a browser: pause, push, set motor, loop, supply and delay, see what the motors do.
 
     Example: codrl-mj view runs/cartpole-ppo-weaker-0, or codrl-mj view furuta (random actions).

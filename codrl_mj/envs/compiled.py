@@ -53,7 +53,7 @@ class Interface(NamedTuple):
 OPTIONS, RANDOM = len(Interface._fields), Interface._fields.index("random")
 
 
-class Steps(NamedTuple):
+class VectorStep(NamedTuple):
     """One environment step of many environments: what it is given, and what it fills."""
 
     forces: np.ndarray
@@ -88,7 +88,7 @@ class Kernels(NamedTuple):
     """(generator, low, high, observation, *arguments) -> nothing: starts an episode from a state that the numpy
     `Generator` draws between `low` and `high` (see `Task.bounds`), and fills the observation."""
     step_rows: Compiled
-    """(tally, rows at once, lane, rows, interface, `Steps`) -> nothing: `step` for every row; see
+    """(tally, rows at once, lane, rows, interface, `VectorStep`) -> nothing: `step` for every row; see
     `codrl_mj.physics.rows.share`."""
     observe_rows: Compiled
     """(which (m,), lane, rows, observations (N, k)) -> nothing: observes rows where episodes start."""
@@ -238,7 +238,7 @@ def _kernels(
 
     @compiled
     def step_rows(tally: np.ndarray, at_once: int, lane: Any, rows: Any, interface: np.ndarray, steps: Any) -> None:
-        steps, lane, rows = Steps(*steps), Lane(*lane), Rows(*rows)
+        steps, lane, rows = VectorStep(*steps), Lane(*lane), Rows(*rows)
         stepping, observations, signals, elapsed = steps.stepping, steps.observations, steps.signals, steps.elapsed
         model, data, settings, trace = lane.model, lane.data, lane.settings, lane.trace
         last, count = trace[len(trace) - 1], len(stepping)

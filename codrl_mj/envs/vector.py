@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 
 from codrl_mj.actuators import ActuatorModel, Ideal, check_same_family
 from codrl_mj.envs.attributes import GymnasiumAttributes, checked_states, read, shared, written
-from codrl_mj.envs.compiled import Kernels, Steps, arguments, compiled_kernels
+from codrl_mj.envs.compiled import Kernels, VectorStep, arguments, compiled_kernels
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.randomization import Draws, put_into_batch
 from codrl_mj.envs.setup import Setup
@@ -300,11 +300,11 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             infos = self._finish(infos)
         return self._observations.copy(), rewards, terminated, truncated, infos
 
-    def _steps(self, forces: Array, stepping: Array) -> Steps:
+    def _steps(self, forces: Array, stepping: Array) -> VectorStep:
         """Where a step of all environments goes to."""
         count, columns = self.num_envs, 1 + len(self.setup.family.Signals._fields)
         limit = np.inf if self.max_episode_steps is None else float(self.max_episode_steps)
-        return Steps(
+        return VectorStep(
             forces,
             stepping,
             self._observations,

@@ -1,7 +1,7 @@
 """Can this motor, with this gear and supply, do that task? Answered before anything is trained; docs/motors.md."""
 
 from codrl_mj.sizing.bounds import HOPELESS, SURELY, SURELY_NOT, TRY_IT, Bound, Feasibility, feasibility
-from codrl_mj.sizing.choice import Catalogued, Choice, actuators_of, catalogued, choose, geared
+from codrl_mj.sizing.choice import Candidate, Catalogued, actuators_of, catalogued, choose, geared
 from codrl_mj.sizing.demand import Demand, demand_of, demands_of, recorded
 from codrl_mj.sizing.operation import Operation, best_ratio, operation
 from codrl_mj.sizing.swing import Swing, least_gain, least_pumped, least_voltage
@@ -18,7 +18,7 @@ __all__ = [
     "SURELY_NOT",
     "HOPELESS",
     "TRY_IT",
-    "Choice",
+    "Candidate",
     "choose",
     "geared",
     "actuators_of",

@@ -37,7 +37,7 @@ class Catalogued(NamedTuple):
     """What its datasheet leaves open, and is not counted."""
 
 
-class Choice(NamedTuple):
+class Candidate(NamedTuple):
     """A motor of the catalogue at its best gear."""
 
     name: str
@@ -67,7 +67,7 @@ class Choice(NamedTuple):
         return 1.0 / self.drive.arm_radius
 
 
-def actuators_of(choices: Mapping[str, tuple[Choice, Demand]]) -> dict[str, Any]:
+def actuators_of(choices: Mapping[str, tuple[Candidate, Demand]]) -> dict[str, Any]:
     """What `codrl_mj.make` and `--actuators` take: pattern -> fields of the actuator.
 
     Args:
@@ -101,7 +101,7 @@ def catalogued(name: str, gear_ratio: float | None = None, voltage: float | None
 
 def choose(
     demand: Demand, motors: Sequence[str] | None = None, voltage: float | None = None, least_margin: float = MARGIN
-) -> list[Choice]:
+) -> list[Candidate]:
     """Motors at their best gears: those that do it, from the smallest; then the others by verdict and margin.
 
     A motor does it if voltage, largest current and heat hold with a margin, its heat is known, and it leaves to the
@@ -128,9 +128,9 @@ def choose(
         fixed = drive.motor.gear_ratio != 1.0 and not demand.linear
         best = drive if fixed else geared(drive, demand, continuous)
         found = feasibility(best, demand, continuous)
-        choices.append(Choice(name, best, unknown, found, _lacks(found, demand, continuous, least_margin)))
+        choices.append(Candidate(name, best, unknown, found, _lacks(found, demand, continuous, least_margin)))
 
-    def rank(choice: Choice) -> tuple[bool, int, float]:
+    def rank(choice: Candidate) -> tuple[bool, int, float]:
         found = choice.feasibility
         return choice.lacks != "", VERDICTS.index(found.verdict), -found.margin if choice.lacks else choice.power
 
