@@ -8,9 +8,10 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
 
+from codrl_mj.envs.setup import one_for_each
 from codrl_mj.envs.single import ActuatedEnv
 from codrl_mj.envs.snapshots import check_snapshot, elapsed_steps, set_elapsed_steps
-from codrl_mj.envs.vector import check_counts, one_for_each
+from codrl_mj.envs.vector import check_counts
 from codrl_mj.physics import Signals
 
 Array = np.ndarray

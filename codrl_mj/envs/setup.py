@@ -2,12 +2,12 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from codrl_mj.actuators import ActuatorModel, Family
+from codrl_mj.actuators import ActuatorModel, Family, Ideal, check_same_family
 from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.disturbances import Disturbances, Joint
 from codrl_mj.engine.reading import check_shafts
@@ -19,7 +19,7 @@ from codrl_mj.physics import Physics
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.registry import find_physics
 from codrl_mj.physics.variation import bare_model
-from codrl_mj.tasks import Task, find_task
+from codrl_mj.tasks import Task, find_task, resolve_actuators
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,3 +154,35 @@ class Setup:
 def alone(several: Sequence[Any]) -> Any:
     """The only one of several, or all of them as a tuple."""
     return several[0] if len(several) == 1 else tuple(several)
+
+
+def one_for_each(actuator: Any, task: str) -> bool:
+    """Whether it is a sequence of what each environment gets, and not what all get: such as one for each motor."""
+    listed = isinstance(actuator, Sequence) and not isinstance(actuator, str)
+    return listed and (len(find_task(task).motors) == 1 or all(isinstance(one, list | tuple) for one in actuator))
+
+
+def set_up_many(
+    num_envs: int, task: str, actuator: Any, arguments: Mapping[str, Any]
+) -> tuple[Setup, list[tuple[ActuatorModel, ...]]]:
+    """The set-up that many environments share, and the actuators to simulate, a tuple for each environment."""
+    if not one_for_each(actuator, task):
+        setup = Setup.build(EnvConfig.of(task, actuator, arguments))
+        return setup, [setup.commands.simulated] * num_envs
+    if len(actuator) != num_envs:
+        raise ValueError(f"actuator: {len(actuator)} actuators for {num_envs} environments: there must be one for each")
+    if arguments.get("action", "force") != "force":
+        raise ValueError(f"action = {arguments['action']!r}: with an actuator for each environment only 'force'")
+    setups: dict[Any, Setup] = {}
+    every: list[tuple[ActuatorModel, ...]] = []
+    for index, one in enumerate(actuator):
+        try:
+            every.append(resolve_actuators(one, find_task(task)))
+            if every[-1] not in setups:
+                setups[every[-1]] = Setup.build(EnvConfig.of(task, every[-1], arguments))
+        except ValueError as error:
+            raise ValueError(f"actuator[{index}]: {error}") from None
+        if isinstance(every[-1][0], Ideal):
+            raise ValueError(f"actuator[{index}] = {one!r}: must be an Actuator; the ideal one cannot be among others")
+    check_same_family([setup.actuators[0] for setup in setups.values()])
+    return dataclasses.replace(setups[every[0]]), every

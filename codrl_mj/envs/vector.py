@@ -1,6 +1,5 @@
 """Thousands of environments as one, on MuJoCo's batched simulation: Gymnasium's `VectorEnv`."""
 
-import dataclasses
 import functools
 import re
 from collections.abc import Mapping, Sequence
@@ -12,12 +11,10 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from codrl_mj.actuators import ActuatorModel, Ideal, check_same_family
 from codrl_mj.envs.attributes import GymnasiumAttributes, checked_states, read, shared, written
 from codrl_mj.envs.compiled import Kernels, VectorStep, arguments, compiled_kernels
-from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.randomization import Draws, put_into_batch
-from codrl_mj.envs.setup import Setup
+from codrl_mj.envs.setup import set_up_many
 from codrl_mj.envs.snapshots import check_snapshot
 from codrl_mj.envs.views import signals_of
 from codrl_mj.physics import Signals
@@ -25,7 +22,7 @@ from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
 from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
 from codrl_mj.physics.streams import Streams
 from codrl_mj.physics.variation import DRAWN, VARIED, field_of, write_fields
-from codrl_mj.tasks import Task, find_task, resolve_actuators
+from codrl_mj.tasks import Task
 
 Array = np.ndarray
 
@@ -97,7 +94,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             modes = ", ".join(self.metadata["render_modes"])
             raise ValueError(f"render_mode = {render_mode!r}: must be one of None, {modes}")
         self.num_envs = int(num_envs)
-        self.setup, actuators = _set_up(self.num_envs, task, actuator, arguments)
+        self.setup, actuators = set_up_many(self.num_envs, task, actuator, arguments)
         self.physics = MujocoBatchPhysics(
             self.setup.task,
             actuators,
@@ -427,42 +424,6 @@ def check_counts(num_envs: int, max_episode_steps: int | None, each: int = 3_000
             f"num_envs = {num_envs}: takes about {num_envs * each / 1e9:.3g} GB of memory, of which {room / 1e9:.3g} "
             f"are free: must be <= {room // each}"
         )
-
-
-def one_for_each(actuator: Any, task: str) -> bool:
-    """Whether it is a sequence of what each environment gets, and not what all get: such as one for each motor."""
-    listed = isinstance(actuator, Sequence) and not isinstance(actuator, str)
-    return listed and (len(find_task(task).motors) == 1 or all(isinstance(one, list | tuple) for one in actuator))
-
-
-def _set_up(
-    num_envs: int, task: str, actuator: Any, arguments: Mapping[str, Any]
-) -> tuple[Setup, list[tuple[ActuatorModel, ...]]]:
-    """The set-up shared by all environments, and the actuators to simulate, a tuple for each environment.
-
-    Raises:
-        ValueError: an argument is out of bounds, or the actuators are not one for each environment.
-    """
-    if not one_for_each(actuator, task):
-        setup = Setup.build(EnvConfig.of(task, actuator, arguments))
-        return setup, [setup.commands.simulated] * num_envs
-    if len(actuator) != num_envs:
-        raise ValueError(f"actuator: {len(actuator)} actuators for {num_envs} environments: there must be one for each")
-    if arguments.get("action", "force") != "force":
-        raise ValueError(f"action = {arguments['action']!r}: with an actuator for each environment only 'force'")
-    setups: dict[Any, Setup] = {}
-    every: list[tuple[ActuatorModel, ...]] = []
-    for index, one in enumerate(actuator):
-        try:
-            every.append(resolve_actuators(one, find_task(task)))
-            if every[-1] not in setups:
-                setups[every[-1]] = Setup.build(EnvConfig.of(task, every[-1], arguments))
-        except ValueError as error:
-            raise ValueError(f"actuator[{index}]: {error}") from None
-        if isinstance(every[-1][0], Ideal):
-            raise ValueError(f"actuator[{index}] = {one!r}: must be an Actuator; the ideal one cannot be among others")
-    check_same_family([setup.actuators[0] for setup in setups.values()])
-    return dataclasses.replace(setups[every[0]]), every
 
 
 def _infos(signals: Signals, stepping: Array) -> dict[str, Any]:
