@@ -1,14 +1,24 @@
-"""Functions that users write for tasks and families: called once before they are compiled, errors in one sentence."""
+"""What users write: modules that names stand for, and functions, called once before they are compiled.
 
+Errors in them are one sentence.
+"""
+
+import contextlib
+import contextvars
+import functools
+import importlib
 import inspect
+import itertools
 import numbers
 import re
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from codrl_mj import fields
 
 Form = Any
 """What a function is to return: the name of a number, or a tuple of forms."""
@@ -74,3 +84,87 @@ def not_compiled(function: Callable[..., Any], error: Exception) -> str:
     said = causes[-1] if causes else " ".join(lines[:2] if lines[0].endswith(":") else lines[:1])
     line = re.search(r'(?m)^\s*File ".+", line (\d+):', text)
     return f"{place(function, int(line[1]) if line else None)}: numba does not compile it: {said.strip()}"
+
+
+_TRUSTED = contextvars.ContextVar("trusted", default=True)
+
+
+@contextlib.contextmanager
+def trusting(trust: bool) -> Iterator[None]:
+    """While the block runs, let `module:NAME` import modules, or refuse it."""
+    token = _TRUSTED.set(trust)
+    try:
+        yield
+    finally:
+        _TRUSTED.reset(token)
+
+
+def load_module(text: str) -> Any:
+    """The module of `module:NAME`.
+
+    Raises:
+        ValueError: there is no such module, or it cannot be imported; or it may not be (`trusting`).
+    """
+    module = text.partition(":")[0]
+    if not _TRUSTED.get():
+        raise ValueError(
+            f"{text!r}: needs the module {module}, and importing it executes whatever its author put there. Pass "
+            "--trust (in Python: trust=True) if that author is you, or somebody whose programs you would run"
+        )
+    try:
+        return importlib.import_module(module)
+    except Exception as error:
+        if not module or (isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}.")):
+            raise ValueError(
+                f"{text!r}: {error}; must be module:NAME of a module that is installed or in the present folder, "
+                f"{Path.cwd()}; on the command line FILE.py:NAME does as well"
+            ) from None
+        frames, package = traceback.extract_tb(error.__traceback__), Path(__file__).parent
+        ours = [Path(frame.filename).is_relative_to(package) for frame in frames]
+        theirs = (frame for frame, own in zip(frames[::-1], ours[::-1], strict=True) if not own)
+        where = next(frame for frame in theirs if not frame.filename.startswith("<"))  # of what dataclasses make
+        said = str(error) if ours[-1] else f"importing {module} failed: {type(error).__name__}: {error}"
+        raise ValueError(f"{text!r}: {said} ({where.filename}, line {where.lineno})") from error
+
+
+def load_object(text: str) -> Any:
+    """What stands at `module:NAME`.
+
+    Raises:
+        ValueError: as for `load_module`, or there is nothing of that name in it.
+    """
+    module, name = load_module(text), text.partition(":")[2]
+    try:
+        return functools.reduce(getattr, name.split("."), module)
+    except AttributeError as error:
+        hint = fields.did_you_mean(name, vars(module)).rstrip() or "see"
+        raise ValueError(f"{text!r}: {error}; must be module:NAME; {hint} {getattr(module, '__file__', '')}") from None
+
+
+def look_up(
+    name: str,
+    known: Mapping[str, Any],
+    what: str,
+    anybodys: bool = True,
+    of: type | None = None,
+    others: Mapping[str, Iterable[str]] | None = None,
+) -> Any:
+    """What a name stands for: a value of `known`, which are ours, or, if `anybodys`, what stands at `module:NAME`.
+
+    Messages call it `what`. What is not ours has to be a subclass `of` a class, if one is given. `others` are names
+    that are known elsewhere, to be suggested but not listed, by what lists them.
+
+    Raises:
+        ValueError: unknown name; the nearest known ones are suggested. Or no such subclass, or as for `load_object`.
+    """
+    if isinstance(name, str) and name in known:
+        return known[name]
+    if anybodys and ":" in str(name):
+        found = load_object(name)
+        if of is None or (isinstance(found, type) and issubclass(found, of)):
+            return found
+        raise ValueError(f"{what} {name!r}: {found!r} is no subclass of codrl_mj's {of.__name__}")
+    hint = fields.did_you_mean(name, [*known, *itertools.chain(*(others or {}).values())])
+    listed = hint + "It can be" if hint else f"Known: {', '.join([*known, *(others or {})])}, or"
+    own = f"{listed} module:NAME of your own" if anybodys else hint or listed.removesuffix(", or")
+    raise ValueError(f"unknown {what} {name!r}: {own.rstrip()}")

@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).parent.parent / "codrl_mj"
 ALLOWED = {
     # a layer: a room, a module at the top, or a module that stands lower than its room -> the layers it may import
     "fields": set(),
-    "own_code": set(),
+    "own_code": {"fields"},
     "actuators": {"catalogue", "fields", "own_code"},
     "disturbances": {"actuators", "fields"},
     "tasks": {"actuators", "fields", "own_code", "tasks.assets"},
@@ -23,9 +23,9 @@ ALLOWED = {
     "__init__": {"plugin", "tasks"},
     "engine": {"actuators", "own_code", "plugin"},
     "specs": {"actuators", "engine", "fields", "plugin"},
-    "physics": {"actuators", "disturbances", "engine", "fields", "tasks", "tasks.assets"},
+    "physics": {"actuators", "disturbances", "engine", "fields", "own_code", "tasks", "tasks.assets"},
     "envs.distributions": {"fields"},
-    "envs.worlds": {"actuators", "specs", "tasks"},
+    "envs.worlds": {"actuators", "own_code", "specs", "tasks"},
     "envs.config": {"actuators", "disturbances", "envs.distributions", "envs.worlds", "fields"},
     "envs": {
         *("actuators", "disturbances", "engine", "envs.config", "envs.distributions", "envs.worlds", "fields"),
@@ -33,10 +33,10 @@ ALLOWED = {
     },
     "foreign": {
         *("actuators", "disturbances", "engine", "envs", "envs.config", "envs.distributions", "fields", "physics"),
-        *("envs.worlds", "specs", "tasks"),
+        *("envs.worlds", "own_code", "specs", "tasks"),
     },
     "suite": {"actuators", "envs", "envs.config", "physics", "tasks"},
-    "agents": {"actuators", "envs", "envs.config", "fields", "physics"},
+    "agents": {"actuators", "envs", "envs.config", "fields", "own_code", "physics"},
     "runs.files": set(),
     "runs.layout": set(),
     "runs.summaries": {"actuators", "envs.worlds", "runs.files", "runs.layout", "tasks"},

@@ -18,14 +18,7 @@ from codrl_mj.actuators.model import (
     UnstableError,
     family_name,
     family_number,
-    field_paths,
-    field_values,
-    options_of,
-    parameter_paths,
-    parameters_type,
     reference,
-    trusting,
-    unchecked,
 )
 from codrl_mj.actuators.named import (
     NAMED,
@@ -41,10 +34,19 @@ from codrl_mj.actuators.named import (
     names_of,
     resolve,
 )
+from codrl_mj.actuators.parameters import (
+    field_paths,
+    field_values,
+    options_of,
+    parameter_paths,
+    parameters_type,
+    unchecked,
+)
 from codrl_mj.actuators.sampled_loop import SampledLoop
 from codrl_mj.actuators.servo import Servo, ServoLoop
 from codrl_mj.actuators.stability import check_stable, spectral_radii, spectral_radius
 from codrl_mj.actuators.torque_speed import TorqueSpeed
+from codrl_mj.own_code import trusting
 
 __all__ = [
     "BUILT_IN",

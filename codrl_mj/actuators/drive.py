@@ -17,7 +17,8 @@ import numpy as np
 from codrl_mj.actuators import sampled, shaft, stability
 from codrl_mj.actuators.current_loop import Supply
 from codrl_mj.actuators.gear_motor import GearMotor
-from codrl_mj.actuators.model import ActuatorModel, Command, Inputs, JointAdditions, UnstableError, parameters_type
+from codrl_mj.actuators.model import ActuatorModel, Command, Inputs, JointAdditions, UnstableError
+from codrl_mj.actuators.parameters import parameters_type
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH, SampledLoop
 from codrl_mj.actuators.shaft import Heat, Means, Shaft, Winding
 from codrl_mj.fields import part

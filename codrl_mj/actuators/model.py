@@ -5,23 +5,26 @@ elsewhere: the doors into MuJoCo, the analytic physics, configuration files, the
 films and evaluations read it. docs/actuators.md builds one.
 """
 
-import contextlib
-import contextvars
 import dataclasses
 import functools
 import hashlib
-import importlib
-import itertools
 import math
-import traceback
-from collections import namedtuple
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from codrl_mj import fields
+from codrl_mj.actuators.parameters import (
+    as_kind,
+    family_of,
+    field_paths,
+    from_values,
+    is_arm,
+    parameter_paths,
+    parameters_type,
+    value_at,
+)
 from codrl_mj.own_code import Form, call, check_form, place
 
 
@@ -171,7 +174,7 @@ class ActuatorModel:
     @property
     def random(self) -> bool:
         """Whether an episode needs a key for its random numbers."""
-        return any(_get(self, path) != 0.0 for path in self.RANDOM)
+        return any(value_at(self, path) != 0.0 for path in self.RANDOM)
 
     @property
     def winding(self) -> tuple[float, float] | None:
@@ -246,7 +249,7 @@ class ActuatorModel:
     @property
     def numbers(self) -> tuple[float, ...]:
         """The parameters, in the order of `parameters_type`: what a model's `user` data hold."""
-        return tuple(float(_get(self, path)) for path in parameter_paths(_family(self)).values())
+        return tuple(float(value_at(self, path)) for path in parameter_paths(family_of(self)).values())
 
     @classmethod
     def from_numbers(cls, numbers: Any, arm_radius: float = 1.0) -> Any:
@@ -259,9 +262,9 @@ class ActuatorModel:
         Raises:
             ValueError: a number is out of its field's bounds.
         """
-        values = dict(zip(parameter_paths(_family(cls)).values(), map(float, numbers), strict=True))
-        values |= {path: arm_radius for path in field_paths(_family(cls)) if _is_arm(path)}
-        return _from_values(cls, values)
+        values = dict(zip(parameter_paths(family_of(cls)).values(), map(float, numbers), strict=True))
+        values |= {path: arm_radius for path in field_paths(family_of(cls)) if is_arm(path)}
+        return from_values(cls, values)
 
     def replaced(self, values: Mapping[str, Any]) -> Any:
         """A copy with other values of some fields.
@@ -273,7 +276,7 @@ class ActuatorModel:
             ValueError: a value is out of bounds.
         """
         whole = [field.name for field in dataclasses.fields(self)]
-        fields.check_names(values, [*field_paths(_family(self)), *whole], "actuator field")
+        fields.check_names(values, [*field_paths(family_of(self)), *whole], "actuator field")
         changes: dict[str, Any] = {}
         nested: dict[str, dict[str, Any]] = {}
         for path, value in values.items():
@@ -281,10 +284,10 @@ class ActuatorModel:
             if rest:
                 nested.setdefault(name, {})[rest] = value
             else:
-                changes[name] = _of_kind(type(self), name, value)
+                changes[name] = as_kind(type(self), name, value)
         for name, inner in nested.items():
-            owner = _get(self, name)
-            kinds = {field: _of_kind(type(owner), field, value) for field, value in inner.items()}
+            owner = value_at(self, name)
+            kinds = {field: as_kind(type(owner), field, value) for field, value in inner.items()}
             changes[name] = dataclasses.replace(owner, **kinds)
         return dataclasses.replace(self, **changes)
 
@@ -302,135 +305,7 @@ class ActuatorModel:
 
     def as_mapping(self) -> dict[str, Any]:
         """The nested mapping, `family` included, that `actuator_from_mapping` reads."""
-        return {"family": family_name(_family(self)), **dataclasses.asdict(self)}
-
-
-def _family(actuator: Any) -> Any:
-    """The family of an actuator, or of itself."""
-    return actuator if isinstance(actuator, type) else type(actuator)
-
-
-def _get(owner: Any, path: str) -> Any:
-    """What stands at a dotted path, a word as its number; in a part that is None, what stands for it."""
-    for name in path.split("."):
-        metadata: Mapping[str, Any] = next((f.metadata for f in dataclasses.fields(owner) if f.name == name), {})
-        value = getattr(owner, name)
-        if "options" in metadata:
-            return metadata["options"].index(value)
-        owner = metadata.get("absent") if value is None else value
-    return owner
-
-
-def _of_kind(cls: type, name: str, value: Any) -> Any:
-    """A number as the field's own type: whole numbers, flags and words come as floats from arrays."""
-    field = next(field for field in dataclasses.fields(cls) if field.name == name)
-    default, options = field.default, field.metadata.get("options", ())
-    if options and not isinstance(value, str) and value in range(len(options)):
-        return options[int(value)]
-    if isinstance(default, bool) and value in (0.0, 1.0):
-        return bool(value)
-    if isinstance(default, int) and isinstance(value, float) and value.is_integer():
-        return int(value)
-    return value
-
-
-def _from_values(cls: type, values: Mapping[str, Any], prefix: str = "") -> Any:
-    """Build a dataclass from values by dotted path; a part whose values stand for None is None."""
-    nested, made = fields.parts(cls), {}
-    for field in dataclasses.fields(cls):
-        if field.name in nested:
-            inner = _from_values(nested[field.name], values, f"{prefix}{field.name}.")
-            made[field.name] = None if inner == field.metadata.get("absent") else inner
-        else:
-            made[field.name] = _of_kind(cls, field.name, values[f"{prefix}{field.name}"])
-    return cls(**made)
-
-
-def field_values(actuator: ActuatorModel) -> tuple[float, ...]:
-    """The values of all fields, in the order of `field_paths`: words as their numbers, flags as 0 and 1."""
-    return tuple(float(_get(actuator, path)) for path in field_paths(_family(actuator)))
-
-
-def unchecked(cls: Family, values: Iterable[float]) -> Any:
-    """An actuator of numbers as they are, for what follows from them: a tenth of the time of one that is checked.
-
-    Args:
-        cls: the family.
-        values: as `field_values` has them.
-    """
-    return _filled(cls, iter(values))
-
-
-def _filled(cls: Family, values: Iterator[float]) -> Any:
-    made = object.__new__(cls)
-    for name, part in _outline(cls):
-        vars(made)[name] = next(values) if part is None else _filled(part, values)
-    return made
-
-
-@functools.cache
-def _outline(cls: Family) -> tuple[tuple[str, Any], ...]:
-    """The fields of a dataclass, each with its class where it is a part, else with None."""
-    nested = fields.parts(cls)
-    return tuple((field.name, nested.get(field.name)) for field in dataclasses.fields(cls))
-
-
-def options_of(cls: type, path: str) -> tuple[str, ...]:
-    """The words that a field at a dotted path can be; empty if it is a number."""
-    owner: Any = cls
-    for name in path.split("."):
-        field = next(field for field in dataclasses.fields(owner) if field.name == name)
-        owner = fields.parts(owner).get(name)
-    words: tuple[str, ...] = field.metadata.get("options", ())
-    return words
-
-
-def _is_arm(path: str) -> bool:
-    return path.rpartition(".")[2] == "arm_radius"
-
-
-@functools.cache
-def field_paths(cls: type) -> tuple[str, ...]:
-    """Dotted paths of all fields of a family, those of its parts too."""
-    nested = fields.parts(cls)
-    inner = (
-        [f"{f.name}.{path}" for path in field_paths(nested[f.name])] if f.name in nested else [f.name]
-        for f in dataclasses.fields(cls)
-    )
-    return tuple(path for paths in inner for path in paths)
-
-
-@functools.cache
-def parameter_paths(cls: type) -> Mapping[str, str]:
-    """Name -> dotted path of the fields that are parameters of `advance`: all but the arm, which is the gear's.
-
-    A parameter is called as its field is, and in a part that may be None by the part's name and the field's.
-
-    Raises:
-        ValueError: two of them have the same name.
-    """
-    optional = {field.name for field in dataclasses.fields(cls) if "absent" in field.metadata}
-    paths = [path for path in field_paths(cls) if not _is_arm(path)]
-    named = {
-        path.replace(".", "_") if path.split(".")[0] in optional else path.rpartition(".")[2]: path for path in paths
-    }
-    if len(named) < len(paths):
-        twice = [path for path in paths if path not in named.values()]
-        raise ValueError(f"{cls.__name__}: another parameter has the same name as {', '.join(twice)}: rename one")
-    return named
-
-
-@functools.cache
-def parameters_type(cls: type) -> Any:
-    """The named tuple that a family's `advance` takes its parameters in."""
-    make: Callable[..., Any] = namedtuple  # mypy wants the names of a named tuple as a literal
-    made = make("Parameters", parameter_paths(cls))
-    made.__reduce__ = lambda self: (_parameters, (cls, *self))  # to be pickled
-    return made
-
-
-def _parameters(cls: type, *numbers: float) -> Any:
-    return parameters_type(cls)(*numbers)
+        return {"family": family_name(family_of(self)), **dataclasses.asdict(self)}
 
 
 def advance_form(cls: Family) -> tuple[Form, str]:
@@ -458,7 +333,7 @@ def check_family(cls: Family) -> None:
         raise ValueError(f"{cls.__name__}.{missing[0]}: must have a default")
     actuator = cls()
     for path in field_paths(cls):
-        if not isinstance(value := _get(actuator, path), int | float):
+        if not isinstance(value := value_at(actuator, path), int | float):
             raise ValueError(f"{cls.__name__}.{path} = {value!r}: must be a number; see `codrl_mj.fields`")
     parameters, step = parameters_type(cls)(*actuator.numbers), np.float64(1e-3)
     inputs = Inputs(*map(np.float64, (0.1, 0.2, 0.3, 0.0, 0.0, 1.0)))
@@ -491,92 +366,3 @@ def family_name(cls: Family) -> str:
     """The name that `find_family` finds it by."""
     name: str = cls.family
     return name if FAMILIES.get(name) is cls else reference(cls)
-
-
-_TRUSTED = contextvars.ContextVar("trusted", default=True)
-
-
-@contextlib.contextmanager
-def trusting(trust: bool) -> Iterator[None]:
-    """While the block runs, let `module:NAME` import modules, or refuse it."""
-    token = _TRUSTED.set(trust)
-    try:
-        yield
-    finally:
-        _TRUSTED.reset(token)
-
-
-def load_module(text: str) -> Any:
-    """The module of `module:NAME`.
-
-    Raises:
-        ValueError: there is no such module, or it cannot be imported; or it may not be (`trusting`).
-    """
-    module = text.partition(":")[0]
-    if not _TRUSTED.get():
-        raise ValueError(
-            f"{text!r}: needs the module {module}, and importing it executes whatever its author put there. Pass "
-            "--trust (in Python: trust=True) if that author is you, or somebody whose programs you would run"
-        )
-    try:
-        return importlib.import_module(module)
-    except Exception as error:
-        if not module or (isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}.")):
-            raise ValueError(
-                f"{text!r}: {error}; must be module:NAME of a module that is installed or in the present folder, "
-                f"{Path.cwd()}; on the command line FILE.py:NAME does as well"
-            ) from None
-        frames, package = traceback.extract_tb(error.__traceback__), Path(__file__).parents[1]
-        ours = [Path(frame.filename).is_relative_to(package) for frame in frames]
-        theirs = (frame for frame, own in zip(frames[::-1], ours[::-1], strict=True) if not own)
-        where = next(frame for frame in theirs if not frame.filename.startswith("<"))  # of what dataclasses make
-        said = str(error) if ours[-1] else f"importing {module} failed: {type(error).__name__}: {error}"
-        raise ValueError(f"{text!r}: {said} ({where.filename}, line {where.lineno})") from error
-
-
-def load_object(text: str) -> Any:
-    """What stands at `module:NAME`.
-
-    Raises:
-        ValueError: as for `load_module`, or there is nothing of that name in it.
-    """
-    module, name = load_module(text), text.partition(":")[2]
-    try:
-        return functools.reduce(getattr, name.split("."), module)
-    except AttributeError as error:
-        hint = fields.did_you_mean(name, vars(module)).rstrip() or "see"
-        raise ValueError(f"{text!r}: {error}; must be module:NAME; {hint} {getattr(module, '__file__', '')}") from None
-
-
-def look_up(
-    name: str,
-    known: Mapping[str, Any],
-    what: str,
-    anybodys: bool = True,
-    of: type | None = None,
-    others: Mapping[str, Iterable[str]] | None = None,
-) -> Any:
-    """What a name stands for: a value of `known`, or what stands at `module:NAME`.
-
-    Args:
-        name: the name.
-        known: ours, by name.
-        what: what to call one in messages.
-        anybodys: whether to import what is not ours.
-        of: the class that what is not ours has to be a subclass of; None for no matter what.
-        others: names that are known elsewhere, to be suggested but not listed, by what lists them.
-
-    Raises:
-        ValueError: unknown name; the nearest known ones are suggested. Or no such subclass, or as for `load_object`.
-    """
-    if isinstance(name, str) and name in known:
-        return known[name]
-    if anybodys and ":" in str(name):
-        found = load_object(name)
-        if of is None or (isinstance(found, type) and issubclass(found, of)):
-            return found
-        raise ValueError(f"{what} {name!r}: {found!r} is no subclass of codrl_mj's {of.__name__}")
-    hint = fields.did_you_mean(name, [*known, *itertools.chain(*(others or {}).values())])
-    listed = hint + "It can be" if hint else f"Known: {', '.join([*known, *(others or {})])}, or"
-    own = f"{listed} module:NAME of your own" if anybodys else hint or listed.removesuffix(", or")
-    raise ValueError(f"unknown {what} {name!r}: {own.rstrip()}")

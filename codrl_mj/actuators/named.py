@@ -13,7 +13,8 @@ from codrl_mj.actuators.drive import Drive
 from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.identified import usable_fields
-from codrl_mj.actuators.model import FAMILIES, ActuatorModel, Family, check_family, family_name, look_up
+from codrl_mj.actuators.model import FAMILIES, ActuatorModel, Family, check_family, family_name
+from codrl_mj.own_code import look_up
 
 
 def _with_loop(paper: Actuator, **gains: float) -> Actuator:

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.actuators.model import UnstableError, parameters_type
+from codrl_mj.actuators.model import UnstableError
+from codrl_mj.actuators.parameters import parameters_type
 
 
 def columns(family: Any, numbers: np.ndarray) -> Any:

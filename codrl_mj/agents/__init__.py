@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from typing import Any
 
-from codrl_mj.actuators.model import look_up
 from codrl_mj.agents.base import AgentConfig
 from codrl_mj.agents.ddpg import DDPGConfig
 from codrl_mj.agents.dqn import DQNConfig
@@ -11,6 +10,7 @@ from codrl_mj.agents.ppo import PPOConfig
 from codrl_mj.agents.sac import SACConfig
 from codrl_mj.agents.sarsa import SARSAConfig
 from codrl_mj.agents.td3 import TD3Config
+from codrl_mj.own_code import look_up
 
 AGENTS: dict[str, type[AgentConfig]] = {
     config.name: config for config in (PPOConfig, DDPGConfig, DQNConfig, TD3Config, SACConfig, SARSAConfig)

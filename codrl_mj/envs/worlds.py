@@ -19,7 +19,7 @@ import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.actuators import IDEAL, ActuatorModel
-from codrl_mj.actuators.model import load_object
+from codrl_mj.own_code import load_object
 from codrl_mj.tasks import TASKS, reference_of
 
 EVERY = ".*"

@@ -9,8 +9,8 @@ from typing import Any
 import gymnasium
 from gymnasium import spaces
 
-from codrl_mj.actuators.model import load_module
 from codrl_mj.envs.worlds import World
+from codrl_mj.own_code import load_module
 
 _ID = re.compile(r"(?:[\w.]+:)?(?:[\w-]+/)?[\w.-]+-v\d+")
 

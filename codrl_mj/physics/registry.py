@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from codrl_mj.actuators.model import look_up
+from codrl_mj.own_code import look_up
 from codrl_mj.physics.analytic import AnalyticPhysics
 from codrl_mj.physics.base import Physics
 from codrl_mj.physics.mujoco_single import MujocoPhysics

@@ -7,7 +7,7 @@ from typing import Any
 from gymnasium.envs.registration import register as register_with_gymnasium
 from gymnasium.envs.registration import registry
 
-from codrl_mj.actuators.model import look_up
+from codrl_mj.own_code import look_up
 from codrl_mj.tasks.base import Task
 
 TASKS: dict[str, Task] = {}
