@@ -10,7 +10,6 @@ from codrl_mj.agents.tile_coding import TileCoder
 from codrl_mj.envs import ActuatedVectorEnv
 from codrl_mj.envs.compiled import arguments, compiled_kernels
 from codrl_mj.envs.sb3 import ActuatedVecEnv
-from codrl_mj.envs.views import signals_of
 from codrl_mj.physics import Signals
 
 
@@ -94,8 +93,8 @@ class CompiledEpisodes:
         )
         if not fine:
             self._physics.check_finite()
-        setup, columns = vector.setup, self._record[:length].T.copy()
-        signals = signals_of(columns[1:], setup.family, columns[0], setup.commands.tracks)
+        columns = self._record[:length].T.copy()
+        signals = vector.setup.signals(columns, columns[0])
         observations, infos = self.env.conclude(observation, total, length, not terminated, signals)
         return Ended(length, observations, infos, total, signals)
 

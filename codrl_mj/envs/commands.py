@@ -123,7 +123,7 @@ class TaskCommands:
             )
         return table
 
-    @property
+    @functools.cached_property
     def tracks(self) -> bool:
         """Whether a force is asked for; otherwise what is delivered counts as desired."""
         return self.simulated[0].tracks

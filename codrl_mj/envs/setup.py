@@ -15,7 +15,8 @@ from codrl_mj.envs.commands import TaskCommands
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.randomization import Draws, Randomization, put_into
 from codrl_mj.envs.views import View
-from codrl_mj.physics import Physics
+from codrl_mj.physics import Physics, Signals
+from codrl_mj.physics.base import named_signals
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.registry import find_physics
 from codrl_mj.physics.variation import bare_model
@@ -83,10 +84,23 @@ class Setup:
         """The actuator; with several motors a tuple of them."""
         return alone(self.actuators)
 
-    @property
+    @functools.cached_property
     def family(self) -> Family:
         """The family of what is simulated."""
         return type(self.commands.simulated[0])
+
+    @functools.cached_property
+    def _columns(self) -> tuple[str, ...]:
+        return ("desired_force", "actual_force", *self.family.Signals._fields)
+
+    def signals(self, columns: Sequence[Any], desired: Any) -> Signals:
+        """A trace's columns, numbers or arrays, as signals: the force [N or N*m] that the agent `desired` is theirs.
+
+        Where an actuator tracks no force, what was delivered counts as desired.
+        """
+        signals = named_signals(self._columns, columns)
+        signals["desired_force"] = desired if self.commands.tracks else signals["actual_force"]
+        return signals
 
     def simulate(self, physics: str) -> Physics:
         """A new simulation on the given physics.

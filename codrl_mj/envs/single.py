@@ -13,7 +13,6 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.recording import Recorder
 from codrl_mj.envs.setup import Setup, alone
 from codrl_mj.envs.snapshots import check_snapshot, generator_of, letters
-from codrl_mj.envs.views import signals_of
 from codrl_mj.envs.window import Window
 from codrl_mj.physics import MujocoPhysics, signal_names, trace_names
 from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
@@ -220,9 +219,8 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
 
     def _info(self, force: Any) -> dict[str, Any]:
         """What the actuators did in the last step, which asked for a force."""
-        row = self.physics.trace[-1][:, 1:]
-        columns = row.T.copy() if len(row) > 1 else row[0].tolist()
-        return signals_of(columns, self.setup.family, force, self.setup.commands.tracks)
+        row = self.physics.trace[-1]
+        return self.setup.signals(row.T.copy() if len(row) > 1 else row[0].tolist(), force)
 
     @property
     def randomization(self) -> dict[str, Any]:

@@ -16,7 +16,6 @@ from codrl_mj.envs.compiled import Kernels, VectorStep, arguments, compiled_kern
 from codrl_mj.envs.randomization import Draws, put_into_batch
 from codrl_mj.envs.setup import set_up_many
 from codrl_mj.envs.snapshots import check_snapshot
-from codrl_mj.envs.views import signals_of
 from codrl_mj.physics import Signals
 from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
 from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
@@ -284,8 +283,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         kernels, interface = self._compiled()
         broken = self.physics.step(kernels.step_rows, interface, steps)
         rewards, terminated, truncated = steps.rewards, steps.terminated, steps.truncated
-        columns = steps.signals.reshape(-1, *forces.shape)
-        self.signals = signals = signals_of(columns, self.setup.family, forces, self.setup.commands.tracks)
+        self.signals = signals = self.setup.signals([forces, *steps.signals.reshape(-1, *forces.shape)], forces)
         if broken:
             self._ended |= terminated | truncated  # what is to be reset still is
             self.physics.check_finite(self.physics.state, stepping)

@@ -10,8 +10,6 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import Family
 from codrl_mj.envs.outcomes import Outcomes, compiled_outcomes
-from codrl_mj.physics import Signals
-from codrl_mj.physics.base import named_signals
 from codrl_mj.tasks import Task
 
 
@@ -81,15 +79,6 @@ class View:
     def terminated(self, state: np.ndarray) -> bool:
         """Whether the task ends the episode in this state."""
         return bool(self.outcomes.terminated(np.ascontiguousarray(state)))
-
-
-def signals_of(columns: Any, family: Family, desired: Any, tracks: bool) -> Signals:
-    """Delivered forces [N or N*m], and a family's own signals: numbers, or arrays of several, by their names.
-
-    The force that was asked for counts as `desired` if the actuator `tracks` it; else what was delivered.
-    """
-    signals = named_signals(("actual_force", *family.Signals._fields), columns)
-    return {"desired_force": desired if tracks else signals["actual_force"], **signals}
 
 
 def sensor_names(motors: Mapping[str, Family]) -> tuple[str, ...]:

@@ -34,7 +34,7 @@ def named_signals(names: tuple[str, ...], columns: Any) -> Signals:
     signals = dict(zip(names, columns, strict=False))
     saturated = signals.pop("saturated", None)
     if saturated is None:
-        saturated = 0.0 if isinstance(columns, list) else np.zeros_like(columns[0])
+        saturated = np.zeros_like(columns[0]) if isinstance(columns[0], np.ndarray) else 0.0
     signals["saturated"] = saturated > 0.0  # which NaN is not
     return signals
 

@@ -14,7 +14,6 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor
-from codrl_mj.envs.views import signals_of
 from codrl_mj.physics.registry import PHYSICS
 from codrl_mj.tasks import TASKS
 from codrl_mj.tasks.assets import asset_path
@@ -81,10 +80,8 @@ def test_a_current_is_the_force_that_it_makes(task, physics):
             info, expected = env.step(action)[-1], by_force.step(np.array([force]))[-1]
         else:  # its own actions do not reach every force
             by_force.physics.step(force)
-            info, expected = (
-                env.step(action)[-1],
-                signals_of(by_force.physics.trace[-1][0, 1:].tolist(), Actuator, force, True),
-            )
+            expected = by_force.setup.signals(by_force.physics.trace[-1][0].tolist(), force)
+            info = env.step(action)[-1]
         assert info["desired_force"] == pytest.approx(force, rel=1e-12)
         assert info["reference_current"] == pytest.approx(commanded(env, action), rel=1e-12)
         np.testing.assert_allclose(list(info.values()), list(expected.values()), rtol=1e-12, atol=1e-12)
