@@ -10,7 +10,7 @@ import pytest
 import codrl_mj
 from codrl_mj.actuators import resolve
 from codrl_mj.engine import load_family
-from codrl_mj.engine.sensors import compiled_observe
+from codrl_mj.engine.families import compiled_observe
 from codrl_mj.envs.outcomes import compiled_outcomes
 from codrl_mj.physics.constrain import compiled_constrain
 from tests import slips

@@ -223,6 +223,24 @@ def _compile(family: Any) -> Any:
     return step
 
 
+@functools.cache
+def compiled_observe(family: Family) -> Any:
+    """(parameters, signals, timestep, time, key, seen) -> nothing: writes what the sensors say.
+
+    Vectors go by their addresses.
+    """
+    kind, signals_of = parameters_type(family), family.Signals
+    kinds = tuple_of(kind), types.float64, tuple_of(signals_of), tuple_of(Inputs)
+    observe = compiled_function(family.observe, family.OBSERVED, f"{family.__name__}.OBSERVED", *kinds)
+
+    @internal
+    def fill(parameters: int, shown: int, timestep: float, time: float, key: float, seen: int) -> None:
+        inputs = Inputs(0.0, 0.0, 0.0, time, key)
+        write(observe(read(parameters, kind), timestep, read(shown, signals_of), inputs), seen)
+
+    return fill
+
+
 @internal
 def is_compiled(number: float) -> bool:
     """Whether a family of that number is in the table; any float will do."""

@@ -26,30 +26,16 @@ import numba
 from numba import types
 
 from codrl_mj.engine.families import SIGNATURE
-from codrl_mj.engine.layout import check_layout, offset
-from codrl_mj.engine.memory import array, f64, i32, i64, internal
+from codrl_mj.engine.layout import DATA, MODEL
+from codrl_mj.engine.memory import at, f64, internal
 
 HILL_NAMES = ("signature_1", "signature_2", "gravity", "wavenumber", "height")
 """What the `user` entries of one of our slide joints hold, in order: the signature (two numbers), the largest
 acceleration along the hill [m/s^2], 1/(its length/2 pi) [1/m], and the height of crests over the middle [m], which is
 for the eye."""
 _, _, GRAVITY, WAVENUMBER, HEIGHT = range(len(HILL_NAMES))
-
-MODEL_FIELDS = (
-    "njnt",
-    "nuser_jnt",
-    "jnt_type",
-    "jnt_qposadr",
-    "jnt_dofadr",
-    "jnt_bodyid",
-    "jnt_user",
-    "body_mass",
-    "body_geomadr",
-    "body_geomnum",
-    "geom_pos",
-    "geom_quat",
-)
-DATA_FIELDS = ("qpos", "qfrc_passive", "xpos", "xmat", "geom_xpos", "geom_xmat")
+_SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
+_FIRST, _SECOND = SIGNATURE
 
 
 class HillCallback(NamedTuple):
@@ -61,6 +47,35 @@ class HillCallback(NamedTuple):
     """The numba objects that own the machine code: they must live as long as the pointer."""
 
 
+@internal(inline="always")
+def _place(model: int, data: int, body: int, height: float, slope: float) -> None:
+    """Put the body's geoms at `height` over its frame, tilted by `slope` about its y axis."""
+    cosine = 1.0 / math.sqrt(1.0 + slope * slope)
+    sine = slope * cosine
+    origin = f64(at(DATA.xpos(data), 3 * body))
+    frame = f64(at(DATA.xmat(data), 9 * body))
+    first = MODEL.body_geomadr(model)[body]
+    for geom in range(first, first + MODEL.body_geomnum(model)[body]):
+        local = f64(at(MODEL.geom_pos(model), 3 * geom))
+        quat = f64(at(MODEL.geom_quat(model), 4 * geom))
+        w, x, y, z = quat[0], quat[1], quat[2], quat[3]
+        rotation = (
+            (w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)),
+            (2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)),
+            (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z),
+        )
+        position = f64(at(DATA.geom_xpos(data), 3 * geom))
+        matrix = f64(at(DATA.geom_xmat(data), 9 * geom))
+        for row in range(3):
+            ahead, left, up = frame[3 * row], frame[3 * row + 1], frame[3 * row + 2]
+            along, normal = cosine * ahead + sine * up, cosine * up - sine * ahead
+            position[row] = origin[row] + height * up + along * local[0] + left * local[1] + normal * local[2]
+            for column in range(3):
+                matrix[3 * row + column] = (
+                    along * rotation[0][column] + left * rotation[1][column] + normal * rotation[2][column]
+                )
+
+
 @functools.cache
 def compiled_hill() -> HillCallback:
     """Compile the callback on first use and keep it for the life of the process.
@@ -68,63 +83,22 @@ def compiled_hill() -> HillCallback:
     Raises:
         LayoutError: the installed MuJoCo's memory is not laid out as its introspection says.
     """
-    check_layout(MODEL_FIELDS, DATA_FIELDS)
-    model_at = {field: offset("mjModel", field) for field in MODEL_FIELDS}
-    data_at = {field: offset("mjData", field) for field in DATA_FIELDS}
-    njnt_at, nuser_at, user_at = model_at["njnt"], model_at["nuser_jnt"], model_at["jnt_user"]
-    type_at, qposadr_at, dofadr_at = model_at["jnt_type"], model_at["jnt_qposadr"], model_at["jnt_dofadr"]
-    bodyid_at, mass_at = model_at["jnt_bodyid"], model_at["body_mass"]
-    geomadr_at, geomnum_at = model_at["body_geomadr"], model_at["body_geomnum"]
-    geom_pos_at, geom_quat_at = model_at["geom_pos"], model_at["geom_quat"]
-    qpos_at, force_at = data_at["qpos"], data_at["qfrc_passive"]
-    xpos_at, xmat_at = data_at["xpos"], data_at["xmat"]
-    geom_xpos_at, geom_xmat_at = data_at["geom_xpos"], data_at["geom_xmat"]
-    first, second = SIGNATURE
-    slide, user_size = int(mujoco.mjtJoint.mjJNT_SLIDE), len(HILL_NAMES)
-
-    @internal(inline="always")
-    def place(model: int, data: int, body: int, height: float, slope: float) -> None:
-        """Put the body's geoms at `height` over its frame, tilted by `slope` about its y axis."""
-        cosine = 1.0 / math.sqrt(1.0 + slope * slope)
-        sine = slope * cosine
-        origin = f64(array(data, xpos_at) + 8 * 3 * body)
-        frame = f64(array(data, xmat_at) + 8 * 9 * body)
-        first = i32(array(model, geomadr_at))[body]
-        for geom in range(first, first + i32(array(model, geomnum_at))[body]):
-            local = f64(array(model, geom_pos_at) + 8 * 3 * geom)
-            quat = f64(array(model, geom_quat_at) + 8 * 4 * geom)
-            w, x, y, z = quat[0], quat[1], quat[2], quat[3]
-            rotation = (
-                (w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)),
-                (2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)),
-                (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z),
-            )
-            position = f64(array(data, geom_xpos_at) + 8 * 3 * geom)
-            matrix = f64(array(data, geom_xmat_at) + 8 * 9 * geom)
-            for row in range(3):
-                ahead, left, up = frame[3 * row], frame[3 * row + 1], frame[3 * row + 2]
-                along, normal = cosine * ahead + sine * up, cosine * up - sine * ahead
-                position[row] = origin[row] + height * up + along * local[0] + left * local[1] + normal * local[2]
-                for column in range(3):
-                    matrix[3 * row + column] = (
-                        along * rotation[0][column] + left * rotation[1][column] + normal * rotation[2][column]
-                    )
 
     @numba.cfunc(types.void(types.uintp, types.uintp), nogil=True, error_model="numpy")
     def passive(model: int, data: int) -> None:
-        width = i64(model + nuser_at)[0]
-        if width < user_size:
+        width = MODEL.nuser_jnt(model)
+        if width < len(HILL_NAMES):
             return  # no joint of this model can be ours
-        for joint in range(i64(model + njnt_at)[0]):
-            user = f64(array(model, user_at) + 8 * joint * width)
-            if user[0] != first or user[1] != second or i32(array(model, type_at))[joint] != slide:
+        for joint in range(MODEL.njnt(model)):
+            user = f64(at(MODEL.jnt_user(model), joint * width))
+            if user[0] != _FIRST or user[1] != _SECOND or MODEL.jnt_type(model)[joint] != _SLIDE:
                 continue
-            phase = user[WAVENUMBER] * f64(array(data, qpos_at))[i32(array(model, qposadr_at))[joint]]
+            phase = user[WAVENUMBER] * DATA.qpos(data)[MODEL.jnt_qposadr(model)[joint]]
             sine, cosine = math.sin(phase), math.cos(phase)
-            body = i32(array(model, bodyid_at))[joint]
-            mass = f64(array(model, mass_at))[body]
-            f64(array(data, force_at))[i32(array(model, dofadr_at))[joint]] -= mass * user[GRAVITY] * cosine
-            place(model, data, body, user[HEIGHT] * sine, user[HEIGHT] * user[WAVENUMBER] * cosine)
+            body = MODEL.jnt_bodyid(model)[joint]
+            mass = MODEL.body_mass(model)[body]
+            DATA.qfrc_passive(data)[MODEL.jnt_dofadr(model)[joint]] -= mass * user[GRAVITY] * cosine
+            _place(model, data, body, user[HEIGHT] * sine, user[HEIGHT] * user[WAVENUMBER] * cosine)
 
     generic = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
     return HillCallback(generic(passive.address), (passive,))

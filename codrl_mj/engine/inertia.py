@@ -9,11 +9,9 @@ import numba
 import numpy as np
 from numba import types
 
-from codrl_mj.engine.layout import check_layout, offset
-from codrl_mj.engine.memory import array, call_inertia, f64, i32, i64, internal, on_stack, u64
+from codrl_mj.engine.layout import DATA, MODEL
+from codrl_mj.engine.memory import call_inertia, internal, on_stack, u64
 
-INERTIA_MODEL_FIELDS = ("nv", "M_rownnz", "M_rowadr", "M_colind")
-INERTIA_DATA_FIELDS = ("qLD", "qLDiagInv", "moment_rownnz", "moment_rowadr", "moment_colind", "actuator_moment")
 MOST_ON_STACK = 1024
 """Degrees of freedom up to which the work is done on the stack, which is quicker."""
 
@@ -31,6 +29,28 @@ def seen_from(model: int, data: int, output: int, gear: float) -> float:
     return call_inertia(u64(_ADDRESS_AT)[0], model, data, output, gear)
 
 
+@internal(inline="always")
+def _eliminated(model: int, data: int, output: int, gear: float, turned: Any) -> float:
+    """The inertia; `turned` becomes L^-T*m; there it has room for a number for each degree of freedom."""
+    start, last = DATA.moment_rowadr(data)[output], 0
+    entries = range(start, start + DATA.moment_rownnz(data)[output])
+    for entry in entries:
+        last = max(last, DATA.moment_colind(data)[entry])
+    for row in range(last + 1):
+        turned[row] = 0.0
+    for entry in entries:
+        turned[DATA.moment_colind(data)[entry]] = gear * DATA.actuator_moment(data)[entry]
+    total = 0.0
+    for row in range(last, -1, -1):
+        if turned[row] == 0.0:
+            continue
+        total += turned[row] * turned[row] * DATA.qLDiagInv(data)[row]
+        start = MODEL.M_rowadr(model)[row]
+        for entry in range(start, start + MODEL.M_rownnz(model)[row] - 1):  # its ancestors; then itself
+            turned[MODEL.M_colind(model)[entry]] -= DATA.qLD(data)[entry] * turned[row]
+    return 1.0 / total if total > 0.0 else math.inf
+
+
 @functools.cache
 def load_inertia() -> Any:
     """Compile what `seen_from` calls, once a process; returns what owns the machine code.
@@ -42,39 +62,13 @@ def load_inertia() -> Any:
     Raises:
         LayoutError: the installed MuJoCo's memory is not laid out as its introspection says.
     """
-    check_layout(INERTIA_MODEL_FIELDS, INERTIA_DATA_FIELDS)
-    nv_at, rownnz_at, rowadr_at, colind_at = (offset("mjModel", field) for field in INERTIA_MODEL_FIELDS)
-    qld_at, inverse_at, moment_nnz_at, moment_adr_at, moment_col_at, moment_at = (
-        offset("mjData", field) for field in INERTIA_DATA_FIELDS
-    )
-
-    @internal(inline="always")
-    def eliminated(model: int, data: int, output: int, gear: float, turned: Any) -> float:
-        """`turned` becomes L^-T*m; there it has room for a number for each degree of freedom."""
-        start, last = i32(array(data, moment_adr_at))[output], 0
-        entries = range(start, start + i32(array(data, moment_nnz_at))[output])
-        for entry in entries:
-            last = max(last, i32(array(data, moment_col_at))[entry])
-        for row in range(last + 1):
-            turned[row] = 0.0
-        for entry in entries:
-            turned[i32(array(data, moment_col_at))[entry]] = gear * f64(array(data, moment_at))[entry]
-        total = 0.0
-        for row in range(last, -1, -1):
-            if turned[row] == 0.0:
-                continue
-            total += turned[row] * turned[row] * f64(array(data, inverse_at))[row]
-            start = i32(array(model, rowadr_at))[row]
-            for entry in range(start, start + i32(array(model, rownnz_at))[row] - 1):  # its ancestors; then itself
-                turned[i32(array(model, colind_at))[entry]] -= f64(array(data, qld_at))[entry] * turned[row]
-        return 1.0 / total if total > 0.0 else math.inf
 
     @numba.cfunc(types.float64(types.uintp, types.uintp, types.int32, types.float64), nogil=True, error_model="numpy")
     def through_gear(model: int, data: int, output: int, gear: float) -> float:
-        count = i64(model + nv_at)[0]
+        count = MODEL.nv(model)
         if count > MOST_ON_STACK:
-            return eliminated(model, data, output, gear, np.empty(count))
-        return eliminated(model, data, output, gear, on_stack(count))
+            return _eliminated(model, data, output, gear, np.empty(count))
+        return _eliminated(model, data, output, gear, on_stack(count))
 
     _ADDRESS[0] = through_gear.address
     return through_gear

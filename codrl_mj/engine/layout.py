@@ -1,17 +1,23 @@
-"""Where MuJoCo's structures keep their fields, for the MuJoCo that is installed.
+"""MuJoCo's structures in functions that numba compiles: `MODEL.actuator_user(model)`, `DATA.time(data)`.
 
 The offsets differ between MuJoCo versions, so none is written down: `mujoco.introspect` describes the structures as
-the C headers declare them, ctypes lays them out by the platform's ABI, and `check_layout` compares the result with
-live objects before anything relies on it.
+the C headers declare them, ctypes lays them out by the platform's ABI, and a field is compared with a live object
+before anything relies on it. Compiled code has the offsets as constants.
 """
 
 import ctypes
 import functools
+from concurrent.futures import ThreadPoolExecutor
+from types import ModuleType
 from typing import Any
 
 import mujoco
+from llvmlite import ir
 from mujoco.introspect import ast_nodes
 from mujoco.introspect.structs import STRUCTS
+from numba import types
+from numba.core.registry import cpu_target
+from numba.extending import intrinsic
 
 from codrl_mj.plugin import LayoutError
 
@@ -88,7 +94,7 @@ def offset(struct_name: str, field: str) -> int:
 
 _PROBE = """
 <mujoco>
-  <option timestep="0.0123" integrator="implicit" actuatorgroupdisable="1 5"><flag clampctrl="disable"/></option>
+  <option timestep="0.0123" integrator="implicitfast" actuatorgroupdisable="1 5"><flag clampctrl="disable"/></option>
   <extension><plugin plugin="mujoco.pid"><instance name="p"/></plugin></extension>
   <worldbody>
     <body>
@@ -114,33 +120,111 @@ _PROBE = """
 """
 
 
-def check_layout(model_fields: tuple[str, ...], data_fields: tuple[str, ...]) -> None:
-    """Compare the computed layout of the given fields with a live model and its data.
-
-    Every listed array must lie where the layout says, and every listed scalar must have its value there; the probe
-    gives every count another value. A field that the public bindings do not show (`pbase`) is checked through its
-    neighbours on both sides.
-
-    Args:
-        model_fields: fields of mjModel that will be read.
-        data_fields: fields of mjData that will be read or written.
-
-    Raises:
-        LayoutError: a field is elsewhere.
-    """
+@functools.cache
+def _live() -> dict[str, Any]:
+    """A model and its data, of which every count has another value, by the names of their structures."""
     model = mujoco.MjSpec.from_string(_PROBE).compile()  # within `motorised`, which this is no model for
     data = mujoco.MjData(model)
     data.time = 4.56
     mujoco.mj_fwdPosition(model, data)  # uses the stack: `maxuse_stack` is no longer zero
-    for owner, name, fields in ((model, "mjModel", model_fields), (data, "mjData", data_fields)):
-        raw: Any = struct(name).from_address(owner._address)
-        for field in fields:
-            live, found = owner, raw
-            for part in field.split("."):
-                live, found = getattr(live, part), getattr(found, part)
-            expected = live.ctypes.data if hasattr(live, "ctypes") else live
-            if found != expected:
-                raise LayoutError(
-                    f"MuJoCo {mujoco.__version__}: {name}.{field} reads {found!r} where its layout says, expected "
-                    f"{expected!r}. Install a MuJoCo that this version of codrl_mj was tested with (see pyproject.toml)"
-                )
+    return {"mjModel": model, "mjData": data}
+
+
+def check_field(struct_name: str, field: str) -> None:
+    """Compare the layout of a field of `mjModel` or `mjData` with a live object.
+
+    An array must lie where the layout says, anything else must have its value there. A field that the public bindings
+    do not show (`pbase`), or of which there is nothing, is checked through its neighbours on both sides.
+
+    Raises:
+        LayoutError: the field is elsewhere.
+    """
+    with ThreadPoolExecutor(1) as thread:  # the compiler of a model, which may be running, is not reentrant in its own
+        owner = thread.submit(_live).result()[struct_name]
+    raw: Any = struct(struct_name).from_address(owner._address)
+    names = [field]
+    if field.count(".") == 0 and not _is_shown(owner, field):
+        order = [one.name for one in STRUCTS[struct_name].fields]
+        place = order.index(field)
+        before, after = order[:place][::-1], order[place + 1 :]
+        names = [next(one for one in side if _is_shown(owner, one)) for side in (before, after)]
+    for name in names:
+        live, found = owner, raw
+        for part in name.split("."):
+            live, found = getattr(live, part), getattr(found, part)
+        expected = live.ctypes.data if hasattr(live, "ctypes") else live
+        if found != expected:
+            raise LayoutError(
+                f"MuJoCo {mujoco.__version__}: {struct_name}.{name} reads {found!r} where its layout says, expected "
+                f"{expected!r}. Install a MuJoCo that this version of codrl_mj was tested with (see pyproject.toml)"
+            )
+
+
+def _is_shown(owner: Any, field: str) -> bool:
+    """Whether the bindings show a field of which there is something."""
+    live = getattr(owner, field, None)
+    return isinstance(live, int | float) or getattr(live, "size", 0) > 0
+
+
+_KINDS = {
+    "mjtNum": types.float64,
+    "int": types.int32,
+    "mjtSize": types.int64,
+    "size_t": types.int64,
+    "uintptr_t": types.int64,
+    "mjtByte": types.uint8,
+    "mjtBool": types.uint8,
+    "bool": types.uint8,
+}
+
+
+class Fields(ModuleType):
+    """The fields of a structure, each a function of the structure's address for compiled code.
+
+    That of an array is a typed pointer to its entries, any other its value. A module, because numba looks up what these
+    have while it compiles.
+    """
+
+    def __init__(self, struct_name: str, within: str = "") -> None:
+        """Of `mjModel` or `mjData`; `within` ends with a dot where the fields are those of a part, such as `opt.`."""
+        super().__init__(f"{struct_name}.{within}".rstrip("."))
+        self._owner, self._within = struct_name, within
+
+    def __getattr__(self, name: str) -> Any:
+        """The function of a field, made and compared when it is first named."""
+        kind = STRUCTS[self._owner]
+        for part in self._within.rstrip(".").split(".") if self._within else ():
+            kind = STRUCTS[next(one.type.name for one in kind.fields if one.name == part)]
+        node = next((one.type for one in kind.fields if one.name == name), None)
+        if node is None:
+            raise AttributeError(name)
+        path = f"{self._within}{name}"
+        if isinstance(node, ast_nodes.ValueType) and node.name in STRUCTS:
+            made: Any = Fields(self._owner, f"{path}.")
+        else:
+            check_field(self._owner, path)
+            made = _function(self._owner, path, node)
+        setattr(self, name, made)
+        return made
+
+
+def _function(struct_name: str, path: str, node: Any) -> Any:
+    """What reads a field, compiled into whoever calls it."""
+    is_array = isinstance(node, ast_nodes.PointerType)
+    element = _KINDS[node.inner_type.name if is_array else node.name]
+    kind, at = types.CPointer(element) if is_array else element, offset(struct_name, path)
+
+    @intrinsic
+    def field(typing_context: Any, address: Any) -> Any:  # noqa: ARG001 - numba fixes the arguments
+        def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
+            place = builder.add(arguments[0], context.get_constant(types.uintp, at))
+            return builder.load(builder.inttoptr(place, ir.PointerType(context.get_value_type(kind))))
+
+        return kind(types.uintp), codegen
+
+    cpu_target.typing_context.refresh()  # numba has to know it at once: it may be compiling what names it
+    return field
+
+
+MODEL, DATA = Fields("mjModel"), Fields("mjData")
+"""The structures that a simulation is known by."""

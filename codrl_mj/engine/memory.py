@@ -77,14 +77,13 @@ def _call(*kinds: Any) -> tuple[Any, Any]:
 
 
 @intrinsic
-def array(typing_context: Any, struct: Any, at: Any) -> Any:  # noqa: ARG001 - numba fixes the arguments
-    """Address of the array whose pointer the structure at address `struct` holds at offset `at`."""
+def at(typing_context: Any, pointer: Any, entry: Any) -> Any:  # noqa: ARG001 - numba fixes the arguments
+    """Address of an entry of what a typed pointer points to."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
-        kind = ir.PointerType(context.get_value_type(types.uintp))
-        return builder.load(builder.inttoptr(builder.add(*arguments), kind))
+        return builder.ptrtoint(builder.gep(arguments[0], [arguments[1]]), context.get_value_type(types.uintp))
 
-    return types.uintp(types.uintp, types.uintp), codegen
+    return types.uintp(pointer, types.int64), codegen
 
 
 @intrinsic

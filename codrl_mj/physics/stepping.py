@@ -15,10 +15,11 @@ from numba import types
 from numba.extending import overload
 
 from codrl_mj.actuators import Family, Ideal
-from codrl_mj.engine.families import Slot, load_family, signals_at
+from codrl_mj.engine.doors import user_of
+from codrl_mj.engine.families import HEAD, Slot, compiled_observe, load_family, signals_at
+from codrl_mj.engine.layout import DATA, MODEL
 from codrl_mj.engine.library import engine
 from codrl_mj.engine.memory import internal, on_stack, read
-from codrl_mj.engine.sensors import compiled_observe, compiled_parameters
 from codrl_mj.physics.constrain import Compiled, compiled_constrain, compiled_reader, is_fine
 from codrl_mj.physics.disturber import KEY_COLUMN, compiled_disturbance, numbers_of
 from codrl_mj.tasks import Task
@@ -94,9 +95,7 @@ def _stepping(
     family: Family,
     motorised: bool,
 ) -> Stepping:
-    mujoco = engine()
-    engine_step, engine_reset, engine_timestep, time_of = mujoco.step, mujoco.reset, mujoco.timestep, mujoco.time
-    qpos_of, qvel_of, ctrl_of, act_of, load_of = mujoco.qpos, mujoco.qvel, mujoco.ctrl, mujoco.act, mujoco.qfrc_applied
+    engine_step, engine_reset, _ = engine()
     size, moving = len(positions) + len(velocities), len(positions)
     bounded, constrain = keep is not None, keep or _nothing
     disturbance = compiled_disturbance()
@@ -104,12 +103,11 @@ def _stepping(
     first, count = signals_at(family), len(family.Signals._fields)
     seeing = bool(family.OBSERVED)
     observe = compiled_observe(family) if seeing else _nothing
-    parameters_of = compiled_parameters()
 
     @numba.njit(nogil=True, error_model="numpy")
     def step(force: Any, model: int, data: int, settings: np.ndarray, memory: np.ndarray, trace: np.ndarray) -> bool:
-        timestep = engine_timestep(model)
-        qpos, qvel, ctrl, act = qpos_of(data), qvel_of(data), ctrl_of(data), act_of(data)
+        timestep = MODEL.opt.timestep(model)
+        qpos, qvel, ctrl, act = DATA.qpos(data), DATA.qvel(data), DATA.ctrl(data), DATA.act(data)
         state = numba.carray(on_stack(size), size)
         for inner in range(len(trace)):
             for actuator in range(len(settings)):
@@ -118,7 +116,7 @@ def _stepping(
                 if disturbed:
                     numbers = numbers_of(settings[actuator, WIRING:])
                     command = disturb(numbers, memory[actuator], command)
-                    load_of(data)[int(wiring.dof)] = disturbing_load(numbers, memory[actuator])
+                    DATA.qfrc_applied(data)[int(wiring.dof)] = disturbing_load(numbers, memory[actuator])
                 ctrl[int(wiring.ctrl)] = command * wiring.arm
                 trace[inner, actuator, 0] = command
             if explicit:
@@ -155,14 +153,14 @@ def _stepping(
         trace: np.ndarray,  # noqa: ARG001 - it is one of the simulation's arguments
     ) -> None:
         engine_reset(model, data)
-        qpos, qvel = qpos_of(data), qvel_of(data)
+        qpos, qvel = DATA.qpos(data), DATA.qvel(data)
         for entry in range(len(positions)):
             qpos[entry] = state[positions[entry]]
         for entry in range(len(velocities)):
             qvel[entry] = state[velocities[entry]]
         for actuator in range(len(settings)):
             if motorised:
-                act_of(data)[int(wiring_of(settings[actuator]).act) + NOISE_KEY] = key + actuator
+                DATA.act(data)[int(wiring_of(settings[actuator]).act) + NOISE_KEY] = key + actuator
             if disturbed:
                 memory[actuator] = 0.0
                 memory[actuator, memory.shape[1] + KEY_COLUMN] = key + actuator
@@ -176,7 +174,7 @@ def _stepping(
         memory: np.ndarray,  # noqa: ARG001
         trace: np.ndarray,  # noqa: ARG001
     ) -> None:
-        read_state(qpos_of(data), qvel_of(data), state)
+        read_state(DATA.qpos(data), DATA.qvel(data), state)
 
     @numba.njit(nogil=True, error_model="numpy")
     def observed(
@@ -192,11 +190,11 @@ def _stepping(
             for actuator in range(len(settings)):
                 wiring = wiring_of(settings[actuator])
                 observe(
-                    parameters_of(model, int(wiring.actuator)),
+                    user_of(model, int(wiring.actuator)) + 8 * HEAD,
                     row[actuator, 2:].ctypes.data,
-                    engine_timestep(model),
-                    time_of(data),
-                    act_of(data)[int(wiring.act) + NOISE_KEY],
+                    MODEL.opt.timestep(model),
+                    DATA.time(data),
+                    DATA.act(data)[int(wiring.act) + NOISE_KEY],
                     seen[actuator].ctypes.data,
                 )
 

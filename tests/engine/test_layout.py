@@ -1,20 +1,24 @@
 """Structure offsets: against the addresses of live objects, and that a wrong layout is never used."""
 
 import ctypes
+import re
+from pathlib import Path
 
 import mujoco
+import numba
 import numpy as np
 import pytest
 
-from codrl_mj.engine import LayoutError, control, hill, layout
+from codrl_mj.engine import LayoutError, layout
 
-OPTION_FIELDS = [field.removeprefix("opt.") for field in control.MODEL_FIELDS if field.startswith("opt.")]
-FIELDS = {
-    "mjModel": [field for field in (*control.MODEL_FIELDS, *hill.MODEL_FIELDS) if "." not in field],
-    "mjData": [*control.DATA_FIELDS, *control.PBASE_NEIGHBOURS, *hill.DATA_FIELDS],
-    "mjOption": OPTION_FIELDS,
-}
-CASES = [(struct, field) for struct, fields in FIELDS.items() for field in dict.fromkeys(fields)]
+SOURCE = "".join(path.read_text() for path in Path(layout.__file__).parents[1].rglob("*.py"))
+OWNERS = {"MODEL": "mjModel", "DATA": "mjData"}
+USED = sorted({(OWNERS[owner], field) for owner, field in re.findall(r"\b(MODEL|DATA)\.([\w.]+)\(", SOURCE)})
+"""Whatever compiled code reads or writes."""
+STACK = [("mjData", field) for field in ("narena", "nbuffer", "pstack", "maxuse_stack")]
+"""Around `pbase`, which the bindings do not show."""
+CASES = [("mjOption", field[4:]) if field.startswith("opt.") else (owner, field) for owner, field in USED]
+CASES = [case for case in CASES if case != ("mjData", "pbase")] + STACK
 # These are equal outside a step: no probe can tell them apart.
 INDISTINGUISHABLE = {
     "pstack": {"pbase", "parena", "threadpool"},
@@ -72,7 +76,7 @@ def test_scalars_are_read_and_written_where_their_offset_says():
 
 def test_the_hidden_stack_frame_lies_between_its_checked_neighbours():
     order = [name for name, _ in layout.struct("mjData")._fields_]
-    at = {name: order.index(name) for name in ("pbase", *control.PBASE_NEIGHBOURS)}
+    at = {name: order.index(name) for name in ("pbase", *(field for _, field in STACK))}
     assert at["narena"] < at["nbuffer"] < at["pstack"] < at["pbase"] < at["maxuse_stack"]
 
 
@@ -86,10 +90,8 @@ def test_unknown_fields_and_types_are_refused():
 
 
 def _check():
-    layout.check_layout(
-        (*control.MODEL_FIELDS, *hill.MODEL_FIELDS),
-        (*control.DATA_FIELDS, *control.PBASE_NEIGHBOURS, *hill.DATA_FIELDS),
-    )
+    for owner, field in {*USED, *STACK}:
+        layout.check_field(owner, field)
 
 
 def _corrupt(monkeypatch, struct_name, members):
@@ -131,9 +133,19 @@ def test_a_scalar_that_changed_places_with_another_is_refused(struct_name, field
                 _check()
 
 
-@pytest.mark.parametrize("compiled", [control.compiled, hill.compiled_hill])
-def test_nothing_is_compiled_from_a_wrong_layout(compiled, monkeypatch):
-    members = list(layout.struct("mjData")._fields_)
-    _corrupt(monkeypatch, "mjData", [("added_by_a_new_version", ctypes.c_int64), *members])
-    with pytest.raises(LayoutError, match=f"MuJoCo {mujoco.__version__}: mjData"):
-        compiled.__wrapped__()
+@pytest.mark.parametrize("owner", ["mjModel", "mjData"])
+def test_nothing_is_compiled_from_a_wrong_layout(owner, monkeypatch):
+    _corrupt(monkeypatch, owner, [("added_by_a_new_version", ctypes.c_int64), *layout.struct(owner)._fields_])
+    fields, name = layout.Fields(owner), "nactuator" if owner == "mjModel" else "time"
+
+    @numba.njit
+    def read(address):
+        return getattr(fields, name)(address)
+
+    with pytest.raises(LayoutError, match=f"MuJoCo {mujoco.__version__}: {owner}"):
+        read.compile("float64(uintp)")
+
+
+def test_a_field_that_a_structure_does_not_have_is_no_attribute():
+    assert not hasattr(layout.MODEL, "no_such_thing")
+    assert not hasattr(layout.MODEL.opt, "nactuator")
