@@ -17,7 +17,6 @@ from dm_env import specs
 from gymnasium import spaces
 
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.single import ActuatedEnv
 from codrl_mj.envs.snapshots import check_snapshot, elapsed_steps, set_elapsed_steps
 from codrl_mj.tasks import TASKS
 
@@ -55,9 +54,7 @@ class DmEnvironment(dm_env.Environment):
             env.unwrapped.np_random = random
         elif random is not None:
             self._seed = operator.index(random)
-        self._ours = env.unwrapped if isinstance(env.unwrapped, ActuatedEnv) else None
-        named = self._ours is not None and not flat_observation
-        self._names = self.setup.view.observation_names if named else ()
+        self._names = () if flat_observation else getattr(env.unwrapped, "observation_names", ())
         self._physics: dm_mujoco.Physics | None = None
 
     def reset(self) -> dm_env.TimeStep:
@@ -119,13 +116,13 @@ class DmEnvironment(dm_env.Environment):
         data = self.data
         if self._physics is None or self._physics.data.ptr is not data:
             self._physics = dm_mujoco.Physics(wrapper.MjData(data))
-        if self._ours is not None:  # whose bodies stand where the last integration step began
-            self._ours.physics.show(self.state)
+        getattr(self.env.unwrapped, "pose", lambda: None)()
         return self._physics
 
     def control_timestep(self) -> float:
         """The duration of a step [s]."""
-        return float(self.dt if self._ours is None else self._ours.task.step_duration)
+        own = self.env.unwrapped
+        return float(own.step_duration if hasattr(own, "step_duration") else self.dt)
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Everything that the future depends on, as plain arrays: the environment's own, and its time limit's count."""

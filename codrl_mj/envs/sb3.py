@@ -205,7 +205,7 @@ def make_sb3_vec_env(env_id: Any, num_envs: int = 64, **arguments: Any) -> Actua
     if callable(env_id):
         envs: Any = SerialVectorEnv(num_envs, env_id, **arguments)
     else:
-        config = env_id if isinstance(env_id, EnvConfig) else EnvConfig(_task_of(env_id))
+        config = EnvConfig(_task_of(env_id)) if isinstance(env_id, str) else env_id
         envs = config.world.vector(config, num_envs, **arguments)
     try:
         _check_spaces(envs.single_observation_space, envs.single_action_space)

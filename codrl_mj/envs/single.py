@@ -140,6 +140,20 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         )
 
     @property
+    def observation_names(self) -> tuple[str, ...]:
+        """Of the observation's entries."""
+        return self.setup.view.observation_names
+
+    @property
+    def step_duration(self) -> float:
+        """[s]."""
+        return self.task.step_duration
+
+    def pose(self) -> None:
+        """Bring the bodies of `data` to the present state: the engine leaves them where its last step began."""
+        self.physics.show(self.physics.state)
+
+    @property
     def signal_names(self) -> tuple[str, ...]:
         """Of the actuators' signals in `info`."""
         return signal_names(self.setup.family)
