@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,6 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import safe_mean
 
+from codrl_mj.agents.sarsa import SARSAConfig
 from codrl_mj.agents.sarsa_kernels import Learner, begin, choose_actions, learn, no_traces, run_episode
 from codrl_mj.agents.tile_coding import make_coder
 from codrl_mj.envs import ActuatedVectorEnv
@@ -25,24 +26,15 @@ from codrl_mj.physics.streams import set_words, words_of
 class TileCodingPolicy(BasePolicy):
     """Acts by action values that are linear in the active tiles: greedily, or epsilon-greedily.
 
-    Of equally good actions a greedy one (`deterministic=True`) is the first. `epsilon` and `generator` are those of
-    `predict(..., deterministic=False)`; training draws from the algorithm's own generator, so that no evaluation
+    Of equally good actions a greedy one (`deterministic=True`) is the first. `predict(..., deterministic=False)` draws
+    from the policy's `generator`; training draws from the algorithm's own generator, so that no evaluation
     changes it.
     """
 
     def __init__(
-        self,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Space[Any],
-        tilings: int = 8,
-        intervals: Sequence[int] = (8, 8),
-        angles: int = 0,
-        low: Sequence[float] | None = None,
-        high: Sequence[float] | None = None,
-        initial_value: float = 0.0,
-        epsilon: float = 0.0,
+        self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], config: SARSAConfig
     ) -> None:
-        """Make a policy that knows nothing yet; what the arguments are, `SARSAConfig` says."""
+        """Make a policy that knows nothing yet."""
         if not isinstance(action_space, spaces.Discrete) or action_space.start != 0:
             raise ValueError(
                 f"action_space = {action_space}: SARSA has a weight for every action: must be Discrete, from 0"
@@ -51,24 +43,20 @@ class TileCodingPolicy(BasePolicy):
             raise ValueError(
                 f"observation_space = {observation_space}: must be a Box with one axis, to be covered by tiles"
             )
+        tilings, intervals, angles = config.tilings, config.intervals, config.angles
         used = slice(2 * angles, len(intervals) + angles)
         if used.stop > observation_space.shape[0]:
             raise ValueError(
-                f"intervals = {tuple(intervals)}, angles = {angles}: are of {used.stop} observation entries, but there "
+                f"intervals = {intervals}, angles = {angles}: are of {used.stop} observation entries, but there "
                 f"are {observation_space.shape[0]}; give one interval for an angle or any other entry"
             )
         super().__init__(observation_space, action_space)
-        self._arguments: dict[str, Any] = {
-            "tilings": tilings,
-            "intervals": tuple(intervals),
-            "angles": angles,
-            "low": tuple(observation_space.low[used].tolist() if low is None else low),
-            "high": tuple(observation_space.high[used].tolist() if high is None else high),
-        }
-        self.coder = make_coder(**self._arguments)
-        self.initial_value, self.epsilon = initial_value, epsilon
+        low = observation_space.low[used].tolist() if config.low is None else config.low
+        high = observation_space.high[used].tolist() if config.high is None else config.high
+        self.config, self.coder = config, make_coder(low, high, tilings, intervals, angles)
         self.generator = np.random.default_rng()
-        weights = torch.full((self.coder.size, int(action_space.n)), initial_value / tilings, dtype=torch.float64)
+        size = self.coder.size, int(action_space.n)
+        weights = torch.full(size, config.initial_value / tilings, dtype=torch.float64)
         self.weights = torch.nn.Parameter(weights, requires_grad=False)
 
     @property
@@ -77,14 +65,13 @@ class TileCodingPolicy(BasePolicy):
         return self.weights.numpy()
 
     def _predict(self, observation: Any, deterministic: bool = False) -> torch.Tensor:
-        actions = choose_actions(
-            observation.numpy(), self.coder, self.table, deterministic, self.epsilon, self.generator
+        epsilon, generator = self.config.epsilon, self.generator
+        return torch.from_numpy(
+            choose_actions(observation.numpy(), self.coder, self.table, deterministic, epsilon, generator)
         )
-        return torch.from_numpy(actions)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        named = {"observation_space": self.observation_space, "action_space": self.action_space}
-        return named | self._arguments | {"initial_value": self.initial_value, "epsilon": self.epsilon}
+        return {"observation_space": self.observation_space, "action_space": self.action_space, "config": self.config}
 
 
 class CompiledEpisodes:
@@ -160,39 +147,27 @@ class SARSA(BaseAlgorithm):
     _last_obs: Any
 
     def __init__(
-        self,
-        policy: str | type[TileCodingPolicy],
-        env: Any,
-        step_size: float = 0.0375,
-        gamma: float = 1.0,
-        epsilon: float = 0.001,
-        epsilon_decay: float = 1.0,
-        trace_decay: float = 0.0,
-        **settings: Any,
+        self, policy: str | type[TileCodingPolicy], env: Any, config: SARSAConfig | None = None, **settings: Any
     ) -> None:
-        """Make the algorithm; `SARSAConfig` says what the arguments are.
+        """Make the algorithm.
 
         Args:
             policy: `TileCodingPolicy`.
             env: a Gymnasium environment, or a `VecEnv` of one.
-            step_size: see there, as for those that follow.
-            gamma: discount factor.
-            epsilon: in the first episode.
-            epsilon_decay: from one episode to the next.
-            trace_decay: lambda.
+            config: the agent's settings; None: the paper's.
             **settings: `BaseAlgorithm`'s.
 
         Raises:
             ValueError: the environment is more than one, or its spaces do not go with tiles.
         """
+        self.config = config or SARSAConfig()
         self._episodes: CompiledEpisodes | None = None
-        self.step_size, self.gamma, self.trace_decay = step_size, gamma, trace_decay
-        self.epsilon, self.epsilon_decay = epsilon, epsilon_decay
-        self.exploration_rate = epsilon  # in the present episode
+        self.exploration_rate = self.config.epsilon  # in the present episode
         if getattr(env, "num_envs", 1) != 1:
             raise ValueError(f"num_envs = {env.num_envs}: SARSA learns from one environment: must be 1")
         set_up = settings.pop("_init_setup_model", True)
-        super().__init__(policy, env, learning_rate=step_size, **{**settings, "device": "cpu"})
+        given = settings | {"policy_kwargs": {"config": self.config}, "device": "cpu"}
+        super().__init__(policy, env, learning_rate=self.config.step_size, **given)
         if set_up:
             self._setup_model()
 
@@ -202,7 +177,17 @@ class SARSA(BaseAlgorithm):
             # A child's seed: seeded alike, the environment's generator would draw the same numbers.
             self._generator = np.random.default_rng(np.random.SeedSequence(self.seed).spawn(1)[0])
         self.policy = self.policy_class(self.observation_space, self.action_space, **self.policy_kwargs)  # type: ignore[assignment]
-        self._traces = no_traces(self.policy.table.size if self.trace_decay else 0)
+        coder, table = self.policy.coder, self.policy.table
+        self._learner = Learner(
+            coder,
+            table,
+            no_traces(table.size if self.config.trace_decay else 0),
+            np.empty(len(coder.displacements), dtype=np.int64),
+            self.config.step_size,
+            self.config.gamma,
+            self.config.trace_decay,
+            self.config.epsilon,
+        )
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """What training depends on between episodes, besides the policy and Stable-Baselines3's own attributes."""
@@ -227,7 +212,7 @@ class SARSA(BaseAlgorithm):
         )
         callback.on_training_start(locals(), globals())
         while self.num_timesteps < total_timesteps:
-            self.exploration_rate = self.epsilon * self.epsilon_decay**self._episode_num
+            self.exploration_rate = self.config.epsilon * self.config.epsilon_decay**self._episode_num
             callback.on_rollout_start()
             if not self._run_episode(callback):
                 break
@@ -240,16 +225,7 @@ class SARSA(BaseAlgorithm):
 
     def _run_episode(self, callback: BaseCallback) -> bool:
         """Learn from the rest of an episode; whether the callback lets it go on."""
-        learner = Learner(
-            self.policy.coder,
-            self.policy.table,
-            self._traces,
-            np.empty(len(self.policy.coder.displacements), dtype=np.int64),
-            self.step_size,
-            self.gamma,
-            self.trace_decay,
-            self.exploration_rate,
-        )
+        learner = self._learner._replace(epsilon=self.exploration_rate)
         if self.compiled and CompiledEpisodes.can_run(self.env):
             if self._episodes is None or self._episodes.env is not self.env:
                 self._episodes = CompiledEpisodes(self.env)  # type: ignore[arg-type]
@@ -304,7 +280,7 @@ class SARSA(BaseAlgorithm):
         self.logger.dump(step=self.num_timesteps)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_traces", "_episodes"]
+        return [*super()._excluded_save_params(), "_learner", "_episodes"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy"], []

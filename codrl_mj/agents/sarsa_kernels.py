@@ -182,19 +182,10 @@ def run_episode(
     record: np.ndarray,
     arguments: tuple[Any, ...],
 ) -> tuple[float, int, bool, bool]:
-    """Learn from an episode of an environment's compiled `step`, from its first observation, which becomes the last.
+    """Learn from an episode of an environment's compiled `step`, from its first observation (k,), which gets the last.
 
-    Args:
-        learner: learns.
-        generator: draws.
-        step: see `codrl_mj.envs.compiled.Kernels`.
-        forces: [N or N*m] of the actions.
-        observation: shape (k,).
-        record: gets the trace's last row, for each step; its length is the time limit.
-        arguments: the last ones of `step`.
-
-    Returns:
-        Sum of the rewards, steps, whether the task ended the episode, and whether the simulation was fine throughout.
+    `record`, as long as the time limit, gets the trace's last row of each step. Sum of the rewards, steps, whether the
+    task ended the episode, and whether the simulation was fine throughout.
     """
     action = begin(learner, generator, observation)
     total, length, terminated = 0.0, 0, False
