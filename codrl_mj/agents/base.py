@@ -87,7 +87,7 @@ class DeepAgentConfig(AgentConfig):
 
     def make_policy(self, observation_space: spaces.Box, action_space: spaces.Space[Any]) -> Any:
         """See `AgentConfig.make_policy`."""
-        arguments = {**self._policy_arguments(), "optimizer_class": no_optimizer}
+        arguments = {**self._policy_arguments(), "optimizer_class": _no_optimizer}
         return self._policy_class()(observation_space, action_space, lambda _: 0.0, **arguments)
 
     def _policy_class(self) -> Any:
@@ -106,5 +106,5 @@ class DeepAgentConfig(AgentConfig):
         }
 
 
-def no_optimizer(*_arguments: Any, **_settings: Any) -> None:
+def _no_optimizer(*_arguments: Any, **_settings: Any) -> None:
     """In the place of one, in policies that only act: torch's first takes almost two seconds to import a compiler."""
