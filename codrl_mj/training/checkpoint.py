@@ -10,7 +10,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load, save
 
 from codrl_mj.runs.files import writing
-from codrl_mj.training.folder import CHECKPOINT
+from codrl_mj.runs.layout import CHECKPOINT
 from codrl_mj.training.state import State
 
 KEPT = 2

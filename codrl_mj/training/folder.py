@@ -6,7 +6,6 @@ import functools
 import hashlib
 import importlib.metadata
 import platform
-import re
 import shutil
 import sys
 from collections.abc import Iterator, Mapping
@@ -15,14 +14,23 @@ from typing import Any
 
 from codrl_mj.actuators import label_of, labelled, trusting
 from codrl_mj.runs.files import check_writable, leftovers, read_json, sealed, write_json
-from codrl_mj.runs.layout import BEST, CONFIG, EVALUATION, POLICY_FILES, PROGRESS, RESULT, finished
+from codrl_mj.runs.layout import (
+    BEST,
+    CHECKPOINT,
+    CHECKPOINTS,
+    CONFIG,
+    CURVE,
+    EPISODES,
+    EVALUATION,
+    LOCK,
+    POLICY_FILES,
+    PROGRESS,
+    RESULT,
+    TENSORBOARD,
+    finished,
+)
 from codrl_mj.training.config import TrainConfig
 
-EPISODES, CURVE = "episodes.csv", "learning_curve.png"
-CHECKPOINTS, TENSORBOARD, LOCK = "checkpoints", "tensorboard", ".lock"
-
-CHECKPOINT = re.compile(r"step-(?P<step>\d{12})-(?P<digest>[0-9a-f]{16})\.safetensors")
-"""Names of checkpoints."""
 _FILES = {CONFIG, RESULT, EVALUATION, PROGRESS, EPISODES, CURVE, *POLICY_FILES}
 _PACKAGES = ("codrl-mj", "gymnasium", "mujoco", "numba", "numpy", "stable-baselines3", "torch")
 
@@ -207,8 +215,3 @@ def owned(run: Path) -> Iterator[None]:
         except BlockingIOError:
             raise RunInUseError(f"{run}: another process is training in it; wait for it, or stop it") from None
         yield
-
-
-def write_result(run: Path, result: Mapping[str, Any]) -> None:
-    """Write what marks a run as finished."""
-    write_json(run / RESULT, sealed(result))

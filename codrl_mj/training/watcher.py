@@ -14,6 +14,7 @@ from stable_baselines3.common.logger import KVWriter, Logger
 
 from codrl_mj.evaluation import Evaluation, evaluate
 from codrl_mj.runs.files import sealed, write_json
+from codrl_mj.runs.layout import BEST, CHECKPOINTS, EPISODES, EVALUATION, PROGRESS, TENSORBOARD
 from codrl_mj.runs.policies import save_policy
 from codrl_mj.training import folder
 from codrl_mj.training.checkpoint import load_checkpoint, save_checkpoint
@@ -68,7 +69,7 @@ class Watcher(BaseCallback):
     def _on_training_start(self) -> None:
         """Continue from the last checkpoint, now that the model has set itself up to start from nothing."""
         self._arms = self.training_env.arm_radii  # type: ignore[attr-defined]
-        state = self._resumed = load_checkpoint(self._out / folder.CHECKPOINTS, self._identity)
+        state = self._resumed = load_checkpoint(self._out / CHECKPOINTS, self._identity)
         rows: dict[str, np.ndarray | None] = {"episodes": None, "reports": None}
         if state is not None:
             restore(self.model, self.training_env, state)
@@ -77,8 +78,8 @@ class Watcher(BaseCallback):
                 setattr(self, f"_{name}", state.facts["watch"][name])
             self.saved_steps = self._steps_before = self.model.num_timesteps
             self.num_timesteps = self.model.num_timesteps
-        self.episodes = GrowingTable(self._out / folder.EPISODES, EPISODE_COLUMNS, rows["episodes"])
-        self.reports = GrowingTable(self._out / folder.PROGRESS, REPORT_COLUMNS, rows["reports"])
+        self.episodes = GrowingTable(self._out / EPISODES, EPISODE_COLUMNS, rows["episodes"])
+        self.reports = GrowingTable(self._out / PROGRESS, REPORT_COLUMNS, rows["reports"])
         self.model.set_logger(Logger(str(self._out), self._writers()))
         self._start = time.perf_counter()
 
@@ -88,7 +89,7 @@ class Watcher(BaseCallback):
         try:
             from stable_baselines3.common.logger import TensorBoardOutputFormat
 
-            return [TensorBoardOutputFormat(str(self._out / folder.TENSORBOARD))]
+            return [TensorBoardOutputFormat(str(self._out / TENSORBOARD))]
         except (AssertionError, ImportError):  # TensorBoard is not installed
             return []
 
@@ -199,9 +200,9 @@ class Watcher(BaseCallback):
         )
         if self.evaluation.returns.mean > self._best["return"]:
             self._best = {"return": self.evaluation.returns.mean, "steps": self.model.num_timesteps}
-            best = self._out / folder.BEST
+            best = self._out / BEST
             save_policy(self.model.policy, config.agent, best)
-            write_json(best / folder.EVALUATION, sealed(self.evaluation.as_mapping()))
+            write_json(best / EVALUATION, sealed(self.evaluation.as_mapping()))
 
     def _report(self, evaluated: bool) -> None:
         if self.reports.last("steps") == self.model.num_timesteps:
@@ -234,7 +235,7 @@ class Watcher(BaseCallback):
         watch["seconds_before"] = self._seconds_before + time.perf_counter() - self._start
         tables = {"watch.episodes": self.episodes.array(), "watch.reports": self.reports.array()}
         state = State(arrays | tables, facts | {"watch": watch})
-        save_checkpoint(self._out / folder.CHECKPOINTS, state, self._identity)
+        save_checkpoint(self._out / CHECKPOINTS, state, self._identity)
         self.saved_steps = self.model.num_timesteps
 
     def result(self) -> dict[str, Any]:
