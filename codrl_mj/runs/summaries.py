@@ -190,9 +190,7 @@ def _mapping(path: Path, what: str, problems: list[str]) -> Mapping[str, Any] | 
 def last_report(path: Path, problems: list[str]) -> Mapping[str, Any]:
     """The last whole row of a training's progress, as text; empty if there is none. A last row may be half written.
 
-    Args:
-        path: the table.
-        problems: gets what is wrong with it.
+    `problems` gets what is wrong with the table.
     """
     try:
         with path.open(newline="") as file:

@@ -106,11 +106,7 @@ def train(
 
 @contextlib.contextmanager
 def _taking(out: Path, exists: bool) -> Iterator[None]:
-    """Own a run folder while the block runs, and leave no new one in which nothing was learned when it raises.
-
-    Raises:
-        RunInUseError: another process trains in it, or has in the meantime.
-    """
+    """Own a run folder while the block runs, and leave no new one in which nothing was learned when it raises."""
     made = [path for path in (out, *out.parents) if not path.exists()]
     with folder.owned(out):
         if finished(out) or not ((out / CONFIG).exists() if exists else folder.unused(out)):

@@ -43,15 +43,7 @@ class Watcher(BaseCallback):
         on_progress: Callable[[Progress], None] | None,
         tensorboard: bool,
     ) -> None:
-        """Prepare.
-
-        Args:
-            config: what is trained.
-            out: the run folder.
-            stop: its `signal` is a signal's number once the training is to stop.
-            on_progress: called with every report.
-            tensorboard: write events for TensorBoard, if it is installed.
-        """
+        """Prepare; the arguments are those of `train`, and a `Stop`."""
         super().__init__()
         self._config, self._out, self._stop, self._on_progress = config, out, stop, on_progress
         self._tensorboard = tensorboard
@@ -130,11 +122,7 @@ class Watcher(BaseCallback):
 
     @contextlib.contextmanager
     def explaining(self) -> Iterator[None]:
-        """Say why the block could not go on: a full disk and its like, a second Ctrl-C, weights that are no numbers.
-
-        Raises:
-            OSError: what could not be written, with what there is to go on from.
-        """
+        """Say why the block could not go on: a full disk and its like, a second Ctrl-C, weights that are no numbers."""
         try:
             yield
         except OSError as error:
@@ -146,11 +134,7 @@ class Watcher(BaseCallback):
             raise
 
     def _check_weights(self) -> None:
-        """Raise if a weight is no finite number, before that is kept.
-
-        Raises:
-            FloatingPointError: as it says, with what makes it likely.
-        """
+        """Raise if a weight is no finite number, before that is kept, with what makes it likely."""
         model = getattr(self, "model", None)  # not before learning begins
         if model is None or all(tensor.isfinite().all() for tensor in model.policy.state_dict().values()):
             return
@@ -164,12 +148,7 @@ class Watcher(BaseCallback):
     # -- between two rollouts -----------------------------------------------------------------------------
 
     def boundary(self, stopping: bool = False, last: bool = False) -> None:
-        """Report, evaluate and write a checkpoint, whichever is due.
-
-        Args:
-            stopping: a checkpoint is due.
-            last: the training is complete: all are due.
-        """
+        """Report, evaluate and write a checkpoint, whichever is due: a checkpoint if stopping, in the end all three."""
         if self.model.num_timesteps == 0:
             return
         evaluation = self._due("evaluation", self._config.evaluation_interval) or last
