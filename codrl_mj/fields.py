@@ -149,6 +149,14 @@ def check_names(
             raise ValueError(f"unknown {what} {prefix}{name}; {' '.join(hints)}")
 
 
+def leaves(mapping: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """What nested mappings hold, by dotted names."""
+    found: dict[str, Any] = {}
+    for key, value in mapping.items():
+        found |= leaves(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return found
+
+
 def did_you_mean(name: object, known: Iterable[str]) -> str:
     """A question with the nearest known names and a space, for the message about an unknown one; or nothing."""
     near = _nearest(name, known)

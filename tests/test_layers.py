@@ -39,7 +39,7 @@ ALLOWED = {
     "agents": {"actuators", "envs", "envs.config", "fields", "own_code", "physics"},
     "runs.files": set(),
     "runs.layout": set(),
-    "runs.summaries": {"actuators", "envs.worlds", "runs.files", "runs.layout", "tasks"},
+    "runs.summaries": {"actuators", "envs.worlds", "fields", "runs.files", "runs.layout", "tasks"},
     "runs.policies": {"actuators", "agents", "runs.files", "runs.layout"},
     "runs": set(),
     "evaluation.measures": set(),

@@ -3,13 +3,10 @@
 from collections.abc import Mapping
 from typing import Any
 
-from codrl_mj.agents.base import AgentConfig
-from codrl_mj.agents.ddpg import DDPGConfig
-from codrl_mj.agents.dqn import DQNConfig
+from codrl_mj.agents.base import AgentConfig, DeepAgentConfig
+from codrl_mj.agents.off_policy import DDPGConfig, DQNConfig, SACConfig, TD3Config
 from codrl_mj.agents.ppo import PPOConfig
-from codrl_mj.agents.sac import SACConfig
 from codrl_mj.agents.sarsa import SARSAConfig
-from codrl_mj.agents.td3 import TD3Config
 from codrl_mj.own_code import look_up
 
 AGENTS: dict[str, type[AgentConfig]] = {
@@ -22,6 +19,7 @@ __all__ = [
     "AgentConfig",
     "DDPGConfig",
     "DQNConfig",
+    "DeepAgentConfig",
     "PPOConfig",
     "SACConfig",
     "SARSAConfig",

@@ -1,12 +1,12 @@
-"""What the agents that learn from a replay buffer have in common."""
+"""The agents that learn from a replay buffer, on Stable-Baselines3: DDPG, TD3, SAC and DQN."""
 
 import dataclasses
-from typing import Any
+from typing import Any, ClassVar
 
 from gymnasium import spaces
 
-from codrl_mj.agents.deep import DeepAgentConfig
-from codrl_mj.fields import integer, real
+from codrl_mj.agents.base import DeepAgentConfig
+from codrl_mj.fields import flag, integer, real, units
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,32 +30,44 @@ class OffPolicyConfig(DeepAgentConfig):
     gradient_steps: int | None = integer(None, least=1)
     """Gradient steps of a training, >= 1; None: one for each environment step since the last training."""
 
-    def _model_arguments(self, env: Any, seed: int) -> dict[str, Any]:
-        """Keyword arguments of the Stable-Baselines3 model.
+    def make_model(self, env: Any, seed: int) -> Any:
+        """See `AgentConfig.make_model`.
 
         Raises:
-            ValueError: the settings do not go with the environments.
+            ValueError: `train_every` is None, and there is more than one environment.
         """
         if self.train_every is None and env.num_envs > 1:
             raise ValueError(
                 f"{type(self).__name__}.train_every = None: training at the end of every episode needs num_envs = 1, "
                 f"not {env.num_envs}; set train_every to a number of steps"
             )
-        return {
-            "policy": self._policy_class(),
-            "env": env,
-            "learning_rate": self.learning_rate,
-            "gamma": self.gamma,
-            "tau": self.tau,
-            "buffer_size": self.buffer_size,
-            "batch_size": self.batch_size,
-            "learning_starts": self.learning_starts,
-            "train_freq": (1, "episode") if self.train_every is None else (self.train_every, "step"),
-            "gradient_steps": self.gradient_steps or -1,
-            "policy_kwargs": self._policy_arguments(),
-            "seed": seed,
-            "device": "cpu",
-        }
+        return self._algorithm()(
+            self._policy_class(),
+            env,
+            learning_rate=self.learning_rate,
+            gamma=self.gamma,
+            tau=self.tau,
+            buffer_size=self.buffer_size,
+            batch_size=self.batch_size,
+            learning_starts=self.learning_starts,
+            train_freq=(1, "episode") if self.train_every is None else (self.train_every, "step"),
+            gradient_steps=self.gradient_steps or -1,
+            policy_kwargs=self._policy_arguments(),
+            seed=seed,
+            device="cpu",
+            **self._algorithm_arguments(env.action_space),
+        )
+
+    def _algorithm(self) -> Any:
+        """The class of the Stable-Baselines3 model."""
+        raise NotImplementedError
+
+    def _algorithm_arguments(self, action_space: Any) -> dict[str, Any]:
+        """Keyword arguments of that class that not all of these agents have."""
+        raise NotImplementedError
+
+    def _policy_class(self) -> Any:
+        return self._algorithm().policy_aliases["MlpPolicy"]
 
     def _policy_arguments(self) -> dict[str, Any]:
         # one call for all tensors of a network: a tenth more steps per second
@@ -69,6 +81,8 @@ class ActorCriticConfig(OffPolicyConfig):
     It explores by Ornstein-Uhlenbeck noise on the action, x' = x - theta * x * dt + sigma * sqrt(dt) * N(0, 1), which
     starts at 0 in every episode. `noise_theta = noise_dt = 1` is independent noise of standard deviation sigma.
     """
+
+    action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (spaces.Box,)
 
     critic_learning_rate: float | None = real(None, above=0, most=1)
     """Adam's step size for the critic, in (0, 1]; None: `learning_rate`."""
@@ -88,19 +102,154 @@ class ActorCriticConfig(OffPolicyConfig):
                 f"and noise_dt = {self.noise_dt!r}"
             )
 
-    def _model_arguments(self, env: Any, seed: int) -> dict[str, Any]:
-        return {
-            **super()._model_arguments(env, seed),
-            "critic_learning_rate": self.critic_learning_rate or self.learning_rate,
-            "action_noise": self._noise(env.action_space),
-        }
-
-    def _noise(self, action_space: spaces.Box) -> Any:
-        if self.noise_sigma == 0:
-            return None
+    def _algorithm_arguments(self, action_space: Any) -> dict[str, Any]:
         import numpy as np
         from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 
-        mean = np.zeros(action_space.shape)
-        sigma = np.full(action_space.shape, self.noise_sigma)
-        return OrnsteinUhlenbeckActionNoise(mean, sigma, theta=self.noise_theta, dt=self.noise_dt)
+        mean, sigma = np.zeros(action_space.shape), np.full(action_space.shape, self.noise_sigma)
+        noise = OrnsteinUhlenbeckActionNoise(mean, sigma, theta=self.noise_theta, dt=self.noise_dt)
+        return {
+            "critic_learning_rate": self.critic_learning_rate or self.learning_rate,
+            "action_noise": noise if self.noise_sigma else None,
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class DDPGConfig(ActorCriticConfig):
+    """Deep deterministic policy gradient, on Stable-Baselines3, with the paper's critic.
+
+    State and action each pass through layers of their own; then they are joined. Every hidden layer has a ReLU; the
+    actor ends in tanh, times half the action's range.
+    """
+
+    name: ClassVar[str] = "ddpg"
+
+    noise_sigma: float = real(0.2, least=0)
+    """Scale sigma of the exploration noise, >= 0, in shares of half the action's range; 0: none."""
+    actor_units: tuple[int, ...] = units((64, 64))
+    """Units of the actor's hidden layers. The paper: 64-64."""
+    state_units: tuple[int, ...] = units((16, 32))
+    """Units of the critic's layers for the state alone; () lets it through. The paper: 1 (pendulum), 64 (car)."""
+    action_units: tuple[int, ...] = units((32,))
+    """Units of the critic's layers for the action alone; () lets it through. The paper: 32 (pendulum), () (car)."""
+    joint_units: tuple[int, ...] = units((256, 256))
+    """Units of the critic's hidden layers after both are joined. The paper: 256-256 (pendulum), 64 (car)."""
+
+    def _algorithm(self) -> Any:
+        from codrl_mj.agents.models import TwoRateDDPG
+
+        return TwoRateDDPG
+
+    def _policy_arguments(self) -> dict[str, Any]:
+        streams = {name: getattr(self, name) for name in ("state_units", "action_units", "joint_units")}
+        return {"net_arch": list(self.actor_units), "n_critics": 1, **streams, **super()._policy_arguments()}
+
+
+@dataclasses.dataclass(frozen=True)
+class TD3Config(ActorCriticConfig):
+    """Twin delayed DDPG (Fujimoto et al., 2018), on Stable-Baselines3. The paper does not use it."""
+
+    name: ClassVar[str] = "td3"
+
+    noise_sigma: float = real(0.1, least=0)
+    """Scale sigma of the exploration noise, >= 0, in shares of half the action's range; 0: none."""
+    hidden: tuple[int, ...] = units((64, 64))
+    """Units of the hidden layers of the actor and of each critic (ReLU)."""
+    policy_delay: int = integer(2, least=1)
+    """Critic updates for each update of the actor and the targets, >= 1."""
+    target_noise: float = real(0.2, least=0)
+    """Standard deviation of the noise on the target actions, >= 0, in shares of half the action's range; clipped at 2.5
+    times that."""
+
+    def _algorithm(self) -> Any:
+        from codrl_mj.agents.models import TwoRateTD3
+
+        return TwoRateTD3
+
+    def _algorithm_arguments(self, action_space: Any) -> dict[str, Any]:
+        return {
+            "policy_delay": self.policy_delay,
+            "target_policy_noise": self.target_noise,
+            "target_noise_clip": 2.5 * self.target_noise,
+            **super()._algorithm_arguments(action_space),
+        }
+
+    def _policy_arguments(self) -> dict[str, Any]:
+        return {"net_arch": list(self.hidden), **super()._policy_arguments()}
+
+
+@dataclasses.dataclass(frozen=True)
+class SACConfig(ActorCriticConfig):
+    """Soft actor-critic (Haarnoja et al., 2018), on Stable-Baselines3. The paper does not use it."""
+
+    name: ClassVar[str] = "sac"
+
+    hidden: tuple[int, ...] = units((64, 64))
+    """Units of the hidden layers of the actor and of each critic (ReLU)."""
+    entropy_coefficient: float | None = real(None, least=0)
+    """Weight of the entropy, >= 0; None: learned, so that the entropy per action entry is -1 nat."""
+    state_dependent_noise: bool = flag(False)
+    """Explore by noise that is a function of the state, drawn anew at every training (Raffin et al., 2021)."""
+    log_std_init: float = real(-3.0)
+    """State-dependent noise: natural logarithm of its standard deviation at the start."""
+
+    def _algorithm(self) -> Any:
+        from codrl_mj.agents.models import TwoRateSAC
+
+        return TwoRateSAC
+
+    def _algorithm_arguments(self, action_space: Any) -> dict[str, Any]:
+        return {
+            "ent_coef": "auto" if self.entropy_coefficient is None else self.entropy_coefficient,
+            "use_sde": self.state_dependent_noise,
+            **super()._algorithm_arguments(action_space),
+        }
+
+    def _policy_arguments(self) -> dict[str, Any]:
+        return {
+            "net_arch": list(self.hidden),
+            "use_sde": self.state_dependent_noise,
+            "log_std_init": self.log_std_init,
+            **super()._policy_arguments(),
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class DQNConfig(OffPolicyConfig):
+    """Deep Q-learning with a target network, on Stable-Baselines3 (Huber loss, gradients clipped to norm 10)."""
+
+    name: ClassVar[str] = "dqn"
+    action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (spaces.Discrete,)
+
+    hidden: tuple[int, ...] = units((64, 128))
+    """Units of the hidden layers (ReLU). The paper: 64-128."""
+    target_every: int = integer(1, least=1)
+    """Environment steps between two updates of the target network, >= 1."""
+    exploration_start: float = real(1.0, least=0, most=1)
+    """Probability epsilon of a random action at the start, in [0, 1]."""
+    exploration_end: float = real(0.01, least=0, most=1)
+    """Smallest epsilon, in [0, 1]."""
+    exploration_decay: float | None = real(0.99, above=0, most=1, optional=True)
+    """Factor on epsilon with every episode, in (0, 1]; None: it falls linearly over `exploration_fraction`."""
+    exploration_fraction: float = real(0.2, above=0, most=1)
+    """Share of all steps over which epsilon falls linearly, in (0, 1], if `exploration_decay` is None."""
+
+    def _algorithm(self) -> Any:
+        from stable_baselines3 import DQN
+
+        from codrl_mj.agents.models import EpisodicDQN
+
+        return DQN if self.exploration_decay is None else EpisodicDQN
+
+    def _algorithm_arguments(self, action_space: Any) -> dict[str, Any]:
+        del action_space
+        return {
+            "target_update_interval": self.target_every,
+            "exploration_initial_eps": self.exploration_start,
+            "exploration_final_eps": self.exploration_end,
+            "exploration_fraction": self.exploration_fraction,
+            **({} if self.exploration_decay is None else {"exploration_decay": self.exploration_decay}),
+        }
+
+    def _policy_arguments(self) -> dict[str, Any]:
+        return {"net_arch": list(self.hidden), **super()._policy_arguments()}

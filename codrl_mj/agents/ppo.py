@@ -5,7 +5,7 @@ from typing import Any, ClassVar, Literal
 
 from gymnasium import spaces
 
-from codrl_mj.agents.deep import DeepAgentConfig
+from codrl_mj.agents.base import DeepAgentConfig
 from codrl_mj.fields import choice, flag, integer, real, units
 
 
@@ -75,11 +75,10 @@ class PPOConfig(DeepAgentConfig):
         Raises:
             ValueError: the rollout is not a multiple of the environments, or of the minibatch.
         """
-        from gymnasium.spaces import Box, Discrete
         from stable_baselines3 import PPO
 
         from codrl_mj.agents.fast_ppo import FastPPO
-        from codrl_mj.agents.two_rate_ppo import TwoRatePPO
+        from codrl_mj.agents.models import TwoRatePPO
 
         batch_size = self.batch_size or self.rollout_steps
         for name, size in (("num_envs", env.num_envs), ("batch_size", batch_size)):
@@ -104,7 +103,7 @@ class PPOConfig(DeepAgentConfig):
             "device": "cpu",
         }
         if self.critic_learning_rate is None:
-            kind = FastPPO if isinstance(env.action_space, Box | Discrete) else PPO
+            kind = FastPPO if isinstance(env.action_space, spaces.Box | spaces.Discrete) else PPO
             return kind(self._policy_class(), env, **arguments)
         return TwoRatePPO(
             self._policy_class(),
@@ -117,7 +116,7 @@ class PPOConfig(DeepAgentConfig):
     def _policy_class(self) -> Any:
         from stable_baselines3.common.policies import ActorCriticPolicy
 
-        from codrl_mj.agents.networks import UnitActionPolicy
+        from codrl_mj.agents.models import UnitActionPolicy
 
         return UnitActionPolicy if self.unit_actions else ActorCriticPolicy
 

@@ -54,26 +54,10 @@ class SARSAConfig(AgentConfig):
         """
         from codrl_mj.agents.sarsa_algorithm import SARSA, TileCodingPolicy
 
-        return SARSA(
-            TileCodingPolicy,
-            env,
-            step_size=self.step_size,
-            gamma=self.gamma,
-            epsilon=self.epsilon,
-            epsilon_decay=self.epsilon_decay,
-            trace_decay=self.trace_decay,
-            policy_kwargs=self._policy_arguments(),
-            seed=seed,
-        )
+        return SARSA(TileCodingPolicy, env, self, seed=seed)
 
     def make_policy(self, observation_space: spaces.Box, action_space: spaces.Space[Any]) -> Any:
         """See `AgentConfig.make_policy`."""
         from codrl_mj.agents.sarsa_algorithm import TileCodingPolicy
 
-        return TileCodingPolicy(observation_space, action_space, **self._policy_arguments())
-
-    def _policy_arguments(self) -> dict[str, Any]:
-        return {
-            name: getattr(self, name)
-            for name in ("tilings", "intervals", "angles", "low", "high", "initial_value", "epsilon")
-        }
+        return TileCodingPolicy(observation_space, action_space, self)

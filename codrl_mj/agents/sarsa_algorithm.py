@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,48 +13,27 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import safe_mean
 
-from codrl_mj.agents.sarsa_episodes import CompiledEpisodes
-from codrl_mj.agents.sarsa_kernels import Rates, begin, choose_actions, learn, no_traces
+from codrl_mj.agents.sarsa import SARSAConfig
+from codrl_mj.agents.sarsa_kernels import Learner, begin, choose_actions, learn, no_traces, run_episode
 from codrl_mj.agents.tile_coding import make_coder
+from codrl_mj.envs import ActuatedVectorEnv
+from codrl_mj.envs.compiled import arguments, compiled_kernels
+from codrl_mj.envs.sb3 import ActuatedVecEnv
 from codrl_mj.physics.streams import set_words, words_of
 
 
 class TileCodingPolicy(BasePolicy):
     """Acts by action values that are linear in the active tiles: greedily, or epsilon-greedily.
 
-    Of equally good actions a greedy one (`deterministic=True`) is the first. `epsilon` and `generator` are those of
-    `predict(..., deterministic=False)`; training draws from the algorithm's own generator, so that no evaluation
+    Of equally good actions a greedy one (`deterministic=True`) is the first. `predict(..., deterministic=False)` draws
+    from the policy's `generator`; training draws from the algorithm's own generator, so that no evaluation
     changes it.
     """
 
     def __init__(
-        self,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Space[Any],
-        tilings: int = 8,
-        intervals: Sequence[int] = (8, 8),
-        angles: int = 0,
-        low: Sequence[float] | None = None,
-        high: Sequence[float] | None = None,
-        initial_value: float = 0.0,
-        epsilon: float = 0.0,
+        self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], config: SARSAConfig
     ) -> None:
-        """Make a policy that knows nothing yet.
-
-        Args:
-            observation_space: a `Box` of shape (k,).
-            action_space: a `Discrete` space that starts at 0.
-            tilings: as for `make_coder`, and so are the next two.
-            intervals: of every axis.
-            angles: leading pairs of cosine and sine.
-            low: lower ends of the axes that are not angles; None takes the observation space's.
-            high: their upper ends.
-            initial_value: of every action everywhere.
-            epsilon: probability of a random action.
-
-        Raises:
-            ValueError: a space of another kind, or an argument out of bounds; the message names it.
-        """
+        """Make a policy that knows nothing yet."""
         if not isinstance(action_space, spaces.Discrete) or action_space.start != 0:
             raise ValueError(
                 f"action_space = {action_space}: SARSA has a weight for every action: must be Discrete, from 0"
@@ -63,24 +42,20 @@ class TileCodingPolicy(BasePolicy):
             raise ValueError(
                 f"observation_space = {observation_space}: must be a Box with one axis, to be covered by tiles"
             )
+        tilings, intervals, angles = config.tilings, config.intervals, config.angles
         used = slice(2 * angles, len(intervals) + angles)
         if used.stop > observation_space.shape[0]:
             raise ValueError(
-                f"intervals = {tuple(intervals)}, angles = {angles}: are of {used.stop} observation entries, but there "
+                f"intervals = {intervals}, angles = {angles}: are of {used.stop} observation entries, but there "
                 f"are {observation_space.shape[0]}; give one interval for an angle or any other entry"
             )
         super().__init__(observation_space, action_space)
-        self._arguments: dict[str, Any] = {
-            "tilings": tilings,
-            "intervals": tuple(intervals),
-            "angles": angles,
-            "low": tuple(observation_space.low[used].tolist() if low is None else low),
-            "high": tuple(observation_space.high[used].tolist() if high is None else high),
-        }
-        self.coder = make_coder(**self._arguments)
-        self.initial_value, self.epsilon = initial_value, epsilon
+        low = observation_space.low[used].tolist() if config.low is None else config.low
+        high = observation_space.high[used].tolist() if config.high is None else config.high
+        self.config, self.coder = config, make_coder(low, high, tilings, intervals, angles)
         self.generator = np.random.default_rng()
-        weights = torch.full((self.coder.size, int(action_space.n)), initial_value / tilings, dtype=torch.float64)
+        size = self.coder.size, int(action_space.n)
+        weights = torch.full(size, config.initial_value / tilings, dtype=torch.float64)
         self.weights = torch.nn.Parameter(weights, requires_grad=False)
 
     @property
@@ -89,14 +64,67 @@ class TileCodingPolicy(BasePolicy):
         return self.weights.numpy()
 
     def _predict(self, observation: Any, deterministic: bool = False) -> torch.Tensor:
-        actions = choose_actions(
-            observation.numpy(), self.coder, self.table, deterministic, self.epsilon, self.generator
+        epsilon, generator = self.config.epsilon, self.generator
+        return torch.from_numpy(
+            choose_actions(observation.numpy(), self.coder, self.table, deterministic, epsilon, generator)
         )
-        return torch.from_numpy(actions)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        named = {"observation_space": self.observation_space, "action_space": self.action_space}
-        return named | self._arguments | {"initial_value": self.initial_value, "epsilon": self.epsilon}
+        return {"observation_space": self.observation_space, "action_space": self.action_space, "config": self.config}
+
+
+class CompiledEpisodes:
+    """Runs the episodes of an `ActuatedVecEnv` of one environment on a simulation of its own, bit for bit the same.
+
+    At the end of each the environment is where its own steps would have brought it: at the start of the next one.
+    """
+
+    def __init__(self, env: ActuatedVecEnv) -> None:
+        """Make the simulation for one that `can_run` says it can."""
+        self.env = env
+        vector: Any = env.env
+        self._physics: Any = vector.setup.simulate("mujoco")
+        self._step = compiled_kernels(vector.setup, self._physics).step
+        self._arguments = arguments(vector.setup, self._physics)
+        self._forces = vector.setup.commands.action_forces
+        self._record = np.empty((vector.max_episode_steps, self._physics.trace.shape[2]))
+
+    @staticmethod
+    def can_run(env: Any) -> bool:
+        """Whether the environment is ours, in MuJoCo, of one motor, not randomised, and has a time limit."""
+        return (
+            type(env) is ActuatedVecEnv
+            and isinstance(env.env, ActuatedVectorEnv)
+            and env.num_envs == 1
+            and not env.env.setup.randomization.names
+            and len(env.env.task.motors) == 1
+            and env.env.max_episode_steps is not None
+        )
+
+    def run(self, learner: Learner, generator: np.random.Generator) -> tuple[Any, ...] | None:
+        """Learn from an episode; None, with nothing done, if the environment stands in the middle of one.
+
+        Returns:
+            Steps, first observation (1, k) of the next episode, sum of the rewards (1,), that the episode ended (1,),
+            infos as the last step would return them, and the actuator's signals, each an array of shape (steps,).
+        """
+        vector: Any = self.env.env
+        setup, start = vector.setup, vector.snapshot()
+        if start["elapsed"][0] != 0:
+            return None
+        self._physics.reset(np.zeros(len(setup.task.state_names)))  # sees to the callbacks
+        self._physics.restore(start["physics"][0])
+        self._physics.memory[:] = start.get("disturbances", np.zeros((1, 0)))[0]
+        observation = start["observations"][0].copy()
+        total, length, terminated, fine = run_episode(
+            learner, generator, self._step, self._forces, observation, self._record, self._arguments
+        )
+        if not fine:
+            self._physics.check_finite()
+        columns = self._record[:length].T.copy()
+        signals = setup.signals(columns, columns[0])
+        observations, infos = self.env.conclude(observation, total, length, not terminated, signals)
+        return length, observations, np.array([total], dtype=np.float32), np.array([True]), infos, signals
 
 
 class SARSA(BaseAlgorithm):
@@ -113,69 +141,33 @@ class SARSA(BaseAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"TileCodingPolicy": TileCodingPolicy}
     policy: TileCodingPolicy
+    compiled = True
+    """Whether to run whole episodes in compiled code where the environment can; the results are the same."""
     _last_obs: Any
 
     def __init__(
-        self,
-        policy: str | type[TileCodingPolicy],
-        env: Any,
-        step_size: float = 0.0375,
-        gamma: float = 1.0,
-        epsilon: float = 0.001,
-        epsilon_decay: float = 1.0,
-        trace_decay: float = 0.0,
-        policy_kwargs: Mapping[str, Any] | None = None,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        verbose: int = 0,
-        compiled: bool = True,
-        seed: int | None = None,
-        device: Any = "cpu",
-        _init_setup_model: bool = True,
+        self, policy: str | type[TileCodingPolicy], env: Any, config: SARSAConfig | None = None, **settings: Any
     ) -> None:
         """Make the algorithm.
 
         Args:
             policy: `TileCodingPolicy`.
             env: a Gymnasium environment, or a `VecEnv` of one.
-            step_size: of each weight: a fraction of the inverse number of tilings.
-            gamma: discount factor.
-            epsilon: probability of a random action in the first episode.
-            epsilon_decay: factor on epsilon from one episode to the next.
-            trace_decay: lambda, of replacing traces; 0 for one-step SARSA.
-            policy_kwargs: arguments of the policy.
-            stats_window_size: episodes over which logged means are taken.
-            tensorboard_log: folder for TensorBoard; None for none.
-            verbose: as in Stable-Baselines3.
-            compiled: whether to run whole episodes in compiled code where the environment can; the results are the
-                same.
-            seed: of the environment, and of the algorithm's own generator.
-            device: not used: tables are looked up on the CPU.
-            _init_setup_model: as in Stable-Baselines3.
+            config: the agent's settings; None: the paper's.
+            **settings: `BaseAlgorithm`'s.
 
         Raises:
             ValueError: the environment is more than one, or its spaces do not go with tiles.
         """
-        del device
-        self.compiled = compiled
+        self.config = config or SARSAConfig()
         self._episodes: CompiledEpisodes | None = None
-        self.step_size, self.gamma, self.trace_decay = step_size, gamma, trace_decay
-        self.epsilon, self.epsilon_decay = epsilon, epsilon_decay
-        self.exploration_rate = epsilon  # in the present episode
+        self.exploration_rate = self.config.epsilon  # in the present episode
         if getattr(env, "num_envs", 1) != 1:
             raise ValueError(f"num_envs = {env.num_envs}: SARSA learns from one environment: must be 1")
-        super().__init__(
-            policy,
-            env,
-            learning_rate=step_size,
-            policy_kwargs=dict(policy_kwargs or {}),
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            verbose=verbose,
-            seed=seed,
-            device="cpu",
-        )
-        if _init_setup_model:
+        set_up = settings.pop("_init_setup_model", True)
+        given = settings | {"policy_kwargs": {"config": self.config}, "device": "cpu"}
+        super().__init__(policy, env, learning_rate=self.config.step_size, **given)
+        if set_up:
             self._setup_model()
 
     def _setup_model(self) -> None:
@@ -184,18 +176,24 @@ class SARSA(BaseAlgorithm):
             # A child's seed: seeded alike, the environment's generator would draw the same numbers.
             self._generator = np.random.default_rng(np.random.SeedSequence(self.seed).spawn(1)[0])
         self.policy = self.policy_class(self.observation_space, self.action_space, **self.policy_kwargs)  # type: ignore[assignment]
-        self._traces = no_traces(self.policy.table.size if self.trace_decay else 0)
+        coder, table = self.policy.coder, self.policy.table
+        self._learner = Learner(
+            coder,
+            table,
+            no_traces(table.size if self.config.trace_decay else 0),
+            np.empty(len(coder.displacements), dtype=np.int64),
+            self.config.step_size,
+            self.config.gamma,
+            self.config.trace_decay,
+            self.config.epsilon,
+        )
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """What training depends on between episodes, besides the policy and Stable-Baselines3's own attributes."""
         return {"generator": words_of(self._generator)}
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
-        """Continue from what `snapshot` returned, bit for bit.
-
-        Raises:
-            KeyError: it is not such a snapshot.
-        """
+        """Continue from what `snapshot` returned, bit for bit."""
         set_words(self._generator, snapshot["generator"])
 
     def learn(  # type: ignore[override]
@@ -207,25 +205,13 @@ class SARSA(BaseAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> "SARSA":
-        """Learn, whole episodes until there were `total_timesteps` steps or the callback stops it.
-
-        Args:
-            total_timesteps: environment steps.
-            callback: as in Stable-Baselines3.
-            log_interval: episodes between two entries in the log; None for no log.
-            tb_log_name: name of the run in TensorBoard.
-            reset_num_timesteps: count steps and episodes anew, and begin another episode.
-            progress_bar: show one.
-
-        Returns:
-            The algorithm itself.
-        """
+        """Learn, whole episodes until there were `total_timesteps` steps or the callback stops it."""
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
         callback.on_training_start(locals(), globals())
         while self.num_timesteps < total_timesteps:
-            self.exploration_rate = self.epsilon * self.epsilon_decay**self._episode_num
+            self.exploration_rate = self.config.epsilon * self.config.epsilon_decay**self._episode_num
             callback.on_rollout_start()
             if not self._run_episode(callback):
                 break
@@ -236,41 +222,27 @@ class SARSA(BaseAlgorithm):
         callback.on_training_end()
         return self
 
-    def _compiled_episodes(self) -> CompiledEpisodes | None:
-        """What runs the environment's episodes in compiled code, if that is wanted and possible."""
-        if not self.compiled or not CompiledEpisodes.can_run(self.env):
-            return None
-        if self._episodes is None or self._episodes.env is not self.env:
-            self._episodes = CompiledEpisodes(self.env)  # type: ignore[arg-type]
-        return self._episodes
-
     def _run_episode(self, callback: BaseCallback) -> bool:
-        """Learn from the rest of an episode.
-
-        Returns:
-            Whether the callback lets it go on.
-        """
-        rates = Rates(self.step_size, self.gamma, self.trace_decay, self.exploration_rate)
-        learner = self.policy.coder, self.policy.table, self._traces, rates, self._generator
-        episodes = self._compiled_episodes()
-        ended = None if episodes is None else episodes.run(*learner)
-        if ended is not None:
-            rewards, dones = np.array([ended.total], dtype=np.float32), np.array([True])
-            return self._count(callback, ended.steps, ended.observations, rewards, dones, ended.infos, ended.signals)
+        """Learn from the rest of an episode; whether the callback lets it go on."""
+        learner = self._learner._replace(epsilon=self.exploration_rate)
+        if self.compiled and CompiledEpisodes.can_run(self.env):
+            if self._episodes is None or self._episodes.env is not self.env:
+                self._episodes = CompiledEpisodes(self.env)  # type: ignore[arg-type]
+            if (episode := self._episodes.run(learner, self._generator)) is not None:
+                return self._count(callback, *episode)
         return self._run_steps(callback, learner)
 
-    def _run_steps(self, callback: BaseCallback, learner: tuple[Any, ...]) -> bool:
+    def _run_steps(self, callback: BaseCallback, learner: Learner) -> bool:
         """The same, step by step."""
         assert self.env is not None
-        tiles = np.empty(len(self.policy.coder.displacements), dtype=np.int64)
-        action = begin(*learner, tiles, self._last_obs[0])
+        action = begin(learner, self._generator, self._last_obs[0])
         dones = np.array([False])
         while not dones[0]:
             new_obs, rewards, dones, infos = self.env.step(np.array([action]))
             info = infos[0]
             terminated = bool(dones[0]) and not info.get("TimeLimit.truncated", False)
             seen = info["terminal_observation"] if dones[0] else new_obs[0]  # type: ignore[index]
-            action = learn(*learner, tiles, action, float(rewards[0]), seen, terminated)
+            action = learn(learner, self._generator, action, float(rewards[0]), seen, terminated)
             if not self._count(callback, 1, new_obs, rewards, dones, infos, getattr(self.env, "signals", None)):
                 return False
         return True
@@ -307,7 +279,7 @@ class SARSA(BaseAlgorithm):
         self.logger.dump(step=self.num_timesteps)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_traces", "_episodes"]
+        return [*super()._excluded_save_params(), "_learner", "_episodes"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy"], []

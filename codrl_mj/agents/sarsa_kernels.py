@@ -1,9 +1,9 @@
-"""Episodic semi-gradient SARSA on tiles, compiled: choosing an action, and learning from a step.
+"""Episodic semi-gradient SARSA on tiles, compiled: choosing an action, learning from a step, and whole episodes.
 
 Sutton and Barto, *Reinforcement Learning: An Introduction* (2018), section 10.1; with traces, section 12.7.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -12,19 +12,6 @@ from codrl_mj.agents.tile_coding import TileCoder, find_tiles
 
 FORGOTTEN = 1e-3
 """Eligibility below which a trace is dropped."""
-
-
-class Rates(NamedTuple):
-    """How an agent learns in an episode."""
-
-    step_size: float
-    """Of each weight."""
-    gamma: float
-    """Discount factor."""
-    trace_decay: float
-    """lambda."""
-    epsilon: float
-    """Probability of a random action."""
 
 
 class Traces(NamedTuple):
@@ -38,6 +25,30 @@ class Traces(NamedTuple):
     """Their number, shape (1,)."""
 
 
+class Learner(NamedTuple):
+    """An agent in an episode: what it knows, where it is, and how it learns. Its arrays change.
+
+    Its generator is no part of it: with one in a tuple, numba takes 0.1 ms to find out what a call's arguments are.
+    """
+
+    coder: TileCoder
+    """Finds tiles."""
+    weights: np.ndarray
+    """Shape (tiles, actions)."""
+    traces: Traces
+    """Of the weights."""
+    tiles: np.ndarray
+    """Indices of the active ones, in which the present observation lies, shape (n,)."""
+    step_size: float
+    """Of each weight."""
+    gamma: float
+    """Discount factor."""
+    trace_decay: float
+    """lambda."""
+    epsilon: float
+    """Probability of a random action."""
+
+
 def no_traces(size: int) -> Traces:
     """Empty traces, with room for `size` weights."""
     return Traces(np.zeros(size), np.zeros(size, dtype=np.int64), np.zeros(1, dtype=np.int64))
@@ -45,28 +56,11 @@ def no_traces(size: int) -> Traces:
 
 @numba.njit(nogil=True, error_model="numpy")
 def action_value(weights: np.ndarray, tiles: np.ndarray, action: int) -> float:
-    """Estimated return of an action: the sum of its weights over the active tiles.
-
-    Args:
-        weights: shape (tiles, actions).
-        tiles: indices of the active ones, shape (n,).
-        action: index of the action.
-    """
+    """Estimated return of an action: the sum of its weights over the active tiles."""
     value = 0.0
     for tile in tiles:
         value += weights[tile, action]
     return value
-
-
-@numba.njit(nogil=True, error_model="numpy")
-def greedy_action(weights: np.ndarray, tiles: np.ndarray) -> int:
-    """The best action; of equally good ones the first."""
-    best, best_value = 0, action_value(weights, tiles, 0)
-    for action in range(1, weights.shape[1]):
-        value = action_value(weights, tiles, action)
-        if value > best_value:
-            best, best_value = action, value
-    return best
 
 
 @numba.njit(nogil=True, error_model="numpy")
@@ -96,90 +90,55 @@ def choose_actions(
     epsilon: float,
     generator: np.random.Generator,
 ) -> np.ndarray:
-    """An action for each of some observations, shape (N, k): greedy, or epsilon-greedy; shape (N,), int64."""
+    """Actions (N,) for observations (N, k): the best, of equally good ones the first; or as `choose_action` does."""
     tiles = np.empty(len(coder.displacements), dtype=np.int64)
     actions = np.empty(len(observations), dtype=np.int64)
     for row in range(len(observations)):
         find_tiles(observations[row], coder, tiles)
         if deterministic:
-            actions[row] = greedy_action(weights, tiles)
+            actions[row] = 0
+            for action in range(1, weights.shape[1]):
+                if action_value(weights, tiles, action) > action_value(weights, tiles, actions[row]):
+                    actions[row] = action
         else:
             actions[row] = choose_action(weights, tiles, epsilon, generator)
     return actions
 
 
 @numba.njit(nogil=True, error_model="numpy")
-def begin(
-    coder: TileCoder,
-    weights: np.ndarray,
-    traces: Traces,
-    rates: Rates,
-    generator: np.random.Generator,
-    tiles: np.ndarray,
-    observation: np.ndarray,
-) -> int:
-    """Begin an episode.
-
-    Args:
-        coder: finds tiles.
-        weights: shape (tiles, actions).
-        traces: are emptied.
-        rates: how to learn.
-        generator: draws.
-        tiles: gets the active tiles, shape (n,).
-        observation: the first, shape (k,).
-
-    Returns:
-        The first action.
-    """
+def begin(learner: Learner, generator: np.random.Generator, observation: np.ndarray) -> int:
+    """Begin an episode with its first observation (k,): no traces are left. The first action."""
+    traces = learner.traces
     for kept in range(traces.used[0]):  # loops over slices take numba longer to compile
         traces.eligibility[traces.eligible[kept]] = 0.0
     traces.used[0] = 0
-    find_tiles(observation, coder, tiles)
-    return choose_action(weights, tiles, rates.epsilon, generator)
+    find_tiles(observation, learner.coder, learner.tiles)
+    return choose_action(learner.weights, learner.tiles, learner.epsilon, generator)
 
 
 @numba.njit(nogil=True, error_model="numpy")
 def learn(
-    coder: TileCoder,
-    weights: np.ndarray,
-    traces: Traces,
-    rates: Rates,
+    learner: Learner,
     generator: np.random.Generator,
-    tiles: np.ndarray,
     action: int,
     reward: float,
     observation: np.ndarray,
     terminated: bool,
 ) -> int:
-    """Learn from a step, and choose the next action.
+    """Learn from a step that led to an observation (k,), and choose the next action, without meaning at the end.
 
     The target is r + gamma q(s', a'), also where a time limit cuts the episode off; and r where the task ends it.
-
-    Args:
-        coder: finds tiles.
-        weights: shape (tiles, actions); changed.
-        traces: changed.
-        rates: how to learn.
-        generator: draws.
-        tiles: tiles of the observation before the step, shape (n,); gets those after it, where the episode goes on.
-        action: what was done.
-        reward: what was earned.
-        observation: what was seen after it, shape (k,).
-        terminated: whether the task ended the episode.
-
-    Returns:
-        The next action; without meaning if the task ended the episode.
     """
+    weights, traces, tiles = learner.weights, learner.traces, learner.tiles
     error = reward - action_value(weights, tiles, action)
     next_tiles, next_action = np.empty_like(tiles), 0
     if not terminated:
-        find_tiles(observation, coder, next_tiles)
-        next_action = choose_action(weights, next_tiles, rates.epsilon, generator)
-        error += rates.gamma * action_value(weights, next_tiles, next_action)
-    change = rates.step_size * error
-    if rates.trace_decay > 0.0:
-        _mark(weights.shape[1], traces, tiles, action, rates.gamma * rates.trace_decay)
+        find_tiles(observation, learner.coder, next_tiles)
+        next_action = choose_action(weights, next_tiles, learner.epsilon, generator)
+        error += learner.gamma * action_value(weights, next_tiles, next_action)
+    change = learner.step_size * error
+    if learner.trace_decay > 0.0:
+        _mark(traces, tiles, action, weights.shape[1], learner.gamma * learner.trace_decay)
         for kept in range(traces.used[0]):
             index = traces.eligible[kept]
             weights[index // weights.shape[1], index % weights.shape[1]] += change * traces.eligibility[index]
@@ -192,7 +151,7 @@ def learn(
 
 
 @numba.njit(nogil=True, error_model="numpy")
-def _mark(actions: int, traces: Traces, tiles: np.ndarray, action: int, decay: float) -> None:
+def _mark(traces: Traces, tiles: np.ndarray, action: int, actions: int, decay: float) -> None:
     """Fade the traces, drop the faintest, and set those of the weights in use to 1 (replacing traces)."""
     kept = 0
     for position in range(traces.used[0]):
@@ -211,3 +170,34 @@ def _mark(actions: int, traces: Traces, tiles: np.ndarray, action: int, decay: f
             kept += 1
         traces.eligibility[index] = 1.0
     traces.used[0] = kept
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def run_episode(
+    learner: Learner,
+    generator: np.random.Generator,
+    step: Any,
+    forces: np.ndarray,
+    observation: np.ndarray,
+    record: np.ndarray,
+    arguments: tuple[Any, ...],
+) -> tuple[float, int, bool, bool]:
+    """Learn from an episode of an environment's compiled `step`, from its first observation (k,), which gets the last.
+
+    `record`, as long as the time limit, gets the trace's last row of each step. Sum of the rewards, steps, whether the
+    task ended the episode, and whether the simulation was fine throughout.
+    """
+    action = begin(learner, generator, observation)
+    total, length, terminated = 0.0, 0, False
+    while not terminated and length < len(record):
+        force = forces[action]
+        reward, terminated, fine = step(force, observation, *arguments)
+        if not fine:
+            return total, length, False, False
+        trace = arguments[-1]
+        record[length] = trace[-1, 0]
+        record[length, 0] = force  # as it was asked for, before anything disturbed it
+        total, length = total + reward, length + 1
+        seen_reward = float(np.float32(reward))  # what Stable-Baselines3's environments hand out
+        action = learn(learner, generator, action, seen_reward, observation, terminated)
+    return total, length, terminated, True

@@ -42,21 +42,11 @@ class TileCoder(NamedTuple):
 def make_coder(
     low: Sequence[float], high: Sequence[float], tilings: int, intervals: Sequence[int], angles: int = 0
 ) -> TileCoder:
-    """A tile coder.
+    """A tile coder, with so many intervals between lower and upper end of every axis, and n tilings, a power of 2.
 
-    The first `angles` axes are angles, each of which the observation has as its cosine and sine; these axes wrap. The
-    other axes are the observation's further entries in their order; entries beyond the last axis are ignored.
-
-    Args:
-        low: lower ends of the axes that are not angles, shape (d - angles,).
-        high: their upper ends.
-        tilings: n, a power of 2, so that the displacements, odd multiples of t, are n different ones along every axis.
-        intervals: tiles between lower and upper end of every axis, d of them; a tiling has one more along an axis that
-            does not wrap, for its displacement.
-        angles: leading pairs of cosine and sine.
-
-    Raises:
-        ValueError: an argument is out of bounds, or there are too many tiles; the message names it.
+    The first `angles` axes are angles, each of which the observation has as its cosine and sine; these axes wrap, and
+    have no ends to be given. The other axes are the observation's further entries in their order; entries beyond the
+    last axis are ignored.
     """
     axes = len(intervals)
     if tilings < 1 or tilings & (tilings - 1):
@@ -102,16 +92,10 @@ def make_coder(
 
 @numba.njit(nogil=True, error_model="numpy")
 def find_tiles(observation: np.ndarray, coder: TileCoder, tiles: np.ndarray) -> None:
-    """Find the tiles that an observation lies in.
+    """Find the tiles (n,) of an observation (k,), one of each tiling: that of tiling t is in [t, t + 1) * size / n.
 
     Entries outside the ends of their axis count as at the nearer end, and so lie in the outer tiles; NaN counts as at
     the lower end.
-
-    Args:
-        observation: shape (k,).
-        coder: what `make_coder` returned.
-        tiles: gets the index of one tile of each tiling, shape (n,), int64; those of tiling t lie in
-            [t, t + 1) * size / n.
     """
     per_tiling = coder.size >> coder.shift
     for tiling in range(len(tiles)):

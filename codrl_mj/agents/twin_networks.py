@@ -14,11 +14,11 @@ import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
-_SLOPES = {
-    nn.Tanh: torch.ops.aten.tanh_backward,
-    nn.ReLU: lambda gradient, output: torch.ops.aten.threshold_backward(gradient, output, 0.0),
+_ACTIVATIONS: dict[type[nn.Module], tuple[Any, Any]] = {
+    nn.Tanh: (torch.tanh, torch.ops.aten.tanh_backward),
+    nn.ReLU: (torch.relu, lambda gradient, output: torch.ops.aten.threshold_backward(gradient, output, 0.0)),
 }
-"""Activation -> (gradient by its output, its output) -> gradient by its input."""
+"""Activation -> its function, and (gradient by its output, its output) -> gradient by its input."""
 
 
 class TwinNetworks:
@@ -28,12 +28,7 @@ class TwinNetworks:
     """
 
     def __init__(self, policy: ActorCriticPolicy) -> None:
-        """Move the policy's parameters into the vector `parameters`, whose gradient is `gradient`.
-
-        Raises:
-            ValueError: the networks differ in their hidden layers or have another activation, or the policy has other
-                parameters.
-        """
+        """Move the policy's parameters into the vector `parameters`, whose gradient is `gradient`."""
         towers = [
             [layer for layer in (*hidden, last) if isinstance(layer, nn.Linear)]
             for hidden, last in (
@@ -44,10 +39,10 @@ class TwinNetworks:
         log_std = getattr(policy, "log_std", None)
         sizes = [[(layer.in_features, layer.out_features) for layer in tower] for tower in towers]
         inputs = [[size[0] for size in tower] for tower in sizes]
-        if inputs[0] != inputs[1] or policy.activation_fn not in _SLOPES:
+        if inputs[0] != inputs[1] or policy.activation_fn not in _ACTIVATIONS:
             raise ValueError(
                 f"actor and critic of {policy.net_arch} with {policy.activation_fn.__name__}: must have the same "
-                f"hidden layers, with {' or '.join(one.__name__ for one in _SLOPES)}; use Stable-Baselines3's PPO"
+                f"hidden layers, with {' or '.join(one.__name__ for one in _ACTIVATIONS)}; use Stable-Baselines3's PPO"
             )
         ours = sum((inputs + 1) * outputs for tower in sizes for inputs, outputs in tower)
         theirs = sum(one.numel() for one in policy.parameters() if one is not log_std)
@@ -73,8 +68,7 @@ class TwinNetworks:
         if log_std is not None:
             _move(log_std, self.parameters[-noise:].view_as(log_std))
             self.log_std_gradient = self.gradient[-noise:].view_as(log_std)
-        activation = policy.activation_fn
-        self._activation, self._slope = {nn.Tanh: torch.tanh, nn.ReLU: torch.relu}[activation], _SLOPES[activation]
+        self._activation, self._slope = _ACTIVATIONS[policy.activation_fn]
 
     def holds(self, policy: ActorCriticPolicy) -> bool:
         """Whether the policy's parameters are views of `parameters` still: a copy of a policy has its own."""
@@ -98,12 +92,7 @@ class TwinNetworks:
         return layers
 
     def backward(self, layers: list[torch.Tensor], gradient: torch.Tensor) -> None:
-        """Fill in `gradient`, but for that of `log_std`.
-
-        Args:
-            layers: what `forward` returned.
-            gradient: of the loss by the outputs, (2, N, a).
-        """
+        """Fill in `gradient`, but for that of `log_std`, from `forward`'s layers and that by the outputs (2, N, a)."""
         for place in reversed(range(len(self.weights))):
             torch.bmm(gradient.mT, layers[place], out=self._weight_gradients[place])
             torch.sum(gradient, 1, keepdim=True, out=self._bias_gradients[place])
@@ -118,13 +107,7 @@ class VectorAdam(torch.optim.Adam):
     """
 
     def __init__(self, vector: torch.Tensor, views: Iterable[nn.Parameter], **options: Any) -> None:
-        """Optimise the vector.
-
-        Args:
-            vector: whose gradient is in `vector.grad`.
-            views: the parameters, in the order in which a plain optimiser would have them.
-            **options: Adam's.
-        """
+        """Optimise the vector by `vector.grad`; the views are in the order in which a plain Adam would have them."""
         super().__init__([vector], fused=True, **options)
         self._layout = [(view.shape, view.stride(), view.storage_offset()) for view in views]
 
@@ -140,11 +123,7 @@ class VectorAdam(torch.optim.Adam):
         return {"state": state if moments else {}, "param_groups": [group]}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take the moments of each parameter.
-
-        Raises:
-            ValueError: they are those of other parameters.
-        """
+        """Take the moments of each parameter."""
         state, group = state_dict["state"], state_dict["param_groups"][0]
         if len(group["params"]) != len(self._layout):
             raise ValueError(f"{len(group['params'])} parameters are optimised: must be {len(self._layout)}")

@@ -188,7 +188,7 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
         returns=bootstrap_mean(returns),
         returns_median=float(np.median(returns)),
         returns_interquartile_mean=interquartile_mean(returns),
-        length=_mean_of(episodes, lambda episode: len(episode.reward)),
+        length=bootstrap_mean(np.array([float(len(episode.reward)) for episode in episodes])),
         success=success,
         failure=None if success is None else Interval(1 - success.mean, 1 - success.high, 1 - success.low),
         time_to_goal=quartiles(reached) if world.timed and len(reached) else None,
@@ -211,11 +211,6 @@ def _of_motor(episodes: Sequence[Episode], driven: Sequence[Sequence["_Driven"]]
     work = float(np.mean([one.work for each in driven for one in each]))
     means = {name: value.mean if isinstance(value, Interval) else value for name, value in measures.items()}
     return means | {"mechanical_work": work}
-
-
-def _mean_of(episodes: Sequence[Episode], value: Callable[[Episode], float]) -> Interval:
-    """Mean over the episodes."""
-    return bootstrap_mean(np.array([value(episode) for episode in episodes], dtype=float))
 
 
 def _time_to_goal(world: World, episode: Episode) -> float | None:

@@ -43,12 +43,7 @@ def bootstrap_mean(values: np.ndarray) -> Interval:
 
 
 def wilson_rate(successes: int, trials: int) -> Interval:
-    """Share of successes, and its 95 % interval by Wilson's score (scipy): good for few trials and shares of 0 or 1.
-
-    Args:
-        successes: from 0 to `trials`.
-        trials: >= 1.
-    """
+    """Share of successes, and its 95 % interval by Wilson's score (scipy): good for few trials and shares of 0 or 1."""
     from scipy.stats import binomtest
 
     interval = binomtest(successes, trials).proportion_ci(confidence_level=0.95, method="wilson")
@@ -56,13 +51,10 @@ def wilson_rate(successes: int, trials: int) -> Interval:
 
 
 def interquartile_mean(values: np.ndarray) -> float:
-    """Mean of what is left without the lowest and the highest quarter of the values, each of floor(n/4) values.
+    """Mean of what is left without the lowest and the highest quarter of n >= 1 values, each of floor(n/4) values.
 
     Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice" (2021), recommend it for
     returns: outliers move it less than the mean, and it uses more of the values than the median.
-
-    Args:
-        values: shape (n,), n >= 1.
     """
     from scipy.stats import trim_mean
 
@@ -70,21 +62,13 @@ def interquartile_mean(values: np.ndarray) -> float:
 
 
 def quartiles(values: np.ndarray) -> Quartiles:
-    """Median and quartiles, linear between values.
-
-    Args:
-        values: shape (n,), n >= 1.
-    """
+    """Median and quartiles of n >= 1 values, linear between these."""
     low, median, high = np.percentile(values, [25, 50, 75])
     return Quartiles(float(median), float(low), float(high))
 
 
 def holds_since(condition: np.ndarray) -> int:
-    """Index from which a condition holds until the end; n if it does not hold at the end.
-
-    Args:
-        condition: bool, shape (n,).
-    """
+    """Index from which a condition, bool of shape (n,), holds until the end; n if it does not hold at the end."""
     broken = np.flatnonzero(~condition)
     return int(broken[-1]) + 1 if len(broken) else 0
 
@@ -99,15 +83,9 @@ def delay(
     from 0 to half the mean length of an episode. Of peaks as high as the highest (`EQUAL_CORRELATION`) the first is
     taken, and refined by the parabola through it and its two neighbours.
 
-    Args:
-        desired: one signal for each episode, shape (n,) each.
-        actual: the same for what follows it, of the same shapes.
-        timestep: between samples [s].
-        motors: whose signals these are in turn, >= 1.
-
-    Returns:
-        The delay, >= 0; None where either signal is constant, where even the highest peak is below
-        `LEAST_CORRELATION`, or where there is none.
+    There is a desired signal and one that follows it for each episode, of several motors in turn. The delay is >= 0;
+    None where either signal is constant, where even the highest peak is below `LEAST_CORRELATION`, or where there is
+    none.
     """
     from scipy.signal import correlate
 
@@ -137,11 +115,8 @@ def delay(
 def _parabolas(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Peaks of the parabolas through every sample but the outer ones and its two neighbours, where it is a peak itself.
 
-    Args:
-        samples: shape (n+2,). Nothing before the second counts as higher than it.
-
-    Returns:
-        Where the peak is, relative to the sample [samples], and its height; -inf where there is none. Shape (n,) each.
+    Where they are, relative to the sample [samples], and how high; -inf where there is none. Shape (n,) each, of
+    samples (n+2,), of which none before the second counts as higher than it.
     """
     before, at, after = samples[:-2], samples[1:-1], samples[2:]
     rises, falls = at >= before, at >= after
@@ -161,12 +136,8 @@ def electrical_energy(voltage: np.ndarray, current: np.ndarray, timestep: float)
     """Energy that a motor draws from its supply, and energy that it returns [J]: two integrals of u*i, both >= 0.
 
     The voltage is held over a step, as a digital controller's is, and the current is taken as linear in it: a step's
-    energy is u*(i + i')/2*dt. Steps where it is positive are drawn, the others returned.
-
-    Args:
-        voltage: over each step [V], shape (n,).
-        current: before the first step and after each [A], shape (n+1,).
-        timestep: dt [s].
+    energy is u*(i + i')/2*dt, with voltages (n,) over the steps and currents (n+1,) before the first and after each.
+    Steps where it is positive are drawn, the others returned.
     """
     return drawn_and_returned(voltage * (current[1:] + current[:-1]) * (timestep / 2))
 
@@ -177,32 +148,20 @@ def drawn_and_returned(energies: np.ndarray) -> tuple[float, float]:
 
 
 def integral_of_square(samples: np.ndarray, timestep: float) -> float:
-    """Integral of the square of what is linear between samples: sum of (i^2 + i*i' + i'^2)/3*dt.
-
-    Args:
-        samples: shape (n+1,).
-        timestep: dt between them [s].
-    """
+    """Integral of the square of what is linear between samples: sum of (i^2 + i*i' + i'^2)/3*dt."""
     before, after = samples[:-1], samples[1:]
     return float(np.sum(before * before + before * after + after * after)) * timestep / 3
 
 
 def mechanical_work(force: np.ndarray, speed: np.ndarray, timestep: float) -> float:
-    """Work of a force on what it moves [J]: the force is held over a step, the speed linear in it, F*(v + v')/2*dt.
+    """Work of a force or torque on what it moves [J], F*(v + v')/2*dt in a step.
 
-    Args:
-        force: over each step [N], or torque [N*m], shape (n,).
-        speed: before the first step and after each [m/s], or [rad/s], shape (n+1,).
-        timestep: dt [s].
+    The force (n,) is held over a step; the speed (n+1,), before the first step and after each, is linear in it.
     """
     return float(np.sum(force * (speed[1:] + speed[:-1]))) * timestep / 2
 
 
 def sign_changes(samples: np.ndarray) -> int:
-    """How often a signal goes from one sign to the other; zeros in between are no sign.
-
-    Args:
-        samples: shape (n,).
-    """
+    """How often a signal goes from one sign to the other; zeros in between are no sign."""
     signs = np.sign(samples[samples != 0])
     return int(np.count_nonzero(signs[1:] != signs[:-1]))

@@ -19,10 +19,10 @@ from codrl_mj.pages.episode import Shown, episode_section, show
 from codrl_mj.pages.loop import held_step, loop_section
 from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.runs.files import check_page, read_json
-from codrl_mj.runs.layout import PROGRESS, finished, told_apart
+from codrl_mj.runs.layout import BEST, EPISODES, PROGRESS, finished, told_apart
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.runs.summaries import RunSummary, compare, read_run
-from codrl_mj.training.folder import BEST, EPISODES, load_config
+from codrl_mj.training.folder import load_config
 from codrl_mj.training.history import learning_curves, read_episodes
 
 _MOST_LOOPS = 4

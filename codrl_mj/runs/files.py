@@ -44,8 +44,7 @@ def leftovers(folder: Path) -> list[tuple[Path, str]]:
 def writing_folder(path: Path) -> Iterator[Path]:
     """A temporary folder beside `path` that becomes `path` when the block ends, and disappears if it raises.
 
-    Raises:
-        OSError: `path` exists and is not an empty folder.
+    It raises where `path` exists and is not an empty folder.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
@@ -65,11 +64,7 @@ def _umask() -> int:
 
 
 def check_writable(folder: Path) -> None:
-    """Find out before hours of work whether `folder` can hold results; makes nothing.
-
-    Raises:
-        OSError: it is a file, or lies below one, or below a folder that cannot be written to.
-    """
+    """Find out before hours of work whether `folder` can hold results; makes nothing."""
     present = folder.absolute()
     while not present.exists():
         present = present.parent
@@ -84,23 +79,14 @@ def check_writable(folder: Path) -> None:
 
 
 def check_file(path: Path) -> None:
-    """Find out before hours of work whether the file `path` can be written; makes nothing.
-
-    Raises:
-        OSError: it is a folder, or `check_writable` refuses where it would lie.
-    """
+    """Find out before hours of work whether the file `path` can be written; makes nothing."""
     if path.is_dir():
         raise IsADirectoryError(f"cannot write {path}: it is a folder: name a file, such as {path}/NAME")
     check_writable(path.parent)
 
 
 def check_page(path: Path) -> None:
-    """Refuse a page's file by its suffix, or where it cannot be written.
-
-    Raises:
-        ValueError: it is none of a page.
-        OSError: see `check_file`.
-    """
+    """Refuse a page's file by its suffix, or where it cannot be written."""
     if path.suffix not in (".html", ".htm"):
         raise ValueError(f"page {path}: the suffix is {path.suffix!r}, must be .html; write {path.stem}.html")
     check_file(path)
@@ -119,11 +105,7 @@ def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_digest(path: Path, content: bytes, expected: Any, beside: str) -> None:
-    """Refuse a file's content that has not the SHA-256 which the file `beside` it names; any where that is None.
-
-    Raises:
-        ValueError: it has another; what may have happened, and the remedy.
-    """
+    """Refuse a file's content that has not the SHA-256 which the file `beside` it names; none where that is None."""
     if expected is not None and hashlib.sha256(content).hexdigest() != expected:
         raise ValueError(
             f"{path} is truncated or damaged, or it and {beside} do not belong together: its sha256 is not the one "
@@ -133,15 +115,9 @@ def check_digest(path: Path, content: bytes, expected: Any, beside: str) -> None
 
 
 def read_json(path: Path, what: str) -> Any:
-    """Read JSON; of what is `sealed`, the content alone.
+    """Read JSON; of what is `sealed`, the content alone. `what` the file is goes into the error.
 
-    Args:
-        path: the file.
-        what: what the file is, for the error.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is not JSON, for instance because it is truncated, or not what was sealed.
+    A missing file is a FileNotFoundError, a truncated or edited one a ValueError.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no {what} at {path}")

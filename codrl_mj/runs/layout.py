@@ -1,14 +1,17 @@
 """What a run folder holds under which name, and what marks it as finished."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 CONFIG, RESULT, EVALUATION = "config.json", "result.json", "evaluation.json"
-PROGRESS = "progress.csv"
-BEST = "best"
+PROGRESS, EPISODES, CURVE = "progress.csv", "episodes.csv", "learning_curve.png"
+BEST, CHECKPOINTS, TENSORBOARD, LOCK = "best", "checkpoints", "tensorboard", ".lock"
 POLICY_FILES = WEIGHTS, DESCRIPTION = "policy.safetensors", "policy.json"
 DIGEST = "weights_sha256"
 """Entry of a policy's description: the digest of its weights."""
+CHECKPOINT = re.compile(r"step-(?P<step>\d{12})-(?P<digest>[0-9a-f]{16})\.safetensors")
+"""Names of checkpoints."""
 
 
 def finished(run: Path) -> bool:

@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from codrl_mj.actuators import actuator_from_mapping, name_of, trusting
 from codrl_mj.envs.worlds import patterns_of
+from codrl_mj.fields import leaves
 from codrl_mj.runs.files import check_digest, read_json
 from codrl_mj.runs.layout import (
     BEST,
@@ -155,8 +156,8 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
         seconds=uninterrupted if seconds is None else seconds,
         modified=_modified(path),
         evaluation=evaluation,
-        configuration=dict(
-            _flat({**config, **{key: one for key, one in (content or {}).items() if key not in ("train", "labels")}})
+        configuration=leaves(
+            {**config, **{key: one for key, one in (content or {}).items() if key not in ("train", "labels")}}
         ),
     )
 
@@ -189,9 +190,7 @@ def _mapping(path: Path, what: str, problems: list[str]) -> Mapping[str, Any] | 
 def last_report(path: Path, problems: list[str]) -> Mapping[str, Any]:
     """The last whole row of a training's progress, as text; empty if there is none. A last row may be half written.
 
-    Args:
-        path: the table.
-        problems: gets what is wrong with it.
+    `problems` gets what is wrong with the table.
     """
     try:
         with path.open(newline="") as file:
@@ -262,15 +261,6 @@ def _actuator_name(actuator: Any, label: Any, paper: Any) -> str:
             return name_of(actuator_from_mapping(actuator), paper)
     except (ValueError, TypeError, AttributeError):
         return str(actuator.get("family", "custom")) if isinstance(actuator, Mapping) else "custom"
-
-
-def _flat(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """The leaves of nested mappings by dotted names."""
-    for key, value in mapping.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 SORT_KEYS = ("name", "task", "agent", "actuator", "state", "steps", "return", "seconds", "modified")

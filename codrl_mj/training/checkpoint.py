@@ -10,7 +10,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load, save
 
 from codrl_mj.runs.files import writing
-from codrl_mj.training.folder import CHECKPOINT
+from codrl_mj.runs.layout import CHECKPOINT
 from codrl_mj.training.state import State
 
 KEPT = 2
@@ -18,18 +18,10 @@ KEPT = 2
 
 
 def save_checkpoint(folder: Path, state: State, run: str) -> Path:
-    """Write a checkpoint and delete those that are no longer needed.
+    """Write a checkpoint and delete those that are no longer needed; those before stay where it cannot be written.
 
-    Args:
-        folder: of checkpoints.
-        state: what to write; its step goes into the name, and so does a digest of the content.
-        run: what the run is (its configuration), so that none is continued from another's checkpoint.
-
-    Returns:
-        The file.
-
-    Raises:
-        OSError: it could not be written; those before are still there.
+    Its name has its step and a digest of its content. `run` says what the run is (its configuration), so that none is
+    continued from another's checkpoint.
     """
     content = save(state.arrays, metadata={"run": run, "facts": json.dumps(state.facts)})
     path = folder / f"step-{state.facts['num_timesteps']:012d}-{_digest(content)}.safetensors"
@@ -46,12 +38,7 @@ def save_checkpoint(folder: Path, state: State, run: str) -> Path:
 
 
 def load_checkpoint(folder: Path, run: str) -> State | None:
-    """The last checkpoint that is intact; None if there is none. Damaged ones are warned about and passed over.
-
-    Args:
-        folder: of checkpoints.
-        run: what the run is, as it was given to `save_checkpoint`.
-    """
+    """The last checkpoint of a run that is intact; None if there is none. Of damaged ones it warns."""
     checkpoints = _checkpoints(folder)
     for path in reversed(checkpoints):
         try:
@@ -64,12 +51,7 @@ def load_checkpoint(folder: Path, run: str) -> State | None:
 
 
 def _read(path: Path, run: str) -> State:
-    """Read one checkpoint.
-
-    Raises:
-        ValueError: it is not what was written, or another run's.
-        OSError: it cannot be read.
-    """
+    """Read one checkpoint, refused if it is not what was written, or another run's."""
     content = path.read_bytes()
     if _digest(content) != _named(path, "digest"):
         raise ValueError("it is damaged: its content does not have the digest in its name")

@@ -11,7 +11,7 @@ from codrl_mj.agents import AgentConfig, agent_from_mapping, check_fits
 from codrl_mj.agents.ppo import PPOConfig
 from codrl_mj.agents.presets import ELSEWHERE, find_preset
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.fields import check_names
+from codrl_mj.fields import check_names, leaves
 
 EVALUATION_SEED = 1_000_000
 """Seed of the first episode in which a trained policy is evaluated, away from those that trainings start from."""
@@ -167,7 +167,7 @@ class TrainConfig:
 
     def differences(self, other: "TrainConfig") -> list[str]:
         """What differs from another configuration, a line a field."""
-        mine, others = _flat("", self.as_mapping()), _flat("", other.as_mapping())
+        mine, others = leaves(self.as_mapping()), leaves(other.as_mapping())
         absent = "absent"
         return [
             f"{name}: {mine.get(name, absent)!r} and {others.get(name, absent)!r}"
@@ -227,10 +227,3 @@ def _yaml_loader() -> Any:
     number = r"(?:[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?|-?Infinity|NaN)$"
     Loader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(number), list("-+.0123456789IN"))
     return Loader
-
-
-def _flat(prefix: str, mapping: Mapping[str, Any]) -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in mapping.items():
-        flat |= _flat(f"{prefix}{key}.", value) if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return flat

@@ -6,7 +6,6 @@ import functools
 import hashlib
 import importlib.metadata
 import platform
-import re
 import shutil
 import sys
 from collections.abc import Iterator, Mapping
@@ -15,14 +14,23 @@ from typing import Any
 
 from codrl_mj.actuators import label_of, labelled, trusting
 from codrl_mj.runs.files import check_writable, leftovers, read_json, sealed, write_json
-from codrl_mj.runs.layout import BEST, CONFIG, EVALUATION, POLICY_FILES, PROGRESS, RESULT, finished
+from codrl_mj.runs.layout import (
+    BEST,
+    CHECKPOINT,
+    CHECKPOINTS,
+    CONFIG,
+    CURVE,
+    EPISODES,
+    EVALUATION,
+    LOCK,
+    POLICY_FILES,
+    PROGRESS,
+    RESULT,
+    TENSORBOARD,
+    finished,
+)
 from codrl_mj.training.config import TrainConfig
 
-EPISODES, CURVE = "episodes.csv", "learning_curve.png"
-CHECKPOINTS, TENSORBOARD, LOCK = "checkpoints", "tensorboard", ".lock"
-
-CHECKPOINT = re.compile(r"step-(?P<step>\d{12})-(?P<digest>[0-9a-f]{16})\.safetensors")
-"""Names of checkpoints."""
 _FILES = {CONFIG, RESULT, EVALUATION, PROGRESS, EPISODES, CURVE, *POLICY_FILES}
 _PACKAGES = ("codrl-mj", "gymnasium", "mujoco", "numba", "numpy", "stable-baselines3", "torch")
 
@@ -54,16 +62,9 @@ def load_config(run: Path, trust: bool = False) -> TrainConfig:
 
 
 def admit(run: Path, config: TrainConfig, resume: bool, accept_changes: bool) -> bool:
-    """Find out, before anything is made or compiled, whether a training can begin or go on in a folder.
+    """Refuse, before anything is made or compiled, a folder in which a training can neither begin nor go on.
 
-    Returns:
-        Whether there is a training to go on with, finished or not.
-
-    Raises:
-        FileExistsError: there is something in the folder, and `resume` is False.
-        OSError: nothing can be written there.
-        RunInUseError: another process trains in it.
-        ValueError: the training in it is another one, see `check_same`.
+    Whether there is a training to go on with, finished or not.
     """
     check_writable(run)
     if (run / LOCK).exists():
@@ -129,17 +130,7 @@ def start_folder(run: Path, config: TrainConfig) -> None:
 
 
 def check_same(run: Path, config: TrainConfig, accept_changes: bool) -> None:
-    """Raise unless a run folder's training can be continued to the result that it would have had uninterrupted.
-
-    Args:
-        run: the run folder.
-        config: what is to be continued.
-        accept_changes: let other code and package versions pass.
-
-    Raises:
-        FileNotFoundError: the folder is no run folder.
-        ValueError: the configuration differs, or code or packages do; the message says what.
-    """
+    """Raise unless a run folder's training can be continued to the result that it would have had uninterrupted."""
     differences = load_config(run, trust=True).differences(config)  # as its caller does, who names it
     if differences:
         raise ValueError(
@@ -195,11 +186,7 @@ def _code_digest(*others: str | Path) -> str:
 
 @contextlib.contextmanager
 def owned(run: Path) -> Iterator[None]:
-    """Hold a run folder for oneself while the block runs; the system lets go of it if the process dies.
-
-    Raises:
-        RunInUseError: another process trains in it.
-    """
+    """Hold a run folder for oneself while the block runs; the system lets go of it if the process dies."""
     run.mkdir(parents=True, exist_ok=True)
     with (run / LOCK).open("a") as lock:
         try:
@@ -207,8 +194,3 @@ def owned(run: Path) -> Iterator[None]:
         except BlockingIOError:
             raise RunInUseError(f"{run}: another process is training in it; wait for it, or stop it") from None
         yield
-
-
-def write_result(run: Path, result: Mapping[str, Any]) -> None:
-    """Write what marks a run as finished."""
-    write_json(run / RESULT, sealed(result))

@@ -47,11 +47,7 @@ EPISODE_COLUMNS = ("episode", "steps", "return", "length")
 
 
 def read_episodes(path: Path) -> np.ndarray:
-    """The table of a run's training episodes, shape (n, 4), columns `EPISODE_COLUMNS`.
-
-    Raises:
-        ValueError: the file is no such table.
-    """
+    """The table of a run's training episodes, shape (n, 4), columns `EPISODE_COLUMNS`; any other is refused."""
     with path.open(newline="") as file:
         header, *rows = [*csv.reader(file)] or [[]]
     try:
@@ -65,10 +61,7 @@ def read_episodes(path: Path) -> np.ndarray:
 def learning_curves(episodes: np.ndarray, steps: np.ndarray, evaluations: np.ndarray) -> list[Curve]:
     """Returns over environment steps: of the training episodes, their running mean, and of the evaluations.
 
-    Args:
-        episodes: rows of `EPISODE_COLUMNS`.
-        steps: environment steps of the reports, shape (n,).
-        evaluations: returns of the evaluations then, NaN where there was none, shape (n,).
+    Episodes are rows of `EPISODE_COLUMNS`; evaluations (n,) are those at the steps (n,), NaN where there was none.
     """
     curves = []
     if len(episodes):
@@ -94,13 +87,7 @@ class GrowingTable:
     """A CSV file of numbers that grows row by row, and the rows in memory."""
 
     def __init__(self, path: Path, columns: Sequence[str], rows: np.ndarray | None = None) -> None:
-        """Write the file anew.
-
-        Args:
-            path: the file.
-            columns: its header.
-            rows: those that are there already, shape (n, columns); what a checkpoint has.
-        """
+        """Write the file anew, with the rows (n, columns) that a checkpoint has."""
         self._columns = columns
         self._rows: list[tuple[float, ...]] = [] if rows is None else [tuple(row) for row in rows.tolist()]
         with writing(path) as temporary, temporary.open("w", newline="") as file:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from codrl_mj.runs.files import sealed, write_json
-from codrl_mj.runs.layout import finished
+from codrl_mj.runs.layout import CONFIG, CURVE, EVALUATION, RESULT, finished
 from codrl_mj.training import folder
 from codrl_mj.training.config import TrainConfig
 from codrl_mj.training.folder import RunInUseError
@@ -106,14 +106,10 @@ def train(
 
 @contextlib.contextmanager
 def _taking(out: Path, exists: bool) -> Iterator[None]:
-    """Own a run folder while the block runs, and leave no new one in which nothing was learned when it raises.
-
-    Raises:
-        RunInUseError: another process trains in it, or has in the meantime.
-    """
+    """Own a run folder while the block runs, and leave no new one in which nothing was learned when it raises."""
     made = [path for path in (out, *out.parents) if not path.exists()]
     with folder.owned(out):
-        if finished(out) or not ((out / folder.CONFIG).exists() if exists else folder.unused(out)):
+        if finished(out) or not ((out / CONFIG).exists() if exists else folder.unused(out)):
             raise RunInUseError(f"{out}: another process trained in it in the meantime; start again")
         folder.remove_leftovers(out)
         try:
@@ -144,10 +140,10 @@ def _finish(config: TrainConfig, out: Path, model: Any, watcher: Any) -> None:
 
     watcher.boundary(last=True)
     save_policy(model.policy, config.agent, out)
-    write_json(out / folder.EVALUATION, sealed(watcher.evaluation.as_mapping()))
+    write_json(out / EVALUATION, sealed(watcher.evaluation.as_mapping()))
     title = f"{config.agent.name.upper()} on {config.task}"
-    history.save_learning_curve(out / folder.CURVE, title, watcher.episodes.array(), watcher.reports.array())
-    folder.write_result(out, watcher.result())
+    history.save_learning_curve(out / CURVE, title, watcher.episodes.array(), watcher.reports.array())
+    write_json(out / RESULT, sealed(watcher.result()))  # marks the run as finished
 
 
 @contextlib.contextmanager

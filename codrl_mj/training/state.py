@@ -36,12 +36,7 @@ class State(NamedTuple):
 
 
 def capture(model: BaseAlgorithm, envs: Any) -> State:
-    """The state of a model between two rollouts.
-
-    Args:
-        model: the model.
-        envs: its environments (`snapshot()`).
-    """
+    """The state of a model and its environments between two rollouts."""
     arrays: dict[str, np.ndarray] = {}
     facts: dict[str, Any] = {name: getattr(model, name) for name in _counters(model)}
     modules, tensors = model._get_torch_save_params()
@@ -76,16 +71,9 @@ def capture(model: BaseAlgorithm, envs: Any) -> State:
 
 
 def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
-    """Bring a model of the same configuration to a state, once `learn` has set it up.
+    """Bring a model of the same configuration to what `capture` returned, once `learn` has set it up.
 
-    Args:
-        model: the model.
-        envs: its environments (`restore()`).
-        state: what `capture` returned.
-
-    Raises:
-        ValueError: the state is of another configuration, or something is missing from it; model and environments are
-            no good then.
+    Model and environments are no good after a state that is refused, which is another configuration's.
     """
     arrays, facts = state
     try:

@@ -14,6 +14,7 @@ from stable_baselines3.common.logger import KVWriter, Logger
 
 from codrl_mj.evaluation import Evaluation, evaluate
 from codrl_mj.runs.files import sealed, write_json
+from codrl_mj.runs.layout import BEST, CHECKPOINTS, EPISODES, EVALUATION, PROGRESS, TENSORBOARD
 from codrl_mj.runs.policies import save_policy
 from codrl_mj.training import folder
 from codrl_mj.training.checkpoint import load_checkpoint, save_checkpoint
@@ -42,15 +43,7 @@ class Watcher(BaseCallback):
         on_progress: Callable[[Progress], None] | None,
         tensorboard: bool,
     ) -> None:
-        """Prepare.
-
-        Args:
-            config: what is trained.
-            out: the run folder.
-            stop: its `signal` is a signal's number once the training is to stop.
-            on_progress: called with every report.
-            tensorboard: write events for TensorBoard, if it is installed.
-        """
+        """Prepare; the arguments are those of `train`, and a `Stop`."""
         super().__init__()
         self._config, self._out, self._stop, self._on_progress = config, out, stop, on_progress
         self._tensorboard = tensorboard
@@ -68,7 +61,7 @@ class Watcher(BaseCallback):
     def _on_training_start(self) -> None:
         """Continue from the last checkpoint, now that the model has set itself up to start from nothing."""
         self._arms = self.training_env.arm_radii  # type: ignore[attr-defined]
-        state = self._resumed = load_checkpoint(self._out / folder.CHECKPOINTS, self._identity)
+        state = self._resumed = load_checkpoint(self._out / CHECKPOINTS, self._identity)
         rows: dict[str, np.ndarray | None] = {"episodes": None, "reports": None}
         if state is not None:
             restore(self.model, self.training_env, state)
@@ -77,8 +70,8 @@ class Watcher(BaseCallback):
                 setattr(self, f"_{name}", state.facts["watch"][name])
             self.saved_steps = self._steps_before = self.model.num_timesteps
             self.num_timesteps = self.model.num_timesteps
-        self.episodes = GrowingTable(self._out / folder.EPISODES, EPISODE_COLUMNS, rows["episodes"])
-        self.reports = GrowingTable(self._out / folder.PROGRESS, REPORT_COLUMNS, rows["reports"])
+        self.episodes = GrowingTable(self._out / EPISODES, EPISODE_COLUMNS, rows["episodes"])
+        self.reports = GrowingTable(self._out / PROGRESS, REPORT_COLUMNS, rows["reports"])
         self.model.set_logger(Logger(str(self._out), self._writers()))
         self._start = time.perf_counter()
 
@@ -88,7 +81,7 @@ class Watcher(BaseCallback):
         try:
             from stable_baselines3.common.logger import TensorBoardOutputFormat
 
-            return [TensorBoardOutputFormat(str(self._out / folder.TENSORBOARD))]
+            return [TensorBoardOutputFormat(str(self._out / TENSORBOARD))]
         except (AssertionError, ImportError):  # TensorBoard is not installed
             return []
 
@@ -129,11 +122,7 @@ class Watcher(BaseCallback):
 
     @contextlib.contextmanager
     def explaining(self) -> Iterator[None]:
-        """Say why the block could not go on: a full disk and its like, a second Ctrl-C, weights that are no numbers.
-
-        Raises:
-            OSError: what could not be written, with what there is to go on from.
-        """
+        """Say why the block could not go on: a full disk and its like, a second Ctrl-C, weights that are no numbers."""
         try:
             yield
         except OSError as error:
@@ -145,11 +134,7 @@ class Watcher(BaseCallback):
             raise
 
     def _check_weights(self) -> None:
-        """Raise if a weight is no finite number, before that is kept.
-
-        Raises:
-            FloatingPointError: as it says, with what makes it likely.
-        """
+        """Raise if a weight is no finite number, before that is kept, with what makes it likely."""
         model = getattr(self, "model", None)  # not before learning begins
         if model is None or all(tensor.isfinite().all() for tensor in model.policy.state_dict().values()):
             return
@@ -163,12 +148,7 @@ class Watcher(BaseCallback):
     # -- between two rollouts -----------------------------------------------------------------------------
 
     def boundary(self, stopping: bool = False, last: bool = False) -> None:
-        """Report, evaluate and write a checkpoint, whichever is due.
-
-        Args:
-            stopping: a checkpoint is due.
-            last: the training is complete: all are due.
-        """
+        """Report, evaluate and write a checkpoint, whichever is due: a checkpoint if stopping, in the end all three."""
         if self.model.num_timesteps == 0:
             return
         evaluation = self._due("evaluation", self._config.evaluation_interval) or last
@@ -199,9 +179,9 @@ class Watcher(BaseCallback):
         )
         if self.evaluation.returns.mean > self._best["return"]:
             self._best = {"return": self.evaluation.returns.mean, "steps": self.model.num_timesteps}
-            best = self._out / folder.BEST
+            best = self._out / BEST
             save_policy(self.model.policy, config.agent, best)
-            write_json(best / folder.EVALUATION, sealed(self.evaluation.as_mapping()))
+            write_json(best / EVALUATION, sealed(self.evaluation.as_mapping()))
 
     def _report(self, evaluated: bool) -> None:
         if self.reports.last("steps") == self.model.num_timesteps:
@@ -234,7 +214,7 @@ class Watcher(BaseCallback):
         watch["seconds_before"] = self._seconds_before + time.perf_counter() - self._start
         tables = {"watch.episodes": self.episodes.array(), "watch.reports": self.reports.array()}
         state = State(arrays | tables, facts | {"watch": watch})
-        save_checkpoint(self._out / folder.CHECKPOINTS, state, self._identity)
+        save_checkpoint(self._out / CHECKPOINTS, state, self._identity)
         self.saved_steps = self.model.num_timesteps
 
     def result(self) -> dict[str, Any]:

@@ -19,7 +19,7 @@ import codrl_mj
 from codrl_mj.agents import find_agent
 from codrl_mj.agents.presets import PRESETS
 from codrl_mj.agents.sarsa import SARSAConfig
-from codrl_mj.agents.sarsa_algorithm import SARSA, TileCodingPolicy
+from codrl_mj.agents.sarsa_algorithm import SARSA
 from codrl_mj.agents.sarsa_kernels import FORGOTTEN
 from codrl_mj.physics.base import SimulationDivergedError
 from codrl_mj.runs.policies import load_policy, save_policy
@@ -59,7 +59,7 @@ def _table(model):
 @pytest.mark.matrix
 def test_it_finds_the_values_of_a_chain():
     """Greedily the way out takes 3, 2, 1 steps; the other action was given up where it seemed no better."""
-    model = SARSA(TileCodingPolicy, Chain(), step_size=0.5, epsilon=0.0, policy_kwargs=TABLE, seed=0).learn(2000)
+    model = SARSAConfig(step_size=0.5, epsilon=0.0, **TABLE).make_model(Chain(), 0).learn(2000)
     values = _table(model)
     np.testing.assert_allclose(values[:, 1], [-3, -2, -1], atol=1e-9)
     assert (values[:, 0] <= values[:, 1]).all()
@@ -72,9 +72,8 @@ def test_it_does_what_the_box_says(trace_decay):
     """The weights are those that the box (10.1; 12.7 with replacing traces) computes from what was done."""
     step_size, gamma = 0.3, 0.9
     env = Chain()
-    model = SARSA(
-        TileCodingPolicy, env, step_size, gamma, epsilon=0.5, trace_decay=trace_decay, policy_kwargs=TABLE, seed=3
-    )
+    config = SARSAConfig(step_size=step_size, gamma=gamma, epsilon=0.5, trace_decay=trace_decay, **TABLE)
+    model = config.make_model(env, 3)
     model.learn(60)
     values = np.zeros((3, 2))
     for episode in env.history[:-1]:  # the last one was only begun
@@ -95,7 +94,7 @@ def test_a_time_limit_is_no_end(limit, value):
     """Staying for ever is worth -1/(1 - gamma), however short the episodes."""
     env = TimeLimit(Chain(), limit)
     env.action_space = spaces.Discrete(1)
-    model = SARSA(TileCodingPolicy, env, step_size=0.5, gamma=0.9, policy_kwargs=TABLE, seed=0).learn(600)
+    model = SARSAConfig(step_size=0.5, gamma=0.9, **TABLE).make_model(env, 0).learn(600)
     assert _table(model)[0, 0] == pytest.approx(value)
 
 
@@ -109,7 +108,7 @@ def test_every_weight_starts_at_its_share_of_the_initial_value():
 def test_equally_good_actions_are_chosen_alike_and_a_greedy_policy_takes_the_first():
     env = Chain(actions=4)
     env.step = lambda action: (env.history[-1].append(action), (np.zeros(1, np.float32), 0.0, True, False, {}))[1]
-    model = SARSA(TileCodingPolicy, env, epsilon=0.0, policy_kwargs=TABLE, seed=0).learn(4000)
+    model = SARSAConfig(epsilon=0.0, **TABLE).make_model(env, 0).learn(4000)
     counts = np.bincount([int(episode[0]) for episode in env.history if episode], minlength=4)
     assert counts.sum() == 4000
     assert abs(counts - 1000).max() < 5 * np.sqrt(4000 * 0.25 * 0.75)
@@ -124,7 +123,7 @@ def test_epsilon_is_the_share_of_random_actions():
 
 
 def test_epsilon_fades_from_episode_to_episode():
-    model = SARSA(TileCodingPolicy, Chain(), epsilon=0.5, epsilon_decay=0.9, policy_kwargs=TABLE, seed=0)
+    model = SARSAConfig(epsilon=0.5, epsilon_decay=0.9, **TABLE).make_model(Chain(), 0)
     seen = []
 
     class Look(BaseCallback):

@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 from gymnasium import spaces
 
-from codrl_mj.agents.deep import DeepAgentConfig
+from codrl_mj.agents import DeepAgentConfig
 from codrl_mj.fields import integer, real
 
 

@@ -18,7 +18,7 @@ from safetensors.torch import load_file
 
 from codrl_mj import Actuator, CurrentLoop, Motor
 from codrl_mj.agents import PPOConfig
-from codrl_mj.agents.sarsa_episodes import CompiledEpisodes
+from codrl_mj.agents.sarsa_algorithm import CompiledEpisodes
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy, evaluate, run_episodes

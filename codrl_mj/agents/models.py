@@ -1,0 +1,224 @@
+"""What the agents' networks and algorithms have that Stable-Baselines3's do not.
+
+Imports torch: import it where an agent is made.
+"""
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3 import DDPG, DQN, PPO, SAC, TD3
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy, ContinuousCritic
+from stable_baselines3.common.torch_layers import FlattenExtractor, create_mlp
+from stable_baselines3.common.utils import update_learning_rate
+from stable_baselines3.td3.policies import TD3Policy
+from torch import nn
+from torch.nn import functional
+
+
+class ScaledObservation(FlattenExtractor):
+    """Multiplies the entries of an observation by fixed factors; entries without a factor stay as they are."""
+
+    def __init__(self, observation_space: spaces.Box, factors: Sequence[float]) -> None:
+        """Take at most as many factors as an observation has entries."""
+        super().__init__(observation_space)
+        if len(factors) > self.features_dim:
+            raise ValueError(
+                f"input_scale = {tuple(factors)}: must have at most {self.features_dim} factors, one for each entry of "
+                "the observation"
+            )
+        padded = torch.ones(self.features_dim)
+        padded[: len(factors)] = torch.tensor(factors)
+        self.register_buffer("factors", padded, persistent=False)
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """Observations (N, k) times the factors (k,)."""
+        return super().forward(observations) * self.factors
+
+
+class UnitActionPolicy(ActorCriticPolicy):
+    """Its actor's mean and noise are in units of the largest action: a torque of 0.08 N*m or a voltage of 18 V is 1."""
+
+    def _build(self, lr_schedule: Any) -> None:
+        if not isinstance(self.action_space, spaces.Box):
+            raise ValueError(f"unit_actions = True: must be False for discrete actions, which {self.action_space} has")
+        super()._build(lr_schedule)
+        self.register_buffer("largest", torch.as_tensor(self.action_space.high), persistent=False)
+
+    def _get_action_dist_from_latent(self, latent_pi: torch.Tensor) -> Any:
+        mean = self.action_net(latent_pi) * self.largest
+        return self.action_dist.proba_distribution(mean, self.log_std + self.largest.log())
+
+
+class TwoStreams(nn.Module):
+    """Q(state, action): state and action each through layers of their own, then joined, then through joint layers."""
+
+    def __init__(
+        self, state_size: int, action_size: int, state: Sequence[int], action: Sequence[int], joint: Sequence[int]
+    ) -> None:
+        """Make layers of so many units for state and action, none letting it through, and joint ones; with ReLUs."""
+        super().__init__()
+        self.state_size = state_size
+        self.state_stream = nn.Sequential(*create_mlp(state_size, -1, list(state), nn.ReLU))
+        self.action_stream = nn.Sequential(*create_mlp(action_size, -1, list(action), nn.ReLU))
+        joined = [state_size, *state][-1] + [action_size, *action][-1]
+        self.joint = nn.Sequential(*create_mlp(joined, 1, list(joint), nn.ReLU))
+
+    def forward(self, state_and_action: torch.Tensor) -> torch.Tensor:
+        """States and actions, concatenated, (N, state_size + action_size) -> values (N, 1)."""
+        state, action = state_and_action[:, : self.state_size], state_and_action[:, self.state_size :]
+        return self.joint(torch.cat([self.state_stream(state), self.action_stream(action)], dim=1))
+
+
+class TwoStreamPolicy(TD3Policy):
+    """Actor and critic of DDPG, the critic's networks being `TwoStreams`."""
+
+    def __init__(
+        self,
+        *args: Any,
+        state_units: Sequence[int],
+        action_units: Sequence[int],
+        joint_units: Sequence[int],
+        **kwargs: Any,
+    ) -> None:
+        """Take what `TD3Policy` takes, and the critic's layers as `TwoStreams` does."""
+        self._streams = state_units, action_units, joint_units
+        super().__init__(*args, **kwargs)
+
+    def make_critic(self, features_extractor: Any = None) -> ContinuousCritic:
+        """A critic, as `TD3Policy` asks for it."""
+        critic = super().make_critic(features_extractor)
+        state_size, (action_size,) = critic.features_extractor.features_dim, self.action_space.shape
+        for index in range(critic.n_critics):
+            critic.q_networks[index] = TwoStreams(state_size, action_size, *self._streams)
+            critic.add_module(f"qf{index}", critic.q_networks[index])
+        return critic
+
+
+class TwoRatePPO(PPO):
+    """Stable-Baselines3's PPO with separate passes, and separate learning rates, for actor and critic.
+
+    The update of Spinning Up and of Keras's example: passes over the rollout improve the actor until it has moved too
+    far (1.5 times `target_kl`), and the critic is fitted whether the actor stopped or not. Gradients are not clipped.
+    One Adam optimiser holds both, in two groups: Adam keeps moments and count for each tensor, and leaves out those
+    without a gradient, so this is two optimisers in one state dict.
+    """
+
+    def __init__(self, *args: Any, critic_learning_rate: float, critic_epochs: int, **kwargs: Any) -> None:
+        """Take what `PPO` takes, whose `learning_rate` is the actor's and whose `n_epochs` are the actor's at most."""
+        self.critic_learning_rate = critic_learning_rate
+        self.critic_epochs = critic_epochs
+        super().__init__(*args, **kwargs)
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        policy = self.policy
+        critic = [*policy.mlp_extractor.value_net.parameters(), *policy.value_net.parameters()]
+        of_critic = {id(parameter) for parameter in critic}
+        actor = [parameter for parameter in policy.parameters() if id(parameter) not in of_critic]
+        groups = [{"params": actor}, {"params": critic}]
+        policy.optimizer = policy.optimizer_class(groups, lr=self.lr_schedule(1), **policy.optimizer_kwargs)
+
+    def train(self) -> None:
+        """Learn from the rollout."""
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        self.policy.optimizer.param_groups[1]["lr"] = self.critic_learning_rate
+        passes = 0
+        while passes < self.n_epochs and self._improve_actor():
+            passes += 1
+        for _ in range(self.critic_epochs):
+            self._improve_critic()
+        self._n_updates += passes
+        self.logger.record("train/actor_passes", passes)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    def _improve_actor(self) -> bool:
+        """One pass over the rollout; False if it stopped because the policy had moved too far."""
+        clip_range = self.clip_range(self._current_progress_remaining)
+        for rollout in self.rollout_buffer.get(self.batch_size):
+            discrete = isinstance(self.action_space, spaces.Discrete)
+            actions = rollout.actions.long().flatten() if discrete else rollout.actions
+            distribution = self.policy.get_distribution(rollout.observations)
+            log_probability = distribution.log_prob(actions)
+            log_ratio = log_probability - rollout.old_log_prob
+            ratio = log_ratio.exp()
+            divergence = (ratio - 1 - log_ratio).mean().item()  # of the old policy from the new, an unbiased estimate
+            self.logger.record("train/approx_kl", divergence)
+            if self.target_kl is not None and divergence > 1.5 * self.target_kl:
+                return False
+            advantages = rollout.advantages
+            advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+            clipped = ratio.clamp(1 - clip_range, 1 + clip_range)
+            loss = -torch.min(ratio * advantages, clipped * advantages).mean()
+            if self.ent_coef:
+                entropy = distribution.entropy()
+                loss = loss - self.ent_coef * (-log_probability if entropy is None else entropy).mean()
+            self._descend(loss)
+            self.logger.record("train/policy_gradient_loss", loss.item())
+        return True
+
+    def _improve_critic(self) -> None:
+        """One pass over the rollout."""
+        losses = []
+        for rollout in self.rollout_buffer.get(self.batch_size):
+            loss = functional.mse_loss(self.policy.predict_values(rollout.observations).flatten(), rollout.returns)
+            self._descend(loss)
+            losses.append(loss.item())
+        self.logger.record("train/value_loss", np.mean(losses))
+
+    def _descend(self, loss: torch.Tensor) -> None:
+        self.policy.optimizer.zero_grad()  # to None: the optimiser then leaves the other network alone
+        loss.backward()
+        self.policy.optimizer.step()
+
+
+class _CriticRate:
+    """Gives the critic a learning rate of its own."""
+
+    def __init__(self, *args: Any, critic_learning_rate: float, **kwargs: Any) -> None:
+        """Take what the Stable-Baselines3 model takes; its `learning_rate` is all others'."""
+        self.critic_learning_rate = critic_learning_rate
+        super().__init__(*args, **kwargs)
+
+    def _update_learning_rate(self, optimizers: Any) -> None:
+        super()._update_learning_rate(optimizers)  # type: ignore[misc]
+        update_learning_rate(self.critic.optimizer, self.critic_learning_rate)  # type: ignore[attr-defined]
+
+
+class TwoRateDDPG(_CriticRate, DDPG):
+    """DDPG whose critic has a learning rate, and two streams, of its own."""
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": TwoStreamPolicy}
+
+
+class TwoRateTD3(_CriticRate, TD3):
+    """TD3 whose critics have a learning rate of their own."""
+
+
+class TwoRateSAC(_CriticRate, SAC):
+    """SAC whose critics have a learning rate of their own."""
+
+
+class EpisodicDQN(DQN):
+    """DQN whose exploration shrinks by a factor with every episode."""
+
+    def __init__(self, *args: Any, exploration_decay: float, **kwargs: Any) -> None:
+        """Take what `DQN` takes, of which `exploration_fraction` has no effect, and that factor."""
+        self.exploration_decay = exploration_decay
+        super().__init__(*args, **kwargs)
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.exploration_schedule = self._decayed
+
+    def _decayed(self, _progress: float) -> float:
+        """Epsilon in the present episode."""
+        return max(self.exploration_final_eps, self.exploration_initial_eps * self.exploration_decay**self._episode_num)
+
+    def _sample_action(self, *args: Any, **kwargs: Any) -> Any:
+        # DQN refreshes epsilon before it counts an episode as ended: the next would start with the last one's
+        self.exploration_rate = self._decayed(self._current_progress_remaining)
+        return super()._sample_action(*args, **kwargs)
