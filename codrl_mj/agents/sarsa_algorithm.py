@@ -13,7 +13,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import safe_mean
 
-from codrl_mj.agents.sarsa import SARSAConfig
 from codrl_mj.agents.sarsa_kernels import Learner, begin, choose_actions, learn, no_traces, run_episode
 from codrl_mj.agents.tile_coding import make_coder
 from codrl_mj.envs import ActuatedVectorEnv
@@ -30,9 +29,7 @@ class TileCodingPolicy(BasePolicy):
     changes it.
     """
 
-    def __init__(
-        self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], config: SARSAConfig
-    ) -> None:
+    def __init__(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], config: Any) -> None:
         """Make a policy that knows nothing yet."""
         if not isinstance(action_space, spaces.Discrete) or action_space.start != 0:
             raise ValueError(
@@ -145,28 +142,26 @@ class SARSA(BaseAlgorithm):
     """Whether to run whole episodes in compiled code where the environment can; the results are the same."""
     _last_obs: Any
 
-    def __init__(
-        self, policy: str | type[TileCodingPolicy], env: Any, config: SARSAConfig | None = None, **settings: Any
-    ) -> None:
+    def __init__(self, policy: str | type[TileCodingPolicy], env: Any, config: Any = None, **settings: Any) -> None:
         """Make the algorithm.
 
         Args:
             policy: `TileCodingPolicy`.
             env: a Gymnasium environment, or a `VecEnv` of one.
-            config: the agent's settings; None: the paper's.
+            config: the agent's settings, a `SARSAConfig`; None only for a saved model, which brings its own.
             **settings: `BaseAlgorithm`'s.
 
         Raises:
             ValueError: the environment is more than one, or its spaces do not go with tiles.
         """
-        self.config = config or SARSAConfig()
+        self.config = config
         self._episodes: CompiledEpisodes | None = None
-        self.exploration_rate = self.config.epsilon  # in the present episode
+        self.exploration_rate = getattr(config, "epsilon", 0.0)  # in the present episode
         if getattr(env, "num_envs", 1) != 1:
             raise ValueError(f"num_envs = {env.num_envs}: SARSA learns from one environment: must be 1")
         set_up = settings.pop("_init_setup_model", True)
         given = settings | {"policy_kwargs": {"config": self.config}, "device": "cpu"}
-        super().__init__(policy, env, learning_rate=self.config.step_size, **given)
+        super().__init__(policy, env, learning_rate=getattr(config, "step_size", 0.0), **given)
         if set_up:
             self._setup_model()
 
