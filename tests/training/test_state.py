@@ -9,7 +9,7 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
-from codrl_mj.training.run import _make_envs
+from codrl_mj.envs.sb3 import make_sb3_vec_env
 from codrl_mj.training.state import State, capture, restore
 from codrl_mj.training.watcher import LearningEnded
 from tests.matrix import but
@@ -78,7 +78,7 @@ class Learner:
 
     def __init__(self, config):
         """Make the model."""
-        self.envs = _make_envs(config)
+        self.envs = make_sb3_vec_env(config.env, config.num_envs)
         self.model = config.agent.make_model(self.envs, config.seed)
         self.model.set_logger(Logger(None, []))
 
