@@ -13,7 +13,7 @@ import pytest
 
 from codrl_mj.cli import main
 from codrl_mj.runs import files, policies
-from codrl_mj.training import checkpoint, folder, history, watcher
+from codrl_mj.training import checkpoint, folder, history, run, watcher
 from tests.matrix import but
 from tests.training.interruptions import differing, kill_test, outcome
 
@@ -134,7 +134,7 @@ KILLED_WHILE = {
     "deleting an old checkpoint": lambda: die_at_call(Path, "unlink", 2),
     "exchanging the best policy's files": lambda: die_at_call(policies, "write_json", 2),
     "writing the best policy": lambda: die_at_call(watcher, "write_json", 1),
-    "marking the run as finished": lambda: die_at_call(folder, "write_json", 2),
+    "marking the run as finished": lambda: die_at_call(run, "write_json", 2),
 }
 
 
