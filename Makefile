@@ -45,6 +45,7 @@ lint: $(STAMP)
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(BIN)/codespell
+	@$(BIN)/python scripts/house.py
 
 bench: $(STAMP)  ## speed beside other libraries, which are installed for it
 	@$(INSTALL) ".[bench]"

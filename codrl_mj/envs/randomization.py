@@ -72,20 +72,29 @@ class Randomization:
             ValueError: an unknown field (the nearest is suggested), one that cannot be drawn here, or impossible
                 bounds; the message names field, value and bound.
         """
-        indices, simulated = list(motors), list(motors.values())
+        indices, simulated, varied = list(motors), list(motors.values()), variable(model) if distributions else ()
+        names, rubbing = names_of(model), [mounts_of(model, index)[2] is not None for index in motors]
+        called = [names[index] for index in indices]
         matched: dict[str, list[int]] = {}
         for path, distribution in distributions.items():
             pattern, field = split_path(path)
             try:
-                own = _matched(pattern, field, model, indices)
-                _check_known(field, [simulated[at] for at in own], model, whose)
+                every = list(range(len(indices)))
+                own = [] if field.startswith(MODEL) else matched_by(pattern, called) if pattern else every
+                if not own and not field.startswith(MODEL):
+                    refuse_unmatched(pattern, called)
+                _check_known(field, [simulated[at] for at in own], varied, whose)
                 if any(split_path(other)[1] == field and {*own} & {*those} for other, those in matched.items()):
                     raise ValueError("it is drawn by another pattern, too")
                 if not own:
                     _check_factor(field, distribution)
                 for at in own:
                     _check(field, distribution, simulated[at], fixed[at])
-                    _check_friction(field, simulated[at], model, indices[at])
+                    if not rubbing[at] and _follows(lambda one: one.additions.friction, simulated[at], field):
+                        raise ValueError(
+                            f"{model.actuator(indices[at]).name or f'actuator {indices[at]}'} drives neither a joint "
+                            "nor a tendon, which the friction that is drawn for its motor would need; draw other fields"
+                        )
             except ValueError as error:
                 label = f"[{pattern!r}]" * bool(pattern) + f"[{field!r}]"
                 raise ValueError(f"randomize{label} = {distribution}: {error}") from None
@@ -330,21 +339,12 @@ def numbers_of(family: Family, fields: np.ndarray) -> np.ndarray:
     return fields[:, [paths.index(path) for path in parameter_paths(family).values()]]
 
 
-def _matched(pattern: str, field: str, model: mujoco.MjModel, indices: Sequence[int]) -> list[int]:
-    """Which motors, by the indices of their actuators, a path is of; none if it is the model's."""
-    if field.startswith(MODEL):
-        return []
-    names = names_of(model)
-    matched = [at for at, index in enumerate(indices) if not pattern or matched_by(pattern, [names[index]])]
-    return matched or refuse_unmatched(pattern, [names[index] for index in indices])
-
-
-def _check_known(field: str, motors: Sequence[ActuatorModel], model: mujoco.MjModel, whose: str) -> None:
+def _check_known(field: str, motors: Sequence[ActuatorModel], varied: Sequence[str], whose: str) -> None:
     """Refuse a name that is no field of all these motors, nor of the model."""
     families: list[Family] = [Actuator if isinstance(one, Ideal) else type(one) for one in motors]
     of_each = [field_paths(family) for family in families]
     known = [path for path in (of_each[0] if of_each else ()) if all(path in paths for paths in of_each)]
-    known += variable(model)
+    known += varied
     if field not in known:
         raise ValueError(f"unknown field {field!r}: {did_you_mean(field, known)}{whose} has {', '.join(known)}")
 
@@ -375,15 +375,6 @@ def _check(field: str, distribution: Distribution, motor: ActuatorModel, fixed: 
         raise ValueError(f"{field} must be a number")
     for value in distribution.extremes:
         motor.replaced({field: value})  # the field's own bounds
-
-
-def _check_friction(field: str, motor: ActuatorModel, model: mujoco.MjModel, index: int) -> None:
-    """Refuse friction of a motor that drives nothing which could have it."""
-    if mounts_of(model, index)[2] is None and _follows(lambda one: one.additions.friction, motor, field):
-        raise ValueError(
-            f"{model.actuator(index).name or f'actuator {index}'} drives neither a joint nor a tendon, which the "
-            "friction that is drawn for its motor would need; draw other fields"
-        )
 
 
 def _kind(family: Family, path: str) -> type:
