@@ -57,8 +57,6 @@ class Functions(NamedTuple):
 
     plugin: dict[str, Any]
     """Those of the plugin, by their names in `mjpPlugin`."""
-    verdict: Any
-    """(model, instance) -> index into `REASONS`: what is wrong with an instance."""
     owners: tuple[Any, ...]
     """What they hold addresses of."""
 
@@ -118,6 +116,35 @@ def _engine_force(model: int, data: int, actuator: int, length: float, velocity:
 
 
 @functools.cache
+def _verdict() -> tuple[Any, Any]:
+    """(model, instance) -> index into `REASONS`: what is wrong with an instance; and what that holds an address of."""
+    configuration_of = _configuration_function()
+    attribute = ctypes.create_string_buffer(FAMILY.encode())
+    attribute_at = ctypes.addressof(attribute)
+
+    @numba.njit(nogil=True, error_model="numpy")
+    def verdict(model: int, instance: int) -> int:
+        for actuator in range(MODEL.nactuator(model)):
+            if MODEL.actuator_plugin(model)[actuator] != instance:
+                continue
+            width, user = MODEL.nuser_actuator(model), f64(user_of(model, actuator))
+            if width < PLUGIN_HEAD or user[0] != _FIRST or user[1] != _SECOND or not user[HEAD] > 0.0:
+                return 1
+            if not is_compiled(user[2]):
+                return 2
+            number = int(user[2])
+            if not is_called(number, configuration_of(model, instance, attribute_at)):
+                return 3
+            if width < PLUGIN_HEAD + parameter_count(number):
+                return 4
+            if MODEL.plugin_statenum(model)[instance] != size_of(number) + EXTRA_STATES:
+                return 5
+        return 0
+
+    return verdict, attribute
+
+
+@functools.cache
 def compiled() -> Functions:
     """Compile the functions on first use and keep them for the life of the process.
 
@@ -170,29 +197,7 @@ def compiled() -> Functions:
         for entry in range(MODEL.plugin_statenum(model)[instance]):
             f64(state)[entry] = 0.0
 
-    configuration_of = _configuration_function()
-    attribute = ctypes.create_string_buffer(FAMILY.encode())
-    attribute_at = ctypes.addressof(attribute)
-
-    @numba.njit(nogil=True, error_model="numpy")
-    def verdict(model: int, instance: int) -> int:
-        for actuator in range(MODEL.nactuator(model)):
-            if MODEL.actuator_plugin(model)[actuator] != instance:
-                continue
-            width, user = MODEL.nuser_actuator(model), f64(user_of(model, actuator))
-            if width < PLUGIN_HEAD or user[0] != _FIRST or user[1] != _SECOND or not user[HEAD] > 0.0:
-                return 1
-            if not is_compiled(user[2]):
-                return 2
-            number = int(user[2])
-            if not is_called(number, configuration_of(model, instance, attribute_at)):
-                return 3
-            if width < PLUGIN_HEAD + parameter_count(number):
-                return 4
-            if MODEL.plugin_statenum(model)[instance] != size_of(number) + EXTRA_STATES:
-                return 5
-        return 0
-
+    verdict, attribute = _verdict()
     complaint = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_int)(_judge)
 
     @numba.cfunc(types.int32(types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")
@@ -202,7 +207,7 @@ def compiled() -> Functions:
         return complaint(model, instance)
 
     functions = {"init": init, "reset": reset, "compute": compute, "advance": advance}
-    return Functions(functions, verdict, (attribute, complaint))
+    return Functions(functions, (attribute, complaint))
 
 
 def _configuration_function() -> Any:
@@ -256,7 +261,7 @@ def _judge(model: int, instance: int) -> int:
     """`init` of an instance whose family has yet to be compiled, or that is wrong: 0, or -1 and a warning."""
     try:
         load_family(_family(_configuration(model, instance)))
-        verdict = compiled().verdict(model, instance)
+        verdict = _verdict()[0](model, instance)
         if verdict:
             raise ValueError(REASONS[verdict])
     except Exception as error:  # there is nobody to raise it to

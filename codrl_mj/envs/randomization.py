@@ -72,33 +72,7 @@ class Randomization:
             ValueError: an unknown field (the nearest is suggested), one that cannot be drawn here, or impossible
                 bounds; the message names field, value and bound.
         """
-        indices, simulated, varied = list(motors), list(motors.values()), variable(model) if distributions else ()
-        names, rubbing = names_of(model), [mounts_of(model, index)[2] is not None for index in motors]
-        called = [names[index] for index in indices]
-        matched: dict[str, list[int]] = {}
-        for path, distribution in distributions.items():
-            pattern, field = split_path(path)
-            try:
-                every = list(range(len(indices)))
-                own = [] if field.startswith(MODEL) else matched_by(pattern, called) if pattern else every
-                if not own and not field.startswith(MODEL):
-                    refuse_unmatched(pattern, called)
-                _check_known(field, [simulated[at] for at in own], varied, whose)
-                if any(split_path(other)[1] == field and {*own} & {*those} for other, those in matched.items()):
-                    raise ValueError("it is drawn by another pattern, too")
-                if not own:
-                    _check_factor(field, distribution)
-                for at in own:
-                    _check(field, distribution, simulated[at], fixed[at])
-                    if not rubbing[at] and _follows(lambda one: one.additions.friction, simulated[at], field):
-                        raise ValueError(
-                            f"{model.actuator(indices[at]).name or f'actuator {indices[at]}'} drives neither a joint "
-                            "nor a tendon, which the friction that is drawn for its motor would need; draw other fields"
-                        )
-            except ValueError as error:
-                label = f"[{pattern!r}]" * bool(pattern) + f"[{field!r}]"
-                raise ValueError(f"randomize{label} = {distribution}: {error}") from None
-            matched[path] = own
+        matched, simulated = _matched(distributions, model, motors, fixed, whose), list(motors.values())
         turned, added = (
             [path for path, own in matched.items() if any(_follows(of, simulated[at], path) for at in own)]
             for of in (lambda one: one.arm_radius, lambda one: one.additions)
@@ -115,7 +89,7 @@ class Randomization:
             ),
             timestep,
             allow_unstable,
-            Variation(model, of_model, indices, mounting=bool(added)) if in_model else None,
+            Variation(model, of_model, list(motors), mounting=bool(added)) if in_model else None,
             in_model,
             bool(turned or added),
         )
@@ -337,6 +311,44 @@ def numbers_of(family: Family, fields: np.ndarray) -> np.ndarray:
     """The numbers, shape (m, p), of motors with the given fields (m, f)."""
     paths = field_paths(family)
     return fields[:, [paths.index(path) for path in parameter_paths(family).values()]]
+
+
+def _matched(
+    distributions: Mapping[str, Distribution],
+    model: mujoco.MjModel,
+    motors: Mapping[int, ActuatorModel],
+    fixed: Sequence[Mapping[str, str]],
+    whose: str,
+) -> dict[str, list[int]]:
+    """Path -> which of the motors, in their order, it is drawn of, checked; none if it is the model's."""
+    indices, simulated, varied = list(motors), list(motors.values()), variable(model) if distributions else ()
+    names, rubbing = names_of(model), [mounts_of(model, index)[2] is not None for index in motors]
+    called = [names[index] for index in indices]
+    matched: dict[str, list[int]] = {}
+    for path, distribution in distributions.items():
+        pattern, field = split_path(path)
+        try:
+            every = list(range(len(indices)))
+            own = [] if field.startswith(MODEL) else matched_by(pattern, called) if pattern else every
+            if not own and not field.startswith(MODEL):
+                refuse_unmatched(pattern, called)
+            _check_known(field, [simulated[at] for at in own], varied, whose)
+            if any(split_path(other)[1] == field and {*own} & {*those} for other, those in matched.items()):
+                raise ValueError("it is drawn by another pattern, too")
+            if not own:
+                _check_factor(field, distribution)
+            for at in own:
+                _check(field, distribution, simulated[at], fixed[at])
+                if not rubbing[at] and _follows(lambda one: one.additions.friction, simulated[at], field):
+                    raise ValueError(
+                        f"{model.actuator(indices[at]).name or f'actuator {indices[at]}'} drives neither a joint "
+                        "nor a tendon, which the friction that is drawn for its motor would need; draw other fields"
+                    )
+        except ValueError as error:
+            label = f"[{pattern!r}]" * bool(pattern) + f"[{field!r}]"
+            raise ValueError(f"randomize{label} = {distribution}: {error}") from None
+        matched[path] = own
+    return matched
 
 
 def _check_known(field: str, motors: Sequence[ActuatorModel], varied: Sequence[str], whose: str) -> None:
