@@ -1,8 +1,10 @@
 """The certificate: what it checks passes, every check can fail, and verdict, files and refusals are what they say."""
 
+import importlib
 import inspect
 import json
 import math
+import re
 import subprocess
 import sys
 
@@ -31,9 +33,10 @@ from codrl_mj.validation import (
     validate,
     validate_model,
 )
-from codrl_mj.validation.compare import Worst, differences
-from codrl_mj.validation.growth import Growth, lyapunov_exponent
+from codrl_mj.validation.compare import differences
 from codrl_mj.validation.mutations import edited, margin, unfailed, wrong_loop, wrong_loop_everywhere
+from codrl_mj.validation.table import TABLE, Case, Comparison, outcome
+from codrl_mj.validation.trajectories import Growth, lyapunov_exponent
 from tests.engine.models import FULL, add_motor, changed, controls, rotor, rotor_spec, trajectory
 from tests.motorised.models import ACTUATORS, INTEGRATORS, LOOP, arm, behind_plugin
 from tests.pages.parsed import Parsed, check_alone
@@ -62,6 +65,35 @@ def test_the_quick_certificate_passes(certificate):
     assert failed == []
     assert certificate.passed
     assert certificate.quick
+
+
+for module in (*GROUPS, "own_model"):
+    importlib.import_module(f"codrl_mj.validation.{module}")
+ELSEWHERE = {"energy", "the eigenvalues of the discrete closed loop"}
+"""Oracles of rows for runs that break down, and for a user's own model."""
+ROWS = [(entry, row) for entry in TABLE for row in entry.rows if row.oracle not in ELSEWHERE]
+
+
+def checks_of(certificate, entry, row):
+    """The certificate's checks that are of a row."""
+    name = re.compile(re.sub(r"\\{[^}]*\\}", ".+", re.escape(row.name)))
+    return [check for check in certificate.checks if check.group == entry.group and name.fullmatch(check.name)]
+
+
+@pytest.mark.parametrize(
+    ("entry", "row"), [pytest.param(entry, row, id=f"{entry.group}, {row.name}") for entry, row in ROWS]
+)
+def test_every_row_of_the_table_is_in_it_and_passes(certificate, entry, row):
+    made = checks_of(certificate, entry, row)
+    assert made
+    assert [check for check in made if not check.passed] == []
+    assert row.tolerance in {check.tolerance for check in made}
+    assert row.unit in {check.unit for check in made}
+
+
+def test_every_check_is_of_the_table(certificate):
+    of_rows = {id(check) for entry, row in ROWS for check in checks_of(certificate, entry, row)}
+    assert of_rows == {id(check) for check in certificate.checks}
 
 
 def test_every_task_and_group_is_in_it_and_every_check_says_what_it_compared(certificate):
@@ -257,12 +289,25 @@ def test_a_check_passes_up_to_its_tolerance_and_never_on_nan(worst, passed):
     assert (margin(check) > 1) is not passed
 
 
+def worst_of(*cases):
+    found = outcome(Comparison("name", "oracle", 1.0), "group", {"task": ""}, [Case(*case) for case in cases])
+    return found.worst, found.where
+
+
 def test_the_worst_is_the_largest_and_a_nan_stays():
-    worst = Worst()
-    for difference, where in ((0.5, "a"), (0.2, "b"), (math.nan, "c"), (7.0, "d")):
-        worst.see(difference, where)
-    assert math.isnan(worst.value)
-    assert worst.where == "c"
+    worst, where = worst_of((0.5, "a"), (0.2, "b"), (math.nan, "c"), (7.0, "d"))
+    assert math.isnan(worst)
+    assert where == "c"
+    assert worst_of((1.0, "a"), (3.0, "b"), (3.0, "c")) == (3.0, "b")
+    assert worst_of((math.inf, "a"), (math.nan, "b"), (2.0, "c"))[1] == "b"
+
+
+def test_the_worst_of_an_array_is_worded_by_its_index_and_no_difference_is_nowhere():
+    assert worst_of((np.array([[0.1, 0.2], [0.9, 0.4]]), "at {}".format), (0.5, "b")) == (0.9, "at 2")
+    assert math.isnan(worst_of((np.array([0.1, math.nan, math.inf]), "at {}".format))[0])
+    assert worst_of((np.zeros(3), "at {}".format)) == (0.0, "everywhere: there is no difference")
+    assert worst_of((0.0, "at the end")) == (0.0, "at the end")
+    assert worst_of() == (0.0, "everywhere: there is no difference")
 
 
 @pytest.mark.parametrize("at", [1, 7, 200])
@@ -276,7 +321,7 @@ def test_one_nan_among_good_samples_fails_the_check(monkeypatch, at):
         return signals
 
     monkeypatch.setattr(MujocoPhysics, "step", broken)
-    check = dynamics.one_step(TASKS["cartpole"], "euler", 200)
+    (check,) = dynamics.one_step(TASKS["cartpole"], "euler", 200)
     assert math.isnan(check.worst)
     assert not check.passed
     assert "x [m] from" in check.where
@@ -530,8 +575,8 @@ def test_the_page_is_well_formed_self_contained_and_has_everything(certificate, 
     words = parsed.text
     for check in certificate.checks:
         assert " ".join(check.name.split()) in words
-    for outcome in caught:
-        assert outcome.mutation in words
+    for one in caught:
+        assert one.mutation in words
     assert len(parsed.data) == sum(len(check.plots) for check in certificate.checks) > 20
     assert "✓ passed" in words
     assert "prefers-color-scheme: dark" in text

@@ -12,7 +12,7 @@ from codrl_mj.pages import page
 from codrl_mj.runs.files import check_writable, writing
 from codrl_mj.validation.certificate import GROUPS, Certificate, verdict, versions
 from codrl_mj.validation.mutations import Caught, margin, unfailed
-from codrl_mj.validation.outcome import Check
+from codrl_mj.validation.table import Check
 
 JSON_NAME, HTML_NAME = "certificate.json", "certificate.html"
 _CHECKS = ("check", "oracle", "samples", "worst", "allowed", "margin", "unit", "where", "verdict")

@@ -2,7 +2,7 @@
 
 from codrl_mj.validation.certificate import GROUPS, Certificate, validate, validate_model
 from codrl_mj.validation.mutations import MUTATIONS, Caught, Mutation, try_mutations
-from codrl_mj.validation.outcome import Check, Skipped
+from codrl_mj.validation.table import Check, Skipped
 
 __all__ = [
     "GROUPS",

@@ -15,7 +15,7 @@ import mujoco
 from codrl_mj.physics import SimulationDivergedError
 from codrl_mj.tasks import OURS, TASKS, find_task
 from codrl_mj.validation import own_model
-from codrl_mj.validation.outcome import Check, Skipped
+from codrl_mj.validation.table import Check, Skipped
 
 GROUPS: dict[str, str] = {
     "dynamics": "Accelerations and single steps against the installed Gymnasium",

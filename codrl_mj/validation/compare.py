@@ -1,6 +1,5 @@
 """What is compared, and how: relative to its size, angles on the circle, a NaN worse than anything."""
 
-import math
 from typing import Any
 
 import numpy as np
@@ -17,30 +16,10 @@ STAND_IN = "default current loop"
 """What stands in for the paper's actuator where a task has none."""
 
 
-class Worst:
-    """The largest difference seen and where; a NaN is larger than anything, and stays."""
-
-    def __init__(self) -> None:
-        """Nothing was seen yet."""
-        self.value = 0.0
-        self.where = "everywhere: there is no difference"
-
-    def see(self, difference: float, where: str) -> None:
-        """Look at one more difference."""
-        if not (difference <= self.value or math.isnan(self.value)):
-            self.value, self.where = float(difference), where
-
-
 def differences(task: Task, ours: np.ndarray, oracle: np.ndarray) -> np.ndarray:
-    """|ours - oracle| / max(1, |oracle|), entry by entry.
+    """|ours - oracle| / max(1, |oracle|), entry by entry, of states of shape (..., n).
 
-    Args:
-        task: the task whose states they are.
-        ours: states, shape (..., n).
-        oracle: states, shape (..., n).
-
-    Returns:
-        Shape (..., n). Entries that the task wraps are compared on the circle while both lie within [-pi, pi].
+    Entries that the task wraps are compared on the circle while both lie within [-pi, pi].
     """
     gap = np.abs(ours - oracle)
     for entry in task.wrapped:
@@ -48,13 +27,6 @@ def differences(task: Task, ours: np.ndarray, oracle: np.ndarray) -> np.ndarray:
         turn = np.abs(2 * np.pi - gap[..., entry])
         gap[..., entry] = np.where(inside, np.minimum(gap[..., entry], turn), gap[..., entry])
     return gap / np.maximum(1.0, np.abs(oracle))
-
-
-def largest(task: Task, ours: np.ndarray, oracle: np.ndarray) -> tuple[float, int, str]:
-    """The largest of the `differences` of states of shape (N, n), its row and the name of its entry; a NaN first."""
-    gaps = differences(task, ours, oracle)
-    row, entry = divmod(int(np.argmax(np.where(np.isnan(gaps), np.inf, gaps))), gaps.shape[1])
-    return float(gaps[row, entry]), row, task.state_names[entry]
 
 
 def both(
@@ -102,12 +74,7 @@ def actuators_of(task: Task) -> tuple[Actuator, ...]:
 
 
 def forces_of(task: Task, shares: np.ndarray) -> np.ndarray:
-    """Desired forces, row by row what `Physics.step` takes.
-
-    Args:
-        task: the task.
-        shares: of the largest forces, shape (steps * motors,).
-    """
+    """Desired forces, row by row what `Physics.step` takes, from shares of the largest, shape (steps * motors,)."""
     forces = task.max_forces * shares.reshape(-1, len(task.motors))
     return forces[:, 0] if len(task.motors) == 1 else forces
 

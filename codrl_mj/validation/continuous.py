@@ -76,18 +76,11 @@ class Solution(NamedTuple):
 def solve(
     task: Task, equations: Equations, start: np.ndarray, forces: np.ndarray, actuators: Sequence[ActuatorModel]
 ) -> Solution:
-    """Solve the continuous equations by scipy's DOP853 at a relative tolerance of 1e-12.
+    """Solve the continuous equations by scipy's DOP853 at a relative tolerance of 1e-12, forces held over each step.
 
-    With a motor they are joined by those of its circuit and its analogue PI loop,
-    L di/dt = u - kE*omega - R*i, u = kP*e + kI*I + kFF*i_ref (+ kE*omega), dI/dt = e, torque = kT*i.
-
-    Args:
-        task: the task.
-        equations: its equations of motion.
-        start: initial mechanical state; the motors start at rest.
-        forces: desired forces, held over each environment step.
-        actuators: one for each motor: ideal, or motors under loops without derivative gain and filters, and never
-            saturated.
+    With motors they are joined by those of each circuit and its analogue PI loop,
+    L di/dt = u - kE*omega - R*i, u = kP*e + kI*I + kFF*i_ref (+ kE*omega), dI/dt = e, torque = kT*i;
+    such a loop has no derivative gain and no filter, is never saturated, and starts at rest.
     """
     size, motors = len(start), [one for one in actuators if isinstance(one, Actuator)]
 

@@ -5,7 +5,7 @@ twin there, of the accelerations that MuJoCo finds: that checks its integrator a
 the Euler variants promise first order and RK4, under a force held over the step, fourth. With a motor all promise first
 order: its winding takes Euler steps, and its torque is held over the mechanical step.
 
-The runs stay away from bounds and walls (`codrl_mj.validation.free_runs`): a clip is not smooth, and the step at which
+The runs stay away from bounds and walls (`FreeRun`): a clip is not smooth, and the step at which
 it acts moves with the step size. What happens at the bounds is compared step by step elsewhere.
 
 The last check makes the current loop faster instead. Its PI gains cancel the winding's pole, kI = kP*R/L, which leaves
@@ -16,19 +16,58 @@ the actuated task approaches Gymnasium's at first order in tau.
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from codrl_mj.actuators import IDEAL, Actuator, ActuatorModel, CurrentLoop, Motor
-from codrl_mj.pages.plots import Plot
-from codrl_mj.physics import SimulationDivergedError
-from codrl_mj.tasks import Task, find_task
-from codrl_mj.validation.compare import NO_TWIN, actuators_of, physics_of
+from codrl_mj.physics import MujocoPhysics, SimulationDivergedError
+from codrl_mj.tasks import OURS, Task, find_task
+from codrl_mj.validation.compare import NO_TWIN, actuators_of, forces_of, physics_of
 from codrl_mj.validation.continuous import equations_of, solve
-from codrl_mj.validation.free_runs import free_run, obstacle
-from codrl_mj.validation.order import Family, order_check
-from codrl_mj.validation.outcome import Check, Skipped
+from codrl_mj.validation.table import ORDER_TOLERANCE, Case, Check, Comparison, Family, Skipped, check, of_order
+
+
+class FreeRun(NamedTuple):
+    """A run, the same every time."""
+
+    start: np.ndarray
+    """Initial state."""
+    forces: np.ndarray
+    """Desired forces: full force either way, each held for one environment step."""
+    balanced: np.ndarray
+    """The first of these, over which energies are balanced."""
+
+
+def free_run(task: Task) -> FreeRun:
+    """The run of `Task.trials`; of a task that has none, a few steps from one of its starts."""
+    trials = task.trials
+    steps, balanced = (6, 2) if trials is None else (trials.steps, trials.balanced_steps)
+    start = task.initial(np.random.default_rng(3), None) if trials is None else np.array(trials.start)
+    forces = forces_of(task, np.random.default_rng(3).choice([-1.0, 1.0], steps * len(task.motors)))
+    return FreeRun(start, forces, forces[:balanced])
+
+
+def obstacle(task: Task) -> str:
+    """Why the run of somebody's task is not smooth; empty if it is."""
+    if task in OURS:  # whose runs are tested
+        return ""
+    start, forces, _ = free_run(task)
+    free = dataclasses.replace(task, step_duration=task.step_duration / 16, constrain=None)
+    physics = MujocoPhysics(free, (IDEAL,) * len(task.motors), 1, task.integrators[0])
+    physics.reset(start)
+    for force in forces.repeat(16, axis=0):
+        try:
+            physics.step(force)
+        except SimulationDivergedError as error:
+            return str(error)
+        if physics.data.nefc:
+            return "a contact, a limit, friction or another constraint acts in the run: name another in Task.trials"
+        if task.constrain is not None:
+            kept = np.array(task.constrain(physics.state, free.step_duration))
+            if not np.array_equal(kept, physics.state):
+                return "the run meets the task's bounds: name another in Task.trials"
+    return ""
 
 
 def _states(
@@ -75,9 +114,16 @@ def analogues(task: Task) -> tuple[Actuator, ...]:
     )
 
 
-def _order_check(
-    task: Task, integrator: str, actuators: Sequence[ActuatorModel], solution: np.ndarray, whose: str, quick: bool
-) -> Check:
+@check("convergence", Comparison("order, {integrator}, {case}", "DOP853 at 1e-12 on {whose}", ORDER_TOLERANCE, "slope"))
+def order_in_the_step(
+    task: Task,
+    case: str,
+    integrator: str,
+    actuators: Sequence[ActuatorModel],
+    solution: np.ndarray,
+    quick: bool,
+) -> Iterator[Case]:
+    """The solution's errors vanish as the integrator promises."""
     motors = [actuator.motor for actuator in actuators if isinstance(actuator, Actuator)]
     finer = _finer(task)
     promised = 4.0 if integrator == "rk4" and not motors else 1.0
@@ -92,16 +138,15 @@ def _order_check(
     for label, kind in physics_of(task):
         errors = [_error(_states(kind, task, actuators, int(count), integrator), solution) for count in counts]
         families.append(Family(label, task.step_duration / counts, np.array(errors), 1e-12))  # the solution's
-    oracle = f"DOP853 at 1e-12 on {whose}"
-    case = "motor in the loop" if motors else "ideal actuator"
-    oracle += " and of the motor" if motors else ""
-    plot = Plot(
-        f"{task.name}, {integrator}, {case}", "integration step [s]", "largest error of the state [relative]", ()
-    )
-    return order_check(f"order, {integrator}, {case}", oracle, families, promised, plot, "convergence", task.name)
+    title, y_label = f"{task.name}, {integrator}, {case}", "largest error of the state [relative]"
+    yield of_order(promised, families, title, "integration step [s]", y_label)
 
 
-def _bandwidth_check(task: Task, quick: bool) -> Check:
+@check(
+    "convergence",
+    Comparison("rate in the loop's bandwidth", "{whose} with the desired force itself", ORDER_TOLERANCE, "slope"),
+)
+def rate_in_the_bandwidth(task: Task, quick: bool) -> Iterator[Case]:
     """The lag is resolved by two integration steps at every bandwidth; both runs take the same steps."""
     lags = task.step_duration / 2 ** ((np.arange(3, 7) if quick else np.arange(4, 9)) + _finer(task))  # tau [s]
     integrator, physics = task.integrators[0], physics_of(task)
@@ -117,24 +162,13 @@ def _bandwidth_check(task: Task, quick: bool) -> Check:
             errors[label].append(_error(_states(kind, task, actuators, count, integrator), ideal))
     bandwidth = 1 / (2 * np.pi * lags)
     families = [Family(label, bandwidth, np.array(found)) for label, found in errors.items()]
-    plot = Plot(
-        f"{task.name}: the actuated task approaches the ideal one",
-        "bandwidth of the current loop [Hz]",
-        "largest difference of the state [relative]",
-        (),
-    )
-    whose = "MuJoCo" if task.twin is None else task.oracle
-    oracle = f"{whose} with the desired force itself"
-    return order_check("rate in the loop's bandwidth", oracle, families, -1.0, plot, "convergence", task.name)
+    title = f"{task.name}: the actuated task approaches the ideal one"
+    x_label = "bandwidth of the current loop [Hz]"
+    yield of_order(-1.0, families, title, x_label, "largest difference of the state [relative]")
 
 
 def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
-    """The checks of convergence.
-
-    Args:
-        task_name: the task.
-        quick: fewer and coarser steps.
-    """
+    """The checks of convergence."""
     task = find_task(task_name)
     reason = obstacle(task)
     if reason:
@@ -144,8 +178,10 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
         yield Skipped("equations of motion that are not MuJoCo's", NO_TWIN, "convergence", task.name)
     equations, whose = equations_of(task)
     start, forces, _ = free_run(task)
-    for actuators in (ideals(task), analogues(task)):
+    for case, actuators in (("ideal actuator", ideals(task)), ("motor in the loop", analogues(task))):
         solution = solve(task, equations, start, forces, actuators).states
+        solved = whose if case == "ideal actuator" else f"{whose} and of the motor"
         for integrator in task.integrators:
-            yield _order_check(task, integrator, actuators, solution, whose, quick)
-    yield _bandwidth_check(task, quick)
+            compared = order_in_the_step.of(whose=solved)
+            yield from compared(task, case, integrator, actuators, solution, quick)
+    yield from rate_in_the_bandwidth.of(whose="MuJoCo" if task.twin is None else task.oracle)(task, quick)

@@ -23,11 +23,10 @@ from codrl_mj.actuators import Drive, resolve
 from codrl_mj.catalogue import motor_names
 from codrl_mj.physics import MujocoPhysics, SimulationDivergedError
 from codrl_mj.tasks import Task
-from codrl_mj.validation.compare import Worst, differences
+from codrl_mj.validation.compare import differences
 from codrl_mj.validation.continuous import gymnasium_equations
-from codrl_mj.validation.outcome import Check
 from codrl_mj.validation.rotors import HELD, drive, motors_on
-from codrl_mj.validation.worst import worst_of
+from codrl_mj.validation.table import Case, Comparison, check
 
 FITTED = {
     "pendulum": ("maxon-ec45-flat-50w", {"gear_ratio": 30.0}, 20e3),
@@ -54,12 +53,7 @@ class Bench:
     """A drive's winding and loop, sample by sample."""
 
     def __init__(self, one: Drive, timestep: float) -> None:
-        """At rest.
-
-        Args:
-            one: with designed gains, back-calculation and a stiff supply.
-            timestep: mechanical step [s].
-        """
+        """At rest, with designed gains, back-calculation and a stiff supply; timestep: mechanical [s]."""
         motor, sample = one.motor, 1.0 / one.controller.sample_rate
         self._motor, self._timestep = motor, timestep
         self._voltage, self._most = one.voltage_limit, one.controller.max_current
@@ -73,12 +67,7 @@ class Bench:
         self._current = self._integral = 0.0
 
     def torque(self, desired: float, speed: float) -> float:
-        """Mean torque [N*m] of the next step at the rotor, behind the gear.
-
-        Args:
-            desired: torque [N*m].
-            speed: of the rotor [rad/s].
-        """
+        """Mean torque [N*m] of the next step at the rotor, behind the gear, of a desired one at a speed [rad/s]."""
         motor, charge, current, integral = self._motor, 0.0, self._current, self._integral
         (decay, _, effect), (kept, _, passed) = self._winding
         back_emf, kp, ki, most = motor.back_emf_constant * speed, self.kp, self.ki, self._voltage
@@ -101,14 +90,7 @@ class Mechanics:
     """Gymnasium's environment of a task, with what a drive adds to its joint."""
 
     def __init__(self, task: Task, one: Drive, timestep: float, integrator: str) -> None:
-        """Make the environment.
-
-        Args:
-            task: one with a twin and one motor.
-            one: the drive whose rotor and friction there are.
-            timestep: integration step [s].
-            integrator: one of the task's.
-        """
+        """Of a task with a twin and one motor, at an integration step [s]."""
         motor, arm = one.motor, one.motor.arm_radius / one.motor.gear_ratio
         self._armature, self._damping = motor.rotor_inertia / arm**2, motor.viscous_friction / arm**2
         self._friction = motor.coulomb_friction / arm
@@ -146,46 +128,50 @@ class Mechanics:
         return np.array(self._task.constrain(after, self._timestep))
 
 
-def runs(task: Task, tolerance: float, quick: bool) -> Iterator[Check]:
-    """A run of a task with its drive of `FITTED` in the engine, by each of its integrators, under bang-bang commands.
+_TWIN = "Gymnasium {task.gymnasium_id} with a rotor on its joint, the winding by scipy.linalg.expm"
 
-    Args:
-        task: one of `FITTED`.
-        tolerance: largest difference of a state.
-        quick: a tenth of the samples.
-    """
-    one = fitted(task.name)
+
+@check("trajectories", Comparison("run, {integrator}, {motor}", _TWIN, 1e-9))
+def fitted_run(task: Task, integrator: str, quick: bool) -> Iterator[Case]:
+    """A run of a task with its drive of `FITTED`, which has that motor, in the engine, under bang-bang commands."""
+    one, generator = fitted(task.name), np.random.default_rng(0)
     inner, arm, speed = task.motor_inner_steps, one.arm_radius, task.speeds[0]
     longest = round((5e4 if quick else 5e5) / (task.step_duration * one.controller.sample_rate))
     steps = min(longest, task.max_episode_steps or longest, (task.trials and task.trials.horizon) or longest)
-    for integrator in task.integrators:
-        generator, timestep = np.random.default_rng(0), task.step_duration / inner
-        state = task.initial(generator, None)
-        physics = MujocoPhysics(task, [one], inner, integrator)
-        physics.reset(state)
-        bench, mechanics, worst = Bench(one, timestep), Mechanics(task, one, timestep, integrator), Worst()
-        for step, force in enumerate(task.max_force * generator.choice([-1.0, 1.0], steps)):
-            try:
-                physics.step(force)
-            except SimulationDivergedError as error:
-                worst.see(math.inf, str(error))
-                break
-            for _ in range(inner):
-                state = mechanics.step(state, bench.torque(force * arm, state[speed] / arm) / arm)
-            gaps = differences(task, physics.state, state)
-            worst.see(gaps.max(), f"{task.state_names[int(gaps.argmax())]} at step {step + 1}")
-        oracle = f"Gymnasium {task.gymnasium_id} with a rotor on its joint, the winding by scipy.linalg.expm"
-        described = f"run, {integrator}, {FITTED[task.name][0]}"
-        yield Check(described, oracle, steps, worst.value, tolerance, worst.where, "trajectories", task.name)
+    timestep, state = task.step_duration / inner, task.initial(generator, None)
+    physics = MujocoPhysics(task, [one], inner, integrator)
+    physics.reset(state)
+    bench, mechanics = Bench(one, timestep), Mechanics(task, one, timestep, integrator)
+    gaps: list[np.ndarray] = []
+    names, error = task.state_names, ""
+    for force in task.max_force * generator.choice([-1.0, 1.0], steps):
+        try:
+            physics.step(force)
+        except SimulationDivergedError as diverged:
+            error = str(diverged)
+            break
+        for _ in range(inner):
+            state = mechanics.step(state, bench.torque(force * arm, state[speed] / arm) / arm)
+        gaps.append(differences(task, physics.state, state))
+    yield Case(gaps, lambda at: f"{names[at % len(names)]} at step {at // len(names) + 1}", steps)
+    if error:
+        yield Case(math.inf, error, 0)
 
 
-def drive_checks(quick: bool) -> Iterator[Check]:
+@check(
+    "motor",
+    Comparison("drives, exact winding", "scipy.linalg.expm, sample by sample", 1e-10, "of the stall torque"),
+    Comparison(
+        "drives, closed form",
+        "the same loops with their gains given, which are stepped in the engine",
+        1e-10,
+        "of the stall torque",
+    ),
+)
+def drive_checks(quick: bool) -> Iterator[tuple[Case, ...]]:
     """Every motor of the catalogue at held speeds in the engine: against its winding, and in closed form and stepped.
 
     Torques are measured against the stall torque: the closed form is good to 1e-13 of it, and so is a sum of samples.
-
-    Args:
-        quick: fewer steps.
     """
     timestep, steps, generator = 0.002, 20 if quick else 200, np.random.default_rng(0)
     given = {"motor": COLD | {"load_inertia": math.inf}, "controller": {"sample_rate": 20e3}}
@@ -210,10 +196,5 @@ def drive_checks(quick: bool) -> Iterator[Check]:
             for rows in zip(torques.tolist(), speeds.tolist(), strict=True)
         ]
     )
-    for name, oracle, found in (
-        ("drives, exact winding", "scipy.linalg.expm, sample by sample", exact),
-        ("drives, closed form", "the same loops with their gains given, which are stepped in the engine", stepped),
-    ):
-        gaps = np.abs(ours - found) / stalls
-        worst, where = worst_of(zip(gaps.max(axis=0).tolist(), jumping, strict=True))
-        yield Check(name, oracle, gaps.size, worst, 1e-10, where, group="motor", unit="of the stall torque")
+    names, gaps = list(jumping), (np.abs(ours - found) / stalls for found in (exact, stepped))
+    yield tuple(Case(found, lambda at: names[at % len(names)]) for found in gaps)

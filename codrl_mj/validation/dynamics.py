@@ -13,8 +13,8 @@ import numpy as np
 from codrl_mj.actuators import IDEAL
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError
 from codrl_mj.tasks import Task, find_task
-from codrl_mj.validation.compare import NO_TWIN, SEVERAL_MOTORS, Worst, both, largest, trials_of, twin_of
-from codrl_mj.validation.outcome import Check, Skipped
+from codrl_mj.validation.compare import NO_TWIN, SEVERAL_MOTORS, both, differences, trials_of, twin_of
+from codrl_mj.validation.table import Case, Check, Comparison, Skipped, check
 
 TOLERANCE = 1e-12
 """One step rounds some tens of numbers to 1e-16; an RK4 step at the speed limits amplifies that a hundredfold."""
@@ -47,62 +47,47 @@ def _after_one_step(physics: MujocoPhysics | AnalyticPhysics, states: np.ndarray
     return after
 
 
-def _check(
-    task: Task, name: str, ours: np.ndarray, oracle: np.ndarray, states: np.ndarray, forces: np.ndarray
-) -> Check:
-    worst = Worst()
-    difference, row, entry = largest(task, ours, oracle)
-    worst.see(difference, f"{entry} from {np.array2string(states[row], precision=3)}, force {forces[row]:.3g}")
-    return Check(name, task.oracle, len(states), worst.value, TOLERANCE, worst.where, "dynamics", task.name)
+def _stepped(task: Task, ours: np.ndarray, oracle: np.ndarray, states: np.ndarray, forces: np.ndarray) -> Case:
+    """What steps from the states under the forces ended in."""
+
+    def where(at: int) -> str:
+        row, entry = divmod(at, states.shape[1])
+        return f"{task.state_names[entry]} from {np.array2string(states[row], precision=3)}, force {forces[row]:.3g}"
+
+    return Case(differences(task, ours, oracle), where, len(states))
 
 
-def one_step(task: Task, integrator: str, samples: int, seed: int = 0) -> Check:
-    """One integration step with an ideal actuator, from random states under random forces.
-
-    Args:
-        task: the task.
-        integrator: one of the task's integrators.
-        samples: random states.
-        seed: of the states and forces.
-    """
+@check("dynamics", Comparison("one step, {integrator}", "{task.oracle}", TOLERANCE))
+def one_step(task: Task, integrator: str, samples: int, seed: int = 0) -> Iterator[Case]:
+    """One integration step with an ideal actuator, from random states under random forces."""
     generator = np.random.default_rng(seed)
     bounds = np.array(trials_of(task).bounds)
     states = generator.uniform(-bounds, bounds, (samples, len(bounds)))
     forces = generator.uniform(-task.max_force, task.max_force, samples)
     ours, oracle = (_after_one_step(physics, states, forces) for physics in both(task, IDEAL, integrator))
-    return _check(task, f"one step, {integrator}", ours, oracle, states, forces)
+    yield _stepped(task, ours, oracle, states, forces)
 
 
-def one_step_at_the_bounds(task: Task, integrator: str, stride: int = 1) -> Check:
-    """One step from the task's edges under no, full and extreme forces, which MuJoCo is allowed here.
-
-    Args:
-        task: the task.
-        integrator: one of the task's integrators.
-        stride: take every so many of the states.
-    """
+@check("dynamics", Comparison("one step at the bounds, {integrator}", "{task.oracle}", TOLERANCE))
+def one_step_at_the_bounds(task: Task, integrator: str, stride: int = 1) -> Iterator[Case]:
+    """One step from the task's edges under no, full and extreme forces, which MuJoCo is allowed here."""
     states, forces = _crossed(
         np.array(list(itertools.product(*trials_of(task).edges)))[::stride],
         task.max_force * np.array([-EXTREME, -1.0, 0.0, 1.0, EXTREME]),
     )
     physics = both(task, IDEAL, integrator, max_force=EXTREME * task.max_force)
     ours, oracle = (_after_one_step(each, states, forces) for each in physics)
-    return _check(task, f"one step at the bounds, {integrator}", ours, oracle, states, forces)
+    yield _stepped(task, ours, oracle, states, forces)
 
 
-def one_step_beyond_the_force_limit(task: Task, integrator: str, points: int) -> Check:
-    """One step under commands up to `EXTREME` times the limit, against Gymnasium under the force clipped to the limit.
-
-    Args:
-        task: the task.
-        integrator: one of the task's integrators.
-        points: grid points along each state entry.
-    """
+@check("dynamics", Comparison("one step beyond the force limit, {integrator}", "{task.oracle}", TOLERANCE))
+def one_step_beyond_the_force_limit(task: Task, integrator: str, points: int) -> Iterator[Case]:
+    """One step under commands up to `EXTREME` times the limit, against Gymnasium under the limit."""
     states, forces = _crossed(grid(task, points), task.max_force * np.array([-EXTREME, -1.001, 1.001, EXTREME]))
     mujoco_physics, analytic = both(task, IDEAL, integrator)
     ours = _after_one_step(mujoco_physics, states, forces)
     oracle = _after_one_step(analytic, states, np.clip(forces, -task.max_force, task.max_force))
-    return _check(task, f"one step beyond the force limit, {integrator}", ours, oracle, states, forces)
+    yield _stepped(task, ours, oracle, states, forces)
 
 
 class _GymnasiumAcceleration:
@@ -131,13 +116,9 @@ class _GymnasiumAcceleration:
         return (after - state)[self._velocities]
 
 
-def accelerations(task: Task, points: int) -> Check:
-    """MuJoCo's `qacc` over a dense grid of states, under no, half, full and extreme forces.
-
-    Args:
-        task: the task.
-        points: grid points along each state entry.
-    """
+@check("dynamics", Comparison("accelerations", "{task.oracle}", TOLERANCE))
+def accelerations(task: Task, points: int) -> Iterator[Case]:
+    """MuJoCo's `qacc` over a dense grid of states, under no, half, full and extreme forces."""
     states, forces = _crossed(grid(task, points), task.max_force * np.array([-EXTREME, -1.0, 0.0, 0.5, EXTREME]))
     physics, _ = both(task, IDEAL, task.integrators[0], max_force=EXTREME * task.max_force)
     acceleration = _GymnasiumAcceleration(task)
@@ -148,21 +129,17 @@ def accelerations(task: Task, points: int) -> Check:
         mujoco.mj_forward(physics.model, physics.data)
         ours[row] = physics.data.qacc
         oracle[row] = acceleration(state, force)
-    worst = Worst()
-    gaps = np.abs(ours - oracle) / np.maximum(1.0, np.abs(oracle))
-    row, entry = divmod(int(np.argmax(np.where(np.isnan(gaps), np.inf, gaps))), gaps.shape[1])
-    name = task.state_names[task.qvel[entry]].partition(" ")[0]
-    worst.see(gaps[row, entry], f"d{name}/dt at {np.array2string(states[row], precision=3)}, force {forces[row]:.3g}")
-    return Check("accelerations", task.oracle, len(states), worst.value, TOLERANCE, worst.where, "dynamics", task.name)
+
+    def where(at: int) -> str:
+        row, entry = divmod(at, len(task.qvel))
+        name = task.state_names[task.qvel[entry]].partition(" ")[0]
+        return f"d{name}/dt at {np.array2string(states[row], precision=3)}, force {forces[row]:.3g}"
+
+    yield Case(np.abs(ours - oracle) / np.maximum(1.0, np.abs(oracle)), where, len(states))
 
 
 def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
-    """The checks of this group.
-
-    Args:
-        task_name: the task.
-        quick: fewer states.
-    """
+    """The checks of this group."""
     task = find_task(task_name)
     missing = NO_TWIN if task.twin is None else SEVERAL_MOTORS if len(task.motors) > 1 else ""
     if missing or task.trials is None:
@@ -170,8 +147,8 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
         return
     flat = len(task.state_names) == 2
     points = (9 if flat else 3) if quick else (51 if flat else 7)
-    yield accelerations(task, points)
+    yield from accelerations(task, points)
     for integrator in task.integrators:
-        yield one_step(task, integrator, 200 if quick else 10_000)
-        yield one_step_at_the_bounds(task, integrator, stride=5 if quick and not flat else 1)
-        yield one_step_beyond_the_force_limit(task, integrator, 3 if quick else (21 if flat else 5))
+        yield from one_step(task, integrator, 200 if quick else 10_000)
+        yield from one_step_at_the_bounds(task, integrator, stride=5 if quick and not flat else 1)
+        yield from one_step_beyond_the_force_limit(task, integrator, 3 if quick else (21 if flat else 5))

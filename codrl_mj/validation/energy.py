@@ -20,7 +20,6 @@ One balance holds at any step: an Euler step of the winding, times the mean curr
 actuators, bounds, walls and saturation included.
 """
 
-import dataclasses
 import math
 from collections.abc import Iterator, Sequence
 
@@ -31,12 +30,9 @@ from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.physics import SimulationDivergedError
 from codrl_mj.tasks import Task, find_task
 from codrl_mj.validation.compare import STAND_IN, actuators_named, forces_of, physics_of
-from codrl_mj.validation.convergence import analogues, ideals
-from codrl_mj.validation.free_runs import free_run, obstacle
+from codrl_mj.validation.convergence import analogues, free_run, ideals, obstacle
 from codrl_mj.validation.ledger import Ledger, Meter, keep
-from codrl_mj.validation.order import TOLERANCE, Family, order_check
-from codrl_mj.validation.outcome import Check, Skipped
-from codrl_mj.validation.worst import worst_of
+from codrl_mj.validation.table import ORDER_TOLERANCE, Case, Check, Comparison, Family, Skipped, check, of_order
 
 ACTUATORS = ("paper", "weak", "weaker", "open_loop")
 """Whose runs are balanced step by step."""
@@ -52,9 +48,11 @@ BALANCES = {
 """Residuals of a `Ledger`, and what each balances."""
 
 
-def _identity_check(task: Task, quick: bool) -> Check:
+@check("energy", Comparison("winding, step by step", "identity of one Euler step of the RL circuit", 1e-13))
+def step_by_step(task: Task, quick: bool) -> Iterator[Case]:
     """Tolerance 1e-13 of the energy supplied: the rounding of some ten operations a step."""
-    steps, found, samples = (20 if quick else 100), [], 0
+    steps = 20 if quick else 100
+    samples = steps * task.motor_inner_steps
     for name in ACTUATORS if task.paper else (STAND_IN,):
         actuators = actuators_named(name, task)
         generator = np.random.default_rng(5)
@@ -62,16 +60,12 @@ def _identity_check(task: Task, quick: bool) -> Check:
         start = task.initial(generator, None)
         for label, kind in physics_of(task):
             where = f"{name} actuator, {label}"
-            samples += steps * task.motor_inner_steps
             try:
                 ledger = keep(kind, task, actuators, start, forces, task.motor_inner_steps, task.integrators[0], 1)
             except SimulationDivergedError as error:
-                found.append((math.inf, f"{where}: {error}"))
+                yield Case(math.inf, f"{where}: {error}", samples)
             else:
-                found.append((ledger.identity, where))
-    worst, where = worst_of(found)
-    oracle = "identity of one Euler step of the RL circuit"
-    return Check("winding, step by step", oracle, samples, worst, 1e-13, where, group="energy", task=task.name)
+                yield Case(ledger.identity, where, samples)
 
 
 def _balance_plot(task: Task, integrator: str, ledger: Ledger) -> Plot:
@@ -100,14 +94,23 @@ def _kept(
     }
 
 
-def _order_checks(task: Task, integrator: str, quick: bool) -> Iterator[Check]:
+@check(
+    "energy",
+    *(
+        Comparison(f"order, {name} balance, {{integrator}}", oracle, ORDER_TOLERANCE, "slope")
+        for name, oracle in BALANCES.items()
+    ),
+)
+def balances(task: Task, integrator: str, quick: bool) -> Iterator[tuple[Case, ...]]:
+    """The residuals vanish at the integrator's order."""
     actuators = analogues(task)
     resolved = task.step_duration / (min(one.motor.electrical_time_constant for one in actuators) / 25)
     counts = 2 ** (math.ceil(math.log2(max(resolved, 64))) + np.arange(4 if quick else 5))
     ledgers = _kept(task, integrator, actuators, counts)
     ideal_counts = 2 ** np.arange(3, 7)  # finer ones reach rounding
     highest = 2.0 if Meter(task).lossy else 4.0
-    for balance, oracle in BALANCES.items():
+    cases = []
+    for balance in BALANCES:
         exact = (balance, integrator) == ("mechanical", "rk4")
         kept, steps = (
             (_kept(task, integrator, ideals(task), ideal_counts), ideal_counts) if exact else (ledgers, counts)
@@ -119,40 +122,36 @@ def _order_checks(task: Task, integrator: str, quick: bool) -> Iterator[Check]:
             rounding = _ROUNDING * max(abs(Meter(task)(free_run(task)[0])), *sizes) if exact else 0.0
             families.append(Family(label, task.step_duration / steps, np.array(residuals), float(rounding)))
         title = f"{task.name}, {integrator}: {balance} balance"
-        plot = Plot(title, "integration step [s]", "largest residual of the run [J]", ())
-        name = f"order, {balance} balance, {integrator}"
-        check = order_check(name, oracle, families, highest if exact else 1.0, plot, "energy", task.name)
+        case = of_order(
+            highest if exact else 1.0, families, title, "integration step [s]", "largest residual of the run [J]"
+        )
         if balance == "whole":
-            over_time = _balance_plot(task, integrator, ledgers["MuJoCo"][0])
-            check = dataclasses.replace(check, plots=(*check.plots, over_time))
-        yield check
+            case = case._replace(plots=(*case.plots, _balance_plot(task, integrator, ledgers["MuJoCo"][0])))
+        cases.append(case)
+    yield tuple(cases)
 
 
-def _diverged(task: Task, integrator: str, error: SimulationDivergedError) -> Check:
-    name = f"order of the balances, {integrator}"
-    return Check(name, "energy", 0, math.inf, TOLERANCE, str(error), group="energy", task=task.name, unit="slope")
+@check("energy", Comparison("order of the balances, {integrator}", "energy", ORDER_TOLERANCE, "slope"))
+def diverged(error: str) -> Iterator[Case]:
+    """What is left of the balances of a run that broke down."""
+    yield Case(math.inf, error, 0)
 
 
 def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
-    """The checks of energy.
-
-    Args:
-        task_name: the task.
-        quick: shorter runs, fewer and coarser steps.
-    """
+    """The checks of energy."""
     task = find_task(task_name)
     try:
         Meter(task)
     except ValueError as error:
         yield Skipped("all checks", str(error), "energy", task.name)
         return
-    yield _identity_check(task, quick)
+    yield from step_by_step(task, quick)
     reason = obstacle(task)
     if reason:
         yield Skipped("the balances of a whole run", reason, "energy", task.name)
         return
     for integrator in task.integrators:
         try:
-            yield from _order_checks(task, integrator, quick)
+            yield from balances(task, integrator, quick)
         except SimulationDivergedError as error:
-            yield _diverged(task, integrator, error)
+            yield from diverged.of(task.name, integrator=integrator)(str(error))

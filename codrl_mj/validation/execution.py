@@ -6,7 +6,7 @@ counted is the number of 64-bit floats that differ.
 
 import copy
 import pickle
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import mujoco
 import numpy as np
@@ -14,8 +14,8 @@ from mujoco.batch import Batch
 
 from codrl_mj.physics import MujocoPhysics, install_callbacks, motors
 from codrl_mj.tasks import Task, find_task
-from codrl_mj.validation.compare import Worst, actuators_of, forces_of
-from codrl_mj.validation.outcome import Check
+from codrl_mj.validation.compare import actuators_of, forces_of
+from codrl_mj.validation.table import Case, Check, Comparison, check
 
 UNIT = "64-bit floats that differ"
 SERIAL = "a loop over mj_step"
@@ -23,7 +23,7 @@ STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 """What a state vector of a task holds: time, positions, velocities and activations, the motor's among them."""
 FULL_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 """The same for a user's model, whose contacts also need the solver's warm start."""
-THREADS = (1, 2)
+THREADS = {"1 thread": 1, "2 threads": 2}
 
 
 def commands(model: mujoco.MjModel, steps: int, seed: int) -> np.ndarray:
@@ -55,21 +55,18 @@ def differing(ours: np.ndarray, oracle: np.ndarray) -> np.ndarray:
     return ours != oracle
 
 
-def _check(name: str, oracle_name: str, ours: np.ndarray, oracle: np.ndarray, task: str) -> Check:
-    """Compare states of shape (steps, n) or (steps, simulations, n)."""
+def bits(ours: np.ndarray, oracle: np.ndarray) -> Iterator[Case]:
+    """States of shape (steps, n) or (steps, simulations, n): how many floats differ, and from which step on."""
     unequal = differing(ours, oracle)
-    worst = Worst()
-    if unequal.any():
-        first = int(np.argmax(unequal.reshape(len(unequal), -1).any(axis=1)))
-        worst.see(float(unequal.sum()), f"the first of them at step {first + 1} of {len(unequal)}")
-    count = int(unequal.size)
-    return Check(name, oracle_name, count, worst.value, 0.0, worst.where, "execution", task, UNIT)
+    first = int(np.argmax(unequal.reshape(len(unequal), -1).any(axis=1)))
+    yield Case(float(unequal.sum()), lambda _: f"the first of them at step {first + 1} of {len(unequal)}", unequal.size)
 
 
-def batched(model: mujoco.MjModel, threads: int, simulations: int, steps: int, task: str = "") -> Check:
+@check("execution", Comparison("batched, {threads}", SERIAL, 0.0, UNIT))
+def batched(model: mujoco.MjModel, threads: str, simulations: int, steps: int) -> Iterator[Case]:
     """A batch, each simulation under commands of its own, against one simulation after the other."""
     inputs = np.stack([commands(model, steps, seed) for seed in range(simulations)], axis=1)
-    batch = Batch(model, nsim=simulations, nthread=threads)
+    batch = Batch(model, nsim=simulations, nthread=THREADS[threads])
     bound = batch.bind("ctrl").reshape(simulations, -1)
     fields = [batch.bind(name).reshape(simulations, -1) for name in ("time", "qpos", "qvel", "act", "plugin_state")]
     ours = []
@@ -78,21 +75,22 @@ def batched(model: mujoco.MjModel, threads: int, simulations: int, steps: int, t
         batch.step()
         ours.append(np.concatenate(fields, axis=1))
     serial = [_advance(model, mujoco.MjData(model), inputs[:, each]) for each in range(simulations)]
-    name = f"batched, {threads} thread{'s' if threads > 1 else ''}"
-    return _check(name, SERIAL, np.array(ours), np.stack(serial, axis=1), task)
+    yield from bits(np.array(ours), np.stack(serial, axis=1))
 
 
-def copied(model: mujoco.MjModel, steps: int, task: str = "") -> Check:
+@check("execution", Comparison("copied", "the original", 0.0, UNIT))
+def copied(model: mujoco.MjModel, steps: int) -> Iterator[Case]:
     """A copy of `MjData` made half-way, against the original."""
     inputs = commands(model, 2 * steps, seed=0)
     original = mujoco.MjData(model)
     _advance(model, original, inputs[:steps])
     twin = copy.copy(original)
     ours = _advance(model, twin, inputs[steps:])
-    return _check("copied", "the original", ours, _advance(model, original, inputs[steps:]), task)
+    yield from bits(ours, _advance(model, original, inputs[steps:]))
 
 
-def restored(model: mujoco.MjModel, steps: int, task: str = "", state: mujoco.mjtState | None = None) -> Check:
+@check("execution", Comparison("restored", "the run it was taken from", 0.0, UNIT))
+def restored(model: mujoco.MjModel, steps: int, state: mujoco.mjtState | None = None) -> Iterator[Case]:
     """A state vector taken half-way and put into a new `MjData`, against the run it was taken from."""
     kind = STATE if state is None else state
     inputs = commands(model, 2 * steps, seed=1)
@@ -102,10 +100,11 @@ def restored(model: mujoco.MjModel, steps: int, task: str = "", state: mujoco.mj
     mujoco.mj_getState(model, original, vector, kind)
     mujoco.mj_setState(model, fresh, vector, kind)
     ours = _advance(model, fresh, inputs[steps:])
-    return _check("restored", "the run it was taken from", ours, _advance(model, original, inputs[steps:]), task)
+    yield from bits(ours, _advance(model, original, inputs[steps:]))
 
 
-def forward_passes(model: mujoco.MjModel, steps: int, task: str = "") -> Check:
+@check("execution", Comparison("forward passes", "one forward pass", 0.0, UNIT))
+def forward_passes(model: mujoco.MjModel, steps: int) -> Iterator[Case]:
     """Between any two steps, three forward passes leave activations and plugins' states, the motors', as one does."""
     inputs, moving = commands(model, steps, seed=2), 1 + model.nq + model.nv
     data = mujoco.MjData(model)
@@ -119,26 +118,19 @@ def forward_passes(model: mujoco.MjModel, steps: int, task: str = "") -> Check:
             mujoco.mj_forward(model, looked_at)
         often.append(_state(looked_at)[moving:])
         mujoco.mj_step(model, data)
-    return _check("forward passes", "one forward pass", np.array(often), np.array(once), task)
+    yield from bits(np.array(often), np.array(once))
 
 
 def model_checks(
     model: mujoco.MjModel, task: str = "", quick: bool = False, state: mujoco.mjtState | None = None
 ) -> Iterator[Check]:
-    """The checks that any model can be put through; callbacks that its motors need must be installed.
-
-    Args:
-        model: any model.
-        task: its name in the certificate.
-        quick: fewer simulations and steps.
-        state: what a state vector holds; None means `STATE`.
-    """
+    """The checks of any model whose callbacks are installed; a state vector holds `state`."""
     simulations, steps = (6, 40) if quick else (32, 200)
     for threads in THREADS:
-        yield batched(model, threads, simulations, steps, task)
-    yield copied(model, steps, task)
-    yield restored(model, steps, task, state)
-    yield forward_passes(model, steps, task)
+        yield from batched.of(task)(model, threads, simulations, steps)
+    yield from copied.of(task)(model, steps)
+    yield from restored.of(task)(model, steps, state)
+    yield from forward_passes.of(task)(model, steps)
 
 
 # -- with a task's bounds and integrator around it ----------------------------------------------------------
@@ -161,24 +153,27 @@ def _simulation(task: Task, integrator: str, seed: int, steps: int) -> tuple[Muj
     return physics, initial, forces_of(task, generator.uniform(-1.0, 1.0, steps * len(task.motors)))
 
 
-def pickled(task: Task, integrator: str, steps: int) -> Check:
+@check("execution", Comparison("pickled, {integrator}", "the original", 0.0, UNIT))
+def pickled(task: Task, integrator: str, steps: int) -> Iterator[Case]:
     """A simulation pickled and unpickled half-way, against the original."""
     physics, _, forces = _simulation(task, integrator, 3, 2 * steps)
     _episode(physics, forces[:steps])
     twin = pickle.loads(pickle.dumps(physics))
     ours, oracle = (_episode(each, forces[steps:]) for each in (twin, physics))
-    return _check(f"pickled, {integrator}", "the original", ours, oracle, task.name)
+    yield from bits(ours, oracle)
 
 
-def repeated(task: Task, integrator: str, steps: int) -> Check:
+@check("execution", Comparison("repeated, {integrator}", "the first episode", 0.0, UNIT))
+def repeated(task: Task, integrator: str, steps: int) -> Iterator[Case]:
     """A second episode after a reset, against the first."""
     physics, initial, forces = _simulation(task, integrator, 4, steps)
     oracle = _episode(physics, forces)
     physics.reset(initial)
-    return _check(f"repeated, {integrator}", "the first episode", _episode(physics, forces), oracle, task.name)
+    yield from bits(_episode(physics, forces), oracle)
 
 
-def looked_at(task: Task, integrator: str, steps: int) -> Check:
+@check("execution", Comparison("looked at, {integrator}", "an episode that nobody looks at", 0.0, UNIT))
+def looked_at(task: Task, integrator: str, steps: int) -> Iterator[Case]:
     """An episode with a forward pass after every environment step, as a viewer makes them, against one without."""
     physics, initial, forces = _simulation(task, integrator, 5, steps)
     oracle = _episode(physics, forces)
@@ -188,24 +183,16 @@ def looked_at(task: Task, integrator: str, steps: int) -> Check:
         physics.step(force)
         states.append(np.concatenate([physics.state, physics.data.act]))
         mujoco.mj_forward(physics.model, physics.data)
-    return _check(f"looked at, {integrator}", "an episode that nobody looks at", np.array(states), oracle, task.name)
-
-
-TASK_CHECKS: tuple[Callable[[Task, str, int], Check], ...] = (pickled, repeated, looked_at)
+    yield from bits(np.array(states), oracle)
 
 
 def checks(task_name: str, quick: bool = False) -> Iterator[Check]:
-    """The checks of this group.
-
-    Args:
-        task_name: the task.
-        quick: fewer simulations and steps.
-    """
+    """The checks of this group."""
     task = find_task(task_name)
     physics, _, _ = _simulation(task, task.integrators[0], 0, 1)
     assert motors(physics.model)
     install_callbacks(physics.model)
     yield from model_checks(physics.model, task.name, quick)
     for integrator in task.integrators:
-        for check in TASK_CHECKS:
-            yield check(task, integrator, 30 if quick else 200)
+        for compared in (pickled, repeated, looked_at):
+            yield from compared(task, integrator, 30 if quick else 200)

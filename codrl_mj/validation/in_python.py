@@ -32,8 +32,8 @@ from codrl_mj.engine.inertia import shaft_inertia
 from codrl_mj.engine.reading import slots
 from codrl_mj.validation.execution import UNIT, commands, differing
 from codrl_mj.validation.motor_loops import EVERY_FEATURE
-from codrl_mj.validation.outcome import Check
 from codrl_mj.validation.rotors import SWINGING, motors_on
+from codrl_mj.validation.table import Case, Check, Comparison, check
 
 KEY = Slot._fields.index("noise_key")
 
@@ -48,16 +48,9 @@ def beside(
 ) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     """Run a model from rest, and each actuator in Python under the inputs that the engine had for it.
 
-    The actuators in Python start at rest and are never corrected. At the plugin's door the desired force is what the
-    engine made of the model's actuator; at the callback's it is the control itself.
-
-    Args:
-        model: any, with the callbacks that it needs installed.
-        actuators: those of ours to compare, by index.
-        controls: of each step, shape (steps, nu).
-
-    Returns:
-        By index, what was found in the engine and in Python, each of shape (steps, k) with columns as in `entries`.
+    The actuators in Python, by index in the model, start at rest and are never corrected. At the plugin's door the
+    desired force is what the engine made of the model's actuator; at the callback's it is the control itself, of shape
+    (steps, nu). By index: what was found in the engine and in Python, of shape (steps, k), columns as in `entries`.
     """
     data = mujoco.MjData(model)
     slot_of = slots(data, actuators)
@@ -115,11 +108,7 @@ EXAMPLES: tuple[ActuatorModel, ...] = (
 
 
 def compiled_checks(quick: bool) -> Iterator[Check]:
-    """`advance` of every family, those that commands leave of it too, on swinging rotors under random torques.
-
-    Args:
-        quick: fewer steps.
-    """
+    """`advance` of every family, those that commands leave of it too, on swinging rotors under random torques."""
     examples = {type(one): one for one in EXAMPLES}
     named = [examples.get(family) or family() for family in FAMILIES.values() if family is not Ideal]
     driven = [command.actuator for one in named for command in one.commands().values()]
@@ -129,10 +118,13 @@ def compiled_checks(quick: bool) -> Iterator[Check]:
     model = motors_on(SWINGING, actuators, 0.01)
     found = beside(model, dict(enumerate(actuators)), commands(model, 200 if quick else 2000, seed=7))
     for at, actuator in enumerate(actuators):
-        unequal = differing(*found[at])
-        where = "everywhere: there is no difference"
-        if unequal.any():
-            step, entry = np.argwhere(unequal)[0]
-            where = f"the first of them at step {step + 1}: {entries(actuator)[entry]}"
-        name, oracle = f"compiled advance: {type(actuator).__name__}", "the same function in plain Python"
-        yield Check(name, oracle, unequal.size, float(unequal.sum()), 0.0, where, group="motor", unit=UNIT)
+        yield from compiled_advance.of(family=type(actuator).__name__)(entries(actuator), *found[at])
+
+
+@check("motor", Comparison("compiled advance: {family}", "the same function in plain Python", 0.0, UNIT))
+def compiled_advance(names: tuple[str, ...], compiled: np.ndarray, python: np.ndarray) -> Iterator[Case]:
+    """Floats that differ, of shape (steps, names), and the first of them."""
+    unequal = differing(compiled, python)
+    step, entry = divmod(int(np.argmax(unequal)), len(names))
+    first = f"the first of them at step {step + 1}: {names[entry]}"
+    yield Case(float(unequal.sum()), lambda _: first, unequal.size)

@@ -116,17 +116,10 @@ def keep(
     integrator: str,
     entries: int,
 ) -> Ledger:
-    """Run and write down the energies.
+    """Run and write down the energies, so many entries for each environment step, which divide its inner steps.
 
-    Args:
-        kind: `MujocoPhysics` or `AnalyticPhysics`.
-        task: the task; its own bounds should not be reached: what they take is no entry of the ledger.
-        actuators: motors under their loops; with ideal ones all electrical entries are zero.
-        start: initial state.
-        forces: desired forces, each held for one environment step.
-        inner_steps: integration steps to an environment step.
-        integrator: one of the task's.
-        entries: of the ledger for each environment step; must divide `inner_steps`.
+    The task's own bounds should not be reached: what they take is no entry of the ledger. Each force is held for one
+    environment step. With ideal actuators all electrical entries are zero.
     """
     timestep = task.step_duration / inner_steps
     # an environment step of one integration step shows each of them, and leaves the motor as it is in between

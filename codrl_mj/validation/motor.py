@@ -11,43 +11,27 @@ from codrl_mj.actuators import Motor
 from codrl_mj.validation.drives import drive_checks
 from codrl_mj.validation.in_python import compiled_checks
 from codrl_mj.validation.motor_analogue import analogue_checks
-from codrl_mj.validation.motor_constants import constants_checks, voltage_limit_check
+from codrl_mj.validation.motor_constants import constants_checks
 from codrl_mj.validation.motor_gem import available, gem_check
 from codrl_mj.validation.motor_loops import Loop, standard_loops
 from codrl_mj.validation.motor_native import MOTORS, native_checks
 from codrl_mj.validation.motor_sampled import sampled_checks
-from codrl_mj.validation.outcome import Check
+from codrl_mj.validation.table import Check
 
 
 def checks(task_name: str | None = None, quick: bool = False) -> Iterator[Check]:
-    """The checks of the motor.
-
-    Args:
-        task_name: check the loop of this task alone; None checks every task's, and a loop with every feature.
-        quick: fewer frequencies, steps and step sizes.
-
-    Raises:
-        KeyError: no such task.
-    """
+    """The checks of the motor, with the loop of one task alone, or with every task's and one with every feature."""
     loops = standard_loops()
     yield from checks_of(loops if task_name is None else {task_name: loops[task_name]}, quick)
     yield from compiled_checks(quick)
     yield from drive_checks(quick)
     yield from native_checks(MOTORS, quick)
     if available():
-        yield gem_check(Motor(), quick)
+        yield from gem_check(Motor(), quick)
 
 
 def checks_of(loops: dict[str, Loop], quick: bool = False) -> Iterator[Check]:
-    """Those checks that apply to any motors, such as a user's own: all but the comparisons with fixed motors.
-
-    Args:
-        loops: motors under their current loops, by name.
-        quick: fewer frequencies, steps and step sizes.
-    """
+    """Those checks that apply to any motors, such as a user's own: all but the comparisons with fixed motors."""
     yield from analogue_checks(loops, quick)
     yield from sampled_checks(loops, quick)
-    limit = voltage_limit_check(loops)
-    if limit is not None:
-        yield limit
-    yield from constants_checks({name: loop.actuator.motor for name, loop in loops.items()})
+    yield from constants_checks(loops)

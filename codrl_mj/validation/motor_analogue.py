@@ -10,25 +10,17 @@ import numpy as np
 from scipy import linalg
 
 from codrl_mj.actuators import Actuator
-from codrl_mj.pages.plots import Plot
 from codrl_mj.validation.motor_loops import Loop, run, unlimited
-from codrl_mj.validation.order import Family, order_check
-from codrl_mj.validation.outcome import Check
-from codrl_mj.validation.worst import worst_of
+from codrl_mj.validation.table import ORDER_TOLERANCE, Case, Comparison, Family, check, of_order
 
 
 def closed_form(actuator: Actuator, timestep: float, torques: np.ndarray, speed: float) -> np.ndarray:
-    """Joint torque [N*m] of the analogue loop after each step, from rest: the matrix exponential.
+    """Joint torque [N*m] of the analogue loop after each step [s], from rest: the matrix exponential.
 
     L di/dt = u - kE*omega - R*i,  u = kP*e + kI*I + kD*D + kFF*i_ref (+ kE*omega),  dI/dt = e - leak*I;
     with a filter D = (e - y)/Td and dy/dt = D; without one D = de/dt, which adds kD to L, and a step of i_ref makes the
-    current jump by kD/(L + kD) of it.
-
-    Args:
-        actuator: motor and gains; the voltage has no limit.
-        timestep: mechanical step [s].
-        torques: desired joint torque [N*m], held over each step.
-        speed: of the joint [rad/s].
+    current jump by kD/(L + kD) of it. The voltage has no limit; desired torques [N*m] are held over each step, and the
+    joint keeps its speed [rad/s].
     """
     motor, loop = actuator.motor, actuator.controller
     filtered = loop.derivative_time_constant > 0
@@ -54,17 +46,21 @@ def closed_form(actuator: Actuator, timestep: float, torques: np.ndarray, speed:
     return np.array(rows)
 
 
-def analogue_checks(loops: Mapping[str, Loop], quick: bool) -> Iterator[Check]:
+_ORACLE = "matrix exponential of the RL circuit under the analogue PID (scipy.linalg.expm)"
+
+
+@check(
+    "motor",
+    Comparison("closed form, order in the substeps", _ORACLE, ORDER_TOLERANCE, "slope"),
+    Comparison("closed form, limit of small substeps", _ORACLE, 1e-5, "N m"),
+)
+def analogue_checks(loops: Mapping[str, Loop], quick: bool) -> Iterator[tuple[Case, ...]]:
     """Convergence to the closed form at first order in the substeps, and the limit itself.
 
     The limit is Richardson's 2 x(2N) - x(N), whose error is of second order: below 1e-5 of the desired 1 N m at the
     finest substep, 1/100 or less of every time constant here. A parameter off by 0.1 % moves it by more.
-
-    Args:
-        loops: by name.
-        quick: stop at coarser substeps.
     """
-    families, limits = [], []
+    families, limits, where = [], [], []
     for name, loop in loops.items():
         counts = loop.actuator.controller.substeps * 2 ** np.arange(5, 10 if quick else 12)
         steps = max(20, round(1.0 / loop.timestep))
@@ -74,12 +70,8 @@ def analogue_checks(loops: Mapping[str, Loop], quick: bool) -> Iterator[Check]:
         errors = np.array([np.abs(run.torque[:, 0] - exact).max() for run in runs])
         families.append(Family(name, loop.timestep / counts, errors))
         limit = 2 * runs[-1].torque[:, 0] - runs[-2].torque[:, 0]
-        where = f"{name}, extrapolated from {counts[-2]} and {counts[-1]} substeps"
-        limits.append((float(np.abs(limit - exact).max()), where))
-    oracle = "matrix exponential of the RL circuit under the analogue PID (scipy.linalg.expm)"
-    plot = Plot("Torque against the analogue loop's closed form", "electrical substep [s]", "largest error [N m]", ())
-    yield order_check("closed form, order in the substeps", oracle, families, 1.0, plot, "motor")
-    worst, where = worst_of(limits)
-    yield Check(
-        "closed form, limit of small substeps", oracle, len(limits), worst, 1e-5, where, group="motor", unit="N m"
-    )
+        where.append(f"{name}, extrapolated from {counts[-2]} and {counts[-1]} substeps")
+        limits.append(np.abs(limit - exact).max())
+    title = "Torque against the analogue loop's closed form"
+    order = of_order(1.0, families, title, "electrical substep [s]", "largest error [N m]")
+    yield order, Case(limits, lambda at: where[at])

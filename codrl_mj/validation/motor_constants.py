@@ -12,26 +12,26 @@ import numpy as np
 from codrl_mj.actuators import Motor
 from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.validation.motor_loops import Loop
-from codrl_mj.validation.outcome import Check
 from codrl_mj.validation.rotors import FREE, HELD, drive, driven_by_voltage, motors_on
-from codrl_mj.validation.worst import worst_of
+from codrl_mj.validation.table import Case, Check, Comparison, check
 
 VOLTAGE = 6.0
 """Supply of every measurement [V]."""
 
 
-def constants_checks(motors: Mapping[str, Motor]) -> Iterator[Check]:
-    """The torque-speed line (stall to regeneration) and the free no-load speed.
+TOLERANCE = 1e-9
+_LINE = "u = R i + kE omega, torque = kT i in steady state"
+
+
+@check("motor", Comparison("torque-speed line and power, stall to regeneration", _LINE, TOLERANCE))
+def torque_speed_line(motors: Mapping[str, Motor]) -> Iterator[Case]:
+    """The torque-speed line, stall to regeneration; without a back-EMF it is measured at rest alone.
 
     Tolerance 1e-9: the measurements wait for 40 electrical (no load: 40 mechanical) time constants, exp(-40) = 4e-18,
     and an Euler step has the circuit's own fixed point.
-
-    Args:
-        motors: by name; those without a back-EMF have no no-load speed and are measured at rest alone.
     """
     shares = np.array([-0.5, 0.0, 0.5, 1.0, 1.5])  # of the no-load speed: reversed, stall, driving, no load, dragged
     names = ("reversed", "stall", "driving", "no load", "regenerating")
-    found, plots = [], []
     for name, motor in motors.items():
         timestep = 0.2 * motor.electrical_time_constant
         spins = motor.back_emf_constant > 0
@@ -41,22 +41,18 @@ def constants_checks(motors: Mapping[str, Motor]) -> Iterator[Check]:
         run = drive(model, np.full(len(speeds), VOLTAGE), speeds)
         line = motor.torque_constant / motor.arm_radius * VOLTAGE / motor.resistance * (1.0 - shares * spins)
         torque, stall = run.torque[-1], float(np.abs(line).max())
-        found += [
-            (float(error), f"{name}, {where}")
-            for error, where in zip(np.abs(torque - line) / stall, names, strict=True)
-        ]
         power = VOLTAGE * run.current[-1]
         drawn = VOLTAGE**2 / motor.resistance * (1.0 - shares * spins)
-        share = np.abs(power - drawn) / np.abs(drawn).max()
-        found += [(float(error), f"{name}, power, {where}") for error, where in zip(share, names, strict=True)]
+        where = [f"{name}, {part}{at}" for part in ("", "power, ") for at in names]
+        gaps = np.append(np.abs(torque - line) / stall, np.abs(power - drawn) / np.abs(drawn).max())
         curves = (Curve("MuJoCo", shares * top, torque), Curve("kT (u - kE omega)/R", shares * top, line, True))
-        plots.append(Plot(f"Torque over speed at {VOLTAGE:g} V, {name}", "speed [rad/s]", "torque [N m]", curves))
-    worst, where = worst_of(found)
-    oracle = "u = R i + kE omega, torque = kT i in steady state"
-    name = "torque-speed line and power, stall to regeneration"
-    yield Check(name, oracle, len(found), worst, 1e-9, where, group="motor", plots=tuple(plots[:1]))
+        plot = Plot(f"Torque over speed at {VOLTAGE:g} V, {name}", "speed [rad/s]", "torque [N m]", curves)
+        yield Case(gaps, where.__getitem__, plots=(plot,) if name == next(iter(motors)) else ())
 
-    found = []
+
+@check("motor", Comparison("no-load speed and current", "u/kE, and none", TOLERANCE))
+def no_load(motors: Mapping[str, Motor]) -> Iterator[Case]:
+    """The free no-load speed of those that have one."""
     for name, motor in motors.items():
         if motor.back_emf_constant == 0:
             continue
@@ -66,26 +62,17 @@ def constants_checks(motors: Mapping[str, Motor]) -> Iterator[Check]:
         steps = int(40 * (2 * motor.electrical_time_constant + mechanical) / timestep)
         run = drive(motors_on(FREE, [driven_by_voltage(motor)], timestep), np.full(min(steps, 40_000), VOLTAGE))
         top = VOLTAGE / motor.back_emf_constant * motor.arm_radius
-        found.append((abs(float(run.speed[-1, 0]) / top - 1.0), f"{name}: {run.speed[-1, 0]:.6g} rad/s"))
-        found.append((abs(float(run.current[-1, 0])) * motor.resistance / VOLTAGE, f"{name}: current without load"))
-    if found:
-        worst, where = worst_of(found)
-        yield Check("no-load speed and current", "u/kE, and none", len(found), worst, 1e-9, where, group="motor")
+        yield Case(abs(run.speed[-1, 0] / top - 1.0), f"{name}: {run.speed[-1, 0]:.6g} rad/s")
+        yield Case(abs(run.current[-1, 0]) * motor.resistance / VOLTAGE, f"{name}: current without load")
 
 
-def voltage_limit_check(loops: Mapping[str, Loop]) -> Check | None:
+@check("motor", Comparison("stall torque at the voltage limit", "kT u_max/R", TOLERANCE))
+def voltage_limit(loops: Mapping[str, Loop]) -> Iterator[Case]:
     """Stall torque at the loop's own voltage limit, in both directions, under a command far beyond it.
 
     A loop asked for 1000 times its stall current saturates whatever its gains, so that the torque must be kT*u_max/R.
-    The tolerance, 1e-9, is that of the other constants.
-
-    Args:
-        loops: by name; those without a limit, or without a gain, never saturate and are left out.
-
-    Returns:
-        The check, or None where no loop saturates.
+    Loops without a limit, or without a gain, never do and are left out. The tolerance is that of the other constants.
     """
-    found = []
     for name, loop in loops.items():
         motor, gains = loop.actuator.motor, loop.actuator.controller
         if not math.isfinite(gains.max_voltage) or not gains.kp + gains.ki + gains.kff > 0:
@@ -96,8 +83,12 @@ def voltage_limit_check(loops: Mapping[str, Loop]) -> Check | None:
             controls = np.full(steps, 1000.0 * sign * stall)
             torque = drive(motors_on(HELD, [loop.actuator], loop.timestep), controls, np.zeros(steps)).torque[-1, 0]
             error = abs(float(torque) * motor.arm_radius / (sign * stall) - 1.0)
-            found.append((error, f"{name}, {torque:.6g} N m at {sign * gains.max_voltage:g} V"))
-    if not found:
-        return None
-    worst, where = worst_of(found)
-    return Check("stall torque at the voltage limit", "kT u_max/R", len(found), worst, 1e-9, where, group="motor")
+            yield Case(error, f"{name}, {torque:.6g} N m at {sign * gains.max_voltage:g} V")
+
+
+def constants_checks(loops: Mapping[str, Loop]) -> Iterator[Check]:
+    """All checks of constants."""
+    yield from voltage_limit(loops)
+    motors = {name: loop.actuator.motor for name, loop in loops.items()}
+    yield from torque_speed_line(motors)
+    yield from no_load(motors)

@@ -10,14 +10,13 @@ apply and is left out.
 """
 
 import importlib.util
+from collections.abc import Iterator
 
 import numpy as np
 
 from codrl_mj.actuators import Motor
-from codrl_mj.pages.plots import Plot
-from codrl_mj.validation.order import Family, order_check
-from codrl_mj.validation.outcome import Check
 from codrl_mj.validation.rotors import FREE, Record, drive, driven_by_voltage, motors_on
+from codrl_mj.validation.table import ORDER_TOLERANCE, Case, Comparison, Family, check, of_order
 
 SUPPLY = 12.0
 """Supply voltage [V]."""
@@ -31,13 +30,7 @@ def available() -> bool:
 
 
 def gem_run(motor: Motor, inertia: float, voltages: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Speed [rad/s] and current [A] of gym-electric-motor's drive after each period.
-
-    Args:
-        motor: of which kT and kE are equal.
-        inertia: of rotor and load [kg m^2].
-        voltages: within the supply's [V].
-    """
+    """Speed [rad/s] and current [A] of gym-electric-motor's drive after each voltage's period."""
     from gym_electric_motor.physical_systems import converters, electric_motors, solvers, voltage_supplies
     from gym_electric_motor.physical_systems.mechanical_loads import PolynomialStaticLoad
     from gym_electric_motor.physical_systems.physical_systems import DcMotorSystem
@@ -66,7 +59,16 @@ def gem_run(motor: Motor, inertia: float, voltages: np.ndarray) -> tuple[np.ndar
     return speed, current
 
 
-def gem_check(motor: Motor, quick: bool) -> Check:
+@check(
+    "motor",
+    Comparison(
+        "gym-electric-motor, order in the step",
+        "gym-electric-motor's DcPermanentlyExcitedMotor",
+        ORDER_TOLERANCE,
+        "slope",
+    ),
+)
+def gem_check(motor: Motor, quick: bool) -> Iterator[Case]:
     """Convergence of speed and current to gym-electric-motor's at first order in the step, Euler on a free rotor."""
     voltages = np.random.default_rng(1).uniform(-SUPPLY, SUPPLY, 20 if quick else 40)
     speed, current = gem_run(motor, FREE.inertia, voltages)
@@ -80,6 +82,5 @@ def gem_check(motor: Motor, quick: bool) -> Check:
         errors[1].append(float(np.abs(run.current[ends, 0] - current).max()))
     steps = PERIOD / counts
     families = [Family("speed [rad/s]", steps, np.array(errors[0])), Family("current [A]", steps, np.array(errors[1]))]
-    plot = Plot("Ours against gym-electric-motor, free rotor", "step [s]", "largest difference [rad/s, A]", ())
-    name = "gym-electric-motor, order in the step"
-    return order_check(name, "gym-electric-motor's DcPermanentlyExcitedMotor", families, 1.0, plot, "motor")
+    title = "Ours against gym-electric-motor, free rotor"
+    yield of_order(1.0, families, title, "step [s]", "largest difference [rad/s, A]")

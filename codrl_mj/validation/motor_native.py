@@ -21,8 +21,6 @@ import numpy as np
 
 from codrl_mj.actuators import Motor
 from codrl_mj.pages.plots import Curve, Plot
-from codrl_mj.validation.order import Family, order_check
-from codrl_mj.validation.outcome import Check
 from codrl_mj.validation.rotors import (
     FREE,
     HELD,
@@ -34,7 +32,7 @@ from codrl_mj.validation.rotors import (
     motors_on,
     native_motor_on,
 )
-from codrl_mj.validation.worst import worst_of
+from codrl_mj.validation.table import ORDER_TOLERANCE, Case, Check, Comparison, Family, check, of_order
 
 MOTORS: dict[str, Motor] = {
     "paper": Motor(),
@@ -62,9 +60,14 @@ def _compare(ours: Record, native: Record) -> np.ndarray:
     return np.max([np.abs(a - b) / np.maximum(1.0, np.abs(b)) for a, b in pairs], axis=(0, 2))
 
 
-def _same_map(motors: Mapping[str, Motor], quick: bool) -> Check:
+@check(
+    "motor",
+    Comparison(
+        "native <dcmotor>, same map", "MuJoCo's <dcmotor>: angle, speed and current; locked, free and swinging", 1e-10
+    ),
+)
+def same_map(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
     """Tolerance 1e-10: rounding of some 100 steps of a coupled, stable system."""
-    found, plots, samples = [], [], 0
     for name, motor in motors.items():
         for load, integrator in _CASES:
             for share in (0.1, 1.0) if quick else (0.01, 0.1, 0.3, 1.0):
@@ -74,21 +77,27 @@ def _same_map(motors: Mapping[str, Motor], quick: bool) -> Check:
                 actuator = driven_by_voltage(exact_inductance(motor, timestep))
                 ours = drive(motors_on(load, [actuator], timestep, integrator), volts)
                 difference = _compare(ours, native)
-                samples += len(difference)
                 at = f"{name} motor, {load.name}, {integrator}, dt = {share:g} L/R, step {difference.argmax() + 1}"
-                found.append((float(difference.max()), at))
+                plots: tuple[Plot, ...] = ()
                 if (name, load, share) == ("paper", SWINGING, 0.1):
                     time = np.arange(1, len(volts) + 1) * timestep
                     theirs = Curve("<dcmotor>", time, native.current[:, 0], reference=True)
                     curves = (Curve("ours", time, ours.current[:, 0]), theirs)
-                    plots.append(Plot("Current on the swinging load, Euler", "time [s]", "current [A]", curves))
-    worst, where = worst_of(found)
-    name = "native <dcmotor>, same map"
-    oracle = "MuJoCo's <dcmotor>: angle, speed and current; locked, free and swinging"
-    return Check(name, oracle, samples, worst, 1e-10, where, group="motor", plots=tuple(plots))
+                    plots = (Plot("Current on the swinging load, Euler", "time [s]", "current [A]", curves),)
+                yield Case(difference, at, plots=plots)
 
 
-def _substeps_check(motors: Mapping[str, Motor], quick: bool) -> Check:
+@check(
+    "motor",
+    Comparison(
+        "native <dcmotor>, Euler, order in the substeps",
+        "MuJoCo's <dcmotor> at the true inductance",
+        ORDER_TOLERANCE,
+        "slope",
+    ),
+)
+def substeps(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
+    """First order in the substeps, at the true inductance."""
     counts, families = 2 ** np.arange(4, 8 if quick else 11), []
     for name, motor in motors.items():
         for load in (HELD, FREE, SWINGING):
@@ -100,12 +109,21 @@ def _substeps_check(motors: Mapping[str, Motor], quick: bool) -> Check:
                 for count in counts
             ]
             families.append(Family(f"{name}, {load.name}", timestep / counts, np.array(errors)))
-    plot = Plot("Ours against <dcmotor>, Euler", "electrical substep [s]", "largest difference [relative]", ())
-    name = "native <dcmotor>, Euler, order in the substeps"
-    return order_check(name, "MuJoCo's <dcmotor> at the true inductance", families, 1.0, plot, "motor")
+    title = "Ours against <dcmotor>, Euler"
+    yield of_order(1.0, families, title, "electrical substep [s]", "largest difference [relative]")
 
 
-def _implicitfast_check(motors: Mapping[str, Motor], quick: bool) -> Check:
+@check(
+    "motor",
+    Comparison(
+        "native <dcmotor>, implicitfast, order in the step",
+        "MuJoCo's <dcmotor> at the same step",
+        ORDER_TOLERANCE,
+        "slope",
+    ),
+)
+def implicitfast(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
+    """Second order in the step."""
     divisors, families = 2 ** np.arange(5, 9 if quick else 11), []
     for name, motor in motors.items():
         for load in (FREE, SWINGING):
@@ -119,12 +137,12 @@ def _implicitfast_check(motors: Mapping[str, Motor], quick: bool) -> Check:
                     _compare(drive(motors_on(load, [actuator], timestep, "implicitfast"), volts), native).max()
                 )
             families.append(Family(f"{name}, {load.name}", steps, np.array(errors)))
-    plot = Plot("Ours against <dcmotor>, implicitfast", "step [s]", "largest difference [relative]", ())
-    name = "native <dcmotor>, implicitfast, order in the step"
-    return order_check(name, "MuJoCo's <dcmotor> at the same step", families, 2.0, plot, "motor")
+    title = "Ours against <dcmotor>, implicitfast"
+    yield of_order(2.0, families, title, "step [s]", "largest difference [relative]")
 
 
-def rk4_check(quick: bool) -> Check:
+@check("motor", Comparison("RK4, locked rotor", "exponential of the RL circuit", 1e-12))
+def rk4_check(quick: bool) -> Iterator[Case]:
     """Our current under RK4 against the exponential, on a locked rotor at 1 V; tolerance 1e-12 of the current.
 
     The native motor's error at the same steps is shown beside it and is no part of the verdict.
@@ -143,8 +161,7 @@ def rk4_check(quick: bool) -> Check:
         )
         for errors, model in zip((ours, native), models, strict=True):
             errors.append(float(np.abs(drive(model, volts).current[:, 0] / exact - 1.0).max()))
-    worst, where = worst_of((error, f"dt = {share:.3g} L/R") for error, share in zip(ours, shares, strict=True))
-    where += (
+    native_error = (
         f"; <dcmotor> reads {native[0]:.1%} wrong at dt = {shares[0]:g} L/R, {native[-1]:.0%} at {shares[-1]:g} L/R"
     )
     curves = (Curve("ours", shares, np.maximum(ours, 1e-17)), Curve("native <dcmotor>", shares, np.array(native)))
@@ -156,26 +173,12 @@ def rk4_check(quick: bool) -> Check:
         x_log=True,
         y_log=True,
     )
-    return Check(
-        "RK4, locked rotor",
-        "exponential of the RL circuit",
-        len(ours),
-        worst,
-        1e-12,
-        where,
-        group="motor",
-        plots=(plot,),
-    )
+    yield Case(ours, lambda at: f"dt = {shares[at]:.3g} L/R{native_error}", plots=(plot,))
 
 
 def native_checks(motors: Mapping[str, Motor], quick: bool) -> Iterator[Check]:
-    """All comparisons with `<dcmotor>`.
-
-    Args:
-        motors: by name.
-        quick: fewer steps and sizes.
-    """
-    yield _same_map(motors, quick)
-    yield _substeps_check(motors, quick)
-    yield _implicitfast_check(motors, quick)
-    yield rk4_check(quick)
+    """All comparisons with `<dcmotor>`."""
+    yield from same_map(motors, quick)
+    yield from substeps(motors, quick)
+    yield from implicitfast(motors, quick)
+    yield from rk4_check(quick)

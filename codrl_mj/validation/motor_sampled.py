@@ -15,9 +15,8 @@ from scipy import signal
 from codrl_mj.actuators import Actuator
 from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.validation.motor_loops import Loop, run, unlimited
-from codrl_mj.validation.outcome import Check
 from codrl_mj.validation.rotors import HELD, drive, motors_on
-from codrl_mj.validation.worst import worst_of
+from codrl_mj.validation.table import Case, Check, Comparison, check
 
 # -- The sampled loop as a state-space system ----------------------------------------------------------------
 
@@ -38,9 +37,17 @@ def sampled_system(actuator: Actuator, timestep: float) -> Any:
     return signal.dlti(rows[:, :3], rows[:, 3:], current[:3], current[3:], dt=dt)
 
 
-def _state_space_check(loops: Mapping[str, Loop], steps: int) -> Check:
+@check(
+    "motor",
+    Comparison(
+        "sampled loop, random torques and speeds",
+        "the sampled loop as a state-space system (scipy.signal.dlsim)",
+        1e-10,
+        "N m",
+    ),
+)
+def random_torques(loops: Mapping[str, Loop], steps: int) -> Iterator[Case]:
     """Random desired torques and speeds: equal to rounding, which a stable loop does not amplify; tolerance 1e-10."""
-    found, plots = [], []
     for name, loop in loops.items():
         generator = np.random.default_rng(0)
         torques = np.repeat(generator.uniform(-1.0, 1.0, steps // 5), 5)
@@ -54,23 +61,12 @@ def _state_space_check(loops: Mapping[str, Loop], steps: int) -> Check:
         _, currents, _ = signal.dlsim(sampled_system(actuator, loop.timestep), inputs)
         oracle = currents[substeps - 1 :: substeps, 0] * motor.torque_constant / motor.arm_radius
         errors = np.abs(measured - oracle)
-        found.append((float(errors.max()), f"{name}, step {int(errors.argmax()) + 1} of {len(torques)}"))
         time = np.arange(1, 61) * loop.timestep
         lines = (("desired", torques, False), ("MuJoCo", measured, False), ("scipy.signal.dlsim", oracle, True))
         curves = tuple(Curve(label, time, line[:60], reference) for label, line, reference in lines)
-        plots.append(Plot(f"Torque under random commands and speeds, {name}", "time [s]", "torque [N m]", curves))
-    worst, where = worst_of(found)
-    return Check(
-        "sampled loop, random torques and speeds",
-        "the sampled loop as a state-space system (scipy.signal.dlsim)",
-        steps * len(loops),
-        worst,
-        1e-10,
-        where,
-        group="motor",
-        unit="N m",
-        plots=tuple(plots[-1:]),
-    )
+        plot = Plot(f"Torque under random commands and speeds, {name}", "time [s]", "torque [N m]", curves)
+        where = f"{name}, step {int(errors.argmax()) + 1} of {len(torques)}"
+        yield Case(errors, where, steps, (plot,) if name == list(loops)[-1] else ())
 
 
 # -- The sampled loop as blocks -------------------------------------------------------------------------------
@@ -96,9 +92,9 @@ def closed_loop(actuator: Actuator, timestep: float) -> Any:
     return control.feedback(pid * winding, 1) + loop.kff * control.feedback(winding, pid)
 
 
-def _step_response_check(loops: Mapping[str, Loop]) -> Check:
+@check("motor", Comparison("step response", "python-control, step_response of the discrete loop", 1e-10, "N m"))
+def step_response(loops: Mapping[str, Loop]) -> Iterator[Case]:
     """Equal to rounding; tolerance 1e-10 of the 1 N m desired."""
-    found, plots, samples = [], [], 0
     for name, loop in loops.items():
         step, actuator = _electrical(loop)
         steps = max(40, round(2.0 / step))
@@ -107,18 +103,20 @@ def _step_response_check(loops: Mapping[str, Loop]) -> Check:
         response = control.step_response(closed_loop(actuator, step), np.arange(steps + 1) * step)
         oracle = np.ravel(response.outputs)[1:]  # the torque of a step is that of the current at its end
         errors = np.abs(measured - oracle)
-        samples += steps
-        found.append((float(errors.max()), f"{name}, at t = {time[errors.argmax()]:.3g} s"))
         curves = (Curve("MuJoCo", time, measured), Curve("python-control", time, oracle, reference=True))
-        plots.append(Plot(f"Step response, {name}", "time [s]", "torque for 1 N m desired [N m]", curves))
-    worst, where = worst_of(found)
-    oracle_name = "python-control, step_response of the discrete loop"
-    return Check(
-        "step response", oracle_name, samples, worst, 1e-10, where, group="motor", unit="N m", plots=tuple(plots)
-    )
+        plot = Plot(f"Step response, {name}", "time [s]", "torque for 1 N m desired [N m]", curves)
+        yield Case(errors, f"{name}, at t = {time[errors.argmax()]:.3g} s", plots=(plot,))
 
 
-def _frequency_response_checks(loops: Mapping[str, Loop], frequencies: int) -> Iterator[Check]:
+_FREQUENCY = "python-control, the discrete loop's frequency response"
+
+
+@check(
+    "motor",
+    Comparison("frequency response, magnitude", _FREQUENCY, 1e-6, "dB"),
+    Comparison("frequency response, phase", _FREQUENCY, 1e-5, "deg"),
+)
+def frequency_response(loops: Mapping[str, Loop], frequencies: int) -> Iterator[tuple[Case, ...]]:
     """Magnitude and phase of desired -> actual torque, from sines driven through MuJoCo, one motor a frequency.
 
     A sampled loop has an exact frequency response, so what is left is the transient, waited out until it is 1e-10 of
@@ -126,8 +124,7 @@ def _frequency_response_checks(loops: Mapping[str, Loop], frequencies: int) -> I
     at which an engineer would call two Bode plots equal. A gain off by 0.1 % shows some 1e-3 dB; a step of delay shows
     up to 180 degrees.
     """
-    quantities = (("magnitude", "dB", 1e-6), ("phase", "deg", 1e-5))
-    found: tuple[list[tuple[float, str]], ...] = ([], [])
+    quantities = (("magnitude", "dB", _decibels), ("phase", "deg", _degrees))
     curves: tuple[list[Curve], ...] = ([], [])
     for name, loop in loops.items():
         step, actuator = _electrical(loop)
@@ -137,26 +134,17 @@ def _frequency_response_checks(loops: Mapping[str, Loop], frequencies: int) -> I
         rotation = np.exp(2j * np.pi * tested * step)
         oracle = system(rotation) * rotation  # the torque of a step is that of the current at its end
         ratio = _measured_response(actuator, step, tested, np.abs(control.poles(system)).max()) / oracle
-        for index, of in enumerate((_decibels, _degrees)):
+        cases = []
+        for (quantity, unit, of), lines in zip(quantities, curves, strict=True):
             error = np.abs(of(ratio))
             at = tested[int(np.argmax(error))]
-            found[index].append((float(error.max()), f"{name}, {at:.3g} Hz ({at / nyquist:.3g} of Nyquist)"))
-            curves[index].append(Curve(f"{name}, MuJoCo", tested, of(ratio * oracle)))
-            curves[index].append(Curve(f"{name}, python-control", tested, of(oracle), reference=True))
-    for (quantity, unit, tolerance), errors, lines in zip(quantities, found, curves, strict=True):
-        worst, where = worst_of(errors)
-        title = f"Frequency response, desired to actual torque: {quantity}"
-        yield Check(
-            f"frequency response, {quantity}",
-            "python-control, the discrete loop's frequency response",
-            frequencies * len(loops),
-            worst,
-            tolerance,
-            where,
-            group="motor",
-            unit=unit,
-            plots=(Plot(title, "frequency [Hz]", f"{quantity} [{unit}]", tuple(lines), x_log=True),),
-        )
+            lines.append(Curve(f"{name}, MuJoCo", tested, of(ratio * oracle)))
+            lines.append(Curve(f"{name}, python-control", tested, of(oracle), reference=True))
+            title = f"Frequency response, desired to actual torque: {quantity}"
+            plot = Plot(title, "frequency [Hz]", f"{quantity} [{unit}]", tuple(lines), x_log=True)  # of all loops
+            where = f"{name}, {at:.3g} Hz ({at / nyquist:.3g} of Nyquist)"
+            cases.append(Case(error, where, plots=(plot,) if name == list(loops)[-1] else ()))
+        yield tuple(cases)
 
 
 def _electrical(loop: Loop) -> tuple[float, Actuator]:
@@ -186,12 +174,7 @@ def _measured_response(actuator: Actuator, step: float, frequencies: np.ndarray,
 
 
 def sampled_checks(loops: Mapping[str, Loop], quick: bool) -> Iterator[Check]:
-    """All checks of the sampled loop, each over all the given loops.
-
-    Args:
-        loops: by name.
-        quick: fewer frequencies and steps.
-    """
-    yield _state_space_check(loops, 200 if quick else 1000)
-    yield _step_response_check(loops)
-    yield from _frequency_response_checks(loops, 8 if quick else 24)
+    """All checks of the sampled loop, each over all the given loops."""
+    yield from random_torques(loops, 200 if quick else 1000)
+    yield from step_response(loops)
+    yield from frequency_response(loops, 8 if quick else 24)

@@ -27,7 +27,7 @@ from codrl_mj.engine.hill import GRAVITY
 from codrl_mj.physics import MujocoPhysics, constrain, mjcf
 from codrl_mj.tasks import OURS, find_task
 from codrl_mj.validation.certificate import WITHOUT_TASK, validate
-from codrl_mj.validation.outcome import Check
+from codrl_mj.validation.table import Check
 
 Fault = contextlib.AbstractContextManager[None]
 
@@ -102,14 +102,9 @@ Edit = tuple[str, str]
 
 
 def edited(module: types.ModuleType, edits: Sequence[Edit]) -> types.ModuleType:
-    """A module made anew from another's source text, with the edits made.
+    """A module made anew from another's source text, with the edits made, each of which must occur exactly once.
 
-    Args:
-        module: a module; it stays what it is.
-        edits: each must occur in the source exactly once.
-
-    Raises:
-        ValueError: a text does not occur exactly once: the source has changed, and the mutation must follow.
+    Otherwise it is a ValueError: the source has changed, and the mutation must follow.
     """
     source = inspect.getsource(module)
     for old, new in edits:

@@ -13,9 +13,9 @@ from codrl_mj.physics import install_callbacks, motors
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.tasks import find_task, resolve_actuators
 from codrl_mj.validation import execution
-from codrl_mj.validation.compare import STAND_IN, Worst, actuators_of
+from codrl_mj.validation.compare import STAND_IN, actuators_of
 from codrl_mj.validation.in_python import beside, entries
-from codrl_mj.validation.outcome import Check, Skipped
+from codrl_mj.validation.table import Case, Check, Comparison, Skipped, check
 
 STEP_TOLERANCE = 1e-11
 """The compiled loop may fuse a multiplication with an addition: 1e-16 a step, which a slow loop adds up."""
@@ -76,39 +76,49 @@ def _names(model: mujoco.MjModel) -> dict[int, tuple[str, ActuatorModel]]:
     }
 
 
+BELOW_ONE = float(np.nextafter(1.0, 0.0))
+
+
+@check("motor", Comparison("stable: {motor}", "the family's own bound", BELOW_ONE, "instability"))
+def stable_actuator(actuator: ActuatorModel, timestep: float) -> Iterator[Case]:
+    """What the family says of its parameters."""
+    yield Case(actuator.instability(np.array([actuator.numbers]), timestep), f"at a step of {timestep:g} s")
+
+
+@check(
+    "motor",
+    Comparison("stable: {motor}", "the eigenvalues of the discrete closed loop", BELOW_ONE, "spectral radius"),
+)
+def stable_loop(actuator: Actuator, timestep: float) -> Iterator[Case]:
+    """The spectral radius, beside what the family says, which is infinite from 1 on."""
+    radius = spectral_radius(actuator, timestep)
+    found = float(actuator.instability(np.array([actuator.numbers]), timestep)[0])
+    yield Case(max(found, radius) if radius < 1.0 else radius, f"at a step of {timestep:g} s")
+
+
 def stability(model: mujoco.MjModel, name: str) -> Iterator[Check]:
     """How unstable each motor is at the model's timestep: below 1; of a current loop it is the spectral radius."""
-    timestep = model.opt.timestep
-    below_one = float(np.nextafter(1.0, 0.0))
     for motor, actuator in _names(model).values():
-        found = float(actuator.instability(np.array([actuator.numbers]), timestep)[0])
-        oracle, unit = "the family's own bound", "instability"
         if isinstance(actuator, Actuator):
-            radius = spectral_radius(actuator, timestep)
-            oracle, unit = "the eigenvalues of the discrete closed loop", "spectral radius"
-            found = max(found, radius) if radius < 1.0 else radius  # the family's own is infinite there
-        where = f"at a step of {timestep:g} s"
-        yield Check(f"stable: {motor}", oracle, 1, found, below_one, where, "motor", name, unit)
+            yield from stable_loop.of(name, motor=motor)(actuator, model.opt.timestep)
+        else:
+            yield from stable_actuator.of(name, motor=motor)(actuator, model.opt.timestep)
 
 
-def motor_steps(model: mujoco.MjModel, name: str, steps: int) -> Iterator[Check]:
-    """Each motor in the engine against its own in plain Python, driven by the speed that the model itself reached.
+@check(
+    "motor", Comparison("steps: {motor}", "the same functions in plain Python at the recorded speed", STEP_TOLERANCE)
+)
+def motor_steps(actuator: ActuatorModel, ours: np.ndarray, oracle: np.ndarray) -> Iterator[Case]:
+    """A motor in the engine against its own in plain Python, driven by the speed that the model itself reached.
 
     The Python motor starts at rest and is never corrected; states and signals are compared after every step, and so is
     the torque that the engine applied.
     """
-    named = {index: found for index, found in _names(model).items() if not _idle(model, index, found[1])}
-    actuators = {index: actuator for index, (_, actuator) in named.items()}
-    for index, (ours, oracle) in beside(model, actuators, execution.commands(model, steps, seed=7)).items():
-        gaps = np.abs(ours - oracle) / np.maximum(1.0, np.abs(oracle))
-        step, entry = np.unravel_index(np.argmax(np.where(np.isnan(gaps), np.inf, gaps)), gaps.shape)
-        worst = Worst()
-        worst.see(gaps[step, entry], f"{entries(actuators[index])[entry]} at step {step + 1}")
-        oracle_name = "the same functions in plain Python at the recorded speed"
-        yield Check(
-            f"steps: {named[index][0]}",
-            *(oracle_name, gaps.size, worst.value, STEP_TOLERANCE, worst.where, "motor", name),
-        )
+    names = entries(actuator)
+    yield Case(
+        np.abs(ours - oracle) / np.maximum(1.0, np.abs(oracle)),
+        lambda at: f"{names[at % len(names)]} at step {at // len(names) + 1}",
+    )
 
 
 def _idle(model: mujoco.MjModel, index: int, actuator: ActuatorModel) -> str:
@@ -124,17 +134,16 @@ def _motor(model: mujoco.MjModel, name: str, quick: bool) -> Iterator[Check | Sk
         if reason := _idle(model, index, actuator):
             yield Skipped(f"steps: {motor}", reason, "motor", name)
     yield from stability(model, name)
-    yield from motor_steps(model, name, 200 if quick else 2000)
+    running = {index: one for index, one in _names(model).items() if not _idle(model, index, one[1])}
+    controls = execution.commands(model, 200 if quick else 2000, seed=7)
+    for index, found in beside(model, {index: actuator for index, (_, actuator) in running.items()}, controls).items():
+        motor, actuator = running[index]
+        yield from motor_steps.of(name, motor=motor)(actuator, *found)
     yield from _alone(model, name, quick)
 
 
 def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
-    """The checks of a task's own motors, in its model.
-
-    Args:
-        task_name: the task.
-        quick: fewer steps.
-    """
+    """The checks of a task's own motors, in its model."""
     task = find_task(task_name)
     if not task.paper:
         yield Skipped("the paper's actuators", f"it has none: the {STAND_IN} is in their place", "motor", task.name)
@@ -157,8 +166,8 @@ def _alone(model: mujoco.MjModel, name: str, quick: bool) -> Iterator[Check | Sk
             loops[motor] = Loop(actuator, model.opt.timestep)
         else:
             yield Skipped(f"responses of {motor}", "its loop is unstable: it has none", "motor", name)
-    for check in sampled_checks(loops, quick) if loops else ():
-        yield dataclasses.replace(check, task=name)
+    for outcome in sampled_checks(loops, quick) if loops else ():
+        yield dataclasses.replace(outcome, task=name)
 
 
 def _execution(model: mujoco.MjModel, name: str, quick: bool) -> Iterator[Check | Skipped]:

@@ -99,12 +99,10 @@ def driven_by_voltage(motor: Motor, substeps: int = 1) -> Actuator:
 
 
 def drive(model: mujoco.MjModel, controls: np.ndarray, speeds: np.ndarray | None = None) -> Record:
-    """Run a model from rest.
+    """Run a model of this module from rest, of motors with a current.
 
-    Args:
-        model: one of this module's, of motors with a current.
-        controls: control of every motor at every step, shape (steps,) for all alike or (steps, motors).
-        speeds: joint speeds [rad/s] set before each step, shape (steps,); None leaves them to the engine.
+    Controls are of shape (steps,) for all alike or (steps, motors); joint speeds [rad/s], shape (steps,), are set
+    before each step, or left to the engine.
     """
     data = mujoco.MjData(model)
     entry = signals_at(Actuator) if model.na == model.nactuator * slot_size(Actuator) else 0  # current comes first

@@ -2,24 +2,25 @@
 
 A run is judged twice. Up to `HORIZON` the difference itself must stay below 1e-9. Over a whole episode, where a chaotic
 task would enlarge even the smallest rounding beyond any fixed bound, the difference is measured against what rounding
-becomes in the oracle itself along this run (see `codrl_mj.validation.growth`): what remains is the error made, not what
+becomes in the oracle itself along this run (`Growth`): what remains is the error made, not what
 chaos made of it.
 """
 
+import copy
 import dataclasses
 import math
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
 from codrl_mj.actuators import Actuator, ActuatorModel, Ideal
 from codrl_mj.pages.plots import Curve, Plot
-from codrl_mj.physics import SimulationDivergedError
+from codrl_mj.physics import AnalyticPhysics, SimulationDivergedError
 from codrl_mj.tasks import Task, find_task, named_actuator
-from codrl_mj.validation.compare import NO_TWIN, SEVERAL_MOTORS, Worst, both, differences, last_signals
-from codrl_mj.validation.drives import FITTED, runs
-from codrl_mj.validation.growth import ROUNDING, Growth, lyapunov_exponent
-from codrl_mj.validation.outcome import Check, Skipped
+from codrl_mj.validation.compare import NO_TWIN, SEVERAL_MOTORS, both, differences, last_signals
+from codrl_mj.validation.drives import FITTED, fitted_run
+from codrl_mj.validation.table import Case, Check, Comparison, Skipped, check
 
 TOLERANCE = 1e-9
 """Of the difference: rounding (1e-16), a thousand steps, and the growth of tasks that are not chaotic."""
@@ -40,19 +41,83 @@ def starved(task: Task) -> Actuator:
     return dataclasses.replace(paper, controller=loop)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Run:
+APART = 1e-7
+"""A displacement, relative to max(1, size): far above rounding, far below anything that bends."""
+ROUNDING = float(np.finfo(float).eps)
+CLOCK = 2
+"""A snapshot of `AnalyticPhysics` ends with time and key; before them are the states of mechanics and motor."""
+
+
+class Growth:
+    """Follows an analytic physics and records how errors grow along its run: what rounding becomes.
+
+    The oracle's step is linearised along the run by finite differences: the state of mechanics and motor is displaced
+    by a small amount along each of its entries, the rest being as in the run. The product of these matrices carries
+
+    - one displacement, scaled back after every step: the mean rate of its growth is Benettin's estimate of the largest
+      Lyapunov exponent, of the driven system along this run;
+    - the covariance of independent rounding errors, one in every entry at every step: P <- M P M' + Q.
+    """
+
+    def __init__(self, task: Task, run: AnalyticPhysics, seed: int) -> None:
+        """Follow a run from its beginning; the seed is of the direction of the first displacement."""
+        self._run = run
+        self._twin = copy.deepcopy(run)
+        self._size = len(task.state_names)
+        self._start = run.snapshot()
+        entries = len(self._start) - CLOCK
+        direction = np.random.default_rng(seed).standard_normal(entries)
+        self._direction = direction / np.linalg.norm(direction)
+        self._covariance = np.zeros((entries, entries))
+        self.logarithms = [0.0]
+        """Logarithm of the displacement's growth since the beginning, after each step."""
+        self.rounding: list[float] = []
+        """Standard deviation of the accumulated rounding errors after each step, relative to max(1, size)."""
+
+    def follow(self, desired_force: float) -> None:
+        """The run has just taken a step: linearise it."""
+        twin, size, entries = self._twin, self._size, len(self._direction)
+        end = self._run.snapshot()
+        matrix = np.empty((entries, entries))
+        for entry in range(entries):
+            apart = APART * max(1.0, abs(self._start[entry]))
+            displaced = self._start.copy()
+            displaced[entry] += apart
+            twin.restore(displaced)
+            twin.step(desired_force)
+            gap = (twin.snapshot() - end)[:entries]
+            gap[:size] -= 2 * math.pi * np.round(gap[:size] / (2 * math.pi))  # one of them was wrapped
+            matrix[:, entry] = gap / apart
+        moved = matrix @ self._direction
+        length = float(np.linalg.norm(moved))
+        self.logarithms.append(self.logarithms[-1] + math.log(max(length, ROUNDING)))
+        self._direction = moved / length if length > ROUNDING else self._direction  # a wall stopped both
+        scale = np.maximum(1.0, np.abs(end[:entries]))
+        self._covariance = matrix @ self._covariance @ matrix.T + np.diag((ROUNDING * scale) ** 2)
+        self.rounding.append(float((np.sqrt(np.diag(self._covariance)) / scale)[:size].max()))
+        self._start = end
+
+
+def lyapunov_exponent(logarithms: np.ndarray, step_duration: float) -> float:
+    """The mean rate of growth [1/s], by least squares through the logarithms."""
+    times = step_duration * np.arange(len(logarithms))
+    return float(np.polyfit(times, logarithms, 1)[0])
+
+
+class _Run(NamedTuple):
     """One run on both physics."""
 
     seed: int
     gaps: np.ndarray
-    """Largest difference of state or force after each step."""
-    entries: list[str]
-    """In what."""
+    """Largest difference of state or force after each step, and infinity for a step that diverged."""
+    where: list[str]
+    """In what, or why it diverged."""
     growth: Growth
     """How errors grow along it."""
-    error: str = ""
-    """What ended it early."""
+
+    def case(self, steps: int, gaps: np.ndarray, plots: tuple[Plot, ...] = ()) -> Case:
+        """Its first steps."""
+        return Case(gaps[:steps], lambda at: self.where[at], steps, plots)
 
 
 def _run(task: Task, actuator: ActuatorModel, integrator: str, steps: int, seed: int) -> _Run:
@@ -64,45 +129,32 @@ def _run(task: Task, actuator: ActuatorModel, integrator: str, steps: int, seed:
         physics.reset(initial)
     growth = Growth(task, analytic, seed)
     gaps: list[float] = []
-    entries: list[str] = []
+    where: list[str] = []
     names = [*task.state_names, "force"]
-    for force in forces.tolist():
+    for step, force in enumerate(forces.tolist(), 1):
         try:
             for physics in (mujoco, analytic):
                 physics.step(force)
             delivered = [last_signals(physics)["actual_force"] for physics in (mujoco, analytic)]
             growth.follow(force)
         except SimulationDivergedError as error:
-            return _Run(seed, np.array(gaps), entries, growth, str(error))
+            gaps.append(math.inf)
+            where.append(f"step {step} of seed {seed}: {error}")
+            break
         state_gaps = differences(task, mujoco.state, analytic.state)
         all_gaps = np.append(state_gaps, abs(delivered[0] - delivered[1]) / task.max_force)
-        worst = int(np.argmax(np.where(np.isnan(all_gaps), np.inf, all_gaps)))
+        worst = int(np.argmax(all_gaps))  # a NaN, if there is one
         gaps.append(float(all_gaps[worst]))
-        entries.append(names[worst])
-    return _Run(seed, np.array(gaps), entries, growth)
-
-
-def _judge(runs: list[_Run], steps: int, in_roundings: bool) -> Worst:
-    worst = Worst()
-    for run in runs:
-        gaps = run.gaps[:steps]
-        if in_roundings:
-            gaps = gaps / run.growth.rounding[: len(gaps)]
-        if len(gaps):
-            index = int(np.argmax(np.where(np.isnan(gaps), np.inf, gaps)))
-            worst.see(gaps[index], f"{run.entries[index]} at step {index + 1} of seed {run.seed}")
-        if run.error and len(gaps) < steps:
-            worst.see(math.inf, f"step {len(gaps) + 1} of seed {run.seed}: {run.error}")
-            break
-    return worst
+        where.append(f"{names[worst]} at step {step} of seed {seed}")
+    return _Run(seed, np.array(gaps), where, growth)
 
 
 def _plot(task: Task, run: _Run, title: str) -> Plot:
-    times = task.step_duration * np.arange(1, len(run.gaps) + 1)
+    rounding = np.array(run.growth.rounding[: len(run.gaps)])
+    gaps, times = run.gaps[: len(rounding)], task.step_duration * np.arange(1, len(rounding) + 1)
     exponent = lyapunov_exponent(np.array(run.growth.logarithms), task.step_duration)
-    rounding = np.array(run.growth.rounding[: len(times)])
     curves = (
-        Curve("difference found (0 is drawn at 1e-18)", times, np.maximum(run.gaps, 1e-18)),
+        Curve("difference found (0 is drawn at 1e-18)", times, np.maximum(gaps, 1e-18)),
         Curve("what rounding becomes in the oracle", times, rounding, reference=True),
         Curve(f"2e-16 × exp(λt), λ = {exponent:.3g} 1/s", times, ROUNDING * np.exp(exponent * times), reference=True),
         Curve(f"allowed: {ROUNDINGS:g} × rounding", times, ROUNDINGS * rounding, reference=True),
@@ -110,42 +162,41 @@ def _plot(task: Task, run: _Run, title: str) -> Plot:
     return Plot(title, "time [s]", "difference [relative]", curves, y_log=True)
 
 
-def episodes(task: Task, actuator_name: str, integrator: str, seeds: range, longest: int = 999) -> Iterator[Check]:
-    """Whole runs under the same random bang-bang commands; the task's ends are ignored, and a divergence fails.
+_NAME, _ORACLE = "{integrator}, {actuator_name} actuator", "{task.oracle}{motor}"
 
-    Args:
-        task: the task.
-        actuator_name: a named actuator, or `starved`.
-        integrator: one of the task's integrators.
-        seeds: one run each.
-        longest: stop after so many environment steps.
 
-    Yields:
-        The check of the difference itself, and that of the difference in roundings, with a plot of the first run.
-    """
-    actuator = starved(task) if actuator_name == STARVED else named_actuator(actuator_name, task.name)
-    oracle = task.oracle + ("" if isinstance(actuator, Ideal) else " and the motor in Python")
+@check(
+    "trajectories",
+    Comparison(f"run, {_NAME}", _ORACLE, TOLERANCE),
+    Comparison(f"run against rounding, {_NAME}", _ORACLE, ROUNDINGS, "accumulated roundings"),
+)
+def whole_runs(
+    task: Task, actuator_name: str, actuator: ActuatorModel, integrator: str, seeds: range, longest: int
+) -> Iterator[tuple[Case, ...]]:
+    """Runs under the same random bang-bang commands: the difference itself up to `HORIZON`, and all in roundings."""
     steps = min(longest, task.max_episode_steps or UNLIMITED_STEPS)
     horizon = min(steps, (task.trials and task.trials.horizon) or steps)
-    runs = [_run(task, actuator, integrator, steps, seed) for seed in seeds]
-    described = f"{integrator}, {actuator_name} actuator"
-    for name, length, in_roundings, tolerance, unit in (
-        (f"run, {described}", horizon, False, TOLERANCE, "relative"),
-        (f"run against rounding, {described}", steps, True, ROUNDINGS, "accumulated roundings"),
-    ):
-        worst = _judge(runs, length, in_roundings)
-        plots = (_plot(task, runs[0], f"{task.name}, {described}"),) if in_roundings and len(runs[0].gaps) > 1 else ()
-        count = length * len(seeds)
-        yield Check(name, oracle, count, worst.value, tolerance, worst.where, "trajectories", task.name, unit, plots)
+    for seed in seeds:
+        run = _run(task, actuator, integrator, steps, seed)
+        rounding = np.array(run.growth.rounding[: len(run.gaps)])
+        in_roundings = run.gaps / np.append(rounding, np.ones(len(run.gaps) - len(rounding)))
+        title = f"{task.name}, {integrator}, {actuator_name} actuator"
+        plots = (_plot(task, run, title),) if seed == seeds[0] and len(rounding) > 1 else ()
+        yield run.case(horizon, run.gaps), run.case(steps, in_roundings, plots)
+
+
+def episodes(task: Task, actuator_name: str, integrator: str, seeds: range, longest: int = 999) -> list[Check]:
+    """Whole runs of a named actuator, or `starved`; the task's ends are ignored, and a divergence fails.
+
+    There is a check of the difference itself, and one of the difference in roundings, with a plot of the first run.
+    """
+    actuator = starved(task) if actuator_name == STARVED else named_actuator(actuator_name, task.name)
+    motor = "" if isinstance(actuator, Ideal) else " and the motor in Python"
+    return whole_runs.of(motor=motor)(task, actuator_name, actuator, integrator, seeds, longest)
 
 
 def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
-    """The checks of this group.
-
-    Args:
-        task_name: the task.
-        quick: one shorter run each instead of two whole episodes.
-    """
+    """The checks of this group."""
     task = find_task(task_name)
     if task.twin is None or len(task.motors) > 1:
         yield Skipped("all checks", NO_TWIN if task.twin is None else SEVERAL_MOTORS, "trajectories", task.name)
@@ -160,6 +211,7 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
             seeds, longest = (range(1), shorter) if quick else (range(2), 999)
             yield from episodes(task, actuator, integrator, seeds, longest)
     if task.name in FITTED:
-        yield from runs(task, TOLERANCE, quick)
+        for integrator in task.integrators:
+            yield from fitted_run.of(motor=FITTED[task.name][0])(task, integrator, quick)
     else:
         yield Skipped("a run with a motor that one can buy", "none was chosen for it", "trajectories", task.name)

@@ -12,7 +12,7 @@ from codrl_mj.actuators import IDEAL
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics
 from codrl_mj.validation import convergence
 from codrl_mj.validation.continuous import gymnasium_equations, solve
-from codrl_mj.validation.free_runs import free_run
+from codrl_mj.validation.convergence import free_run
 from tests.reference import cartpole_accelerations
 from tests.validation.mutations import failed, late_force, looks_complete, scaled, scaled_motor, wrong_model
 

@@ -44,7 +44,7 @@ def outcomes():
     """All checks with a few loops and motors only, by name."""
     checks = [*motor.checks_of({"every feature": EVERY_FEATURE}, quick=True)]
     checks += [*in_python.compiled_checks(quick=True), *motor_native.native_checks(SMALL, quick=True)]
-    checks += [motor_gem.gem_check(Motor(), quick=True), *drives.drive_checks(quick=True)]
+    checks += [*motor_gem.gem_check(Motor(), quick=True), *drives.drive_checks(quick=True)]
     return {check.name: check for check in checks}
 
 
@@ -216,7 +216,7 @@ def test_the_oracles_use_none_of_our_mathematics():
 
 
 def test_the_native_motor_is_wrong_under_rk4_and_ours_is_not():
-    check = motor_native.rk4_check(quick=True)
+    (check,) = motor_native.rk4_check(quick=True)
     ours, native = check.plots[0].curves
     assert ours.y.max() < 1e-12
     assert native.y[0] > 0.02

@@ -6,16 +6,18 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from codrl_mj.pages.plots import Plot
-from codrl_mj.validation.order import Family, fit_slope, order_check
-from codrl_mj.validation.worst import worst_of
+from codrl_mj.validation.table import ORDER_TOLERANCE, Comparison, Family, fit_slope, of_order, outcome
 
 STEPS = 0.1 / 2.0 ** np.arange(5)
-PLOT = Plot("title", "step [s]", "error [m]", ())
+ROW = Comparison("name", "oracle", ORDER_TOLERANCE, "slope")
 
 
 def check(errors, promised):
-    return order_check("name", "oracle", [Family("family", STEPS, np.asarray(errors))], promised, PLOT, "group", "task")
+    return judged(Family("family", STEPS, np.asarray(errors)), promised)
+
+
+def judged(family, promised):
+    return outcome(ROW, "group", {"task": "task"}, [of_order(promised, [family], "title", "step [s]", "error [m]")])
 
 
 @pytest.mark.parametrize("order", [1.0, 4.0, -1.0])
@@ -54,7 +56,7 @@ def test_what_is_not_of_the_promised_order_fails(errors):
 )
 def test_an_order_is_not_fitted_to_rounding(errors, passed, said):
     family = Family("family", STEPS, np.array(errors), 1e-15)
-    found = order_check("name", "oracle", [family], 4.0, PLOT, "group")
+    found = judged(family, 4.0)
     assert found.passed == passed
     assert said in found.where
 
@@ -73,8 +75,3 @@ def test_the_promised_slope_is_drawn_beside_the_errors():
     assert promise.reference
     assert not measured.reference
     np.testing.assert_allclose(promise.y, measured.y / 2)
-
-
-def test_the_worst_is_the_largest_and_a_nan_is_larger_than_anything():
-    assert worst_of([(1.0, "a"), (3.0, "b"), (2.0, "c")]) == (3.0, "b")
-    assert worst_of([(math.inf, "a"), (math.nan, "b"), (2.0, "c")])[1] == "b"
