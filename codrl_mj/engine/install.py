@@ -9,7 +9,7 @@ from codrl_mj.engine.control import compiled
 from codrl_mj.engine.hill import compiled_hill
 
 
-class _Part(NamedTuple):
+class _CallbackGroup(NamedTuple):
     """Callbacks that are installed together."""
 
     names: tuple[str, ...]
@@ -20,8 +20,8 @@ class _Part(NamedTuple):
 
 
 _PARTS = {
-    "motor": _Part(("control", "act_bias"), compiled, "actuator='ideal' or physics='analytic'"),
-    "hill": _Part(("passive",), compiled_hill, "physics='analytic'"),
+    "motor": _CallbackGroup(("control", "act_bias"), compiled, "actuator='ideal' or physics='analytic'"),
+    "hill": _CallbackGroup(("passive",), compiled_hill, "physics='analytic'"),
 }
 
 
