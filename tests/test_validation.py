@@ -35,7 +35,7 @@ from codrl_mj.validation import (
 )
 from codrl_mj.validation.compare import differences
 from codrl_mj.validation.mutations import edited, margin, unfailed, wrong_loop, wrong_loop_everywhere
-from codrl_mj.validation.table import TABLE, Case, Comparison, outcome
+from codrl_mj.validation.table import TABLE, Case, Oracle, outcome
 from codrl_mj.validation.trajectories import Growth, lyapunov_exponent
 from tests.engine.models import FULL, add_motor, changed, controls, rotor, rotor_spec, trajectory
 from tests.motorised.models import ACTUATORS, INTEGRATORS, LOOP, arm, behind_plugin
@@ -290,7 +290,7 @@ def test_a_check_passes_up_to_its_tolerance_and_never_on_nan(worst, passed):
 
 
 def worst_of(*cases):
-    found = outcome(Comparison("name", "oracle", 1.0), "group", {"task": ""}, [Case(*case) for case in cases])
+    found = outcome(Oracle("name", "oracle", 1.0), "group", {"task": ""}, [Case(*case) for case in cases])
     return found.worst, found.where
 
 

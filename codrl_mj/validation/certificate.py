@@ -1,6 +1,7 @@
 """The certificate: all groups of checks over all tasks, or over a user's own model, and what they found."""
 
 import dataclasses
+import functools
 import importlib
 import importlib.metadata
 import importlib.util
@@ -99,16 +100,12 @@ def versions() -> dict[str, str]:
     return found
 
 
-@dataclasses.dataclass(frozen=True)
-class _Part:
-    """Checks that are made together."""
-
-    group: str
-    task: str
-    run: Callable[[], Iterator[Check | Skipped]]
+Outcomes = Iterator[Check | Skipped]
+Part = tuple[str, str, Callable[[], Outcomes]]
+"""Group, task or model, and the checks that are made together."""
 
 
-def _checks(group: str, task: str | None, quick: bool) -> Iterator[Check]:
+def _checks(group: str, task: str | None, quick: bool) -> Outcomes:
     """The checks of a group's module, which is imported here: some need libraries that nothing else does."""
     of_task = group in WITHOUT_TASK and task is not None
     module = "own_model" if of_task else group
@@ -119,20 +116,20 @@ Progress = Callable[[int, int, str], None]
 """(parts done, parts in all, the part that begins) -> nothing."""
 
 
-def _outcomes(part: _Part) -> Iterator[Check | Skipped]:
+def _outcomes(group: str, task: str, run: Callable[[], Outcomes]) -> Outcomes:
     """The outcomes of a part; a simulation that breaks down is a failed check, a missing library a skipped one."""
     try:
-        yield from part.run()
+        yield from run()
     except ModuleNotFoundError as error:
-        yield Skipped("the rest of the group", f"{error}: pip install 'codrl-mj[validate]'", part.group, part.task)
+        yield Skipped("the rest of the group", f"{error}: pip install 'codrl-mj[validate]'", group, task)
     except (ArithmeticError, SimulationDivergedError) as error:
         reason = f"{type(error).__name__}: {error}"
-        yield Check("runs to its end", "itself", 1, math.inf, 0.0, reason, part.group, part.task, "")
+        yield Check("runs to its end", "itself", 1, math.inf, 0.0, reason, group, task, "")
 
 
 def _certify(
     subject: str,
-    parts: Sequence[_Part],
+    parts: Sequence[Part],
     skipped: Sequence[Skipped],
     quick: bool,
     on_check: Callable[[Check], None] | None,
@@ -141,10 +138,10 @@ def _certify(
     started = time.perf_counter()
     found: list[Check] = []
     skips = list(skipped)
-    for index, part in enumerate(parts):
+    for index, (group, task, run) in enumerate(parts):
         if on_part is not None:
-            on_part(index, len(parts), f"{part.group}, {part.task}" if part.task else part.group)
-        for outcome in _outcomes(part):
+            on_part(index, len(parts), f"{group}, {task}" if task else group)
+        for outcome in _outcomes(group, task, run):
             if isinstance(outcome, Skipped):
                 skips.append(outcome)
                 continue
@@ -187,7 +184,7 @@ def validate(
         if group not in GROUPS:
             raise ValueError(f"unknown group of checks {group!r}: must be one of {', '.join(GROUPS)}")
     parts = [
-        _Part(group, task or "", lambda group=group, task=task: _checks(group, task, quick))  # type: ignore[misc]
+        (group, task or "", functools.partial(_checks, group, task, quick))
         for group in GROUPS
         if group in chosen
         for task in ([None, *others] if group in WITHOUT_TASK else names)
@@ -226,8 +223,5 @@ def validate_model(
         CallbackInUseError: another library's MuJoCo callback is installed where ours has to go.
     """
     subject = own_model.prepare(model)
-    parts = [
-        _Part(group, name, lambda run=run: run(subject, name, quick))  # type: ignore[misc]
-        for group, run in own_model.PARTS.items()
-    ]
+    parts = [(group, name, functools.partial(run, subject, name, quick)) for group, run in own_model.PARTS.items()]
     return _certify(name, parts, own_model.skipped(subject, name), quick, on_check, on_part)

@@ -25,7 +25,7 @@ from codrl_mj.physics import MujocoPhysics, SimulationDivergedError
 from codrl_mj.tasks import OURS, Task, find_task
 from codrl_mj.validation.compare import NO_TWIN, actuators_of, forces_of, physics_of
 from codrl_mj.validation.continuous import equations_of, solve
-from codrl_mj.validation.table import ORDER_TOLERANCE, Case, Check, Comparison, Family, Skipped, check, of_order
+from codrl_mj.validation.table import Case, Check, Family, Skipped, check, of_order, order
 
 
 class FreeRun(NamedTuple):
@@ -114,7 +114,7 @@ def analogues(task: Task) -> tuple[Actuator, ...]:
     )
 
 
-@check("convergence", Comparison("order, {integrator}, {case}", "DOP853 at 1e-12 on {whose}", ORDER_TOLERANCE, "slope"))
+@check("convergence", order("order, {integrator}, {case}", "DOP853 at 1e-12 on {whose}"))
 def order_in_the_step(
     task: Task,
     case: str,
@@ -142,10 +142,7 @@ def order_in_the_step(
     yield of_order(promised, families, title, "integration step [s]", y_label)
 
 
-@check(
-    "convergence",
-    Comparison("rate in the loop's bandwidth", "{whose} with the desired force itself", ORDER_TOLERANCE, "slope"),
-)
+@check("convergence", order("rate in the loop's bandwidth", "{whose} with the desired force itself"))
 def rate_in_the_bandwidth(task: Task, quick: bool) -> Iterator[Case]:
     """The lag is resolved by two integration steps at every bandwidth; both runs take the same steps."""
     lags = task.step_duration / 2 ** ((np.arange(3, 7) if quick else np.arange(4, 9)) + _finer(task))  # tau [s]

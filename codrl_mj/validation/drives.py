@@ -26,7 +26,7 @@ from codrl_mj.tasks import Task
 from codrl_mj.validation.compare import differences
 from codrl_mj.validation.continuous import gymnasium_equations
 from codrl_mj.validation.rotors import HELD, drive, motors_on
-from codrl_mj.validation.table import Case, Comparison, check
+from codrl_mj.validation.table import Case, Oracle, check
 
 FITTED = {
     "pendulum": ("maxon-ec45-flat-50w", {"gear_ratio": 30.0}, 20e3),
@@ -131,7 +131,7 @@ class Mechanics:
 _TWIN = "Gymnasium {task.gymnasium_id} with a rotor on its joint, the winding by scipy.linalg.expm"
 
 
-@check("trajectories", Comparison("run, {integrator}, {motor}", _TWIN, 1e-9))
+@check("trajectories", Oracle("run, {integrator}, {motor}", _TWIN, 1e-9))
 def fitted_run(task: Task, integrator: str, quick: bool) -> Iterator[Case]:
     """A run of a task with its drive of `FITTED`, which has that motor, in the engine, under bang-bang commands."""
     one, generator = fitted(task.name), np.random.default_rng(0)
@@ -160,8 +160,8 @@ def fitted_run(task: Task, integrator: str, quick: bool) -> Iterator[Case]:
 
 @check(
     "motor",
-    Comparison("drives, exact winding", "scipy.linalg.expm, sample by sample", 1e-10, "of the stall torque"),
-    Comparison(
+    Oracle("drives, exact winding", "scipy.linalg.expm, sample by sample", 1e-10, "of the stall torque"),
+    Oracle(
         "drives, closed form",
         "the same loops with their gains given, which are stepped in the engine",
         1e-10,

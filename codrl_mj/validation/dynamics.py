@@ -14,7 +14,7 @@ from codrl_mj.actuators import IDEAL
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError
 from codrl_mj.tasks import Task, find_task
 from codrl_mj.validation.compare import NO_TWIN, SEVERAL_MOTORS, both, differences, trials_of, twin_of
-from codrl_mj.validation.table import Case, Check, Comparison, Skipped, check
+from codrl_mj.validation.table import Case, Check, Oracle, Skipped, check
 
 TOLERANCE = 1e-12
 """One step rounds some tens of numbers to 1e-16; an RK4 step at the speed limits amplifies that a hundredfold."""
@@ -57,7 +57,7 @@ def _stepped(task: Task, ours: np.ndarray, oracle: np.ndarray, states: np.ndarra
     return Case(differences(task, ours, oracle), where, len(states))
 
 
-@check("dynamics", Comparison("one step, {integrator}", "{task.oracle}", TOLERANCE))
+@check("dynamics", Oracle("one step, {integrator}", "{task.oracle}", TOLERANCE))
 def one_step(task: Task, integrator: str, samples: int, seed: int = 0) -> Iterator[Case]:
     """One integration step with an ideal actuator, from random states under random forces."""
     generator = np.random.default_rng(seed)
@@ -68,7 +68,7 @@ def one_step(task: Task, integrator: str, samples: int, seed: int = 0) -> Iterat
     yield _stepped(task, ours, oracle, states, forces)
 
 
-@check("dynamics", Comparison("one step at the bounds, {integrator}", "{task.oracle}", TOLERANCE))
+@check("dynamics", Oracle("one step at the bounds, {integrator}", "{task.oracle}", TOLERANCE))
 def one_step_at_the_bounds(task: Task, integrator: str, stride: int = 1) -> Iterator[Case]:
     """One step from the task's edges under no, full and extreme forces, which MuJoCo is allowed here."""
     states, forces = _crossed(
@@ -80,7 +80,7 @@ def one_step_at_the_bounds(task: Task, integrator: str, stride: int = 1) -> Iter
     yield _stepped(task, ours, oracle, states, forces)
 
 
-@check("dynamics", Comparison("one step beyond the force limit, {integrator}", "{task.oracle}", TOLERANCE))
+@check("dynamics", Oracle("one step beyond the force limit, {integrator}", "{task.oracle}", TOLERANCE))
 def one_step_beyond_the_force_limit(task: Task, integrator: str, points: int) -> Iterator[Case]:
     """One step under commands up to `EXTREME` times the limit, against Gymnasium under the limit."""
     states, forces = _crossed(grid(task, points), task.max_force * np.array([-EXTREME, -1.001, 1.001, EXTREME]))
@@ -116,7 +116,7 @@ class _GymnasiumAcceleration:
         return (after - state)[self._velocities]
 
 
-@check("dynamics", Comparison("accelerations", "{task.oracle}", TOLERANCE))
+@check("dynamics", Oracle("accelerations", "{task.oracle}", TOLERANCE))
 def accelerations(task: Task, points: int) -> Iterator[Case]:
     """MuJoCo's `qacc` over a dense grid of states, under no, half, full and extreme forces."""
     states, forces = _crossed(grid(task, points), task.max_force * np.array([-EXTREME, -1.0, 0.0, 0.5, EXTREME]))

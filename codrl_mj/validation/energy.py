@@ -32,7 +32,7 @@ from codrl_mj.tasks import Task, find_task
 from codrl_mj.validation.compare import STAND_IN, actuators_named, forces_of, physics_of
 from codrl_mj.validation.convergence import analogues, free_run, ideals, obstacle
 from codrl_mj.validation.ledger import Ledger, Meter, keep
-from codrl_mj.validation.table import ORDER_TOLERANCE, Case, Check, Comparison, Family, Skipped, check, of_order
+from codrl_mj.validation.table import Case, Check, Family, Oracle, Skipped, check, of_order, order
 
 ACTUATORS = ("paper", "weak", "weaker", "open_loop")
 """Whose runs are balanced step by step."""
@@ -48,7 +48,7 @@ BALANCES = {
 """Residuals of a `Ledger`, and what each balances."""
 
 
-@check("energy", Comparison("winding, step by step", "identity of one Euler step of the RL circuit", 1e-13))
+@check("energy", Oracle("winding, step by step", "identity of one Euler step of the RL circuit", 1e-13))
 def step_by_step(task: Task, quick: bool) -> Iterator[Case]:
     """Tolerance 1e-13 of the energy supplied: the rounding of some ten operations a step."""
     steps = 20 if quick else 100
@@ -96,10 +96,7 @@ def _kept(
 
 @check(
     "energy",
-    *(
-        Comparison(f"order, {name} balance, {{integrator}}", oracle, ORDER_TOLERANCE, "slope")
-        for name, oracle in BALANCES.items()
-    ),
+    *(order(f"order, {name} balance, {{integrator}}", oracle) for name, oracle in BALANCES.items()),
 )
 def balances(task: Task, integrator: str, quick: bool) -> Iterator[tuple[Case, ...]]:
     """The residuals vanish at the integrator's order."""
@@ -131,7 +128,7 @@ def balances(task: Task, integrator: str, quick: bool) -> Iterator[tuple[Case, .
     yield tuple(cases)
 
 
-@check("energy", Comparison("order of the balances, {integrator}", "energy", ORDER_TOLERANCE, "slope"))
+@check("energy", order("order of the balances, {integrator}", "energy"))
 def diverged(error: str) -> Iterator[Case]:
     """What is left of the balances of a run that broke down."""
     yield Case(math.inf, error, 0)

@@ -15,7 +15,7 @@ from mujoco.batch import Batch
 from codrl_mj.physics import MujocoPhysics, install_callbacks, motors
 from codrl_mj.tasks import Task, find_task
 from codrl_mj.validation.compare import actuators_of, forces_of
-from codrl_mj.validation.table import Case, Check, Comparison, check
+from codrl_mj.validation.table import Case, Check, Oracle, check
 
 UNIT = "64-bit floats that differ"
 SERIAL = "a loop over mj_step"
@@ -62,7 +62,7 @@ def bits(ours: np.ndarray, oracle: np.ndarray) -> Iterator[Case]:
     yield Case(float(unequal.sum()), lambda _: f"the first of them at step {first + 1} of {len(unequal)}", unequal.size)
 
 
-@check("execution", Comparison("batched, {threads}", SERIAL, 0.0, UNIT))
+@check("execution", Oracle("batched, {threads}", SERIAL, 0.0, UNIT))
 def batched(model: mujoco.MjModel, threads: str, simulations: int, steps: int) -> Iterator[Case]:
     """A batch, each simulation under commands of its own, against one simulation after the other."""
     inputs = np.stack([commands(model, steps, seed) for seed in range(simulations)], axis=1)
@@ -78,7 +78,7 @@ def batched(model: mujoco.MjModel, threads: str, simulations: int, steps: int) -
     yield from bits(np.array(ours), np.stack(serial, axis=1))
 
 
-@check("execution", Comparison("copied", "the original", 0.0, UNIT))
+@check("execution", Oracle("copied", "the original", 0.0, UNIT))
 def copied(model: mujoco.MjModel, steps: int) -> Iterator[Case]:
     """A copy of `MjData` made half-way, against the original."""
     inputs = commands(model, 2 * steps, seed=0)
@@ -89,7 +89,7 @@ def copied(model: mujoco.MjModel, steps: int) -> Iterator[Case]:
     yield from bits(ours, _advance(model, original, inputs[steps:]))
 
 
-@check("execution", Comparison("restored", "the run it was taken from", 0.0, UNIT))
+@check("execution", Oracle("restored", "the run it was taken from", 0.0, UNIT))
 def restored(model: mujoco.MjModel, steps: int, state: mujoco.mjtState | None = None) -> Iterator[Case]:
     """A state vector taken half-way and put into a new `MjData`, against the run it was taken from."""
     kind = STATE if state is None else state
@@ -103,7 +103,7 @@ def restored(model: mujoco.MjModel, steps: int, state: mujoco.mjtState | None = 
     yield from bits(ours, _advance(model, original, inputs[steps:]))
 
 
-@check("execution", Comparison("forward passes", "one forward pass", 0.0, UNIT))
+@check("execution", Oracle("forward passes", "one forward pass", 0.0, UNIT))
 def forward_passes(model: mujoco.MjModel, steps: int) -> Iterator[Case]:
     """Between any two steps, three forward passes leave activations and plugins' states, the motors', as one does."""
     inputs, moving = commands(model, steps, seed=2), 1 + model.nq + model.nv
@@ -153,7 +153,7 @@ def _simulation(task: Task, integrator: str, seed: int, steps: int) -> tuple[Muj
     return physics, initial, forces_of(task, generator.uniform(-1.0, 1.0, steps * len(task.motors)))
 
 
-@check("execution", Comparison("pickled, {integrator}", "the original", 0.0, UNIT))
+@check("execution", Oracle("pickled, {integrator}", "the original", 0.0, UNIT))
 def pickled(task: Task, integrator: str, steps: int) -> Iterator[Case]:
     """A simulation pickled and unpickled half-way, against the original."""
     physics, _, forces = _simulation(task, integrator, 3, 2 * steps)
@@ -163,7 +163,7 @@ def pickled(task: Task, integrator: str, steps: int) -> Iterator[Case]:
     yield from bits(ours, oracle)
 
 
-@check("execution", Comparison("repeated, {integrator}", "the first episode", 0.0, UNIT))
+@check("execution", Oracle("repeated, {integrator}", "the first episode", 0.0, UNIT))
 def repeated(task: Task, integrator: str, steps: int) -> Iterator[Case]:
     """A second episode after a reset, against the first."""
     physics, initial, forces = _simulation(task, integrator, 4, steps)
@@ -172,7 +172,7 @@ def repeated(task: Task, integrator: str, steps: int) -> Iterator[Case]:
     yield from bits(_episode(physics, forces), oracle)
 
 
-@check("execution", Comparison("looked at, {integrator}", "an episode that nobody looks at", 0.0, UNIT))
+@check("execution", Oracle("looked at, {integrator}", "an episode that nobody looks at", 0.0, UNIT))
 def looked_at(task: Task, integrator: str, steps: int) -> Iterator[Case]:
     """An episode with a forward pass after every environment step, as a viewer makes them, against one without."""
     physics, initial, forces = _simulation(task, integrator, 5, steps)

@@ -33,7 +33,7 @@ from codrl_mj.engine.reading import slots
 from codrl_mj.validation.execution import UNIT, commands, differing
 from codrl_mj.validation.motor_loops import EVERY_FEATURE
 from codrl_mj.validation.rotors import SWINGING, motors_on
-from codrl_mj.validation.table import Case, Check, Comparison, check
+from codrl_mj.validation.table import Case, Check, Oracle, check
 
 KEY = Slot._fields.index("noise_key")
 
@@ -121,7 +121,7 @@ def compiled_checks(quick: bool) -> Iterator[Check]:
         yield from compiled_advance.of(family=type(actuator).__name__)(entries(actuator), *found[at])
 
 
-@check("motor", Comparison("compiled advance: {family}", "the same function in plain Python", 0.0, UNIT))
+@check("motor", Oracle("compiled advance: {family}", "the same function in plain Python", 0.0, UNIT))
 def compiled_advance(names: tuple[str, ...], compiled: np.ndarray, python: np.ndarray) -> Iterator[Case]:
     """Floats that differ, of shape (steps, names), and the first of them."""
     unequal = differing(compiled, python)

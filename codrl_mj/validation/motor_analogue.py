@@ -11,7 +11,7 @@ from scipy import linalg
 
 from codrl_mj.actuators import Actuator
 from codrl_mj.validation.motor_loops import Loop, run, unlimited
-from codrl_mj.validation.table import ORDER_TOLERANCE, Case, Comparison, Family, check, of_order
+from codrl_mj.validation.table import Case, Family, Oracle, check, of_order, order
 
 
 def closed_form(actuator: Actuator, timestep: float, torques: np.ndarray, speed: float) -> np.ndarray:
@@ -51,8 +51,8 @@ _ORACLE = "matrix exponential of the RL circuit under the analogue PID (scipy.li
 
 @check(
     "motor",
-    Comparison("closed form, order in the substeps", _ORACLE, ORDER_TOLERANCE, "slope"),
-    Comparison("closed form, limit of small substeps", _ORACLE, 1e-5, "N m"),
+    order("closed form, order in the substeps", _ORACLE),
+    Oracle("closed form, limit of small substeps", _ORACLE, 1e-5, "N m"),
 )
 def analogue_checks(loops: Mapping[str, Loop], quick: bool) -> Iterator[tuple[Case, ...]]:
     """Convergence to the closed form at first order in the substeps, and the limit itself.

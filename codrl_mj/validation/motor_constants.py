@@ -13,7 +13,7 @@ from codrl_mj.actuators import Motor
 from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.validation.motor_loops import Loop
 from codrl_mj.validation.rotors import FREE, HELD, drive, driven_by_voltage, motors_on
-from codrl_mj.validation.table import Case, Check, Comparison, check
+from codrl_mj.validation.table import Case, Check, Oracle, check
 
 VOLTAGE = 6.0
 """Supply of every measurement [V]."""
@@ -23,7 +23,7 @@ TOLERANCE = 1e-9
 _LINE = "u = R i + kE omega, torque = kT i in steady state"
 
 
-@check("motor", Comparison("torque-speed line and power, stall to regeneration", _LINE, TOLERANCE))
+@check("motor", Oracle("torque-speed line and power, stall to regeneration", _LINE, TOLERANCE))
 def torque_speed_line(motors: Mapping[str, Motor]) -> Iterator[Case]:
     """The torque-speed line, stall to regeneration; without a back-EMF it is measured at rest alone.
 
@@ -50,7 +50,7 @@ def torque_speed_line(motors: Mapping[str, Motor]) -> Iterator[Case]:
         yield Case(gaps, where.__getitem__, plots=(plot,) if name == next(iter(motors)) else ())
 
 
-@check("motor", Comparison("no-load speed and current", "u/kE, and none", TOLERANCE))
+@check("motor", Oracle("no-load speed and current", "u/kE, and none", TOLERANCE))
 def no_load(motors: Mapping[str, Motor]) -> Iterator[Case]:
     """The free no-load speed of those that have one."""
     for name, motor in motors.items():
@@ -66,7 +66,7 @@ def no_load(motors: Mapping[str, Motor]) -> Iterator[Case]:
         yield Case(abs(run.current[-1, 0]) * motor.resistance / VOLTAGE, f"{name}: current without load")
 
 
-@check("motor", Comparison("stall torque at the voltage limit", "kT u_max/R", TOLERANCE))
+@check("motor", Oracle("stall torque at the voltage limit", "kT u_max/R", TOLERANCE))
 def voltage_limit(loops: Mapping[str, Loop]) -> Iterator[Case]:
     """Stall torque at the loop's own voltage limit, in both directions, under a command far beyond it.
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from codrl_mj.actuators import Motor
 from codrl_mj.validation.rotors import FREE, Record, drive, driven_by_voltage, motors_on
-from codrl_mj.validation.table import ORDER_TOLERANCE, Case, Comparison, Family, check, of_order
+from codrl_mj.validation.table import Case, Family, check, of_order, order
 
 SUPPLY = 12.0
 """Supply voltage [V]."""
@@ -59,15 +59,7 @@ def gem_run(motor: Motor, inertia: float, voltages: np.ndarray) -> tuple[np.ndar
     return speed, current
 
 
-@check(
-    "motor",
-    Comparison(
-        "gym-electric-motor, order in the step",
-        "gym-electric-motor's DcPermanentlyExcitedMotor",
-        ORDER_TOLERANCE,
-        "slope",
-    ),
-)
+@check("motor", order("gym-electric-motor, order in the step", "gym-electric-motor's DcPermanentlyExcitedMotor"))
 def gem_check(motor: Motor, quick: bool) -> Iterator[Case]:
     """Convergence of speed and current to gym-electric-motor's at first order in the step, Euler on a free rotor."""
     voltages = np.random.default_rng(1).uniform(-SUPPLY, SUPPLY, 20 if quick else 40)

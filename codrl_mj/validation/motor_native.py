@@ -19,7 +19,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from codrl_mj.actuators import Motor
+from codrl_mj.actuators import Actuator, Motor
 from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.validation.rotors import (
     FREE,
@@ -32,7 +32,7 @@ from codrl_mj.validation.rotors import (
     motors_on,
     native_motor_on,
 )
-from codrl_mj.validation.table import ORDER_TOLERANCE, Case, Check, Comparison, Family, check, of_order
+from codrl_mj.validation.table import Case, Check, Family, Oracle, check, of_order, order
 
 MOTORS: dict[str, Motor] = {
     "paper": Motor(),
@@ -54,15 +54,19 @@ def _voltages(hold: int, count: int) -> np.ndarray:
     return np.random.default_rng(0).uniform(-4.0, 4.0, count).repeat(hold)
 
 
-def _compare(ours: Record, native: Record) -> np.ndarray:
-    """Differences of angle, speed and current after each step, relative to max(1, size)."""
+def _both(
+    load: Load, motor: Motor, actuator: Actuator, timestep: float, volts: np.ndarray, integrator: str = "Euler"
+) -> tuple[Record, Record, np.ndarray]:
+    """Ours and the native motor, and their differences of angle, speed and current, relative to max(1, size)."""
+    ours = drive(motors_on(load, [actuator], timestep, integrator), volts)
+    native = drive(native_motor_on(load, motor, timestep, integrator), volts)
     pairs = zip(ours[:3], native[:3], strict=True)
-    return np.max([np.abs(a - b) / np.maximum(1.0, np.abs(b)) for a, b in pairs], axis=(0, 2))
+    return ours, native, np.max([np.abs(a - b) / np.maximum(1.0, np.abs(b)) for a, b in pairs], axis=(0, 2))
 
 
 @check(
     "motor",
-    Comparison(
+    Oracle(
         "native <dcmotor>, same map", "MuJoCo's <dcmotor>: angle, speed and current; locked, free and swinging", 1e-10
     ),
 )
@@ -73,10 +77,8 @@ def same_map(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
             for share in (0.1, 1.0) if quick else (0.01, 0.1, 0.3, 1.0):
                 timestep = share * motor.electrical_time_constant
                 volts = _voltages(5, 20 if quick else 100)
-                native = drive(native_motor_on(load, motor, timestep, integrator), volts)
                 actuator = driven_by_voltage(exact_inductance(motor, timestep))
-                ours = drive(motors_on(load, [actuator], timestep, integrator), volts)
-                difference = _compare(ours, native)
+                ours, native, difference = _both(load, motor, actuator, timestep, volts, integrator)
                 at = f"{name} motor, {load.name}, {integrator}, dt = {share:g} L/R, step {difference.argmax() + 1}"
                 plots: tuple[Plot, ...] = ()
                 if (name, load, share) == ("paper", SWINGING, 0.1):
@@ -87,41 +89,21 @@ def same_map(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
                 yield Case(difference, at, plots=plots)
 
 
-@check(
-    "motor",
-    Comparison(
-        "native <dcmotor>, Euler, order in the substeps",
-        "MuJoCo's <dcmotor> at the true inductance",
-        ORDER_TOLERANCE,
-        "slope",
-    ),
-)
+@check("motor", order("native <dcmotor>, Euler, order in the substeps", "MuJoCo's <dcmotor> at the true inductance"))
 def substeps(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
     """First order in the substeps, at the true inductance."""
     counts, families = 2 ** np.arange(4, 8 if quick else 11), []
     for name, motor in motors.items():
         for load in (HELD, FREE, SWINGING):
             timestep = 0.2 * motor.electrical_time_constant
-            volts = _voltages(5, 20)
-            native = drive(native_motor_on(load, motor, timestep), volts)
-            errors = [
-                _compare(drive(motors_on(load, [driven_by_voltage(motor, int(count))], timestep), volts), native).max()
-                for count in counts
-            ]
+            actuators = [driven_by_voltage(motor, int(count)) for count in counts]
+            errors = [_both(load, motor, one, timestep, _voltages(5, 20))[-1].max() for one in actuators]
             families.append(Family(f"{name}, {load.name}", timestep / counts, np.array(errors)))
     title = "Ours against <dcmotor>, Euler"
     yield of_order(1.0, families, title, "electrical substep [s]", "largest difference [relative]")
 
 
-@check(
-    "motor",
-    Comparison(
-        "native <dcmotor>, implicitfast, order in the step",
-        "MuJoCo's <dcmotor> at the same step",
-        ORDER_TOLERANCE,
-        "slope",
-    ),
-)
+@check("motor", order("native <dcmotor>, implicitfast, order in the step", "MuJoCo's <dcmotor> at the same step"))
 def implicitfast(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
     """Second order in the step."""
     divisors, families = 2 ** np.arange(5, 9 if quick else 11), []
@@ -130,18 +112,14 @@ def implicitfast(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
             steps = motor.electrical_time_constant / divisors
             errors = []
             for divisor, timestep in zip(divisors, steps, strict=True):
-                volts = _voltages(int(divisor), 10)
-                native = drive(native_motor_on(load, motor, timestep, "implicitfast"), volts)
-                actuator = driven_by_voltage(exact_inductance(motor, timestep))
-                errors.append(
-                    _compare(drive(motors_on(load, [actuator], timestep, "implicitfast"), volts), native).max()
-                )
+                actuator, volts = driven_by_voltage(exact_inductance(motor, timestep)), _voltages(int(divisor), 10)
+                errors.append(_both(load, motor, actuator, timestep, volts, "implicitfast")[-1].max())
             families.append(Family(f"{name}, {load.name}", steps, np.array(errors)))
     title = "Ours against <dcmotor>, implicitfast"
     yield of_order(2.0, families, title, "step [s]", "largest difference [relative]")
 
 
-@check("motor", Comparison("RK4, locked rotor", "exponential of the RL circuit", 1e-12))
+@check("motor", Oracle("RK4, locked rotor", "exponential of the RL circuit", 1e-12))
 def rk4_check(quick: bool) -> Iterator[Case]:
     """Our current under RK4 against the exponential, on a locked rotor at 1 V; tolerance 1e-12 of the current.
 

@@ -16,7 +16,7 @@ from codrl_mj.actuators import Actuator
 from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.validation.motor_loops import Loop, run, unlimited
 from codrl_mj.validation.rotors import HELD, drive, motors_on
-from codrl_mj.validation.table import Case, Check, Comparison, check
+from codrl_mj.validation.table import Case, Check, Oracle, check
 
 # -- The sampled loop as a state-space system ----------------------------------------------------------------
 
@@ -39,7 +39,7 @@ def sampled_system(actuator: Actuator, timestep: float) -> Any:
 
 @check(
     "motor",
-    Comparison(
+    Oracle(
         "sampled loop, random torques and speeds",
         "the sampled loop as a state-space system (scipy.signal.dlsim)",
         1e-10,
@@ -92,7 +92,7 @@ def closed_loop(actuator: Actuator, timestep: float) -> Any:
     return control.feedback(pid * winding, 1) + loop.kff * control.feedback(winding, pid)
 
 
-@check("motor", Comparison("step response", "python-control, step_response of the discrete loop", 1e-10, "N m"))
+@check("motor", Oracle("step response", "python-control, step_response of the discrete loop", 1e-10, "N m"))
 def step_response(loops: Mapping[str, Loop]) -> Iterator[Case]:
     """Equal to rounding; tolerance 1e-10 of the 1 N m desired."""
     for name, loop in loops.items():
@@ -113,8 +113,8 @@ _FREQUENCY = "python-control, the discrete loop's frequency response"
 
 @check(
     "motor",
-    Comparison("frequency response, magnitude", _FREQUENCY, 1e-6, "dB"),
-    Comparison("frequency response, phase", _FREQUENCY, 1e-5, "deg"),
+    Oracle("frequency response, magnitude", _FREQUENCY, 1e-6, "dB"),
+    Oracle("frequency response, phase", _FREQUENCY, 1e-5, "deg"),
 )
 def frequency_response(loops: Mapping[str, Loop], frequencies: int) -> Iterator[tuple[Case, ...]]:
     """Magnitude and phase of desired -> actual torque, from sines driven through MuJoCo, one motor a frequency.

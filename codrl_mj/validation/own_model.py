@@ -15,7 +15,7 @@ from codrl_mj.tasks import find_task, resolve_actuators
 from codrl_mj.validation import execution
 from codrl_mj.validation.compare import STAND_IN, actuators_of
 from codrl_mj.validation.in_python import beside, entries
-from codrl_mj.validation.table import Case, Check, Comparison, Skipped, check
+from codrl_mj.validation.table import Case, Check, Oracle, Skipped, check
 
 STEP_TOLERANCE = 1e-11
 """The compiled loop may fuse a multiplication with an addition: 1e-16 a step, which a slow loop adds up."""
@@ -79,16 +79,13 @@ def _names(model: mujoco.MjModel) -> dict[int, tuple[str, ActuatorModel]]:
 BELOW_ONE = float(np.nextafter(1.0, 0.0))
 
 
-@check("motor", Comparison("stable: {motor}", "the family's own bound", BELOW_ONE, "instability"))
+@check("motor", Oracle("stable: {motor}", "the family's own bound", BELOW_ONE, "instability"))
 def stable_actuator(actuator: ActuatorModel, timestep: float) -> Iterator[Case]:
     """What the family says of its parameters."""
     yield Case(actuator.instability(np.array([actuator.numbers]), timestep), f"at a step of {timestep:g} s")
 
 
-@check(
-    "motor",
-    Comparison("stable: {motor}", "the eigenvalues of the discrete closed loop", BELOW_ONE, "spectral radius"),
-)
+@check("motor", Oracle("stable: {motor}", "the eigenvalues of the discrete closed loop", BELOW_ONE, "spectral radius"))
 def stable_loop(actuator: Actuator, timestep: float) -> Iterator[Case]:
     """The spectral radius, beside what the family says, which is infinite from 1 on."""
     radius = spectral_radius(actuator, timestep)
@@ -105,9 +102,7 @@ def stability(model: mujoco.MjModel, name: str) -> Iterator[Check]:
             yield from stable_actuator.of(name, motor=motor)(actuator, model.opt.timestep)
 
 
-@check(
-    "motor", Comparison("steps: {motor}", "the same functions in plain Python at the recorded speed", STEP_TOLERANCE)
-)
+@check("motor", Oracle("steps: {motor}", "the same functions in plain Python at the recorded speed", STEP_TOLERANCE))
 def motor_steps(actuator: ActuatorModel, ours: np.ndarray, oracle: np.ndarray) -> Iterator[Case]:
     """A motor in the engine against its own in plain Python, driven by the speed that the model itself reached.
 

@@ -17,6 +17,11 @@ from codrl_mj.pages.plots import Curve, Plot
 Arguments = ParamSpec("Arguments")
 
 
+ORDER_TOLERANCE = 0.1
+"""Farthest that any end of a slope's 95 % interval may lie from the promised order. A method one order worse misses by
+1; an error that does not vanish, such as a parameter off by 1 %, bends the line until its slope is near 0."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Check:
     """The outcome of one check."""
@@ -72,13 +77,18 @@ class Skipped:
     """The task or model."""
 
 
-class Comparison(NamedTuple):
+class Oracle(NamedTuple):
     """A row of the table: name and oracle may hold words in braces, such as `{task.oracle}`, an argument's."""
 
     name: str
     oracle: str
     tolerance: float
     unit: str = "relative"
+
+
+def order(name: str, oracle: str) -> Oracle:
+    """A row of slopes, which `of_order` finds: how far from the promised order errors vanish."""
+    return Oracle(name, oracle, ORDER_TOLERANCE, "slope")
 
 
 class Case(NamedTuple):
@@ -101,7 +111,7 @@ Cases = Iterable[Case | tuple[Case, ...]]
 class Compared(Generic[Arguments]):
     """A check as it stands in the table; called, it makes its cases and returns an outcome for each row."""
 
-    def __init__(self, group: str, rows: tuple[Comparison, ...], cases: Callable[Arguments, Cases]) -> None:
+    def __init__(self, group: str, rows: tuple[Oracle, ...], cases: Callable[Arguments, Cases]) -> None:
         """Of a group, with what is compared."""
         self.group, self.rows, self.cases = group, rows, cases
         self.__doc__ = cases.__doc__
@@ -127,7 +137,7 @@ TABLE: list[Compared[Any]] = []
 """Every check of the modules that were imported."""
 
 
-def check(group: str, *rows: Comparison) -> Callable[[Callable[Arguments, Cases]], Compared[Arguments]]:
+def check(group: str, *rows: Oracle) -> Callable[[Callable[Arguments, Cases]], Compared[Arguments]]:
     """Enter a function of cases in the table.
 
     The function yields a `Case` each time, or of several rows a tuple of them, one for each.
@@ -144,7 +154,7 @@ def check(group: str, *rows: Comparison) -> Callable[[Callable[Arguments, Cases]
     return enter
 
 
-def outcome(row: Comparison, group: str, said: dict[str, Any], cases: Iterable[Case]) -> Check:
+def outcome(row: Oracle, group: str, said: dict[str, Any], cases: Iterable[Case]) -> Check:
     """The worst of a row's cases: the largest gap, the first of equals; a NaN is larger than anything."""
     worst, where, samples = -math.inf, "", 0
     plots: list[Plot] = []
@@ -166,10 +176,6 @@ def outcome(row: Comparison, group: str, said: dict[str, Any], cases: Iterable[C
 
 
 # -- orders of convergence ----------------------------------------------------------------------------------
-
-ORDER_TOLERANCE = 0.1
-"""Farthest that any end of a slope's 95 % interval may lie from the promised order. A method one order worse misses by
-1; an error that does not vanish, such as a parameter off by 1 %, bends the line until its slope is near 0."""
 
 
 class Slope(NamedTuple):

@@ -1,9 +1,9 @@
 """Whole runs under the same commands: MuJoCo with the motor in its callback against Gymnasium with the motor in Python.
 
-A run is judged twice. Up to `HORIZON` the difference itself must stay below 1e-9. Over a whole episode, where a chaotic
-task would enlarge even the smallest rounding beyond any fixed bound, the difference is measured against what rounding
-becomes in the oracle itself along this run (`Growth`): what remains is the error made, not what
-chaos made of it.
+A run is judged twice. Up to the horizon of `Task.trials` the difference itself must stay below 1e-9. Over a whole
+episode, where a chaotic task would enlarge even the smallest rounding beyond any fixed bound, the difference is
+measured against what rounding becomes in the oracle itself along this run (`Growth`): what remains is the error made,
+not what chaos made of it.
 """
 
 import copy
@@ -20,7 +20,7 @@ from codrl_mj.physics import AnalyticPhysics, SimulationDivergedError
 from codrl_mj.tasks import Task, find_task, named_actuator
 from codrl_mj.validation.compare import NO_TWIN, SEVERAL_MOTORS, both, differences, last_signals
 from codrl_mj.validation.drives import FITTED, fitted_run
-from codrl_mj.validation.table import Case, Check, Comparison, Skipped, check
+from codrl_mj.validation.table import Case, Check, Oracle, Skipped, check
 
 TOLERANCE = 1e-9
 """Of the difference: rounding (1e-16), a thousand steps, and the growth of tasks that are not chaotic."""
@@ -107,7 +107,6 @@ def lyapunov_exponent(logarithms: np.ndarray, step_duration: float) -> float:
 class _Run(NamedTuple):
     """One run on both physics."""
 
-    seed: int
     gaps: np.ndarray
     """Largest difference of state or force after each step, and infinity for a step that diverged."""
     where: list[str]
@@ -146,7 +145,7 @@ def _run(task: Task, actuator: ActuatorModel, integrator: str, steps: int, seed:
         worst = int(np.argmax(all_gaps))  # a NaN, if there is one
         gaps.append(float(all_gaps[worst]))
         where.append(f"{names[worst]} at step {step} of seed {seed}")
-    return _Run(seed, np.array(gaps), where, growth)
+    return _Run(np.array(gaps), where, growth)
 
 
 def _plot(task: Task, run: _Run, title: str) -> Plot:
@@ -167,13 +166,13 @@ _NAME, _ORACLE = "{integrator}, {actuator_name} actuator", "{task.oracle}{motor}
 
 @check(
     "trajectories",
-    Comparison(f"run, {_NAME}", _ORACLE, TOLERANCE),
-    Comparison(f"run against rounding, {_NAME}", _ORACLE, ROUNDINGS, "accumulated roundings"),
+    Oracle(f"run, {_NAME}", _ORACLE, TOLERANCE),
+    Oracle(f"run against rounding, {_NAME}", _ORACLE, ROUNDINGS, "accumulated roundings"),
 )
 def whole_runs(
     task: Task, actuator_name: str, actuator: ActuatorModel, integrator: str, seeds: range, longest: int
 ) -> Iterator[tuple[Case, ...]]:
-    """Runs under the same random bang-bang commands: the difference itself up to `HORIZON`, and all in roundings."""
+    """Runs under the same random bang-bang commands: the difference itself up to the horizon, and all in roundings."""
     steps = min(longest, task.max_episode_steps or UNLIMITED_STEPS)
     horizon = min(steps, (task.trials and task.trials.horizon) or steps)
     for seed in seeds:

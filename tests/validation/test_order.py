@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from codrl_mj.validation.table import ORDER_TOLERANCE, Comparison, Family, fit_slope, of_order, outcome
+from codrl_mj.validation.table import ORDER_TOLERANCE, Family, Oracle, fit_slope, of_order, outcome
 
 STEPS = 0.1 / 2.0 ** np.arange(5)
-ROW = Comparison("name", "oracle", ORDER_TOLERANCE, "slope")
+ROW = Oracle("name", "oracle", ORDER_TOLERANCE, "slope")
 
 
 def check(errors, promised):
