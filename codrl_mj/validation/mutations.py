@@ -186,10 +186,10 @@ _LATE_FORCE: tuple[Edit, ...] = (
         f"                f64(HIDDEN)[actuator] = f64(slot)[2]\n{_COMMIT}"
         "            if time == 0.0:\n                f64(HIDDEN)[actuator] = 0.0\n",
     ),
-    ("return f64(slot_of(model, data, actuator))[2]", "return f64(HIDDEN)[actuator]"),
+    ("return f64(_slot_of(model, data, actuator))[2]", "return f64(HIDDEN)[actuator]"),
 )
 _EVERY_PASS: Edit = ("if time != f64(slot)[0]:", "if True:")
-_EVERY_STAGE: Edit = ("if i64(data + pbase_at)[0] != 0:", "if False:")
+_EVERY_STAGE: Edit = ("if DATA.pbase(data) != 0:", "if False:")
 _ADVANCED = "if asks_inertia(number) else math.inf,\n            )\n"
 _CANDIDATE = SLOT + len(current_loop.State._fields)
 _SHARED_CURRENT: tuple[Edit, ...] = (
