@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium import spaces
 
 import codrl_mj
+import tests
 from codrl_mj.fields import real
 from codrl_mj.tasks.trials import Trials
 
@@ -39,7 +40,7 @@ def plain(state: Any) -> Any:
 def function(name: str, arguments: str, body: str) -> Any:
     """A function of these arguments; its body is an expression to be returned, or statements."""
     lines = body if "return" in body or "raise" in body else f"return {body}"
-    namespace: dict[str, Any] = {"np": np, "plain": plain, "State": State, "Signals": Signals}
+    namespace: dict[str, Any] = {"np": np, "plain": plain, "tests": tests, "State": State, "Signals": Signals}
     exec(compile(f"def {name}({arguments}):\n    {lines}", "slip.py", "exec"), namespace)
     return namespace[name]
 

@@ -98,6 +98,11 @@ REFUSED = {
     "a number": ({"a": 0.3}, "randomize: a: 0.3 is no distribution: must be uniform(LOW, HIGH), "),
     "unknown": (["a=gauss(0, 1)"], "randomize: a: 'gauss(0, 1)' is no distribution: it must be uniform(LOW, HIGH), "),
     "too few": (["a=uniform(1)"], "randomize: a: 'uniform(1)' has 1 values: must be uniform(LOW, HIGH)"),
+    "the model's, of a motor": (
+        {"arm": {"model.gravity": "uniform(1, 2)"}},
+        "randomize: arm:model.gravity: model.gravity is the model's, not a motor's: leave 'arm' out",
+    ),
+    "no expression": (["(:a=uniform(0, 1)"], "randomize: (:a: '(' must be a regular expression (missing ), "),
     "bounds": (["a=uniform(2, 1)"], "randomize: a: 'uniform(2, 1)': Uniform.high = 1: must be >= low = 2"),
 }
 

@@ -84,6 +84,12 @@ def test_functions_that_a_function_calls_are_found():
     assert [terminated(np.array([position, 0.0, 0.0])) for position in (0.5, 1.5)] == [False, True]
 
 
+def test_so_are_those_of_a_package_that_is_named_whole():
+    task = slips.task(terminated="tests.slips.plain(state)")
+    terminated = compiled_outcomes(task).terminated
+    assert [terminated(np.array([position, 0.0, 0.0])) for position in (0.5, 1.5)] == [False, True]
+
+
 @pytest.mark.parametrize("face", but(["vector"], ["single", "vector", "training"]))
 def test_no_slip_ends_the_process(face):
     program = [sys.executable, "-m", "tests.slips", face]

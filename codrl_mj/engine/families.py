@@ -157,13 +157,15 @@ def _make_known(function: Any) -> None:
     closed = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
     scope = function.__globals__ | {name: cell.cell_contents for name, cell in closed}
     found = [scope[name] for name in names & scope.keys()]
-    found += [getattr(one, name, None) for one in found if isinstance(one, ModuleType) for name in names]
-    for called in found:
-        ours = isinstance(called, FunctionType) and called.__module__.partition(".")[0] not in _OTHERS
-        if ours and called not in _KNOWN:
-            _KNOWN.add(called)
-            register_jitable(called)
-            _make_known(called)
+    for one in found:  # which grows by what modules have
+        if isinstance(one, ModuleType) and one.__name__.partition(".")[0] not in _OTHERS:
+            inner = [getattr(one, name) for name in names if hasattr(one, name)]
+            found += [new for new in inner if all(new is not other for other in found)]
+        ours = isinstance(one, FunctionType) and one.__module__.partition(".")[0] not in _OTHERS
+        if ours and one not in _KNOWN:
+            _KNOWN.add(one)
+            register_jitable(one)
+            _make_known(one)
 
 
 @functools.cache

@@ -188,7 +188,10 @@ class EnvConfig:
         Raises:
             ValueError: fields do not go with each other, or with the model.
         """
-        return self.world.make(self, **view)
+        made = self.world.make(self, **view)
+        if not isinstance(made, gymnasium.Env):
+            raise ValueError(f"{self.task}: its `make` returned {made!r}: must be a gymnasium.Env")
+        return made
 
     def as_mapping(self) -> dict[str, Any]:
         """The configuration as JSON-serialisable values; `from_mapping` reads it."""

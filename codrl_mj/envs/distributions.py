@@ -205,8 +205,17 @@ def paths_of(randomize: Any) -> dict[str, Distribution]:
     for path, one in _flat(randomize) if isinstance(randomize, Mapping) else map(_split, randomize):
         if path in found:
             raise ValueError(f"randomize: {path} is named twice: give it one distribution")
+        pattern, field = split_path(path)
         try:
+            if pattern and field.startswith(MODEL):
+                raise ValueError(f"{field} is the model's, not a motor's: leave {pattern!r} out")
+            re.compile(pattern)
             found[path] = one if isinstance(one, Distribution) else parse(one)
+        except re.error as error:
+            raise ValueError(
+                f"randomize: {path}: {pattern!r} must be a regular expression ({error}); '.*' is any motor, 'leg.*' "
+                "those of a leg"
+            ) from None
         except ValueError as error:
             raise ValueError(f"randomize: {path}: {error}") from None
     return found

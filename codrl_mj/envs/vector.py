@@ -1,4 +1,4 @@
-"""Thousands of environments as one, on MuJoCo's batched simulation: Gymnasium's `VectorEnv`."""
+"""Thousands of environments as one, stepped together by compiled code: Gymnasium's `VectorEnv`."""
 
 import functools
 import re

@@ -301,11 +301,15 @@ def world_of(thing: Any) -> World:
     """The world of what stands at `module:NAME`.
 
     Raises:
-        ValueError: it is neither a world nor a task.
+        ValueError: it is neither a world, with a name, nor a task.
     """
+    if isinstance(thing, type) and issubclass(thing, World):
+        raise ValueError(f"{thing.__qualname__}: must be an instance of it: {thing.__qualname__}(...)")
     raise ValueError(f"{thing!r}: must be a codrl_mj.Task or a codrl_mj.World")
 
 
 @world_of.register
 def _(world: World) -> World:
+    if not isinstance(getattr(world, "name", None), str):
+        raise ValueError(f"{type(world).__qualname__}: must have a `name`, a text, which messages call it by")
     return world

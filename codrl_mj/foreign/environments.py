@@ -78,6 +78,8 @@ def make(
     """
     if isinstance(env_id, str):
         entry = gymnasium.spec(env_id)
+    elif not callable(env_id):
+        raise ValueError(f"env_id = {env_id!r}: must be an id, or a function or class that makes an environment")
     else:
         entry = EnvSpec(getattr(env_id, "__name__", "environment"), env_id)
         env_id = entry.id

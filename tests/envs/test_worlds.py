@@ -5,9 +5,10 @@ import json
 import numpy as np
 import pytest
 
+import codrl_mj
 from codrl_mj import EnvConfig
 from codrl_mj.__main__ import main
-from codrl_mj.envs.worlds import find_world
+from codrl_mj.envs.worlds import World, find_world, world_of
 from codrl_mj.training import TrainConfig
 from tests.envs.rig import RIG
 
@@ -48,6 +49,32 @@ def test_what_it_does_not_have_is_refused_by_the_configuration():
         EnvConfig("tests.envs.rig:rk4_of_nobody")
     with pytest.raises(ValueError, match=r"must be a codrl_mj.Task or a codrl_mj.World"):
         EnvConfig("tests.envs.rig:XML")
+    with pytest.raises(ValueError, match=r"^Rig: must be an instance of it: Rig\(...\)"):
+        EnvConfig("tests.envs.rig:Rig")
+
+
+def test_a_world_without_what_every_world_has_is_refused_in_a_sentence():
+    class Nameless(World):
+        def make(self, *_, **__):
+            return 3
+
+    with pytest.raises(ValueError, match="Nameless: must have a `name`, a text, which messages call it by"):
+        world_of(Nameless())
+    named = Nameless()
+    named.name = "named"
+    assert world_of(named) is named
+    config = EnvConfig(NAME)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(RIG), "make", lambda *_, **__: 3)
+        with pytest.raises(ValueError, match=r"tests.envs.rig:RIG: its `make` returned 3: must be a gymnasium.Env"):
+            config.make()
+
+
+def test_what_makes_no_environment_is_refused():
+    from tests.envs.rig import RigEnv
+
+    with pytest.raises(ValueError, match="must be an id, or a function or class that makes an environment"):
+        codrl_mj.make(RigEnv(), {".*": "lag"})
 
 
 def test_ideal_motors_change_nothing():
