@@ -303,7 +303,7 @@ def world_of(thing: Any) -> World:
     Raises:
         ValueError: it is neither a world, with a name, nor a task.
     """
-    if isinstance(thing, type) and issubclass(thing, World):
+    if isinstance(thing, type):
         raise ValueError(f"{thing.__qualname__}: must be an instance of it: {thing.__qualname__}(...)")
     raise ValueError(f"{thing!r}: must be a codrl_mj.Task or a codrl_mj.World")
 
