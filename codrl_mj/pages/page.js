@@ -115,10 +115,12 @@ const codrl = (() => {
     };
     clock.followers.add(own.follow);
     clock.told.add(drive);
-    video.addEventListener("loadedmetadata", () => {
+    const loaded = () => {
       video.currentTime = frame / 2;  // sought, it shows its own frame in place of the poster
       own.follow(clock.time);
-    });
+    };
+    if (video.readyState >= HTMLMediaElement.HAVE_METADATA) loaded();  // known before this script ran: there is no event more
+    else video.addEventListener("loadedmetadata", loaded);
     video.addEventListener("click", () => clock.play(!clock.playing));
     films.push(own);
   }
