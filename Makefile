@@ -55,8 +55,8 @@ soak: $(STAMP)  ## a million steps: memory, threads, episodes
 	@$(BIN)/python scripts/soak.py
 
 results: $(STAMP)  ## docs/results/ anew: hours; what is finished in runs/ is not done again
-	@$(BIN)/codrl-mj reproduce
-	@$(BIN)/codrl-mj study actuators
+	@$(BIN)/python scripts/reproduce.py
+	@$(BIN)/python scripts/study_actuators.py
 
 docs: $(DOCS)  ## the site in build/site, and the pages that are written from the code
 	@$(BIN)/python scripts/environment_pages.py

@@ -17,13 +17,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import benchmark_subjects as subjects
 import gymnasium
 import mujoco
 import numpy as np
-from benchmark_subjects import Subject
 from rich.table import Table
 
+import benchmark_subjects as subjects
+from benchmark_subjects import Subject
 from codrl_mj.cli.terminal import console
 from codrl_mj.runs.files import write_json
 from codrl_mj.tasks import OURS

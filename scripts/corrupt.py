@@ -251,8 +251,6 @@ COMMANDS = (
     f"identify check log.csv {COLUMNS} --json",
     f"identify log.csv {COLUMNS} --rig free --known load_inertia=0 gear_ratio=1 --out found",
     "validate pendulum --quick --out certificate",
-    "reproduce --dry-run",
-    "study actuators --dry-run",
     "--version",
 )
 """What a user types, short."""

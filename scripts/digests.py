@@ -345,11 +345,7 @@ def helps() -> Entries:
     verbs = [
         [verb] for verb in ("train", "evaluate", "runs", "render", "replay", "view", "report", "advise", "validate")
     ]
-    verbs += [["train", task] for task in (*TASKS, "furuta", "HalfCheetah-v5")] + [
-        ["reproduce"],
-        ["study"],
-        ["identify"],
-    ]
+    verbs += [["train", task] for task in (*TASKS, "furuta", "HalfCheetah-v5")] + [["identify"]]
     verbs += [["motor", verb] for verb in ("list", "show", "feasible", "choose", "design", "step", "new")]
     for words in ([], *verbs):
         out = subprocess.run([sys.executable, "-m", "codrl_mj", *words, "--help"], capture_output=True, check=False)

@@ -1,7 +1,7 @@
 """How strict is 'upright and still'? Pendulum's success under other tolerances, of policies that the study trained.
 
 In the episodes that the study tests by. Writes docs/upright_tolerances.csv, and prints it as the table of
-docs/evaluation.md. The study's run folders have to be there: codrl-mj study actuators.
+docs/evaluation.md. The study's run folders have to be there: python scripts/study_actuators.py
 """
 
 import argparse
@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from actuator_study.study import ActuatorStudy
 from codrl_mj.evaluation.episodes import run_episodes
 from codrl_mj.runs.policies import load_policy
-from codrl_mj.study.actuators.study import ActuatorStudy
-from codrl_mj.study.tables import write_csv
+from codrl_mj.study.pages import write_csv
 from codrl_mj.tasks import find_task
 from codrl_mj.tasks.pendulum import GOAL_HOLD, upright_angle
 from codrl_mj.training import finished
@@ -54,10 +54,10 @@ def main() -> int:
     parser.add_argument("--root", type=Path, default=Path("runs/actuators"), help="folder of the study's run folders")
     parser.add_argument("--out", type=Path, default=Path("docs/upright_tolerances.csv"), help="file of the table")
     options = parser.parse_args()
-    study = ActuatorStudy(options.root, tasks=("pendulum",))
+    study = ActuatorStudy(root=options.root, tasks=("pendulum",))
     rows = [found for name in TRIALS if (found := row(name, study))["seeds"]]
     if not rows:
-        print(f"no finished training in {options.root}: run codrl-mj study actuators first", file=sys.stderr)
+        print(f"no finished training in {options.root}: run python scripts/study_actuators.py first", file=sys.stderr)
         return 1
     write_csv(options.out, rows)
     lines = [list(rows[0]), ["---"] * len(rows[0]), *(found.values() for found in rows)]

@@ -482,8 +482,7 @@ def test_a_line_that_is_not_understood_costs_one_line(capsys, line, expected):
             "identify plan maxon-re65 --out {}",
             "identify simulate maxon-re65 --out {}/l.csv",
         ),
-        *("identify log.csv --columns time=t:s --out {}", "validate --out {}", "study actuators --out {}"),
-        *("reproduce --root {}", "study actuators --root {} --out ."),
+        *("identify log.csv --columns time=t:s --out {}", "validate --out {}"),
     ],
 )
 def test_what_cannot_be_written_is_refused_before_anything_is_computed(capsys, tmp_path, line):

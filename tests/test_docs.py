@@ -116,8 +116,6 @@ SHORTER = {
     "evaluate": "--episodes 1",
     "render": "--env.max-episode-steps 4 --width 160 --height 120",
     "report": "--no-film",
-    "study": "--dry-run",
-    "reproduce": "--dry-run",
     "validate": "--quick",
 }
 """Verb -> flags with which a command takes seconds."""

@@ -14,7 +14,7 @@ USE = """
 import gymnasium as gym
 import numpy as np
 import codrl_mj
-from codrl_mj.study.actuators.evidence import Evidence
+from codrl_mj.study.evidence import Evidence
 print(codrl_mj.__file__)
 print(Evidence.read().loss("pendulum", "lag", 1.0) is not None)
 for env_id in sorted(name for name in gym.registry if name.startswith("codrl_mj/")):

@@ -26,9 +26,7 @@ from codrl_mj.cli.parsing import parse, understood
 from codrl_mj.cli.render import Render
 from codrl_mj.cli.replay import Replay
 from codrl_mj.cli.report import Report
-from codrl_mj.cli.reproduce import Reproduce
 from codrl_mj.cli.runs import Runs
-from codrl_mj.cli.study import Computed, Study
 from codrl_mj.cli.train import Train, train_verb
 from codrl_mj.cli.validate import Validate
 from codrl_mj.cli.view import LiveView
@@ -47,8 +45,6 @@ VERBS: dict[str, Any] = {
     "advise": Advise,
     "identify": Identify,
     "validate": Validate,
-    "study": Study,
-    "reproduce": Reproduce,
 }
 """The verbs by name."""
 _MADE: dict[str, Callable[[list[str]], Any]] = {
@@ -109,7 +105,7 @@ def _run(arguments: list[str], traced: bool) -> int:
         if traced:
             traceback.print_exc()
         if _interrupted(error):
-            again = "goes on where it was" if isinstance(verb, Computed | Advise) else "begins anew"
+            again = "goes on where it was" if isinstance(verb, Advise) else "begins anew"
             told = isinstance(error, KeyboardInterrupt) and str(error)
             print(f"codrl-mj: {told or f'stopped: the same command {again}'}", file=sys.stderr)
             return 130

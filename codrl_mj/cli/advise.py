@@ -64,9 +64,9 @@ class Advise:
     def run(self) -> int:
         """Print the doses, what they cost, and the verdict last."""
         from codrl_mj.cli.terminal import say
-        from codrl_mj.study.actuators.advice import advise
-        from codrl_mj.study.actuators.evidence import Evidence
-        from codrl_mj.study.actuators.levels import REFERENCE_SPEEDS, posed
+        from codrl_mj.study.advice import advise
+        from codrl_mj.study.doses import REFERENCE_SPEEDS, posed
+        from codrl_mj.study.evidence import Evidence
 
         if self.task not in REFERENCE_SPEEDS:
             raise ValueError(
@@ -100,10 +100,10 @@ class Advise:
         return {"name": self.actuator, **changed} if changed else self.actuator
 
     def _measured(self, actuator: Any, seeds: int) -> Any:
-        from codrl_mj.cli.study import compute
         from codrl_mj.cli.terminal import print_table, say
-        from codrl_mj.study.actuators.measured import measured, measured_grid
+        from codrl_mj.study.measured import measured, measured_grid
         from codrl_mj.study.parallel import Workers
+        from codrl_mj.study.program import compute
 
         grid = measured_grid(actuator, self.task, seeds, self.root)
         if self.as_json:
@@ -123,8 +123,8 @@ class Advise:
 
 def _print(name: str, found: Any) -> None:
     from codrl_mj.cli.terminal import print_table, say
-    from codrl_mj.study.actuators.advice import LOOP
-    from codrl_mj.study.actuators.levels import AXES
+    from codrl_mj.study.advice import LOOP
+    from codrl_mj.study.doses import AXES
 
     columns = "what it does to the largest force", "value", "unit"
     rows: list[tuple[Any, ...]] = [

@@ -1,1 +1,37 @@
-"""Experiments of many runs: a grid that scales, inference over seeds, the paper's experiments, what actuators cost."""
+"""Studies: arms that are trained with many seeds, trials that test them, questions that are judged, and a page."""
+
+from codrl_mj.study.inference import Stratum, detectable, effect, equivalence_p, false_discovery, holm, permutation_p
+from codrl_mj.study.pages import conclusions_section, markdown_table, read_csv, write_csv, write_page
+from codrl_mj.study.parallel import Workers
+from codrl_mj.study.program import Program, main
+from codrl_mj.study.questions import Contrast, Question, Scores, Verdict, judge
+from codrl_mj.study.trials import Arm, Collected, Grid, Trial, run_rows, trial_rows
+
+__all__ = [
+    "Arm",
+    "Trial",
+    "Grid",
+    "Workers",
+    "Collected",
+    "Contrast",
+    "Question",
+    "Scores",
+    "Verdict",
+    "judge",
+    "Program",
+    "main",
+    "run_rows",
+    "trial_rows",
+    "read_csv",
+    "write_csv",
+    "write_page",
+    "markdown_table",
+    "conclusions_section",
+    "Stratum",
+    "effect",
+    "permutation_p",
+    "equivalence_p",
+    "holm",
+    "false_discovery",
+    "detectable",
+]

@@ -1,26 +1,46 @@
 """What studies consist of: arms that are trained with many seeds, and trials that test their policies.
 
 A study is its trials. Every training is a run folder that is found again by its configuration, every test of a policy a
-file in it; so whatever is there is never computed again, whoever computed it.
+file in it; so whatever is there is never computed again, whoever computed it. Run folders do not outlive a machine: a
+row of every test, with the name of its run, is published, and stands for a run folder that is not at hand.
 """
 
 import collections
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+import functools
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from codrl_mj.actuators import mapping_of
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.evaluation.measures import bootstrap_mean
 from codrl_mj.runs.files import read_json
 from codrl_mj.study.grid import Deployment, cell_folder, deploy_cells, read_failure, train_runs
+from codrl_mj.study.pages import read_csv
 from codrl_mj.study.parallel import Workers
 from codrl_mj.training import EVALUATION_SEED, TrainConfig, finished
 from codrl_mj.training.folder import RESULT
 
 TEST_SECONDS = 1.0
 """What a test takes [s of one core], about."""
+RUNS, TOTALS = "runs.csv", "totals.json"
+"""What is published of a study: a row for every policy and test; what its trainings took in all."""
+MEASURES = (
+    "success",
+    "tracking_percent",
+    "saturated_percent",
+    "rms_current",
+    "peak_current",
+    "energy_drawn",
+    "copper_loss",
+    "mechanical_work",
+    "torque_rms",
+    "reversals",
+)
+"""What is published of a test besides its return: fields of `codrl_mj.evaluation.Evaluation`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,6 +106,19 @@ class Cost(NamedTuple):
         return len(self.missing) * self.seconds + self.tests * TEST_SECONDS
 
 
+class Totals(NamedTuple):
+    """What the trainings of a study took."""
+
+    trainings: int
+    """Finished ones."""
+    missing: int
+    """Trainings and tests that are not there."""
+    seconds: float
+    """What the finished ones took, each on one core [s]."""
+    codes: Mapping[str, int]
+    """How many of them each version of the code has trained, by its digest."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Grid:
     """Arms, their seeds, and their trials.
@@ -102,6 +135,8 @@ class Grid:
     """The seeds of an arm."""
     episodes: int = 100
     """Test episodes of every policy, >= 1."""
+    published: Path | None = None
+    """Folder of the published rows, which stand for run folders that are not at hand."""
 
     def __post_init__(self) -> None:
         """Validate."""
@@ -137,6 +172,21 @@ class Grid:
             for seed in self.seeds_of(trial.arm)
         }
 
+    @functools.cached_property
+    def rows(self) -> dict[tuple[str, int], dict[str, float | None]]:
+        """Published measures of tests of these very trainings, by trial and seed."""
+        tests, found = self.deployments(), {}
+        for row in [] if self.published is None else read_csv(self.published / RUNS):
+            key = f"{row['task']}: {row['trained']} on {row['tested']}", int(row["seed"])
+            if key in tests and tests[key].run.name == row["run"]:
+                found[key] = {name: float(row[name]) if row[name] else None for name in ("returns", *MEASURES)}
+        return found
+
+    def _untested(self) -> dict[tuple[str, int], Deployment]:
+        """The tests of which there is neither a file nor a row."""
+        tests = self.deployments()
+        return {key: test for key, test in tests.items() if key not in self.rows and not test.record.is_file()}
+
     def compute(
         self,
         workers: Workers = Workers(),  # noqa: B008 - frozen
@@ -154,10 +204,16 @@ class Grid:
             ValueError: Ray is asked for and not installed.
             TrainingStoppedError: a signal asked to stop.
         """
-        cells, folders, tests = self.cells(), self.folders(), self.deployments()
+        cells, folders, tests = self.cells(), self.folders(), self._untested()
+        needed = {test.run for test in tests.values()}
         for seed in sorted({seed for _, seed in cells}):  # trained and tested, so that a part says something of all
             runs = {folders[cell]: config for cell, config in cells.items() if cell[1] == seed}
-            train_runs(runs, workers, lambda _: on_cell("training"), accept_changes=accept_changes, tensorboard=False)
+            for _ in set(runs) - needed:
+                on_cell("training")
+            waiting = {folder: config for folder, config in runs.items() if folder in needed}
+            train_runs(
+                waiting, workers, lambda _: on_cell("training"), accept_changes=accept_changes, tensorboard=False
+            )
             ready = {called(*key): test for key, test in tests.items() if key[1] == seed and finished(test.run)}
             deploy_cells(ready, workers, lambda _: on_cell("test"))
 
@@ -168,7 +224,9 @@ class Grid:
             ValueError: a file of a run is damaged.
         """
         folders, tests = self.folders(), self.deployments()
-        done = {cell: folder for cell, folder in folders.items() if finished(folder)}
+        at_hand = {cell: folder for cell, folder in folders.items() if finished(folder)}
+        arm_of = {trial.name: trial.arm.name for trial in self.trials}
+        done = at_hand | {cell: folders[cell] for trial, seed in self.rows if (cell := (arm_of[trial], seed))}
         evaluations: dict[str, dict[int, Mapping[str, Any]]] = {trial.name: {} for trial in self.trials}
         missing: dict[str, Path | Deployment] = {
             called(*cell): folder for cell, folder in folders.items() if cell not in done
@@ -176,20 +234,33 @@ class Grid:
         for (trial, seed), test in tests.items():
             if test.record.is_file():
                 evaluations[trial][seed] = read_json(test.record, "evaluation")
+            elif (trial, seed) in self.rows:
+                evaluations[trial][seed] = self.rows[trial, seed]
             elif finished(test.run):
                 missing[called(trial, seed)] = test
         failures = {name: read_failure(cell) for name, cell in missing.items()}
         return Collected(
             grid=self,
-            folders=done,
+            folders={cell: done[cell] for cell in folders if cell in done},
             evaluations=evaluations,
             missing=tuple(missing),
             failures={name: failure for name, failure in failures.items() if failure is not None},
-            seconds=sum(training_seconds(folder) for folder in done.values()),
-            codes=collections.Counter(
-                str(read_json(folder / "config.json", "run configuration").get("code"))[:8] for folder in done.values()
-            ),
+            totals=self._totals(at_hand, len(done), len(missing)),
         )
+
+    def _totals(self, at_hand: Mapping[tuple[str, int], Path], done: int, missing: int) -> "Totals":
+        """What trainings took: those whose folders are at hand, beside what is published of all that have rows."""
+        arm_of = {trial.name: trial.arm.name for trial in self.trials}
+        have_rows = {(arm_of[trial], seed) for trial, seed in self.rows}
+        before, file = Totals(0, 0, 0.0, {}), (self.published or self.root) / TOTALS
+        if self.rows and file.is_file() and len(read_csv(file.with_name(RUNS))) == len(self.rows):
+            before = Totals(**read_json(file, "totals of a study"))
+        new = [folder for cell, folder in at_hand.items() if not before.trainings or cell not in have_rows]
+        if before.trainings and not new:
+            return before
+        codes = [str(read_json(folder / "config.json", "run configuration").get("code"))[:8] for folder in new]
+        seconds = before.seconds + sum(training_seconds(folder) for folder in new)
+        return Totals(done, missing, seconds, dict(collections.Counter(before.codes) + collections.Counter(codes)))
 
     def costs(self) -> list[Cost]:
         """What every arm takes.
@@ -197,15 +268,16 @@ class Grid:
         Raises:
             ValueError: a file of a finished run is damaged.
         """
-        folders, tests = self.folders(), self.deployments()
-        untested = collections.Counter(test.run for test in tests.values() if not test.record.is_file())
+        folders = self.folders()
+        untested = collections.Counter(test.run for test in self._untested().values())
         found = []
         for arm in self.arms:
             mine = {seed: folders[arm.name, seed] for seed in self.seeds_of(arm)}
             took = {seed: training_seconds(folder) for seed, folder in mine.items() if finished(folder)}
             seconds = float(np.mean(list(took.values()))) if took else arm.seconds
             waiting = sum(untested[folder] for folder in mine.values())
-            found.append(Cost(arm, tuple(took), tuple(seed for seed in mine if seed not in took), seconds, waiting))
+            done = tuple(seed for seed, folder in mine.items() if seed in took or not untested[folder])
+            found.append(Cost(arm, done, tuple(seed for seed in mine if seed not in done), seconds, waiting))
         return found
 
 
@@ -223,10 +295,8 @@ class Collected:
     """Trainings that are not finished, and tests of finished ones that are not there, by name."""
     failures: Mapping[str, str]
     """What went wrong, by the names of those of them that were tried."""
-    seconds: float
-    """What the finished trainings took, each on one core [s]."""
-    codes: Mapping[str, int]
-    """How many of them each version of the code has trained, by its digest."""
+    totals: Totals
+    """What they took."""
 
     def scores(self, trial: Trial, measure: str = "returns") -> dict[int, float]:
         """A measure of every policy of a trial that has one, by seed: means of intervals, medians of quartiles.
@@ -236,6 +306,49 @@ class Collected:
         tested = self.evaluations.get(trial.name, {})
         found = {seed: plain(evaluation[measure]) for seed, evaluation in tested.items()}
         return {seed: float(value) for seed, value in found.items() if value is not None}
+
+
+def run_rows(collected: Collected, score: Callable[[Trial], Mapping[int, float]]) -> Iterable[dict[str, Any]]:
+    """A row for every policy and test, units as in docs/evaluation.md; `score` gives those of a trial by seed."""
+    for trial in collected.grid.trials:
+        scores = score(trial)
+        measured = {name: collected.scores(trial, name) for name in ("returns", *MEASURES)}
+        for seed in collected.evaluations[trial.name]:
+            yield {
+                "task": trial.arm.task,
+                "trained": trial.arm.name.partition(": ")[2],
+                "tested": trial.test,
+                "seed": seed,
+                "score": scores.get(seed),
+                **{name: found.get(seed) for name, found in measured.items()},
+                "run": collected.folders[trial.arm.name, seed].name,
+            }
+
+
+def trial_rows(collected: Collected, score: Callable[[Trial], Mapping[int, float]]) -> Iterable[dict[str, Any]]:
+    """A row for every trial: mean score with its 95 % bootstrap interval over policies, and means of the measures."""
+    for trial in collected.grid.trials:
+        scores = np.array(list(score(trial).values()))
+        if not scores.size:
+            continue
+        mean = bootstrap_mean(scores)
+        measured = {name: list(collected.scores(trial, name).values()) for name in ("returns", *MEASURES)}
+        env = trial.env
+        yield {
+            "task": trial.arm.task,
+            "trained": trial.arm.name.partition(": ")[2],
+            "tested": trial.test,
+            "policies": len(scores),
+            "score": mean.mean,
+            "low": mean.low,
+            "high": mean.high,
+            "worst": scores.min(),
+            "best": scores.max(),
+            **{name: np.mean(found) if found else None for name, found in measured.items()},
+            "actuator": mapping_of(env.actuators[0]) or "ideal",
+            "joint": env.joint.friction,
+            "command_delay": env.disturbances.command_delay,
+        }
 
 
 def called(name: str, seed: int) -> str:

@@ -3,27 +3,28 @@
 import csv
 import dataclasses
 import operator
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import stats
 
-from codrl_mj import cli
+from actuator_study import arms
+from actuator_study.exploration import paper_loops, windup
+from actuator_study.page import FOLDER, PAGE, write
+from actuator_study.questions import primary, secondary, trials, wrong_motors
+from actuator_study.study import ActuatorStudy
 from codrl_mj.actuators import Lag
 from codrl_mj.evaluation.measures import Interval
-from codrl_mj.study.actuators import arms
-from codrl_mj.study.actuators.evidence import Evidence
-from codrl_mj.study.actuators.exploration import paper_loops, windup
-from codrl_mj.study.actuators.levels import AXES, needed_voltage, posed
-from codrl_mj.study.actuators.page import FOLDER, write
-from codrl_mj.study.actuators.questions import primary, secondary, trials, wrong_motors
-from codrl_mj.study.actuators.study import ActuatorStudy
-from codrl_mj.study.actuators.verdicts import FLOORS, Scores, Verdict, judge, seeds_to_close
+from codrl_mj.study.doses import AXES, FLOORS, SECONDS, at_home, ideal, needed_voltage, posed
+from codrl_mj.study.evidence import Evidence
+from codrl_mj.study.program import main
+from codrl_mj.study.questions import Scores, Verdict, judge
 from codrl_mj.tasks import find_task
 from tests.study.pretended import pretend
 
-PLAN = Path(__file__).parents[2] / "docs/results/plan.md"
+RESULTS = Path(__file__).parents[2] / "docs/results"
 
 
 def returns(score):
@@ -40,6 +41,16 @@ def noisy(level):
     return score
 
 
+def alone(root, **options):
+    """The study in a folder, with nothing published."""
+    return ActuatorStudy(root=root, out=root, **options)
+
+
+def judged(grid):
+    """The verdicts of the primary questions."""
+    return judge(Scores(grid.collect(), FLOORS, [at_home(ideal(task)) for task in SECONDS]), primary(), primary=True)
+
+
 @pytest.fixture(scope="module")
 def study(tmp_path_factory):
     """Matched training is worth 0.3 everywhere; every motor costs ideal-trained policies half of the span."""
@@ -50,13 +61,13 @@ def study(tmp_path_factory):
             return 1.0 if at_home else 0.5
         return 0.8
 
-    grid = ActuatorStudy(tmp_path_factory.mktemp("runs"), seeds=6).grid
+    grid = alone(tmp_path_factory.mktemp("runs"), seeds=6).grid
     pretend(grid, returns(noisy(level)))
     return grid
 
 
 @pytest.mark.parametrize(
-    "task", [pytest.param(task, marks=[] if task == "furuta" else pytest.mark.matrix) for task in arms.SECONDS]
+    "task", [pytest.param(task, marks=[] if task == "furuta" else pytest.mark.matrix) for task in SECONDS]
 )
 @pytest.mark.parametrize("axis", AXES)
 def test_every_dose_is_an_environment_that_can_be_stepped(task, axis):
@@ -70,7 +81,7 @@ def test_every_dose_is_an_environment_that_can_be_stepped(task, axis):
 
 
 def test_doses_are_in_steps_of_the_policy_and_shares_of_the_force():
-    for task in arms.SECONDS:
+    for task in SECONDS:
         definition = find_task(task)
         assert AXES["lag"].at(task, 2.0).actuator == Lag(2.0 * definition.step_duration)
         assert AXES["delay"].at(task, 3.0).disturbances.command_delay == 3.0 * definition.step_duration
@@ -83,7 +94,7 @@ def test_doses_are_in_steps_of_the_policy_and_shares_of_the_force():
 
 def test_where_half_the_voltage_is_missing_the_stall_torque_is_just_the_largest():
     """U = 2*sqrt(F*w) of which half is R*F/k: what the motor of 1 ohm takes to hold the largest force."""
-    for task in arms.SECONDS:
+    for task in SECONDS:
         drive = AXES["supply"].at(task, 0.5).actuator
         stall = drive.motor.torque_constant * drive.supply.voltage / drive.motor.resistance
         assert stall == pytest.approx(find_task(task).max_force)
@@ -104,7 +115,7 @@ def test_the_plan_is_what_is_computed():
 
     What is explored beyond it tests more, and trains nothing else.
     """
-    plan, planned = PLAN.read_text(), trials()
+    plan, planned = (RESULTS / "plan.md").read_text(), trials()
     grid = ActuatorStudy().grid
     assert set(planned) <= set(grid.trials)
     counts = len(grid.arms), len(grid.cells()), len(planned) * 20
@@ -166,7 +177,7 @@ def flattened(mapping, prefix=""):
 
 
 def test_what_is_so_is_found(study):
-    verdicts = {one.hypothesis.name: one for one in judge(Scores(study.collect()), primary())}
+    verdicts = {one.question.name: one for one in judged(study)}
     for name in ("P1", "P2", "P3", "P4", "P5", "P6", "P12"):
         assert verdicts[name].outcome == "yes"
         assert verdicts[name].effect.mean == pytest.approx(0.3)
@@ -181,12 +192,12 @@ def test_what_is_otherwise_is_said(tmp_path):
         matched = trial.arm.name in {f"{task}: lag" for task in arms.TRAINED}
         return 0.2 if matched else 1.0 if trial.test != "good motor" else 0.5
 
-    grid = ActuatorStudy(tmp_path, seeds=6).grid
+    grid = alone(tmp_path, seeds=6).grid
     pretend(grid, returns(noisy(level)))
-    verdicts = {one.hypothesis.name: one for one in judge(Scores(grid.collect()), primary())}
+    verdicts = {one.question.name: one for one in judged(grid)}
     assert verdicts["P1"].outcome == "the other way"
     assert verdicts["P11"].outcome == "no"
-    assert seeds_to_close(verdicts["P11"]) is None
+    assert verdicts["P11"].seeds_to_close(12) is None
 
 
 @pytest.mark.parametrize(("kind", "mean", "seeds"), [("better", 0.05, 30), ("equivalent", 0.0, 27)])
@@ -196,7 +207,7 @@ def test_seeds_that_would_tell_find_it_as_often_as_power_says(kind, mean, seeds)
     hypothesis = next(one for one in primary() if one.kind == kind)
     interval = Interval(mean, mean - half, mean + half)
     verdict = Verdict(hypothesis, (20, 20), (1, 1), interval, 0.2, 1.0)
-    assert seeds_to_close(verdict) == seeds
+    assert verdict.seeds_to_close(12) == seeds
     random = np.random.default_rng(0)
     one, other = random.normal(mean, 0.05, (20_000, seeds)), random.normal(0.0, 0.05, (20_000, seeds))
     if kind == "better":
@@ -219,9 +230,9 @@ def test_policies_that_are_tested_in_several_contrasts_count_once(tmp_path):
             return 0.5 + own[seed]
         return 1.0 + 0.01 * (-1) ** seed
 
-    grid = ActuatorStudy(tmp_path, tasks=("pendulum",), seeds=6).grid
+    grid = alone(tmp_path, tasks=("pendulum",), seeds=6).grid
     pretend(grid, returns(score))
-    verdicts = {one.hypothesis.name: one for one in judge(Scores(grid.collect()), primary())}
+    verdicts = {one.question.name: one for one in judged(grid)}
     matched = 1.0 + 0.01 * (-1.0) ** np.arange(6)
     for name, strata, test in (
         ("P7", (6, 12), stats.ttest_ind(matched, 0.5 + own, equal_var=False)),
@@ -233,9 +244,9 @@ def test_policies_that_are_tested_in_several_contrasts_count_once(tmp_path):
 
 
 def test_nothing_is_concluded_from_nothing(tmp_path):
-    collected = ActuatorStudy(tmp_path / "none").grid.collect()
-    assert {one.outcome for one in judge(Scores(collected), primary())} == {"open"}
-    files = write(collected, tmp_path / "out")
+    grid = ActuatorStudy(root=tmp_path / "none", out=tmp_path / "out").grid
+    assert {one.outcome for one in judged(grid)} == {"open"}
+    files = write(grid.collect(), tmp_path / "out")
     text = files[0].read_text()
     assert "0 of 860 trainings" in text
     assert "What is missing" in text
@@ -249,7 +260,7 @@ def test_the_page_says_which_doses_are_borne(tmp_path):
         axis, _, dose = trial.test.rpartition(" ")
         return 1.0 if axis != "lag" else 0.98 if float(dose) <= 0.5 else 0.8
 
-    grid = ActuatorStudy(tmp_path / "runs", tasks=("pendulum",), seeds=4).grid
+    grid = alone(tmp_path / "runs", tasks=("pendulum",), seeds=4).grid
     pretend(grid, returns(noisy(level)))
     page = write(grid.collect(), tmp_path)[0].read_text()
     assert "| Pendulum | 0.5, 1 | 0.7, – | 0.7, – | 4, – | 0.3, – | 1.6, – |" in page
@@ -270,7 +281,7 @@ def test_the_page_has_every_number_in_a_file(study, tmp_path):
     assert f"({FOLDER}/chart.svg)" in page
     assert "| Pendulum | 0.50 / 0.50 |" in page
     evidence = Evidence.read(files["hypotheses.csv"])
-    for task in arms.SECONDS:
+    for task in SECONDS:
         for axis, described in AXES.items():
             loss = evidence.loss(task, axis, described.doses[3])
             assert loss.loss.mean == pytest.approx(0.5)
@@ -283,23 +294,54 @@ def test_the_page_has_every_number_in_a_file(study, tmp_path):
 @pytest.mark.matrix
 def test_from_the_command_line_a_small_study_is_computed_and_goes_on(tmp_path, monkeypatch, capsys):
     """One training and its tests, for a few steps; the second call trains nothing."""
-    from codrl_mj.study.actuators import study as module
+    from actuator_study import study as module
 
     few = [one for one in module.trials() if one.arm.name == "mountain_car: ideal"][:2]
     monkeypatch.setattr(module, "trials", lambda: few)
-    call = ["study", "actuators", "--root", str(tmp_path / "runs"), "--out", str(tmp_path / "out"), "--jobs", "1"]
+    call = ["--root", str(tmp_path / "runs"), "--out", str(tmp_path / "out"), "--jobs", "1"]
     call += ["--tasks", "mountain_car", "--seeds", "1", "--episodes", "2", "--total-steps", "400"]
-    assert cli.main([*call, "--dry-run"]) == 0
+    assert main(ActuatorStudy, [*call, "--dry-run"]) == 0
     assert "mountain_car: ideal" in capsys.readouterr().out
-    assert cli.main(call) == 0
+    assert main(ActuatorStudy, call) == 0
     run = next((tmp_path / "runs").glob("mountain_car-*/result.json"))
     before = run.stat().st_mtime_ns
-    assert cli.main(call) == 0
+    assert main(ActuatorStudy, call) == 0
     assert run.stat().st_mtime_ns == before
-    assert "1 of 1 trainings" in (tmp_path / "out" / "actuators.md").read_text()
+    page = tmp_path / "out" / "actuators.md"
+    assert "1 of 1 trainings" in page.read_text()
+    shutil.rmtree(tmp_path / "runs")  # its rows stand for it
+    written = page.read_bytes()
+    assert main(ActuatorStudy, call) == 0
+    assert page.read_bytes() == written
+    assert not [*(tmp_path / "runs").glob("mountain_car-*")]
+    assert main(ActuatorStudy, [*call, "--total-steps", "500"]) == 0  # of another configuration they do not
+    assert [*(tmp_path / "runs").glob("mountain_car-*/result.json")]
+
+
+@pytest.mark.matrix
+def test_the_published_page_is_what_the_published_rows_say(tmp_path):
+    """Byte for byte, with its tables and figures; no run folder is at hand."""
+    for name in ("runs.csv", "totals.json"):
+        (tmp_path / FOLDER).mkdir(exist_ok=True)
+        shutil.copy(RESULTS / FOLDER / name, tmp_path / FOLDER)
+    shutil.copy(RESULTS / "actuators_conclusions.md", tmp_path)
+    files, failures = ActuatorStudy(root=tmp_path / "none", out=tmp_path).write()
+    assert not failures
+    assert {file.name for file in files} == {PAGE, *(file.name for file in (RESULTS / FOLDER).iterdir())}
+    for file in files:
+        assert file.read_bytes() == (RESULTS / file.relative_to(tmp_path)).read_bytes(), file.name
 
 
 @pytest.mark.parametrize("wrong", [{"tasks": ("pendulm",)}, {"seeds": 0}, {"episodes": 1.5}, {"total_steps": True}])
 def test_what_cannot_be_is_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         ActuatorStudy(**wrong)
+
+
+@pytest.mark.parametrize("flag", ["--root", "--out"])
+def test_what_cannot_be_written_is_refused_before_anything_is_computed(flag, tmp_path, capsys):
+    (tmp_path / "file").touch()
+    options = {"--root": tmp_path / "runs", "--out": tmp_path / "out"} | {flag: tmp_path / "file" / "inside"}
+    assert main(ActuatorStudy, [*(str(word) for pair in options.items() for word in pair)]) == 2
+    assert "file" in capsys.readouterr().err
+    assert not (tmp_path / "runs").exists()

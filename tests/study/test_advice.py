@@ -8,10 +8,11 @@ import math
 import numpy as np
 import pytest
 
+from actuator_study.questions import secondary
 from codrl_mj import cli
 from codrl_mj.actuators import Actuator, CurrentLoop, Lag, Motor, Supply
 from codrl_mj.motor_design import find_drive, torque_limits
-from codrl_mj.study.actuators.advice import (
+from codrl_mj.study.advice import (
     BUY,
     IDEAL,
     LOOP,
@@ -23,11 +24,9 @@ from codrl_mj.study.actuators.advice import (
     doses,
     redesign,
 )
-from codrl_mj.study.actuators.evidence import Evidence
-from codrl_mj.study.actuators.levels import AXES, REFERENCE_SPEEDS, supplied, timestep
-from codrl_mj.study.actuators.measured import measured, measured_grid
-from codrl_mj.study.actuators.questions import secondary
-from codrl_mj.study.actuators.verdicts import FLOORS
+from codrl_mj.study.doses import AXES, FLOORS, REFERENCE_SPEEDS, supplied, timestep
+from codrl_mj.study.evidence import Evidence
+from codrl_mj.study.measured import measured, measured_grid
 from codrl_mj.tasks import find_task, named_actuator
 from tests.matrix import but
 from tests.study.pretended import pretend

@@ -7,13 +7,13 @@ import pytest
 
 from codrl_mj import CurrentLoop, Motor, named_actuator
 from codrl_mj.actuators import IDEAL
-from codrl_mj.study.reproduction.arms import ARMS, TASKS
-from codrl_mj.study.reproduction.claims import CLAIMS, LONG_EPOCH, PAPER_SAYS, PORT
-from codrl_mj.study.reproduction.figures import band, running_mean
-from codrl_mj.study.reproduction.series import Series, by_epoch
-from codrl_mj.study.reproduction.verdicts import COMPATIBLE, CONFIRMED, NOT_CONFIRMED, NOT_TESTABLE, OUTCOMES
 from codrl_mj.study.trials import numbers_as_text
 from codrl_mj.training import TrainConfig
+from reproduction.arms import ARMS, TASKS
+from reproduction.checks import COMPATIBLE, CONFIRMED, NOT_CONFIRMED, NOT_TESTABLE, OUTCOMES
+from reproduction.claims import CLAIMS, LONG_EPOCH, PAPER_SAYS, PORT
+from reproduction.figures import band, running_mean
+from reproduction.series import Series, by_epoch
 from tests.study.reproduction.worlds import OTHERS, PAPERS, trained, world
 
 ARM = {arm.name: arm for arm in ARMS}

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from codrl_mj.study.reproduction.value_iteration import Mesh, Model, interpolation, iterate, optimum
+from reproduction.value_iteration import Mesh, Model, interpolation, iterate, optimum
 
 COARSE = Mesh(61, 61, 11)
 

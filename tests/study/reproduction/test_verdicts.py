@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from codrl_mj.study.reproduction.verdicts import (
+from reproduction.checks import (
     COMPATIBLE,
     CONFIRMED,
     NOT_CONFIRMED,

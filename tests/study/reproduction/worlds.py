@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from codrl_mj.study.reproduction.arms import ARMS, CENTRE, TEST
-from codrl_mj.study.reproduction.series import Series, Trained
+from reproduction.arms import ARMS, CENTRE, TEST
+from reproduction.series import Series, Trained
 
 SPREAD = np.array([-1.0, 0.0, 1.0, 0.5, -0.5])
 """Of five seeds around what they are said to be."""

@@ -1,4 +1,4 @@
-"""What stands between a command and its force, in doses: one thing at a time, from none of it to too much.
+"""What stands between a command and its force, in doses: one thing at a time; and policies trained and tested on it.
 
 Every dose is a pure number that means the same on every task: times in steps of the policy, forces in shares of the
 task's largest one, supplies in shares of what the task's motor needs.
@@ -12,8 +12,32 @@ from typing import Any
 from codrl_mj.actuators import IDEAL, Actuator, CurrentLoop, Drive, GearMotor, Lag, Motor, SampledLoop, Supply
 from codrl_mj.disturbances import Disturbances, Joint
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.study.reproduction.arms import CENTRE_RADIUS
+from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import find_task
+from codrl_mj.training import TrainConfig
+
+SECONDS: Mapping[str, float] = {
+    "pendulum": 22.0,
+    "cartpole": 11.0,
+    "acrobot": 35.0,
+    "furuta": 40.0,
+    "mountain_car": 4.0,
+    "mountain_car_continuous": 25.0,
+}
+"""Task -> a training's computing time [s of one core], about. The tasks of the study."""
+BUDGETS: Mapping[str, int] = {"pendulum": 160_000}
+"""Task -> environment steps of a training, where the agent's default budget leaves some seeds short."""
+FLOORS: Mapping[str, float] = {
+    "pendulum": -1223.0,
+    "cartpole": 17.8,
+    "acrobot": -499.8,
+    "furuta": 3.1,
+    "mountain_car": -200.0,
+    "mountain_car_continuous": -32.9,
+}
+"""Task -> mean return of random actions on ideal forces, over 300 episodes: the lower end of the task's span."""
+CENTRE_RADIUS = 0.1
+"""How near to the centre the paper's CartPole is rewarded [m]."""
 
 REFERENCE_SPEEDS: Mapping[str, float] = {
     "pendulum": 6.0,
@@ -168,3 +192,38 @@ AXES: Mapping[str, Axis] = {
     ),
 }
 """The axes by name."""
+
+
+def arm(task: str, name: str, env: EnvConfig) -> Arm:
+    """The arm of the task's agent in an environment: default settings, and nothing is evaluated on the way."""
+    agent = "sarsa" if task == "mountain_car" else "ppo"
+    changes: dict[str, Any] = {"total_steps": BUDGETS[task]} if task in BUDGETS else {}
+    base = TrainConfig.preset(task, agent, **changes)
+    never = 10**9
+    config = dataclasses.replace(base, env=env, evaluation_interval=never, checkpoint_interval=never)
+    return Arm(f"{task}: {name}", config, SECONDS[task])
+
+
+def ideal(task: str) -> Arm:
+    """Trained on forces that come as they are asked for."""
+    return arm(task, "ideal", posed(task))
+
+
+def matched(task: str, axis: str) -> Arm:
+    """Trained through one dose of one thing."""
+    return arm(task, axis, AXES[axis].at(task, AXES[axis].trained[task]))
+
+
+def dosed(arm: Arm, axis: str, dose: float) -> Trial:
+    """Policies tested on a dose."""
+    return Trial(arm, f"{axis} {dose:g}", AXES[axis].at(arm.task, dose))
+
+
+def at_home(arm: Arm) -> Trial:
+    """Policies tested on ideal forces."""
+    return Trial(arm, "ideal", posed(arm.task))
+
+
+def undosed(arm: Arm, axis: str) -> Trial:
+    """Policies tested on none of it: on ideal forces, or on the axis' motor."""
+    return dosed(arm, axis, 0.0) if AXES[axis].own_motor else at_home(arm)

@@ -9,12 +9,12 @@ from typing import NamedTuple
 import numpy as np
 
 from codrl_mj.evaluation.measures import Interval
-from codrl_mj.study.actuators import arms
-from codrl_mj.study.actuators.levels import AXES
-from codrl_mj.study.actuators.questions import MARGIN, Contrast, dosed, undosed
-from codrl_mj.study.actuators.tables import HYPOTHESES
+from codrl_mj.study.doses import AXES, dosed, ideal, matched, undosed
+from codrl_mj.study.questions import MARGIN, Contrast
 
-_PACKAGE = Path(__file__).parents[2]
+HYPOTHESES = "hypotheses.csv"
+"""A row for every question of the study."""
+_PACKAGE = Path(__file__).parents[1]
 EVIDENCE = (_PACKAGE / "_assets" / "study", _PACKAGE.parent / "docs" / "results" / "actuators")
 """Where the study's results lie: in a wheel, in a checkout."""
 _COLUMNS = ("name", "compared", "effect", "low", "high")
@@ -76,9 +76,7 @@ class Evidence:
                 with path.open(newline="", encoding="utf-8") as opened:
                     rows = list(csv.DictReader(opened))
                 if lacking := [name for name in _COLUMNS if rows and name not in rows[0]]:
-                    raise ValueError(
-                        f"{path}: has no column {lacking[0]!r}: give the {HYPOTHESES} of codrl-mj study actuators"
-                    )
+                    raise ValueError(f"{path}: has no column {lacking[0]!r}: give the {HYPOTHESES} of the study")
                 for number, row in enumerate(rows, start=2):
                     for key in _COLUMNS[2:]:
                         if row["effect"] and not _finite(row[key]):
@@ -88,7 +86,7 @@ class Evidence:
 
     def effect(self, contrast: Contrast) -> tuple[str, Interval] | None:
         """Name and effect of the hypothesis that has this comparison alone; None if it was not answered."""
-        row = self._rows.get(f"{contrast.one.name} over {contrast.other.name}")
+        row = self._rows.get(contrast.name)
         if row is None:
             return None
         return row["name"], Interval(*(float(row[key]) for key in ("effect", "low", "high")))
@@ -113,9 +111,9 @@ class Evidence:
         return Loss(axis, dose, between, dose > 1.005 * tested[-1], rows, curve.kept, curve.trained)
 
     def _curve(self, task: str, axis: str) -> "_Curve | None":
-        ideal, tested = arms.ideal(task), AXES[axis].doses
-        none = undosed(ideal, axis)
-        found = {dose: self.effect(Contrast(dosed(ideal, axis, dose), none)) for dose in tested[1:]}
+        home, tested = ideal(task), AXES[axis].doses
+        none = undosed(home, axis)
+        found = {dose: self.effect(Contrast(dosed(home, axis, dose), none)) for dose in tested[1:]}
         known = {dose: effect for dose, effect in found.items() if effect is not None}
         if len(known) < len(found):
             return None
@@ -124,7 +122,7 @@ class Evidence:
         if task not in AXES[axis].trained:
             return _Curve(lost, rows, None, math.inf)
         at = AXES[axis].trained[task]
-        won = self.effect(Contrast(dosed(arms.matched(task, axis), axis, at), dosed(ideal, axis, at)))
+        won = self.effect(Contrast(dosed(matched(task, axis), axis, at), dosed(home, axis, at)))
         return _Curve(lost, rows, None if won is None else lost[tested.index(at)].mean - won[1].mean, at)
 
 

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from codrl_mj.study.reproduction.arms import CENTRE
-from codrl_mj.study.reproduction.series import Epochs, Series
-from codrl_mj.study.reproduction.value_iteration import TASK as VALUE_TASK
-from codrl_mj.study.reproduction.verdicts import Check, Verdict, every_seed, higher, one_episode, one_run, same, within
 from codrl_mj.tasks import TASKS
+from reproduction.arms import CENTRE
+from reproduction.checks import Check, Verdict, every_seed, higher, one_episode, one_run, same, within
+from reproduction.series import Epochs, Series
+from reproduction.value_iteration import TASK as VALUE_TASK
 
 PAPER_SAYS, PORT = "paper", "this port"
 """Who says it: the paper; or ourselves, since both kinds of physics are to be one."""

@@ -6,13 +6,13 @@ from typing import Any
 
 from codrl_mj.actuators import IDEAL, Actuator, CurrentLoop
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.study.doses import CENTRE_RADIUS
 from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import find_task
 from codrl_mj.training import TrainConfig
 
 TEST, CENTRE = "test", "centre"
 """Tests of a trained policy: the task as Gymnasium poses it; CartPole's with the reward that it was trained with."""
-CENTRE_RADIUS = 0.1  # m, the paper's, CartPole
 
 
 @dataclasses.dataclass(frozen=True)

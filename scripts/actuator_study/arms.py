@@ -3,25 +3,14 @@
 import dataclasses
 from typing import Any
 
-from codrl_mj.actuators import Actuator, Drive, GearMotor, Lag, SampledLoop, Supply
+from codrl_mj.actuators import Drive, Lag
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.study.actuators.levels import AXES, posed, timestep
+from codrl_mj.study.advice import redesigned
+from codrl_mj.study.doses import AXES, arm, posed, timestep
 from codrl_mj.study.trials import Arm
 from codrl_mj.tasks import find_task, named_actuator
-from codrl_mj.training import TrainConfig
 
-SECONDS: dict[str, float] = {
-    "pendulum": 22.0,
-    "cartpole": 11.0,
-    "acrobot": 35.0,
-    "furuta": 40.0,
-    "mountain_car": 4.0,
-    "mountain_car_continuous": 25.0,
-}
-"""Task -> a training's computing time [s of one core], about. The tasks of the study."""
-BUDGETS: dict[str, int] = {"pendulum": 160_000}
-"""Task -> environment steps of a training, where the agent's default budget leaves some seeds short."""
 TRAINED = ("pendulum", "furuta")
 """The tasks on which doses are trained through: those whose score every dose moves, and that have no ceiling nearby.
 (CartPole's is reached by ideal-trained policies under every dose but lag and delay.)"""
@@ -45,16 +34,6 @@ MARGINAL: dict[str, dict[str, Any]] = {
     "furuta": {"name": "quanser-qube-servo-2", "gear": 1.0, "voltage": 6.0},
 }
 """Task -> a motor that it calls `try it`: some bound says that it does not suffice. On the cars there is none."""
-
-
-def ideal(task: str) -> Arm:
-    """Trained on forces that come as they are asked for."""
-    return arm(task, "ideal", posed(task))
-
-
-def matched(task: str, axis: str) -> Arm:
-    """Trained through one dose of one thing."""
-    return arm(task, axis, AXES[axis].at(task, AXES[axis].trained[task]))
 
 
 def drawn(task: str, axis: str) -> Arm:
@@ -101,39 +80,9 @@ def designed(task: str) -> Drive:
     return redesigned(named_actuator("paper", task), task)
 
 
-def redesigned(actuator: Actuator, task: str) -> Drive:
-    """The motor and supply of a current loop under a designed one: pole-zero cancellation, anti-windup, a limit."""
-    motor, voltage = actuator.motor, actuator.controller.max_voltage
-    if actuator.supply is not None:
-        voltage = min(voltage, actuator.supply.voltage)
-    limit = motor.arm_radius * find_task(task).max_force / motor.torque_constant
-    return Drive(
-        GearMotor(
-            motor.resistance,
-            motor.inductance,
-            motor.torque_constant,
-            motor.back_emf_constant,
-            rotor_inertia=0.0,
-            arm_radius=motor.arm_radius,
-        ),
-        SampledLoop(sample_rate=20.0 / timestep(task), max_current=limit),
-        Supply(voltage) if actuator.supply is None else dataclasses.replace(actuator.supply, voltage=voltage),
-    )
-
-
 def motor(task: str, chosen: dict[str, Any]) -> EnvConfig:
     """A motor of the catalogue under the drive that it gets there, at a gear, on its nominal or another voltage."""
     named = {"name": chosen["name"], "motor": {"gear_ratio": chosen["gear"]}}
     if "voltage" in chosen:
         named["supply"] = {"voltage": chosen["voltage"]}
     return posed(task, named)
-
-
-def arm(task: str, name: str, env: EnvConfig) -> Arm:
-    """The arm of the task's agent in an environment: default settings, and nothing is evaluated on the way."""
-    agent = "sarsa" if task == "mountain_car" else "ppo"
-    changes: dict[str, Any] = {"total_steps": BUDGETS[task]} if task in BUDGETS else {}
-    base = TrainConfig.preset(task, agent, **changes)
-    never = 10**9
-    config = dataclasses.replace(base, env=env, evaluation_interval=never, checkpoint_interval=never)
-    return Arm(f"{task}: {name}", config, SECONDS[task])

@@ -8,14 +8,13 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from codrl_mj.actuators import Actuator, Drive
+from codrl_mj.actuators import Actuator, Drive, GearMotor, SampledLoop, Supply
 from codrl_mj.evaluation.measures import Interval
 from codrl_mj.sizing.bench import Delivery, delivery
-from codrl_mj.study.actuators import arms
-from codrl_mj.study.actuators.evidence import Evidence, Loss
-from codrl_mj.study.actuators.levels import AXES, REFERENCE_SPEEDS, noise, timestep
-from codrl_mj.study.actuators.questions import MARGIN
+from codrl_mj.study.doses import AXES, REFERENCE_SPEEDS, noise, timestep
+from codrl_mj.study.evidence import Evidence, Loss
 from codrl_mj.study.grid import check_chosen
+from codrl_mj.study.questions import MARGIN
 from codrl_mj.tasks import find_task
 
 IDEAL, LOOP, THROUGH, BUY = "train on ideal", "design the loop", "train through it", "buy another"
@@ -97,11 +96,31 @@ def redesign(actuator: Any, task: str) -> Drive | None:
     """
     if isinstance(actuator, Actuator):  # what a sensor gets wrong no loop makes right
         wrong = actuator.controller.current_noise or actuator.controller.current_bias
-        return None if wrong else arms.redesigned(actuator, task)
+        return None if wrong else redesigned(actuator, task)
     if isinstance(actuator, Drive):
         loop = dataclasses.replace(actuator.controller, bandwidth=0.0, kp=0.0, ki=0.0, anti_windup="back_calculation")
         return None if loop == actuator.controller else dataclasses.replace(actuator, controller=loop)
     return None
+
+
+def redesigned(actuator: Actuator, task: str) -> Drive:
+    """The motor and supply of a current loop under a designed one: pole-zero cancellation, anti-windup, a limit."""
+    motor, voltage = actuator.motor, actuator.controller.max_voltage
+    if actuator.supply is not None:
+        voltage = min(voltage, actuator.supply.voltage)
+    limit = motor.arm_radius * find_task(task).max_force / motor.torque_constant
+    return Drive(
+        GearMotor(
+            motor.resistance,
+            motor.inductance,
+            motor.torque_constant,
+            motor.back_emf_constant,
+            rotor_inertia=0.0,
+            arm_radius=motor.arm_radius,
+        ),
+        SampledLoop(sample_rate=20.0 / timestep(task), max_current=limit),
+        Supply(voltage) if actuator.supply is None else dataclasses.replace(actuator.supply, voltage=voltage),
+    )
 
 
 def advise(actuator: Any, task: str, evidence: Evidence) -> Advice:

@@ -7,30 +7,21 @@ from pathlib import Path
 
 import numpy as np
 
-from codrl_mj.runs.files import writing
-from codrl_mj.study.actuators import arms, figures, tables
-from codrl_mj.study.actuators.evidence import Evidence
-from codrl_mj.study.actuators.exploration import around_the_paper, paper_loops, windup
-from codrl_mj.study.actuators.levels import AXES
-from codrl_mj.study.actuators.questions import (
-    at_home,
-    dosed,
-    on_loop,
-    on_motor,
-    primary,
-    secondary,
-    through_loop,
-    through_motor,
-)
-from codrl_mj.study.actuators.verdicts import FLOORS, LEVEL, MARGIN, Scores, Verdict, judge, seeds_to_close
-from codrl_mj.study.conclusions import conclusions_section
-from codrl_mj.study.figures import TITLES
+from actuator_study import arms, figures
+from actuator_study.exploration import around_the_paper, paper_loops, windup
+from actuator_study.questions import on_loop, on_motor, primary, secondary, through_loop, through_motor
+from codrl_mj.runs.files import write_json
+from codrl_mj.study.doses import AXES, FLOORS, SECONDS, at_home, dosed, ideal
+from codrl_mj.study.evidence import HYPOTHESES, Evidence
 from codrl_mj.study.inference import detectable
-from codrl_mj.study.tables import markdown_table
-from codrl_mj.study.trials import Collected, Trial
+from codrl_mj.study.pages import TITLES, conclusions_section, markdown_table, write_csv, write_page
+from codrl_mj.study.questions import LEVEL, MARGIN, Scores, Verdict, judge
+from codrl_mj.study.trials import RUNS, TOTALS, Collected, Trial, run_rows, trial_rows
 
 PAGE, FOLDER = "actuators.md", "actuators"
 """The page, and the folder beside it with its figures and tables."""
+TRIALS = "trials.csv"
+"""A row for every trial."""
 QUESTIONS: Mapping[str, str] = {
     "matters": "When does an actuator matter?",
     "tune": "Tune or train?",
@@ -51,10 +42,17 @@ def write(collected: Collected, out: Path) -> list[Path]:
     Returns:
         The files that were written.
     """
-    folder, scores = out / FOLDER, Scores(collected)
-    first, others = judge(scores, primary()), judge(scores, secondary())
+    folder, scores = out / FOLDER, Scores(collected, FLOORS, [at_home(ideal(task)) for task in SECONDS])
+    first, others = judge(scores, primary(), primary=True), judge(scores, secondary())
     drawn = _draw(scores, folder)
-    written = [*drawn.values(), *tables.write(collected, scores, [*first, *others], folder)]
+    rows = {
+        RUNS: run_rows(collected, scores.of),
+        TRIALS: trial_rows(collected, scores.of),
+        HYPOTHESES: (verdict.row(len(first)) for verdict in (*first, *others)),
+    }
+    for name, table in rows.items():
+        write_csv(folder / name, list(table))
+    write_json(folder / TOTALS, collected.totals._asdict())
     advice = _advice(folder, scores)
     parts = [
         _head(collected),
@@ -66,9 +64,8 @@ def write(collected: Collected, out: Path) -> list[Path]:
         _missing(collected),
         _method(collected, scores),
     ]
-    with writing(out / PAGE) as temporary:
-        temporary.write_text("\n".join(part for part in parts if part))
-    return [out / PAGE, *written, *advice]
+    write_page(out / PAGE, parts)
+    return [out / PAGE, *drawn.values(), *(folder / name for name in (*rows, TOTALS)), *advice]
 
 
 def _draw(scores: Scores, folder: Path) -> dict[str, Path]:
@@ -77,7 +74,7 @@ def _draw(scores: Scores, folder: Path) -> dict[str, Path]:
     figures.doses(found["matters"], scores)
     loops: dict[str, list[tuple[str, Trial]]] = {
         f"{TITLES[task]},\n{loop}": [
-            ("ideal-trained", on_loop(arms.ideal(task), loop)),
+            ("ideal-trained", on_loop(ideal(task), loop)),
             ("trained through it", on_loop(through_loop(task, loop), loop)),
         ]
         for task in arms.LOOPED
@@ -85,14 +82,14 @@ def _draw(scores: Scores, folder: Path) -> dict[str, Path]:
     }
     figures.bars(found["tune"], scores, loops, "The paper's motor under three loops")
     motors: dict[str, list[tuple[str, Trial]]] = {}
-    for task in arms.SECONDS:
-        ideal = arms.ideal(task)
+    for task in SECONDS:
+        home = ideal(task)
         motors[TITLES[task].replace("Continuous ", "Continuous\n")] = [
-            ("ideal-trained, on ideal forces", at_home(ideal)),
-            ("ideal-trained, on the good motor", on_motor(ideal, "good")),
+            ("ideal-trained, on ideal forces", at_home(home)),
+            ("ideal-trained, on the good motor", on_motor(home, "good")),
             *(
                 [
-                    ("ideal-trained, on the marginal motor", on_motor(ideal, "marginal")),
+                    ("ideal-trained, on the marginal motor", on_motor(home, "marginal")),
                     ("trained through the marginal motor", on_motor(through_motor(task), "marginal")),
                 ]
                 if task in arms.MARGINAL
@@ -105,7 +102,7 @@ def _draw(scores: Scores, folder: Path) -> dict[str, Path]:
 
 def _advice(folder: Path, scores: Scores) -> list[Path]:
     """Draw what is advised, and how well it was foretold; nothing where results are missing."""
-    evidence, files = Evidence.read(folder / tables.HYPOTHESES), [folder / "chart.svg", folder / "foretold.svg"]
+    evidence, files = Evidence.read(folder / HYPOTHESES), [folder / "chart.svg", folder / "foretold.svg"]
     if not figures.chart(files[0], evidence):
         return []
     figures.foretold(files[1], scores, evidence)
@@ -152,7 +149,7 @@ def _explored(scores: Scores) -> str:
     ]
     return f"""## Exploration
 
-Not planned, and without p: mean scores of the same policies, rows of [trials]({FOLDER}/{tables.TRIALS}). A supply that
+Not planned, and without p: mean scores of the same policies, rows of [trials]({FOLDER}/{TRIALS}). A supply that
 lacks a share of what is needed, under ideal-trained policies, with anti-windup / with an integrator that goes on while
 the voltage saturates:
 
@@ -168,19 +165,19 @@ def _mean(scores: Scores, trial: Trial) -> str:
 
 
 def _head(collected: Collected) -> str:
-    grid = collected.grid
-    done, wanted = len(collected.folders), len(grid.cells())
+    grid, totals = collected.grid, collected.totals
+    done, wanted = totals.trainings, len(grid.cells())
     tested, tests = sum(map(len, collected.evaluations.values())), len(grid.deployments())
-    codes = ", ".join(f"`{code}` ({count})" for code, count in sorted(collected.codes.items())) or "none"
+    codes = ", ".join(f"`{code}` ({count})" for code, count in sorted(totals.codes.items())) or "none"
     return f"""# What does an actuator cost?
 
-{done} of {wanted} trainings are finished ({collected.seconds / 3600:.1f} hours of one core), and {tested} of {tests}
+{done} of {wanted} trainings are finished ({totals.seconds / 3600:.1f} hours of one core), and {tested} of {tests}
 tests. [The plan](plan.md) was written before the first of them: questions, hypotheses, tests.
 Versions of the code that trained, with the number of runs: {codes}.
 
-`codrl-mj study actuators` writes this page, its figures and its tables; do not edit it
-([how to run it](../studies.md)). The numbers are files: [hypotheses]({FOLDER}/{tables.HYPOTHESES}),
-[trials]({FOLDER}/{tables.TRIALS}), [runs]({FOLDER}/{tables.RUNS}).
+`python scripts/study_actuators.py` writes this page, its figures and its tables; do not edit it
+([how to run it](../studies.md)). The numbers are files: [hypotheses]({FOLDER}/{HYPOTHESES}),
+[trials]({FOLDER}/{TRIALS}), [runs]({FOLDER}/{RUNS}).
 """
 
 
@@ -188,14 +185,14 @@ def _verdicts(verdicts: Sequence[Verdict]) -> str:
     """The primary hypotheses, one row each."""
     rows = []
     for verdict in verdicts:
-        says = verdict.hypothesis.statement
-        if verdict.outcome == "open" and (seeds := seeds_to_close(verdict)) is not None:
+        says = verdict.question.statement
+        if verdict.outcome == "open" and (seeds := verdict.seeds_to_close(len(verdicts))) is not None:
             says += f" (about {seeds} seeds would tell)"
         tested, wanted = verdict.strata
         if tested < wanted:
             says += f" ({tested} of {wanted} comparisons have runs)"
         policies = str(min(verdict.runs))
-        name = verdict.hypothesis.name
+        name = verdict.question.name
         rows.append([name, verdict.outcome, _effect(verdict), _p(verdict.corrected), policies, says])
     header = ["", "holds", "effect [95 %]", "corrected p", "policies", "says"]
     return f"## The twelve hypotheses\n\n{markdown_table(header, rows)}"
@@ -212,7 +209,7 @@ def _p(value: float) -> str:
 
 def _question(name: str, title: str, verdicts: Sequence[Verdict], drawn: Mapping[str, Path]) -> str:
     """A question: its figure, and how many of its secondary comparisons were decided, with the largest effects."""
-    mine = [verdict for verdict in verdicts if verdict.hypothesis.question == name and verdict.runs != (0, 0)]
+    mine = [verdict for verdict in verdicts if verdict.question.section == name and verdict.runs != (0, 0)]
     decided = [verdict for verdict in mine if verdict.outcome != "open"]
     lines = [f"## {title}", ""]
     if name in drawn:
@@ -225,18 +222,18 @@ def _question(name: str, title: str, verdicts: Sequence[Verdict], drawn: Mapping
         f"{beyond or 'none'} by more than {MARGIN:g} of the span (its 95 % interval)." + " The largest:" * bool(decided)
     )
     largest = sorted(decided, key=lambda verdict: -abs(verdict.effect.mean))[:3]
-    lines += ["", *(f"- {one.hypothesis.statement}: {_effect(one)}" for one in largest)] if largest else []
+    lines += ["", *(f"- {one.question.statement}: {_effect(one)}" for one in largest)] if largest else []
     return "\n".join(lines) + "\n"
 
 
 def _harm(verdicts: Sequence[Verdict]) -> str:
     """A table of the doses that do no harm, and of those that do, to ideal-trained policies."""
-    effects = {pair.one.name: one.effect for one in verdicts for pair in one.hypothesis.contrasts}
+    effects = {pair.one.name: one.effect for one in verdicts for pair in one.question.contrasts}
     rows = []
-    for task in arms.SECONDS:
+    for task in SECONDS:
         rows.append([TITLES[task]])
         for name, axis in AXES.items():
-            known = [effects.get(dosed(arms.ideal(task), name, dose).name) for dose in axis.doses[1:]]
+            known = [effects.get(dosed(ideal(task), name, dose).name) for dose in axis.doses[1:]]
             borne = list(itertools.takewhile(lambda one: one is not None and one.low > -MARGIN, known))
             beyond = [dose for dose, one in zip(axis.doses[1:], known, strict=True) if one and one.high < -MARGIN]
             rows[-1].append(f"{axis.doses[len(borne)]:g}, {format(beyond[0], 'g') if beyond else '–'}")
@@ -248,7 +245,7 @@ lie within {MARGIN:g} of the span, and the smallest whose interval lies beyond i
 
 
 def _missing(collected: Collected) -> str:
-    if not collected.missing:
+    if not collected.totals.missing:
         return ""
     shown = [f"- failed: {name}: {error}" for name, error in list(collected.failures.items())[:10]]
     return (
@@ -256,8 +253,8 @@ def _missing(collected: Collected) -> str:
             [
                 "## What is missing",
                 "",
-                f"{len(collected.missing)} trainings and tests, of which "
-                f"{len(collected.failures)} failed. `codrl-mj study actuators --dry-run` lists them.",
+                f"{collected.totals.missing} trainings and tests, of which "
+                f"{len(collected.failures)} failed. `python scripts/study_actuators.py --dry-run` lists them.",
                 *shown,
             ]
         )

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.study.reproduction.arms import TEST, PaperArm
 from codrl_mj.study.trials import Collected, plain, training_seconds
 from codrl_mj.training.folder import EPISODES
 from codrl_mj.training.history import EPISODE_COLUMNS, read_episodes
+from reproduction.arms import TEST, PaperArm
 
 LAST = 50
 """Training episodes that the paper takes its means over."""

@@ -11,12 +11,13 @@ from codrl_mj.actuators import IDEAL
 from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.films.strip import ACTUAL, DESIRED
 from codrl_mj.runs.policies import load_policy
-from codrl_mj.study.figures import COLOURS, legend, save
-from codrl_mj.study.reproduction.arms import CENTRE_RADIUS, TEST, PaperArm
-from codrl_mj.study.reproduction.series import LAST, Series
-from codrl_mj.study.reproduction.value_iteration import Optimum
+from codrl_mj.study.doses import CENTRE_RADIUS
+from codrl_mj.study.pages import COLOURS, legend, save
 from codrl_mj.tasks import acrobot, cartpole, find_task, mountain_car, mountain_car_continuous, pendulum
 from codrl_mj.training import EVALUATION_SEED
+from reproduction.arms import TEST, PaperArm
+from reproduction.series import LAST, Series
+from reproduction.value_iteration import Optimum
 
 STYLES = {"ideal": (COLOURS[0], "--"), "paper gains": (COLOURS[2], "-"), "fast gains": (COLOURS[1], "-.")}
 """Of an arm, by its motor: colour and dashes."""

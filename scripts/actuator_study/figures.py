@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from actuator_study import arms
+from actuator_study.questions import on_loop, on_motor
 from codrl_mj.evaluation.measures import bootstrap_mean
-from codrl_mj.study.actuators import arms
-from codrl_mj.study.actuators.advice import BUY, IDEAL, LOOP, MEASURE, THROUGH, advise, decide
-from codrl_mj.study.actuators.evidence import Evidence
-from codrl_mj.study.actuators.levels import AXES
-from codrl_mj.study.actuators.questions import MARGIN, at_home, dosed, on_loop, on_motor, undosed
-from codrl_mj.study.actuators.verdicts import Scores
-from codrl_mj.study.figures import COLOURS, MARKERS, TITLES, legend, save
+from codrl_mj.study.advice import BUY, IDEAL, LOOP, MEASURE, THROUGH, advise, decide
+from codrl_mj.study.doses import AXES, SECONDS, at_home, dosed, ideal, matched, undosed
+from codrl_mj.study.evidence import Evidence
+from codrl_mj.study.pages import COLOURS, MARKERS, TITLES, legend, save
+from codrl_mj.study.questions import MARGIN, Scores
 from codrl_mj.study.trials import Trial
 
 _LOWEST = -0.1  # of the span; what is worse is as lost
@@ -30,9 +30,9 @@ def doses(path: Path, scores: Scores) -> None:
     figure = Figure(figsize=(10.0, 6.4), layout="constrained")
     panels: Any = figure.subplots(2, 3, sharey=True).ravel()
     for panel, (name, axis) in zip(panels, AXES.items(), strict=True):
-        for number, task in enumerate(arms.SECONDS):
+        for number, task in enumerate(SECONDS):
             colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
-            trials = [undosed(arms.ideal(task), name), *(dosed(arms.ideal(task), name, x) for x in axis.doses[1:])]
+            trials = [undosed(ideal(task), name), *(dosed(ideal(task), name, x) for x in axis.doses[1:])]
             there = [(place, found) for place, one in enumerate(trials) if (found := _values(scores, one)).size]
             if there:
                 means = [bootstrap_mean(found) for _, found in there]
@@ -41,9 +41,9 @@ def doses(path: Path, scores: Scores) -> None:
                 _bars(panel, places, means, colour, marker, TITLES[task])
             if task in axis.trained:
                 place = axis.doses.index(axis.trained[task]) + 0.06 * (number - 2.5)
-                matched = _values(scores, dosed(arms.matched(task, name), name, axis.trained[task]))
-                if matched.size:
-                    panel.plot(place, matched.mean(), "*", color=colour, markersize=13, markeredgecolor="white")
+                through = _values(scores, dosed(matched(task, name), name, axis.trained[task]))
+                if through.size:
+                    panel.plot(place, through.mean(), "*", color=colour, markersize=13, markeredgecolor="white")
         panel.set_xticks(range(len(axis.doses)), [f"{dose:g}" for dose in axis.doses])
         panel.set(xlabel=axis.unit, title=axis.title, ylim=(_LOWEST - 0.04, 1.12))
         panel.grid(axis="y", color="0.9")
@@ -99,7 +99,7 @@ def chart(path: Path, evidence: Evidence) -> bool:
     from scipy.ndimage import distance_transform_edt
 
     lags, lacks = np.geomspace(0.05, 8.0, 120), np.linspace(0.0, 0.8, 81)
-    tasks = [task for task in arms.SECONDS if all(evidence.loss(task, axis, 0.0) for axis in ("lag", "supply"))]
+    tasks = [task for task in SECONDS if all(evidence.loss(task, axis, 0.0) for axis in ("lag", "supply"))]
     if not tasks:
         return False
     figure = Figure(figsize=(10.0, 6.4), layout="constrained")
@@ -137,11 +137,11 @@ def foretold(path: Path, scores: Scores, evidence: Evidence) -> None:
 
     figure = Figure(figsize=(5.4, 4.6), layout="constrained")
     axes: Any = figure.subplots()
-    for number, task in enumerate(arms.SECONDS):
-        ideal = arms.ideal(task)
-        home = _values(scores, at_home(ideal))
-        tested = [on_motor(ideal, "good"), *([on_motor(ideal, "marginal")] if task in arms.MARGINAL else [])]
-        tested += [on_loop(ideal, loop) for loop in ("weaker", "paper", "designed") if task in arms.LOOPED]
+    for number, task in enumerate(SECONDS):
+        arm = ideal(task)
+        home = _values(scores, at_home(arm))
+        tested = [on_motor(arm, "good"), *([on_motor(arm, "marginal")] if task in arms.MARGINAL else [])]
+        tested += [on_loop(arm, loop) for loop in ("weaker", "paper", "designed") if task in arms.LOOPED]
         for trial in tested:
             values, advice = _values(scores, trial), advise(trial.env.actuator, task, evidence)
             if values.size and advice.losses:

@@ -3,10 +3,10 @@
 import dataclasses
 from typing import Any
 
+from actuator_study import arms
+from actuator_study.questions import on_loop, through_loop
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.study.actuators import arms
-from codrl_mj.study.actuators.levels import AXES, posed, supply, timestep
-from codrl_mj.study.actuators.questions import dosed, on_loop, through_loop
+from codrl_mj.study.doses import AXES, SECONDS, dosed, ideal, posed, supply, timestep
 from codrl_mj.study.trials import Trial
 from codrl_mj.tasks import find_task
 
@@ -23,12 +23,12 @@ def windup() -> dict[str, list[tuple[Trial, Trial]]]:
     return {
         task: [
             (
-                dosed(arms.ideal(task), "supply", dose),
-                Trial(arms.ideal(task), f"supply {dose:g}, winding up", wound_up(task, dose)),
+                dosed(ideal(task), "supply", dose),
+                Trial(ideal(task), f"supply {dose:g}, winding up", wound_up(task, dose)),
             )
             for dose in AXES["supply"].doses[1:]
         ]
-        for task in arms.SECONDS
+        for task in SECONDS
     }
 
 
@@ -62,7 +62,7 @@ def around_the_paper() -> dict[str, list[Trial]]:
             *(Trial(arm, f"paper, {otherwise}", env) for otherwise, env in paper_loops(task).items()),
         ]
         for task in arms.LOOPED
-        for name, arm in (("ideal-trained", arms.ideal(task)), ("trained on it", through_loop(task, "paper")))
+        for name, arm in (("ideal-trained", ideal(task)), ("trained on it", through_loop(task, "paper")))
     }
 
 

@@ -8,13 +8,11 @@ import numpy as np
 
 from codrl_mj.actuators import IDEAL as IDEAL_ACTUATOR
 from codrl_mj.evaluation.measures import Interval
-from codrl_mj.study.actuators import arms
-from codrl_mj.study.actuators.advice import BUY, IDEAL, LOOP, THROUGH, redesign
-from codrl_mj.study.actuators.levels import REFERENCE_SPEEDS, posed
-from codrl_mj.study.actuators.questions import MARGIN, at_home
-from codrl_mj.study.actuators.verdicts import FLOORS
+from codrl_mj.study.advice import BUY, IDEAL, LOOP, THROUGH, redesign
+from codrl_mj.study.doses import FLOORS, REFERENCE_SPEEDS, arm, at_home, ideal, posed
 from codrl_mj.study.grid import check_chosen
 from codrl_mj.study.inference import Stratum, effect
+from codrl_mj.study.questions import MARGIN
 from codrl_mj.study.trials import Collected, Grid, Trial
 
 
@@ -40,11 +38,11 @@ def measured_grid(actuator: Any, task: str, seeds: int, root: Path, episodes: in
 
 
 def _measured(actuator: Any, task: str) -> dict[str, Trial]:
-    here, ideal = posed(task, actuator), arms.ideal(task)
-    through = arms.arm(task, "through it", here)
-    found = {"home": at_home(ideal), IDEAL: Trial(ideal, "it", here), THROUGH: Trial(through, "it", here)}
+    here, untouched = posed(task, actuator), ideal(task)
+    through = arm(task, "through it", here)
+    found = {"home": at_home(untouched), IDEAL: Trial(untouched, "it", here), THROUGH: Trial(through, "it", here)}
     better = redesign(actuator, task)
-    return found if better is None else found | {LOOP: Trial(ideal, "designed", posed(task, better))}
+    return found if better is None else found | {LOOP: Trial(untouched, "designed", posed(task, better))}
 
 
 class Measured(NamedTuple):

@@ -1,0 +1,232 @@
+"""The hypotheses of the study, as they were written down before it: docs/results/plan.md has them in words."""
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Any
+
+from actuator_study import arms
+from actuator_study.arms import DRAWN, GOOD, LOOPED, MARGINAL, TRAINED
+from codrl_mj.disturbances import Disturbances, Joint
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.study.doses import AXES, SECONDS, arm, at_home, dosed, ideal, matched, posed, undosed
+from codrl_mj.study.questions import Contrast, Question
+from codrl_mj.study.trials import Arm, Trial
+from codrl_mj.tasks import find_task
+
+
+def _trained_dose(arm: Arm, axis: str) -> Trial:
+    return dosed(arm, axis, AXES[axis].trained[arm.task])
+
+
+def _contrasts(axis: str, one: Any, other: Any) -> tuple[Contrast, ...]:
+    """At the axis' trained dose, on every task: arms made by functions of the task."""
+    return tuple(Contrast(_trained_dose(one(task), axis), _trained_dose(other(task), axis)) for task in TRAINED)
+
+
+def on_loop(arm: Arm, loop: str) -> Trial:
+    """Policies tested on the paper's motor under a loop."""
+    return Trial(arm, loop, posed(arm.task, arms.designed(arm.task) if loop == "designed" else loop))
+
+
+def through_loop(task: str, loop: str) -> Arm:
+    """Trained on the paper's motor under a loop."""
+    return arm(task, loop, posed(task, arms.designed(task) if loop == "designed" else loop))
+
+
+def on_motor(arm: Arm, kind: str) -> Trial:
+    """Policies tested on a motor of the catalogue."""
+    chosen = {"good": GOOD, "marginal": MARGINAL}[kind]
+    return Trial(arm, f"{kind} motor", arms.motor(arm.task, chosen[arm.task]))
+
+
+def through_motor(task: str, otherwise: str = "", **changes: Any) -> Arm:
+    """Trained through the marginal motor of the catalogue, with changes that have a name."""
+    named = ", ".join(filter(None, ["marginal motor", otherwise]))
+    return arm(task, named, dataclasses.replace(arms.motor(task, MARGINAL[task]), **changes))
+
+
+WRONG: dict[str, tuple[str, float]] = {
+    f"{name} {100 * (factor - 1):+.0f} %": (name, factor)
+    for name in ("resistance", "inductance")
+    for factor in (0.5, 0.75, 0.9, 1.1, 1.25, 1.5)
+}
+"""What of the motor is otherwise than in training, by what factor. A torque constant that the loop does not know of is
+an axis of its own, `weakness`."""
+
+
+def wrong_motors(task: str) -> dict[str, EnvConfig]:
+    """The actuator `weaker`, otherwise than trained through, by name: `WRONG`, and shares of the largest force."""
+    nominal, step, force = posed(task, "weaker"), find_task(task).step_duration, find_task(task).max_force
+    motor, loop = nominal.actuator.motor, nominal.actuator.controller
+
+    def driven(**parts: Any) -> EnvConfig:
+        return dataclasses.replace(nominal, actuator=dataclasses.replace(nominal.actuator, **parts))
+
+    def pushed(share: float) -> EnvConfig:
+        pulses = Disturbances(pulse_force=share * force, pulse_duration=step, pulse_interval=10 * step)
+        return dataclasses.replace(nominal, disturbances=pulses)
+
+    def rubbed(share: float) -> EnvConfig:
+        return dataclasses.replace(nominal, joint=Joint(friction=share * force))
+
+    noise = 0.2 * motor.arm_radius * force / motor.torque_constant  # A
+    return {
+        name: driven(motor=dataclasses.replace(motor, **{field: getattr(motor, field) * factor}))
+        for name, (field, factor) in WRONG.items()
+    } | {
+        "friction 5 %": rubbed(0.05),
+        "friction 20 %": rubbed(0.2),
+        "current noise 20 %": driven(controller=dataclasses.replace(loop, current_noise=noise)),
+        "pulses 25 %": pushed(0.25),
+        "pulses 50 %": pushed(0.5),
+    }
+
+
+def identified(task: str) -> Arm:
+    """Trained on what an identification leaves open: R within 2 %, L within 10 %, for every episode anew."""
+    nominal = posed(task, "weaker")
+    motor = nominal.actuator.motor
+
+    def around(name: str, share: float) -> str:
+        value = getattr(motor, name)
+        return f"motor.{name}=uniform({value * (1 - share):g}, {value * (1 + share):g})"
+
+    text = around("resistance", 0.02), around("inductance", 0.1)
+    return arm(task, "weaker, drawn", dataclasses.replace(nominal, randomize=text))
+
+
+def _mean_wrong(task: str, names: Iterable[str]) -> list[Contrast]:
+    nominal = through_loop(task, "weaker")
+    motors = wrong_motors(task)
+    return [Contrast(Trial(nominal, name, motors[name]), on_loop(nominal, "weaker")) for name in names]
+
+
+def primary() -> list[Question]:
+    """The twelve that are corrected together."""
+    numbered = enumerate(AXES, start=1)
+    quarter = [name for name in WRONG if name.endswith("25 %")]
+    return [
+        *(
+            Question(
+                f"P{number}",
+                "matters",
+                f"{AXES[axis].title}: policies trained through it score higher on it than policies trained on ideal "
+                "forces",
+                _contrasts(axis, lambda task, axis=axis: matched(task, axis), ideal),
+            )
+            for number, axis in numbered
+        ),
+        Question(
+            "P7",
+            "matters",
+            "Over all six: training through the very actuator scores higher than generic robustification as the plan "
+            "has it",
+            tuple(
+                pair
+                for axis in AXES
+                for pair in _contrasts(axis, lambda task, axis=axis: matched(task, axis), arms.generic)
+            ),
+        ),
+        Question(
+            "P8",
+            "matters",
+            "Over four: policies trained on drawn doses score as high as those trained on the very dose",
+            tuple(
+                pair
+                for axis in DRAWN
+                for pair in _contrasts(
+                    axis,
+                    lambda task, axis=axis: arms.drawn(task, axis),
+                    lambda task, axis=axis: matched(task, axis),
+                )
+            ),
+            "equivalent",
+        ),
+        Question(
+            "P9",
+            "tune",
+            "A designed loop under ideal-trained policies scores higher than a detuned one under policies that were "
+            "trained through it",
+            tuple(
+                Contrast(on_loop(ideal(task), "designed"), on_loop(through_loop(task, "weaker"), "weaker"))
+                for task in LOOPED
+            ),
+        ),
+        Question(
+            "P10",
+            "wrong",
+            "Policies trained through a motor score as high where its resistance or inductance is 25 % off",
+            tuple(pair for task in LOOPED for pair in _mean_wrong(task, quarter)),
+            "equivalent",
+        ),
+        Question(
+            "P11",
+            "motors",
+            "On a good motor that exists, ideal-trained policies score as high as on ideal forces",
+            tuple(Contrast(on_motor(ideal(task), "good"), at_home(ideal(task))) for task in SECONDS),
+            "equivalent",
+        ),
+        Question(
+            "P12",
+            "motors",
+            "On a marginal motor that exists, policies trained through it score higher than ideal-trained ones",
+            tuple(
+                Contrast(on_motor(through_motor(task), "marginal"), on_motor(ideal(task), "marginal"))
+                for task in MARGINAL
+            ),
+        ),
+    ]
+
+
+def secondary() -> list[Question]:
+    """All others, by section; each is one contrast."""
+    found: list[tuple[str, str, Trial, Trial]] = []
+    for task in SECONDS:
+        home = ideal(task)
+        for axis, described in AXES.items():
+            for dose in described.doses[1:]:
+                says = f"{task}, ideal-trained: {axis} {dose:g} over none"
+                found.append(("matters", says, dosed(home, axis, dose), undosed(home, axis)))
+    for task in TRAINED:
+        for axis in AXES:
+            through, generic = matched(task, axis), arms.generic(task)
+            for one, other in ((through, ideal(task)), (through, generic), (generic, ideal(task))):
+                pair = _trained_dose(one, axis), _trained_dose(other, axis)
+                found.append(("matters", f"{pair[0].name}, over {other.name}", *pair))
+        for axis in DRAWN:
+            pair = _trained_dose(arms.drawn(task, axis), axis), _trained_dose(matched(task, axis), axis)
+            found.append(("matters", f"{task}, {axis}: drawn over matched", *pair))
+    for task in LOOPED:
+        home, nominal, open_ = ideal(task), through_loop(task, "weaker"), identified(task)
+        for loop in ("weaker", "paper", "designed"):
+            says = f"{task}, {loop} loop: trained through it over ideal-trained"
+            found.append(("tune", says, on_loop(through_loop(task, loop), loop), on_loop(home, loop)))
+        says = f"{task}: designed loop over the paper's, ideal-trained"
+        found.append(("tune", says, on_loop(home, "designed"), on_loop(home, "paper")))
+        for name, env in wrong_motors(task).items():
+            there = Trial(nominal, name, env)
+            found.append(("wrong", f"{task}, {name} over nominal", there, on_loop(nominal, "weaker")))
+            found.append(("wrong", f"{task}, {name}: drawn over nominal", Trial(open_, name, env), there))
+    for task in SECONDS:
+        home = ideal(task)
+        found.append(("motors", f"{task}: good motor over ideal", on_motor(home, "good"), at_home(home)))
+    for task in MARGINAL:
+        there = on_motor(ideal(task), "marginal")
+        found.append(("motors", f"{task}: marginal motor over ideal", there, at_home(ideal(task))))
+        says = f"{task}, marginal motor: trained through it over ideal-trained"
+        found.append(("motors", says, on_motor(through_motor(task), "marginal"), there))
+    told = [through_motor(task, "current and reference observed", observe_actuator=True) for task in TRAINED]
+    # on Pendulum the marginal drive's current limit would bind the torque arm alone
+    for arm_told in (*told, through_motor("furuta", "voltage", action="voltage")):
+        plain = on_motor(through_motor(arm_told.task), "marginal")
+        found.append(("command", f"{arm_told.name}, over torque and no more", on_motor(arm_told, "marginal"), plain))
+    return [
+        Question(f"S{number}", section, says, (Contrast(one, other),))
+        for number, (section, says, one, other) in enumerate(found, start=1)
+    ]
+
+
+def trials() -> tuple[Trial, ...]:
+    """Every trial of the study once."""
+    pairs = [pair for question in (*primary(), *secondary()) for pair in question.contrasts]
+    return tuple({trial.name: trial for pair in pairs for trial in pair}.values())

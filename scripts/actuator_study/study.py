@@ -1,0 +1,53 @@
+"""The study of what an actuator costs, as a program: its grid, and what it writes."""
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from actuator_study.exploration import explored
+from actuator_study.page import FOLDER, write
+from actuator_study.questions import trials
+from codrl_mj.fields import integer
+from codrl_mj.study.doses import SECONDS
+from codrl_mj.study.grid import check_chosen
+from codrl_mj.study.program import Program
+from codrl_mj.study.trials import Grid
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ActuatorStudy(Program):
+    """Run the study of what an actuator costs, or go on with it, and write its page: docs/studies.md.
+
+    What is finished is not computed again, so the same command resumes a study, adds seeds to it, and writes its page
+    anew. Example: python scripts/study_actuators.py --dry-run, or with --tasks pendulum --seeds 3 --jobs 2
+    """
+
+    root: Path = Path("runs/actuators")
+    """Folder of the run folders."""
+    tasks: tuple[str, ...] = tuple(SECONDS)
+    """Tasks."""
+    seeds: int = integer(20, least=1)
+    """Training runs of every arm, with seeds from 0."""
+    episodes: int = integer(50, least=1)
+    """Test episodes of every policy."""
+    total_steps: int | None = integer(None, least=1)
+    """Environment steps of every training, for trying things out; None: the agents' own budgets."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        super().__post_init__()
+        check_chosen("tasks", self.tasks, SECONDS)
+
+    @property
+    def grid(self) -> Grid:
+        """Its trainings and tests."""
+        every = {trial.name: trial for trial in trials()} | explored()
+        chosen = [trial for trial in every.values() if trial.arm.task in self.tasks]
+        if self.total_steps is not None:
+            chosen = [dataclasses.replace(trial, arm=trial.arm.shortened(self.total_steps)) for trial in chosen]
+        return Grid(self.root, tuple(chosen), lambda _: range(self.seeds), self.episodes, self.out / FOLDER)
+
+    def write(self) -> tuple[Iterable[Path], Mapping[str, str]]:
+        """The page of all results that there are, and what failed."""
+        collected = self.grid.collect()
+        return write(collected, self.out), collected.failures
