@@ -11,6 +11,7 @@ import argparse
 import dataclasses
 import hashlib
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -367,8 +368,10 @@ def identified() -> Entries:
         for one in identify(logs, rig, {"gear_ratio": 1.0, **known}).estimates:
             yield f"identified/{rig}/{one.name}", f"{one.value!r} {one.low!r} {one.high!r} {one.status}"
 
-    columns, here = "time=time:s,position=position:rad,torque=torque:N*m", Path(__file__).parents[1] / "examples"
-    real = [read_log(here / "bench_logs" / "dfki_pendulum" / f"{name}.csv.gz", columns) for name in ("ddp", "ilqr")]
+    columns, here = "time=time:s,position=position:rad,torque=torque:N*m", Path(os.environ.get("CODRL_MJ_DATA", "data"))
+    if not (here / "bench_logs" / "dfki_pendulum").is_dir():
+        return  # codrl-mj data dfki_pendulum
+    real = [read_log(here / "bench_logs" / "dfki_pendulum" / f"{name}.csv", columns) for name in ("ddp", "ilqr")]
     for one in identify(real, "pendulum").estimates:
         yield f"identified/real pendulum/{one.name}", f"{one.value!r} {one.low!r} {one.high!r} {one.status}"
 

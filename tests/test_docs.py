@@ -18,6 +18,7 @@ from codrl_mj.agents import PPOConfig
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.study.trials import Grid
 from codrl_mj.training import TrainConfig, train
+from tests.published import folder_of
 
 ROOT = Path(__file__).parent.parent
 PAGES = {
@@ -90,6 +91,8 @@ def folder_of_a_reader(trained, tmp_path, monkeypatch):
 )
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_the_python_of_a_page_runs(page, monkeypatch):
+    if "data/bench_logs/dfki_pendulum" in PAGES[page]:
+        Path("data").symlink_to(folder_of("dfki_pendulum").parents[1])
     monkeypatch.setattr(Grid, "compute", lambda *_: None)  # hours
     namespace = {}
     for block in re.findall(r"```python\n(.*?)```", PAGES[page], re.DOTALL):
@@ -120,7 +123,7 @@ SHORTER = {
 }
 """Verb -> flags with which a command takes seconds."""
 NEEDING_MORE = (
-    r"identify|view|validate (--model|--mutations|--out)|validate *(#.*)?$|.*policies/theirs|.*model.zip"
+    r"identify|data |view|validate (--model|--mutations|--out)|validate *(#.*)?$|.*policies/theirs|.*model.zip"
     "|.*--backend ray|.*motor/actuator.yaml"
 )
 """Commands that have logs, a browser, a cluster, somebody else's files or minutes before them: they are only parsed."""

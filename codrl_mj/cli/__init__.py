@@ -18,6 +18,7 @@ import mujoco
 
 import codrl_mj
 from codrl_mj.cli.advise import Advise
+from codrl_mj.cli.data import Data
 from codrl_mj.cli.evaluate import Evaluate
 from codrl_mj.cli.fields import with_environment
 from codrl_mj.cli.identify import Identify, identify_verb
@@ -44,6 +45,7 @@ VERBS: dict[str, Any] = {
     "motor": MotorTools,
     "advise": Advise,
     "identify": Identify,
+    "data": Data,
     "validate": Validate,
 }
 """The verbs by name."""

@@ -1,15 +1,13 @@
 """Logs of known motors, made by others: scipy's matrix exponential, and MuJoCo."""
 
-from pathlib import Path
-
 import mujoco
 import numpy as np
 from scipy.linalg import expm
 
 from codrl_mj.identify import Log, read_log
 from codrl_mj.identify.simulation import Moved, moving
+from tests.published import folder_of
 
-EXAMPLES = Path(__file__).parents[2] / "examples" / "bench_logs"
 PENDULUM = "time=time:s,position=position:rad,torque=torque:N*m"
 SERVO = (
     "time=timestamp:s,position=position:rad,voltage=twos_complement(load,16)/885*input_volts:V,bus=input_volts:V,"
@@ -21,7 +19,7 @@ LOOP = 20000.0
 
 
 def pendulum_log(name):
-    return read_log(EXAMPLES / "dfki_pendulum" / f"{name}.csv.gz", PENDULUM)
+    return read_log(folder_of("dfki_pendulum") / f"{name}.csv", PENDULUM)
 
 
 def prbs(time, random, clock=2e-3):

@@ -1,13 +1,18 @@
-"""The two rigs whose logs are among the examples."""
+"""The two rigs whose logs others have published."""
 
 import numpy as np
 import pytest
 
 from codrl_mj.identify import identify, read_log
 from tests.identify import bench
+from tests.published import folder_of
 
 PUBLISHED = {"inertia": 0.0626, "mgl": 1.003, "viscous_friction": 0.0471, "coulomb_friction": 0.1839}
 """Of the pendulum, by its authors."""
+
+
+def servo_log(time):
+    return read_log(folder_of("bam_xl330") / f"2026-01-15_{time}.json", bench.SERVO)
 
 
 @pytest.mark.matrix
@@ -40,13 +45,8 @@ def test_the_pendulum_is_identified_and_foretells_what_it_was_not_fitted_to():
 
 @pytest.mark.matrix
 def test_a_servo_without_a_current_sensor_tells_ratios_and_friction_that_depends_on_the_load():
-    folder = bench.EXAMPLES / "bam_xl330"
-    logs = [
-        read_log(folder / f"kp{kp}_{name}.json.gz", bench.SERVO)
-        for kp in (100, 800)
-        for name in ("sin_sin", "up_and_down")
-    ]
-    held_out = [read_log(folder / f"kp200_{name}.json.gz", bench.SERVO) for name in ("sin_sin", "up_and_down")]
+    logs = [servo_log(time) for time in ("10h28m10", "10h28m24", "10h29m47", "10h30m02")]  # gains of 100 and 800
+    held_out = [servo_log(time) for time in ("10h28m42", "10h28m57")]  # 200
     known = {"mgl": 0.49 * 9.81 * 0.1}
     plain, loaded = (identify(logs, "pendulum", known, kind, held_out) for kind in ("coulomb", "load"))
     errors = [np.mean([one.closed_loop for one in found.held_out]) for found in (plain, loaded)]

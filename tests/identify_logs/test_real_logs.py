@@ -1,20 +1,18 @@
-"""Logs of real motors, made by others (see logs/README.md): what is known of them is found."""
-
-from pathlib import Path
+"""Logs of real motors, made by others (codrl-mj data): what is known of them is found."""
 
 import pytest
 
 from codrl_mj.identify.balances import torque_balance, velocity_lag
 from codrl_mj.identify.checks import check
 from codrl_mj.identify.reading import read_log
+from tests.published import folder_of
 
-LOGS = Path(__file__).parent / "logs"
 PENDULUM = "time=time:s,position=position:rad,velocity=velocity:rad/s,torque=torque:N*m"
 SERVO = (
     "time=timestamp:s,position=position:rad,velocity=speed:rad/s,bus=input_volts:V,command=goal_position:rad,"
     "temperature=temp:degC,voltage=twos_complement(load, 16)/885*input_volts:V,only=torque_enable"
 )
-SERVO_LOGS = ["xl330_kp800_sin_time_square.json.gz", "xl330_kp200_lift_and_drop.json.gz"]
+SERVO_LOGS = ["2026-01-15_10h30m10.json", "2026-01-15_10h28m49.json"]
 
 
 def kinds(log):
@@ -23,43 +21,45 @@ def kinds(log):
 
 @pytest.mark.parametrize("name", SERVO_LOGS)
 def test_the_servos_speed_register_lags(name):
-    log = read_log(LOGS / name, SERVO)
+    log = read_log(folder_of("bam_xl330") / name, SERVO)
     assert 0.018 <= velocity_lag(log).lag <= 0.024
     assert "lag" in kinds(log)
 
 
 def test_the_servos_load_register_has_a_sign():
     plain = SERVO.replace("twos_complement(load, 16)", "load")
-    findings = [one for one in check(read_log(LOGS / SERVO_LOGS[0], plain)) if one.check == "register"]
+    findings = [
+        one for one in check(read_log(folder_of("bam_xl330") / SERVO_LOGS[0], plain)) if one.check == "register"
+    ]
     assert [one.remedy for one in findings] == ["write twos_complement(load, 16)"]
-    assert kinds(read_log(LOGS / SERVO_LOGS[0], SERVO)) == {"lag"}
+    assert kinds(read_log(folder_of("bam_xl330") / SERVO_LOGS[0], SERVO)) == {"lag"}
 
 
 def test_the_servos_file_states_its_rig_and_its_resolution():
-    log = read_log(LOGS / SERVO_LOGS[0], SERVO)
+    log = read_log(folder_of("bam_xl330") / SERVO_LOGS[0], SERVO)
     assert log.constants == {"mass": 0.49, "length": 0.1, "kp": 800.0, "vin": 7.4}
     assert log.resolution["position"] == pytest.approx(6.283185307 / 4096, rel=1e-6)
     assert log.signals["bus"].min() > 5.0
 
 
 def test_the_released_servo_leaves_no_rows():
-    assert len(read_log(LOGS / SERVO_LOGS[1], SERVO).time) < 400 < 700
+    assert len(read_log(folder_of("bam_xl330") / SERVO_LOGS[1], SERVO).time) < 400 < 700
 
 
 def test_the_servos_voltage_against_its_pendulum_tells_a_wrong_sign():
     turned = SERVO.replace("voltage=", "voltage=-")
-    assert "sign" in kinds(read_log(LOGS / SERVO_LOGS[0], turned))
+    assert "sign" in kinds(read_log(folder_of("bam_xl330") / SERVO_LOGS[0], turned))
 
 
 def test_the_good_pendulum_log_is_left_in_peace_and_the_bad_one_is_not():
-    good, bad = (read_log(LOGS / f"pendulum_{name}.csv.gz", PENDULUM) for name in ("ddp", "sysid"))
+    good, bad = (read_log(folder_of("dfki_pendulum") / f"{name}.csv", PENDULUM) for name in ("ddp", "sysid"))
     assert kinds(good) == set()
     assert "torque" in kinds(bad)
     assert good.resolution == pytest.approx({"position": 2.914e-3, "velocity": 0.02198, "torque": 8.791e-3}, rel=1e-3)
 
 
 def test_the_pendulums_balance_is_near_what_was_fitted_to_it():
-    values = torque_balance(read_log(LOGS / "pendulum_ddp.csv.gz", PENDULUM)).values
+    values = torque_balance(read_log(folder_of("dfki_pendulum") / "ddp.csv", PENDULUM)).values
     assert values["inertia"] == pytest.approx(0.19, rel=0.1)
     assert values["gravity"] == pytest.approx(3.7, rel=0.1)
 
@@ -69,5 +69,5 @@ def test_the_pendulums_balance_is_near_what_was_fitted_to_it():
     [("torque=", "torque=-"), ("velocity=", "velocity=-"), ("position:rad", "position:deg"), ("time:s", "time:ms")],
 )
 def test_wrong_mappings_of_the_pendulum_are_errors(old, new):
-    log = read_log(LOGS / "pendulum_ddp.csv.gz", PENDULUM.replace(old, new))
+    log = read_log(folder_of("dfki_pendulum") / "ddp.csv", PENDULUM.replace(old, new))
     assert "error" in {one.severity for one in check(log)}
