@@ -66,7 +66,7 @@ ALLOWED = {
     },
     "rl_zoo3": set(),
     "motor_design": {"actuators", "catalogue", "fields"},
-    "identify": {"actuators", "catalogue", "fields", "runs.files"},
+    "identify": {"actuators", "catalogue", "fields", "runs.files", "tasks.assets"},
     "pages": {
         *("__init__", "actuators", "catalogue", "evaluation", "films", "foreign", "identify", "motor_design"),
         *("pages.plots", "replay", "runs.files", "runs.layout", "runs.policies", "runs.summaries", "tasks", "training"),
@@ -107,7 +107,7 @@ FOREIGN = {
     "tasks.assets": set(),
     "catalogue": {"pint"},
     "motor_design": {"control", "matplotlib", "numpy", "scipy"},
-    "identify": {"numba", "numpy", "scipy", "yaml"},
+    "identify": {"numba", "numpy", "pooch", "scipy", "yaml"},
     "pages.plots": {"matplotlib", "numpy"},
     "pages": {"jinja2", "markupsafe", "numpy", "scipy"},
     "plugin": {"mujoco"},
