@@ -167,7 +167,9 @@ def learning(quick: bool) -> dict[str, dict[str, float]]:
 def families() -> dict[str, float]:
     """Seconds until a family runs in the engine, the first one's and the others'; they are compiled once a process."""
     code = "import time, codrl_mj\nfrom codrl_mj.actuators import FAMILIES\nfor name, family in FAMILIES.items():\n"
-    code += "    if name != 'ideal':\n        start = time.perf_counter()\n        codrl_mj.load_family(family)\n"
+    code += (
+        "    if name != 'ideal':\n        start = time.perf_counter()\n        codrl_mj.engine.load_family(family)\n"
+    )
     code += "        print(name, time.perf_counter() - start)"
     lines = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     return dict(zip(lines[::2], map(float, lines[1::2]), strict=True))

@@ -79,7 +79,11 @@ def chain(motors: int, actuator: str | None, substeps: int = 10) -> Subject:
         body.explicitinertial, body.mass, body.inertia = True, 0.1, [0.01, 0.01, 0.01]
         motor = spec.add_actuator(name=f"motor{index}", target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         motor.set_to_motor()
-    given: Any = {"current_loop": codrl_mj.Actuator(controller=codrl_mj.CurrentLoop(ki=1.0, substeps=substeps))}
+    given: Any = {
+        "current_loop": codrl_mj.actuators.Actuator(
+            controller=codrl_mj.actuators.CurrentLoop(ki=1.0, substeps=substeps)
+        )
+    }
     if actuator is not None:
         spec = codrl_mj.motorise(spec, {".*": given.get(actuator, actuator)})
     model = spec.compile()
@@ -120,7 +124,9 @@ def theirs(env_id: str) -> Subject:
 
 def foreign(env_id: str, actuator: str | None) -> Subject:
     """An environment of Gymnasium's with motors behind its actuators; None: as it is."""
-    given: Any = {"current_loop": codrl_mj.Actuator(controller=codrl_mj.CurrentLoop(ki=1.0, max_voltage=24.0))}
+    given: Any = {
+        "current_loop": codrl_mj.actuators.Actuator(controller=codrl_mj.actuators.CurrentLoop(ki=1.0, max_voltage=24.0))
+    }
     if actuator is None:
         return theirs(env_id)
     actuators = {".*": given.get(actuator, actuator)}

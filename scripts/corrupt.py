@@ -154,7 +154,7 @@ TASK = codrl_mj.register(codrl_mj.Task(
 FAMILY = """\
 import dataclasses
 from typing import ClassVar, NamedTuple
-from codrl_mj import ActuatorModel
+from codrl_mj.actuators import ActuatorModel
 from codrl_mj.fields import real
 
 class State(NamedTuple):

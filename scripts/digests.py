@@ -26,7 +26,8 @@ from gymnasium.spaces import Discrete
 from safetensors.numpy import load_file
 
 import codrl_mj
-from codrl_mj import Actuator, CurrentLoop, Ideal, Motor, Supply, Uniform, named_actuator
+from codrl_mj import Uniform
+from codrl_mj.actuators import Actuator, CurrentLoop, Ideal, Motor, Supply
 from codrl_mj.agents import AGENTS
 from codrl_mj.agents.presets import SETTINGS
 from codrl_mj.envs.config import EnvConfig
@@ -34,7 +35,7 @@ from codrl_mj.identify import identify, read_log
 from codrl_mj.identify.synthetic import Excitation, Load, Sampler, Sensor, simulate
 from codrl_mj.motor_design import find_drive
 from codrl_mj.runs.files import read_json, write_json
-from codrl_mj.tasks import OURS, find_task
+from codrl_mj.tasks import OURS, find_task, named_actuator
 from codrl_mj.training import TrainConfig, train
 
 TASKS = {task.name: task for task in OURS}

@@ -20,10 +20,11 @@ import numpy as np
 from gymnasium.spaces import Discrete
 from gymnasium.vector import AutoresetMode
 
-from codrl_mj import LogUniform, named_actuator, spectral_radius
+from codrl_mj import LogUniform
+from codrl_mj.actuators import spectral_radius
 from codrl_mj.cli.terminal import console
 from codrl_mj.envs import ActuatedVectorEnv
-from codrl_mj.tasks import OURS, TASKS
+from codrl_mj.tasks import OURS, TASKS, named_actuator
 
 GROWTH = 4 * 2**20
 """Largest growth of resident memory after the first tenth [bytes]: 4 MiB, less than 5 bytes a step."""

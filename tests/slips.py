@@ -197,7 +197,9 @@ def family(**changes: Any) -> Any:
         parts[name] = staticmethod(function(name, arguments, change) if isinstance(change, str) else change)
     gain = changes.pop("gain", real(1.0))
     made = type(
-        "Slipped", (codrl_mj.ActuatorModel,), parts | changes | {"gain": gain, "__annotations__": {"gain": float}}
+        "Slipped",
+        (codrl_mj.actuators.ActuatorModel,),
+        parts | changes | {"gain": gain, "__annotations__": {"gain": float}},
     )
     return dataclasses.dataclass(frozen=True)(made)
 

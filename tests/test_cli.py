@@ -17,14 +17,14 @@ import numpy as np
 import pytest
 
 import codrl_mj
-from codrl_mj import TASKS, CurrentLoop, Ideal, Lag, Motor, Supply, named_actuator, register
-from codrl_mj.actuators import NAMED
+from codrl_mj import register
+from codrl_mj.actuators import NAMED, CurrentLoop, Ideal, Lag, Motor, Supply
 from codrl_mj.agents.presets import ELSEWHERE, PRESETS
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import evaluate, run_episodes
 from codrl_mj.runs.policies import load_policy
-from codrl_mj.tasks import find_task
+from codrl_mj.tasks import TASKS, find_task, named_actuator
 from codrl_mj.training import TrainConfig, folder, load_config
 from tests.matrix import but
 
@@ -293,7 +293,7 @@ OWN_FAMILY = """
 import dataclasses
 from pathlib import Path
 
-from codrl_mj import Lag
+from codrl_mj.actuators import Lag
 from codrl_mj.fields import real
 
 Path("executed").touch()

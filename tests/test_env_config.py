@@ -14,21 +14,8 @@ import pytest
 import yaml
 from hypothesis import strategies as st
 
-from codrl_mj import (
-    Actuator,
-    Choice,
-    CurrentLoop,
-    Disturbances,
-    Joint,
-    Lag,
-    LogUniform,
-    Motor,
-    Supply,
-    TorqueSpeed,
-    Uniform,
-    make_sb3_vec_env,
-    suite,
-)
+from codrl_mj import Choice, Disturbances, Joint, LogUniform, Uniform, make_sb3_vec_env, suite
+from codrl_mj.actuators import Actuator, CurrentLoop, Lag, Motor, Supply, TorqueSpeed
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
 

@@ -6,11 +6,12 @@ import gymnasium
 import numpy as np
 import pytest
 
-from codrl_mj import TASKS, Actuator, Ideal, Supply, Uniform, named_actuator
-from codrl_mj.actuators import IDEAL
+from codrl_mj import Uniform
+from codrl_mj.actuators import IDEAL, Actuator, Ideal, Supply
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation.episodes import RandomPolicy, load_episode, run_episodes, save_episode
 from codrl_mj.physics import signal_names, trace_names
+from codrl_mj.tasks import TASKS, named_actuator
 from tests.tasks.faces import every_rebuilt
 
 ARRAYS = ("time", "state", "observation", "action", "reward")

@@ -8,8 +8,8 @@ import gymnasium
 import numpy as np
 import pytest
 
-from codrl_mj import TASKS, Actuator, CurrentLoop, Motor, Uniform, named_actuator
-from codrl_mj.actuators import IDEAL, Drive, GearMotor, SampledLoop, Supply
+from codrl_mj import Uniform
+from codrl_mj.actuators import IDEAL, Actuator, CurrentLoop, Drive, GearMotor, Motor, SampledLoop, Supply
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import (
@@ -21,6 +21,7 @@ from codrl_mj.evaluation import (
     summarize,
 )
 from codrl_mj.physics import trace_names
+from codrl_mj.tasks import TASKS, named_actuator
 from tests.tasks.faces import every_rebuilt
 
 TRACE = trace_names(Actuator)

@@ -35,6 +35,7 @@ ALLOWED = {
         *("actuators", "disturbances", "engine", "envs", "envs.config", "envs.distributions", "fields", "physics"),
         *("envs.worlds", "own_code", "specs", "tasks"),
     },
+    "making": {"envs", "envs.config", "envs.worlds", "foreign"},
     "suite": {"actuators", "envs", "envs.config", "physics", "tasks"},
     "agents": {"actuators", "envs", "envs.config", "fields", "own_code", "physics"},
     "runs.files": set(),

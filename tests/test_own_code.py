@@ -12,6 +12,7 @@ from codrl_mj.actuators import resolve
 from codrl_mj.engine import load_family
 from codrl_mj.engine.families import compiled_observe
 from codrl_mj.envs.outcomes import compiled_outcomes
+from codrl_mj.foreign import environments
 from codrl_mj.physics.constrain import compiled_constrain
 from tests import slips
 from tests.matrix import but
@@ -48,10 +49,10 @@ def test_a_family_with_a_slip_is_refused_at_every_door_before_it_is_compiled(par
 
 
 def test_a_family_that_is_no_dataclass_or_has_no_advance_is_refused():
-    class Undecorated(codrl_mj.ActuatorModel):
+    class Undecorated(codrl_mj.actuators.ActuatorModel):
         gain = slips.real(1.0)
 
-    class Idle(codrl_mj.ActuatorModel):
+    class Idle(codrl_mj.actuators.ActuatorModel):
         pass
 
     refused(lambda: load_family(Undecorated), "Undecorated: must be decorated with @dataclasses.dataclass")
@@ -140,7 +141,7 @@ def test_a_models_joints_and_integrator_are_compared_with_the_task(tmp_path):
 def test_the_speeds_of_a_task_follow_from_its_model():
     assert slips.task().speeds == (2,)
     assert slips.task(motors=("elbow",)).speeds == (3,)
-    assert [task.speeds for task in codrl_mj.TASKS.values() if task.name == "acrobot"] == [(3,)]
+    assert [task.speeds for task in codrl_mj.tasks.TASKS.values() if task.name == "acrobot"] == [(3,)]
 
 
 @pytest.mark.parametrize(
@@ -151,7 +152,7 @@ def test_the_speeds_of_a_task_follow_from_its_model():
             r"spec = 'arm\.xml': must be .* mujoco\.MjSpec\.from_file\('arm\.xml'\)",
         ),
         (
-            lambda: codrl_mj.make("codrl_mj/Pendulum-v0", {}),
+            lambda: environments.make("codrl_mj/Pendulum-v0", {}),
             r"codrl_mj/Pendulum-v0: .* gymnasium\.make\('codrl_mj/Pend",
         ),
         (

@@ -33,7 +33,7 @@ DISTURBED = {"command_delay": 0.013, "pulse_force": 0.5, "pulse_duration": 0.05,
 def _registered():
     """Task and physics are known during these tests, and to no other test."""
     codrl_mj.register(arm.TASK)
-    codrl_mj.register_physics("slow_motion", slow_motion.SlowMotion)
+    codrl_mj.physics.register_physics("slow_motion", slow_motion.SlowMotion)
     yield
     del PHYSICS["slow_motion"]
 
@@ -63,7 +63,7 @@ def test_the_family_runs_in_the_engine_as_in_python():
                 assert (torque, *signals) == tuple(row[motor, 1:-1])
 
 
-@pytest.mark.parametrize("actuator", ["ideal", "lag", SOFT, codrl_mj.Actuator()], ids=str)
+@pytest.mark.parametrize("actuator", ["ideal", "lag", SOFT, codrl_mj.actuators.Actuator()], ids=str)
 def test_a_vector_of_arms_is_the_arms_alone(actuator):
     arguments = {"actuator": actuator, "disturbances": DISTURBED}
     mode = {"autoreset_mode": AutoresetMode.NEXT_STEP}
@@ -132,7 +132,7 @@ def test_the_physics_is_taken_by_name_and_is_another():
         env.step(np.array([5.0, 1.0], np.float32))
     assert slow.unwrapped.data.time == plain.unwrapped.data.time / 2
     with pytest.raises(ValueError, match="physics 'mujoco' is registered already"):
-        codrl_mj.register_physics("mujoco", slow_motion.SlowMotion)
+        codrl_mj.physics.register_physics("mujoco", slow_motion.SlowMotion)
 
 
 def test_dm_control_has_the_arm_too():

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from codrl_mj import TASKS, Actuator, Drive, Motor, named_actuator
-from codrl_mj.actuators import IDEAL
+from codrl_mj.actuators import IDEAL, Actuator, Drive, Motor
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import Episode, RandomPolicy, run_episodes
 from codrl_mj.films.film import Panel, film
@@ -19,6 +18,7 @@ from codrl_mj.films.strip import torque_label
 from codrl_mj.physics import signal_names
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.offscreen import OffscreenRenderer
+from codrl_mj.tasks import TASKS, named_actuator
 from codrl_mj.tasks.assets import asset_path
 
 WIDTH, HEIGHT = 200, 120

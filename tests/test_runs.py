@@ -8,12 +8,12 @@ import os
 import pytest
 import tyro
 
-from codrl_mj import Actuator, CurrentLoop, Motor, named_actuator
-from codrl_mj.actuators import actuator_over, mapping_of, resolve
+from codrl_mj.actuators import Actuator, CurrentLoop, Motor, actuator_over, mapping_of, resolve
 from codrl_mj.cli.runs import Runs
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.pages import report
 from codrl_mj.runs.summaries import SORT_KEYS, compare, find_runs, read_run, sort_runs
+from codrl_mj.tasks import named_actuator
 from codrl_mj.training.config import TrainConfig
 from codrl_mj.training.folder import load_config, start_folder
 

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 import codrl_mj
-from codrl_mj import TASKS
 from codrl_mj.actuators import IDEAL, Actuator, Lag, TorqueSpeed
 from codrl_mj.cli import main
 from codrl_mj.pages import certificate as page
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError, needed_callbacks
+from codrl_mj.tasks import TASKS
 from codrl_mj.validation import (
     GROUPS,
     MUTATIONS,

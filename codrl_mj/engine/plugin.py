@@ -253,7 +253,7 @@ def _family(name: str) -> Any:
             return family
     raise ValueError(
         f"its family {name!r} is not loaded, and is not imported because a model says so: import its module and call "
-        "codrl_mj.load_family with it before the model is loaded"
+        "codrl_mj.engine.load_family with it before the model is loaded"
     )
 
 

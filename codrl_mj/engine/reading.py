@@ -70,7 +70,8 @@ def _family(number: float) -> Family:
     known = {family_number(family): family for family in (*BUILT_IN, *loaded_families())}
     if number not in known:
         raise ValueError(
-            f"family {number:g} is not known in this process: import its module and call codrl_mj.load_family first"
+            f"family {number:g} is not known in this process: import its module and call "
+            "codrl_mj.engine.load_family first"
         )
     return known[int(number)]
 

@@ -48,10 +48,7 @@ def make(
 ) -> "MotorisedEnv":
     """An environment of Gymnasium's, or of anybody's who registers with it, with motors behind its actuators.
 
-        >>> env = codrl_mj.make("HalfCheetah-v5", actuators={".*": "maxon-ec45-flat-50w"})
-
-    With `"ideal"` actuators it is bit for bit the environment that `gymnasium.make` makes. Processes are given
-    functions that call this, such as `functools.partial(codrl_mj.make, "HalfCheetah-v5", {".*": "lag"})`.
+    With `"ideal"` actuators it is bit for bit the environment that `gymnasium.make` makes.
 
     Args:
         env_id: the id; or a function, or class, that makes an environment of one's own, which needs no id.

@@ -4,6 +4,7 @@ from codrl_mj.physics.analytic import AnalyticPhysics
 from codrl_mj.physics.base import Physics, Signals, SimulationDivergedError, signal_names, trace_names
 from codrl_mj.physics.mjcf import hills, install_callbacks, motors, needed_callbacks
 from codrl_mj.physics.mujoco_single import MujocoPhysics
+from codrl_mj.physics.registry import register_physics
 
 __all__ = [
     "AnalyticPhysics",
@@ -15,6 +16,7 @@ __all__ = [
     "install_callbacks",
     "motors",
     "needed_callbacks",
+    "register_physics",
     "signal_names",
     "trace_names",
 ]

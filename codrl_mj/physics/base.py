@@ -42,7 +42,7 @@ def named_signals(names: tuple[str, ...], columns: Any) -> Signals:
 class Physics(Protocol):
     """One simulation of one task.
 
-    Somebody's own is given to `codrl_mj.register_physics`. What it cannot simulate it refuses when it is made.
+    Somebody's own is given to `codrl_mj.physics.register_physics`. What it cannot simulate it refuses when it is made.
     """
 
     trace: np.ndarray

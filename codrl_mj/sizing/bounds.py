@@ -95,7 +95,9 @@ def feasibility(drive: Drive, demand: Demand, continuous_current: float | None =
         ValueError: the actuator is no `Drive`.
     """
     if not isinstance(drive, Drive):
-        raise ValueError(f"{drive!r}: must be a codrl_mj.Drive, a motor with gear and supply, or a catalogue's name")
+        raise ValueError(
+            f"{drive!r}: must be a codrl_mj.actuators.Drive, a motor with gear and supply, or a catalogue's name"
+        )
     asked, unmet = operation(demand, drive), SURELY_NOT if demand.exact else TRY_IT
     bounds = [*_limits(drive, asked, continuous_current, unmet), *_necessary(drive, demand, unmet)]
     if demand.swing is not None:

@@ -459,7 +459,7 @@ def test_a_drive_that_was_switched_off_begins_anew():
         mujoco.mj_step(model, data)
     model.opt.disableactuator = 0
     cleared.qpos[:], cleared.qvel[:], cleared.time = data.qpos, data.qvel, data.time
-    codrl_mj.clear_motors(cleared)
+    codrl_mj.engine.clear_motors(cleared)
     for each in (data, cleared):
         each.ctrl[:] = 0.3
         mujoco.mj_step(model, each)

@@ -146,8 +146,8 @@ def test_resolve_refuses_anything_else(value):
 
 
 def test_the_public_names_are_the_functions():
-    assert codrl_mj.named_actuator is named_actuator
-    assert codrl_mj.Actuator is Actuator
+    assert codrl_mj.tasks.named_actuator is named_actuator
+    assert codrl_mj.actuators.Actuator is Actuator
 
 
 # -- several motors -----------------------------------------------------------------------------------------

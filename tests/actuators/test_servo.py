@@ -10,8 +10,8 @@ import pytest
 from scipy import signal
 
 import codrl_mj
-from codrl_mj import Servo, ServoLoop, Uniform
-from codrl_mj.actuators import GearMotor, Inputs, SampledLoop, Supply, parameters_type
+from codrl_mj import Uniform
+from codrl_mj.actuators import GearMotor, Inputs, SampledLoop, Servo, ServoLoop, Supply, parameters_type
 from tests.matrix import but
 
 INERTIA, RATIO = 0.02, 10.0

@@ -86,7 +86,7 @@ def test_current_and_temperature_are_those_of_mujoco_s_own_motor():
         )
         theirs = spec.compile()
         data, other, unequal = mujoco.MjData(ours), mujoco.MjData(theirs), []
-        readout = codrl_mj.Readout(ours)
+        readout = codrl_mj.engine.Readout(ours)
         for step in range(round(4.0 / timestep)):
             volts = 12.0 if int(step * timestep / 0.5) % 2 == 0 else -4.0
             data.ctrl[:], other.ctrl[:] = HOT.torque_constant * volts, volts

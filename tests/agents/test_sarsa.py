@@ -324,8 +324,8 @@ def test_an_episode_that_was_left_is_finished_step_by_step():
 
 @pytest.mark.parametrize("compiled", [False, True])
 def test_a_diverging_simulation_is_an_error(compiled):
-    loop = codrl_mj.CurrentLoop(kp=1.0, kd=0.2, max_voltage=np.inf)
-    env = _car(actuator=codrl_mj.Actuator(codrl_mj.Motor(), loop), allow_unstable=True)
+    loop = codrl_mj.actuators.CurrentLoop(kp=1.0, kd=0.2, max_voltage=np.inf)
+    env = _car(actuator=codrl_mj.actuators.Actuator(codrl_mj.actuators.Motor(), loop), allow_unstable=True)
     model = SARSAConfig().make_model(env, 0)
     model.compiled = compiled
     with pytest.raises(SimulationDivergedError, match="mountain_car"):

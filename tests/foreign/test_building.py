@@ -25,7 +25,7 @@ def _nothing_is_left():
 
 
 def _families(model):
-    return {model.actuator(index).name: type(motor) for index, motor in codrl_mj.motors(model).items()}
+    return {model.actuator(index).name: type(motor) for index, motor in codrl_mj.engine.motors(model).items()}
 
 
 def test_models_from_files_and_text_get_motors_inside_and_none_outside(tmp_path):
@@ -34,7 +34,7 @@ def test_models_from_files_and_text_get_motors_inside_and_none_outside(tmp_path)
     with codrl_mj.motorised({"servo": "lag"}):
         models = [mujoco.MjModel.from_xml_path(str(path)), mujoco.MjModel.from_xml_string(xml=ARM)]
     assert [_families(model) for model in models] == [{"servo": Lag}] * 2
-    assert not codrl_mj.motors(mujoco.MjModel.from_xml_string(ARM))
+    assert not codrl_mj.engine.motors(mujoco.MjModel.from_xml_string(ARM))
 
 
 def test_assets_are_found():
@@ -51,7 +51,7 @@ def test_names_of_joints_match_too():
 def test_an_environment_that_is_built_inside_has_motors():
     with codrl_mj.motorised({"b.*": "lag"}):
         env = gym.make("HalfCheetah-v5")
-    assert list(codrl_mj.motors(env.unwrapped.model)) == [0, 1, 2]
+    assert list(codrl_mj.engine.motors(env.unwrapped.model)) == [0, 1, 2]
 
 
 def test_a_model_without_a_match_is_left_alone_where_another_has_one():
@@ -72,7 +72,7 @@ def test_of_nested_blocks_the_innermost_counts():
 def test_an_exception_passes_and_everything_is_restored():
     with pytest.raises(ZeroDivisionError), codrl_mj.motorised({"servo": "lag"}):
         raise ZeroDivisionError
-    assert not codrl_mj.motors(mujoco.MjModel.from_xml_string(ARM))
+    assert not codrl_mj.engine.motors(mujoco.MjModel.from_xml_string(ARM))
 
 
 def test_threads_have_motors_of_their_own():
@@ -134,7 +134,7 @@ def test_first_use_of_a_drive_builds_nothing_of_ours_with_motors():
         "import codrl_mj, mujoco\n"
         "with codrl_mj.motorised({'.*': 'maxon-ec45-flat-50w'}):\n"
         f"    model = mujoco.MjModel.from_xml_string({ARM!r})\n"
-        "print(len(codrl_mj.motors(model)))"
+        "print(len(codrl_mj.engine.motors(model)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "2\n"

@@ -41,7 +41,7 @@ def test_ideal_motors_change_no_bit_of_whole_episodes(name):
     """1000 steps are the suite's longest episodes; shorter ones start again."""
     ours = codrl_mj.make_dm_control(name, IDEAL, task_kwargs={"random": 1})
     plain = suite.load(*name.split("/"), task_kwargs={"random": 1})
-    assert len(codrl_mj.motors(ours.mujoco[0])) == plain.physics.model.nactuator > 0
+    assert len(codrl_mj.engine.motors(ours.mujoco[0])) == plain.physics.model.nactuator > 0
     for specification in ("action_spec", "observation_spec", "reward_spec", "discount_spec"):
         assert getattr(ours, specification)() == getattr(plain, specification)()
     _assert_same(ours, plain, 1001)
@@ -67,7 +67,7 @@ def test_environments_that_build_their_model_at_every_reset_have_motors_in_each(
     for _ in range(2):
         _assert_same(ours, plain, 10)
         models.append(ours.mujoco[0])
-        assert len(codrl_mj.motors(models[-1])) == models[-1].nactuator
+        assert len(codrl_mj.engine.motors(models[-1])) == models[-1].nactuator
         assert len(ours.signals()["actual_force"]) == models[-1].nactuator
     assert models[0] is not models[1]
 
@@ -110,7 +110,7 @@ def test_noise_differs_between_episodes_and_repeats_with_its_seed():
 def test_motors_can_be_given_to_dm_control_in_a_block():
     with codrl_mj.motorised({"b.*": "lag"}):
         env = suite.load("cheetah", "run")
-    assert set(map(type, codrl_mj.motors(env.physics.model.ptr).values())) == {Lag}
+    assert set(map(type, codrl_mj.engine.motors(env.physics.model.ptr).values())) == {Lag}
 
 
 MAXON = {".*": "maxon-ec45-flat-50w"}

@@ -397,7 +397,7 @@ def test_motors_of_several_families_are_drawn_each_by_its_fields():
     motors = list(env.motors.values())
     assert {one.motor.resistance for one in motors[:3]} == {*drawn["b.*"].values()}
     assert {one.time_constant for one in motors[3:]} == {*drawn["f.*"].values()}
-    assert list(codrl_mj.motors(env.unwrapped.model).values())[3:] == motors[3:]
+    assert list(codrl_mj.engine.motors(env.unwrapped.model).values())[3:] == motors[3:]
     with pytest.raises(ValueError, match=r"unknown field 'motor\.resistance'"):  # not of every motor
         codrl_mj.make("HalfCheetah-v5", actuators, randomize={"motor.resistance": "uniform(0.6, 1.2)"})
 
@@ -541,9 +541,9 @@ def test_stable_baselines3s_processes_too(context):
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        ({"actuators": {"knee": "lag"}}, "'knee': no actuator has such a name"),
-        ({"actuators": {".*": "lagg"}}, "did you mean 'lag'"),
-        ({"actuators": {"b.*": "lag", "bfoot": "lag"}}, "both 'b.*' and 'bfoot' match it"),
+        ({"actuator": {"knee": "lag"}}, "'knee': no actuator has such a name"),
+        ({"actuator": {".*": "lagg"}}, "did you mean 'lag'"),
+        ({"actuator": {"b.*": "lag", "bfoot": "lag"}}, "both 'b.*' and 'bfoot' match it"),
         (
             {"action": "voltage"},
             r"action = 'voltage': must be one of force, which the lag actuator of '\.\*' takes; or",
@@ -562,11 +562,11 @@ def test_stable_baselines3s_processes_too(context):
         ({"randomize": {"model.mass.torso": "uniform(0, 2)"}}, r"mass.torso'\] = uniform\(0.*= 0: must be .* > 0"),
         ({"randomize": {"model.length.torso": "uniform(0.5, 2)"}}, "unknown field 'model.length.torso'"),
         (
-            {"actuators": {".*": NOISY}, "randomize": {".*": {"controller.substeps": "uniform(1, 4)"}}},
+            {"actuator": {".*": NOISY}, "randomize": {".*": {"controller.substeps": "uniform(1, 4)"}}},
             "controller.substeps must be drawn from a Choice of int values",
         ),
         (
-            {"actuators": MAXON, "action": "current", "randomize": {"motor.torque_constant": "uniform(0.01, 0.02)"}},
+            {"actuator": MAXON, "action": "current", "randomize": {"motor.torque_constant": "uniform(0.01, 0.02)"}},
             "with action='current' it would change what an action means; draw it with action='force'",
         ),
         ({"randomize": {"model.gravity": "uniform(0)"}}, "randomize: model.gravity: .* has 1 values"),
@@ -575,7 +575,7 @@ def test_stable_baselines3s_processes_too(context):
 )
 def test_what_is_wrong_is_said(arguments, text):
     with pytest.raises(ValueError, match=text):
-        codrl_mj.make("HalfCheetah-v5", **{"actuators": {".*": "lag"}, "allow_unstable": True, **arguments})
+        codrl_mj.make("HalfCheetah-v5", **{"actuator": {".*": "lag"}, "allow_unstable": True, **arguments})
 
 
 def test_what_does_not_go_with_a_model_is_said(arm_id):

@@ -127,6 +127,8 @@ def test_what_is_wrong_is_said(robot, tmp_path):
         codrl_mj.make(robot(path), IDEAL)
     with pytest.raises(gym.error.NameNotFound, match="Did you mean: `HalfCheetah`"):
         codrl_mj.make("HalfChetah-v5", IDEAL)
-    stiff = codrl_mj.Actuator(codrl_mj.Motor(inductance=1e-3), codrl_mj.CurrentLoop(kp=1.0))
+    stiff = codrl_mj.actuators.Actuator(
+        codrl_mj.actuators.Motor(inductance=1e-3), codrl_mj.actuators.CurrentLoop(kp=1.0)
+    )
     with pytest.raises(ValueError, match=r"'\.\*': actuator: .* unstable at a step of 0.01 s.*allow_unstable"):
         codrl_mj.make("HalfCheetah-v5", {".*": stiff})

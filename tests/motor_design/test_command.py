@@ -97,7 +97,7 @@ def test_show_takes_a_datasheet_of_one_s_own_and_any_drive(capsys):
     assert sorted(parts, key=text.index) == list(parts)
     found = read(capsys, "show", "own.toml")
     assert {row["name"]: row["value"] for row in found["abilities"]}["stall_torque"] == pytest.approx(0.12)
-    assert "numbers" not in read(capsys, "show", "codrl_mj:Drive")
+    assert "numbers" not in read(capsys, "show", "codrl_mj.actuators:Drive")
 
 
 def test_a_file_is_written_filled_in_and_shown(capsys):

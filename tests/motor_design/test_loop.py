@@ -7,8 +7,7 @@ import control
 import numpy as np
 import pytest
 
-from codrl_mj import Actuator, CurrentLoop
-from codrl_mj.actuators import Drive, SampledLoop
+from codrl_mj.actuators import Actuator, CurrentLoop, Drive, SampledLoop
 from codrl_mj.motor_design import (
     closed_loop,
     design,

@@ -132,7 +132,7 @@ def behind_callback(spec, actuators):
     """The same at the control callback's door, where controls are torques at the shaft."""
     spec = spec.copy()
     for name, actuator in actuators.items():
-        codrl_mj.load_family(type(actuator))
+        codrl_mj.engine.load_family(type(actuator))
         drive(spec.actuator(name), actuator, 1.0 / actuator.arm_radius**2 if actuator.MOTION else 1.0)
     model = spec.compile()
     install_callbacks(model)

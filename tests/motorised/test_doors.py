@@ -35,8 +35,8 @@ def _both(actuators, integrator, kind="hinge"):
     inputs = controls(STEPS, 2)
     for build in (behind_callback, behind_plugin):
         model = build(arm(integrator, kind), actuators)
-        data, read, rows = mujoco.MjData(model), codrl_mj.Readout(model), []
-        codrl_mj.clear_motors(data, range(5, 5 + len(actuators)))
+        data, read, rows = mujoco.MjData(model), codrl_mj.engine.Readout(model), []
+        codrl_mj.engine.clear_motors(data, range(5, 5 + len(actuators)))
         shaft = np.ones(2)
         if build is behind_callback:  # where a control is the torque at the shaft, or the shaft's motion
             arms = [(1 / one.arm_radius if one.MOTION else one.arm_radius) for one in actuators.values()]
@@ -51,7 +51,7 @@ def _both(actuators, integrator, kind="hinge"):
             )
             np.testing.assert_allclose(seen.pop("desired_force"), wanted, rtol=1e-15)
             rows.append(np.concatenate((data.qpos, data.qvel, data.qfrc_actuator, *seen.values())))
-        assert list(codrl_mj.motors(model).values()) == list(actuators.values())
+        assert list(codrl_mj.engine.motors(model).values()) == list(actuators.values())
         found.append(np.array(rows))
     return found
 
@@ -195,7 +195,7 @@ def test_a_set_state_needs_motors_cleared_and_then_they_are():
         data.qpos[:], data.qvel[:], data.time = 0.0, 0.0, 0.25
         data.qacc_warmstart[:] = 0.0
         if cleared:
-            codrl_mj.clear_motors(data)
+            codrl_mj.engine.clear_motors(data)
         after.append(trajectory(model, inputs[:20], data))
     fresh = mujoco.MjData(model)
     fresh.time = 0.25
@@ -209,12 +209,12 @@ def test_noise_has_the_key_that_it_is_given():
     inputs, ends = controls(50, 2), []
     for keys in ((1, 2), (1, 2), (2, 1)):
         data = mujoco.MjData(model)
-        codrl_mj.clear_motors(data, keys)
+        codrl_mj.engine.clear_motors(data, keys)
         ends.append(trajectory(model, inputs, data))
     np.testing.assert_array_equal(ends[0], ends[1])
     assert not np.array_equal(ends[0], ends[2])
     with pytest.raises(ValueError, match="there are 1, must be 2, one for each motor"):
-        codrl_mj.clear_motors(data, [1])
+        codrl_mj.engine.clear_motors(data, [1])
 
 
 def test_actuation_switched_off_and_on_again_is_the_same_at_both_doors():

@@ -16,7 +16,7 @@ def _check(path, integrator, steps):
     spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     plain = spec.compile()
     ours = codrl_mj.motorise(spec, {".*": "ideal"}).compile()
-    assert len(codrl_mj.motors(ours)) == plain.nactuator > 0
+    assert len(codrl_mj.engine.motors(ours)) == plain.nactuator > 0
     for name in (
         "actuator_gainprm",
         "actuator_biasprm",

@@ -40,9 +40,9 @@ THREE = (
 def test_patterns_match_names_or_what_is_driven_from_beginning_to_end():
     lag, loop = Lag(time_constant=0.1), LOOP
     model = codrl_mj.motorise(_spec(*THREE), {"left": lag, "hip_r.*": loop}).compile()
-    assert codrl_mj.motors(model) == {0: lag, 1: loop}
+    assert codrl_mj.engine.motors(model) == {0: lag, 1: loop}
     model = codrl_mj.motorise(_spec(*THREE), {"hip_.*": "lag", "rope": "ideal"}).compile()
-    assert codrl_mj.motors(model) == {0: Lag(), 1: Lag(), 2: Ideal()}
+    assert codrl_mj.engine.motors(model) == {0: Lag(), 1: Lag(), 2: Ideal()}
     with pytest.raises(ValueError, match="'hip': no actuator has such a name, nor drives anything that has"):
         codrl_mj.motorise(_spec(*THREE), {"hip": "lag"})
 
@@ -72,13 +72,13 @@ def test_two_patterns_for_one_actuator_are_refused():
     ],
 )
 def test_actuators_are_given_as_everywhere(given, expected):
-    assert codrl_mj.motors(codrl_mj.motorise(arm(), {"one": given}).compile()) == {0: expected}
+    assert codrl_mj.engine.motors(codrl_mj.motorise(arm(), {"one": given}).compile()) == {0: expected}
 
 
 def test_an_actuator_may_come_from_a_file(tmp_path):
     path = tmp_path / "drive.yaml"
     path.write_text("family: lag\ntime_constant: 0.3\n")
-    assert codrl_mj.motors(codrl_mj.motorise(arm(), {"one": str(path)}).compile()) == {0: Lag(time_constant=0.3)}
+    assert codrl_mj.engine.motors(codrl_mj.motorise(arm(), {"one": str(path)}).compile()) == {0: Lag(time_constant=0.3)}
 
 
 def test_the_given_spec_is_not_changed():
@@ -120,7 +120,7 @@ def test_plugins_and_motors_of_ours_are_not_motorised_again():
     ):
         codrl_mj.motorise(once, {"one": "ideal"})
     twice = codrl_mj.motorise(once, {"two": "ideal"}).compile()
-    assert codrl_mj.motors(twice) == {0: Lag(), 1: Ideal()}
+    assert codrl_mj.engine.motors(twice) == {0: Lag(), 1: Ideal()}
 
 
 def test_the_limit_of_a_tendon_is_not_applied_to_plugins():
@@ -170,7 +170,9 @@ def test_an_unstable_actuator_is_refused_unless_asked_for():
     unstable = Actuator(controller=CurrentLoop(kp=500.0))
     with pytest.raises(ValueError, match=r"'one': actuator: the current loop is unstable at a step of 0.005 s"):
         codrl_mj.motorise(arm(), {"one": unstable})
-    assert codrl_mj.motors(codrl_mj.motorise(arm(), {"one": unstable}, allow_unstable=True).compile()) == {0: unstable}
+    assert codrl_mj.engine.motors(codrl_mj.motorise(arm(), {"one": unstable}, allow_unstable=True).compile()) == {
+        0: unstable
+    }
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicitfast"])
@@ -209,7 +211,7 @@ def test_motorised_models_are_attached_to_others():
     for name in ("a", "b"):
         scene.attach(child.copy(), prefix=f"{name}/", frame=scene.worldbody.add_frame())
     model = scene.compile()
-    assert list(codrl_mj.motors(model).values()) == [LOOP, Lag(), LOOP, Lag()]
+    assert list(codrl_mj.engine.motors(model).values()) == [LOOP, Lag(), LOOP, Lag()]
     alone = child.compile()
     inputs = own_controls(alone, 100)
     both, one = trajectory(model, np.tile(inputs, 2)), trajectory(alone, inputs)
@@ -217,7 +219,7 @@ def test_motorised_models_are_attached_to_others():
     np.testing.assert_allclose(both[:, 2:4], one[:, :2], rtol=0, atol=1e-12)
 
 
-RUBBING = codrl_mj.Drive(codrl_mj.GearMotor(coulomb_friction=1e-3))
+RUBBING = codrl_mj.actuators.Drive(codrl_mj.actuators.GearMotor(coulomb_friction=1e-3))
 
 
 def test_friction_needs_a_joint_or_a_tendon():

@@ -28,9 +28,9 @@ def _mixed():
 
 def test_motors_of_both_doors_are_found():
     model = _mixed()
-    assert codrl_mj.motors(model) == {0: LOOP, 1: LINE}
-    codrl_mj.check(model)
-    assert codrl_mj.motors(arm().compile()) == {}
+    assert codrl_mj.engine.motors(model) == {0: LOOP, 1: LINE}
+    codrl_mj.engine.check(model)
+    assert codrl_mj.engine.motors(arm().compile()) == {}
 
 
 def test_signals_of_both_doors_are_read():
@@ -61,7 +61,7 @@ def test_controls_beyond_their_range_are_what_the_model_makes_of_them():
     for build in (behind_callback, behind_plugin):
         model = build(arm(), {"one": source, "two": source})
         model.actuator_ctrllimited[:], model.actuator_ctrlrange[:] = True, (-0.4, 0.5)
-        data, readout = mujoco.MjData(model), codrl_mj.Readout(model)
+        data, readout = mujoco.MjData(model), codrl_mj.engine.Readout(model)
         data.ctrl[:] = 0.9, -0.7
         for flags, expected in ((0, [0.5, -0.4]), (mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL, [0.9, -0.7])):
             model.opt.disableflags = flags
@@ -96,11 +96,11 @@ def test_desired_and_actual_force_are_before_the_models_own_gear():
 def test_clearing_motors_at_both_doors_brings_them_to_rest():
     model = _mixed()
     data = mujoco.MjData(model)
-    codrl_mj.clear_motors(data, [7, 8])
+    codrl_mj.engine.clear_motors(data, [7, 8])
     data.ctrl[:] = 0.15, 0.5, 0.1
     mujoco.mj_step(model, data, 10)
     assert codrl_mj.signals(model, data)["current"][0] != 0.0
-    codrl_mj.clear_motors(data)
+    codrl_mj.engine.clear_motors(data)
     states = np.concatenate((data.act, data.plugin_state))
     assert states[states != 0.0].tolist() == [data.time, 7.0, data.time, 8.0]
 
@@ -109,14 +109,14 @@ def test_clearing_motors_at_both_doors_brings_them_to_rest():
 def test_a_key_that_is_no_key_is_refused_and_nothing_is_changed(key):
     model = _mixed()
     data = mujoco.MjData(model)
-    codrl_mj.clear_motors(data, np.array([2**53 - 1, 8]))
+    codrl_mj.engine.clear_motors(data, np.array([2**53 - 1, 8]))
     data.ctrl[:] = 0.15, 0.5, 0.1
     mujoco.mj_step(model, data, 10)
     before = np.concatenate((data.act, data.plugin_state))
     assert before[1] == 2.0**53 - 1
     message = f"noise_keys[1] = {key!r}: must be a whole number from 0 to 2**53 - 1"
     with pytest.raises(ValueError, match=re.escape(message)):
-        codrl_mj.clear_motors(data, [3, key])
+        codrl_mj.engine.clear_motors(data, [3, key])
     with pytest.raises(ValueError, match="there are 1, must be 2, one for each motor"):
-        codrl_mj.clear_motors(data, 7)
+        codrl_mj.engine.clear_motors(data, 7)
     np.testing.assert_array_equal(np.concatenate((data.act, data.plugin_state)), before)

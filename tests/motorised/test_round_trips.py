@@ -49,8 +49,8 @@ def _reloaded(model, how, tmp_path):
 def test_a_compiled_model_keeps_its_motors(how, tmp_path):
     model = behind_plugin(arm(), TWO)
     again = _reloaded(model, how, tmp_path)
-    codrl_mj.check(again)
-    assert codrl_mj.motors(again) == {0: NOISY, 1: Worn()}
+    codrl_mj.engine.check(again)
+    assert codrl_mj.engine.motors(again) == {0: NOISY, 1: Worn()}
     inputs = controls(100, 2)
     np.testing.assert_array_equal(trajectory(again, inputs), trajectory(model, inputs))
 
@@ -70,12 +70,12 @@ def test_an_xml_file_keeps_motors_to_its_six_digits(integrator, tmp_path):
     path = tmp_path / "model.xml"
     path.write_text(motorised.to_xml())
     model, again = motorised.compile(), mujoco.MjModel.from_xml_path(str(path))
-    assert codrl_mj.motors(again) == {0: NOISY, 1: Lag()}
+    assert codrl_mj.engine.motors(again) == {0: NOISY, 1: Lag()}
     inputs = controls(100, 2)
     np.testing.assert_array_equal(trajectory(again, inputs), trajectory(model, inputs))
     third = NOISY.replaced({"motor.resistance": 4 / 3})
     again = mujoco.MjModel.from_xml_string(codrl_mj.motorise(spec, {"one": third}).to_xml())
-    assert codrl_mj.motors(again)[0].motor.resistance == 1.33333
+    assert codrl_mj.engine.motors(again)[0].motor.resistance == 1.33333
 
 
 def test_gain_and_bias_are_in_the_xml_every_time():
@@ -126,7 +126,7 @@ except ValueError as error:
 final(mujoco.MjModel.from_binary_path("model.mjb"))
 final(mujoco.MjModel.from_xml_path("model.xml"))
 from tests.motorised.models import Worn
-codrl_mj.load_family(Worn)
+codrl_mj.engine.load_family(Worn)
 final(mujoco.MjModel.from_xml_path("somebody.xml"))
 """
 
@@ -194,22 +194,22 @@ def test_a_model_whose_plugin_has_another_slot_is_refused():
     model.plugin[:] = 0  # as in an .mjb file from a process where plugins were registered in another order
     slot = registered()[NAME][0]
     with pytest.raises(ValueError, match=f"^one: plugin slot = 0: a motor of codrl_mj needs {slot}"):
-        codrl_mj.check(model)
+        codrl_mj.engine.check(model)
 
 
 def test_a_model_whose_motors_do_not_agree_with_their_plugins_is_refused():
     model = behind_plugin(arm(), TWO)
     model.actuator_user[0, 0] = 1.0
     with pytest.raises(ValueError, match=r"^one: its actuator's user data do not begin with codrl_mj's signature"):
-        codrl_mj.check(model)
+        codrl_mj.engine.check(model)
     model = behind_plugin(arm(), TWO)
     model.actuator_user[:, 2] = model.actuator_user[::-1, 2]
     with pytest.raises(ValueError, match=r"^one: family = 'codrl_mj.actuators.current_loop:Actuator' of its plugin"):
-        codrl_mj.check(model)
+        codrl_mj.engine.check(model)
     model.actuator_user[0, 2] = 123.0
     with pytest.raises(ValueError, match=r"^one: family 123 is not known in this process: import its module and call"):
-        codrl_mj.check(model)
+        codrl_mj.engine.check(model)
     model = behind_plugin(arm(), TWO)
     model.actuator_user[0, 4] = -1.0
     with pytest.raises(ValueError, match=r"^one: Motor\.resistance = -1\.0: must be"):
-        codrl_mj.check(model)
+        codrl_mj.engine.check(model)

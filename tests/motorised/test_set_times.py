@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import codrl_mj
-from codrl_mj import TorqueSpeed
+from codrl_mj.actuators import TorqueSpeed
 from tests.motorised.models import arm
 
 UNLIMITED = TorqueSpeed(stall_torque=1e6, no_load_speed=1e6, max_torque=1e6)

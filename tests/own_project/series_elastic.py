@@ -5,8 +5,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
-from codrl_mj import ActuatorModel
-from codrl_mj.actuators import Inputs
+from codrl_mj.actuators import ActuatorModel, Inputs
 from codrl_mj.fields import real
 
 

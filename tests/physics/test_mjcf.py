@@ -92,7 +92,7 @@ def test_motors_are_found_by_their_index_in_order():
 
 
 def test_the_package_offers_the_function():
-    assert codrl_mj.motors is motors
+    assert codrl_mj.engine.motors is motors
 
 
 def _text(numbers):
@@ -186,7 +186,7 @@ def test_a_default_gain_is_refused_though_it_would_add_nothing_to_the_torque():
 def test_a_family_that_nobody_knows_is_refused_with_the_remedy():
     model = _spec(Lag()).compile()
     model.actuator_user[0, 2] = 123456.0
-    with pytest.raises(ValueError, match=r"drive: family 123456 is not known .* call codrl_mj\.load_family first"):
+    with pytest.raises(ValueError, match=r"drive: family 123456 is not known .* call codrl_mj\.engine\.load"):
         motors(model)
 
 

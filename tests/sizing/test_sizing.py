@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from codrl_mj import Drive, GearMotor, Ideal, SampledLoop, Supply
-from codrl_mj.actuators import Inputs, parameters_type
+from codrl_mj.actuators import Drive, GearMotor, Ideal, Inputs, SampledLoop, Supply, parameters_type
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes
@@ -321,7 +320,7 @@ def test_on_a_slide_a_geared_motor_gets_a_wheel():
         (lambda: recorded([0.0, 1.0], [1.0], [1.0, 1.0]), "torque: shape"),
         (lambda: recorded([0.0, 0.0], [1.0, 1.0], [1.0, 1.0]), r"time\[1\] = 0 s"),
         (lambda: recorded([0.0, 1.0], [1.0, math.nan], [1.0, 1.0]), r"torque\[1\] = nan"),
-        (lambda: feasibility(Ideal(), steady(1.0, 1.0)), "must be a codrl_mj.Drive"),
+        (lambda: feasibility(Ideal(), steady(1.0, 1.0)), "must be a codrl_mj.actuators.Drive"),
     ],
 )
 def test_bad_input_is_refused_with_a_remedy(call, match):

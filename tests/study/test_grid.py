@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from codrl_mj import Actuator, CurrentLoop, Motor
+from codrl_mj.actuators import Actuator, CurrentLoop, Motor
 from codrl_mj.agents import PPOConfig
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import evaluate

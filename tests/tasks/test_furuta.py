@@ -12,8 +12,8 @@ import sympy
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
-from codrl_mj import Drive, Uniform, make_sb3_vec_env, suite
-from codrl_mj.actuators import IDEAL, NAMED
+from codrl_mj import Uniform, make_sb3_vec_env, suite
+from codrl_mj.actuators import IDEAL, NAMED, Drive
 from codrl_mj.catalogue import motor_entry
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes, summarize

@@ -6,11 +6,12 @@ import math
 
 import pytest
 
-from codrl_mj import Actuator, CurrentLoop, Ideal, Motor, named_actuator
+from codrl_mj.actuators import Actuator, CurrentLoop, Ideal, Motor
 from codrl_mj.agents import AGENTS, PPOConfig
 from codrl_mj.agents.presets import ELSEWHERE, PRESETS
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.tasks import named_actuator
 from codrl_mj.training import TrainConfig, load_config, read_config
 
 ENV = EnvConfig("cartpole", "weaker")

@@ -16,7 +16,7 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file
 
-from codrl_mj import Actuator, CurrentLoop, Motor
+from codrl_mj.actuators import Actuator, CurrentLoop, Motor
 from codrl_mj.agents import PPOConfig
 from codrl_mj.agents.sarsa_algorithm import CompiledEpisodes
 from codrl_mj.cli import main

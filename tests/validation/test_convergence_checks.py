@@ -7,9 +7,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from codrl_mj import TASKS
 from codrl_mj.actuators import IDEAL
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics
+from codrl_mj.tasks import TASKS
 from codrl_mj.validation import convergence
 from codrl_mj.validation.continuous import gymnasium_equations, solve
 from codrl_mj.validation.convergence import free_run

@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from codrl_mj import TASKS
 from codrl_mj.engine.hill import GRAVITY
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError
+from codrl_mj.tasks import TASKS
 from codrl_mj.validation import energy
 from codrl_mj.validation.ledger import Meter, hill_potential, keep
 from tests.validation.mutations import failed, looks_complete, scaled, scaled_motor, wrong_model

@@ -163,7 +163,7 @@ def test_controls_are_the_fields_with_their_bounds_and_units(motorised):
 
 
 def test_an_endless_voltage_ends_at_the_end_of_its_slider():
-    from codrl_mj import Actuator
+    from codrl_mj.actuators import Actuator
 
     (voltage,) = [one for one in controls(Actuator(), 48.0) if one.path == ("supply", "voltage")]
     assert voltage.high == 48.0

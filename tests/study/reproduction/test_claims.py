@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from codrl_mj import CurrentLoop, Motor, named_actuator
-from codrl_mj.actuators import IDEAL
+from codrl_mj.actuators import IDEAL, CurrentLoop, Motor
 from codrl_mj.study.trials import numbers_as_text
+from codrl_mj.tasks import named_actuator
 from codrl_mj.training import TrainConfig
 from reproduction.arms import ARMS, TASKS
 from reproduction.checks import COMPATIBLE, CONFIRMED, NOT_CONFIRMED, NOT_TESTABLE, OUTCOMES

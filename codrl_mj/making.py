@@ -1,0 +1,80 @@
+"""What makes environments of whatever world: one, or many at once."""
+
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import gymnasium
+from gymnasium.vector import VectorEnv
+
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.envs.serial import SerialVectorEnv
+from codrl_mj.envs.task_world import claims
+from codrl_mj.envs.worlds import find_world
+from codrl_mj.foreign import environments
+
+
+def make(
+    env: str | EnvConfig | Callable[..., Any], actuator: Any = None, **arguments: Any
+) -> "gymnasium.Env[Any, Any]":
+    """An environment with motors behind its actuators.
+
+        >>> env = codrl_mj.make("pendulum", "maxon-dcx22l")
+        >>> env = codrl_mj.make("HalfCheetah-v5", {"b.*": "maxon-ec45-flat-50w", "f.*": "lag"})
+
+    Processes are given functions that call this, such as `functools.partial(codrl_mj.make, "Hopper-v5", "lag")`.
+
+    Args:
+        env: a task's name or id, such as `pendulum`; the id of anybody's environment; `module:NAME` of a task or world
+            of one's own; an `EnvConfig`; or a function or class that makes an environment, which needs no id.
+        actuator: what its forces go through: a name, an actuator, or a mapping of patterns of motors to these; None: a
+            task's own motor, and nothing at all elsewhere. With `"ideal"` an environment is, bit for bit, the one
+            without motors.
+        **arguments: other fields of `EnvConfig`, and options of the task, or of `gymnasium.make` and the environment,
+            such as `render_mode` and `max_episode_steps`; of an `EnvConfig`, those of its `make`.
+
+    Raises:
+        gymnasium.error.UnregisteredEnv: there is no such environment.
+        ValueError: names or arguments that are unknown, or do not go with each other; the message has the remedy.
+    """
+    by_pattern = actuator if isinstance(actuator, Mapping) else {".*": "ideal" if actuator is None else actuator}
+    if callable(env):
+        return environments.make(env, by_pattern, **arguments)
+    if not isinstance(env, str):
+        return env.make(**arguments)
+    world: Any = find_world(env)
+    given = {} if actuator is None else {"actuator": actuator}
+    if claims(env):
+        return gymnasium.make(world.task.env_id, **given, **arguments)
+    if ":" in env:
+        return EnvConfig(env, **given, **arguments).make()
+    return environments.make(env, by_pattern, **arguments)
+
+
+def make_vec(
+    env: str | EnvConfig | Callable[..., Any], num_envs: int = 1, actuator: Any = None, **arguments: Any
+) -> "VectorEnv[Any, Any, Any]":
+    """Many environments as one of Gymnasium's vectors, which is reset in the step that ends an episode.
+
+        >>> envs = codrl_mj.make_vec("pendulum", 1024, "weak", randomize={"motor.resistance": "uniform(1, 2)"})
+
+    Tasks on MuJoCo are stepped as a batch, in threads; whatever else there is, one by one.
+
+    Args:
+        env: as for `make`.
+        num_envs: how many, >= 1.
+        actuator: as for `make`.
+        **arguments: as for `make`; of an `EnvConfig` those of the vector, such as `num_threads` and
+            `max_episode_steps`.
+
+    Raises:
+        ValueError: see `make`; or more than memory holds.
+    """
+    if callable(env) or "render_mode" in arguments:
+        return SerialVectorEnv(num_envs, functools.partial(make, env, actuator, **arguments))
+    if isinstance(env, str):
+        limit = {name: arguments.pop(name) for name in ("max_episode_steps",) if name in arguments}
+        chosen = find_world(env).default_actuator if actuator is None else actuator
+        env, arguments = EnvConfig.of(env, chosen, arguments), limit
+    vector: VectorEnv[Any, Any, Any] = env.world.vector(env, num_envs, **arguments)
+    return vector
