@@ -38,7 +38,7 @@ def make(
         ValueError: names or arguments that are unknown, or do not go with each other; the message has the remedy.
     """
     by_pattern = actuator if isinstance(actuator, Mapping) else {".*": "ideal" if actuator is None else actuator}
-    if callable(env):
+    if not isinstance(env, str) and not hasattr(env, "make"):  # a function or class
         return environments.make(env, by_pattern, **arguments)
     if not isinstance(env, str):
         return env.make(**arguments)

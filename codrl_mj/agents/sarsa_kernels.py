@@ -5,10 +5,10 @@ Sutton and Barto, *Reinforcement Learning: An Introduction* (2018), section 10.1
 
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
 from codrl_mj.agents.tile_coding import TileCoder, find_tiles
+from codrl_mj.kept import njit
 
 FORGOTTEN = 1e-3
 """Eligibility below which a trace is dropped."""
@@ -54,7 +54,7 @@ def no_traces(size: int) -> Traces:
     return Traces(np.zeros(size), np.zeros(size, dtype=np.int64), np.zeros(1, dtype=np.int64))
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def action_value(weights: np.ndarray, tiles: np.ndarray, action: int) -> float:
     """Estimated return of an action: the sum of its weights over the active tiles."""
     value = 0.0
@@ -63,7 +63,7 @@ def action_value(weights: np.ndarray, tiles: np.ndarray, action: int) -> float:
     return value
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def choose_action(weights: np.ndarray, tiles: np.ndarray, epsilon: float, generator: np.random.Generator) -> int:
     """An action at random with probability `epsilon`, else the best; of equally good ones one at random."""
     actions = weights.shape[1]
@@ -81,7 +81,7 @@ def choose_action(weights: np.ndarray, tiles: np.ndarray, epsilon: float, genera
     return best
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def choose_actions(
     observations: np.ndarray,
     coder: TileCoder,
@@ -105,7 +105,7 @@ def choose_actions(
     return actions
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def begin(learner: Learner, generator: np.random.Generator, observation: np.ndarray) -> int:
     """Begin an episode with its first observation (k,): no traces are left. The first action."""
     traces = learner.traces
@@ -116,7 +116,7 @@ def begin(learner: Learner, generator: np.random.Generator, observation: np.ndar
     return choose_action(learner.weights, learner.tiles, learner.epsilon, generator)
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def learn(
     learner: Learner,
     generator: np.random.Generator,
@@ -150,7 +150,7 @@ def learn(
     return next_action
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _mark(traces: Traces, tiles: np.ndarray, action: int, actions: int, decay: float) -> None:
     """Fade the traces, drop the faintest, and set those of the weights in use to 1 (replacing traces)."""
     kept = 0
@@ -172,7 +172,7 @@ def _mark(traces: Traces, tiles: np.ndarray, action: int, actions: int, decay: f
     traces.used[0] = kept
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def run_episode(
     learner: Learner,
     generator: np.random.Generator,

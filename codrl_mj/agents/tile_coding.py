@@ -9,8 +9,9 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numba
 import numpy as np
+
+from codrl_mj.kept import njit
 
 LARGEST_TABLE = 2**24
 """Most tiles in all: 128 MiB of weights for every action."""
@@ -90,7 +91,7 @@ def make_coder(
     )
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def find_tiles(observation: np.ndarray, coder: TileCoder, tiles: np.ndarray) -> None:
     """Find the tiles (n,) of an observation (k,), one of each tiling: that of tiling t is in [t, t + 1) * size / n.
 

@@ -18,6 +18,7 @@ import mujoco
 
 import codrl_mj
 from codrl_mj.cli.advise import Advise
+from codrl_mj.cli.cache import Cache
 from codrl_mj.cli.data import Data
 from codrl_mj.cli.evaluate import Evaluate
 from codrl_mj.cli.fields import with_environment
@@ -46,6 +47,7 @@ VERBS: dict[str, Any] = {
     "advise": Advise,
     "identify": Identify,
     "data": Data,
+    "cache": Cache,
     "validate": Validate,
 }
 """The verbs by name."""

@@ -10,7 +10,6 @@ import math
 from typing import Any, NamedTuple
 
 import mujoco
-import numba
 from numba import types
 
 from codrl_mj.engine.doors import command, is_disabled, user_of
@@ -27,6 +26,7 @@ from codrl_mj.engine.families import (
 from codrl_mj.engine.inertia import seen_from
 from codrl_mj.engine.layout import DATA, MODEL
 from codrl_mj.engine.memory import at, f64, internal
+from codrl_mj.kept import cfunc
 
 _USER_DYNAMICS, _USER_BIAS = int(mujoco.mjtDyn.mjDYN_USER), int(mujoco.mjtBias.mjBIAS_USER)
 _FIRST, _SECOND = SIGNATURE
@@ -71,7 +71,7 @@ def compiled() -> Callbacks:
         LayoutError: the installed MuJoCo's memory is not laid out as its introspection says.
     """
 
-    @numba.cfunc(types.void(types.uintp, types.uintp), nogil=True, error_model="numpy")
+    @cfunc(types.void(types.uintp, types.uintp), nogil=True, error_model="numpy")
     def control(model: int, data: int) -> None:
         if MODEL.nuser_actuator(model) < HEAD:
             return  # no actuator of this model can be ours
@@ -98,7 +98,7 @@ def compiled() -> Callbacks:
                 seen_from(model, data, out, 1.0) if asks_inertia(number) else math.inf,
             )
 
-    @numba.cfunc(types.float64(types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")
+    @cfunc(types.float64(types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")
     def act_bias(model: int, data: int, actuator: int) -> float:
         if not _is_ours(model, actuator):
             return 0.0  # as the engine does when there is no callback

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numba import types
 from numba.extending import register_jitable
@@ -20,7 +19,8 @@ from numba.extending import register_jitable
 from codrl_mj.actuators import Family, Inputs, family_number, parameters_type, reference
 from codrl_mj.actuators.model import advance_form, check_family
 from codrl_mj.engine.inertia import load_inertia
-from codrl_mj.engine.memory import call_family, f64, i32, internal, read, tuple_of, u8, u64, write
+from codrl_mj.engine.memory import call_family, f64, i32, internal, read, symbol, tuple_of, u8, u64, write
+from codrl_mj.kept import Note, cfunc
 from codrl_mj.own_code import Form, check_form, not_compiled
 
 SIGNATURE = (250700.0, 268401.0)
@@ -64,7 +64,9 @@ _REFERENCES = np.zeros(10**6, dtype=np.uintp)
 _COMPILED: dict[int, tuple[Family, Any]] = {}
 """Number -> (family, what owns the memory that the tables point to)."""
 
-ADDRESSES_AT, SIZES_AT, REFERENCES_AT = (table.ctypes.data for table in (_ADDRESSES, _SIZES, _REFERENCES))
+addresses_at = symbol("codrl_mj_families", _ADDRESSES.ctypes.data)
+sizes_at = symbol("codrl_mj_sizes", _SIZES.ctypes.data)
+references_at = symbol("codrl_mj_references", _REFERENCES.ctypes.data)
 
 _F64, _AT = types.float64, types.uintp
 _FUNCTION = _F64(_AT, _F64, _AT, _AT, _AT, *(_F64,) * 6)
@@ -170,18 +172,23 @@ def _make_known(function: Any) -> None:
 
 @functools.cache
 def compiled_function(function: Callable[..., Any], form: Form, declared: str, *kinds: Any) -> Any:
-    """A user's function, compiled for arguments of such types, whose result is of a form in numba's eyes too.
+    """A user's function for arguments of such types, whose result is of a form in numba's eyes too.
+
+    It is compiled to find that out, unless a process before has, of the very same function.
 
     Raises:
         ValueError: it is not what numba compiles, or returns something else.
     """
-    compiled = internal(function)
+    compiled, noted = internal(function), Note("fits", function, form, kinds)
     try:
         _make_known(function)
+        if noted.is_there():
+            return compiled
         compiled.compile(kinds)
     except Exception as error:
         raise ValueError(not_compiled(function, error)) from error
     check_form(function, _example(compiled.overloads[kinds].signature.return_type), form, declared)
+    noted.leave()
     return compiled
 
 
@@ -198,7 +205,7 @@ def _compile(family: Any) -> Any:
     kinds = tuple_of(parameters_of), _F64, tuple_of(state_of), tuple_of(Inputs)
     advance = compiled_function(family.advance, *advance_form(family), *kinds)
 
-    @numba.cfunc(_FUNCTION, nogil=True, error_model="numpy")
+    @cfunc(_FUNCTION, nogil=True, error_model="numpy")
     def step(
         parameters: int,
         timestep: float,
@@ -246,43 +253,43 @@ def compiled_observe(family: Family) -> Any:
 @internal
 def is_compiled(number: float) -> bool:
     """Whether a family of that number is in the table; any float will do."""
-    return 0.0 <= number < 1e6 and u64(ADDRESSES_AT)[int(number)] != 0
+    return 0.0 <= number < 1e6 and u64(addresses_at())[int(number)] != 0
 
 
 @internal
 def state_count(number: int) -> int:
     """A family's number of states."""
-    return i32(SIZES_AT)[5 * number]
+    return i32(sizes_at())[5 * number]
 
 
 @internal
 def size_of(number: int) -> int:
     """`slot_size` by a family's number."""
-    return SLOT + 2 * i32(SIZES_AT)[5 * number] + i32(SIZES_AT)[5 * number + 1] + 1
+    return SLOT + 2 * i32(sizes_at())[5 * number] + i32(sizes_at())[5 * number + 1] + 1
 
 
 @internal(inline="always")
 def parameter_count(number: int) -> int:
     """A family's number of parameters."""
-    return i32(SIZES_AT)[5 * number + 2]
+    return i32(sizes_at())[5 * number + 2]
 
 
 @internal(inline="always")
 def asks_inertia(number: int) -> bool:
     """A family's `INERTIA`."""
-    return i32(SIZES_AT)[5 * number + 3] != 0
+    return i32(sizes_at())[5 * number + 3] != 0
 
 
 @internal(inline="always")
 def asked_motion(number: int) -> bool:
     """A family's `MOTION`."""
-    return i32(SIZES_AT)[5 * number + 4] != 0
+    return i32(sizes_at())[5 * number + 4] != 0
 
 
 @internal(inline="always")
 def is_called(number: int, text: int) -> bool:
     """Whether the C string at an address is a family's `reference`."""
-    name, place = u64(REFERENCES_AT)[number], 0
+    name, place = u64(references_at())[number], 0
     while u8(name)[place] == u8(text)[place]:
         if u8(name)[place] == 0:
             return True
@@ -320,7 +327,7 @@ def advance_slot(
     before = slot + 8 * SLOT
     after = before + size
     own[2] = call_family(
-        u64(ADDRESSES_AT)[number],
+        u64(addresses_at())[number],
         *(parameters, timestep, before, after, after + size, desired, position, speed, time, own[1], inertia),
     )
     return own[2]

@@ -22,12 +22,12 @@ import math
 from typing import Any, NamedTuple
 
 import mujoco
-import numba
 from numba import types
 
 from codrl_mj.engine.families import SIGNATURE
 from codrl_mj.engine.layout import DATA, MODEL
 from codrl_mj.engine.memory import at, f64, internal
+from codrl_mj.kept import cfunc
 
 HILL_NAMES = ("signature_1", "signature_2", "gravity", "wavenumber", "height")
 """What the `user` entries of one of our slide joints hold, in order: the signature (two numbers), the largest
@@ -84,7 +84,7 @@ def compiled_hill() -> HillCallback:
         LayoutError: the installed MuJoCo's memory is not laid out as its introspection says.
     """
 
-    @numba.cfunc(types.void(types.uintp, types.uintp), nogil=True, error_model="numpy")
+    @cfunc(types.void(types.uintp, types.uintp), nogil=True, error_model="numpy")
     def passive(model: int, data: int) -> None:
         width = MODEL.nuser_jnt(model)
         if width < len(HILL_NAMES):

@@ -5,19 +5,19 @@ import math
 from typing import Any
 
 import mujoco
-import numba
 import numpy as np
 from numba import types
 
 from codrl_mj.engine.layout import DATA, MODEL
-from codrl_mj.engine.memory import call_inertia, internal, on_stack, u64
+from codrl_mj.engine.memory import call_inertia, internal, on_stack, symbol, u64
+from codrl_mj.kept import cfunc
 
 MOST_ON_STACK = 1024
 """Degrees of freedom up to which the work is done on the stack, which is quicker."""
 
 
 _ADDRESS = np.zeros(1, dtype=np.uintp)
-_ADDRESS_AT = _ADDRESS.ctypes.data
+_address_at = symbol("codrl_mj_inertia", _ADDRESS.ctypes.data)
 
 
 @internal
@@ -26,7 +26,7 @@ def seen_from(model: int, data: int, output: int, gear: float) -> float:
 
     To be compiled takes a second, which only families that ask for it are to pay.
     """
-    return call_inertia(u64(_ADDRESS_AT)[0], model, data, output, gear)
+    return call_inertia(u64(_address_at())[0], model, data, output, gear)
 
 
 @internal(inline="always")
@@ -63,7 +63,7 @@ def load_inertia() -> Any:
         LayoutError: the installed MuJoCo's memory is not laid out as its introspection says.
     """
 
-    @numba.cfunc(types.float64(types.uintp, types.uintp, types.int32, types.float64), nogil=True, error_model="numpy")
+    @cfunc(types.float64(types.uintp, types.uintp, types.int32, types.float64), nogil=True, error_model="numpy")
     def through_gear(model: int, data: int, output: int, gear: float) -> float:
         count = MODEL.nv(model)
         if count > MOST_ON_STACK:

@@ -5,13 +5,14 @@ call. A fault that the engine itself finds (an unknown integrator, memory run
 out) ends the process there, where `mujoco.mj_step` would raise `mujoco.FatalError`; our models cause none.
 """
 
-import ctypes
 import functools
 from typing import Any, NamedTuple
 
 import mujoco
+from numba import types
 
 from codrl_mj.engine.layout import offset
+from codrl_mj.kept import external
 from codrl_mj.plugin import library
 
 
@@ -45,6 +46,5 @@ def engine() -> Engine:
     """
     mujoco_library = library()
     functions = mujoco_library.mj_step, mujoco_library.mj_resetData, mujoco_library.mj_setConst
-    for function in functions:
-        function.argtypes, function.restype = (ctypes.c_void_p, ctypes.c_void_p), None
-    return Engine(*functions)
+    signature = types.void(types.uintp, types.uintp)
+    return Engine(*(external(f"mj_function_{at}", one, signature) for at, one in enumerate(functions)))

@@ -9,6 +9,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
+from codrl_mj.kept import linked
+
 internal = functools.partial(numba.njit, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 """`numba.njit` for what only compiled code calls: the ways in from Python, left out, take their time to compile."""
 
@@ -24,6 +26,23 @@ def _pointer(element: Any) -> Any:
         return types.CPointer(element)(types.uintp), codegen
 
     return pointer
+
+
+def symbol(name: str, address: int) -> Any:
+    """A numba intrinsic for an address of this process, which compiled code knows by a name."""
+    name = linked(name, address)
+
+    @intrinsic
+    def at_symbol(typing_context: Any) -> Any:  # noqa: ARG001 - numba fixes the arguments
+        def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
+            known = builder.module.globals.get(name)
+            place = known or ir.GlobalVariable(builder.module, ir.IntType(8), name)
+            place.linkage = "external"
+            return builder.ptrtoint(place, context.get_value_type(types.uintp))
+
+        return types.uintp(), codegen
+
+    return at_symbol
 
 
 f64, i32, i64, u8, u64 = (

@@ -11,7 +11,6 @@ import math
 from typing import Any, NamedTuple
 
 import mujoco
-import numba
 from numba import types
 
 from codrl_mj.actuators import BUILT_IN, Ideal, family_number, reference
@@ -33,7 +32,8 @@ from codrl_mj.engine.families import (
 )
 from codrl_mj.engine.inertia import seen_from
 from codrl_mj.engine.layout import DATA, MODEL
-from codrl_mj.engine.memory import at, f64, internal
+from codrl_mj.engine.memory import at, f64, internal, symbol
+from codrl_mj.kept import cfunc, external, njit
 from codrl_mj.plugin import FAMILY, NAME, complain, library, registered
 
 PLUGIN_HEAD = HEAD + 1
@@ -118,11 +118,12 @@ def _engine_force(model: int, data: int, actuator: int, length: float, velocity:
 @functools.cache
 def _verdict() -> tuple[Any, Any]:
     """(model, instance) -> index into `REASONS`: what is wrong with an instance; and what that holds an address of."""
-    configuration_of = _configuration_function()
+    wanted = types.uintp(types.uintp, types.int32, types.uintp)
+    configuration_of = external("mj_plugin_configuration", _configuration_function(), wanted)
     attribute = ctypes.create_string_buffer(FAMILY.encode())
-    attribute_at = ctypes.addressof(attribute)
+    attribute_at = symbol("codrl_mj_attribute", ctypes.addressof(attribute))
 
-    @numba.njit(nogil=True, error_model="numpy")
+    @njit(nogil=True, error_model="numpy")
     def verdict(model: int, instance: int) -> int:
         for actuator in range(MODEL.nactuator(model)):
             if MODEL.actuator_plugin(model)[actuator] != instance:
@@ -133,7 +134,7 @@ def _verdict() -> tuple[Any, Any]:
             if not is_compiled(user[2]):
                 return 2
             number = int(user[2])
-            if not is_called(number, configuration_of(model, instance, attribute_at)):
+            if not is_called(number, configuration_of(model, instance, attribute_at())):
                 return 3
             if width < PLUGIN_HEAD + parameter_count(number):
                 return 4
@@ -152,7 +153,7 @@ def compiled() -> Functions:
         LayoutError: the installed MuJoCo's memory is not laid out as its introspection says.
     """
 
-    @numba.cfunc(types.void(types.uintp, types.uintp, types.int32, types.int32), nogil=True, error_model="numpy")
+    @cfunc(types.void(types.uintp, types.uintp, types.int32, types.int32), nogil=True, error_model="numpy")
     def compute(model: int, data: int, instance: int, capability: int) -> None:  # noqa: ARG001
         time, timestep = DATA.time(data), MODEL.opt.timestep(model)
         slot = _slot_of(model, data, instance)
@@ -184,7 +185,7 @@ def compiled() -> Functions:
                 own[size_of(number)], own[size_of(number) + 1] = own[2] * gear if motion else force, 1.0
             DATA.actuator_force(data)[out] = own[2] * gear
 
-    @numba.cfunc(types.void(types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")
+    @cfunc(types.void(types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")
     def advance(model: int, data: int, instance: int) -> None:
         for actuator in range(MODEL.nactuator(model)):
             if MODEL.actuator_plugin(model)[actuator] == instance:
@@ -192,22 +193,23 @@ def compiled() -> Functions:
                 commit_slot(number, slot, DATA.time(data))
                 f64(slot)[size_of(number) + 1] = 0.0
 
-    @numba.cfunc(types.void(types.uintp, types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")
+    @cfunc(types.void(types.uintp, types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")
     def reset(model: int, state: int, data: int, instance: int) -> None:  # noqa: ARG001
         for entry in range(MODEL.plugin_statenum(model)[instance]):
             f64(state)[entry] = 0.0
 
     verdict, attribute = _verdict()
-    complaint = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_int)(_judge)
+    judge = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_int)(_judge)
+    complaint = external("codrl_mj_judge", judge, types.int32(types.uintp, types.int32))
 
-    @numba.cfunc(types.int32(types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")
+    @cfunc(types.int32(types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")
     def init(model: int, data: int, instance: int) -> int:  # noqa: ARG001
         if verdict(model, instance) == 0:
             return 0
         return complaint(model, instance)
 
     functions = {"init": init, "reset": reset, "compute": compute, "advance": advance}
-    return Functions(functions, (attribute, complaint))
+    return Functions(functions, (attribute, judge))
 
 
 def _configuration_function() -> Any:

@@ -4,7 +4,7 @@
 
     parts = compiled_env(env.unwrapped)  # None where this cannot be
 
-    @numba.njit(nogil=True)
+    @njit(nogil=True)
     def episode(step, reset, forces, generator, low, high, observation, arguments):
         reset(generator, low, high, observation, *arguments)
         total, ended = 0.0, False
@@ -36,6 +36,7 @@ from codrl_mj.engine.families import compiled_function
 from codrl_mj.engine.memory import floats, internal, on_stack
 from codrl_mj.envs.outcomes import Outcomes, compiled_outcomes
 from codrl_mj.envs.setup import Setup
+from codrl_mj.kept import njit
 from codrl_mj.physics.constrain import Compiled
 from codrl_mj.physics.rows import Lane, Rows, claim, complain, finish, load, store
 from codrl_mj.physics.stepping import Stepping
@@ -168,7 +169,7 @@ def _kernels(
 ) -> Kernels:
     advance, start, read, observed = stepping
     observe, rewarded, ended = outcomes.observe, outcomes.reward, outcomes.terminated
-    compiled = numba.njit(nogil=True, error_model="numpy")
+    compiled = njit(nogil=True, error_model="numpy")
     initial_entries = internal(initial_state)
     delivered = _only if single else _each
 

@@ -8,13 +8,13 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numba import types
 from numba.np.unsafe.ndarray import to_fixed_tuple
 
 from codrl_mj.engine.families import compiled_function
 from codrl_mj.engine.memory import entries_type, floats, internal, read, tuple_of
+from codrl_mj.kept import njit
 from codrl_mj.physics.constrain import Compiled
 from codrl_mj.tasks import Task
 
@@ -55,7 +55,7 @@ def _compiled(
     names: tuple[str, ...],
     several: bool,
 ) -> Outcomes:
-    compiled = numba.njit(nogil=True, error_model="numpy")
+    compiled = njit(nogil=True, error_model="numpy")
     options_count, entries = len(options_type._fields), entries_type(size)
     state, force = tuple_of(entries), types.float64[::1] if several else types.float64
     observation_of = compiled_function(observation, names, "Task.observation_names", state)

@@ -69,9 +69,9 @@ def moved(number: Mapping[str, float], gain: float, braking: float = 0.0) -> Mov
 @functools.cache
 def winding() -> Callable[..., np.ndarray]:
     """The compiled (times, volts, speeds, current, resistance, inductance, constant) -> currents at the times, (n,)."""
-    import numba
+    from codrl_mj.kept import njit
 
-    @numba.njit(nogil=True, error_model="numpy")
+    @njit(nogil=True, error_model="numpy")
     def simulate(
         times: np.ndarray,
         volts: np.ndarray,
@@ -97,10 +97,12 @@ def turned() -> Any:
     """The compiled shaft over one interval: (duration, input, slope, position, speed, moved) -> position, speed."""
     import numba
 
+    from codrl_mj.kept import njit
+
     taken: Any = numba.njit(shaft.friction)
     make: Any = shaft.Shaft
 
-    @numba.njit(nogil=True, error_model="numpy")
+    @njit(nogil=True, error_model="numpy")
     def turn(
         duration: float, given: float, slope: float, position: float, speed: float, moved: Any
     ) -> tuple[float, float]:
@@ -134,11 +136,11 @@ def moving() -> Callable[..., tuple[np.ndarray, np.ndarray]]:
     Between two rows the input is inputs[k] + slopes[k]*(t - times[k]). Gravity acts in the middle of a substep, and
     viscous friction by its mean speed: both to second order; dry friction is an implicit step, and never chatters.
     """
-    import numba
+    from codrl_mj.kept import njit
 
     turn = turned()
 
-    @numba.njit(nogil=True, error_model="numpy")
+    @njit(nogil=True, error_model="numpy")
     def simulate(
         times: np.ndarray, inputs: np.ndarray, slopes: np.ndarray, position: float, speed: float, moved: Any
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -159,11 +161,11 @@ def served() -> Callable[..., np.ndarray]:
 
     The input at a row is law*(target - position), within the row's limit, and holds till the next.
     """
-    import numba
+    from codrl_mj.kept import njit
 
     turn = turned()
 
-    @numba.njit(nogil=True, error_model="numpy")
+    @njit(nogil=True, error_model="numpy")
     def simulate(
         times: np.ndarray,
         targets: np.ndarray,

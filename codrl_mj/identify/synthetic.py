@@ -293,11 +293,12 @@ def write_log(path: Path, log: Log) -> str:
 
 @functools.cache
 def _compiled() -> Callable[..., np.ndarray]:
-    import numba
+
+    from codrl_mj.kept import njit
 
     turn = simulation.turned()
 
-    @numba.njit(nogil=True, error_model="numpy")
+    @njit(nogil=True, error_model="numpy")
     def course(
         period: float, shares: Any, limit: float, sag: float, winding: Any, moved: Any, locked: bool, position: float
     ) -> np.ndarray:

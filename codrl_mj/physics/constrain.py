@@ -7,12 +7,12 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import numba
 import numpy as np
 from numba import types
 
 from codrl_mj.engine.families import compiled_function
 from codrl_mj.engine.memory import entries_type, floats, internal, read, tuple_of
+from codrl_mj.kept import njit
 from codrl_mj.physics.base import LARGEST
 from codrl_mj.tasks import Task
 
@@ -55,7 +55,7 @@ def _keeper(
     fill, entries = _reader(positions, velocities), entries_type(len(names))
     bounded = compiled_function(constrain, names, "Task.state_names", tuple_of(entries), types.float64)
 
-    @numba.njit(nogil=True, error_model="numpy")
+    @njit(nogil=True, error_model="numpy")
     def keep(qpos: Any, qvel: Any, state: np.ndarray, timestep: float) -> None:
         fill(qpos, qvel, state)
         if not is_fine(state):

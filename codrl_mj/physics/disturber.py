@@ -3,7 +3,6 @@
 import functools
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numba.extending import register_jitable
 
@@ -12,6 +11,7 @@ from codrl_mj.disturbances import Disturbances
 from codrl_mj.disturbances.command import delayed, quantised, rate_limited, whole_and_fraction
 from codrl_mj.disturbances.pulses import KEY, PULSE_NAMES, pulse_load
 from codrl_mj.engine.memory import internal, read
+from codrl_mj.kept import njit
 
 for _function in (delayed, quantised, rate_limited, philox, unit):
     register_jitable(_function)
@@ -146,12 +146,12 @@ def compiled_disturbance() -> Disturbance:
         own = memory[len(memory) - len(PULSE_NAMES) :]
         return pulses(own, numbers.timestep, numbers.pulse_force, numbers.pulse_duration, numbers.pulse_interval)
 
-    @numba.njit(nogil=True, error_model="numpy")
+    @njit(nogil=True, error_model="numpy")
     def commands(numbers: np.ndarray, memory: np.ndarray, forces: np.ndarray, commands: np.ndarray) -> None:
         for row in range(len(memory)):
             commands[row] = command(numbers_of(numbers[row % len(numbers)]), memory[row], forces[row])
 
-    @numba.njit(nogil=True, error_model="numpy")
+    @njit(nogil=True, error_model="numpy")
     def loads(numbers: np.ndarray, memory: np.ndarray, loads: np.ndarray) -> None:
         for row in range(len(memory)):
             loads[row] = load(numbers_of(numbers[row % len(numbers)]), memory[row])

@@ -12,11 +12,11 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import mujoco
-import numba
 import numpy as np
 
 from codrl_mj.engine.library import address_of, addresses, engine
 from codrl_mj.engine.memory import copy_bytes, count_on, f64, internal
+from codrl_mj.kept import njit
 from codrl_mj.physics.mujoco_single import ARM, MujocoPhysics
 from codrl_mj.physics.variation import field_of
 
@@ -133,7 +133,7 @@ def compiled_set_const() -> Any:
     """
     set_const = engine().set_const
 
-    @numba.njit(nogil=True, error_model="numpy")
+    @njit(nogil=True, error_model="numpy")
     def fill(rows: np.ndarray, lane: Any, derived: np.ndarray) -> None:
         lane = Lane(*lane)
         for row in rows:
@@ -164,7 +164,7 @@ def complain(tally: np.ndarray) -> None:
     count_on(tally[2:].ctypes.data, 1)
 
 
-@numba.njit(nogil=True)
+@njit(nogil=True)
 def _await(tally: np.ndarray, count: int) -> bool:
     """Whether all rows are done, after a short wait for others."""
     patience = 2000

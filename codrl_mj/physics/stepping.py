@@ -20,6 +20,7 @@ from codrl_mj.engine.families import HEAD, Slot, compiled_observe, load_family, 
 from codrl_mj.engine.layout import DATA, MODEL
 from codrl_mj.engine.library import engine
 from codrl_mj.engine.memory import internal, on_stack, read
+from codrl_mj.kept import njit
 from codrl_mj.physics.constrain import Compiled, compiled_constrain, compiled_reader, is_fine
 from codrl_mj.physics.disturber import KEY_COLUMN, compiled_disturbance, numbers_of
 from codrl_mj.tasks import Task
@@ -104,7 +105,7 @@ def _stepping(
     seeing = bool(family.OBSERVED)
     observe = compiled_observe(family) if seeing else _nothing
 
-    @numba.njit(nogil=True, error_model="numpy")
+    @njit(nogil=True, error_model="numpy")
     def step(force: Any, model: int, data: int, settings: np.ndarray, memory: np.ndarray, trace: np.ndarray) -> bool:
         timestep = MODEL.opt.timestep(model)
         qpos, qvel, ctrl, act = DATA.qpos(data), DATA.qvel(data), DATA.ctrl(data), DATA.act(data)
@@ -142,7 +143,7 @@ def _stepping(
         read_state(qpos, qvel, state)
         return is_fine(state)
 
-    @numba.njit(nogil=True, error_model="numpy")
+    @njit(nogil=True, error_model="numpy")
     def start(
         state: np.ndarray,
         key: float,
@@ -165,7 +166,7 @@ def _stepping(
                 memory[actuator] = 0.0
                 memory[actuator, memory.shape[1] + KEY_COLUMN] = key + actuator
 
-    @numba.njit(nogil=True, error_model="numpy")
+    @njit(nogil=True, error_model="numpy")
     def read(
         state: np.ndarray,
         model: int,  # noqa: ARG001 - the arguments of a simulation go together
@@ -176,7 +177,7 @@ def _stepping(
     ) -> None:
         read_state(DATA.qpos(data), DATA.qvel(data), state)
 
-    @numba.njit(nogil=True, error_model="numpy")
+    @njit(nogil=True, error_model="numpy")
     def observed(
         row: np.ndarray,
         seen: np.ndarray,

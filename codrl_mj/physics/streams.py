@@ -4,9 +4,11 @@ import ctypes
 from collections.abc import Sequence
 from typing import Any
 
-import numba
 import numpy as np
 from gymnasium.utils import seeding
+from numba import types
+
+from codrl_mj.kept import external, njit
 
 WORDS = 6
 """Numbers that hold one generator's state: PCG64's state and increment (two words each), and its spare 32 bits."""
@@ -94,9 +96,9 @@ def _filler(next_double: int | None) -> Any:
     """A compiled function that fills rows from the generators at the given addresses."""
     assert next_double is not None
     if next_double not in _fillers:
-        draw = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_size_t)(next_double)
+        draw = external("next_double", ctypes.c_void_p(next_double), types.float64(types.uintp))
 
-        @numba.njit("void(uintp[::1], float64[:,::1])")
+        @njit
         def fill(addresses: np.ndarray, drawn: np.ndarray) -> None:
             for row in range(len(addresses)):
                 for column in range(drawn.shape[1]):
