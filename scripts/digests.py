@@ -283,14 +283,14 @@ def environments_of_others() -> Entries:
     """Names and digests of trajectories of environments of others, Gymnasium's and dm_control's."""
     drive = {"name": "maxon-ec45-flat-50w", "motor": {"gear_ratio": 5}}
     ways: dict[str, dict[str, Any]] = {
-        "ideal": {"actuators": {".*": "ideal"}},
-        "lag": {"actuators": {".*": "lag"}},
-        "drive": {"actuators": {".*": drive}, "observe_actuator": True},
-        "current": {"actuators": {".*": drive}, "action": "current"},
-        "delayed": {"actuators": {".*": drive}, "disturbances": {"command_delay": 0.1, "command_quantum": 0.1}},
-        "pulses": {"actuators": {".*": "lag"}, "disturbances": _PULSE},
+        "ideal": {"actuator": {".*": "ideal"}},
+        "lag": {"actuator": {".*": "lag"}},
+        "drive": {"actuator": {".*": drive}, "observe_actuator": True},
+        "current": {"actuator": {".*": drive}, "action": "current"},
+        "delayed": {"actuator": {".*": drive}, "disturbances": {"command_delay": 0.1, "command_quantum": 0.1}},
+        "pulses": {"actuator": {".*": "lag"}, "disturbances": _PULSE},
         "drawn": {
-            "actuators": {".*": drive},
+            "actuator": {".*": drive},
             "randomize": {".*": {"motor.resistance": "uniform(0.5, 2.0)"}, "model.gravity": "uniform(0.8, 1.2)"},
         },
     }
@@ -301,7 +301,7 @@ def environments_of_others() -> Entries:
     for name in ("ideal", "drive", "drawn"):
         arguments = {"randomize": None} | {key: ways[name][key] for key in ways[name] if key != "observe_actuator"}
         made_by = {"task_kwargs": {"random": 1}, "noise_seed": 3, "allow_unstable": True}
-        env = codrl_mj.make_dm_control("cheetah/run", **made_by, **arguments)
+        env = codrl_mj.make_dm_control("cheetah/run", arguments.pop("actuator"), **made_by, **arguments)
         generator, seen = np.random.default_rng(1), []
         env.reset()
         for _ in range(60):
