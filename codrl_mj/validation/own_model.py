@@ -15,6 +15,7 @@ from codrl_mj.tasks import find_task, resolve_actuators
 from codrl_mj.validation import execution
 from codrl_mj.validation.compare import STAND_IN, actuators_of
 from codrl_mj.validation.in_python import beside, entries
+from codrl_mj.validation.rotors import Loop
 from codrl_mj.validation.table import Case, Check, Oracle, Skipped, check
 
 STEP_TOLERANCE = 1e-11
@@ -150,8 +151,7 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
 
 def _alone(model: mujoco.MjModel, name: str, quick: bool) -> Iterator[Check | Skipped]:
     """The model's current loops, each on a rotor of its own, against python-control's discrete model of the loop."""
-    from codrl_mj.validation.motor_loops import Loop
-    from codrl_mj.validation.motor_sampled import sampled_checks  # needs scipy and python-control
+    from codrl_mj.validation.motor_loops import sampled_checks  # needs scipy and python-control
 
     loops = {}
     for motor, actuator in _names(model).values():
