@@ -5,9 +5,8 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import Actuator, ActuatorModel, CurrentLoop, spectral_radius
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, trace_names
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics
 from codrl_mj.tasks import Task, resolve_actuators
-from codrl_mj.tasks.trials import Trials
 
 NO_TWIN = "it rebuilds no environment of Gymnasium's: there is no second implementation of its mechanics"
 SEVERAL_MOTORS = "it has several motors, and commands are made for one"
@@ -41,18 +40,6 @@ def both(
     )
 
 
-def twin_of(task: Task) -> Any:
-    """The environment that a task rebuilds, driven by any force; it must have one."""
-    assert task.twin is not None
-    return task.twin()
-
-
-def trials_of(task: Task) -> Trials:
-    """What a task is tried in; it must say so."""
-    assert task.trials is not None
-    return task.trials
-
-
 def physics_of(task: Task) -> tuple[tuple[str, type], ...]:
     """The physics that a task can be simulated by, MuJoCo first."""
     return PHYSICS if task.twin is not None else PHYSICS[:1]
@@ -77,8 +64,3 @@ def forces_of(task: Task, shares: np.ndarray) -> np.ndarray:
     """Desired forces, row by row what `Physics.step` takes, from shares of the largest, shape (steps * motors,)."""
     forces = task.max_forces * shares.reshape(-1, len(task.motors))
     return forces[:, 0] if len(task.motors) == 1 else forces
-
-
-def last_signals(physics: MujocoPhysics | AnalyticPhysics) -> dict[str, float]:
-    """What the actuator did in the last integration step, by the names of `trace_names`."""
-    return dict(zip(trace_names(physics.family), physics.trace[-1, 0].tolist(), strict=True))

@@ -4,7 +4,6 @@ The oracle is an unmodified Gymnasium environment that is driven through its att
 """
 
 import itertools
-import math
 from collections.abc import Iterator
 
 import mujoco
@@ -13,7 +12,9 @@ import numpy as np
 from codrl_mj.actuators import IDEAL
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError
 from codrl_mj.tasks import Task, find_task
-from codrl_mj.validation.compare import NO_TWIN, SEVERAL_MOTORS, both, differences, trials_of, twin_of
+from codrl_mj.tasks.trials import Trials
+from codrl_mj.validation.compare import NO_TWIN, SEVERAL_MOTORS, both, differences
+from codrl_mj.validation.continuous import gymnasium_equations
 from codrl_mj.validation.table import Case, Check, Oracle, Skipped, check
 
 TOLERANCE = 1e-12
@@ -21,6 +22,12 @@ TOLERANCE = 1e-12
 
 EXTREME = 10.0
 """Extreme forces are this many times the largest that a task asks for."""
+
+
+def trials_of(task: Task) -> Trials:
+    """What a task is tried in; it must say so."""
+    assert task.trials is not None
+    return task.trials
 
 
 def grid(task: Task, points: int) -> np.ndarray:
@@ -90,45 +97,19 @@ def one_step_beyond_the_force_limit(task: Task, integrator: str, points: int) ->
     yield _stepped(task, ours, oracle, states, forces)
 
 
-class _GymnasiumAcceleration:
-    """The acceleration (state, force) -> one number for each velocity, of an unmodified Gymnasium environment."""
-
-    def __init__(self, task: Task) -> None:
-        self._driver = twin_of(task)
-        self._velocities = list(task.qvel)
-        self._derivative = getattr(self._driver, "derivative", None)
-        if self._derivative is None:
-            env = getattr(self._driver, "env", None)
-            # one explicit step of 1 s changes the velocities by the accelerations, where nothing bounds them
-            for owner, name, value in (
-                (env, "max_speed", math.inf),
-                (self._driver, "_max_speed", math.inf),
-                (env, "min_position", -math.inf),
-                (env, "max_position", math.inf),
-            ):
-                if hasattr(owner, name):
-                    setattr(owner, name, value)
-
-    def __call__(self, state: np.ndarray, force: float) -> np.ndarray:
-        if self._derivative is not None:
-            return self._derivative(state, force)[self._velocities]
-        after = np.array(self._driver(state, force, 1.0, "euler"))
-        return (after - state)[self._velocities]
-
-
 @check("dynamics", Oracle("accelerations", "{task.oracle}", TOLERANCE))
 def accelerations(task: Task, points: int) -> Iterator[Case]:
     """MuJoCo's `qacc` over a dense grid of states, under no, half, full and extreme forces."""
     states, forces = _crossed(grid(task, points), task.max_force * np.array([-EXTREME, -1.0, 0.0, 0.5, EXTREME]))
     physics, _ = both(task, IDEAL, task.integrators[0], max_force=EXTREME * task.max_force)
-    acceleration = _GymnasiumAcceleration(task)
+    equations, velocities = gymnasium_equations(task, dt=1.0), list(task.qvel)
     ours, oracle = (np.empty((len(states), len(task.qvel))) for _ in range(2))
     for row, (state, force) in enumerate(zip(states, forces.tolist(), strict=True)):
         physics.reset(state)
         physics.data.ctrl[0] = force
         mujoco.mj_forward(physics.model, physics.data)
         ours[row] = physics.data.qacc
-        oracle[row] = acceleration(state, force)
+        oracle[row] = equations(state, force)[velocities]
 
     def where(at: int) -> str:
         row, entry = divmod(at, len(task.qvel))
