@@ -136,12 +136,14 @@ def model_checks(
 # -- with a task's bounds and integrator around it ----------------------------------------------------------
 
 
-def _episode(physics: MujocoPhysics, forces: np.ndarray) -> np.ndarray:
-    """The motor's and the mechanical state after each environment step."""
+def _episode(physics: MujocoPhysics, forces: np.ndarray, look: bool = False) -> np.ndarray:
+    """The motor's and the mechanical state after each environment step, looked at by a forward pass or not."""
     states = []
     for force in forces:
         physics.step(force)
         states.append(np.concatenate([physics.state, physics.data.act]))
+        if look:
+            mujoco.mj_forward(physics.model, physics.data)
     return np.array(states)
 
 
@@ -178,12 +180,7 @@ def looked_at(task: Task, integrator: str, steps: int) -> Iterator[Case]:
     physics, initial, forces = _simulation(task, integrator, 5, steps)
     oracle = _episode(physics, forces)
     physics.reset(initial)
-    states = []
-    for force in forces:
-        physics.step(force)
-        states.append(np.concatenate([physics.state, physics.data.act]))
-        mujoco.mj_forward(physics.model, physics.data)
-    yield from bits(np.array(states), oracle)
+    yield from bits(_episode(physics, forces, look=True), oracle)
 
 
 def checks(task_name: str, quick: bool = False) -> Iterator[Check]:
