@@ -54,8 +54,11 @@ def _after_one_step(physics: MujocoPhysics | AnalyticPhysics, states: np.ndarray
     return after
 
 
-def _stepped(task: Task, ours: np.ndarray, oracle: np.ndarray, states: np.ndarray, forces: np.ndarray) -> Case:
-    """What steps from the states under the forces ended in."""
+def _stepped(task: Task, integrator: str, states: np.ndarray, forces: np.ndarray, limit: float) -> Case:
+    """One step from the states under the forces, which MuJoCo limits itself and Gymnasium is given limited."""
+    physics, analytic = both(task, IDEAL, integrator, max_force=limit)
+    ours = _after_one_step(physics, states, forces)
+    oracle = _after_one_step(analytic, states, np.clip(forces, -limit, limit))
 
     def where(at: int) -> str:
         row, entry = divmod(at, states.shape[1])
@@ -71,30 +74,22 @@ def one_step(task: Task, integrator: str, samples: int, seed: int = 0) -> Iterat
     bounds = np.array(trials_of(task).bounds)
     states = generator.uniform(-bounds, bounds, (samples, len(bounds)))
     forces = generator.uniform(-task.max_force, task.max_force, samples)
-    ours, oracle = (_after_one_step(physics, states, forces) for physics in both(task, IDEAL, integrator))
-    yield _stepped(task, ours, oracle, states, forces)
+    yield _stepped(task, integrator, states, forces, task.max_force)
 
 
 @check("dynamics", Oracle("one step at the bounds, {integrator}", "{task.oracle}", TOLERANCE))
 def one_step_at_the_bounds(task: Task, integrator: str, stride: int = 1) -> Iterator[Case]:
     """One step from the task's edges under no, full and extreme forces, which MuJoCo is allowed here."""
-    states, forces = _crossed(
-        np.array(list(itertools.product(*trials_of(task).edges)))[::stride],
-        task.max_force * np.array([-EXTREME, -1.0, 0.0, 1.0, EXTREME]),
-    )
-    physics = both(task, IDEAL, integrator, max_force=EXTREME * task.max_force)
-    ours, oracle = (_after_one_step(each, states, forces) for each in physics)
-    yield _stepped(task, ours, oracle, states, forces)
+    states = np.array(list(itertools.product(*trials_of(task).edges)))[::stride]
+    crossed = _crossed(states, task.max_force * np.array([-EXTREME, -1.0, 0.0, 1.0, EXTREME]))
+    yield _stepped(task, integrator, *crossed, EXTREME * task.max_force)
 
 
 @check("dynamics", Oracle("one step beyond the force limit, {integrator}", "{task.oracle}", TOLERANCE))
 def one_step_beyond_the_force_limit(task: Task, integrator: str, points: int) -> Iterator[Case]:
     """One step under commands up to `EXTREME` times the limit, against Gymnasium under the limit."""
-    states, forces = _crossed(grid(task, points), task.max_force * np.array([-EXTREME, -1.001, 1.001, EXTREME]))
-    mujoco_physics, analytic = both(task, IDEAL, integrator)
-    ours = _after_one_step(mujoco_physics, states, forces)
-    oracle = _after_one_step(analytic, states, np.clip(forces, -task.max_force, task.max_force))
-    yield _stepped(task, ours, oracle, states, forces)
+    crossed = _crossed(grid(task, points), task.max_force * np.array([-EXTREME, -1.001, 1.001, EXTREME]))
+    yield _stepped(task, integrator, *crossed, task.max_force)
 
 
 @check("dynamics", Oracle("accelerations", "{task.oracle}", TOLERANCE))

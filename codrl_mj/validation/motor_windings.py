@@ -52,10 +52,10 @@ MOTORS: dict[str, Motor] = {
 _ON: tuple[tuple[Load, str], ...] = ((HELD, "Euler"), (HELD, "implicitfast"), (FREE, "Euler"), (SWINGING, "Euler"))
 
 
-def exact_inductance(motor: Motor, timestep: float) -> Motor:
-    """The motor at the inductance for which one Euler step is the exact step of the given one."""
+def exact(motor: Motor, timestep: float) -> Actuator:
+    """A motor of ours under a voltage, whose inductance makes its Euler step the exact one of the given motor."""
     decay = 1.0 - math.exp(-timestep * motor.resistance / motor.inductance)
-    return dataclasses.replace(motor, inductance=motor.resistance * timestep / decay)
+    return driven_by_voltage(dataclasses.replace(motor, inductance=motor.resistance * timestep / decay))
 
 
 def _voltages(hold: int, count: int) -> np.ndarray:
@@ -85,7 +85,7 @@ def same_map(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
     for (name, motor), (load, integrator), share in itertools.product(motors.items(), _ON, shares):
         timestep = share * motor.electrical_time_constant
         volts = _voltages(5, 20 if quick else 100)
-        actuator = driven_by_voltage(exact_inductance(motor, timestep))
+        actuator = exact(motor, timestep)
         ours, native, difference = _both(load, motor, actuator, timestep, volts, integrator)
         at = f"{name} motor, {load.name}, {integrator}, dt = {share:g} L/R, step {difference.argmax() + 1}"
         time = np.arange(1, len(volts) + 1) * timestep
@@ -115,7 +115,7 @@ def implicitfast(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
     for (name, motor), load in itertools.product(motors.items(), (FREE, SWINGING)):
         steps, errors = motor.electrical_time_constant / divisors, []
         for divisor, timestep in zip(divisors, steps, strict=True):
-            actuator, volts = driven_by_voltage(exact_inductance(motor, timestep)), _voltages(int(divisor), 10)
+            actuator, volts = exact(motor, timestep), _voltages(int(divisor), 10)
             errors.append(_both(load, motor, actuator, timestep, volts, "implicitfast")[-1].max())
         families.append(Family(f"{name}, {load.name}", steps, np.array(errors)))
     title = "Ours against <dcmotor>, implicitfast"
@@ -134,12 +134,12 @@ def rk4_check(quick: bool) -> Iterator[Case]:
     for at, share in enumerate(shares):
         timestep = float(share) * motor.electrical_time_constant
         volts = np.ones(math.ceil(3.0 / share))
-        exact = (1.0 / motor.resistance) * (1.0 - np.exp(-share * np.arange(1, len(volts) + 1)))
+        currents = (1.0 / motor.resistance) * (1.0 - np.exp(-share * np.arange(1, len(volts) + 1)))
         models = (
-            motors_on(HELD, [driven_by_voltage(exact_inductance(motor, timestep))], timestep, "RK4"),
+            motors_on(HELD, [exact(motor, timestep)], timestep, "RK4"),
             native_motor_on(HELD, motor, timestep, "RK4"),
         )
-        ours[at], native[at] = (np.abs(drive(one, volts).current[:, 0] / exact - 1.0).max() for one in models)
+        ours[at], native[at] = (np.abs(drive(one, volts).current[:, 0] / currents - 1.0).max() for one in models)
     native_error = (
         f"; <dcmotor> reads {native[0]:.1%} wrong at dt = {shares[0]:g} L/R, {native[-1]:.0%} at {shares[-1]:g} L/R"
     )
