@@ -82,11 +82,9 @@ def verdict(passed: Sequence[bool]) -> str:
 
 
 def _check_mapping(check: Check) -> dict[str, Any]:
-    fields = {field.name: getattr(check, field.name) for field in dataclasses.fields(check) if field.name != "plots"}
-    for name, value in fields.items():
-        if isinstance(value, float) and not math.isfinite(value):
-            fields[name] = str(value)
-    return fields | {"samples": int(check.samples), "passed": check.passed}
+    found = {field.name: getattr(check, field.name) for field in dataclasses.fields(check) if field.name != "plots"}
+    text = {name: str(one) for name, one in found.items() if isinstance(one, float) and not math.isfinite(one)}
+    return found | text | {"samples": int(check.samples), "passed": check.passed}
 
 
 def versions() -> dict[str, str]:

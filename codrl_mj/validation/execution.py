@@ -90,15 +90,14 @@ def copied(model: mujoco.MjModel, steps: int) -> Iterator[Case]:
 
 
 @check("execution", Oracle("restored", "the run it was taken from", 0.0, UNIT))
-def restored(model: mujoco.MjModel, steps: int, state: mujoco.mjtState | None = None) -> Iterator[Case]:
+def restored(model: mujoco.MjModel, steps: int, state: mujoco.mjtState = STATE) -> Iterator[Case]:
     """A state vector taken half-way and put into a new `MjData`, against the run it was taken from."""
-    kind = STATE if state is None else state
     inputs = commands(model, 2 * steps, seed=1)
     original, fresh = mujoco.MjData(model), mujoco.MjData(model)
     _advance(model, original, inputs[:steps])
-    vector = np.empty(mujoco.mj_stateSize(model, kind))
-    mujoco.mj_getState(model, original, vector, kind)
-    mujoco.mj_setState(model, fresh, vector, kind)
+    vector = np.empty(mujoco.mj_stateSize(model, state))
+    mujoco.mj_getState(model, original, vector, state)
+    mujoco.mj_setState(model, fresh, vector, state)
     ours = _advance(model, fresh, inputs[steps:])
     yield from bits(ours, _advance(model, original, inputs[steps:]))
 
@@ -122,7 +121,7 @@ def forward_passes(model: mujoco.MjModel, steps: int) -> Iterator[Case]:
 
 
 def model_checks(
-    model: mujoco.MjModel, task: str = "", quick: bool = False, state: mujoco.mjtState | None = None
+    model: mujoco.MjModel, task: str = "", quick: bool = False, state: mujoco.mjtState = STATE
 ) -> Iterator[Check]:
     """The checks of any model whose callbacks are installed; a state vector holds `state`."""
     simulations, steps = (6, 40) if quick else (32, 200)

@@ -30,7 +30,7 @@ from codrl_mj.tasks import OURS, find_task
 from codrl_mj.validation.certificate import WITHOUT_TASK, validate
 from codrl_mj.validation.table import Check
 
-Fault = contextlib.AbstractContextManager[Any]
+Fault = contextlib.AbstractContextManager[object]
 
 
 @contextlib.contextmanager
@@ -61,7 +61,7 @@ def wrong_model(change: Callable[[mujoco.MjModel], None]) -> Iterator[None]:
         yield
 
 
-def _off(field: str, at: Any, factor: float) -> Callable[[mujoco.MjModel], None]:
+def _off(field: str, at: int | tuple[int, int], factor: float) -> Callable[[mujoco.MjModel], None]:
     """A change that scales a part of one of the model's arrays."""
 
     def change(model: mujoco.MjModel) -> None:
