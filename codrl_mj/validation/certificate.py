@@ -106,13 +106,17 @@ Progress = Callable[[int, int, str], None]
 """(parts done, parts in all, the part that begins) -> nothing."""
 
 
+def unheard(*_: object) -> None:
+    """What is called where nobody listens."""
+
+
 def _certify(
     subject: str,
     parts: Sequence[Part],
     skipped: Sequence[Skipped],
     quick: bool,
-    on_check: Callable[[Check], None] | None,
-    on_part: Progress | None,
+    on_check: Callable[[Check], None],
+    on_part: Progress,
 ) -> Certificate:
     """Make the parts; a simulation that breaks down is a failed check, a missing library a skipped one."""
     started = time.perf_counter()
@@ -124,12 +128,10 @@ def _certify(
             skips.append(outcome)
             return
         found.append(outcome)
-        if on_check is not None:
-            on_check(outcome)
+        on_check(outcome)
 
     for index, (group, task, run) in enumerate(parts):
-        if on_part is not None:
-            on_part(index, len(parts), f"{group}, {task}" if task else group)
+        on_part(index, len(parts), f"{group}, {task}" if task else group)
         try:
             for outcome in run():
                 take(outcome)
@@ -138,8 +140,7 @@ def _certify(
         except (ArithmeticError, SimulationDivergedError) as error:
             reason = f"{type(error).__name__}: {error}"
             take(Check("runs to its end", "itself", 1, math.inf, 0.0, reason, group, task, ""))
-    if on_part is not None:
-        on_part(len(parts), len(parts), "done")
+    on_part(len(parts), len(parts), "done")
     return Certificate(subject, tuple(found), tuple(skips), quick, time.perf_counter() - started)
 
 
@@ -192,7 +193,7 @@ def validate(
         "motor",
     )
     missing = [] if importlib.util.find_spec("gym_electric_motor") or "motor" not in chosen else [no_oracle]
-    return _certify(subject, parts, missing, quick, on_check, on_part)
+    return _certify(subject, parts, missing, quick, on_check or unheard, on_part or unheard)
 
 
 def validate_model(
@@ -222,4 +223,4 @@ def validate_model(
         ("motor", name, functools.partial(own_model.motor_checks, subject, name, quick)),
         ("execution", name, functools.partial(execution.model_checks, subject, name, quick, state)),
     ]
-    return _certify(name, parts, own_model.skipped(subject, name), quick, on_check, on_part)
+    return _certify(name, parts, own_model.skipped(subject, name), quick, on_check or unheard, on_part or unheard)

@@ -9,7 +9,6 @@ from codrl_mj.physics import AnalyticPhysics, MujocoPhysics
 from codrl_mj.tasks import Task, resolve_actuators
 
 NO_TWIN = "it rebuilds no environment of Gymnasium's: there is no second implementation of its mechanics"
-SEVERAL_MOTORS = "it has several motors, and commands are made for one"
 PHYSICS = (("MuJoCo", MujocoPhysics), ("analytic", AnalyticPhysics))
 STAND_IN = "default current loop"
 """What stands in for the paper's actuator where a task has none."""
@@ -26,6 +25,12 @@ def differences(task: Task, ours: np.ndarray, oracle: np.ndarray) -> np.ndarray:
         turn = np.abs(2 * np.pi - gap[..., entry])
         gap[..., entry] = np.where(inside, np.minimum(gap[..., entry], turn), gap[..., entry])
     return gap / np.maximum(1.0, np.abs(oracle))
+
+
+def without_oracle(task: Task) -> str:
+    """Why a task cannot be compared with Gymnasium step by step; empty if it can."""
+    several = "it has several motors, and commands are made for one" if len(task.motors) > 1 else ""
+    return NO_TWIN if task.twin is None else several
 
 
 def both(

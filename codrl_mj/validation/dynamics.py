@@ -13,7 +13,7 @@ from codrl_mj.actuators import IDEAL
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError
 from codrl_mj.tasks import Task, find_task
 from codrl_mj.tasks.trials import Trials
-from codrl_mj.validation.compare import NO_TWIN, SEVERAL_MOTORS, both, differences
+from codrl_mj.validation.compare import both, differences, without_oracle
 from codrl_mj.validation.continuous import gymnasium_equations
 from codrl_mj.validation.table import Case, Check, Oracle, Skipped, check
 
@@ -117,7 +117,7 @@ def accelerations(task: Task, points: int) -> Iterator[Case]:
 def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     """The checks of this group."""
     task = find_task(task_name)
-    missing = NO_TWIN if task.twin is None else SEVERAL_MOTORS if len(task.motors) > 1 else ""
+    missing = without_oracle(task)
     if missing or task.trials is None:
         yield Skipped("all checks", missing or "it names no states to try it in: Task.trials", "dynamics", task.name)
         return

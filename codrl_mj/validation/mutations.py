@@ -27,7 +27,7 @@ from codrl_mj.engine.families import SLOT, replaced
 from codrl_mj.engine.hill import GRAVITY
 from codrl_mj.physics import MujocoPhysics, constrain, mjcf
 from codrl_mj.tasks import OURS, find_task
-from codrl_mj.validation.certificate import WITHOUT_TASK, validate
+from codrl_mj.validation.certificate import WITHOUT_TASK, unheard, validate
 from codrl_mj.validation.table import Check
 
 Fault = contextlib.AbstractContextManager[object]
@@ -358,11 +358,10 @@ def try_mutations(
     Raises:
         ValueError: see `faulty`.
     """
-    names = faulty(tasks)
+    names, begun = faulty(tasks), on_part or unheard
     results = []
     for index, mutation in enumerate(mutations):
-        if on_part is not None:
-            on_part(index, len(mutations), mutation.name)
+        begun(index, len(mutations), mutation.name)
         affected = [name for name in names if name in mutation.tasks]
         if not affected:
             continue
@@ -372,8 +371,7 @@ def try_mutations(
             made = [check for check in certificate.checks if check.task == task]
             failed = tuple(check for check in made if not check.passed)
             results.append(Caught(mutation.name, task, failed, len(made)))
-    if on_part is not None:
-        on_part(len(mutations), len(mutations), "done")
+    begun(len(mutations), len(mutations), "done")
     return results
 
 

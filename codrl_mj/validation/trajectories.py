@@ -17,7 +17,7 @@ from codrl_mj.actuators import Actuator, ActuatorModel, Ideal
 from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.physics import AnalyticPhysics, SimulationDivergedError, trace_names
 from codrl_mj.tasks import Task, find_task, named_actuator
-from codrl_mj.validation.compare import NO_TWIN, SEVERAL_MOTORS, both, differences
+from codrl_mj.validation.compare import both, differences, without_oracle
 from codrl_mj.validation.drives import FITTED, fitted_run
 from codrl_mj.validation.table import Case, Check, Oracle, Skipped, check
 
@@ -187,8 +187,8 @@ def episodes(task: Task, actuator_name: str, integrator: str, seeds: range, long
 def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     """The checks of this group."""
     task = find_task(task_name)
-    if task.twin is None or len(task.motors) > 1:
-        yield Skipped("all checks", NO_TWIN if task.twin is None else SEVERAL_MOTORS, "trajectories", task.name)
+    if missing := without_oracle(task):
+        yield Skipped("all checks", missing, "trajectories", task.name)
         return
     actuators = ACTUATORS if task.paper else ACTUATORS[:1]
     if not task.paper:
