@@ -15,7 +15,7 @@ import mujoco
 
 from codrl_mj.physics import SimulationDivergedError
 from codrl_mj.tasks import OURS, TASKS, find_task
-from codrl_mj.validation import own_model
+from codrl_mj.validation import execution, own_model
 from codrl_mj.validation.table import Check, Skipped
 
 GROUPS: dict[str, str] = {
@@ -82,11 +82,9 @@ def verdict(passed: Sequence[bool]) -> str:
 
 
 def _check_mapping(check: Check) -> dict[str, Any]:
-    fields = {field.name: getattr(check, field.name) for field in dataclasses.fields(check) if field.name != "plots"}
-    for name, value in fields.items():
-        if isinstance(value, float) and not math.isfinite(value):
-            fields[name] = str(value)
-    return fields | {"samples": int(check.samples), "passed": check.passed}
+    found = {field.name: getattr(check, field.name) for field in dataclasses.fields(check) if field.name != "plots"}
+    text = {name: str(one) for name, one in found.items() if isinstance(one, float) and not math.isfinite(one)}
+    return found | text | {"samples": int(check.samples), "passed": check.passed}
 
 
 def versions() -> dict[str, str]:
@@ -100,31 +98,16 @@ def versions() -> dict[str, str]:
     return found
 
 
-Outcomes = Iterator[Check | Skipped]
-Part = tuple[str, str, Callable[[], Outcomes]]
+Part = tuple[str, str, Callable[[], Iterator[Check | Skipped]]]
 """Group, task or model, and the checks that are made together."""
-
-
-def _checks(group: str, task: str | None, quick: bool) -> Outcomes:
-    """The checks of a group's module, which is imported here: some need libraries that nothing else does."""
-    of_task = group in WITHOUT_TASK and task is not None
-    module = "own_model" if of_task else group
-    yield from importlib.import_module(f"codrl_mj.validation.{module}").checks(task, quick)
 
 
 Progress = Callable[[int, int, str], None]
 """(parts done, parts in all, the part that begins) -> nothing."""
 
 
-def _outcomes(group: str, task: str, run: Callable[[], Outcomes]) -> Outcomes:
-    """The outcomes of a part; a simulation that breaks down is a failed check, a missing library a skipped one."""
-    try:
-        yield from run()
-    except ModuleNotFoundError as error:
-        yield Skipped("the rest of the group", f"{error}: pip install 'codrl-mj[validate]'", group, task)
-    except (ArithmeticError, SimulationDivergedError) as error:
-        reason = f"{type(error).__name__}: {error}"
-        yield Check("runs to its end", "itself", 1, math.inf, 0.0, reason, group, task, "")
+def unheard(*_: object) -> None:
+    """What is called where nobody listens."""
 
 
 def _certify(
@@ -132,24 +115,32 @@ def _certify(
     parts: Sequence[Part],
     skipped: Sequence[Skipped],
     quick: bool,
-    on_check: Callable[[Check], None] | None,
-    on_part: Progress | None,
+    on_check: Callable[[Check], None],
+    on_part: Progress,
 ) -> Certificate:
+    """Make the parts; a simulation that breaks down is a failed check, a missing library a skipped one."""
     started = time.perf_counter()
     found: list[Check] = []
     skips = list(skipped)
+
+    def take(outcome: Check | Skipped) -> None:
+        if isinstance(outcome, Skipped):
+            skips.append(outcome)
+            return
+        found.append(outcome)
+        on_check(outcome)
+
     for index, (group, task, run) in enumerate(parts):
-        if on_part is not None:
-            on_part(index, len(parts), f"{group}, {task}" if task else group)
-        for outcome in _outcomes(group, task, run):
-            if isinstance(outcome, Skipped):
-                skips.append(outcome)
-                continue
-            found.append(outcome)
-            if on_check is not None:
-                on_check(outcome)
-    if on_part is not None:
-        on_part(len(parts), len(parts), "done")
+        on_part(index, len(parts), f"{group}, {task}" if task else group)
+        try:
+            for outcome in run():
+                take(outcome)
+        except ModuleNotFoundError as error:
+            take(Skipped("the rest of the group", f"{error}: pip install 'codrl-mj[validate]'", group, task))
+        except (ArithmeticError, SimulationDivergedError) as error:
+            reason = f"{type(error).__name__}: {error}"
+            take(Check("runs to its end", "itself", 1, math.inf, 0.0, reason, group, task, ""))
+    on_part(len(parts), len(parts), "done")
     return Certificate(subject, tuple(found), tuple(skips), quick, time.perf_counter() - started)
 
 
@@ -183,22 +174,26 @@ def validate(
     for group in chosen:
         if group not in GROUPS:
             raise ValueError(f"unknown group of checks {group!r}: must be one of {', '.join(GROUPS)}")
+
+    def of_task(group: str, task: str | None) -> Iterator[Check | Skipped]:
+        module = "own_model" if group in WITHOUT_TASK and task is not None else group
+        # imported here: some need libraries that nothing else does
+        yield from importlib.import_module(f"codrl_mj.validation.{module}").checks(task, quick)
+
     parts = [
-        (group, task or "", functools.partial(_checks, group, task, quick))
+        (group, task or "", functools.partial(of_task, group, task))
         for group in GROUPS
         if group in chosen
         for task in ([None, *others] if group in WITHOUT_TASK else names)
     ]
     subject = "all tasks" if len(names) == len(TASKS) else ", ".join(names)
-    missing = [] if importlib.util.find_spec("gym_electric_motor") or "motor" not in chosen else [_NO_GEM]
-    return _certify(subject, parts, missing, quick, on_check, on_part)
-
-
-_NO_GEM = Skipped(
-    "the motor against gym-electric-motor's permanently excited DC motor",
-    "gym-electric-motor is not installed",
-    "motor",
-)
+    no_oracle = Skipped(
+        "the motor against gym-electric-motor's permanently excited DC motor",
+        "gym-electric-motor is not installed",
+        "motor",
+    )
+    missing = [] if importlib.util.find_spec("gym_electric_motor") or "motor" not in chosen else [no_oracle]
+    return _certify(subject, parts, missing, quick, on_check or unheard, on_part or unheard)
 
 
 def validate_model(
@@ -223,5 +218,9 @@ def validate_model(
         CallbackInUseError: another library's MuJoCo callback is installed where ours has to go.
     """
     subject = own_model.prepare(model)
-    parts = [(group, name, functools.partial(run, subject, name, quick)) for group, run in own_model.PARTS.items()]
-    return _certify(name, parts, own_model.skipped(subject, name), quick, on_check, on_part)
+    state = execution.FULL_STATE
+    parts: list[Part] = [
+        ("motor", name, functools.partial(own_model.motor_checks, subject, name, quick)),
+        ("execution", name, functools.partial(execution.model_checks, subject, name, quick, state)),
+    ]
+    return _certify(name, parts, own_model.skipped(subject, name), quick, on_check or unheard, on_part or unheard)

@@ -5,12 +5,10 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import Actuator, ActuatorModel, CurrentLoop, spectral_radius
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, trace_names
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics
 from codrl_mj.tasks import Task, resolve_actuators
-from codrl_mj.tasks.trials import Trials
 
 NO_TWIN = "it rebuilds no environment of Gymnasium's: there is no second implementation of its mechanics"
-SEVERAL_MOTORS = "it has several motors, and commands are made for one"
 PHYSICS = (("MuJoCo", MujocoPhysics), ("analytic", AnalyticPhysics))
 STAND_IN = "default current loop"
 """What stands in for the paper's actuator where a task has none."""
@@ -29,6 +27,12 @@ def differences(task: Task, ours: np.ndarray, oracle: np.ndarray) -> np.ndarray:
     return gap / np.maximum(1.0, np.abs(oracle))
 
 
+def without_oracle(task: Task) -> str:
+    """Why a task cannot be compared with Gymnasium step by step; empty if it can."""
+    several = "it has several motors, and commands are made for one" if len(task.motors) > 1 else ""
+    return NO_TWIN if task.twin is None else several
+
+
 def both(
     task: Task, actuator: ActuatorModel, integrator: str, max_force: float | None = None
 ) -> tuple[MujocoPhysics, AnalyticPhysics]:
@@ -39,18 +43,6 @@ def both(
         MujocoPhysics(task, [actuator], steps, integrator, limits),
         AnalyticPhysics(task, [actuator], steps, integrator),
     )
-
-
-def twin_of(task: Task) -> Any:
-    """The environment that a task rebuilds, driven by any force; it must have one."""
-    assert task.twin is not None
-    return task.twin()
-
-
-def trials_of(task: Task) -> Trials:
-    """What a task is tried in; it must say so."""
-    assert task.trials is not None
-    return task.trials
 
 
 def physics_of(task: Task) -> tuple[tuple[str, type], ...]:
@@ -77,8 +69,3 @@ def forces_of(task: Task, shares: np.ndarray) -> np.ndarray:
     """Desired forces, row by row what `Physics.step` takes, from shares of the largest, shape (steps * motors,)."""
     forces = task.max_forces * shares.reshape(-1, len(task.motors))
     return forces[:, 0] if len(task.motors) == 1 else forces
-
-
-def last_signals(physics: MujocoPhysics | AnalyticPhysics) -> dict[str, float]:
-    """What the actuator did in the last integration step, by the names of `trace_names`."""
-    return dict(zip(trace_names(physics.family), physics.trace[-1, 0].tolist(), strict=True))

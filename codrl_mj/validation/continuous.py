@@ -1,8 +1,9 @@
 """The continuous equations behind a task, taken from its twin where it has one, and solved by scipy to 12 digits."""
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -12,7 +13,9 @@ from codrl_mj.actuators import IDEAL, Actuator, ActuatorModel
 from codrl_mj.physics import install_callbacks
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.tasks import Task
-from codrl_mj.validation.compare import twin_of
+
+BOUNDS = {"max_speed": math.inf, "_max_speed": math.inf, "min_position": -math.inf, "max_position": math.inf}
+"""Attributes of environments and their twins that bound a state, and what bounds none."""
 
 Equations = Callable[[np.ndarray, Any], np.ndarray]
 """(mechanical state, force [N or N*m], of several motors an array) -> its time derivative."""
@@ -42,41 +45,39 @@ def engine_equations(task: Task) -> Equations:
     return derivative
 
 
-def gymnasium_equations(task: Task) -> Equations:
-    """The right-hand side of the task's equations of motion, read off the unmodified environment.
+def gymnasium_equations(task: Task, dt: float | None = None) -> Equations:
+    """The right-hand side of the task's equations of motion, read off the environment, which nothing bounds here.
 
     No equation is written down here. A twin may have its right-hand side as a method (Acrobot). The others take Euler
     steps, whose new velocity is v + a*dt, linear in dt: one step of the environment gives a = (v_new - v)/dt, and the
-    derivative of a position is its velocity. dt is a power of two and no longer than a quarter of an environment step.
+    derivative of a position is its velocity. dt [s] is a power of two, or None for one of at most a quarter of an
+    environment step.
     """
-    driver = twin_of(task)
+    assert task.twin is not None
+    driver: Any = task.twin()
     if hasattr(driver, "derivative"):
         return driver.derivative
-    dt = 2.0 ** math.floor(math.log2(task.step_duration / 4))
+    for owner, name in itertools.product((driver, getattr(driver, "env", None)), BOUNDS):
+        if hasattr(owner, name):
+            setattr(owner, name, BOUNDS[name])
+    step = 2.0 ** math.floor(math.log2(task.step_duration / 4)) if dt is None else dt
     qpos, qvel, integrator = list(task.qpos), list(task.qvel), task.integrators[0]
 
     def derivative(state: np.ndarray, force: float) -> np.ndarray:
         change = np.empty_like(state)
         change[qpos] = state[qvel]
-        change[qvel] = (np.asarray(driver(state, force, dt, integrator))[qvel] - state[qvel]) / dt
+        change[qvel] = (np.asarray(driver(state, force, step, integrator))[qvel] - state[qvel]) / step
         return change
 
     return derivative
 
 
-class Solution(NamedTuple):
-    """The solution at the ends of the environment steps."""
-
-    states: np.ndarray
-    """Mechanical states, shape (steps, n)."""
-    currents: np.ndarray
-    """Motor currents [A], shape (steps, motors); zeros without a motor."""
-
-
 def solve(
     task: Task, equations: Equations, start: np.ndarray, forces: np.ndarray, actuators: Sequence[ActuatorModel]
-) -> Solution:
-    """Solve the continuous equations by scipy's DOP853 at a relative tolerance of 1e-12, forces held over each step.
+) -> np.ndarray:
+    """Mechanical states, shape (steps, n), at the ends of the environment steps, the forces held over each.
+
+    They are found by scipy's DOP853 at a relative tolerance of 1e-12.
 
     With motors they are joined by those of each circuit and its analogue PI loop,
     L di/dt = u - kE*omega - R*i, u = kP*e + kI*I + kFF*i_ref (+ kE*omega), dI/dt = e, torque = kT*i;
@@ -105,6 +106,5 @@ def solve(
             derivative, span, state, "DOP853", rtol=1e-12, atol=1e-15, args=(np.atleast_1d(force),)
         )
         state = found.y[:, -1]
-        rows.append(state)
-    solved = np.array(rows)
-    return Solution(solved[:, :size], solved[:, size::2] if motors else np.zeros((len(forces), len(actuators))))
+        rows.append(state[:size])
+    return np.array(rows)

@@ -5,7 +5,7 @@ twin there, of the accelerations that MuJoCo finds: that checks its integrator a
 the Euler variants promise first order and RK4, under a force held over the step, fourth. With a motor all promise first
 order: its winding takes Euler steps, and its torque is held over the mechanical step.
 
-The runs stay away from bounds and walls (`FreeRun`): a clip is not smooth, and the step at which
+The runs stay away from bounds and walls (`free_run`): a clip is not smooth, and the step at which
 it acts moves with the step size. What happens at the bounds is compared step by step elsewhere.
 
 The last check makes the current loop faster instead. Its PI gains cancel the winding's pole, kI = kP*R/L, which leaves
@@ -16,7 +16,7 @@ the actuated task approaches Gymnasium's at first order in tau.
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -28,24 +28,17 @@ from codrl_mj.validation.continuous import equations_of, solve
 from codrl_mj.validation.table import Case, Check, Family, Skipped, check, of_order, order
 
 
-class FreeRun(NamedTuple):
-    """A run, the same every time."""
+def free_run(task: Task) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The run of `Task.trials`, the same every time; of a task that has none, a few steps from one of its starts.
 
-    start: np.ndarray
-    """Initial state."""
-    forces: np.ndarray
-    """Desired forces: full force either way, each held for one environment step."""
-    balanced: np.ndarray
-    """The first of these, over which energies are balanced."""
-
-
-def free_run(task: Task) -> FreeRun:
-    """The run of `Task.trials`; of a task that has none, a few steps from one of its starts."""
+    Its initial state, the desired forces, full either way and each held for one environment step, and the first of
+    these, over which energies are balanced.
+    """
     trials = task.trials
     steps, balanced = (6, 2) if trials is None else (trials.steps, trials.balanced_steps)
     start = task.initial(np.random.default_rng(3), None) if trials is None else np.array(trials.start)
     forces = forces_of(task, np.random.default_rng(3).choice([-1.0, 1.0], steps * len(task.motors)))
-    return FreeRun(start, forces, forces[:balanced])
+    return start, forces, forces[:balanced]
 
 
 def obstacle(task: Task) -> str:
@@ -176,7 +169,7 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     equations, whose = equations_of(task)
     start, forces, _ = free_run(task)
     for case, actuators in (("ideal actuator", ideals(task)), ("motor in the loop", analogues(task))):
-        solution = solve(task, equations, start, forces, actuators).states
+        solution = solve(task, equations, start, forces, actuators)
         solved = whose if case == "ideal actuator" else f"{whose} and of the motor"
         for integrator in task.integrators:
             compared = order_in_the_step.of(whose=solved)

@@ -4,7 +4,6 @@ The oracle is an unmodified Gymnasium environment that is driven through its att
 """
 
 import itertools
-import math
 from collections.abc import Iterator
 
 import mujoco
@@ -13,7 +12,9 @@ import numpy as np
 from codrl_mj.actuators import IDEAL
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError
 from codrl_mj.tasks import Task, find_task
-from codrl_mj.validation.compare import NO_TWIN, SEVERAL_MOTORS, both, differences, trials_of, twin_of
+from codrl_mj.tasks.trials import Trials
+from codrl_mj.validation.compare import both, differences, without_oracle
+from codrl_mj.validation.continuous import gymnasium_equations
 from codrl_mj.validation.table import Case, Check, Oracle, Skipped, check
 
 TOLERANCE = 1e-12
@@ -21,6 +22,12 @@ TOLERANCE = 1e-12
 
 EXTREME = 10.0
 """Extreme forces are this many times the largest that a task asks for."""
+
+
+def trials_of(task: Task) -> Trials:
+    """What a task is tried in; it must say so."""
+    assert task.trials is not None
+    return task.trials
 
 
 def grid(task: Task, points: int) -> np.ndarray:
@@ -47,8 +54,11 @@ def _after_one_step(physics: MujocoPhysics | AnalyticPhysics, states: np.ndarray
     return after
 
 
-def _stepped(task: Task, ours: np.ndarray, oracle: np.ndarray, states: np.ndarray, forces: np.ndarray) -> Case:
-    """What steps from the states under the forces ended in."""
+def _stepped(task: Task, integrator: str, states: np.ndarray, forces: np.ndarray, limit: float) -> Case:
+    """One step from the states under the forces, which MuJoCo limits itself and Gymnasium is given limited."""
+    physics, analytic = both(task, IDEAL, integrator, max_force=limit)
+    ours = _after_one_step(physics, states, forces)
+    oracle = _after_one_step(analytic, states, np.clip(forces, -limit, limit))
 
     def where(at: int) -> str:
         row, entry = divmod(at, states.shape[1])
@@ -64,56 +74,22 @@ def one_step(task: Task, integrator: str, samples: int, seed: int = 0) -> Iterat
     bounds = np.array(trials_of(task).bounds)
     states = generator.uniform(-bounds, bounds, (samples, len(bounds)))
     forces = generator.uniform(-task.max_force, task.max_force, samples)
-    ours, oracle = (_after_one_step(physics, states, forces) for physics in both(task, IDEAL, integrator))
-    yield _stepped(task, ours, oracle, states, forces)
+    yield _stepped(task, integrator, states, forces, task.max_force)
 
 
 @check("dynamics", Oracle("one step at the bounds, {integrator}", "{task.oracle}", TOLERANCE))
 def one_step_at_the_bounds(task: Task, integrator: str, stride: int = 1) -> Iterator[Case]:
     """One step from the task's edges under no, full and extreme forces, which MuJoCo is allowed here."""
-    states, forces = _crossed(
-        np.array(list(itertools.product(*trials_of(task).edges)))[::stride],
-        task.max_force * np.array([-EXTREME, -1.0, 0.0, 1.0, EXTREME]),
-    )
-    physics = both(task, IDEAL, integrator, max_force=EXTREME * task.max_force)
-    ours, oracle = (_after_one_step(each, states, forces) for each in physics)
-    yield _stepped(task, ours, oracle, states, forces)
+    states = np.array(list(itertools.product(*trials_of(task).edges)))[::stride]
+    crossed = _crossed(states, task.max_force * np.array([-EXTREME, -1.0, 0.0, 1.0, EXTREME]))
+    yield _stepped(task, integrator, *crossed, EXTREME * task.max_force)
 
 
 @check("dynamics", Oracle("one step beyond the force limit, {integrator}", "{task.oracle}", TOLERANCE))
 def one_step_beyond_the_force_limit(task: Task, integrator: str, points: int) -> Iterator[Case]:
     """One step under commands up to `EXTREME` times the limit, against Gymnasium under the limit."""
-    states, forces = _crossed(grid(task, points), task.max_force * np.array([-EXTREME, -1.001, 1.001, EXTREME]))
-    mujoco_physics, analytic = both(task, IDEAL, integrator)
-    ours = _after_one_step(mujoco_physics, states, forces)
-    oracle = _after_one_step(analytic, states, np.clip(forces, -task.max_force, task.max_force))
-    yield _stepped(task, ours, oracle, states, forces)
-
-
-class _GymnasiumAcceleration:
-    """The acceleration (state, force) -> one number for each velocity, of an unmodified Gymnasium environment."""
-
-    def __init__(self, task: Task) -> None:
-        self._driver = twin_of(task)
-        self._velocities = list(task.qvel)
-        self._derivative = getattr(self._driver, "derivative", None)
-        if self._derivative is None:
-            env = getattr(self._driver, "env", None)
-            # one explicit step of 1 s changes the velocities by the accelerations, where nothing bounds them
-            for owner, name, value in (
-                (env, "max_speed", math.inf),
-                (self._driver, "_max_speed", math.inf),
-                (env, "min_position", -math.inf),
-                (env, "max_position", math.inf),
-            ):
-                if hasattr(owner, name):
-                    setattr(owner, name, value)
-
-    def __call__(self, state: np.ndarray, force: float) -> np.ndarray:
-        if self._derivative is not None:
-            return self._derivative(state, force)[self._velocities]
-        after = np.array(self._driver(state, force, 1.0, "euler"))
-        return (after - state)[self._velocities]
+    crossed = _crossed(grid(task, points), task.max_force * np.array([-EXTREME, -1.001, 1.001, EXTREME]))
+    yield _stepped(task, integrator, *crossed, task.max_force)
 
 
 @check("dynamics", Oracle("accelerations", "{task.oracle}", TOLERANCE))
@@ -121,14 +97,14 @@ def accelerations(task: Task, points: int) -> Iterator[Case]:
     """MuJoCo's `qacc` over a dense grid of states, under no, half, full and extreme forces."""
     states, forces = _crossed(grid(task, points), task.max_force * np.array([-EXTREME, -1.0, 0.0, 0.5, EXTREME]))
     physics, _ = both(task, IDEAL, task.integrators[0], max_force=EXTREME * task.max_force)
-    acceleration = _GymnasiumAcceleration(task)
+    equations, velocities = gymnasium_equations(task, dt=1.0), list(task.qvel)
     ours, oracle = (np.empty((len(states), len(task.qvel))) for _ in range(2))
     for row, (state, force) in enumerate(zip(states, forces.tolist(), strict=True)):
         physics.reset(state)
         physics.data.ctrl[0] = force
         mujoco.mj_forward(physics.model, physics.data)
         ours[row] = physics.data.qacc
-        oracle[row] = acceleration(state, force)
+        oracle[row] = equations(state, force)[velocities]
 
     def where(at: int) -> str:
         row, entry = divmod(at, len(task.qvel))
@@ -141,7 +117,7 @@ def accelerations(task: Task, points: int) -> Iterator[Case]:
 def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     """The checks of this group."""
     task = find_task(task_name)
-    missing = NO_TWIN if task.twin is None else SEVERAL_MOTORS if len(task.motors) > 1 else ""
+    missing = without_oracle(task)
     if missing or task.trials is None:
         yield Skipped("all checks", missing or "it names no states to try it in: Task.trials", "dynamics", task.name)
         return

@@ -100,28 +100,25 @@ def _kept(
 )
 def balances(task: Task, integrator: str, quick: bool) -> Iterator[tuple[Case, ...]]:
     """The residuals vanish at the integrator's order."""
-    actuators = analogues(task)
+    actuators, meter = analogues(task), Meter(task)
     resolved = task.step_duration / (min(one.motor.electrical_time_constant for one in actuators) / 25)
     counts = 2 ** (math.ceil(math.log2(max(resolved, 64))) + np.arange(4 if quick else 5))
     ledgers = _kept(task, integrator, actuators, counts)
-    ideal_counts = 2 ** np.arange(3, 7)  # finer ones reach rounding
-    highest = 2.0 if Meter(task).lossy else 4.0
     cases = []
     for balance in BALANCES:
-        exact = (balance, integrator) == ("mechanical", "rk4")
-        kept, steps = (
-            (_kept(task, integrator, ideals(task), ideal_counts), ideal_counts) if exact else (ledgers, counts)
-        )
+        kept, steps, promised, rounding = ledgers, counts, 1.0, 0.0
+        if exact := (balance, integrator) == ("mechanical", "rk4"):
+            steps, promised = 2 ** np.arange(3, 7), 2.0 if meter.lossy else 4.0  # finer ones reach rounding
+            kept = _kept(task, integrator, ideals(task), steps)
         families = []
         for label, of_steps in kept.items():
             residuals = [float(np.abs(getattr(ledger, f"{balance}_residual")).max()) for ledger in of_steps]
-            sizes = [np.abs(one).max() for one in (of_steps[-1].shaft, of_steps[-1].mechanical)]
-            rounding = _ROUNDING * max(abs(Meter(task)(free_run(task)[0])), *sizes) if exact else 0.0
-            families.append(Family(label, task.step_duration / steps, np.array(residuals), float(rounding)))
+            if exact:
+                sizes = [np.abs(one).max() for one in (of_steps[-1].shaft, of_steps[-1].mechanical)]
+                rounding = _ROUNDING * float(max(abs(meter(free_run(task)[0])), *sizes))
+            families.append(Family(label, task.step_duration / steps, np.array(residuals), rounding))
         title = f"{task.name}, {integrator}: {balance} balance"
-        case = of_order(
-            highest if exact else 1.0, families, title, "integration step [s]", "largest residual of the run [J]"
-        )
+        case = of_order(promised, families, title, "integration step [s]", "largest residual of the run [J]")
         if balance == "whole":
             case = case._replace(plots=(*case.plots, _balance_plot(task, integrator, ledgers["MuJoCo"][0])))
         cases.append(case)

@@ -90,15 +90,14 @@ def copied(model: mujoco.MjModel, steps: int) -> Iterator[Case]:
 
 
 @check("execution", Oracle("restored", "the run it was taken from", 0.0, UNIT))
-def restored(model: mujoco.MjModel, steps: int, state: mujoco.mjtState | None = None) -> Iterator[Case]:
+def restored(model: mujoco.MjModel, steps: int, state: mujoco.mjtState = STATE) -> Iterator[Case]:
     """A state vector taken half-way and put into a new `MjData`, against the run it was taken from."""
-    kind = STATE if state is None else state
     inputs = commands(model, 2 * steps, seed=1)
     original, fresh = mujoco.MjData(model), mujoco.MjData(model)
     _advance(model, original, inputs[:steps])
-    vector = np.empty(mujoco.mj_stateSize(model, kind))
-    mujoco.mj_getState(model, original, vector, kind)
-    mujoco.mj_setState(model, fresh, vector, kind)
+    vector = np.empty(mujoco.mj_stateSize(model, state))
+    mujoco.mj_getState(model, original, vector, state)
+    mujoco.mj_setState(model, fresh, vector, state)
     ours = _advance(model, fresh, inputs[steps:])
     yield from bits(ours, _advance(model, original, inputs[steps:]))
 
@@ -122,7 +121,7 @@ def forward_passes(model: mujoco.MjModel, steps: int) -> Iterator[Case]:
 
 
 def model_checks(
-    model: mujoco.MjModel, task: str = "", quick: bool = False, state: mujoco.mjtState | None = None
+    model: mujoco.MjModel, task: str = "", quick: bool = False, state: mujoco.mjtState = STATE
 ) -> Iterator[Check]:
     """The checks of any model whose callbacks are installed; a state vector holds `state`."""
     simulations, steps = (6, 40) if quick else (32, 200)
@@ -136,12 +135,14 @@ def model_checks(
 # -- with a task's bounds and integrator around it ----------------------------------------------------------
 
 
-def _episode(physics: MujocoPhysics, forces: np.ndarray) -> np.ndarray:
-    """The motor's and the mechanical state after each environment step."""
+def _episode(physics: MujocoPhysics, forces: np.ndarray, look: bool = False) -> np.ndarray:
+    """The motor's and the mechanical state after each environment step, looked at by a forward pass or not."""
     states = []
     for force in forces:
         physics.step(force)
         states.append(np.concatenate([physics.state, physics.data.act]))
+        if look:
+            mujoco.mj_forward(physics.model, physics.data)
     return np.array(states)
 
 
@@ -178,12 +179,7 @@ def looked_at(task: Task, integrator: str, steps: int) -> Iterator[Case]:
     physics, initial, forces = _simulation(task, integrator, 5, steps)
     oracle = _episode(physics, forces)
     physics.reset(initial)
-    states = []
-    for force in forces:
-        physics.step(force)
-        states.append(np.concatenate([physics.state, physics.data.act]))
-        mujoco.mj_forward(physics.model, physics.data)
-    yield from bits(np.array(states), oracle)
+    yield from bits(_episode(physics, forces, look=True), oracle)
 
 
 def checks(task_name: str, quick: bool = False) -> Iterator[Check]:

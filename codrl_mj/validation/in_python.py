@@ -31,8 +31,7 @@ from codrl_mj.engine.families import SLOT, Slot, slot_size
 from codrl_mj.engine.inertia import shaft_inertia
 from codrl_mj.engine.reading import slots
 from codrl_mj.validation.execution import UNIT, commands, differing
-from codrl_mj.validation.motor_loops import EVERY_FEATURE
-from codrl_mj.validation.rotors import SWINGING, motors_on
+from codrl_mj.validation.rotors import EVERY_FEATURE, SWINGING, motors_on
 from codrl_mj.validation.table import Case, Check, Oracle, check
 
 KEY = Slot._fields.index("noise_key")

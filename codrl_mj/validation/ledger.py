@@ -22,11 +22,7 @@ class Meter:
     """
 
     def __init__(self, task: Task) -> None:
-        """Compile the model.
-
-        Raises:
-            ValueError: it has a hill, and no twin to say how high it is.
-        """
+        """Compile the model; a ValueError if it has a hill, and no twin to say how high it is."""
         self._model = mujoco.MjModel.from_xml_path(str(asset_path(task.asset)))
         self._data = mujoco.MjData(self._model)
         self._qpos, self._qvel = list(task.qpos), list(task.qvel)

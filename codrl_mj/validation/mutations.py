@@ -15,6 +15,7 @@ import types
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
+from unittest import mock
 
 import mujoco
 import numpy as np
@@ -26,34 +27,21 @@ from codrl_mj.engine.families import SLOT, replaced
 from codrl_mj.engine.hill import GRAVITY
 from codrl_mj.physics import MujocoPhysics, constrain, mjcf
 from codrl_mj.tasks import OURS, find_task
-from codrl_mj.validation.certificate import WITHOUT_TASK, validate
+from codrl_mj.validation.certificate import WITHOUT_TASK, unheard, validate
 from codrl_mj.validation.table import Check
 
-Fault = contextlib.AbstractContextManager[None]
+Fault = contextlib.AbstractContextManager[object]
 
 
 @contextlib.contextmanager
 def _everywhere(name: str, original: Any, wrong: Any) -> Iterator[None]:
     """Replace `original` by `wrong` in every module of the package that knows it as `name`."""
     modules = [module for key, module in sys.modules.items() if key.startswith("codrl_mj")]
-    holders = [module for module in modules if getattr(module, name, None) is original]
-    for module in holders:
-        setattr(module, name, wrong)
-    try:
+    with contextlib.ExitStack() as stack:
+        for module in modules:
+            if getattr(module, name, None) is original:
+                stack.enter_context(mock.patch.object(module, name, wrong))
         yield
-    finally:
-        for module in holders:
-            setattr(module, name, original)
-
-
-@contextlib.contextmanager
-def _method(owner: type, name: str, wrong: Any) -> Iterator[None]:
-    original = vars(owner)[name]  # as it stands there: a static method stays one
-    setattr(owner, name, wrong)
-    try:
-        yield
-    finally:
-        setattr(owner, name, original)
 
 
 # -- in a model ---------------------------------------------------------------------------------------------
@@ -73,8 +61,13 @@ def wrong_model(change: Callable[[mujoco.MjModel], None]) -> Iterator[None]:
         yield
 
 
-def _heavier(model: mujoco.MjModel) -> None:
-    model.body_mass[-1] *= 1.001
+def _off(field: str, at: int | tuple[int, int], factor: float) -> Callable[[mujoco.MjModel], None]:
+    """A change that scales a part of one of the model's arrays."""
+
+    def change(model: mujoco.MjModel) -> None:
+        getattr(model, field)[at] *= factor
+
+    return change
 
 
 def _stronger_gravity(model: mujoco.MjModel) -> None:
@@ -83,16 +76,8 @@ def _stronger_gravity(model: mujoco.MjModel) -> None:
         model.jnt_user[0, GRAVITY] *= 1.001  # the hill's
 
 
-def _longer_gear(model: mujoco.MjModel) -> None:
-    model.actuator_gear[0, 0] *= 1.01
-
-
 def _slower_clock(model: mujoco.MjModel) -> None:
     model.opt.timestep *= 1.001
-
-
-def _tighter_range(model: mujoco.MjModel) -> None:
-    model.actuator_ctrlrange[0] *= 0.99
 
 
 # -- in the source text -------------------------------------------------------------------------------------
@@ -131,14 +116,12 @@ def _wrong_callbacks(edits: tuple[Edit, ...]) -> Callable[[], Any]:
 def wrong_callback(*edits: Edit) -> Iterator[None]:
     """MuJoCo runs a callback that was compiled from edited source."""
     parts = importlib.import_module("codrl_mj.engine.install")._PARTS  # the package's `install` is the function
-    part = parts["motor"]
     engine.uninstall()
-    parts["motor"] = part._replace(compile=_wrong_callbacks(edits))
-    try:
-        yield
-    finally:
-        engine.uninstall()
-        parts["motor"] = part
+    with mock.patch.dict(parts, motor=parts["motor"]._replace(compile=_wrong_callbacks(edits))):
+        try:
+            yield
+        finally:
+            engine.uninstall()
 
 
 @functools.cache
@@ -167,7 +150,7 @@ def wrong_loop_everywhere(*edits: Edit) -> Iterator[None]:
     with wrong_loop(*edits), contextlib.ExitStack() as stack:
         for family in _wrong_families(current_loop, edits):
             right = getattr(current_loop, family.__name__)
-            stack.enter_context(_method(right, "advance", vars(family)["advance"]))
+            stack.enter_context(mock.patch.object(right, "advance", vars(family)["advance"]))
         yield
 
 
@@ -208,7 +191,7 @@ def _stale_command() -> Fault:
         force, self.waiting = getattr(self, "waiting", 0.0), desired_force
         return step(self, force)
 
-    return _method(MujocoPhysics, "step", late)
+    return mock.patch.object(MujocoPhysics, "step", late)
 
 
 def _no_bounds() -> Fault:
@@ -224,7 +207,7 @@ def _other_integrator() -> Fault:
         other = "semi-implicit" if integrator == "euler" else "euler"
         make(self, task, actuators, inner_steps, other, *more, **named)
 
-    return _method(MujocoPhysics, "__init__", explicit)
+    return mock.patch.object(MujocoPhysics, "__init__", explicit)
 
 
 def _warm_reset() -> Fault:
@@ -235,7 +218,7 @@ def _warm_reset() -> Fault:
         reset(self, state, key)
         self.data.act[:] = motor
 
-    return _method(MujocoPhysics, "reset", warm)
+    return mock.patch.object(MujocoPhysics, "reset", warm)
 
 
 # -- the list -----------------------------------------------------------------------------------------------
@@ -276,11 +259,11 @@ def _in_loop(
 
 
 MUTATIONS: tuple[Mutation, ...] = (
-    _in_model("a mass off by 0.1 %", _heavier, "convergence", "energy"),
+    _in_model("a mass off by 0.1 %", _off("body_mass", -1, 1.001), "convergence", "energy"),
     _in_model("gravity, or the hill, off by 0.1 %", _stronger_gravity),
-    _in_model("a gear off by 1 %", _longer_gear, "convergence", "energy"),
+    _in_model("a gear off by 1 %", _off("actuator_gear", (0, 0), 1.01), "convergence", "energy"),
     _in_model("a time step off by 0.1 %", _slower_clock, "convergence", "energy"),
-    _in_model("a wrong clip: the force limit 1 % low", _tighter_range),
+    _in_model("a wrong clip: the force limit 1 % low", _off("actuator_ctrlrange", 0, 0.99)),
     _in_loop("a wrong clip: the voltage limit 1 % low", _VOLTAGE_LIMIT),
     _in_loop("a winding resistance off by 1 %", _RESISTANCE, (*_LOOP, "energy")),
     _in_loop("the sign of the back-EMF", _BACK_EMF, (*_LOOP, "energy")),
@@ -342,7 +325,7 @@ def margin(check: Check) -> float:
 def _quiet() -> Iterator[None]:
     """A fault may well overflow: that is what its checks are to say, and no warning besides."""
     handler = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(_ignore)
+    mujoco.set_mju_user_warning(lambda _: None)  # its own prints and writes a file
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore", RuntimeWarning)
@@ -351,16 +334,8 @@ def _quiet() -> Iterator[None]:
         mujoco.set_mju_user_warning(handler)
 
 
-def _ignore(message: str) -> None:
-    """Take the place of the engine's own handler, which prints and writes a file."""
-
-
 def faulty(tasks: str | Sequence[str] | None = None) -> list[str]:
-    """The names of the tasks that faults are made in: those given, or all that there are.
-
-    Raises:
-        ValueError: an unknown task, or one of somebody else's.
-    """
+    """The names of the tasks that faults are made in, all that there are or those given, which must be ours."""
     names = [tasks] if isinstance(tasks, str) else list(tasks or Mutation.tasks)
     for name in names:
         if find_task(name) not in OURS:
@@ -383,11 +358,10 @@ def try_mutations(
     Raises:
         ValueError: see `faulty`.
     """
-    names = faulty(tasks)
+    names, begun = faulty(tasks), on_part or unheard
     results = []
     for index, mutation in enumerate(mutations):
-        if on_part is not None:
-            on_part(index, len(mutations), mutation.name)
+        begun(index, len(mutations), mutation.name)
         affected = [name for name in names if name in mutation.tasks]
         if not affected:
             continue
@@ -397,8 +371,7 @@ def try_mutations(
             made = [check for check in certificate.checks if check.task == task]
             failed = tuple(check for check in made if not check.passed)
             results.append(Caught(mutation.name, task, failed, len(made)))
-    if on_part is not None:
-        on_part(len(mutations), len(mutations), "done")
+    begun(len(mutations), len(mutations), "done")
     return results
 
 

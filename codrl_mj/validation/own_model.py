@@ -2,7 +2,7 @@
 
 import copy
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import mujoco
@@ -15,6 +15,7 @@ from codrl_mj.tasks import find_task, resolve_actuators
 from codrl_mj.validation import execution
 from codrl_mj.validation.compare import STAND_IN, actuators_of
 from codrl_mj.validation.in_python import beside, entries
+from codrl_mj.validation.rotors import Loop
 from codrl_mj.validation.table import Case, Check, Oracle, Skipped, check
 
 STEP_TOLERANCE = 1e-11
@@ -22,12 +23,7 @@ STEP_TOLERANCE = 1e-11
 
 
 def load(path: Path) -> mujoco.MjModel:
-    """Compile an MJCF file.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: MuJoCo cannot compile it.
-    """
+    """Compile an MJCF file; a FileNotFoundError or a ValueError where there is none that MuJoCo takes."""
     if not path.is_file():
         raise FileNotFoundError(f"no model at {path}")
     try:
@@ -37,11 +33,7 @@ def load(path: Path) -> mujoco.MjModel:
 
 
 def prepare(model: mujoco.MjModel) -> mujoco.MjModel:
-    """A copy of the model that is left to diverge instead of being reset by the engine, with our callbacks installed.
-
-    Raises:
-        ValueError: the model has no motor of ours, or one that is not as it should be.
-    """
+    """A copy of the model, our callbacks installed, that is left to diverge and not reset by the engine."""
     if not motors(model):
         raise ValueError(
             f"the model has no motor of codrl_mj among its {model.nactuator} actuators: put some in with "
@@ -53,27 +45,24 @@ def prepare(model: mujoco.MjModel) -> mujoco.MjModel:
     return subject
 
 
+UNKNOWN = {
+    "dynamics": "no Gymnasium environment has these equations of motion",
+    "trajectories": "no Gymnasium environment has these equations of motion",
+    "convergence": "there is no second implementation of the mechanics to converge to",
+    "energy": "the losses of joints, contacts and constraints are not modelled here",
+}
+"""Groups that need to know more of a model than its motors, and what."""
+
+
 def skipped(model: mujoco.MjModel, name: str) -> list[Skipped]:
     """What does not apply to a model of which nothing but its motors is known."""
     ours = motors(model)
     foreign = [model.actuator(index).name or str(index) for index in range(model.nactuator) if index not in ours]
-    found = [
-        Skipped("all checks", "no Gymnasium environment has these equations of motion", "dynamics", name),
-        Skipped("all checks", "no Gymnasium environment has these equations of motion", "trajectories", name),
-        Skipped("all checks", "there is no second implementation of the mechanics to converge to", "convergence", name),
-        Skipped("all checks", "the losses of joints, contacts and constraints are not modelled here", "energy", name),
-    ]
+    found = [Skipped("all checks", reason, group, name) for group, reason in UNKNOWN.items()]
     if foreign:
         reason = "not motors of codrl_mj, which leaves them alone"
         found.append(Skipped(f"actuators {', '.join(foreign)}", reason, "motor", name))
     return found
-
-
-def _names(model: mujoco.MjModel) -> dict[int, tuple[str, ActuatorModel]]:
-    return {
-        index: (model.actuator(index).name or f"actuator {index}", actuator)
-        for index, actuator in motors(model).items()
-    }
 
 
 BELOW_ONE = float(np.nextafter(1.0, 0.0))
@@ -91,15 +80,6 @@ def stable_loop(actuator: Actuator, timestep: float) -> Iterator[Case]:
     radius = spectral_radius(actuator, timestep)
     found = float(actuator.instability(np.array([actuator.numbers]), timestep)[0])
     yield Case(max(found, radius) if radius < 1.0 else radius, f"at a step of {timestep:g} s")
-
-
-def stability(model: mujoco.MjModel, name: str) -> Iterator[Check]:
-    """How unstable each motor is at the model's timestep: below 1; of a current loop it is the spectral radius."""
-    for motor, actuator in _names(model).values():
-        if isinstance(actuator, Actuator):
-            yield from stable_loop.of(name, motor=motor)(actuator, model.opt.timestep)
-        else:
-            yield from stable_actuator.of(name, motor=motor)(actuator, model.opt.timestep)
 
 
 @check("motor", Oracle("steps: {motor}", "the same functions in plain Python at the recorded speed", STEP_TOLERANCE))
@@ -124,17 +104,22 @@ def _idle(model: mujoco.MjModel, index: int, actuator: ActuatorModel) -> str:
     return "it is ideal: there is nothing to step" if isinstance(actuator, Ideal) else ""
 
 
-def _motor(model: mujoco.MjModel, name: str, quick: bool) -> Iterator[Check | Skipped]:
-    for index, (motor, actuator) in _names(model).items():
-        if reason := _idle(model, index, actuator):
-            yield Skipped(f"steps: {motor}", reason, "motor", name)
-    yield from stability(model, name)
-    running = {index: one for index, one in _names(model).items() if not _idle(model, index, one[1])}
+def motor_checks(model: mujoco.MjModel, name: str, quick: bool) -> Iterator[Check | Skipped]:
+    """The motors of a model whose callbacks are installed: stable, in step with Python, and each loop alone."""
+    ours = {at: (model.actuator(at).name or f"actuator {at}", actuator) for at, actuator in motors(model).items()}
+    idle = {at: reason for at, (_, actuator) in ours.items() if (reason := _idle(model, at, actuator))}
+    for at, reason in idle.items():
+        yield Skipped(f"steps: {ours[at][0]}", reason, "motor", name)
+    for motor, actuator in ours.values():
+        if isinstance(actuator, Actuator):
+            yield from stable_loop.of(name, motor=motor)(actuator, model.opt.timestep)
+        else:
+            yield from stable_actuator.of(name, motor=motor)(actuator, model.opt.timestep)
     controls = execution.commands(model, 200 if quick else 2000, seed=7)
-    for index, found in beside(model, {index: actuator for index, (_, actuator) in running.items()}, controls).items():
-        motor, actuator = running[index]
-        yield from motor_steps.of(name, motor=motor)(actuator, *found)
-    yield from _alone(model, name, quick)
+    running = {at: actuator for at, (_, actuator) in ours.items() if at not in idle}
+    for at, found in beside(model, running, controls).items():
+        yield from motor_steps.of(name, motor=ours[at][0])(running[at], *found)
+    yield from _alone(model.opt.timestep, dict(ours.values()), name, quick)
 
 
 def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
@@ -145,32 +130,20 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     actuators = actuators_of(task) if task.actuator == "ideal" else resolve_actuators("default", task)
     model = task_model(task, actuators, task.step_duration / task.motor_inner_steps)
     install_callbacks(model)
-    yield from _motor(model, task.name, quick)
+    yield from motor_checks(model, task.name, quick)
 
 
-def _alone(model: mujoco.MjModel, name: str, quick: bool) -> Iterator[Check | Skipped]:
-    """The model's current loops, each on a rotor of its own, against python-control's discrete model of the loop."""
-    from codrl_mj.validation.motor_loops import Loop
-    from codrl_mj.validation.motor_sampled import sampled_checks  # needs scipy and python-control
+def _alone(timestep: float, ours: Mapping[str, ActuatorModel], name: str, quick: bool) -> Iterator[Check | Skipped]:
+    """Current loops, each on a rotor of its own, against python-control's discrete model of the loop."""
+    from codrl_mj.validation.motor_loops import sampled_checks  # needs scipy and python-control
 
     loops = {}
-    for motor, actuator in _names(model).values():
+    for motor, actuator in ours.items():
         if not isinstance(actuator, Actuator):
             yield Skipped(f"responses of {motor}", "it is no current loop: there is no oracle for it", "motor", name)
-        elif spectral_radius(actuator, model.opt.timestep) < 1.0:
-            loops[motor] = Loop(actuator, model.opt.timestep)
+        elif spectral_radius(actuator, timestep) < 1.0:
+            loops[motor] = Loop(actuator, timestep)
         else:
             yield Skipped(f"responses of {motor}", "its loop is unstable: it has none", "motor", name)
     for outcome in sampled_checks(loops, quick) if loops else ():
         yield dataclasses.replace(outcome, task=name)
-
-
-def _execution(model: mujoco.MjModel, name: str, quick: bool) -> Iterator[Check | Skipped]:
-    yield from execution.model_checks(model, name, quick, execution.FULL_STATE)
-
-
-PARTS: dict[str, Callable[[mujoco.MjModel, str, bool], Iterator[Check | Skipped]]] = {
-    "motor": _motor,
-    "execution": _execution,
-}
-"""The groups that apply."""

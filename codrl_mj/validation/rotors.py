@@ -1,4 +1,4 @@
-"""Small MuJoCo models of motors on a bench, ours and MuJoCo's own, and a way to drive them."""
+"""The bench: small MuJoCo models of motors, ours and MuJoCo's own, current loops to try, and a way to drive them."""
 
 import dataclasses
 import math
@@ -11,6 +11,7 @@ import numpy as np
 from codrl_mj.actuators import Actuator, ActuatorModel, CurrentLoop, Motor
 from codrl_mj.engine.families import signals_at, slot_size
 from codrl_mj.physics import install_callbacks, mjcf
+from codrl_mj.tasks import OURS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,3 +116,53 @@ def drive(model: mujoco.MjModel, controls: np.ndarray, speeds: np.ndarray | None
         mujoco.mj_step(model, data)
         row[0], row[1], row[2], row[3] = data.qpos, data.qvel, data.act[currents], data.qfrc_actuator
     return Record(*rows.swapaxes(0, 1))
+
+
+# -- current loops --------------------------------------------------------------------------------------------
+
+
+class Loop(NamedTuple):
+    """A motor under its current loop, and the step at which it is sampled."""
+
+    actuator: Actuator
+    """Motor and gains."""
+    timestep: float
+    """Mechanical step [s]."""
+
+
+EVERY_FEATURE = Loop(
+    Actuator(
+        Motor(resistance=1.2, inductance=0.05, torque_constant=0.8, back_emf_constant=0.7, arm_radius=0.5),
+        CurrentLoop(
+            kp=2.0,
+            ki=5.0,
+            kd=1e-3,
+            kff=0.4,
+            bemf_compensation=False,
+            substeps=2,
+            integral_leak=0.3,
+            derivative_time_constant=0.01,
+        ),
+    ),
+    0.01,
+)
+"""A loop in which every parameter counts; nothing hides its back-EMF."""
+
+
+def standard_loops() -> dict[str, Loop]:
+    """The paper's loop of each of our tasks at the task's inner step, and one with every feature."""
+    paper = {task.name: Loop(task.paper[0], task.step_duration / task.motor_inner_steps) for task in OURS}
+    return {**paper, "every feature": EVERY_FEATURE}
+
+
+def unlimited(loop: Loop, substeps: int) -> Actuator:
+    """The loop's actuator where it is linear: without limit and sensor errors, with so many electrical substeps."""
+    controller = dataclasses.replace(
+        loop.actuator.controller, substeps=substeps, max_voltage=math.inf, current_bias=0.0, current_noise=0.0
+    )
+    return dataclasses.replace(loop.actuator, controller=controller, supply=None)
+
+
+def run(actuator: Actuator, timestep: float, torques: np.ndarray, speeds: np.ndarray) -> Record:
+    """Drive one motor in MuJoCo with desired joint torques at joint speeds."""
+    return drive(motors_on(HELD, [actuator], timestep), torques * actuator.motor.arm_radius, speeds)

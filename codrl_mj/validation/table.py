@@ -138,13 +138,9 @@ TABLE: list[Compared[Any]] = []
 
 
 def check(group: str, *rows: Oracle) -> Callable[[Callable[Arguments, Cases]], Compared[Arguments]]:
-    """Enter a function of cases in the table.
+    """Enter a function of cases in the table, in a group of the certificate.
 
     The function yields a `Case` each time, or of several rows a tuple of them, one for each.
-
-    Args:
-        group: of the certificate.
-        rows: what is compared, with what, and how close.
     """
 
     def enter(cases: Callable[Arguments, Cases]) -> Compared[Arguments]:

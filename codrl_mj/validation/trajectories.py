@@ -10,15 +10,14 @@ import copy
 import dataclasses
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 
 from codrl_mj.actuators import Actuator, ActuatorModel, Ideal
 from codrl_mj.pages.plots import Curve, Plot
-from codrl_mj.physics import AnalyticPhysics, SimulationDivergedError
+from codrl_mj.physics import AnalyticPhysics, SimulationDivergedError, trace_names
 from codrl_mj.tasks import Task, find_task, named_actuator
-from codrl_mj.validation.compare import NO_TWIN, SEVERAL_MOTORS, both, differences, last_signals
+from codrl_mj.validation.compare import both, differences, without_oracle
 from codrl_mj.validation.drives import FITTED, fitted_run
 from codrl_mj.validation.table import Case, Check, Oracle, Skipped, check
 
@@ -104,22 +103,13 @@ def lyapunov_exponent(logarithms: np.ndarray, step_duration: float) -> float:
     return float(np.polyfit(times, logarithms, 1)[0])
 
 
-class _Run(NamedTuple):
-    """One run on both physics."""
+def _run(
+    task: Task, actuator: ActuatorModel, integrator: str, steps: int, seed: int
+) -> tuple[np.ndarray, list[str], Growth]:
+    """One run on both physics, and how errors grow along it.
 
-    gaps: np.ndarray
-    """Largest difference of state or force after each step, and infinity for a step that diverged."""
-    where: list[str]
-    """In what, or why it diverged."""
-    growth: Growth
-    """How errors grow along it."""
-
-    def case(self, steps: int, gaps: np.ndarray, plots: tuple[Plot, ...] = ()) -> Case:
-        """Its first steps."""
-        return Case(gaps[:steps], lambda at: self.where[at], steps, plots)
-
-
-def _run(task: Task, actuator: ActuatorModel, integrator: str, steps: int, seed: int) -> _Run:
+    The largest difference of state or force after each step, and in what it was; of a step that diverged infinity.
+    """
     mujoco, analytic = both(task, actuator, integrator)
     generator = np.random.default_rng(seed)
     initial = task.initial(generator, None)
@@ -134,7 +124,8 @@ def _run(task: Task, actuator: ActuatorModel, integrator: str, steps: int, seed:
         try:
             for physics in (mujoco, analytic):
                 physics.step(force)
-            delivered = [last_signals(physics)["actual_force"] for physics in (mujoco, analytic)]
+            at = trace_names(analytic.family).index("actual_force")
+            delivered = [float(physics.trace[-1, 0, at]) for physics in (mujoco, analytic)]
             growth.follow(force)
         except SimulationDivergedError as error:
             gaps.append(math.inf)
@@ -145,15 +136,15 @@ def _run(task: Task, actuator: ActuatorModel, integrator: str, steps: int, seed:
         worst = int(np.argmax(all_gaps))  # a NaN, if there is one
         gaps.append(float(all_gaps[worst]))
         where.append(f"{names[worst]} at step {step} of seed {seed}")
-    return _Run(np.array(gaps), where, growth)
+    return np.array(gaps), where, growth
 
 
-def _plot(task: Task, run: _Run, title: str) -> Plot:
-    rounding = np.array(run.growth.rounding[: len(run.gaps)])
-    gaps, times = run.gaps[: len(rounding)], task.step_duration * np.arange(1, len(rounding) + 1)
-    exponent = lyapunov_exponent(np.array(run.growth.logarithms), task.step_duration)
+def _plot(task: Task, gaps: np.ndarray, growth: Growth, title: str) -> Plot:
+    rounding = np.array(growth.rounding)
+    times = task.step_duration * np.arange(1, len(rounding) + 1)
+    exponent = lyapunov_exponent(np.array(growth.logarithms), task.step_duration)
     curves = (
-        Curve("difference found (0 is drawn at 1e-18)", times, np.maximum(gaps, 1e-18)),
+        Curve("difference found (0 is drawn at 1e-18)", times, np.maximum(gaps[: len(rounding)], 1e-18)),
         Curve("what rounding becomes in the oracle", times, rounding, reference=True),
         Curve(f"2e-16 × exp(λt), λ = {exponent:.3g} 1/s", times, ROUNDING * np.exp(exponent * times), reference=True),
         Curve(f"allowed: {ROUNDINGS:g} × rounding", times, ROUNDINGS * rounding, reference=True),
@@ -176,12 +167,11 @@ def whole_runs(
     steps = min(longest, task.max_episode_steps or UNLIMITED_STEPS)
     horizon = min(steps, (task.trials and task.trials.horizon) or steps)
     for seed in seeds:
-        run = _run(task, actuator, integrator, steps, seed)
-        rounding = np.array(run.growth.rounding[: len(run.gaps)])
-        in_roundings = run.gaps / np.append(rounding, np.ones(len(run.gaps) - len(rounding)))
+        gaps, where, growth = _run(task, actuator, integrator, steps, seed)
+        in_roundings = gaps / np.append(growth.rounding, np.ones(len(gaps) - len(growth.rounding)))
         title = f"{task.name}, {integrator}, {actuator_name} actuator"
-        plots = (_plot(task, run, title),) if seed == seeds[0] and len(rounding) > 1 else ()
-        yield run.case(horizon, run.gaps), run.case(steps, in_roundings, plots)
+        plots = (_plot(task, gaps, growth, title),) if seed == seeds[0] and len(growth.rounding) > 1 else ()
+        yield Case(gaps[:horizon], where.__getitem__, horizon), Case(in_roundings, where.__getitem__, steps, plots)
 
 
 def episodes(task: Task, actuator_name: str, integrator: str, seeds: range, longest: int = 999) -> list[Check]:
@@ -197,8 +187,8 @@ def episodes(task: Task, actuator_name: str, integrator: str, seeds: range, long
 def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     """The checks of this group."""
     task = find_task(task_name)
-    if task.twin is None or len(task.motors) > 1:
-        yield Skipped("all checks", NO_TWIN if task.twin is None else SEVERAL_MOTORS, "trajectories", task.name)
+    if missing := without_oracle(task):
+        yield Skipped("all checks", missing, "trajectories", task.name)
         return
     actuators = ACTUATORS if task.paper else ACTUATORS[:1]
     if not task.paper:

@@ -21,7 +21,7 @@ from codrl_mj.motor_design import (
     step,
 )
 from codrl_mj.motor_design.windup import ANTI_WINDUPS
-from codrl_mj.validation import motor_sampled
+from codrl_mj.validation import motor_loops
 
 MOTORS = ("quanser-qube-servo-2", "maxon-dcx22l", "heinzmann-pmg-132", "lego-ev3-large")
 every_motor = pytest.mark.parametrize("name", MOTORS)
@@ -116,7 +116,7 @@ def test_the_margins_are_those_that_python_control_finds(own, delayed):
 def test_an_actuators_loop_is_the_one_that_python_control_joins(loop):
     actuator, timestep = Actuator(controller=loop), 0.02
     dt = timestep / loop.substeps
-    other = motor_sampled.closed_loop(actuator, dt)
+    other = motor_loops.closed_loop(actuator, dt)
     at = np.exp(1j * np.linspace(0.01, 3.1, 40))
     np.testing.assert_allclose(closed_loop(actuator, timestep)(at), other(at), rtol=1e-9)
     response = respond(actuator, np.full(200, 0.01), timestep=timestep)

@@ -144,7 +144,7 @@ def test_the_runs_stay_away_from_every_bound(task, motor):
     definition = TASKS[task]
     start, forces, _ = free_run(definition)
     actuators = convergence.analogues(definition) if motor else [IDEAL]
-    states = [*solve(definition, gymnasium_equations(definition), start, forces, actuators).states]
+    states = [*solve(definition, gymnasium_equations(definition), start, forces, actuators)]
     unbounded = dataclasses.replace(definition, step_duration=definition.step_duration / 128, constrain=None)
     physics = MujocoPhysics(unbounded, actuators, 1, definition.integrators[0])
     physics.reset(start)

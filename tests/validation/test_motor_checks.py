@@ -12,16 +12,15 @@ import pytest
 from scipy import integrate, signal
 
 from codrl_mj.actuators import FAMILIES, Actuator, CurrentLoop, Motor
-from codrl_mj.validation import drives, in_python, motor, motor_gem, motor_native, rotors
-from codrl_mj.validation.motor_analogue import closed_form
-from codrl_mj.validation.motor_loops import EVERY_FEATURE, Loop, standard_loops
-from codrl_mj.validation.motor_sampled import closed_loop, sampled_system
+from codrl_mj.validation import drives, in_python, motor, motor_windings, rotors
+from codrl_mj.validation.motor_loops import closed_form, closed_loop, sampled_system
+from codrl_mj.validation.rotors import EVERY_FEATURE, Loop, standard_loops
 from tests.reference import of_actuator
 from tests.validation.mutations import entry
 
 pytestmark = pytest.mark.usefixtures("bare_engine")
 
-SMALL = {"small": motor_native.MOTORS["small"]}
+SMALL = {"small": motor_windings.MOTORS["small"]}
 ORDER, LIMIT = "closed form, order in the substeps", "closed form, limit of small substeps"
 SAMPLED, STEP = "sampled loop, random torques and speeds", "step response"
 MAGNITUDE, PHASE = "frequency response, magnitude", "frequency response, phase"
@@ -43,8 +42,8 @@ EVERY = LOOP | {VOLTAGE, LINE, NO_LOAD, RK4, GEM} | NATIVE | COMPILED | DRIVES
 def outcomes():
     """All checks with a few loops and motors only, by name."""
     checks = [*motor.checks_of({"every feature": EVERY_FEATURE}, quick=True)]
-    checks += [*in_python.compiled_checks(quick=True), *motor_native.native_checks(SMALL, quick=True)]
-    checks += [*motor_gem.gem_check(Motor(), quick=True), *drives.drive_checks(quick=True)]
+    checks += [*in_python.compiled_checks(quick=True), *motor_windings.native_checks(SMALL, quick=True)]
+    checks += [*motor_windings.gem_check(Motor(), quick=True), *drives.drive_checks(quick=True)]
     return {check.name: check for check in checks}
 
 
@@ -216,7 +215,7 @@ def test_the_oracles_use_none_of_our_mathematics():
 
 
 def test_the_native_motor_is_wrong_under_rk4_and_ours_is_not():
-    (check,) = motor_native.rk4_check(quick=True)
+    (check,) = motor_windings.rk4_check(quick=True)
     ours, native = check.plots[0].curves
     assert ours.y.max() < 1e-12
     assert native.y[0] > 0.02
