@@ -99,7 +99,7 @@ def njit(function: Any = None, **options: Any) -> Any:
     if function is None:
         return functools.partial(njit, **options)
     compiled = numba.njit(function, **options)
-    compiled._cache = _Kept(function)
+    compiled._cache = _Kept("njit", function, options)
     return compiled
 
 
@@ -108,7 +108,7 @@ def cfunc(signature: Any, **options: Any) -> Callable[[Any], Any]:
 
     def compiled(function: Any) -> Any:
         made: Any = CFunc(function, sigutils.normalize_signature(signature), locals={}, options=options)
-        made._cache = _Kept(function)
+        made._cache = _Kept("cfunc", function, options)
         made.compile()
         return made
 
@@ -135,8 +135,8 @@ class Note:
 class _Kept(_Cache):  # type: ignore[misc]
     """What numba asks for the compiled forms of one function."""
 
-    def __init__(self, function: Any) -> None:
-        self._function = function
+    def __init__(self, kind: str, function: Any, options: Any) -> None:
+        self._name, self._about = function.__name__, (kind, tuple(sorted(options.items())), function)
 
     @property
     def cache_path(self) -> str:
@@ -175,18 +175,17 @@ class _Kept(_Cache):  # type: ignore[misc]
             _write(path, payload)
 
     def _place(self, sig: Any) -> Path | None:
-        return _path(self._function.__name__, (self._function, tuple(getattr(sig, "args", sig))))
+        return _path(self._name, (*self._about, tuple(getattr(sig, "args", sig))))
 
 
 def _path(name: str, about: Any) -> Path | None:
     """The file for values; None where nothing is kept, or nothing can be said of one of them."""
-    place = folder()
-    if place is None:
-        return None
-    key = hashlib.sha256(_foundation())
     try:
+        place, key = folder(), hashlib.sha256(_foundation())
+        if place is None:
+            return None
         _tell(key, about, (), {})
-    except (_NotKnownError, RecursionError):
+    except Exception:  # whatever somebody's value does when it is looked at: then it is compiled in every process
         return None
     return place / f"{name}-{key.hexdigest()}.code"
 
@@ -242,9 +241,12 @@ def _foundation() -> bytes:
     for one in (numba, llvmlite, np, mujoco):
         key.update(f"{one.__name__} {one.__version__}\n".encode())
     cpu = binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten(), platform.machine(), sys.version
-    settings = sorted((name, value) for name, value in os.environ.items() if name.startswith("NUMBA_"))
+    settings = sorted((name, repr(value)) for name, value in vars(numba.config).items() if isinstance(value, _PLAIN))
     key.update(repr((cpu, settings)).encode())
-    for path in sorted(_PACKAGE.rglob("*.py")):
+    sources = sorted(_PACKAGE.rglob("*.py"))
+    if not sources:
+        raise _NotKnownError("this package's source")
+    for path in sources:
         key.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())
     return key.digest()
 

@@ -245,6 +245,16 @@ def test_what_a_function_closes_over_counts(place):
     assert compiled_by(lambda: function(2.0)(3)) == (1, 6.0)  # of other types
 
 
+def test_options_count(place):
+    def divided(by):
+        return 1.0 / by
+
+    assert compiled_by(lambda: kept.njit(divided, error_model="numpy")(0.0)) == (1, np.inf)
+    with pytest.raises(ZeroDivisionError):
+        kept.njit(divided)(0.0)
+    assert compiled_by(lambda: kept.njit(divided, error_model="numpy")(0.0)) == (0, np.inf)
+
+
 def test_an_array_counts_by_its_content_and_what_is_unknown_is_not_kept(place):
     array = np.arange(3.0)
 
