@@ -76,7 +76,7 @@ def test_the_training_and_rendering_libraries_are_extras(wheel):
     (name,) = (name for name in archive.namelist() if name.endswith("METADATA"))
     needed = [line for line in archive.read(name).decode().splitlines() if line.startswith("Requires-Dist: ")]
     core = {line.split()[1].split("<")[0].split(">")[0] for line in needed if "extra ==" not in line}
-    assert core == {"gymnasium", "mujoco", "numba", "numpy", "pint", "rich", "tyro"}
+    assert core == {"gymnasium", "mujoco", "numba", "numpy", "pint", "platformdirs", "rich", "tyro"}
 
 
 def test_the_unpacked_wheel_steps_and_draws_every_task_from_another_folder(wheel, tmp_path):
