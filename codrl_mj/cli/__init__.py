@@ -1,7 +1,7 @@
 """The command line: parses, calls the package, prints. Nothing imports it."""
 
 import contextlib
-import functools
+import importlib
 import os
 import re
 import signal
@@ -9,7 +9,7 @@ import sys
 import textwrap
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,49 +17,30 @@ import gymnasium
 import mujoco
 
 import codrl_mj
-from codrl_mj.cli.advise import Advise
-from codrl_mj.cli.cache import Cache
-from codrl_mj.cli.data import Data
-from codrl_mj.cli.evaluate import Evaluate
-from codrl_mj.cli.fields import with_environment
-from codrl_mj.cli.identify import Identify, identify_verb
-from codrl_mj.cli.motor import MotorTools
 from codrl_mj.cli.parsing import parse, understood
-from codrl_mj.cli.render import Render
-from codrl_mj.cli.replay import Replay
-from codrl_mj.cli.report import Report
-from codrl_mj.cli.runs import Runs
-from codrl_mj.cli.train import Train, train_verb
-from codrl_mj.cli.validate import Validate
-from codrl_mj.cli.view import LiveView
 from codrl_mj.runs.files import check_file, check_page, check_writable
-from codrl_mj.training import TrainingStoppedError
 
-VERBS: dict[str, Any] = {
-    "train": Train,
-    "evaluate": Evaluate,
-    "runs": Runs,
-    "render": Render,
-    "replay": Replay,
-    "view": LiveView,
-    "report": Report,
-    "motor": MotorTools,
-    "advise": Advise,
-    "identify": Identify,
-    "data": Data,
-    "cache": Cache,
-    "validate": Validate,
+VERBS: dict[str, tuple[str, str, str]] = {
+    # verb: its class, what it does in a sentence, and an example
+    "train": ("train:Train", "Train an agent through an actuator.", "cartpole --actuator weaker"),
+    "evaluate": ("evaluate:Evaluate", "Measure a policy on any actuator.", "runs/mine --actuator lag"),
+    "runs": ("runs:Runs", "List the runs of a folder, or compare some.", "runs --sort return"),
+    "render": ("render:Render", "Film one episode.", "runs/mine --out balance.mp4"),
+    "replay": ("replay:Replay", "Write one episode as a page in three dimensions.", "runs/mine --out balance.html"),
+    "view": ("view:LiveView", "Watch a simulation live in a browser, and set its motor.", "cartpole"),
+    "report": ("report:Report", "Write a report of a run as one HTML file.", "runs/mine --out mine.html"),
+    "motor": ("motor:MotorTools", "List motors that one can buy, look at one, design its loop, choose one.", "list"),
+    "advise": ("advise:Advise", "Say whether to train through an actuator or do something else.", "weak pendulum"),
+    "identify": ("identify:Identify", "Identify a motor from its bench logs.", "check swing.csv --columns time=t:s"),
+    "data": ("data:Data", "List or fetch measurements of real motors that others have published.", "dfki_pendulum"),
+    "cache": ("cache:Cache", "Show or clear the compiled code that is kept on disk.", "--clear"),
+    "validate": ("validate:Validate", "Certify that the port is right.", "cartpole --out certificate"),
 }
-"""The verbs by name."""
-_MADE: dict[str, Callable[[list[str]], Any]] = {
-    "train": train_verb,
-    "identify": identify_verb,
-    "evaluate": functools.partial(with_environment, Evaluate),
-    "render": functools.partial(with_environment, Render),
-    "replay": functools.partial(with_environment, Replay),
-    "view": functools.partial(with_environment, LiveView),
-}
-"""Those whose flags depend on the rest of the command line."""
+"""The verbs by name; the module of one is imported when it is called."""
+_ABOUT = (
+    "Reinforcement learning through a real actuator: classic control in MuJoCo, driven by a motor. Each verb has "
+    "its own --help; -h leaves descriptions out; --version; --traceback shows where an error arose."
+)
 
 
 _FILES: dict[str, Callable[[Path], None]] = {
@@ -68,6 +49,12 @@ _FILES: dict[str, Callable[[Path], None]] = {
     "Render": lambda path: check_writable(path.parent),  # a film or a folder, which it checks itself
 }
 """Verbs whose `--out` is a file and no folder -> its check."""
+
+
+def find_verb(name: str) -> Any:
+    """The class of a verb."""
+    module, _, kind = VERBS[name][0].partition(":")
+    return getattr(importlib.import_module(f"codrl_mj.cli.{module}"), kind)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -95,26 +82,38 @@ def _run(arguments: list[str], traced: bool) -> int:
     verb: Any = None
     try:
         words = understood(arguments)
-        made = {verb: make(words[1:]) for verb, make in _MADE.items() if words[:1] == [verb]}
-        verb = parse(VERBS | made, words)
+        if words[:1] and words[0] in VERBS:
+            verb = parse(_for_line(find_verb(words[0]), words[1:]), f"codrl-mj {words[0]}", words[1:])
+        else:
+            verb = parse(_helped(), "codrl-mj", words, _ABOUT)
         _check_outputs(getattr(verb, "verb", verb))
         return verb.run()
     except BrokenPipeError:  # whoever read the output has enough of it, such as head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left is flushed at exit
         return 141
-    except TrainingStoppedError as stopped:
-        print(f"codrl-mj: {stopped}", file=sys.stderr)
-        return 128 + stopped.signal_number
     except (Exception, KeyboardInterrupt) as error:
+        if (stopped_by := getattr(error, "signal_number", None)) is not None:  # of a TrainingStoppedError
+            print(f"codrl-mj: {error}", file=sys.stderr)
+            return int(128 + stopped_by)
         if traced:
             traceback.print_exc()
         if _interrupted(error):
-            again = "goes on where it was" if isinstance(verb, Advise) else "begins anew"
+            again = "goes on where it was" if arguments[:1] == ["advise"] else "begins anew"
             told = isinstance(error, KeyboardInterrupt) and str(error)
             print(f"codrl-mj: {told or f'stopped: the same command {again}'}", file=sys.stderr)
             return 130
         print(f"codrl-mj: error: {_sentence(error)}", file=sys.stderr)
         return 2
+
+
+def _helped() -> dict[str, str]:
+    """What the verbs do, and an example of each."""
+    return {name: f"{says}\n\nExample: codrl-mj {name} {words}" for name, (_, says, words) in VERBS.items()}
+
+
+def _for_line(kind: Any, words: Sequence[str]) -> Any:
+    """A verb's class, or the one that it makes for a command line on which its flags depend."""
+    return kind.for_line(words) if hasattr(kind, "for_line") else kind
 
 
 def _check_outputs(verb: Any) -> None:

@@ -39,6 +39,8 @@ class Evaluate:
     out: Path | None = None
     """JSON file for the result; of several policies for all of them, by their names."""
 
+    for_line = classmethod(with_environment)
+
     def run(self: Any) -> int:
         """Evaluate and print a table."""
         from codrl_mj.cli.terminal import print_evaluations, progress_bar

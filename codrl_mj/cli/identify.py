@@ -1,6 +1,7 @@
 """`codrl-mj identify`: a motor from its bench logs, and what is done before."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -48,6 +49,11 @@ class Identify:
     ignore_errors: tyro.conf.FlagCreatePairsOff[bool] = False
     """Fit logs that the checks find errors in."""
     as_json: AsJson = False
+
+    @classmethod
+    def for_line(cls, words: Sequence[str]) -> Any:
+        """The fit, or what is done before."""
+        return IdentifyTools if words[:1] and words[0] in TOOLS else cls
 
     def run(self) -> int:
         """Check the logs, fit, print a table, write the files."""
@@ -123,11 +129,6 @@ class Identify:
             text = f"warning: {log.name}, which is held out, has errors, and is left out"
             console().print(text, markup=False, highlight=False, style="yellow")
         return [log for log in held_out if not any(log is one for one in wrong)]
-
-
-def identify_verb(arguments: list[str]) -> Any:
-    """The verb's dataclass for a command line: the fit, or what is done before."""
-    return IdentifyTools if arguments[:1] and arguments[0] in TOOLS else Identify
 
 
 def _numbers(texts: tuple[str, ...]) -> dict[str, float]:

@@ -1,6 +1,7 @@
 """From the words of a command line to a verb: its own modules and numbers understood, errors in one plain sentence."""
 
 import contextlib
+import dataclasses
 import io
 import itertools
 import os
@@ -18,29 +19,29 @@ _PATHS = ("--out", "--root", "--html", "--trajectory", "--config", "--resume", "
 _SHORT = {"--gear-ratio": "gear ratio", "--voltage": "supply voltage"}
 
 
-def parse(verbs: Mapping[str, Any], arguments: Sequence[str]) -> Any:
-    """The verb, with its settings; SystemExit after help."""
+def parse(kind: Any, called: str, words: Sequence[str], about: str | None = None) -> Any:
+    """A dataclass with its settings; of a mapping of verbs to what they do nothing but help; SystemExit after help."""
     cli: Any = tyro.cli  # of a union of as many kinds as there are
+    if isinstance(kind, Mapping):
+        verbs = [dataclasses.make_dataclass(name, [], namespace={"__doc__": says}) for name, says in kind.items()]
+        kind = Union[tuple(Annotated[verb, tyro.conf.subcommand(verb.__name__)] for verb in verbs)]  # noqa: UP007
     errors: Any = getattr(tyro, "_errors", None)  # of no public name; without it errors come in boxes
-    hook = errors and errors.on_parse_error(lambda event: _refuse(event, verbs, arguments))
-    kinds = [
-        Annotated[Any, tyro.conf.subcommand(name=name, constructor=constructor)] for name, constructor in verbs.items()
-    ]
+    hook = errors and errors.on_parse_error(lambda event: _refuse(event, kind, called, words))
     with hook or contextlib.nullcontext():
         return cli(
-            Union[tuple(kinds)],  # noqa: UP007
-            prog="codrl-mj",
-            description="Reinforcement learning through a real actuator: classic control in MuJoCo, driven by a motor."
-            " -h instead of --help leaves descriptions out; --version; --traceback shows where an error arose.",
-            args=arguments,
-            compact_help=not {"-h", "-H", "--help-verbose"}.isdisjoint(arguments),
+            kind,
+            prog=called,
+            description=about,
+            args=words,
+            compact_help=not {"-h", "-H", "--help-verbose"}.isdisjoint(words),
         )
 
 
-def _refuse(event: Any, verbs: Mapping[str, Any], arguments: Sequence[str]) -> None:
+def _refuse(event: Any, kind: Any, called: str, words: Sequence[str]) -> None:
     """Say in a sentence what the parser would in a box; of kinds of errors that are not known here its box remains."""
-    words = [word for word in arguments[:2] if re.fullmatch(r"[a-z]+", word)] if {*arguments[:1]} & {*verbs} else []
-    shown = " ".join(["codrl-mj", *words[: 2 if words[:1] in (["motor"], ["identify"]) else 1]])
+    several = called in ("codrl-mj motor", "codrl-mj identify")
+    inner = [word for word in words[:1] if several and re.fullmatch(r"[a-z]+", word)]
+    shown = " ".join([called, *inner])
     match type(event).__name__:
         case "MissingSubcommand":
             known = ", ".join(event.subcommand_spec.parser_from_name)
@@ -60,7 +61,7 @@ def _refuse(event: Any, verbs: Mapping[str, Any], arguments: Sequence[str]) -> N
             raise ValueError(f"{_called(event.argument)}{given}: must be {_kind(event.argument)}")
         case "UnrecognizedArgs":
             with contextlib.redirect_stdout(io.StringIO()) as printed, contextlib.suppress(SystemExit):
-                parse(verbs, [*words, "--help"])
+                parse(kind, called, [*inner, "--help"])
             _refuse_words(event.tokens, printed.getvalue(), shown)
 
 

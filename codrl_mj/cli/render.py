@@ -6,7 +6,7 @@ from typing import Any
 
 import tyro
 
-from codrl_mj.cli.fields import AS_TRAINED, ActuatorName
+from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, with_environment
 from codrl_mj.cli.subject import Source, SubjectWord, policy_and_environment, title_of
 from codrl_mj.fields import did_you_mean
 
@@ -37,6 +37,8 @@ class Render:
     """Shadows, reflections and multisampling: slower."""
     motor: str | None = None
     """Of several motors that whose torque and voltage the strip shows, by its name; the first unless given."""
+
+    for_line = classmethod(with_environment)
 
     def run(self: Any) -> int:
         """Run the episode and film it."""

@@ -6,7 +6,7 @@ from typing import Any
 
 import tyro
 
-from codrl_mj.cli.fields import AS_TRAINED, ActuatorName
+from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, with_environment
 from codrl_mj.cli.subject import Source, SubjectWord, policy_and_environment, title_of
 
 
@@ -24,6 +24,8 @@ class Replay:
     """Seed of the episode."""
     out: Path = Path("episode.html")
     """File to write."""
+
+    for_line = classmethod(with_environment)
 
     def run(self: Any) -> int:
         """Run the episode and write it."""

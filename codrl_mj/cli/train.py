@@ -111,6 +111,7 @@ class Train:
     """Write events for TensorBoard, if it is installed."""
     wandb: str | None = None
     """Weights & Biases project to report to as well."""
+    for_line = staticmethod(train_verb)
 
     def run(self: Any) -> int:
         """Train, with a progress bar."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import tyro
 
-from codrl_mj.cli.fields import AS_TRAINED, ActuatorName
+from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, with_environment
 from codrl_mj.cli.subject import Source, SubjectWord, policy_and_environment, title_of
 from codrl_mj.envs.worlds import is_world
 from codrl_mj.fields import field_docs
@@ -33,6 +33,8 @@ class LiveView:
     """Where to listen, on this machine alone; the next free one, where it is taken."""
     native: bool = False
     """MuJoCo's own viewer instead of a browser; needs a display."""
+
+    for_line = classmethod(with_environment)
 
     def run(self: Any) -> int:
         """Serve until Ctrl-C."""
