@@ -43,7 +43,8 @@ class Evaluate:
 
     def run(self: Any) -> int:
         """Evaluate and print a table."""
-        from codrl_mj.cli.terminal import print_evaluations, progress_bar
+        from codrl_mj.cli.tables import print_evaluations
+        from codrl_mj.cli.terminal import progress_bar
         from codrl_mj.evaluation import evaluate
         from codrl_mj.runs.layout import told_apart
 

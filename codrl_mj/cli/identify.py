@@ -149,8 +149,7 @@ def print_identified(found: Any) -> None:
     """Print parameters and errors of the simulation, and what is to be known of them."""
     from rich.markup import escape
 
-    from codrl_mj.cli.look import titled_table
-    from codrl_mj.cli.terminal import console
+    from codrl_mj.cli.terminal import console, titled_table
     from codrl_mj.identify.log import SIGNALS
     from codrl_mj.identify.result import USABLE
 

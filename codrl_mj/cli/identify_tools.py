@@ -70,7 +70,7 @@ def findings_table(title: str, findings: Sequence[Any]) -> Any:
     """Findings of `codrl_mj.identify.checks.check` as a rich table, or a line where there are none."""
     from rich.markup import escape
 
-    from codrl_mj.cli.look import titled_table
+    from codrl_mj.cli.terminal import titled_table
 
     if not findings:
         return f"{escape(title)}: nothing is wrong with it"
@@ -149,8 +149,7 @@ class PlanExperiment:
         return 0
 
     def _print(self, found: Any, goals: dict[str, float]) -> None:
-        from codrl_mj.cli.look import titled_table
-        from codrl_mj.cli.terminal import console
+        from codrl_mj.cli.terminal import console, titled_table
 
         title = f"{self.name}: errors to be expected [%]"
         table = titled_table(title)

@@ -189,7 +189,7 @@ def _ranking(choices: Sequence[tuple[str, Any]], demands: Mapping[str, Any], tit
     """A row for each choice; of several motors, each with what it drives."""
     from rich.text import Text
 
-    from codrl_mj.cli.look import titled_table
+    from codrl_mj.cli.terminal import titled_table
 
     columns: tuple[str, ...]
     columns = ("motor", "gear", "supply\n[V]", "power\n[W]", "does\nit", "margin", "rotor's\nshare", "peak\n[A]")

@@ -1,4 +1,4 @@
-"""Results as tables for a terminal of 110 columns. They are built here, and printed by `codrl_mj.cli.terminal`."""
+"""Results as tables for a terminal of 110 columns."""
 
 import datetime
 from collections.abc import Callable, Mapping, Sequence
@@ -7,7 +7,7 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from codrl_mj.cli.look import titled_table
+from codrl_mj.cli.terminal import console, titled_table
 from codrl_mj.evaluation import MEASURES, Evaluation
 from codrl_mj.evaluation.measures import Interval, Quartiles
 from codrl_mj.runs.summaries import Comparison, RunSummary
@@ -23,6 +23,12 @@ def evaluation_tables(evaluations: Mapping[str, Evaluation], details: bool = Tru
     of_motors = [_motors(name, evaluations[name]) for name in names if evaluations[name].motors]
     whole = [_details({name: evaluations[name] for name in chunk}) for chunk in chunks]
     return [_compact(evaluations), *of_motors, *whole]
+
+
+def print_evaluations(evaluations: Mapping[str, Evaluation], details: bool = True) -> None:
+    """Print the most telling measures in one table, a row for each evaluation by its name, and details below it."""
+    for table in evaluation_tables(evaluations, details):
+        console().print(table)
 
 
 _TELLING: dict[str, tuple[str, Callable[[Any], str]]] = {

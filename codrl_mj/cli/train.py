@@ -1,8 +1,12 @@
 """`codrl-mj train`: its flags depend on the agent, and their defaults on agent, task and configuration file."""
 
 import argparse
+import contextlib
 import dataclasses
+import math
 import re
+import threading
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,11 +23,14 @@ from codrl_mj.cli.fields import (
     flags,
     scan,
 )
+from codrl_mj.cli.terminal import console, progress_bar, say
 from codrl_mj.envs.worlds import find_world
-from codrl_mj.runs.layout import finished
+from codrl_mj.runs.layout import PROGRESS, finished
+from codrl_mj.runs.summaries import last_report
 from codrl_mj.tasks import TASKS
 from codrl_mj.training.config import TrainConfig, default_agent, read_config
 from codrl_mj.training.folder import admit, load_config
+from codrl_mj.training.history import REPORT_COLUMNS
 
 _OWN_FLAGS = ("agent", "env")  # of the configuration: not made from its fields' types
 
@@ -115,7 +122,6 @@ class Train:
 
     def run(self: Any) -> int:
         """Train, with a progress bar."""
-        from codrl_mj.cli.terminal import say, training_bars
         from codrl_mj.training import train
 
         if _task(self.task) != _task(self.base.task) and self.resume is None:
@@ -155,6 +161,46 @@ class Train:
             )
         print(f"wrote {out}: see {out / 'learning_curve.png'}; {following} {out}")
         return 0
+
+
+@contextlib.contextmanager
+def training_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> Iterator[None]:
+    """Show a bar for each training while the block runs, by what the run folders say, whatever process writes them."""
+    columns = (
+        "{task.completed:,}/{task.total:,} {task.fields[unit]}",
+        "return {task.fields[mean_return]:.1f}",
+        "end torque err {task.fields[torque_error]:.2g} N·m",
+        "{task.fields[steps_per_second]:.0f}/s",
+    )
+    with progress_bar(*(one for one in columns if "torque" not in one or console().width >= 100)) as bar:
+        rows = {}
+        for name, (config, folder) in runs.items():
+            unit, total = (
+                ("episodes", config.total_episodes) if config.total_episodes else ("steps", config.total_steps)
+            )
+            nothing: dict[str, Any] = dict.fromkeys(REPORT_COLUMNS, math.nan)
+            rows[bar.add_task(name, total=total, unit=unit, **nothing)] = folder / PROGRESS, unit, total or 0
+
+        def show() -> None:
+            for row, (file, unit, total) in rows.items():
+                report: dict[str, Any] = {name: float(value) for name, value in last_report(file, []).items()}
+                if report:
+                    bar.update(row, completed=min(int(report[unit]), total), **report)
+
+        ended = threading.Event()
+
+        def follow() -> None:
+            while not ended.wait(0.2):
+                show()
+
+        follower = threading.Thread(target=follow)
+        follower.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            follower.join()
+            show()
 
 
 def _base(chosen: argparse.Namespace) -> TrainConfig:

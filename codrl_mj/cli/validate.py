@@ -36,7 +36,8 @@ class Validate:
 
     def run(self) -> int:
         """Validate and print a table for each group."""
-        from codrl_mj.cli.terminal import print_certificate, print_mutations, progress_bar
+        from codrl_mj.cli.certificate import print_certificate, print_mutations
+        from codrl_mj.cli.terminal import progress_bar
         from codrl_mj.validation import own_model, try_mutations, validate, validate_model
         from codrl_mj.validation.mutations import faulty, unfailed
 
