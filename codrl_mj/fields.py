@@ -135,9 +135,6 @@ def check_names(
         prefix: stands before each of them in the message.
         every: list the known ones beside the nearest, too: for names that somebody else has for the same.
         listed_by: the command that lists them, where they are many.
-
-    Raises:
-        ValueError: one is unknown.
     """
     known = list(known)
     for name in given:
@@ -188,17 +185,7 @@ def field_docs(kind: type) -> Mapping[str, str]:
 
 
 def build(cls: type, mapping: object, what: str, prefix: str = "") -> Any:
-    """Build a dataclass, and those in its fields, from nested mappings; absent fields take their defaults.
-
-    Args:
-        cls: the dataclass; a field whose default is a dataclass, or that `part` made, is nested.
-        mapping: the fields by name.
-        what: what to call a field in messages.
-        prefix: dotted path of the mapping.
-
-    Raises:
-        ValueError: an unknown field (the nearest known one is suggested) or a value out of bounds.
-    """
+    """Build a dataclass, and those in its fields, from nested mappings; absent fields take their defaults."""
     if not isinstance(mapping, Mapping):
         raise ValueError(f"{what} {prefix.rstrip('.')!r} = {mapping!r}: must be a mapping of {cls.__name__}'s fields")
     check_names(mapping, (field.name for field in dataclasses.fields(cls)), what, prefix)
@@ -212,11 +199,7 @@ def build(cls: type, mapping: object, what: str, prefix: str = "") -> Any:
 
 
 def part(absent: Any) -> Any:
-    """A field for an optional dataclass, None by default.
-
-    Args:
-        absent: the instance whose numbers stand for None.
-    """
+    """A field for an optional dataclass, None by default."""
     return dataclasses.field(default=None, metadata={"absent": absent})
 
 

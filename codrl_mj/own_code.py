@@ -25,11 +25,7 @@ Form = Any
 
 
 def call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """What a function of a user's, known by a name in messages, returns.
-
-    Raises:
-        ValueError: it is no function, or raises an error: its file, line, name and error.
-    """
+    """What a function of a user's, known by a name in messages, returns."""
     if not inspect.isfunction(function):
         raise ValueError(f"{name} = {function!r}: must be a function in plain Python")
     try:
@@ -100,11 +96,7 @@ def trusting(trust: bool) -> Iterator[None]:
 
 
 def load_module(text: str) -> Any:
-    """The module of `module:NAME`.
-
-    Raises:
-        ValueError: there is no such module, or it cannot be imported; or it may not be (`trusting`).
-    """
+    """The module of `module:NAME`."""
     module = text.partition(":")[0]
     if not _TRUSTED.get():
         raise ValueError(
@@ -128,11 +120,7 @@ def load_module(text: str) -> Any:
 
 
 def load_object(text: str) -> Any:
-    """What stands at `module:NAME`.
-
-    Raises:
-        ValueError: as for `load_module`, or there is nothing of that name in it.
-    """
+    """What stands at `module:NAME`."""
     module, name = load_module(text), text.partition(":")[2]
     try:
         return functools.reduce(getattr, name.split("."), module)
@@ -153,9 +141,6 @@ def look_up(
 
     Messages call it `what`. What is not ours has to be a subclass `of` a class, if one is given. `others` are names
     that are known elsewhere, to be suggested but not listed, by what lists them.
-
-    Raises:
-        ValueError: unknown name; the nearest known ones are suggested. Or no such subclass, or as for `load_object`.
     """
     if isinstance(name, str) and name in known:
         return known[name]

@@ -47,11 +47,7 @@ class Plugin(ctypes.Structure):
 
 
 def library() -> ctypes.CDLL:
-    """MuJoCo's shared library, which the bindings have loaded.
-
-    Raises:
-        LayoutError: it is not where its package should have it.
-    """
+    """MuJoCo's shared library, which the bindings have loaded."""
     for pattern in ("libmujoco.so*", "libmujoco*.dylib", "mujoco.dll"):
         for path in Path(mujoco.__file__).parent.glob(pattern):
             return ctypes.CDLL(str(path))
@@ -68,14 +64,7 @@ def registered() -> dict[str, tuple[int, Any]]:
 
 
 def check_structure(known: dict[str, tuple[int, Any]]) -> None:
-    """Compare `Plugin` with the one that MuJoCo itself filled for `mujoco.pid`.
-
-    Args:
-        known: as `registered` returns it.
-
-    Raises:
-        LayoutError: they differ.
-    """
+    """Compare `Plugin` with the one that MuJoCo itself filled for `mujoco.pid`."""
     pid = known["mujoco.pid"][1] if "mujoco.pid" in known else Plugin()
     attributes = {pid.attributes[index] for index in range(pid.nattribute)} if 0 < pid.nattribute < 20 else set()
     filled = {function for function in _FUNCTIONS if getattr(pid, function)}

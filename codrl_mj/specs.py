@@ -80,11 +80,7 @@ def _call(target: mujoco.MjsActuator, index: int) -> str:
 
 
 def resolve_patterns(actuators: Mapping[str, Any], whose: str) -> dict[str, ActuatorModel]:
-    """Pattern -> actuator, of whatever a user may write for either; messages call the model `whose`.
-
-    Raises:
-        ValueError: it is no mapping, a pattern is no regular expression, or an actuator is none.
-    """
+    """Pattern -> actuator, of whatever a user may write for either; messages call the model `whose`."""
     if not isinstance(actuators, Mapping):
         raise ValueError(f"actuators = {actuators!r}: must be a mapping of patterns, such as {{'.*': 'lag'}}")
     for pattern in actuators:
@@ -116,11 +112,7 @@ def matched_by(pattern: str, names: list[list[str]]) -> list[int]:
 
 
 def refuse_unmatched(pattern: str, names: list[list[str]]) -> NoReturn:
-    """Say that a pattern matches none of the actuators with these `names_of`.
-
-    Raises:
-        ValueError: always.
-    """
+    """Say that a pattern matches none of the actuators with these `names_of`."""
     known = list(dict.fromkeys(name for own in names for name in own))
     raise ValueError(
         f"{pattern!r}: no actuator has such a name, nor drives anything that has; "

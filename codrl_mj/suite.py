@@ -181,9 +181,6 @@ def load(
         environment_kwargs: `flat_observation`, as for `DmEnvironment`.
         **options: the other fields of `codrl_mj.envs.config.EnvConfig`, and the task's own options, over a
             configuration's.
-
-    Raises:
-        ValueError: unknown domain or task, or arguments out of bounds.
     """
     if task_name != TASK_NAME:
         raise ValueError(f"task_name = {task_name!r}: every domain has one task, {TASK_NAME!r}")

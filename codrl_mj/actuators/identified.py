@@ -11,11 +11,7 @@ ENTRY = "identified"
 
 
 def usable_fields(mapping: Mapping[str, Any]) -> dict[str, Any]:
-    """An actuator's fields as its file has them, without the entry.
-
-    Raises:
-        ValueError: the file says that the actuator must not be used.
-    """
+    """An actuator's fields as its file has them, without the entry."""
     fields = dict(mapping)
     section = fields.pop(ENTRY, None)
     if isinstance(section, Mapping) and section.get("problem"):

@@ -315,11 +315,7 @@ def advance_form(cls: Family) -> tuple[Form, str]:
 
 @functools.cache
 def check_family(cls: Family) -> None:
-    """Refuse a family whose functions do not return what it declares: each is called once on plain numbers.
-
-    Raises:
-        ValueError: as it says; the message has the place, or the name of what is declared.
-    """
+    """Refuse a family whose functions do not return what it declares: each is called once on plain numbers."""
     for name in ("State", "Signals"):
         if not hasattr(kind := getattr(cls, name), "_fields"):
             raise ValueError(f"{cls.__name__}.{name} = {kind!r}: must be a typing.NamedTuple of floats")

@@ -197,17 +197,7 @@ _FILES = (".yaml", ".yml", ".json")
 
 
 def actuator_from_file(path: Path, paper: Actuator | None, whose: str) -> Any:
-    """Read an actuator from a YAML or JSON file that holds a mapping of its fields.
-
-    Args:
-        path: the file; a `name` in it is that of another actuator, but no other file.
-        paper: as for `resolve`.
-        whose: as for `resolve`.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is not YAML, or describes no actuator; the message has the file's name.
-    """
+    """Read an actuator from a YAML or JSON file that holds a mapping of its fields."""
     import yaml
 
     if not path.is_file():

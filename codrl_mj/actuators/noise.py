@@ -19,17 +19,9 @@ LARGEST_KEY = 2**53
 
 
 def philox(c0: int, c1: int, c2: int, c3: int, key: int) -> tuple[int, int, int, int]:
-    """Philox4x32-10 (Salmon, Moraes, Dror, Shaw: "Parallel random numbers: as easy as 1, 2, 3", 2011).
+    """Philox4x32-10: four words of 32 bits from four such and a key of 64, the low word first.
 
-    Args:
-        c0: counter word, 32 bits; so are c1, c2 and c3.
-        c1: see c0.
-        c2: see c0.
-        c3: see c0.
-        key: 64 bits, the low word first.
-
-    Returns:
-        Four words of 32 bits.
+    Salmon, Moraes, Dror, Shaw: "Parallel random numbers: as easy as 1, 2, 3" (2011).
     """
     k0, k1 = key & _MASK, (key >> 32) & _MASK
     for _ in range(10):
@@ -46,12 +38,6 @@ def unit(high: int, low: int) -> float:
 
 
 def standard_normal(key: float, step: int, index: int) -> float:
-    """A standard normal number (Box and Muller's), the sensor's at an integration step.
-
-    Args:
-        key: of the environment and episode, a whole number below `LARGEST_KEY`.
-        step: integration step since the start.
-        index: electrical substep within it.
-    """
+    """A standard normal number (Box and Muller's) of a key < `LARGEST_KEY`, integration step and electrical substep."""
     w0, w1, w2, w3 = philox(step & _MASK, (step >> 32) & _MASK, index, SENSOR_STREAM, int(key))
     return math.sqrt(-2.0 * math.log(unit(w0, w1))) * math.cos(2.0 * math.pi * unit(w2, w3))

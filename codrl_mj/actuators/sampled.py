@@ -24,12 +24,6 @@ def designed_gains(resistance: float, inductance: float, sample_time: float, ban
     """Proportional gain [V/A] and integral gain per sample [V/A] of the loop whose zero cancels the winding's pole.
 
     kp = R*P*e/(1 - e) and ki*T = R*P: the loop from reference to current is P/(z - 1 + P).
-
-    Args:
-        resistance: R [ohm].
-        inductance: L [H].
-        sample_time: T [s].
-        bandwidth: wc [rad/s].
     """
     x = resistance * sample_time / inductance
     step = -math.expm1(-bandwidth * sample_time)

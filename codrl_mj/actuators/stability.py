@@ -62,11 +62,6 @@ MARGIN = 1e-9
 def stability_radii(family: Any, numbers: np.ndarray, timestep: float) -> np.ndarray:
     """`spectral_radii`, but 0 or infinity in clear cases, which saves nearly all of the eigenvalues.
 
-    Args:
-        family: as for `spectral_radii`, and so are the others.
-        numbers: see there.
-        timestep: see there.
-
     Returns:
         Shape (m,): below 1 exactly where the spectral radii are.
     """

@@ -65,11 +65,7 @@ def _is_ours(model: int, actuator: int) -> bool:
 
 @functools.cache
 def compiled() -> Callbacks:
-    """Compile the callbacks on first use and keep them for the life of the process.
-
-    Raises:
-        LayoutError: the installed MuJoCo's memory is not laid out as its introspection says.
-    """
+    """Compile the callbacks on first use and keep them for the life of the process."""
 
     @cfunc(types.void(types.uintp, types.uintp), nogil=True, error_model="numpy")
     def control(model: int, data: int) -> None:

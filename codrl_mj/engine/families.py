@@ -175,9 +175,6 @@ def compiled_function(function: Callable[..., Any], form: Form, declared: str, *
     """A user's function for arguments of such types, whose result is of a form in numba's eyes too.
 
     It is compiled to find that out, unless a process before has, of the very same function.
-
-    Raises:
-        ValueError: it is not what numba compiles, or returns something else.
     """
     compiled, noted = internal(function), Note("fits", function, form, kinds)
     try:

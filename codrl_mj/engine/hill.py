@@ -78,11 +78,7 @@ def _place(model: int, data: int, body: int, height: float, slope: float) -> Non
 
 @functools.cache
 def compiled_hill() -> HillCallback:
-    """Compile the callback on first use and keep it for the life of the process.
-
-    Raises:
-        LayoutError: the installed MuJoCo's memory is not laid out as its introspection says.
-    """
+    """Compile the callback on first use and keep it for the life of the process."""
 
     @cfunc(types.void(types.uintp, types.uintp), nogil=True, error_model="numpy")
     def passive(model: int, data: int) -> None:

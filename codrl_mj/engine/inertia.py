@@ -58,9 +58,6 @@ def load_inertia() -> Any:
     With its moment m, the gear times a row of `actuator_moment`, and the inertia matrix M = L^T*D*L that
     `mj_fwdPosition` has factorised, it is 1/(m*M^-1*m): how hard it is to turn with all other joints free. Infinite
     where nothing moves.
-
-    Raises:
-        LayoutError: the installed MuJoCo's memory is not laid out as its introspection says.
     """
 
     @cfunc(types.float64(types.uintp, types.uintp, types.int32, types.float64), nogil=True, error_model="numpy")

@@ -69,20 +69,12 @@ def _structure(name: str, fields: Any) -> type[ctypes.Structure]:
 
 @functools.cache
 def struct(name: str) -> type[ctypes.Structure]:
-    """MuJoCo's structure of a C name (`mjModel`, `mjData`, `mjOption`, ...) as a ctypes structure.
-
-    Raises:
-        LayoutError: the structure holds a type that is not known here.
-    """
+    """MuJoCo's structure of a C name (`mjModel`, `mjData`, `mjOption`, ...) as a ctypes structure."""
     return _structure(name, STRUCTS[name].fields)
 
 
 def offset(struct_name: str, field: str) -> int:
-    """Offset in bytes of a field of `mjModel` or `mjData`, which may be dotted (`opt.timestep`).
-
-    Raises:
-        LayoutError: there is no such field in the installed MuJoCo.
-    """
+    """Offset in bytes of a field of `mjModel` or `mjData`, which may be dotted (`opt.timestep`)."""
     kind, total = struct(struct_name), 0
     for part in field.split("."):
         if not hasattr(kind, part):
@@ -135,9 +127,6 @@ def check_field(struct_name: str, field: str) -> None:
 
     An array must lie where the layout says, anything else must have its value there. A field that the public bindings
     do not show (`pbase`), or of which there is nothing, is checked through its neighbours on both sides.
-
-    Raises:
-        LayoutError: the field is elsewhere.
     """
     with ThreadPoolExecutor(1) as thread:  # the compiler of a model, which may be running, is not reentrant in its own
         owner = thread.submit(_live).result()[struct_name]

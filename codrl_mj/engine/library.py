@@ -39,11 +39,7 @@ class Engine(NamedTuple):
 
 @functools.cache
 def engine() -> Engine:
-    """The functions, found on first use.
-
-    Raises:
-        LayoutError: the installed MuJoCo has no library where its package should have it.
-    """
+    """The functions, found on first use."""
     mujoco_library = library()
     functions = mujoco_library.mj_step, mujoco_library.mj_resetData, mujoco_library.mj_setConst
     signature = types.void(types.uintp, types.uintp)

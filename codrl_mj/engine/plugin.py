@@ -147,11 +147,7 @@ def _verdict() -> tuple[Any, Any]:
 
 @functools.cache
 def compiled() -> Functions:
-    """Compile the functions on first use and keep them for the life of the process.
-
-    Raises:
-        LayoutError: the installed MuJoCo's memory is not laid out as its introspection says.
-    """
+    """Compile the functions on first use and keep them for the life of the process."""
 
     @cfunc(types.void(types.uintp, types.uintp, types.int32, types.int32), nogil=True, error_model="numpy")
     def compute(model: int, data: int, instance: int, capability: int) -> None:  # noqa: ARG001
@@ -230,11 +226,7 @@ def start(model: int, data: int, instance: int) -> int:
 
 
 def states_of(model: int, instance: int) -> int:
-    """The plugin's `nstate`: how many numbers of state an instance's actuator has.
-
-    Raises:
-        ValueError: its family is not known.
-    """
+    """The plugin's `nstate`: how many numbers of state an instance's actuator has."""
     return slot_size(_family(_configuration(model, instance))) + EXTRA_STATES
 
 
@@ -245,11 +237,7 @@ def _configuration(model: int, instance: int) -> str:
 
 
 def _family(name: str) -> Any:
-    """The family that a model names. A model must not have code imported: only ours is, and what the user has loaded.
-
-    Raises:
-        ValueError: it is somebody else's and was not loaded.
-    """
+    """The family that a model names. No model has code imported: it is ours, or the user has loaded it."""
     for family in (*loaded_families(), *BUILT_IN):
         if reference(family) == name:
             return family

@@ -173,17 +173,7 @@ def check_shafts(
     held: bool = False,
     actuators: Mapping[int, ActuatorModel] | None = None,
 ) -> None:
-    """Refuse motors that what they move makes unstable (`ActuatorModel.check_shaft`), in the model's initial position.
-
-    Args:
-        model: any MuJoCo model.
-        allow_unstable: whether to let them be.
-        held: whether they will not be told what they move, as on the analytic physics.
-        actuators: what `motors` would read, where that is known.
-
-    Raises:
-        ValueError: see `motors`; or a motor is refused: the message has its name, the number and a remedy.
-    """
+    """Refuse motors that what they move makes unstable; where they are `held`, they are not told what that is."""
     asking = {index: one for index, one in (actuators or motors(model)).items() if one.INERTIA}
     if not asking:
         return

@@ -29,11 +29,7 @@ def shared(attribute: Attribute) -> bool:
 
 
 def read(name: str, setup: Setup, model: Any) -> Any:
-    """The value of an attribute of an environment, whose simulation has this `mjModel`; without one, the physics.
-
-    Raises:
-        AttributeError: the physics is on no model, of MuJoCo or Gymnasium, that has the number.
-    """
+    """The value of an attribute of an environment, whose simulation has this `mjModel`; without one, the physics."""
     attribute = setup.task.attributes[name]
     if isinstance(attribute, Fixed):
         return attribute.value
@@ -50,18 +46,8 @@ def read(name: str, setup: Setup, model: Any) -> Any:
 def written(name: str, value: Any, setup: Setup, model: Any) -> Setup:
     """Write an attribute; to be followed by `mj_setConst`.
 
-    Args:
-        name: its name.
-        value: the new value.
-        setup: of the environment.
-        model: as for `read`; it is changed.
-
     Returns:
         The set-up to go on with.
-
-    Raises:
-        AttributeError: it can be read only; the message says why and what to do instead.
-        ValueError: the value is no number, or out of bounds.
     """
     present = read(name, setup, model)
     if np.array_equal(value, present):
@@ -75,11 +61,7 @@ def written(name: str, value: Any, setup: Setup, model: Any) -> Setup:
 
 
 def checked_states(states: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Mechanical states as float64.
-
-    Raises:
-        ValueError: of another shape, or not finite numbers.
-    """
+    """Mechanical states as float64."""
     try:
         array = np.array(states, dtype=np.float64)
     except (TypeError, ValueError):
@@ -99,11 +81,7 @@ def _place(attribute: ModelNumber, model: Any) -> np.ndarray:
 
 
 def _gymnasiums(physics: Any) -> Any:
-    """The Gymnasium environment that a physics without a MuJoCo model drives.
-
-    Raises:
-        AttributeError: it drives none.
-    """
+    """The Gymnasium environment that a physics without a MuJoCo model drives."""
     if not isinstance(physics, AnalyticPhysics) or not hasattr(physics.twin, "env"):
         raise AttributeError(
             f"{type(physics).__name__} has no MuJoCo model or data, and no environment of Gymnasium's, whose number it "
@@ -230,11 +208,7 @@ class GymnasiumAttributes:
         self._offer_attributes(self.task)  # type: ignore[attr-defined]
 
     def _offer_attributes(self, task: Task) -> None:
-        """Make the names of a task's attributes known to the class; called when an environment has been made.
-
-        Raises:
-            ValueError: environments have an attribute of that name.
-        """
+        """Make the names of a task's attributes known to the class; called when an environment has been made."""
         for name in task.attributes:
             if isinstance(vars(GymnasiumAttributes).get(name), _Access):
                 continue

@@ -17,11 +17,7 @@ from codrl_mj.tasks import Task
 
 
 def command_of(actuator: ActuatorModel, name: str, whose: str = "") -> Command:
-    """What an action means to an actuator, that of a pattern `whose`; a force is one of the actuator as it is.
-
-    Raises:
-        ValueError: the actuator takes no such command.
-    """
+    """What an action means to an actuator, that of a pattern `whose`; a force is one of the actuator as it is."""
     if name == "force":
         return Command("N or N*m", actuator, actuator.arm_radius, None, {})
     known = actuator.commands()
@@ -64,12 +60,7 @@ class TaskCommands:
     def build(
         cls, task: Task, actuators: tuple[ActuatorModel, ...], name: str, levels: Sequence[float] | None
     ) -> "TaskCommands":
-        """Resolve a command by its name; `levels` are for discrete tasks and other commands than `force`.
-
-        Raises:
-            ValueError: an unknown command, one that the actuator or the task cannot take, or a missing or invalid
-            table.
-        """
+        """Resolve a command by its name; `levels` are for discrete tasks and other commands than `force`."""
         if name == "force" and actuators[0].MOTION:
             raise ValueError(
                 f"action = 'force': a {type(actuators[0]).__name__} is not asked for forces; must be one of "
@@ -162,9 +153,6 @@ class TaskCommands:
         """The force [N] or torque [N*m] that the physics is to ask the actuator for; with several motors an array (n,).
 
         An action of a box saturates.
-
-        Raises:
-            ValueError: the action is no element, or not a number.
         """
         forces = self.action_forces
         if forces is not None:
@@ -185,11 +173,7 @@ class TaskCommands:
         return np.clip(array.astype(np.float64), -limit, limit) * scale
 
     def forces(self, actions: Any) -> np.ndarray:
-        """What `force` does, for a batch (N, ...): forces (N,), or with several motors (N, n), float64.
-
-        Raises:
-            ValueError: wrong shape or type, or a row that is no element; the message has its index.
-        """
+        """What `force` does, for a batch (N, ...): forces (N,), or with several motors (N, n), float64."""
         space, array = self.action_space, np.asarray(actions)
         discrete = isinstance(space, spaces.Discrete)
         kinds = "iu" if discrete else "f"
@@ -228,10 +212,6 @@ class ControlCommands:
 
         `actions` has the environment's own, `motors` what one means to an actuator, by its index: None where it is the
         environment's own. An environment step takes `step_duration` [s], if that is known.
-
-        Raises:
-            ValueError: actions are not the model's controls, an actuator is not a plain motor, or has no limit; or
-                disturbances need a duration, or a joint to act on.
         """
         self.action_space, model, indices = actions, data.model, list(motors)
         self._scales: np.ndarray | None = None
@@ -298,11 +278,7 @@ class ControlCommands:
             self._data.qfrc_applied[self._dofs] = 0.0
 
     def controls(self, action: Any) -> Any:
-        """The environment's own action for one of `action_space`, as it arrives in this step; loads go to the joints.
-
-        Raises:
-            ValueError: the action has not the shape of the action space.
-        """
+        """The environment's own action for one of `action_space`, as it arrives in a step; loads go to the joints."""
         if self._scales is not None:
             if np.shape(action) != self.action_space.shape:
                 raise ValueError(f"action has shape {np.shape(action)}: must be {self.action_space.shape}")

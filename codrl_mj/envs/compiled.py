@@ -115,15 +115,9 @@ class CompiledEnv(NamedTuple):
 def compiled_env(env: Any) -> CompiledEnv | None:
     """An environment's compiled parts.
 
-    Args:
-        env: an `ActuatedEnv` (`env.unwrapped` of what `gymnasium.make` returns).
-
     Returns:
         None where they would not be the whole of it: on physics that are Python, such as the analytic one, and where
         actuator or model are drawn at resets, which is Python too.
-
-    Raises:
-        ValueError: a function of the task's is not what numba compiles.
     """
     setup, physics = env.setup, env.physics
     if physics.compiled is None or setup.randomization.names:

@@ -146,10 +146,6 @@ def parse(text: str) -> Distribution:
     Args:
         text: `uniform(LOW, HIGH)`, `loguniform(LOW, HIGH)` or `choice(VALUE, ...)`. A value is a number, `inf`, `True`
             or `False`; one without point and exponent is an integer.
-
-    Raises:
-        ValueError: an unknown distribution (the nearest is suggested), the wrong number of values, one that is no
-            number, or impossible bounds; the message has the text.
     """
     match = re.fullmatch(r"\s*(\w+)\s*\(([^()]*)\)\s*", text) if isinstance(text, str) else None
     *others, last = _FORMS.values()
@@ -191,9 +187,6 @@ def paths_of(randomize: Any) -> dict[str, Distribution]:
     Args:
         randomize: a mapping of paths to distributions or their text, of patterns to such mappings, or a sequence of
             'PATH=DISTRIBUTION'; a path is FIELD, PATTERN:FIELD or model.FIELD. None is for nothing.
-
-    Raises:
-        ValueError: it is neither or empty, a path is named twice, or a distribution is none.
     """
     if randomize is None:
         return {}
@@ -231,11 +224,7 @@ def _flat(randomize: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def _split(item: Any) -> tuple[str, str]:
-    """Path and distribution of 'PATH=DISTRIBUTION'; a pattern may hold '=' itself.
-
-    Raises:
-        ValueError: it has no path or no '='.
-    """
+    """Path and distribution of 'PATH=DISTRIBUTION'; a pattern may hold '=' itself."""
     match = re.fullmatch(r"\s*((?:.*:)?[^:=]+?)\s*=(.*)", item) if isinstance(item, str) else None
     if match is None:
         raise ValueError(

@@ -45,9 +45,6 @@ class Motors:
         `commands` say what an action of a name, `action`, means to the motors of a pattern, `actions` are the
         environment's own. An environment step takes `step_duration` [s], if that is known. What else is given is as for
         `codrl_mj.make`.
-
-        Raises:
-            ValueError: an argument does not go with the actuators or the environment.
         """
         self.data, model = data, data.model
         self.readout = Readout(model)
@@ -91,11 +88,7 @@ class Motors:
         mujoco.mj_setConst(self.data.model, self.data)
 
     def draw(self, generator: np.random.Generator) -> None:
-        """Draw motors and model of the next episode; to be followed by a reset.
-
-        Raises:
-            ValueError: nothing stable was drawn.
-        """
+        """Draw motors and model of the next episode; to be followed by a reset."""
         self.draws.draw(lambda rows, count: generator.random((len(rows), count)), np.zeros(1, dtype=int))
 
     def begin(self, generator: np.random.Generator) -> None:
@@ -123,11 +116,7 @@ class Motors:
         return np.array(values)
 
     def check_finite(self, who: str, time: float) -> None:
-        """Raise if the engine met what is no number, or too large a one; it starts anew then, and the episode goes on.
-
-        Raises:
-            SimulationDivergedError: as it says, of the environment `who`, at the `time` [s] before the step.
-        """
+        """Raise if the engine met what is no number, or too large a one; it would start anew and go on."""
         counts, model = self.data.warning.number, self.data.model
         if not counts[_POSITION:].any():  # since the reset
             return

@@ -35,11 +35,7 @@ class Outcomes(NamedTuple):
 
 
 def compiled_outcomes(task: Task) -> Outcomes:
-    """The functions of a task; its own are compiled at once, ours as they are used, once a process.
-
-    Raises:
-        ValueError: one of its own is not what numba compiles.
-    """
+    """The functions of a task; its own are compiled at once, ours as they are used, once a process."""
     size, several = len(task.state_names), len(task.motors) > 1
     functions = task.observation, task.reward, task.terminated
     return _compiled(*functions, task.options, size, task.observation_names, several)  # type: ignore[arg-type]

@@ -67,10 +67,6 @@ class Randomization:
 
         The `model` is without what its `motors`, by the indices of their actuators, add; `fixed` are the fields of
         each that cannot be drawn, with the reason; the `timestep` is in [s]; messages call the model `whose`.
-
-        Raises:
-            ValueError: an unknown field (the nearest is suggested), one that cannot be drawn here, or impossible
-                bounds; the message names field, value and bound.
         """
         matched, simulated = _matched(distributions, model, motors, fixed, whose), list(motors.values())
         turned, added = (
@@ -116,9 +112,6 @@ class Randomization:
 
         `random` is asked for positions in `nominal`, which is as `fields_of` has it. Returned are the values (m, k),
         and how many sets were rejected before, (m,).
-
-        Raises:
-            ValueError: `LIMIT` sets in a row were unstable.
         """
         count = len(nominal[0])
         values, rejected = np.empty((count, len(self.distributions))), np.zeros(count, dtype=np.int64)
@@ -209,11 +202,7 @@ class Draws:
         self._rejected = np.zeros(len(motors), dtype=np.int64)
 
     def draw(self, random: Uniforms, rows: np.ndarray) -> None:
-        """Draw anew for the simulations `rows` (m,), which are to be reset afterwards.
-
-        Raises:
-            ValueError: nothing stable was drawn.
-        """
+        """Draw anew for the simulations `rows` (m,), which are to be reset afterwards."""
         if not self.randomization.names:
             return
         self._values[rows], self._rejected[rows] = self.randomization.draw(

@@ -89,20 +89,12 @@ class ActuatedVecEnv(VecEnv):
     def conclude(
         self, observation: np.ndarray, total: float, length: int, truncated: bool, signals: Signals
     ) -> tuple[np.ndarray, list[dict[str, Any]]]:
-        """Take the episode of the only environment as run elsewhere, from its first step to its end; start the next.
+        """Take the episode of the only environment as run elsewhere, with its last observation (k,) and sum of rewards.
 
-        Args:
-            observation: the last, shape (k,).
-            total: sum of the rewards.
-            length: steps.
-            truncated: whether the time limit ended it, and not the task.
-            signals: the actuator's, each an array of shape (length,).
+        Its `length` steps have `signals` (length,) each; `truncated` by the time limit, not the task. The next begins.
 
         Returns:
             Observations and infos, as the last step would have returned them.
-
-        Raises:
-            ValueError: there is more than one environment.
         """
         if self.num_envs != 1:
             raise ValueError(f"num_envs = {self.num_envs}: an episode can be concluded only where it is the only one")
@@ -125,9 +117,6 @@ class ActuatedVecEnv(VecEnv):
 
         Returns:
             None; or the first observations (N, k), where the environments could only start an episode anew.
-
-        Raises:
-            ValueError: the snapshot is of another number of environments, another task or other arguments.
         """
         own = self._records()
         check_snapshot(snapshot, self.env.snapshot() | own)
@@ -163,11 +152,7 @@ class ActuatedVecEnv(VecEnv):
         return [values[index] for index in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of the vector environment, which all its environments share, or else that of each of them.
-
-        Raises:
-            ValueError: only some of the environments were named.
-        """
+        """Set an attribute of the vector environment, which all share, or else that of each environment."""
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise ValueError(f"set_attr({attr_name!r}): the environments share it; it can only be set for all of them")
         owners: list[Any] = [self.env]

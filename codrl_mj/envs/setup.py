@@ -48,11 +48,7 @@ class Setup:
 
     @classmethod
     def build(cls, config: EnvConfig) -> "Setup":
-        """Make an environment's parts, and check what its configuration cannot.
-
-        Raises:
-            ValueError: fields do not go with each other; or the loop is unstable.
-        """
+        """Make an environment's parts, and check what its configuration cannot."""
         task = find_task(config.task)
         steps = task.steps_within(config.actuators[0], config.inner_steps, config.timestep)
         timestep, integrator = task.step_duration / steps, task.integrator(config.integrator)
@@ -103,12 +99,7 @@ class Setup:
         return signals
 
     def simulate(self, physics: str) -> Physics:
-        """A new simulation on the given physics.
-
-        Raises:
-            ValueError: unknown physics, or one that cannot simulate this.
-            CallbackInUseError: another library's MuJoCo callback is installed.
-        """
+        """A new simulation on the given physics."""
         made = find_physics(physics)(
             self.task,
             self.commands.simulated,
@@ -136,9 +127,6 @@ class Setup:
         """Start an episode: draw the initial state and then, if anything is randomised, actuator and model.
 
         Disturbances and sensors that are random draw the key of their numbers last.
-
-        Raises:
-            ValueError: no stable current loop was drawn.
         """
         initial = self.task.initial(generator, options)
         draws.draw(lambda rows, count: generator.random((len(rows), count)), np.zeros(1, dtype=int))

@@ -52,9 +52,6 @@ def check_snapshot(snapshot: Mapping[str, np.ndarray], expected: Mapping[str, np
     """Refuse a snapshot of other entries, shapes or types than those of the environment's own, `expected`.
 
     The entry of a `name`, if there is one, has the `letters` of what it is of.
-
-    Raises:
-        ValueError: an entry is missing, unknown, or of another shape or type; or it is of something else.
     """
     for entry in [*expected, *(one for one in snapshot if one not in expected)]:
         found, wanted = (_description(arrays.get(entry)) for arrays in (snapshot, expected))

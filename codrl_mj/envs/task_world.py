@@ -59,12 +59,7 @@ class TaskWorld(World):
         return {self.task.reward.__module__, asset_path(self.task.asset).resolve()}
 
     def options(self, given: Any) -> Any:
-        """The task's options as its `NamedTuple`.
-
-        Raises:
-            UnknownOptionError: unknown option.
-            ValueError: one that is not a number > 0, or not True or False where its default is either.
-        """
+        """The task's options as its `NamedTuple`."""
         known = self.task.options
         plain = self.changed(given) if isinstance(given, tuple) else dict(given or {})
         for name, value in plain.items():
@@ -112,11 +107,7 @@ class TaskWorld(World):
         return made[0] if len(made) == 1 else made
 
     def _by_pattern(self, patterns: Mapping[str, Any]) -> dict[str, Any]:
-        """Motor -> what a pattern of the motors' names gives it, as a motor with several.
-
-        Raises:
-            ValueError: a pattern matches no motor, or two the same.
-        """
+        """Motor -> what a pattern of the motors' names gives it, as a motor with several."""
         motors, found = self.task.motors, {}
         for pattern, given in patterns.items():
             try:
@@ -166,11 +157,7 @@ class TaskWorld(World):
         return str(self.task.agent)
 
     def view(self, config: Any, width: int, height: int, camera: str | None) -> None:  # noqa: ARG002
-        """None: images are drawn from an episode's states.
-
-        Raises:
-            ValueError: no such camera, or a size out of bounds.
-        """
+        """None: images are drawn from an episode's states."""
         import mujoco
 
         from codrl_mj.physics.offscreen import check_view
@@ -207,11 +194,7 @@ def claims(name: str) -> bool:
 
 
 def find(name: Any) -> TaskWorld:
-    """The world of the task of that name.
-
-    Raises:
-        ValueError: unknown name; the nearest known one is suggested.
-    """
+    """The world of the task of that name."""
     ours = {task.env_id: task for task in TASKS.values()}
     return TaskWorld(ours[name] if name in ours else find_task(name))
 

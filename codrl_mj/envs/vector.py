@@ -401,16 +401,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
 
 
 def check_counts(num_envs: int, max_episode_steps: int | None, each: int = 3_000) -> None:
-    """Refuse impossible numbers of environments and steps.
-
-    Args:
-        num_envs: how many environments.
-        max_episode_steps: time limit of each; None for none.
-        each: memory that an environment takes [bytes].
-
-    Raises:
-        ValueError: either is no integer >= 1, or the memory that is free does not hold so many environments.
-    """
+    """Refuse impossible numbers of environments, each of which takes memory of `each` [bytes], and of steps."""
     limit = {} if max_episode_steps is None else {"max_episode_steps": max_episode_steps}
     for name, count in {"num_envs": num_envs, **limit}.items():
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:

@@ -26,11 +26,7 @@ class View:
 
     @classmethod
     def build(cls, task: Task, options: Any, family: Family, observe_actuator: bool) -> "View":
-        """A view of a task with its options; if `observe_actuator`, of what the sensors of its actuators say, too.
-
-        Raises:
-            ValueError: they have none.
-        """
+        """A view of a task with its options; if `observe_actuator`, of what the sensors of its actuators say, too."""
         motors = dict.fromkeys(task.motors if len(task.motors) > 1 else ("",), family)
         sensors = sensor_names(motors)
         if observe_actuator:

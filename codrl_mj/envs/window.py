@@ -10,11 +10,7 @@ class Window:
     """Shows images one after another, no faster than a frame rate."""
 
     def __init__(self, width: int, height: int) -> None:
-        """Open it, for images of a size [px].
-
-        Raises:
-            DependencyNotInstalled: pygame is not installed.
-        """
+        """Open it, for images of a size [px]."""
         try:
             import pygame
         except ImportError:

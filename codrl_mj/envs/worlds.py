@@ -282,11 +282,7 @@ def is_world(word: str) -> bool:
 
 
 def find_world(name: Any) -> World:
-    """The world called `name`: a task's name, an environment's id, or `module:NAME` of a world or a task.
-
-    Raises:
-        ValueError: unknown name; the nearest known one is suggested.
-    """
+    """The world called `name`: a task's name, an environment's id, or `module:NAME` of a world or a task."""
     if isinstance(name, str):
         for kind in _kinds():
             if kind.claims(name):
@@ -298,11 +294,7 @@ def find_world(name: Any) -> World:
 
 @functools.singledispatch
 def world_of(thing: Any) -> World:
-    """The world of what stands at `module:NAME`.
-
-    Raises:
-        ValueError: it is neither a world, with a name, nor a task.
-    """
+    """The world of what stands at `module:NAME`."""
     if isinstance(thing, type):
         raise ValueError(f"{thing.__qualname__}: must be an instance of it: {thing.__qualname__}(...)")
     raise ValueError(f"{thing!r}: must be a codrl_mj.Task or a codrl_mj.World")

@@ -18,15 +18,7 @@ class Building:
     """The actuators for models yet to be built, and what was met of these."""
 
     def __init__(self, actuators: Mapping[str, Any], allow_unstable: bool = False) -> None:
-        """Check what needs no model.
-
-        Args:
-            actuators: as for `codrl_mj.motorise`, but that a pattern may match nothing in some of the models.
-            allow_unstable: likewise.
-
-        Raises:
-            ValueError: a pattern is no regular expression, or an actuator is none.
-        """
+        """Check what needs no model; a pattern may match nothing in some of the models."""
         self.actuators: dict[str, ActuatorModel] = resolve_patterns(actuators, "another's environment")
         self._allow_unstable = allow_unstable
         self._met: list[list[list[str]]] = []

@@ -37,20 +37,7 @@ class MotorisedEnvironment(dm_env.Environment):
         allow_unstable: bool = False,
         noise_seed: int | None = None,
     ) -> None:
-        """Build it.
-
-        Args:
-            build: makes the environment.
-            actuators: pattern -> actuator.
-            action: as for `make_dm_control`, and so are the others.
-            randomize: see there.
-            disturbances: see there.
-            allow_unstable: see there.
-            noise_seed: see there.
-
-        Raises:
-            ValueError: see `make_dm_control`.
-        """
+        """Build it."""
         self._action, self._commands = action, {name: command_of(one, action, name) for name, one in actuators.items()}
         simulated = {pattern: command.actuator for pattern, command in self._commands.items()}
         self._building = Building(simulated, allow_unstable)

@@ -105,11 +105,7 @@ class Motorised:
 
     @functools.cached_property
     def commands(self) -> dict[str, Command]:
-        """Pattern -> what an action means to its motors.
-
-        Raises:
-            ValueError: an actuator takes no such command.
-        """
+        """Pattern -> what an action means to its motors."""
         return {pattern: command_of(one, self.action, pattern) for pattern, one in self.actuators.items()}
 
     @property
@@ -122,11 +118,7 @@ class Motorised:
         return load_env_creator(self.entry_point) if isinstance(self.entry_point, str) else self.entry_point
 
     def __call__(self, **options: Any) -> gymnasium.Env:
-        """Make it.
-
-        Raises:
-            ValueError: see `codrl_mj.motorised`.
-        """
+        """Make it."""
         simulated = {pattern: command.actuator for pattern, command in self.commands.items()}
         creator, building = self._creator, Building(simulated, self.allow_unstable)
         ours = isinstance(creator, type) and issubclass(creator, MujocoEnv)
@@ -180,17 +172,7 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         randomize: Mapping[str, Mapping[str, Any]] | None = None,
         disturbances: Any = None,
     ) -> None:
-        """Wrap an environment that `Motorised` made.
-
-        Args:
-            env: the environment.
-            observe_actuator: as for `make`, and so are the others.
-            randomize: see there.
-            disturbances: see there.
-
-        Raises:
-            ValueError: see `make`.
-        """
+        """Wrap an environment that `Motorised` made."""
         RecordConstructorArgs.__init__(
             self, observe_actuator=observe_actuator, randomize=randomize, disturbances=disturbances
         )
@@ -211,11 +193,7 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         self._bind()
 
     def _bind(self) -> None:
-        """Find the motors of the environment's model.
-
-        Raises:
-            ValueError: see `make`.
-        """
+        """Find the motors of the environment's model."""
         base: Any = self.unwrapped
         motorised = self._motorised
         self._watch: StepWatch | None = None
@@ -314,10 +292,6 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
 
         Returns:
             None; or the first observation of the episode that was started, where the state is not in the snapshot.
-
-        Raises:
-            ValueError: the snapshot is of another environment, or of arguments that need other entries or shapes;
-                nothing was changed.
         """
         check_snapshot(snapshot, self.snapshot(), "environment")
         if not self._begun:  # which Gymnasium's wrappers insist on

@@ -31,11 +31,7 @@ class GymnasiumWorld(World):
 
     @property
     def spec(self) -> gymnasium.envs.registration.EnvSpec:
-        """What Gymnasium knows of it.
-
-        Raises:
-            ValueError: there is no such environment; Gymnasium's message suggests one.
-        """
+        """What Gymnasium knows of it."""
         try:
             return gymnasium.spec(self.name.rpartition(":")[2])
         except (gymnasium.error.Error, ModuleNotFoundError) as error:

@@ -126,11 +126,7 @@ need not reach infinity there."""
 
 
 def check_finite(task: Task, state: np.ndarray, time: float) -> None:
-    """Raise if `state` is not finite or beyond `LARGEST`, saying which entry of which task and when.
-
-    Raises:
-        SimulationDivergedError: as it says.
-    """
+    """Raise if `state` is not finite or beyond `LARGEST`, saying which entry of which task and when."""
     if state @ state <= LARGEST:  # the quick answer; false for NaN too
         return
     fine = np.abs(state) <= LARGEST

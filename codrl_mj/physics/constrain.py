@@ -29,9 +29,6 @@ def compiled_constrain(task: Task) -> Compiled | None:
 
     None for a task without bounds. A state beyond `LARGEST` becomes NaN in all its entries, to be noticed: within its
     bounds it would look like any other.
-
-    Raises:
-        ValueError: `constrain` is not what numba compiles.
     """
     return None if task.constrain is None else _keeper(task.constrain, task.state_names, task.qpos, task.qvel)
 

@@ -91,10 +91,6 @@ def task_model(
     A diverging simulation is left to diverge, so that it can be reported, instead of being reset by the engine. Where
     the Euler integrator is made `explicit`, joint damping is explicit too. The integration step is in [s]; `max_forces`
     [N or N*m], shape (n,), limit the desired forces in place of the task's; `joint` is added to the actuated joints.
-
-    Raises:
-        ValueError: it is no model, has no actuator of the name of one of the task's motors, or other joints than the
-            task's state has entries, or another integrator.
     """
     try:
         spec = mujoco.MjSpec.from_file(str(asset_path(task.asset)))

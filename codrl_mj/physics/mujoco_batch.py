@@ -167,11 +167,7 @@ class MujocoBatchPhysics:
             yield model
 
     def reset(self, rows: np.ndarray, states: np.ndarray, keys: np.ndarray | float = 0.0) -> None:
-        """Start episodes of m simulations, from states (m, n) with keys (m,) of random numbers, motors at rest.
-
-        Raises:
-            CallbackInUseError: another library's MuJoCo callback was installed in the meantime.
-        """
+        """Start episodes of m simulations, from states (m, n) with keys (m,) of random numbers, motors at rest."""
         self._nominal.install()  # raises if somebody replaced ours since the last episodes
         self._states[rows] = self._rest
         self._place(rows, states)
@@ -201,11 +197,7 @@ class MujocoBatchPhysics:
         return self._disturber.memory.reshape(self.num_envs, -1)
 
     def check_finite(self, states: np.ndarray, rows: np.ndarray) -> None:
-        """Raise if a state among `rows` (a mask, shape (N,)) left the finite numbers, naming the simulation.
-
-        Raises:
-            SimulationDivergedError: as it says.
-        """
+        """Raise if a state among `rows` (a mask, shape (N,)) left the finite numbers, naming the simulation."""
         fine = np.abs(states) <= LARGEST
         broken = np.flatnonzero(~fine.all(axis=1) & rows)
         if len(broken) == 0:

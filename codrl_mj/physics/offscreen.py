@@ -210,11 +210,7 @@ def _abandon(renderer: mujoco.Renderer | None) -> None:
 
 
 def check_view(model: mujoco.MjModel, width: int, height: int, camera: str) -> None:
-    """Check that a model can be drawn so, without making an OpenGL context; the arguments are `OffscreenRenderer`'s.
-
-    Raises:
-        ValueError: unknown camera, or a size out of bounds.
-    """
+    """Check that a model can be drawn so, without making an OpenGL context; the arguments are `OffscreenRenderer`'s."""
     for name, value, largest in (
         ("width", width, model.vis.global_.offwidth),
         ("height", height, model.vis.global_.offheight),

@@ -28,9 +28,5 @@ def register_physics(name: str, make: Callable[..., Any]) -> None:
 
 
 def find_physics(name: str) -> Callable[..., Physics]:
-    """The physics called `name`.
-
-    Raises:
-        ValueError: unknown name; the nearest known one is suggested.
-    """
+    """The physics called `name`."""
     return look_up(name, PHYSICS, "physics", anybodys=False)

@@ -65,11 +65,7 @@ class Streams:
 
 
 def words_of(generator: np.random.Generator) -> np.ndarray:
-    """Where a generator stands, shape (6,), uint64.
-
-    Raises:
-        ValueError: it is no PCG64, as Gymnasium's are.
-    """
+    """Where a generator stands, shape (6,), uint64."""
     pcg: Any = generator.bit_generator.state
     if pcg["bit_generator"] != "PCG64":
         raise ValueError(f"np_random is a {pcg['bit_generator']}: must be a PCG64, as Gymnasium's reset makes it")

@@ -6,11 +6,7 @@ _PACKAGE = Path(__file__).parents[1]
 
 
 def asset_folder() -> Path:
-    """The folder of the MJCF files and of `motors/`.
-
-    Raises:
-        FileNotFoundError: neither the checkout nor the wheel has it.
-    """
+    """The folder of the MJCF files and of `motors/`."""
     for folder in (_PACKAGE / "_assets", _PACKAGE.parent / "assets"):
         if folder.is_dir():
             return folder
@@ -18,14 +14,7 @@ def asset_folder() -> Path:
 
 
 def asset_path(name: str) -> Path:
-    """Path of the MJCF file `name`.
-
-    Args:
-        name: file name, such as `cartpole.xml`; or the path of a file.
-
-    Raises:
-        FileNotFoundError: there is no such file, and neither the checkout nor the wheel has it.
-    """
+    """Path of the MJCF file `name`."""
     if Path(name).is_file():
         return Path(name)
     for folder in (_PACKAGE / "_assets", _PACKAGE.parent / "assets"):
