@@ -52,7 +52,7 @@ def groups(quick: bool) -> dict[str, Makers]:
         drivers = (None, "ideal", "torque_speed", "lag", "current_loop")
         found[f"motorised: {count} motors"] = [partial(subjects.chain, count, driver) for driver in drivers]
     for env_id in ("HalfCheetah-v5", "Humanoid-v5"):
-        given = (None, "ideal", "lag", "torque_speed", "current_loop", BOUGHT)
+        given = (None, "ideal", "lag", "torque_speed", BOUGHT)
         found[f"foreign: {env_id}"] = [partial(subjects.foreign, env_id, driver) for driver in given]
         found[f"foreign: {env_id}"].append(partial(subjects.without_motors, env_id, BOUGHT))
     for task, definition in TASKS.items():

@@ -124,13 +124,9 @@ def theirs(env_id: str) -> Subject:
 
 def foreign(env_id: str, actuator: str | None) -> Subject:
     """An environment of Gymnasium's with motors behind its actuators; None: as it is."""
-    given: Any = {
-        "current_loop": codrl_mj.actuators.Actuator(controller=codrl_mj.actuators.CurrentLoop(ki=1.0, max_voltage=24.0))
-    }
     if actuator is None:
         return theirs(env_id)
-    actuators = {".*": given.get(actuator, actuator)}
-    return single(actuator, codrl_mj.make(env_id, actuators, allow_unstable=True, disable_env_checker=True))
+    return single(actuator, codrl_mj.make(env_id, {".*": actuator}, allow_unstable=True, disable_env_checker=True))
 
 
 def without_motors(env_id: str, actuator: str) -> Subject:

@@ -1,5 +1,6 @@
 """What compiled models and their data say of our actuators, at either door."""
 
+import math
 import numbers
 from collections.abc import Mapping, Sequence
 
@@ -211,8 +212,9 @@ class Readout:
         # places in activations, then plugins' states, then forces, then a NaN
         in_plugin = model.plugin_stateadr[instances] if model.nplugin else 0
         starts = np.where(behind_plugin, model.na + in_plugin, model.actuator_actadr[indices])
-        actual = model.na + model.npluginstate + out
-        nothing = model.na + model.npluginstate + model.nout
+        states = model.na + model.npluginstate
+        self._ends = model.na, states, states + model.nout
+        actual, nothing = states + out, states + model.nout
         last = np.array([slot_size(family) for family in families], dtype=int)
         places = {"desired_force": np.where(behind_plugin & tracks, starts + last, actual), "actual_force": actual}
         for motor, (start, family) in enumerate(zip(starts, families, strict=True)):
@@ -236,8 +238,13 @@ class Readout:
         Args:
             data: a simulation of the model.
         """
-        numbers = np.concatenate((data.act, data.plugin_state, data.actuator_force, _NAN))
-        table: np.ndarray = numbers[self._places]
+        found = np.empty(self._ends[2] + 1)  # slice by slice: in a third of np.concatenate's time
+        activations, states, forces = self._ends
+        found[:activations] = data.act
+        found[activations:states] = data.plugin_state
+        found[states:forces] = data.actuator_force
+        found[forces] = math.nan
+        table: np.ndarray = found[self._places]
         if self._called.size:
             table[:2] *= self._gear
             controls = data.ctrl[self._control]
@@ -258,9 +265,6 @@ class Readout:
             motor's family has none of that name.
         """
         return dict(zip(self.names, self.table(data), strict=True))
-
-
-_NAN = np.array([np.nan])
 
 
 def signals(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, np.ndarray]:

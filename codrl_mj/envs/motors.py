@@ -118,7 +118,7 @@ class Motors:
     def check_finite(self, who: str, time: float) -> None:
         """Raise if the engine met what is no number, or too large a one; it would start anew and go on."""
         counts, model = self.data.warning.number, self.data.model
-        if not counts[_POSITION:].any():  # since the reset
+        if not np.count_nonzero(counts[_POSITION:]):  # since the reset; any() takes six times as long
             return
         kind = _POSITION + int(np.argmax(counts[_POSITION:]))
         place = int(self.data.warning.lastinfo[kind])

@@ -33,9 +33,10 @@ def named_signals(names: tuple[str, ...], columns: Any) -> Signals:
     """Numbers of one actuator, or arrays of several, by the names of the first of them; `saturated` is a flag."""
     signals = dict(zip(names, columns, strict=False))
     saturated = signals.pop("saturated", None)
-    if saturated is None:
-        saturated = np.zeros_like(columns[0]) if isinstance(columns[0], np.ndarray) else 0.0
-    signals["saturated"] = saturated > 0.0  # which NaN is not
+    if saturated is not None:
+        signals["saturated"] = saturated > 0.0  # which NaN is not
+    else:
+        signals["saturated"] = np.zeros(columns[0].shape, dtype=bool) if isinstance(columns[0], np.ndarray) else False
     return signals
 
 
