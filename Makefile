@@ -33,6 +33,7 @@ test: $(STAMP)  ## in two processes, each with whole files: a file's tests share
 
 check: $(STAMP)  ## the full matrices, of which make test runs a few combinations
 	@$(BIN)/python -m pytest -m matrix -n 2 --dist loadfile --no-loadscope-reorder
+	@$(BIN)/python scripts/benchmark.py --quick
 
 node_modules/axe-core:
 	@npm install --no-save --silent axe-core@4.14.1

@@ -2,6 +2,9 @@
 
 The members of a group take turns: A, B, C, A, B, C, ... with many steps a turn; the table has the median of the ratios
 to the group's first member, turn by turn, with their range. Libraries that are not installed are skipped.
+
+`--quick` compares with scripts/ratios.json instead, in two minutes, and fails where something became slower; a change
+that is meant to be slower says why, and writes them anew by `--keep`. Trainings are in scripts/benchmark_training.py.
 """
 
 import codrl_mj  # isort: skip - before mujoco, which chooses its OpenGL platform when it is imported
@@ -25,7 +28,7 @@ from rich.table import Table
 import benchmark_subjects as subjects
 from benchmark_subjects import Subject
 from codrl_mj.cli.terminal import console
-from codrl_mj.runs.files import write_json
+from codrl_mj.runs.files import read_json, write_json
 from codrl_mj.tasks import OURS
 
 Makers = list[Callable[[], Subject]]
@@ -40,10 +43,70 @@ ENVPOOL = {  # of its dm_control swing-ups Pendulum's alone: a thousand of the o
 }
 TASKS = {task.name: task for task in OURS}
 APART = ("mountain_car", "mountain_car_continuous")  # whose walls need a call of the engine for each step of it
+RATIOS = Path(__file__).with_name("ratios.json")
+"""Group -> member -> its ratio to the group's first member, as it was."""
+SLOWER = 0.85
+"""Of a ratio that is kept, below which something became slower."""
+TRIES = 4
+"""Measurements of a group, by whose best it is judged: other processes make something slower, none makes it faster."""
 DM_CONTROL = {"pendulum": "swingup", "cartpole": "swingup", "acrobot": "swingup"}
 
 
-def groups(quick: bool) -> dict[str, Makers]:
+def kept_groups() -> dict[str, Makers]:
+    """What `--quick` compares: the single step, the batch, the engine and an environment of others."""
+    found: dict[str, Makers] = {
+        "single: pendulum": [partial(subjects.theirs, "Pendulum-v1"), partial(subjects.ours, "pendulum", "paper")],
+        "single: cartpole": [
+            partial(subjects.theirs, "InvertedPendulum-v5"),
+            partial(subjects.ours, "cartpole", "paper"),
+        ],
+        "foreign: HalfCheetah-v5": [
+            partial(subjects.without_motors, "HalfCheetah-v5", BOUGHT),
+            partial(subjects.foreign, "HalfCheetah-v5", BOUGHT),
+        ],
+        "engine: pendulum": [partial(subjects.engine, "pendulum", one) for one in (None, "paper", "drive")],
+    }
+    for task in ("pendulum", "cartpole", "acrobot"):
+        found[f"two threads: {task}"] = [subject(task, NUM_ENVS, 2) for subject in (_batch, _vector)]
+    return found
+
+
+def _batch(task: str, num_envs: int, threads: int) -> Callable[[], Subject]:
+    return partial(subjects.raw_batch, task, num_envs, threads, task in APART)
+
+
+def _vector(task: str, num_envs: int, threads: int) -> Callable[[], Subject]:
+    return partial(subjects.vector, task, num_envs, threads)
+
+
+def compare(keep: bool) -> int:
+    """Measure what is kept; 1 where something became slower, by the best of some tries.
+
+    Args:
+        keep: write the ratios, each the least of the tries, instead of comparing.
+    """
+    kept: dict[str, Any] = {} if keep else read_json(RATIOS, "ratios")
+    slower = False
+    for title, makers in kept_groups().items():
+        first, *others = members = build(makers)
+        was = np.array([0.0 if keep else kept[title][one.name] for one in others])
+        clock = time.perf_counter if "threads" in title else time.process_time  # which other processes do not move
+        tries: list[list[float]] = []
+        while len(tries) < TRIES and (keep or not tries or (np.max(tries, axis=0) < SLOWER * was).any()):
+            found = measure(members, 15, 0.02, clock)
+            tries.append([found[one.name]["ratio"][0] for one in others])
+        if keep:
+            kept[title] = {one.name: round(ratio, 3) for one, ratio in zip(others, np.min(tries, axis=0), strict=True)}
+        for one, ratio, before in zip(others, np.max(tries, axis=0), was, strict=True):
+            verdict = "  SLOWER" if ratio < SLOWER * before else ""
+            print(f"{title}: {one.name}: {ratio:.3f} of {first.name}, was {before:.3f}{verdict}", flush=True)
+            slower |= bool(verdict)
+    if keep:
+        write_json(RATIOS, kept)
+    return int(slower)
+
+
+def groups() -> dict[str, Makers]:
     """What is compared with what; the first of a group is what the others are divided by."""
     found: dict[str, Makers] = {}
     for task in TASKS:
@@ -76,9 +139,8 @@ def groups(quick: bool) -> dict[str, Makers]:
         found[f"two threads: {task}"] = members
     sizes = [(num_envs, threads) for num_envs in (1024, 1, 64, 16384) for threads in (1, 2)]
     found["sizes: pendulum"] = [partial(subjects.vector, "pendulum", *size) for size in sizes]
-    if not quick:
-        for task in ("cartpole", "mountain_car"):
-            found[f"drawing: {task}"] = [partial(subjects.drawing, task, fast) for fast in (False, True)]
+    for task in ("cartpole", "mountain_car"):
+        found[f"drawing: {task}"] = [partial(subjects.drawing, task, fast) for fast in (False, True)]
     return found
 
 
@@ -95,15 +157,17 @@ def build(makers: Makers) -> list[Subject]:
     return members
 
 
-def seconds(member: Subject, calls: int) -> float:
+def seconds(member: Subject, calls: int, clock: Callable[[], float]) -> float:
     """The time that some calls take."""
     member.prepare()
-    start = time.perf_counter()
+    start = clock()
     member.run(calls)
-    return time.perf_counter() - start
+    return clock() - start
 
 
-def measure(members: list[Subject], turns: int, turn_duration: float) -> dict[str, dict[str, list[float]]]:
+def measure(
+    members: list[Subject], turns: int, turn_duration: float, clock: Callable[[], float] = time.perf_counter
+) -> dict[str, dict[str, list[float]]]:
     """Time the members in turn.
 
     Returns:
@@ -111,15 +175,15 @@ def measure(members: list[Subject], turns: int, turn_duration: float) -> dict[st
     """
     calls = []
     for member in members:
-        seconds(member, 1)  # compiles what it needs
+        seconds(member, 1, clock)  # compiles what it needs
         count = 1
-        while (taken := seconds(member, count)) < turn_duration / 4 and count < 1_000_000:
+        while (taken := seconds(member, count, clock)) < turn_duration / 4 and count < 1_000_000:
             count *= 4
         calls.append(max(1, round(count * turn_duration / taken)))
     speeds = np.empty((turns, len(members)))
     for turn in range(turns):
         for column, member in enumerate(members):
-            speeds[turn, column] = calls[column] * member.per_call / seconds(member, calls[column])
+            speeds[turn, column] = calls[column] * member.per_call / seconds(member, calls[column], clock)
     ratios = speeds / speeds[:, :1]
     return {
         member.name: {
@@ -148,13 +212,13 @@ def memory() -> dict[str, float]:
     return {"bytes_per_environment": (resident() - before) / num_envs}
 
 
-def learning(quick: bool) -> dict[str, dict[str, float]]:
+def learning() -> dict[str, dict[str, float]]:
     """PPO's environment steps per second, and the share of the time that stepping takes."""
     found = {}
     for num_envs, ours in ((8, False), (64, True), (256, True)):
         name, train = subjects.ppo(num_envs, ours)
         train(2048)  # warm-up
-        steps = 4096 if quick else 20480
+        steps = 20480
         start = time.perf_counter()
         share = train(steps)
         found[name] = {
@@ -189,30 +253,33 @@ def report(title: str, results: dict[str, dict[str, list[float]]]) -> None:
 def main() -> int:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="under a minute, and less exact")
+    parser.add_argument("--quick", action="store_true", help="compare with the ratios that are kept: two minutes")
+    parser.add_argument("--keep", action="store_true", help="measure and write those")
     parser.add_argument("--only", default="", help="only groups whose name contains this, such as 'vector'")
-    parser.add_argument("--turns", type=int, help="turns of each member of a group")
+    parser.add_argument("--turns", type=int, default=11, help="turns of each member of a group")
+    parser.add_argument("--duration", type=float, default=0.1, help="of a turn [s]")
     parser.add_argument("--out", type=Path, help="JSON file for the results")
     options = parser.parse_args()
-    turns = (5 if options.quick else 11) if options.turns is None else options.turns
+    turns = options.turns
     if turns < 1:
         parser.error(f"--turns {turns}: must be >= 1")
-    turn_duration = 0.02 if options.quick else 0.1  # s
     gymnasium.logger.min_level = gymnasium.logger.ERROR
+    if options.quick or options.keep:
+        return compare(options.keep)
     results: dict[str, Any] = {}
     if options.only in "memory":
         results["memory"] = memory()  # first: later, freed memory would hide the growth
         console().print("memory: {bytes_per_environment:,.0f} bytes an environment".format(**results["memory"]))
-    for title, makers in groups(options.quick).items():
+    for title, makers in groups().items():
         if options.only in title:
-            results[title] = measure(build(makers), turns, turn_duration)
+            results[title] = measure(build(makers), turns, options.duration)
             report(f"{title}, {turns} alternating turns: median (least to most)", results[title])
     if options.only in "families":
         results["families"] = families()
         text = ", ".join(f"{name} {duration:.2f} s" for name, duration in results["families"].items())
         console().print(f"families, in a process of their own, one after the other: {text}")
     if options.only in "learning":
-        results["learning"] = learning(options.quick)
+        results["learning"] = learning()
         for name, numbers in results["learning"].items():
             text = f"PPO, {name}: {numbers['steps_per_second']:,.0f} steps/s"
             console().print(f"{text}, {numbers['share_in_environment']:.1%} of the time in the environment")

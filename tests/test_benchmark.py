@@ -27,7 +27,7 @@ def _run(script, *arguments, folder):
 @pytest.mark.matrix
 def test_a_group_of_the_benchmark_is_measured_against_its_first_member(group, least, own, tmp_path):
     out = tmp_path / "bench.json"
-    finished = _run("benchmark.py", "--quick", "--turns", 2, "--only", group, "--out", out, folder=tmp_path)
+    finished = _run("benchmark.py", "--duration", 0.02, "--turns", 2, "--only", group, "--out", out, folder=tmp_path)
     assert finished.returncode == 0, finished.stderr
     content = json.loads(out.read_text())
     assert content["results"].keys() == {group}

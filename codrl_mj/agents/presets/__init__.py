@@ -1,4 +1,4 @@
-"""Settings that suit an agent to a task, by name: `default`, the paper's own (`paper`), and those mended (`repaired`).
+"""Settings that suit an agent to a task, by name: `default`, the paper's own (`paper`), those mended (`repaired`), `fast`.
 
 One TOML file an agent beside this module: a table for each task and name with the fields of `Preset`, where `"none"`
 stands for None, and `like` names the settings above that it starts from. What the numbers gave, in training and in
@@ -15,8 +15,9 @@ from codrl_mj.agents import AGENTS, AgentConfig, find_agent
 
 __all__ = ["ELSEWHERE", "PRESETS", "SETTINGS", "Preset", "find_preset"]
 
-SETTINGS = ("default", "paper", "repaired")
-"""Names that settings can have: ours, the paper's as printed, and the paper's with what makes it fail changed."""
+SETTINGS = ("default", "paper", "repaired", "fast")
+"""Names that settings can have: ours, the paper's as printed, the paper's with what makes it fail changed, and ours for
+the least time."""
 ELSEWHERE = "another's environment"
 """Instead of a task: any environment that is none of ours."""
 
