@@ -9,7 +9,7 @@ import sys
 import textwrap
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -83,9 +83,12 @@ def _run(arguments: list[str], traced: bool) -> int:
     try:
         words = understood(arguments)
         if words[:1] and words[0] in VERBS:
-            verb = parse(_for_line(find_verb(words[0]), words[1:]), f"codrl-mj {words[0]}", words[1:])
+            kind = find_verb(words[0])  # or the one that it makes for a line on which its flags depend
+            kind = kind.for_line(words[1:]) if hasattr(kind, "for_line") else kind
+            verb = parse(kind, f"codrl-mj {words[0]}", words[1:])
         else:
-            verb = parse(_helped(), "codrl-mj", words, _ABOUT)
+            helped = {name: f"{says}\n\nExample: codrl-mj {name} {line}" for name, (_, says, line) in VERBS.items()}
+            verb = parse(helped, "codrl-mj", words, _ABOUT)
         _check_outputs(getattr(verb, "verb", verb))
         return verb.run()
     except BrokenPipeError:  # whoever read the output has enough of it, such as head
@@ -104,16 +107,6 @@ def _run(arguments: list[str], traced: bool) -> int:
             return 130
         print(f"codrl-mj: error: {_sentence(error)}", file=sys.stderr)
         return 2
-
-
-def _helped() -> dict[str, str]:
-    """What the verbs do, and an example of each."""
-    return {name: f"{says}\n\nExample: codrl-mj {name} {words}" for name, (_, says, words) in VERBS.items()}
-
-
-def _for_line(kind: Any, words: Sequence[str]) -> Any:
-    """A verb's class, or the one that it makes for a command line on which its flags depend."""
-    return kind.for_line(words) if hasattr(kind, "for_line") else kind
 
 
 def _check_outputs(verb: Any) -> None:

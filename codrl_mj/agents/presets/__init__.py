@@ -1,4 +1,4 @@
-"""Settings that suit an agent to a task, by name: `default`, the paper's own (`paper`), those mended (`repaired`), `fast`.
+"""Settings that suit an agent and a task: ours (`default`, `fast`), the paper's (`paper`), these mended (`repaired`).
 
 One TOML file an agent beside this module: a table for each task and name with the fields of `Preset`, where `"none"`
 stands for None, and `like` names the settings above that it starts from. What the numbers gave, in training and in
