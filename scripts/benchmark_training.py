@@ -27,6 +27,7 @@ import gymnasium
 import numpy as np
 
 ROWS = Path(__file__).parents[1] / "docs" / "results" / "training_speed.csv"
+PAGE, WRITTEN = ROWS.parents[1] / "training_speed.md", "<!-- written by scripts/benchmark_training.py -->"
 COLUMNS = ("task", "contender", "seed", "steps", "seconds", "greedy_steps", "greedy_seconds", "first")
 ENOUGH = {"cartpole": 475.0, "pendulum": -200.0}
 WORTH = {"cartpole": 200.0, "pendulum": -500.0}
@@ -357,7 +358,7 @@ def table() -> str:
 
 
 def main() -> None:
-    """Measure what is not there yet, and print the table."""
+    """Measure what is not there yet, print the table and put it on its page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--task", choices=list(ENOUGH))
@@ -384,6 +385,7 @@ def main() -> None:
                     print(f"measured: {name}, {task}", flush=True)
     if not options.here:
         print(table())
+        PAGE.write_text(f"{PAGE.read_text().partition(WRITTEN)[0]}{WRITTEN}\n\n{table()}")
 
 
 if __name__ == "__main__":
