@@ -73,7 +73,7 @@ def test_settings_have_the_names_that_are_known_and_one_budget():
             assert (preset.total_steps is None) != (preset.total_episodes is None)
         for name in set(named) - {"default"}:
             assert named[name].about, "where it deviates from the paper"
-            assert named[name].num_envs == 1
+            assert named[name].num_envs == 1 or name == "fast"
 
 
 @pytest.mark.parametrize(("agent", "task"), PRINTED)
