@@ -10,14 +10,14 @@ import numpy as np
 
 from codrl_mj.fields import check_names
 from codrl_mj.identify import honesty
+from codrl_mj.identify.fitting import Fitted, fitted, with_friction
 from codrl_mj.identify.judgement import judged
 from codrl_mj.identify.log import Log
-from codrl_mj.identify.models import ShaftStage, WindingStage
+from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import ESTIMABLE, OF_RIG, PARAMETERS
 from codrl_mj.identify.prediction import fitted_traces, predict
 from codrl_mj.identify.result import Identified, missing
 from codrl_mj.identify.segments import SEGMENT, moves, shifted
-from codrl_mj.identify.stages import Fitted, chosen_friction, fitted
 
 INPUTS = "torque", "current", "voltage"
 """What drives the shaft: the nearest to it that all logs that move have."""
@@ -74,28 +74,30 @@ def identify(
     winding = shaft = None
     constant: dict[str, float] = {}
     if electrical:
-        winding = fitted(WindingStage(given), electrical, step("winding"))
+        winding = fitted(WindingModel(known=given), electrical, step("winding"))
     if driven_by is not None:
         constant = _constant(given, winding, driven_by, estimated)
-        stage = ShaftStage(rig, "coulomb", driven_by, {**given, **constant}, tuple(estimated), segment, output)
-        shaft = fitted(chosen_friction(stage, moving, friction, step("friction")), moving, step("shaft"))
+        model = ShaftModel(rig=rig, friction="coulomb", driven_by=driven_by, output=output, segment=segment,
+                           known={**given, **constant}, estimated=tuple(estimated))  # fmt: skip
+        model = with_friction(model, moving, friction, step("friction"))
+        friction, shaft = model.friction, fitted(model, moving, step("shaft"))
         if winding is not None and driven_by != "voltage":
-            winding = winding.refitted(WindingStage(given, shaft))
+            winding = winding.refitted(WindingModel(known=given, shaft=shaft))
         constant = _constant(given, winding, driven_by, estimated)
-        shaft = shaft.refitted(dataclasses.replace(shaft.stage, known={**shaft.stage.known, **constant}))
+        shaft = shaft.refitted(dataclasses.replace(model, known={**model.known, **constant}))
 
     parts = {name: one for name, one in (("winding", winding), ("shaft", shaft)) if one is not None}
     estimates, warnings, unexplained = judged(parts, given, bool(constant), seed, step)
     foretold, foretold_too = (
-        tuple(predict(shaft.model, shaft.fit.values, shifted(log, shaft.model.driven_by, shaft.delay))
-              for log in several if shaft is not None and moves(log) and log.has(shaft.model.driven_by, output))
+        tuple(predict(shaft.fit, shifted(log, shaft.fit.model.driven_by, shaft.delay))
+              for log in several if shaft is not None and moves(log) and log.has(shaft.fit.model.driven_by, output))
         for several in (moving, held_out)
     )  # fmt: skip
     volts = [log.signals[name] for log in logs for name in ("voltage", "bus") if log.has(name)]
     return Identified(
         tuple(log.name for log in logs),
         rig,
-        friction if shaft is None else shaft.stage.friction,
+        friction,
         driven_by,
         {name: part.delay for name, part in parts.items()},
         tuple(estimates),
@@ -103,7 +105,7 @@ def identify(
         foretold_too,
         tuple(warnings),
         base,
-        tuple(one for name, part in parts.items() for one in fitted_traces(name, part)),
+        tuple(one for name, part in parts.items() for one in fitted_traces(name, part.fit, part.logs)),
         {name: honesty.correlations(parts[name].fit) if name in parts else {} for name in ("winding", "shaft")},
         max((float(np.abs(one).max()) for one in volts), default=None),
         unexplained,
@@ -168,7 +170,7 @@ def checked(
             "rig is not given (--rig on the command line, rig= in Python): what the output moves decides what is "
             "fitted, must be pendulum, free or load; a motor on its own is free, with load_inertia=0 known"
         )
-    return known
+    return {name: float(value) for name, value in known.items()}
 
 
 def foreseen(logs: Sequence[Log], known: Mapping[str, float], base: Mapping[str, Any] | None) -> str | None:
@@ -202,5 +204,5 @@ def _constant(
         return {}
     if "back_emf_constant" in given:
         return {"torque_constant": given["back_emf_constant"]}
-    found = {} if winding is None else winding.model.all_values(winding.fit.values)
+    found = {} if winding is None else winding.fit.model.all_values(winding.fit.values)
     return {"torque_constant": found["back_emf_constant"]} if found.get("back_emf_constant", 0.0) > 0.0 else {}

@@ -16,9 +16,9 @@ import numpy as np
 
 from codrl_mj.actuators import Drive
 from codrl_mj.fields import check, check_names, real
-from codrl_mj.identify.estimate import Model, estimate
+from codrl_mj.identify.estimate import Model, refit
 from codrl_mj.identify.log import Log
-from codrl_mj.identify.models import ShaftStage, WindingStage
+from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import ELECTRICAL, PARAMETERS
 from codrl_mj.identify.segments import Segment, winding_segments
 from codrl_mj.identify.synthetic import EXCITATIONS, FREE, Excitation, Load, Sampler, logged, run, sample_times
@@ -175,7 +175,7 @@ def _electrical(drive: Drive, log: Log, noise: float) -> dict[str, float]:
     """Relative errors of a winding by the current, at the speed that is: see `Winding` for how it is found."""
     turned = np.append(np.diff(log.signals["position"]) / np.diff(log.time), 0.0)
     segments = winding_segments([log], [turned])
-    model, _ = WindingStage({"gear_ratio": drive.motor.gear_ratio}).model(segments)
+    model, _ = WindingModel(known={"gear_ratio": drive.motor.gear_ratio}).begun(segments)
     return _errors(drive, FREE, model, segments, noise * float(np.abs(log.signals["current"]).max()), True)
 
 
@@ -184,9 +184,11 @@ def _mechanical(drive: Drive, log: Log, load: Load, encoder: float) -> dict[str,
     known = {name: value for name, value in vars(drive.motor).items() if name in PARAMETERS and name != "rotor_inertia"}
     known |= {"mgl": load.gravity, "constant_torque": load.torque}
     known = {name: value for name, value in known.items() if name not in GOALS or value == 0.0}
-    stage = ShaftStage("free", "coulomb", "current", known, segment=_SEGMENT)
-    segments = stage.segments([log])
-    model, _ = stage.model(segments)
+    whole = ShaftModel(
+        rig="free", friction="coulomb", driven_by="current", output="position", known=known, segment=_SEGMENT
+    )
+    segments = whole.segments([log])
+    model, _ = whole.begun(segments)
     return _errors(drive, load, model, segments, 2.0 * math.pi / encoder / math.sqrt(12.0), False)
 
 
@@ -195,7 +197,7 @@ def _errors(
 ) -> dict[str, float]:
     """Relative errors of a fit by noise of a deviation, and by what it cannot explain; those above 1 are left out."""
     truth = np.array([_value(drive, load, name) for name in model.names])
-    fit, _ = estimate(model, [one._replace(deviation=deviation) for one in segments], [truth], most=0)
+    fit = refit(model, [one._replace(deviation=deviation) for one in segments], truth, 0)
     inverse = np.linalg.pinv(np.concatenate(fit.jacobians) * truth)
     found = np.linalg.norm(inverse, axis=1)
     if biased:

@@ -2,14 +2,13 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from codrl_mj.identify import simulation
-from codrl_mj.identify.estimate import settled_state
+from codrl_mj.identify.estimate import Fit, settled_state
 from codrl_mj.identify.log import Log, usable
-from codrl_mj.identify.models import ShaftModel
 from codrl_mj.identify.segments import initial_state, shaft_segments
 
 HORIZON = 0.5
@@ -58,25 +57,28 @@ class Prediction:
     """What `open_loop` is the error of; in no file."""
 
 
-def predict(model: ShaftModel, values: np.ndarray, log: Log) -> Prediction:
-    """Errors of a model's simulations of a log."""
-    simulate, found, pieces = model.at(values), [], []
+def predict(fit: Fit, log: Log) -> Prediction:
+    """Errors of a fitted shaft's simulations of a log."""
+    model, simulate, found, pieces = fit.model, fit.model.at(fit.values), [], []
     for segment in shaft_segments([log], model.driven_by, model.output, HORIZON):
         known = max(int(np.searchsorted(segment.times, segment.times[0] + KNOWN)), 5)
-        state = settled_state(model, values, segment.first(known))
+        state = settled_state(model, fit.values, segment.first(known))
         simulated = simulate(segment, state)
         found.append(np.abs(simulated - segment.measured)[known:])
         pieces.append((segment.times, segment.measured, simulated))
     errors, foretold = np.concatenate(found), trace(log.name, "shaft", model.output, pieces)
-    return Prediction(log.name, model.output, float(errors.mean()), closed_loop_error(model, values, log), foretold)
+    return Prediction(log.name, model.output, float(errors.mean()), closed_loop_error(fit, log), foretold)
 
 
-def closed_loop_error(model: ShaftModel, values: np.ndarray, log: Log) -> float | None:
+def closed_loop_error(fit: Fit, log: Log) -> float | None:
     """Mean absolute error [rad] of a whole log under its own command, by a proportional law found in the log.
 
     The law is the straight line through the origin from the command's error to the input, where the input is not at
     its limit: `bus`, or the largest that the log has. None where the log has no command that explains its input.
     """
+    from codrl_mj.identify.simulation import served
+
+    model: Any = fit.model
     if model.output != "position" or not log.has("command", model.driven_by):
         return None
     wanted, given = log.signals["command"], log.signals[model.driven_by]
@@ -89,22 +91,19 @@ def closed_loop_error(model: ShaftModel, values: np.ndarray, log: Log) -> float 
     lawful = np.clip(law * error, -limits, limits)
     if not np.mean((given - lawful) ** 2) < 0.25 * np.mean(given**2):
         return None
-    moved, found = model.moved(values), []
+    moved, found = model.moved(fit.values), []
     for stretch in usable(log):
         position, speed = initial_state(log, stretch)
-        simulated = simulation.served()(
-            log.time[stretch], wanted[stretch], limits[stretch], law, position, speed, moved
-        )
+        simulated = served(log.time[stretch], wanted[stretch], limits[stretch], law, position, speed, moved)
         found.append(np.abs(simulated - log.signals["position"][stretch]))
     total = float(np.concatenate(found).mean())
     return total if math.isfinite(total) else None
 
 
-def fitted_traces(name: str, part: Any) -> tuple[Trace, ...]:
-    """The fit of each log of a `Fitted` part."""
+def fitted_traces(part: str, fit: Fit, logs: Sequence[Log]) -> tuple[Trace, ...]:
+    """The fit of `winding` or `shaft` to each of its logs."""
     pieces: dict[int, list[Any]] = {}
-    for segment, residuals in zip(part.segments, part.fit.residuals, strict=True):
+    for segment, residuals in zip(fit.segments, fit.residuals, strict=True):
         simulated = segment.measured + residuals * segment.deviation
         pieces.setdefault(segment.log, []).append((segment.times, segment.measured, simulated))
-    output = "current" if name == "winding" else part.model.output
-    return tuple(trace(part.logs[place].name, name, output, several) for place, several in pieces.items())
+    return tuple(trace(logs[place].name, part, fit.model.output, several) for place, several in pieces.items())

@@ -1,8 +1,5 @@
 """Logs that are computed: a drive of ours under a voltage, through sensors and a sampler, with faults to order.
 
-The winding is exact between the drive's samples, at the speed in their middle; the shaft moves half a sample before and
-half a sample after it (Strang's splitting, of second order).
-
 Voltages are pure functions of time. Slow turning shows resistance, back-EMF and friction; only what changes within the
 winding's time constant L/R shows the inductance. PRBS: a pseudo-random binary sequence, white up to its clock. Source:
 Ljung, *System Identification* (2nd ed. 1999), sec. 13.3.
@@ -19,7 +16,6 @@ import numpy as np
 
 from codrl_mj.actuators import Drive
 from codrl_mj.fields import check, check_names, real
-from codrl_mj.identify import simulation
 from codrl_mj.identify.columns import KINDS
 from codrl_mj.identify.log import Log
 from codrl_mj.runs.files import writing
@@ -175,6 +171,8 @@ def run(drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, po
 
     A bridge makes the voltage u of a share d = u/V of the supply, which sags by its resistance times d*i.
     """
+    from codrl_mj.identify.simulation import driven
+
     period, limit, motor = 1.0 / drive.controller.sample_rate, drive.voltage_limit, drive.motor
     locked = load.locked
     if isinstance(excitation, Excitation):
@@ -184,7 +182,8 @@ def run(drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, po
     sag = 0.0 if drive.supply is None else drive.supply.resistance
     shares = np.sign(commanded) * np.maximum(np.abs(commanded) - drive.controller.deadband, 0.0) / limit
     winding = motor.resistance, motor.inductance, motor.back_emf_constant * motor.gear_ratio
-    states = _compiled()(period, shares, float(limit), float(sag), winding, moved(drive, load), locked, float(position))
+    parts = winding, _moved(drive, load)
+    states = driven(period, shares, float(limit), float(sag), parts, locked, float(position))
     return Course(period * np.arange(len(shares)), states[:, 0], commanded, *states[:, 1:].T)
 
 
@@ -194,8 +193,10 @@ def sample_times(drive: Drive, duration: float) -> np.ndarray:
     return period * np.arange(math.ceil(duration / period - 1e-9) + 1)
 
 
-def moved(drive: Drive, load: Load) -> simulation.Moved:
-    """The shaft under the motor's current."""
+def _moved(drive: Drive, load: Load) -> Any:
+    """The shaft under the motor's current, as a simulation takes it."""
+    from codrl_mj.identify.simulation import moved
+
     motor = drive.motor
     inertia = motor.rotor_inertia * motor.gear_ratio**2 + load.inertia
     if not inertia > 0.0 and not load.locked:
@@ -204,7 +205,7 @@ def moved(drive: Drive, load: Load) -> simulation.Moved:
             "give the load its inertia, or lock the shaft"
         )
     of_load = {"inertia": inertia, "mgl": load.gravity, "constant_torque": load.torque}
-    return simulation.moved({**vars(motor), **of_load}, motor.torque_constant * motor.gear_ratio)
+    return moved({**vars(motor), **of_load}, motor.torque_constant * motor.gear_ratio)
 
 
 def simulate(
@@ -289,33 +290,3 @@ def write_log(path: Path, log: Log) -> str:
         np.savetxt(temporary, table, fmt="%.9g", delimiter=",", header=",".join(names), comments="")
     texts = {name: f"mean({name})" if log.mean_voltage and name == "voltage" else name for name in names}
     return ",".join(f"{name}={text}:{KINDS[name] or '1'}" for name, text in texts.items())
-
-
-@functools.cache
-def _compiled() -> Callable[..., np.ndarray]:
-
-    from codrl_mj.kept import njit
-
-    turn = simulation.turned()
-
-    @njit(nogil=True, error_model="numpy")
-    def course(
-        period: float, shares: Any, limit: float, sag: float, winding: Any, moved: Any, locked: bool, position: float
-    ) -> np.ndarray:
-        """Voltage, current, speed and position of the output, and bus voltage, at each sample, shape (n, 5)."""
-        states = np.empty((len(shares), 5))
-        current, speed, (resistance, inductance, constant) = 0.0, 0.0, winding
-        decay = math.exp(-resistance * period / inductance)
-        for row in range(len(shares)):
-            bus = limit - sag * shares[row] * current
-            voltage = shares[row] * bus
-            states[row] = voltage, current, speed, position, bus
-            if not locked:
-                position, speed = turn(0.5 * period, current, 0.0, position, speed, moved)
-            reached = (voltage - constant * speed) / resistance
-            current = reached + (current - reached) * decay
-            if not locked:
-                position, speed = turn(0.5 * period, current, 0.0, position, speed, moved)
-        return states
-
-    return course  # type: ignore[no-any-return]
