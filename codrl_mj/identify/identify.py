@@ -15,7 +15,7 @@ from codrl_mj.identify.judgement import judged
 from codrl_mj.identify.log import Log
 from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import ESTIMABLE, OF_RIG, PARAMETERS
-from codrl_mj.identify.prediction import fitted_traces, predict
+from codrl_mj.identify.prediction import Prediction, fitted_traces, predict
 from codrl_mj.identify.result import Identified, missing
 from codrl_mj.identify.segments import SEGMENT, moves, shifted
 
@@ -23,7 +23,7 @@ INPUTS = "torque", "current", "voltage"
 """What drives the shaft: the nearest to it that all logs that move have."""
 OUTPUTS = "position", "velocity"
 """What a simulation is compared with."""
-STEPS_OF_A_STAGE = 8 + 4
+STEPS_OF_A_PART = 8 + 4
 RAREST = 0.05
 """Rows that are farther apart [s] say too little within the time that is foretold."""
 
@@ -62,37 +62,30 @@ def identify(
     """
     given = checked(logs, rig, known or {}, friction, estimated, segment, base)
     rig = rig or ("pendulum" if "mgl" in given else "free")
-    moving, electrical = [log for log in logs if moves(log)], _electrical(logs)
-    driven_by, output = _common(moving, *INPUTS), _common(moving, *OUTPUTS) or ""
-    total = STEPS_OF_A_STAGE * max(bool(electrical) + bool(moving), 1) + 4 * len(moving) * (friction == "auto")
+    electrical, moving, driven_by, output = _uses(logs)
+    total = STEPS_OF_A_PART * max(bool(electrical) + bool(moving), 1) + 4 * len(moving) * (friction == "auto")
     done = itertools.count(1)
 
     def step(what: str) -> Callable[[], None]:
         return lambda: on_progress(what, min(next(done), total), total)
 
     # the winding, and the shaft by the torque constant that the winding tells; then each again, beside the other
-    winding = shaft = None
+    parts: dict[str, Fitted] = {}
     constant: dict[str, float] = {}
     if electrical:
-        winding = fitted(WindingModel(known=given), electrical, step("winding"))
+        parts["winding"] = fitted(WindingModel(known=given), electrical, step("winding"))
     if driven_by is not None:
-        constant = _constant(given, winding, driven_by, estimated)
+        constant = _constant(given, parts.get("winding"), driven_by, estimated)
         model = ShaftModel(rig=rig, friction="coulomb", driven_by=driven_by, output=output, segment=segment,
                            known={**given, **constant}, estimated=tuple(estimated))  # fmt: skip
         model = with_friction(model, moving, friction, step("friction"))
-        friction, shaft = model.friction, fitted(model, moving, step("shaft"))
-        if winding is not None and driven_by != "voltage":
-            winding = winding.refitted(WindingModel(known=given, shaft=shaft))
-        constant = _constant(given, winding, driven_by, estimated)
-        shaft = shaft.refitted(dataclasses.replace(model, known={**model.known, **constant}))
+        friction, parts["shaft"] = model.friction, fitted(model, moving, step("shaft"))
+        if electrical and driven_by != "voltage":
+            parts["winding"] = parts["winding"].refitted(WindingModel(known=given, shaft=parts["shaft"]))
+        constant = _constant(given, parts.get("winding"), driven_by, estimated)
+        parts["shaft"] = parts["shaft"].refitted(dataclasses.replace(model, known={**model.known, **constant}))
 
-    parts = {name: one for name, one in (("winding", winding), ("shaft", shaft)) if one is not None}
     estimates, warnings, unexplained = judged(parts, given, bool(constant), seed, step)
-    foretold, foretold_too = (
-        tuple(predict(shaft.fit, shifted(log, shaft.fit.model.driven_by, shaft.delay))
-              for log in several if shaft is not None and moves(log) and log.has(shaft.fit.model.driven_by, output))
-        for several in (moving, held_out)
-    )  # fmt: skip
     volts = [log.signals[name] for log in logs for name in ("voltage", "bus") if log.has(name)]
     return Identified(
         tuple(log.name for log in logs),
@@ -101,8 +94,8 @@ def identify(
         driven_by,
         {name: part.delay for name, part in parts.items()},
         tuple(estimates),
-        foretold,
-        foretold_too,
+        _foretold(parts.get("shaft"), moving),
+        _foretold(parts.get("shaft"), held_out),
         tuple(warnings),
         base,
         tuple(one for name, part in parts.items() for one in fitted_traces(name, part.fit, part.logs)),
@@ -128,8 +121,7 @@ def checked(
     # of a motor with a gear that too: otherwise its numbers would be those of the output
     ratio = drive.motor.gear_ratio if isinstance(drive, Drive) else 1.0
     known = {**({} if ratio == 1.0 else {"gear_ratio": ratio}), **(known or {})}
-    moving = [log for log in logs if moves(log)]
-    driven_by = _common(moving, *INPUTS)
+    electrical, moving, driven_by, output = _uses(logs)
     if not segment >= 0.05:
         raise ValueError(f"segment = {segment!r}: must be >= 0.05 s; {SEGMENT:g} is the default")
     if not logs:
@@ -145,7 +137,7 @@ def checked(
                 f"known {name} = {value!r}: must be from {parameter.least:g} to {parameter.most:g} "
                 f"{parameter.unit}; give {parameter.what}".strip()
             )
-    if not _electrical(logs) and driven_by is None:
+    if not electrical and driven_by is None:
         have = "; ".join(f"{log.name}: {', '.join(log.signals) or 'nothing'}" for log in logs)
         raise ValueError(
             f"logs tell nothing ({have}): give voltage and current for the winding, or torque, current or voltage with "
@@ -157,7 +149,7 @@ def checked(
     possible = [name for name, only in ESTIMABLE.items() if only is None or only == driven_by]
     if driven_by is not None or estimated:
         check_names(estimated, possible, f"parameter of a shaft under a {driven_by}", "estimated.")
-    if moving and _common(moving, *OUTPUTS) is None:
+    if moving and not output:
         have = "; ".join(f"{log.name}: {'position' if log.has('position') else 'velocity'}" for log in moving)
         raise ValueError(f"logs tell different things ({have}): give all that move a position, or all a velocity")
     rare = [log for log in moving if log.step > RAREST]
@@ -175,25 +167,34 @@ def checked(
 
 def foreseen(logs: Sequence[Log], known: Mapping[str, float], base: Mapping[str, Any] | None) -> str | None:
     """What will be missing for an actuator however well logs are fitted, by their signals; None: nothing."""
-    moving = [log for log in logs if moves(log)]
-    driven_by = _common(moving, *INPUTS)
-    names = {*known, *(("resistance", "inductance") if _electrical(logs) else ())}
+    electrical, moving, driven_by, _ = _uses(logs)
+    names = {*known, *(("resistance", "inductance") if electrical else ())}
     names |= {"resistance"} if driven_by == "voltage" else set()
     constants = {"torque_constant", "back_emf_constant"}
-    if names & constants or driven_by == "voltage" or (_electrical(logs) and moving):
+    if names & constants or driven_by == "voltage" or (electrical and moving):
         names |= constants
     if "load_inertia" in known and driven_by is not None:
         names |= {"rotor_inertia"}
     return missing(names, base)
 
 
-def _electrical(logs: Sequence[Log]) -> list[Log]:
-    return [log for log in logs if log.has("voltage", "current")]
+def _uses(logs: Sequence[Log]) -> tuple[list[Log], list[Log], str | None, str]:
+    """Logs that tell the winding, logs that tell the shaft; by which input, and by which output if they have one."""
+    moving = [log for log in logs if moves(log)]
+    driven_by, output = (
+        next((name for name in names if moving and all(log.has(name) for log in moving)), None)
+        for names in (INPUTS, OUTPUTS)
+    )
+    return [log for log in logs if log.has("voltage", "current")], moving, driven_by, output or ""
 
 
-def _common(logs: Sequence[Log], *names: str) -> str | None:
-    """The first of these signals that all logs have."""
-    return next((name for name in names if logs and all(log.has(name) for log in logs)), None)
+def _foretold(shaft: Fitted | None, logs: Sequence[Log]) -> tuple[Prediction, ...]:
+    """What the shaft makes of those of the logs that it is told by."""
+    if shaft is None:
+        return ()
+    driven_by, output = shaft.fit.model.driven_by, shaft.fit.model.output
+    told = [log for log in logs if moves(log) and log.has(driven_by, output)]
+    return tuple(predict(shaft.fit, shifted(log, driven_by, shaft.delay)) for log in told)
 
 
 def _constant(
