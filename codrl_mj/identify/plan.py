@@ -21,7 +21,7 @@ from codrl_mj.identify.log import Log
 from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import ELECTRICAL, PARAMETERS
 from codrl_mj.identify.segments import Segment, winding_segments
-from codrl_mj.identify.synthetic import EXCITATIONS, FREE, Excitation, Load, Sampler, logged, run, sample_times
+from codrl_mj.identify.synthetic import EXCITATIONS, FREE, Excitation, Load, Sampler, run, sample_times, simulate
 from codrl_mj.runs.files import writing
 
 GOALS = {
@@ -159,9 +159,7 @@ def _options(
             if excess <= 1.0:
                 break
             amplitude *= 0.98 / excess
-        else:
-            course = run(drive, amplitude * shape, held)
-        log = logged(drive, course, sampler=Sampler(rate, mean_voltage=sensing.voltage == "mean"))
+        log = simulate(drive, amplitude * shape, held, sampler=Sampler(rate, mean_voltage=sensing.voltage == "mean"))
         errors = _electrical(drive, log, sensing.current_noise)
         if not held.locked:
             constant_error = errors.get("back_emf_constant", 0.0)  # which the torque is known by
