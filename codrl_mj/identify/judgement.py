@@ -149,20 +149,18 @@ def _causes(
 
 def _with_constant(found: list[Estimate], constant: Estimate, known: Mapping[str, float]) -> list[Estimate]:
     """Estimates of a shaft under a current whose torque constant was itself found: they are no better than that."""
-    made = [
-        Estimate("torque_constant", constant.value, constant.low, constant.high, constant.status,
-                 f"taken as the back-EMF constant{': ' + constant.why if constant.why else ''}", constant.causes)
-    ]  # fmt: skip
+    made = []
     relative = max(constant.high - constant.value, constant.value - constant.low) / max(constant.value, 1e-12)
     anchored = "mgl" in known or "inertia" in known
     for one in found:
         own = one.value * relative if one.name not in ("gear_efficiency", "stribeck_speed") and not anchored else 0.0
-        low, high = one.value - math.hypot(one.value - one.low, own), one.value + math.hypot(one.high - one.value, own)
-        status, why = one.status, one.why
-        if status in ("identified", "rough") and constant.status not in ("identified", "given"):
-            status, why = "refused", f"the torque constant that it is in proportion to is {constant.status}"
-        ends = max(low, PARAMETERS[one.name].least), min(high, PARAMETERS[one.name].most)
-        made.append(Estimate(one.name, one.value, *ends, status, why, {**one.causes, "torque_constant": own}))
+        low = max(one.value - math.hypot(one.value - one.low, own), PARAMETERS[one.name].least)
+        high = min(one.value + math.hypot(one.high - one.value, own), PARAMETERS[one.name].most)
+        one = dataclasses.replace(one, low=low, high=high, causes={**one.causes, "torque_constant": own})
+        if one.status in ("identified", "rough") and constant.status not in ("identified", "given"):
+            why = f"the torque constant that it is in proportion to is {constant.status}"
+            one = dataclasses.replace(one, status="refused", why=why)
+        made.append(one)
     return made
 
 

@@ -160,34 +160,34 @@ def _options(
                 break
             amplitude *= 0.98 / excess
         log = simulate(drive, amplitude * shape, held, sampler=Sampler(rate, mean_voltage=sensing.voltage == "mean"))
-        errors = _electrical(drive, log, sensing.current_noise)
-        if not held.locked:
-            constant_error = errors.get("back_emf_constant", 0.0)  # which the torque is known by
-            by_position = _mechanical(drive, log, held, sensing.encoder)
-            errors |= {name: math.hypot(error, constant_error) for name, error in by_position.items()}
-        options.append(Option(dataclasses.replace(excitation, amplitude=amplitude), rate, peak, rms, errors))
+        excitation = dataclasses.replace(excitation, amplitude=amplitude)
+        options.append(Option(excitation, rate, peak, rms, _expected(drive, held, sensing, log)))
     return options
 
 
-def _electrical(drive: Drive, log: Log, noise: float) -> dict[str, float]:
-    """Relative errors of a winding by the current, at the speed that is: see `Winding` for how it is found."""
+def _expected(drive: Drive, load: Load, sensing: Sensing, log: Log) -> dict[str, float]:
+    """Relative errors of a winding by the current, at the speed that is, and of a shaft by the position.
+
+    The torque is known by the back-EMF constant; what the datasheet leaves at 0 is left out.
+    """
+    motor, deviation = drive.motor, sensing.current_noise * float(np.abs(log.signals["current"]).max())
     turned = np.append(np.diff(log.signals["position"]) / np.diff(log.time), 0.0)
     segments = winding_segments([log], [turned])
-    model, _ = WindingModel(known={"gear_ratio": drive.motor.gear_ratio}).begun(segments)
-    return _errors(drive, FREE, model, segments, noise * float(np.abs(log.signals["current"]).max()), True)
-
-
-def _mechanical(drive: Drive, log: Log, load: Load, encoder: float) -> dict[str, float]:
-    """Relative errors of a shaft by the position; what the datasheet leaves at 0 is left out."""
-    known = {name: value for name, value in vars(drive.motor).items() if name in PARAMETERS and name != "rotor_inertia"}
+    winding, _ = WindingModel(known={"gear_ratio": motor.gear_ratio}).begun(segments)
+    errors = _errors(drive, FREE, winding, segments, deviation, True)
+    if load.locked:
+        return errors
+    known = {name: value for name, value in vars(motor).items() if name in PARAMETERS and name != "rotor_inertia"}
     known |= {"mgl": load.gravity, "constant_torque": load.torque}
     known = {name: value for name, value in known.items() if name not in GOALS or value == 0.0}
-    whole = ShaftModel(
+    shaft = ShaftModel(
         rig="free", friction="coulomb", driven_by="current", output="position", known=known, segment=_SEGMENT
     )
-    segments = whole.segments([log])
-    model, _ = whole.begun(segments)
-    return _errors(drive, load, model, segments, 2.0 * math.pi / encoder / math.sqrt(12.0), False)
+    segments = shaft.segments([log])
+    shaft, _ = shaft.begun(segments)
+    by_position = _errors(drive, load, shaft, segments, 2.0 * math.pi / sensing.encoder / math.sqrt(12.0), False)
+    constant = errors.get("back_emf_constant", 0.0)
+    return errors | {name: math.hypot(error, constant) for name, error in by_position.items()}
 
 
 def _errors(

@@ -2,14 +2,14 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from codrl_mj.identify.estimate import Fit, settled_state
 from codrl_mj.identify.log import Log, usable
-from codrl_mj.identify.segments import initial_state, shaft_segments
+from codrl_mj.identify.segments import Segment, initial_state, shaft_segments
 
 HORIZON = 0.5
 """Time [s] that is foretold at once,"""
@@ -35,11 +35,11 @@ class Trace(NamedTuple):
     """Rows at which pieces begin."""
 
 
-def trace(log: str, part: str, output: str, pieces: Any) -> Trace:
-    """A trace of some (times, measured, simulated), each of shape (m,)."""
-    times, measured, simulated = (np.concatenate(column) for column in zip(*pieces, strict=True))
-    starts = np.cumsum([0, *(len(piece[0]) for piece in pieces)])[:-1]
-    return Trace(log, part, output, times, measured, simulated, starts)
+def traced(log: str, part: str, output: str, segments: Sequence[Segment], made: Sequence[np.ndarray]) -> Trace:
+    """A trace of segments of a log, beside what a simulation made of each, of shape (m,)."""
+    times, measured = (np.concatenate([getattr(one, name) for one in segments]) for name in ("times", "measured"))
+    starts = np.cumsum([0, *(len(one.times) for one in segments)])[:-1]
+    return Trace(log, part, output, times, measured, np.concatenate(made), starts)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,15 +59,14 @@ class Prediction:
 
 def predict(fit: Fit, log: Log) -> Prediction:
     """Errors of a fitted shaft's simulations of a log."""
-    model, simulate, found, pieces = fit.model, fit.model.at(fit.values), [], []
-    for segment in shaft_segments([log], model.driven_by, model.output, HORIZON):
+    model, simulate, errors, made = fit.model, fit.model.at(fit.values), [], []
+    segments = shaft_segments([log], model.driven_by, model.output, HORIZON)
+    for segment in segments:
         known = max(int(np.searchsorted(segment.times, segment.times[0] + KNOWN)), 5)
-        state = settled_state(model, fit.values, segment.first(known))
-        simulated = simulate(segment, state)
-        found.append(np.abs(simulated - segment.measured)[known:])
-        pieces.append((segment.times, segment.measured, simulated))
-    errors, foretold = np.concatenate(found), trace(log.name, "shaft", model.output, pieces)
-    return Prediction(log.name, model.output, float(errors.mean()), closed_loop_error(fit, log), foretold)
+        made.append(simulate(segment, settled_state(model, fit.values, segment.first(known))))
+        errors.append(np.abs(made[-1] - segment.measured)[known:])
+    foretold, error = traced(log.name, "shaft", model.output, segments, made), float(np.concatenate(errors).mean())
+    return Prediction(log.name, model.output, error, closed_loop_error(fit, log), foretold)
 
 
 def closed_loop_error(fit: Fit, log: Log) -> float | None:
@@ -100,10 +99,10 @@ def closed_loop_error(fit: Fit, log: Log) -> float | None:
     return total if math.isfinite(total) else None
 
 
-def fitted_traces(part: str, fit: Fit, logs: Sequence[Log]) -> tuple[Trace, ...]:
+def fitted_traces(part: str, fit: Fit, logs: Sequence[Log]) -> Iterator[Trace]:
     """The fit of `winding` or `shaft` to each of its logs."""
-    pieces: dict[int, list[Any]] = {}
-    for segment, residuals in zip(fit.segments, fit.residuals, strict=True):
-        simulated = segment.measured + residuals * segment.deviation
-        pieces.setdefault(segment.log, []).append((segment.times, segment.measured, simulated))
-    return tuple(trace(logs[place].name, part, fit.model.output, several) for place, several in pieces.items())
+    for place, log in enumerate(logs):
+        pairs = zip(fit.segments, fit.residuals, strict=True)
+        own = [(one, one.measured + residuals * one.deviation) for one, residuals in pairs if one.log == place]
+        if own:
+            yield traced(log.name, part, fit.model.output, *zip(*own, strict=True))
