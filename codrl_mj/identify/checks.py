@@ -90,8 +90,8 @@ def name_of_factor(ratio: float, angle: bool = True) -> str:
 @_needs("")
 def _times(seen: Examined) -> Iterator[Finding]:
     """Gaps, dropped rows, jitter, and stamps in another unit."""
-    log = seen.log
-    steps, usual, rows = np.diff(log.time), log.step, log.row_numbers
+    log, usual, rows = seen.log, seen.log.step, seen.log.row_numbers
+    steps = np.diff(log.time)
     gaps = np.flatnonzero(steps > LONGEST_STEP * usual)
     for place in gaps[:_MOST_LISTED]:
         text = f"a gap of {steps[place]:.4g} s after {log.time[place]:.4g} s, {steps[place] / usual:.0f} usual steps"
@@ -134,15 +134,14 @@ def _resolution(log: Log, signal: str) -> Iterator[Finding]:
     if step == 0.0 or signal in ("command", "temperature", "duty", "voltage", "bus"):
         return
     spread = float(np.ptp(values))
-    coarse = spread < 100.0 * step if signal == "position" else step > 0.1 * float(np.std(values))
-    if not coarse:
-        return
-    text = f"{signal} is known to {step:.3g} {unit} and spans {spread:.3g} {unit}, {spread / step:.0f} steps"
-    remedy = {
-        "position": "move further, or use a finer encoder",
-        "velocity": "leave it out and give the position, or smooth it over several ms and give that",
-    }.get(signal, "measure in a smaller range, or drive harder")
-    yield Finding("warning", "resolution", None, text, remedy)
+    if spread < 100.0 * step if signal == "position" else step > 0.1 * float(np.std(values)):
+        text = f"{signal} is known to {step:.3g} {unit} and spans {spread:.3g} {unit}, {spread / step:.0f} steps"
+        remedies = {
+            "position": "move further, or use a finer encoder",
+            "velocity": "leave it out and give the position, or smooth it over several ms and give that",
+        }
+        remedy = remedies.get(signal, "measure in a smaller range, or drive harder")
+        yield Finding("warning", "resolution", None, text, remedy)
 
 
 def _saturation(log: Log, signal: str) -> Iterator[Finding]:
@@ -178,14 +177,12 @@ def _outliers(log: Log, signal: str) -> Iterator[Finding]:
     bound = max(5.0 * float(np.quantile(peaks, 0.8)), 4.0 * log.resolution.get(signal, 0.0))
     bound = max(bound, 0.02 * float(np.ptp(values)))
     wild = np.flatnonzero(height > bound) + 1
-    if not wild.size:
-        return
-    share = wild.size / len(values)
-    rows = ", ".join(str(log.row_numbers[row]) for row in wild[:5])
-    text = f"{signal} leaves both its neighbours by over {bound:.3g} {SIGNALS[signal]} in {wild.size} rows ({rows})"
-    remedy = "nothing up to 1 % of the rows, which a robust fit bears; else find out where they come from"
-    severity = "info" if share <= 0.01 else "warning"
-    yield Finding(severity, "outliers", int(log.row_numbers[wild[0]]), text, remedy)
+    if wild.size:
+        rows = ", ".join(str(log.row_numbers[row]) for row in wild[:5])
+        text = f"{signal} leaves both its neighbours by over {bound:.3g} {SIGNALS[signal]} in {wild.size} rows ({rows})"
+        remedy = "nothing up to 1 % of the rows, which a robust fit bears; else find out where they come from"
+        severity = "info" if wild.size / len(values) <= 0.01 else "warning"
+        yield Finding(severity, "outliers", int(log.row_numbers[wild[0]]), text, remedy)
 
 
 @_needs("position")
@@ -193,11 +190,10 @@ def _wrapped(seen: Examined) -> Iterator[Finding]:
     """A position that jumps by a turn."""
     steps = np.diff(seen.log.signals["position"])
     jumps = np.flatnonzero(np.abs(np.abs(steps) - 2.0 * np.pi) < 0.1 * 2.0 * np.pi)
-    if not jumps.size or np.mean(np.abs(steps) > np.pi / 2.0) > 0.2:
-        return
-    text = f"the position jumps by a turn, {jumps.size} times, first here"
-    remedy = "write position=unwrap(column, 2*pi):rad, or unwrap(column, 360):deg"
-    yield Finding("error", "wrapped", int(seen.log.row_numbers[jumps[0] + 1]), text, remedy)
+    if jumps.size and np.mean(np.abs(steps) > np.pi / 2.0) <= 0.2:
+        text = f"the position jumps by a turn, {jumps.size} times, first here"
+        remedy = "write position=unwrap(column, 2*pi):rad, or unwrap(column, 360):deg"
+        yield Finding("error", "wrapped", int(seen.log.row_numbers[jumps[0] + 1]), text, remedy)
 
 
 @_needs("")
@@ -332,14 +328,12 @@ def _delay(seen: Examined) -> Iterator[Finding]:
 def _sag(seen: Examined) -> Iterator[Finding]:
     """A supply that gives way, where the share of its voltage changes; at one share it looks as the winding does."""
     balance, share = seen.winding, np.abs(seen.log.signals["voltage"])
-    with_sag = voltage_balance(seen.log, sag=True) if float(np.std(share)) > 0.1 * float(share.max()) else None
-    if balance is None or with_sag is None or with_sag.residual > 0.96 * balance.residual:
+    sagging = voltage_balance(seen.log, sag=True) if float(np.std(share)) > 0.1 * float(share.max()) else None
+    if balance is None or sagging is None or sagging.residual > 0.96 * balance.residual:
         return
-    supply = with_sag.values["supply_resistance"]
-    if with_sag.certainty["supply_resistance"] > _CERTAIN and supply > 0.03 * with_sag.values["resistance"] > 0.0:
-        text = (
-            f"the voltage sags as behind {supply:.2g} ohm, beside a winding of {with_sag.values['resistance']:.2g} ohm"
-        )
+    supply, winding = sagging.values["supply_resistance"], sagging.values["resistance"]
+    if sagging.certainty["supply_resistance"] > _CERTAIN and supply > 0.03 * winding > 0.0:
+        text = f"the voltage sags as behind {supply:.2g} ohm, beside a winding of {winding:.2g} ohm"
         remedy = "log the voltage of the supply, and write voltage=duty*bus:V"
         yield Finding("warning", "sag", None, text, remedy)
 
@@ -406,11 +400,10 @@ def _zero(balance: Balance | None, effort: str) -> Iterator[Finding]:
 @_needs("motion")
 def _motion(seen: Examined) -> Iterator[Finding]:
     """Whether it moves back and forth."""
-    signals = seen.log.signals
+    signals, remedy = seen.log.signals, "leave position and velocity out if it is"
     speed = signals["velocity"] if "velocity" in signals else np.diff(signals["position"])
     if "stands" in seen.holds:
-        text = "the shaft stands still, as if it were locked"
-        yield Finding("info", "excitation", None, text, "leave position and velocity out if it is")
+        yield Finding("info", "excitation", None, "the shaft stands still, as if it were locked", remedy)
     elif seen.effort and min(float(speed.max()), float(-speed.min())) < 0.05 * float(np.abs(speed).max()):
         text = "the shaft turns one way only: friction cannot be told from a constant load"
         yield Finding("info", "excitation", None, text, "add a log that reverses")
@@ -432,8 +425,8 @@ def _two_constants(seen: Examined) -> Iterator[Finding]:
     elif abs(math.log(constant / back_emf)) > math.log(2.0):
         text = (
             f"torque/current is {constant:.3g} N*m/A and the back-EMF constant {back_emf:.3g} V*s/rad, must be about "
-            f"equal: {name_of_factor(constant / back_emf)}"
         )
+        text += f"equal: {name_of_factor(constant / back_emf)}"
         yield Finding("error", "unit", None, text, "correct the unit of torque, current, voltage or motion")
 
 
@@ -441,12 +434,12 @@ def _two_constants(seen: Examined) -> Iterator[Finding]:
 def _datasheet(seen: Examined) -> Iterator[Finding]:
     """Resistance and back-EMF constant against what is printed."""
     motor, balance = seen.motor, seen.winding
-    if balance is None:
-        return
     constant = motor.back_emf_constant * motor.gear_ratio
     for name, value in (("resistance", motor.resistance), ("back_emf_constant", constant)):
-        found = balance.values.get(name, 0.0)
-        if balance.certainty.get(name, 0.0) > _CERTAIN and value > 0.0 and abs(math.log(found / value)) > math.log(2.0):
+        if balance is None or balance.certainty.get(name, 0.0) <= _CERTAIN or value <= 0.0:
+            continue
+        found = balance.values[name]
+        if abs(math.log(found / value)) > math.log(2.0):
             unit = PARAMETERS[name].unit
             text = f"the {name.replace('_', ' ')} would be {found:.3g} {unit}, the datasheet says {value:.3g} {unit}: "
             remedy = "correct the units of voltage, current and motion, or name the right motor"

@@ -60,7 +60,7 @@ class WindingModel(Model):
         free = tuple(name for name in ELECTRICAL if name not in self.known and (moving or name != "back_emf_constant"))
         given = {**DEFAULTS, "back_emf_constant": 0.0, **self.known}
         starts = []
-        for count in (2, 8, 32):
+        for count in (2, 8, 32):  # rows of a window
             rows = np.concatenate([_winding_rows(one, count, given["gear_ratio"]) for one in segments])
             starts.append(_regressed(rows[:, :3], rows[:, 3], ELECTRICAL, free, given))
         magnitudes = np.abs(np.median(starts, axis=0))
