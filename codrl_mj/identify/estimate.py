@@ -8,7 +8,7 @@ handful of unknowns however many segments there are.
 import abc
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -72,7 +72,8 @@ class Model(abc.ABC):
 class Fit:
     """Parameters that fit, and what is needed to judge them."""
 
-    model: Model
+    model: Any
+    """A `Model`."""
     segments: Sequence[Segment]
     values: np.ndarray
     """Shape (p,)."""

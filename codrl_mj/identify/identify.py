@@ -69,28 +69,15 @@ def identify(
     def step(what: str) -> Callable[[], None]:
         return lambda: on_progress(what, min(next(done), total), total)
 
-    # the winding, and the shaft by the torque constant that the winding tells; then each again, beside the other
-    parts: dict[str, Fitted] = {}
-    constant: dict[str, float] = {}
-    if electrical:
-        parts["winding"] = fitted(WindingModel(known=given), electrical, step("winding"))
-    if driven_by is not None:
-        constant = _constant(given, parts.get("winding"), driven_by, estimated)
-        model = ShaftModel(rig=rig, friction="coulomb", driven_by=driven_by, output=output, segment=segment,
-                           known={**given, **constant}, estimated=tuple(estimated))  # fmt: skip
-        model = with_friction(model, moving, friction, step("friction"))
-        friction, parts["shaft"] = model.friction, fitted(model, moving, step("shaft"))
-        if electrical and driven_by != "voltage":
-            parts["winding"] = parts["winding"].refitted(WindingModel(known=given, shaft=parts["shaft"]))
-        constant = _constant(given, parts.get("winding"), driven_by, estimated)
-        parts["shaft"] = parts["shaft"].refitted(dataclasses.replace(model, known={**model.known, **constant}))
-
-    estimates, warnings, unexplained = judged(parts, given, bool(constant), seed, step)
+    shaft = ShaftModel(rig=rig, friction="coulomb", driven_by=driven_by or "", output=output, known=given,
+                       estimated=tuple(estimated), segment=segment)  # fmt: skip
+    parts = _parts(WindingModel(known=given), electrical, shaft, moving, friction, step)
+    estimates, warnings, unexplained = judged(parts, given, seed, step)
     volts = [log.signals[name] for log in logs for name in ("voltage", "bus") if log.has(name)]
     return Identified(
         tuple(log.name for log in logs),
         rig,
-        friction,
+        parts["shaft"].fit.model.friction if "shaft" in parts else friction,
         driven_by,
         {name: part.delay for name, part in parts.items()},
         tuple(estimates),
@@ -103,6 +90,38 @@ def identify(
         max((float(np.abs(one).max()) for one in volts), default=None),
         unexplained,
     )
+
+
+def _parts(
+    winding: WindingModel,
+    electrical: Sequence[Log],
+    shaft: ShaftModel,
+    moving: Sequence[Log],
+    friction: str,
+    step: Callable[[str], Callable[[], None]],
+) -> dict[str, Fitted]:
+    """The winding, and the shaft by the torque constant that the winding tells; then each again, beside the other."""
+    parts: dict[str, Fitted] = {}
+    if electrical:
+        parts["winding"] = fitted(winding, electrical, step("winding"))
+    if not shaft.driven_by:
+        return parts
+    told = with_friction(_told(shaft, parts.get("winding")), moving, friction, step("friction"))
+    parts["shaft"] = fitted(told, moving, step("shaft"))
+    if electrical and shaft.driven_by != "voltage":
+        parts["winding"] = parts["winding"].refitted(dataclasses.replace(winding, shaft=parts["shaft"]))
+    told = _told(dataclasses.replace(shaft, friction=told.friction), parts.get("winding"))
+    parts["shaft"] = parts["shaft"].refitted(told)
+    return parts
+
+
+def _told(shaft: ShaftModel, winding: Fitted | None) -> ShaftModel:
+    """The shaft, with the back-EMF constant for a torque constant that is not known: but for losses they are equal."""
+    numbers = shaft.known if winding is None else winding.fit.model.all_values(winding.fit.values)
+    constant = numbers.get("back_emf_constant", 0.0)
+    if shaft.driven_by != "current" or "torque_constant" in (*shaft.known, *shaft.estimated) or not constant > 0.0:
+        return shaft
+    return dataclasses.replace(shaft, known={**shaft.known, "torque_constant": constant})
 
 
 def checked(
@@ -195,15 +214,3 @@ def _foretold(shaft: Fitted | None, logs: Sequence[Log]) -> tuple[Prediction, ..
     driven_by, output = shaft.fit.model.driven_by, shaft.fit.model.output
     told = [log for log in logs if moves(log) and log.has(driven_by, output)]
     return tuple(predict(shaft.fit, shifted(log, driven_by, shaft.delay)) for log in told)
-
-
-def _constant(
-    given: Mapping[str, float], winding: Fitted | None, driven_by: str, estimated: Sequence[str]
-) -> dict[str, float]:
-    """The back-EMF constant where it stands for the torque constant, which it is in SI units but for losses."""
-    if driven_by != "current" or "torque_constant" in {*given, *estimated}:
-        return {}
-    if "back_emf_constant" in given:
-        return {"torque_constant": given["back_emf_constant"]}
-    found = {} if winding is None else winding.fit.model.all_values(winding.fit.values)
-    return {"torque_constant": found["back_emf_constant"]} if found.get("back_emf_constant", 0.0) > 0.0 else {}

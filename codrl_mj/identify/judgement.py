@@ -46,19 +46,18 @@ UNLIKE = 0.02
 
 
 def judged(
-    parts: Mapping[str, Fitted], given: Mapping[str, float], by_constant: bool, seed: int, step: Callable[[str], Any]
+    parts: Mapping[str, Fitted], given: Mapping[str, float], seed: int, step: Callable[[str], Any]
 ) -> tuple[list[Estimate], list[str], float]:
-    """Every number that was found, given or follows, warnings, and the largest share of a log that is not explained.
-
-    `by_constant`: the shaft's torque constant is the back-EMF constant.
-    """
+    """Every number that was found, given or follows, warnings, and the largest share of a log that is not explained."""
     estimates: list[Estimate] = []
     warnings: list[str] = []
     unlike: dict[str, float] = {}
     for name, part in parts.items():
-        constant = next((one for one in estimates if by_constant and one.name == "back_emf_constant"), None)
-        found = _of_part(part, seed, step(name))
-        estimates += found if constant is None else _with_constant(found, constant, part.fit.model.known)
+        found, known = _of_part(part, seed, step(name)), part.fit.model.known
+        if "torque_constant" in known and "torque_constant" not in given:  # it is the back-EMF constant
+            constant = [one for one in estimates if one.name == "back_emf_constant"]
+            found = _with_constant(found, constant[0], known) if constant else found
+        estimates += found
         warnings += _warnings(part, unlike)
     return _completed(estimates, given), warnings, max(unlike.values(), default=0.0)
 

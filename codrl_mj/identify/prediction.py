@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -77,7 +77,7 @@ def closed_loop_error(fit: Fit, log: Log) -> float | None:
     """
     from codrl_mj.identify.simulation import served
 
-    model: Any = fit.model
+    model = fit.model
     if model.output != "position" or not log.has("command", model.driven_by):
         return None
     wanted, given = log.signals["command"], log.signals[model.driven_by]
