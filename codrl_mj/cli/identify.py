@@ -153,28 +153,24 @@ def print_identified(found: Any) -> None:
     from codrl_mj.identify.log import SIGNALS
     from codrl_mj.identify.result import USABLE
 
-    table = titled_table(f"Identified from {', '.join(found.logs)}")
-    for name in ("parameter", "value", "95 % interval", "unit", "status", "why"):
-        table.add_column(name, justify="right" if name in ("value", "95 % interval") else "left", overflow="fold")
+    columns = "parameter", "value", "95 % interval", "unit", "status", "why"
+    table = titled_table(f"Identified from {', '.join(found.logs)}", columns, right=columns[1:3])
     for one in found.estimates:
         interval = "" if one.status == "given" else f"{one.low:.4g} to {one.high:.4g}"
         texts = one.name, f"{one.value:.4g}", interval, one.unit, one.status, one.why
         table.add_row(*map(escape, texts), style="" if one.status in USABLE else "yellow")
     console().print(table)
-    if found.fitted or found.held_out:
-        table = titled_table("Errors of the simulation, mean absolute")
-        for name in ("log", "", "of", "open loop, 0.5 s", "closed loop"):
-            table.add_column(name, justify="right" if "loop" in name else "left")
-        for kind, several in (("fitted", found.fitted), ("held out", found.held_out)):
-            for one in several:
-                closed = "" if one.closed_loop is None else f"{one.closed_loop:.3g}"
-                table.add_row(
-                    escape(one.log), kind, f"{one.output} {SIGNALS[one.output]}", f"{one.open_loop:.3g}", closed
-                )
-        console().print(table)
-    for part, rows in found.delays.items():
-        if rows:
-            print(f"{part}: the input is late by {rows} row{'s' if abs(rows) > 1 else ''}, which is allowed for")
+    rows = [
+        (one.log, kind, f"{one.output} {SIGNALS[one.output]}", f"{one.open_loop:.3g}",
+         "" if one.closed_loop is None else f"{one.closed_loop:.3g}")
+        for kind, several in (("fitted", found.fitted), ("held out", found.held_out)) for one in several
+    ]  # fmt: skip
+    if rows:
+        heads = "log", "", "of", "open loop, 0.5 s", "closed loop"
+        console().print(titled_table("Errors of the simulation, mean absolute", heads, rows, right=heads[3:]))
+    for part, late in found.delays.items():
+        if late:
+            print(f"{part}: the input is late by {late} row{'s' if abs(late) > 1 else ''}, which is allowed for")
     for text in found.warnings:
         console().print(f"warning: {text}", markup=False, highlight=False, style="yellow")
     if found.supply_text:

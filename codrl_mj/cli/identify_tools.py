@@ -74,9 +74,7 @@ def findings_table(title: str, findings: Sequence[Any]) -> Any:
 
     if not findings:
         return f"{escape(title)}: nothing is wrong with it"
-    table = titled_table(title)
-    for header in ("", "check", "row", "what", "remedy"):
-        table.add_column(header, overflow="fold", justify="right" if header == "row" else "left")
+    table = titled_table(title, ("", "check", "row", "what", "remedy"), right=["row"])
     for one in findings:
         texts = one.severity, one.check, "" if one.row is None else str(one.row), one.message, one.remedy
         table.add_row(*map(escape, texts), style=_STYLES[one.severity])
@@ -151,18 +149,16 @@ class PlanExperiment:
     def _print(self, found: Any, goals: dict[str, float]) -> None:
         from codrl_mj.cli.terminal import console, titled_table
 
-        title = f"{self.name}: errors to be expected [%]"
-        table = titled_table(title)
-        heads = "excitation", "kHz", "V", "peak A", "rms A", *(f"{_SHORT[name]}\n≤ {goals[name]:.0%}" for name in goals)
-        for head in heads:
-            table.add_column(head, justify="left" if head == "excitation" else "right")
+        heads = "kHz", "V", "peak A", "rms A", *(f"{_SHORT[name]}\n≤ {goals[name]:.0%}" for name in goals)
+        rows = []
         for option in found.options:
             mark = "*" if option is found.best else ""
             numbers = option.rate / 1e3, option.excitation.amplitude, option.peak_current, option.rms_current
             errors = (option.errors.get(name) for name in goals)
             texts = (("–" if error is None else f"{100.0 * error:.2g}") for error in errors)
-            table.add_row(f"{mark}{option.excitation.kind}", *(f"{one:.3g}" for one in numbers), *texts)
-        console().print(table)
+            rows.append((f"{mark}{option.excitation.kind}", *(f"{one:.3g}" for one in numbers), *texts))
+        title = f"{self.name}: errors to be expected [%]"
+        console().print(titled_table(title, ("excitation", *heads), rows, right=heads))
         best = found.best.excitation
         clock = f", a clock of {1e3 * best.clock:.3g} ms" if "prbs" in best.kind else ""
         print(f"* play {best.kind}, {best.amplitude:.4g} V, {best.duration:g} s{clock}, rows at {found.best.rate:g} Hz")

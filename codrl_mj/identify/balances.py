@@ -5,8 +5,6 @@ the derivatives go over to phi. Source: Shinbrot, *On the Analysis of Linear and
 of modulating functions. Good for signs, orders of magnitude and starts; noise in what is regressed on biases it.
 """
 
-import dataclasses
-import functools
 import math
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
@@ -22,10 +20,11 @@ _LONGEST = 20_000
 """Rows of a log beyond which a lag is not looked for."""
 _WINDOWS = 400
 """More tell no more of a lag."""
-_POWER = 5
-"""Of s - s^2 in phi: so high that the trapezoidal rule is good for phi'' too."""
-
-
+_BUMP = np.polynomial.Polynomial([0.0, 1.0, -1.0]) ** 5
+"""s - s^2 to a power so high that the trapezoidal rule is good for phi'' too."""
+_UNIT = _BUMP / _BUMP.integ()(1.0)
+_PHI = {-1: _UNIT.integ(), 0: _UNIT, 1: _UNIT.deriv(), 2: _UNIT.deriv(2)}
+"""Order of the derivative by the phase -> polynomial; -1: its integral."""
 BODY = "inertia", "viscous", "coulomb"
 """Terms of a torque balance that no body and no friction has negative."""
 
@@ -50,10 +49,7 @@ class Windows:
         """Cut it."""
         duration = min(duration, float(log.time[-1] - log.time[0]) / 10.0)
         count = max(math.ceil(duration / log.step), _ROWS)
-        starts = [
-            np.arange(part.start, part.stop - count, max(count // 4, 1)) for part in usable(log)
-        ]  # of the whole windows of every stretch
-        every = np.concatenate(starts)
+        every = np.concatenate([np.arange(one.start, one.stop - count, max(count // 4, 1)) for one in usable(log)])
         self.rows = every[:: math.ceil(len(every) / most) or 1, None] + np.arange(count + 1)
         self._log = log
         time = log.time[self.rows] if self.rows.size else np.zeros(self.rows.shape)
@@ -62,17 +58,13 @@ class Windows:
         self._steps = np.diff(time, axis=1)
         self._weights: dict[int, np.ndarray] = {}
 
-    def __len__(self) -> int:
-        """How many windows there are."""
-        return len(self.rows)
-
     def mean(self, signal: str | np.ndarray, order: int = 0) -> np.ndarray:
         """The weighted mean of a signal's derivative of some order, shape (windows,)."""
         values = (self._log.signals[signal] if isinstance(signal, str) else signal)[self.rows]
         if order > 0:  # what is constant counts for nothing, and would only be rounded
             values = values - values.mean(axis=1, keepdims=True)
         if order not in self._weights:
-            self._weights[order] = _phi(self._phase, order) * (-1.0 / self.length) ** order
+            self._weights[order] = _PHI[order](self._phase) * (-1.0 / self.length) ** order
         weighted = values * self._weights[order]
         return np.sum(0.5 * self._steps * (weighted[:, 1:] + weighted[:, :-1]), axis=1) / self.length[:, 0]
 
@@ -83,19 +75,7 @@ class Windows:
         rows = np.arange(-reach, self.rows.shape[1] - 1 + reach) + self.rows[:, :1]
         rows = np.clip(rows, 0, len(time) - 2)
         edges = [np.clip((time[rows + k] + lag - self.begin) / self.length, 0.0, 1.0) for k in (0, 1)]
-        return np.sum(values[rows] * (_phi(edges[1], -1) - _phi(edges[0], -1)), axis=1)
-
-
-def _phi(phase: np.ndarray, order: int) -> np.ndarray:
-    """Phi's derivative of some order by the phase; -1: its integral."""
-    return _polynomials()[order](phase)
-
-
-@functools.cache
-def _polynomials() -> dict[int, np.polynomial.Polynomial]:
-    phi = np.polynomial.Polynomial([0.0, 1.0, -1.0]) ** _POWER
-    phi = phi / phi.integ()(1.0)
-    return {-1: phi.integ(), 0: phi, 1: phi.deriv(), 2: phi.deriv(2)}
+        return np.sum(values[rows] * (_PHI[-1](edges[1]) - _PHI[-1](edges[0])), axis=1)
 
 
 def regress(target: np.ndarray, terms: Mapping[str, np.ndarray], least: float = -np.inf) -> Balance | None:
@@ -134,22 +114,17 @@ def regress(target: np.ndarray, terms: Mapping[str, np.ndarray], least: float = 
     )
 
 
-def speed_terms(log: Log, windows: Windows, order: int = 0) -> np.ndarray | None:
-    """The weighted mean of the speed, or of its derivative; by the position if there is one. None without a motion."""
-    if log.has("position"):
-        return windows.mean("position", order + 1)
-    return windows.mean("velocity", order) if log.has("velocity") else None
+def _speed(log: Log, windows: Windows, order: int = 0) -> np.ndarray:
+    """The weighted mean of the speed, or of its derivative; by the position if there is one."""
+    return windows.mean("position", order + 1) if log.has("position") else windows.mean("velocity", order)
 
 
-def voltage_terms(log: Log, windows: Windows, sag: bool = False) -> dict[str, np.ndarray]:
-    """The terms of `voltage_balance`."""
+def _voltage_terms(log: Log, windows: Windows, sag: bool = False) -> dict[str, np.ndarray]:
     terms = {"resistance": windows.mean("current"), "inductance": windows.mean("current", 1)}
-    speed = speed_terms(log, windows)
-    if speed is not None:
-        terms["back_emf_constant"] = speed
+    if log.has("position") or log.has("velocity"):
+        terms["back_emf_constant"] = _speed(log, windows)
     if sag:
-        voltage = log.signals["voltage"]
-        share = voltage / max(float(np.abs(voltage).max()), 1e-300)
+        share = log.signals["voltage"] / max(float(np.abs(log.signals["voltage"]).max()), 1e-300)
         terms["supply_resistance"] = windows.mean(share**2 * log.signals["current"])
     return terms
 
@@ -160,20 +135,14 @@ def voltage_balance(log: Log, duration: float = 0.0, sag: bool = False) -> Balan
     Without a motion the shaft counts as locked. `sag`: on (u/max u)^2*i too, which a `supply_resistance` takes.
     """
     windows = Windows(log, duration)
-    return regress(windows.mean_held("voltage"), voltage_terms(log, windows, sag)) if len(windows) else None
+    return regress(windows.mean_held("voltage"), _voltage_terms(log, windows, sag))
 
 
-def torque_terms(
-    log: Log, windows: Windows, aside: bool = False, rig: str | None = None
-) -> dict[str, np.ndarray] | None:
-    """The terms of `torque_balance`; None without a motion."""
+def _torque_terms(log: Log, windows: Windows, aside: bool = False, rig: str | None = None) -> dict[str, np.ndarray]:
     from scipy.integrate import cumulative_trapezoid
 
-    speed, acceleration = speed_terms(log, windows), speed_terms(log, windows, 1)
-    if speed is None or acceleration is None:
-        return None
-    one = windows.mean(np.ones(len(log.time)))
-    terms = {"inertia": acceleration, "viscous": speed, "coulomb": np.sign(speed) * one, "constant": one}
+    speed, one = _speed(log, windows), windows.mean(np.ones(len(log.time)))
+    terms = {"inertia": _speed(log, windows, 1), "viscous": speed, "coulomb": np.sign(speed) * one, "constant": one}
     if rig in (None, "pendulum"):
         known = log.has("position")
         angle = log.signals["position"] if known else cumulative_trapezoid(log.signals["velocity"], log.time, initial=0)
@@ -197,9 +166,7 @@ def torque_balance(
     of the effort, with which inertia and friction must not be negative; 0: they may be. Windows have a `duration` [s].
     """
     windows = Windows(log, duration)
-    terms = torque_terms(log, windows, aside, rig) if len(windows) else None
-    if terms is None:
-        return None
+    terms = _torque_terms(log, windows, aside, rig)
     given = windows.mean_held(effort) if effort == "voltage" else windows.mean(effort)
     return regress(sign * given, terms, 0.0) if sign else regress(given, terms)
 
@@ -221,10 +188,8 @@ class Shift(NamedTuple):
 
 def velocity_lag(log: Log) -> Shift | None:
     """How late, up to 0.1 s, the velocity is against the differentiated position, and its gain over that."""
-    log = _beginning(log)
+    log = log.part(slice(0, _LONGEST))
     windows = Windows(log, max(0.05, 4.0 * log.step), _WINDOWS)
-    if not len(windows):
-        return None
     rate = windows.mean("position", 1)
     velocity, time = log.signals["velocity"], log.time
     if not np.any(rate) or not np.any(velocity):
@@ -245,30 +210,21 @@ def velocity_lag(log: Log) -> Shift | None:
     return Shift(lag, best / max(now, 1e-300), gain, best, noise)
 
 
-def current_lag(log: Log) -> Shift | None:
-    """How late, up to 20 rows, the current is against the voltage, by the voltage balance."""
-    log = _beginning(log)
-    windows = Windows(log, most=_WINDOWS)
-    if not len(windows) or not np.any(log.signals["voltage"]):
-        return None
-    return _by_balance(log, windows, "voltage", voltage_terms(log, windows), 3.0 * log.step, 20.0 * log.step)
+def effort_lag(log: Log, effort: str) -> Shift | None:
+    """How late what follows is against the effort, by their balance.
 
-
-def motion_lag(log: Log) -> Shift | None:
-    """How late, up to 60 ms, the motion is against the torque that causes it, by the torque balance."""
-    log = _beginning(log)
-    windows = Windows(log, 0.3, _WINDOWS)
-    terms = torque_terms(log, windows) if len(windows) else None
-    return None if terms is None else _by_balance(log, windows, "torque", terms, 0.06, 0.06)
-
-
-def _by_balance(
-    log: Log, windows: Windows, signal: str, terms: Mapping[str, np.ndarray], ahead: float, behind: float
-) -> Shift | None:
-    """How late the terms of a balance are against what they explain."""
+    That is the current, up to 20 rows, against a `voltage`; the motion, up to 60 ms, against a `torque`.
+    """
+    log = log.part(slice(0, _LONGEST))
+    if effort == "voltage":
+        windows, ahead, behind = Windows(log, most=_WINDOWS), 3.0 * log.step, 20.0 * log.step
+        terms = _voltage_terms(log, windows)
+    else:
+        windows, ahead, behind = Windows(log, 0.3, _WINDOWS), 0.06, 0.06
+        terms = _torque_terms(log, windows)
 
     def compare(lag: float) -> tuple[float, float]:
-        balance = regress(windows.mean_held(signal, lag), terms)
+        balance = regress(windows.mean_held(effort, lag), terms)
         # of a nearly sinusoidal current a delay looks like more inductance, and too long a one like less than none
         if balance is None or (lag > 0.0 and balance.certainty.get("inductance", 0.0) < -3.0):
             return np.inf, 1.0
@@ -294,7 +250,3 @@ def _least(compare: Callable[[float], tuple[float, float]], step: float, ahead: 
             return float(best)
         shift /= 2.0
         places = best + shift * np.arange(-2, 3)
-
-
-def _beginning(log: Log) -> Log:
-    return dataclasses.replace(log.part(slice(0, _LONGEST)), findings=())

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.identify.balances import Balance, current_lag, motion_lag, torque_balance, velocity_lag, voltage_balance
+from codrl_mj.identify.balances import Balance, effort_lag, torque_balance, velocity_lag, voltage_balance
 from codrl_mj.identify.log import LONGEST_STEP, SIGNALS, Finding, Log, find_resolution
 from codrl_mj.identify.parameters import PARAMETERS
 from codrl_mj.identify.segments import moves, replaced
@@ -42,14 +42,11 @@ class Examined:
         """See what it holds."""
         self.log, self.motor, self.rig = log, motor, rig
         self.effort = next((name for name in ("torque", "current", "voltage") if log.has(name)), "")
-
-    @functools.cached_property
-    def holds(self) -> set[str]:
+        self.holds = {*log.signals, *(["effort"] if self.effort else []), *(["datasheet"] if motor else [])}
         """What a check may need: signals, and what is known of them."""
-        found = {*self.log.signals, *(["effort"] if self.effort else []), *(["datasheet"] if self.motor else [])}
-        if self.log.has("position") or self.log.has("velocity"):
-            found |= {"motion", "moves" if moves(self.log) else "stands"}
-        return found | {"hangs"} if self.rig in (None, "pendulum") else found
+        if log.has("position") or log.has("velocity"):
+            self.holds |= {"motion", "moves" if moves(log) else "stands"}
+        self.holds |= {"hangs"} if rig in (None, "pendulum") else set()
 
     @functools.cached_property
     def winding(self) -> Balance | None:
@@ -57,11 +54,23 @@ class Examined:
         return voltage_balance(self.log) if self.log.has("voltage", "current") else None
 
 
+CHECKS: list[tuple[set[str], Callable[[Examined], Iterator[Finding]]]] = []
+"""What a check needs of a log, by words of `Examined.holds`, and what finds and words what it finds; in this order."""
+
+
+def _needs(words: str) -> Callable[[Any], Any]:
+    def add(found: Any) -> Any:
+        CHECKS.append(({*words.split()}, found))
+        return found
+
+    return add
+
+
 def check(log: Log, motor: Any = None, rig: str | None = None) -> list[Finding]:
     """What is noteworthy about a log, errors first; beside a datasheet's `GearMotor` and on a rig, where given."""
     seen, findings = Examined(log, motor, rig), [*log.findings]
     for needs, found in CHECKS:
-        if {*needs.split()} <= seen.holds:
+        if needs <= seen.holds:
             findings += found(seen)
     order = ("error", "warning", "info")
     return sorted(findings, key=lambda one: order.index(one.severity))
@@ -78,10 +87,11 @@ def name_of_factor(ratio: float, angle: bool = True) -> str:
     return f"a factor of {math.exp(size):.4g}, " + " or ".join([*near, "a wrong scale, another motor, or a gear"])
 
 
+@_needs("")
 def _times(seen: Examined) -> Iterator[Finding]:
     """Gaps, dropped rows, jitter, and stamps in another unit."""
-    log = seen.log
-    steps, usual, rows = np.diff(log.time), log.step, log.row_numbers
+    log, usual, rows = seen.log, seen.log.step, seen.log.row_numbers
+    steps = np.diff(log.time)
     gaps = np.flatnonzero(steps > LONGEST_STEP * usual)
     for place in gaps[:_MOST_LISTED]:
         text = f"a gap of {steps[place]:.4g} s after {log.time[place]:.4g} s, {steps[place] / usual:.0f} usual steps"
@@ -108,6 +118,7 @@ def _times(seen: Examined) -> Iterator[Finding]:
         yield Finding("error", "unit", None, text, "write time=column:ms, or us, or ns")
 
 
+@_needs("")
 def _signals(seen: Examined) -> Iterator[Finding]:
     """Each signal by itself; only what a sensor sees is clipped or spoiled, others rest where they like."""
     for signal in seen.log.signals:
@@ -123,15 +134,14 @@ def _resolution(log: Log, signal: str) -> Iterator[Finding]:
     if step == 0.0 or signal in ("command", "temperature", "duty", "voltage", "bus"):
         return
     spread = float(np.ptp(values))
-    coarse = spread < 100.0 * step if signal == "position" else step > 0.1 * float(np.std(values))
-    if not coarse:
-        return
-    text = f"{signal} is known to {step:.3g} {unit} and spans {spread:.3g} {unit}, {spread / step:.0f} steps"
-    remedy = {
-        "position": "move further, or use a finer encoder",
-        "velocity": "leave it out and give the position, or smooth it over several ms and give that",
-    }.get(signal, "measure in a smaller range, or drive harder")
-    yield Finding("warning", "resolution", None, text, remedy)
+    if spread < 100.0 * step if signal == "position" else step > 0.1 * float(np.std(values)):
+        text = f"{signal} is known to {step:.3g} {unit} and spans {spread:.3g} {unit}, {spread / step:.0f} steps"
+        remedies = {
+            "position": "move further, or use a finer encoder",
+            "velocity": "leave it out and give the position, or smooth it over several ms and give that",
+        }
+        remedy = remedies.get(signal, "measure in a smaller range, or drive harder")
+        yield Finding("warning", "resolution", None, text, remedy)
 
 
 def _saturation(log: Log, signal: str) -> Iterator[Finding]:
@@ -167,27 +177,26 @@ def _outliers(log: Log, signal: str) -> Iterator[Finding]:
     bound = max(5.0 * float(np.quantile(peaks, 0.8)), 4.0 * log.resolution.get(signal, 0.0))
     bound = max(bound, 0.02 * float(np.ptp(values)))
     wild = np.flatnonzero(height > bound) + 1
-    if not wild.size:
-        return
-    share = wild.size / len(values)
-    rows = ", ".join(str(log.row_numbers[row]) for row in wild[:5])
-    text = f"{signal} leaves both its neighbours by over {bound:.3g} {SIGNALS[signal]} in {wild.size} rows ({rows})"
-    remedy = "nothing up to 1 % of the rows, which a robust fit bears; else find out where they come from"
-    severity = "info" if share <= 0.01 else "warning"
-    yield Finding(severity, "outliers", int(log.row_numbers[wild[0]]), text, remedy)
+    if wild.size:
+        rows = ", ".join(str(log.row_numbers[row]) for row in wild[:5])
+        text = f"{signal} leaves both its neighbours by over {bound:.3g} {SIGNALS[signal]} in {wild.size} rows ({rows})"
+        remedy = "nothing up to 1 % of the rows, which a robust fit bears; else find out where they come from"
+        severity = "info" if wild.size / len(values) <= 0.01 else "warning"
+        yield Finding(severity, "outliers", int(log.row_numbers[wild[0]]), text, remedy)
 
 
+@_needs("position")
 def _wrapped(seen: Examined) -> Iterator[Finding]:
     """A position that jumps by a turn."""
     steps = np.diff(seen.log.signals["position"])
     jumps = np.flatnonzero(np.abs(np.abs(steps) - 2.0 * np.pi) < 0.1 * 2.0 * np.pi)
-    if not jumps.size or np.mean(np.abs(steps) > np.pi / 2.0) > 0.2:
-        return
-    text = f"the position jumps by a turn, {jumps.size} times, first here"
-    remedy = "write position=unwrap(column, 2*pi):rad, or unwrap(column, 360):deg"
-    yield Finding("error", "wrapped", int(seen.log.row_numbers[jumps[0] + 1]), text, remedy)
+    if jumps.size and np.mean(np.abs(steps) > np.pi / 2.0) <= 0.2:
+        text = f"the position jumps by a turn, {jumps.size} times, first here"
+        remedy = "write position=unwrap(column, 2*pi):rad, or unwrap(column, 360):deg"
+        yield Finding("error", "wrapped", int(seen.log.row_numbers[jumps[0] + 1]), text, remedy)
 
 
+@_needs("")
 def _sizes(seen: Examined) -> Iterator[Finding]:
     """Values that no bench has."""
     for signal in _MOST.keys() & seen.log.signals.keys():
@@ -197,6 +206,7 @@ def _sizes(seen: Examined) -> Iterator[Finding]:
             yield Finding("error", "unit", None, text, f"correct its unit, such as {signal}=column:m{unit}")
 
 
+@_needs("voltage")
 def _supply(seen: Examined) -> Iterator[Finding]:
     """More voltage than the supply has, and what looks like a duty."""
     log, voltage = seen.log, np.abs(seen.log.signals["voltage"])
@@ -213,6 +223,7 @@ def _supply(seen: Examined) -> Iterator[Finding]:
         yield Finding("warning", "unit", None, text, remedy)
 
 
+@_needs("position")
 def _degrees(seen: Examined) -> Iterator[Finding]:
     """A position in degrees: gravity pulls as at a fraction of it, or its encoder divides 360 and not 2 pi."""
     log, effort, remedy = seen.log, seen.effort, "write position=column:deg"
@@ -235,6 +246,7 @@ def _degrees(seen: Examined) -> Iterator[Finding]:
             yield Finding("error" if encoder else "warning", "unit", None, text, remedy)
 
 
+@_needs("position velocity moves")
 def _velocity(seen: Examined) -> Iterator[Finding]:
     """The velocity against the differentiated position."""
     found = velocity_lag(seen.log)
@@ -262,6 +274,7 @@ def _velocity(seen: Examined) -> Iterator[Finding]:
         yield Finding("warning", "lag", None, text, remedy)
 
 
+@_needs("voltage current")
 def _electrical(seen: Examined) -> Iterator[Finding]:
     """Signs and certainty of R, L and kE."""
     balance = seen.winding
@@ -291,9 +304,10 @@ def _electrical(seen: Examined) -> Iterator[Finding]:
         yield Finding("warning", "voltage", None, text, remedy)
 
 
+@_needs("voltage current")
 def _delay(seen: Examined) -> Iterator[Finding]:
     """The current against the voltage."""
-    log, found = seen.log, current_lag(seen.log)
+    log, found = seen.log, effort_lag(seen.log, "voltage")
     if found is None or found.unexplained > 0.3:
         return
     rows = found.lag / log.step
@@ -310,21 +324,21 @@ def _delay(seen: Examined) -> Iterator[Finding]:
         yield Finding("warning" if log.mean_voltage else "info", "voltage", None, text, remedy)
 
 
+@_needs("voltage current")
 def _sag(seen: Examined) -> Iterator[Finding]:
     """A supply that gives way, where the share of its voltage changes; at one share it looks as the winding does."""
     balance, share = seen.winding, np.abs(seen.log.signals["voltage"])
-    with_sag = voltage_balance(seen.log, sag=True) if float(np.std(share)) > 0.1 * float(share.max()) else None
-    if balance is None or with_sag is None or with_sag.residual > 0.96 * balance.residual:
+    sagging = voltage_balance(seen.log, sag=True) if float(np.std(share)) > 0.1 * float(share.max()) else None
+    if balance is None or sagging is None or sagging.residual > 0.96 * balance.residual:
         return
-    supply = with_sag.values["supply_resistance"]
-    if with_sag.certainty["supply_resistance"] > _CERTAIN and supply > 0.03 * with_sag.values["resistance"] > 0.0:
-        text = (
-            f"the voltage sags as behind {supply:.2g} ohm, beside a winding of {with_sag.values['resistance']:.2g} ohm"
-        )
+    supply, winding = sagging.values["supply_resistance"], sagging.values["resistance"]
+    if sagging.certainty["supply_resistance"] > _CERTAIN and supply > 0.03 * winding > 0.0:
+        text = f"the voltage sags as behind {supply:.2g} ohm, beside a winding of {winding:.2g} ohm"
         remedy = "log the voltage of the supply, and write voltage=duty*bus:V"
         yield Finding("warning", "sag", None, text, remedy)
 
 
+@_needs("effort moves")
 def _mechanical(seen: Examined) -> Iterator[Finding]:
     """Signs of inertia and gravity; whether the motion follows from the torque."""
     log, effort, rig = seen.log, seen.effort, seen.rig
@@ -344,7 +358,7 @@ def _mechanical(seen: Examined) -> Iterator[Finding]:
     large = 0.08 * float(np.std(log.signals[effort]))  # else it is what fast changes leave of rounding
     if effort == "torque" and balance.unexplained > 0.25 and balance.residual > large:
         text = f"the motion leaves {balance.unexplained:.0%} of the torque unexplained (mean over 0.3 s)"
-        lag = motion_lag(log)
+        lag = effort_lag(log, effort)
         if lag is not None and abs(lag.lag) > log.step and lag.improvement < 0.9:
             text += f"; {lag.unexplained:.0%} if the motion came {1e3 * lag.lag:.3g} ms later"
         remedy = "something else moves it, or the columns are not of one time: trust this log less than others"
@@ -383,18 +397,19 @@ def _zero(balance: Balance | None, effort: str) -> Iterator[Finding]:
         yield Finding("warning", "zero", None, text, remedy)
 
 
+@_needs("motion")
 def _motion(seen: Examined) -> Iterator[Finding]:
     """Whether it moves back and forth."""
-    signals = seen.log.signals
+    signals, remedy = seen.log.signals, "leave position and velocity out if it is"
     speed = signals["velocity"] if "velocity" in signals else np.diff(signals["position"])
     if "stands" in seen.holds:
-        text = "the shaft stands still, as if it were locked"
-        yield Finding("info", "excitation", None, text, "leave position and velocity out if it is")
+        yield Finding("info", "excitation", None, "the shaft stands still, as if it were locked", remedy)
     elif seen.effort and min(float(speed.max()), float(-speed.min())) < 0.05 * float(np.abs(speed).max()):
         text = "the shaft turns one way only: friction cannot be told from a constant load"
         yield Finding("info", "excitation", None, text, "add a log that reverses")
 
 
+@_needs("voltage current torque")
 def _two_constants(seen: Examined) -> Iterator[Finding]:
     """The torque constant against the back-EMF constant, which in SI are equal but for losses and star or delta."""
     # the steps of an encoder take less from the speed of longer windows
@@ -410,41 +425,23 @@ def _two_constants(seen: Examined) -> Iterator[Finding]:
     elif abs(math.log(constant / back_emf)) > math.log(2.0):
         text = (
             f"torque/current is {constant:.3g} N*m/A and the back-EMF constant {back_emf:.3g} V*s/rad, must be about "
-            f"equal: {name_of_factor(constant / back_emf)}"
         )
+        text += f"equal: {name_of_factor(constant / back_emf)}"
         yield Finding("error", "unit", None, text, "correct the unit of torque, current, voltage or motion")
 
 
+@_needs("voltage current datasheet")
 def _datasheet(seen: Examined) -> Iterator[Finding]:
     """Resistance and back-EMF constant against what is printed."""
     motor, balance = seen.motor, seen.winding
-    if balance is None:
-        return
     constant = motor.back_emf_constant * motor.gear_ratio
     for name, value in (("resistance", motor.resistance), ("back_emf_constant", constant)):
-        found = balance.values.get(name, 0.0)
-        if balance.certainty.get(name, 0.0) > _CERTAIN and value > 0.0 and abs(math.log(found / value)) > math.log(2.0):
+        if balance is None or balance.certainty.get(name, 0.0) <= _CERTAIN or value <= 0.0:
+            continue
+        found = balance.values[name]
+        if abs(math.log(found / value)) > math.log(2.0):
             unit = PARAMETERS[name].unit
             text = f"the {name.replace('_', ' ')} would be {found:.3g} {unit}, the datasheet says {value:.3g} {unit}: "
             remedy = "correct the units of voltage, current and motion, or name the right motor"
             text += name_of_factor(found / value, name != "resistance")
             yield Finding("error", "unit", None, text, remedy)
-
-
-CHECKS: tuple[tuple[str, Callable[[Examined], Iterator[Finding]]], ...] = (
-    ("", _times),
-    ("", _signals),
-    ("position", _wrapped),
-    ("", _sizes),
-    ("voltage", _supply),
-    ("position", _degrees),
-    ("position velocity moves", _velocity),
-    ("voltage current", _electrical),
-    ("voltage current", _delay),
-    ("voltage current", _sag),
-    ("effort moves", _mechanical),
-    ("motion", _motion),
-    ("voltage current torque", _two_constants),
-    ("voltage current datasheet", _datasheet),
-)
-"""What a check needs of a log, by words of `Examined.holds`, and what finds and words what it finds; in this order."""

@@ -2,9 +2,10 @@
 
 import ast
 import dataclasses
+import functools
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -55,19 +56,24 @@ class Column:
     def __post_init__(self) -> None:
         """Validate, without a file."""
         check_names([self.signal], KINDS, "signal")
-        tree = self._tree()
-        for node in ast.walk(tree):
+        for node in ast.walk(self._tree):
             if not isinstance(node, _ALLOWED) or (isinstance(node, ast.BinOp) and type(node.op) not in _OPERATORS):
                 raise ValueError(
                     f"columns: {self.text}: {type(node).__name__} is not allowed; write names, numbers, + - * / and "
                     f"{', '.join(FUNCTIONS)}"
                 )
-        for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
-            self._check_call(call)
+        for call in (node for node in ast.walk(self._tree) if isinstance(node, ast.Call)):
+            name = call.func.id if isinstance(call.func, ast.Name) else "?"
+            check_names([name], FUNCTIONS, "function")
+            needed = FUNCTIONS[name][0]
+            if len(call.args) != needed:
+                raise ValueError(f"columns: {self.text}: {name} takes {needed} arguments, not {len(call.args)}")
+            if needed == 2 and _names(call.args[1]):
+                raise ValueError(f"columns: {self.text}: the second argument of {name} must be a number, such as 16")
         kind = KINDS[self.signal]
         if self.unit is not None:
             self._quantity(1.0)
-        elif kind and isinstance(tree.body, ast.Name | ast.Constant):
+        elif kind and isinstance(self._tree.body, ast.Name | ast.Constant):
             raise ValueError(
                 f"columns: {self.text}: has no unit, must have one that is of {kind}; write "
                 f"{self.signal}={self.formula}:{kind} if it is in {kind}"
@@ -81,16 +87,15 @@ class Column:
     @property
     def names(self) -> set[str]:
         """The columns and constants that it reads."""
-        tree = self._tree()
-        calls = {id(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call)}
-        return {name for node, name in _names(tree) if id(node) not in calls and name != "pi"}
+        return _names(self._tree)
 
     def value(self, table: Mapping[str, Any]) -> Any:
         """The signal in SI, by a table of columns and constants."""
         check_names(self.names, table, "column")
         with np.errstate(divide="ignore", invalid="ignore"):
-            return self._quantity(_evaluate(self._tree().body, {"pi": math.pi, **table}))
+            return self._quantity(_evaluate(self._tree.body, {"pi": math.pi, **table}))
 
+    @functools.cached_property
     def _tree(self) -> ast.Expression:
         try:
             return ast.parse(self.formula.strip(), mode="eval")
@@ -99,15 +104,6 @@ class Column:
                 f"columns: {self.signal}={self.formula}: no formula ({error.msg}); write a column's name, in quotes if "
                 f"it has spaces, as in {_EXAMPLE}"
             ) from None
-
-    def _check_call(self, call: ast.Call) -> None:
-        name = call.func.id if isinstance(call.func, ast.Name) else "?"
-        check_names([name], FUNCTIONS, "function")
-        needed = FUNCTIONS[name][0]
-        if len(call.args) != needed or call.keywords:
-            raise ValueError(f"columns: {self.text}: {name} takes {needed} arguments, not {len(call.args)}")
-        if needed == 2 and {name for _, name in _names(call.args[1])} - {"pi"}:
-            raise ValueError(f"columns: {self.text}: the second argument of {name} must be a number, such as 16")
 
     def _quantity(self, value: Any) -> Any:
         """A value in SI."""
@@ -136,12 +132,14 @@ _ALLOWED = (
 )
 
 
-def _names(tree: ast.AST) -> Iterator[tuple[ast.AST, str]]:
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Name):
-            yield node, node.id
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-            yield node, node.value
+def _names(tree: ast.AST) -> set[str]:
+    """What a formula reads: names that are not called, and texts."""
+    nodes = list(ast.walk(tree))
+    called = [node.func for node in nodes if isinstance(node, ast.Call)]
+    plain = {node.id for node in nodes if isinstance(node, ast.Name) and node not in called}
+    return (plain | {one.value for one in nodes if isinstance(one, ast.Constant) and isinstance(one.value, str)}) - {
+        "pi"
+    }
 
 
 def _evaluate(node: ast.AST, table: Mapping[str, Any]) -> Any:

@@ -5,12 +5,14 @@ variable projection method for solving separable nonlinear least squares problem
 handful of unknowns however many segments there are.
 """
 
+import abc
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
+from codrl_mj.identify.log import Log
 from codrl_mj.identify.parameters import DEFAULTS, PARAMETERS
 from codrl_mj.identify.segments import Segment
 
@@ -22,15 +24,19 @@ SCREENING = 12
 Simulate = Callable[[Segment, np.ndarray], np.ndarray]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Model:
-    """What is fitted; `at` is a subclass's."""
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class Model(abc.ABC):
+    """A part of a motor: what drives it, what is known of it and what is fitted; how it does so is a subclass's."""
 
-    names: tuple[str, ...]
-    """Free parameters."""
+    driven_by: str
+    """Signal of a log."""
+    output: str
+    """Signal that a simulation is compared with."""
     known: Mapping[str, float]
-    """Values of the others."""
-    scales: np.ndarray
+    """Values of parameters that are not fitted."""
+    names: tuple[str, ...] = ()
+    """Free parameters; none before `begun`."""
+    scales: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(0))
     """What a change of each is measured by, > 0, shape (p,)."""
     steps: ClassVar[np.ndarray]
     """Steps of finite differences of the state, shape (s,)."""
@@ -49,16 +55,26 @@ class Model:
         """Free and known parameters by name."""
         return {**DEFAULTS, **self.known, **dict(zip(self.names, map(float, values), strict=True))}
 
+    @abc.abstractmethod
+    def segments(self, logs: Sequence[Log]) -> list[Segment]:
+        """The logs, cut."""
+
+    @abc.abstractmethod
+    def begun(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
+        """With what is free in such segments, and starts for it, each of shape (p,)."""
+
+    @abc.abstractmethod
     def at(self, values: np.ndarray) -> Simulate:
         """(segment, state at its beginning) -> what the sensor would have seen, shape (m,), for parameters (p,)."""
-        raise NotImplementedError
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Fit:
     """Parameters that fit, and what is needed to judge them."""
 
-    names: tuple[str, ...]
+    model: Any
+    """A `Model`."""
+    segments: Sequence[Segment]
     values: np.ndarray
     """Shape (p,)."""
     cost: float
@@ -71,6 +87,10 @@ class Fit:
     """Of each segment, what its states cannot do taken out, shape (m, p)."""
     states: tuple[np.ndarray, ...]
     """At the beginning of each segment."""
+
+    def costs(self, scale: float) -> np.ndarray:
+        """Robust cost of each segment."""
+        return np.array([robust_cost(residuals, scale) for residuals in self.residuals])
 
     def weights(self, segment: int) -> np.ndarray:
         """What each of a segment's residuals counts: 1 where it is small, shape (m,)."""
@@ -131,12 +151,6 @@ def settled_state(model: Model, values: np.ndarray, segment: Segment) -> np.ndar
     return _settle(simulate, segment, segment.state, model.steps, scale).state
 
 
-def settled(model: Model, values: np.ndarray, segments: Sequence[Segment]) -> list[np.ndarray]:
-    """What the model makes of each segment, shape (m,), from the state from which it fits best."""
-    simulate = model.at(values)
-    return [simulate(segment, settled_state(model, values, segment)) for segment in segments]
-
-
 class _Problem:
     """The outer problem, as scipy takes it; begins from the states at the last Jacobian, moved as that says."""
 
@@ -186,57 +200,34 @@ class _Problem:
         return np.concatenate(self.jacobians(values))
 
 
-def _minimise(problem: _Problem, start: np.ndarray, most: int) -> np.ndarray:
-    from scipy.optimize import least_squares
-
-    model = problem.model
-    if not model.names or not most:
-        return start
-    inside = np.clip(start, model.lower + 1e-9 * model.scales, model.upper - 1e-9 * model.scales)
-    found = least_squares(
-        problem.residuals,
-        inside,
-        problem.jacobian,
-        bounds=(model.lower, model.upper),
-        x_scale=model.scales,
-        loss="soft_l1",
-        f_scale=problem.scale,
-        max_nfev=most,
-        xtol=1e-6,
-        ftol=1e-6,
-        gtol=1e-10,
-    )
-    return np.asarray(found.x)
-
-
 def robust_scale(residuals: np.ndarray) -> float:
     """One and a half standard deviations of what is no outlier, and at least those of the sensor."""
     return 1.5 * max(1.4826 * float(np.median(np.abs(residuals))), 1.0)
 
 
-def estimate(
-    model: Model,
-    segments: Sequence[Segment],
-    starts: Sequence[np.ndarray],
-    on_start: Callable[[], None] = lambda: None,
-    most: int = 40,
-    scale: float | None = None,
+def refit(
+    model: Model, segments: Sequence[Segment], start: np.ndarray, most: int = 40, scale: float | None = None
+) -> Fit:
+    """A fit from parameters that are about right, and from the states that they fit best from."""
+    return _refined(model, segments, start, [settled_state(model, start, one) for one in segments], most, scale)
+
+
+def search(
+    model: Model, segments: Sequence[Segment], starts: Sequence[np.ndarray], on_start: Callable[[], None] = lambda: None
 ) -> tuple[Fit, tuple[Fit, ...]]:
-    """Fit a model to segments: the best fit, and what each start led to."""
-    if len(starts) == 1:
-        states = [settled_state(model, starts[0], one) for one in segments]
-        best = _refined(model, segments, starts[0], states, most, scale)
-        on_start()
-        return best, (best,)
+    """The best fit from any of several starts, and what each of them led to, the best first."""
     found = []
     for start in starts:
         found.append(_refined(model, segments, start, [segment.state for segment in segments], SCREENING))
         on_start()
     least = min(one.scale for one in found)
-    found.sort(key=lambda one: robust_cost(np.concatenate(one.residuals), least))
-    polished = [_refined(model, segments, one.values, one.states, most, one.scale) for one in found[:2]]
-    best = min(polished, key=lambda one: robust_cost(np.concatenate(one.residuals), least))
-    return best, tuple(found)
+
+    def cost(fit: Fit) -> float:
+        return robust_cost(np.concatenate(fit.residuals), least)
+
+    found.sort(key=cost)
+    polished = [_refined(model, segments, one.values, one.states, 40, one.scale) for one in found[:2]]
+    return min(polished, key=cost), tuple(found)
 
 
 def _refined(
@@ -252,23 +243,32 @@ def _refined(
     In the end each state is also looked for from the segment's own guess: dry friction gives a segment several minima,
     and the one that it was in under other parameters need not be the best.
     """
+    from scipy.optimize import least_squares
+
     values = np.clip(start, model.lower, model.upper)
     if scale is None:
         simulate = model.at(values)
         left = [_residuals(simulate, one, state) for one, state in zip(segments, states, strict=True)]
         scale = robust_scale(np.concatenate(left))
     problem = _Problem(model, segments, states, scale)
-    values = _minimise(problem, values, most)
+    if model.names and most:
+        values = least_squares(
+            problem.residuals,
+            np.clip(values, model.lower + 1e-9 * model.scales, model.upper - 1e-9 * model.scales),
+            problem.jacobian,
+            bounds=(model.lower, model.upper),
+            x_scale=model.scales,
+            loss="soft_l1",
+            f_scale=scale,
+            max_nfev=most,
+            xtol=1e-6,
+            ftol=1e-6,
+            gtol=1e-10,
+        ).x
     problem.scale = robust_scale(problem.residuals(values))
     problem.reconsider(values)
     jacobians = problem.jacobians(values)
     found = problem.solve(values)
-    return Fit(
-        model.names,
-        values,
-        robust_cost(np.concatenate([one.residuals for one in found]), problem.scale),
-        problem.scale,
-        tuple(one.residuals for one in found),
-        tuple(jacobians),
-        tuple(one.state for one in found),
-    )
+    residuals = tuple(one.residuals for one in found)
+    cost, states = robust_cost(np.concatenate(residuals), problem.scale), [one.state for one in found]
+    return Fit(model, segments, values, cost, problem.scale, residuals, tuple(jacobians), tuple(states))

@@ -5,12 +5,16 @@ of the logs are resampled, and the interval is widened by what differs between l
 simulated and fitted again, and by what is found at half the rate.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from codrl_mj.identify.estimate import Fit
-from codrl_mj.identify.segments import Segment
+from codrl_mj.identify.estimate import Fit, refit
+from codrl_mj.identify.fitting import Fitted
+from codrl_mj.identify.log import Log
+from codrl_mj.identify.models import WindingModel
+from codrl_mj.identify.segments import halved, moves, replaced
 
 LEAST_LOGS = 5
 """From so many logs on whole logs are resampled; below, blocks of them."""
@@ -21,6 +25,10 @@ ATTENUATION = 6.0
 """How much larger than the share of variance that is not explained the bias by errors of the input may be."""
 SLACK = 1e-3
 """Share of the cost that a fit may be better by luck: dry friction has many minima."""
+UNKNOWN = 0.5
+"""A direction in which the parameters may go by so much of themselves, unnoticed, is not identified."""
+PART = 0.1
+"""Share of such a direction from which a parameter belongs to it."""
 
 
 def total(causes: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -29,14 +37,15 @@ def total(causes: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.asarray(np.hypot(wide, causes["half_rate"]) + causes["self_test"] + causes["unexplained"])
 
 
-def unexplained(fit: Fit, segments: Sequence[Segment]) -> float:
+def unexplained(fit: Fit) -> float:
     """Share by which a factor of the input may be off for what is not explained.
 
     Errors of the input, as of a voltage that changes between the rows, attenuate its factor by a multiple of their
     share of the variance: 2 to 4.6 of PRBS whose clock is 1 to 4 rows; no fit of fewer rows shows it.
     """
-    rest = sum(one.deviation**2 * float(fit.weights(i) @ fit.residuals[i] ** 2) for i, one in enumerate(segments))
-    return ATTENUATION * rest / max(sum(float(np.var(one.measured)) * len(one.measured) for one in segments), 1e-300)
+    rest = sum(one.deviation**2 * float(fit.weights(i) @ fit.residuals[i] ** 2) for i, one in enumerate(fit.segments))
+    swing = sum(float(np.var(one.measured)) * len(one.measured) for one in fit.segments)
+    return ATTENUATION * rest / max(swing, 1e-300)
 
 
 def _sums(fit: Fit, groups: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -64,9 +73,7 @@ def _inverse(matrix: np.ndarray, scales: np.ndarray) -> np.ndarray:
     return np.asarray((vectors / np.maximum(values, FLAT)) @ vectors.T * np.outer(units, units))
 
 
-def half_widths(
-    fit: Fit, segments: Sequence[Segment], scales: np.ndarray, of: np.ndarray, seed: int
-) -> dict[str, np.ndarray]:
+def half_widths(fit: Fit, scales: np.ndarray, of: np.ndarray, seed: int) -> dict[str, np.ndarray]:
     """Half-widths of 95 % intervals by cause, each of shape (q,), of `of` @ the parameters with `of` of shape (q, p).
 
     `curvature`: were the model exact and each residual by itself: never less, however few the stretches. `resampling`:
@@ -76,7 +83,7 @@ def half_widths(
     """
     from scipy.stats import t
 
-    by_log, by_block = _sums(fit, [one.log for one in segments]), _sums(fit, [one.block for one in segments])
+    by_log, by_block = (_sums(fit, [getattr(one, part) for one in fit.segments]) for part in ("log", "block"))
     inverse = _inverse(by_block[1].sum(axis=0), scales)
     curvature = 1.96 * np.sqrt(_noise(fit) * np.diag(of @ inverse @ of.T))
     logs, count = np.zeros(len(of)), len(by_log[0])
@@ -95,28 +102,59 @@ def half_widths(
 
 def correlations(fit: Fit) -> dict[str, dict[str, float]]:
     """Of the parameters, each with each, by the Jacobian: near 1 or -1, one may stand for the other."""
-    if not fit.names:
+    names = fit.model.names
+    if not names:
         return {}
     _, matrices = _sums(fit, [0] * len(fit.residuals))
-    covariance = _inverse(matrices[0], np.ones(len(fit.values)))
+    covariance = _inverse(matrices[0], np.ones(len(names)))
     spread = np.sqrt(np.diag(covariance))
     table = np.clip(covariance / np.outer(spread, spread), -1.0, 1.0).tolist()
-    return {name: dict(zip(fit.names, row, strict=True)) for name, row in zip(fit.names, table, strict=True)}
+    return {name: dict(zip(names, row, strict=True)) for name, row in zip(names, table, strict=True)}
 
 
-def weakest_direction(fit: Fit, segments: Sequence[Segment], scales: np.ndarray) -> np.ndarray:
-    """The direction in which the parameters change the residuals least, in their scales: a unit vector, shape (p,)."""
-    _, matrices = _sums(fit, [segment.block for segment in segments])
-    return np.asarray(np.linalg.eigh(matrices.sum(axis=0) * np.outer(scales, scales))[1][:, 0])
+def unknown_directions(fit: Fit, scales: np.ndarray) -> list[dict[str, float]]:
+    """Directions in which the parameters may go, and nobody would notice: parameter -> share, the largest 1.
+
+    In the direction that the derivatives say is the weakest, the parameter that has most of it is moved by half its
+    scale, shape (p,), and all others are fitted anew: if the logs are then explained as well, what the others did is
+    the direction. (Derivatives alone do not tell: dry friction makes them rough, and what is flat looks known.)
+    """
+    found: list[dict[str, float]] = []
+    here, own = fit, scales
+    while len(here.model.names) > 1 or not found:
+        model, values = here.model, here.values
+        matrix = _sums(here, [one.block for one in here.segments])[1].sum(axis=0)
+        direction = np.linalg.eigh(matrix * np.outer(own, own))[1][:, 0]  # a unit vector, in the scales
+        place = int(np.argmax(np.abs(direction)))
+        step = UNKNOWN * own[place] * np.sign(direction[place])
+        if not model.lower[place] <= values[place] + step <= model.upper[place]:
+            step = -step
+        start = np.clip(values + step / own[place] / direction[place] * direction * own, 0.2 * values, None)
+        rest = dataclasses.replace(
+            model,
+            names=tuple(np.delete(model.names, place).tolist()),
+            known={**model.known, model.names[place]: float(values[place] + step)},
+            scales=np.delete(model.scales, place),
+        )
+        other = refit(rest, here.segments, np.delete(start, place), 20, here.scale)
+        if other.costs(here.scale).sum() > here.cost + _noticed(here):
+            break
+        changes = (other.values - np.delete(values, place)) / np.delete(own, place)
+        shares = np.insert(changes, place, step / own[place]) / step * own[place]
+        found.append({name: float(s) for name, s in zip(model.names, shares, strict=True) if abs(s) > PART})
+        if len(model.names) == 1:
+            break
+        here, own = other, np.delete(own, place)
+    return found
 
 
-def noticed(fit: Fit, segments: Sequence[Segment]) -> float:
+def _noticed(fit: Fit) -> float:
     """By how much the robust cost must rise to be more than chance, at 95 %.
 
     Residuals of a block belong together: the ratio of both estimates of the covariance along the direction that is
     known best, by blocks and by rows, makes up for that.
     """
-    gradients, matrices = _sums(fit, [segment.block for segment in segments])
+    gradients, matrices = _sums(fit, [segment.block for segment in fit.segments])
     whole = matrices.sum(axis=0)
     root = np.sqrt(np.maximum(np.diag(whole), 1e-300))
     strengths, vectors = np.linalg.eigh(whole / root / root[:, None])
@@ -124,3 +162,48 @@ def noticed(fit: Fit, segments: Sequence[Segment]) -> float:
     noise = _noise(fit)
     together = max(float(pulls @ pulls) / max(strengths[-1] * noise, 1e-30), 1.0)
     return 3.84 * noise * together + SLACK * fit.cost
+
+
+def half_rate(part: Fitted) -> np.ndarray:
+    """The parameters at half the rate."""
+    return _again(part.fit, [halved(log) for log in part.logs])
+
+
+def self_test(part: Fitted) -> np.ndarray:
+    """The parameters found in what the fit would have made of its logs: the mean of two such, of opposed residuals.
+
+    Residuals keep their order and size, stretch by stretch with a random sign, so that they belong together as they
+    do in the logs; in the mean of a draw and its opposite what they do at random cancels.
+    """
+    return np.asarray(0.5 * sum(_again(part.fit, _pretended(part, sign)) for sign in (1.0, -1.0)))
+
+
+def _again(fit: Fit, logs: Sequence[Log]) -> np.ndarray:
+    """The parameters that other logs give, from where a fit ended."""
+    return refit(fit.model, fit.model.segments(logs), fit.values, 20).values
+
+
+def _pretended(part: Fitted, sign: float) -> list[Log]:
+    """The logs as the fit would have made them, rounded anew; of a winding also what it took for the motion."""
+    fit, output, simulate = part.fit, part.fit.model.output, part.fit.model.at(part.fit.values)
+    signals = [log.signals[output].copy() for log in part.logs]
+    speeds = [np.zeros(len(log.time)) for log in part.logs]
+    signs = np.random.default_rng(1).choice([-1.0, 1.0], len(fit.segments)) * sign
+    for place, segment in enumerate(fit.segments):
+        # what is far off is an outlier of the logs, and no noise of the sensor
+        noise = np.clip(fit.residuals[place], -3.0 * fit.scale, 3.0 * fit.scale) * segment.deviation
+        signals[segment.log][segment.rows] = simulate(segment, fit.states[place]) + signs[place] * noise
+        speeds[segment.log][segment.rows] = segment.speeds
+    made = []
+    for log, values, speed in zip(part.logs, signals, speeds, strict=True):
+        made.append(_rounded(log, output, values))
+        if isinstance(fit.model, WindingModel) and log.has("position") and moves(log):
+            turns = np.append(0.0, np.cumsum(speed[:-1] * np.diff(log.time)))
+            made[-1] = _rounded(made[-1], "position", log.signals["position"][0] + turns)
+    return made
+
+
+def _rounded(log: Log, name: str, values: np.ndarray) -> Log:
+    """A log with another signal, rounded as its sensor rounds."""
+    step = log.resolution.get(name, 0.0)
+    return replaced(log, name, np.round(values / step) * step if step > 0.0 else values)

@@ -10,20 +10,20 @@ import numpy as np
 
 from codrl_mj.fields import check_names
 from codrl_mj.identify import honesty
+from codrl_mj.identify.fitting import Fitted, fitted, with_friction
 from codrl_mj.identify.judgement import judged
 from codrl_mj.identify.log import Log
-from codrl_mj.identify.models import ShaftStage, WindingStage
+from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import ESTIMABLE, OF_RIG, PARAMETERS
-from codrl_mj.identify.prediction import fitted_traces, predict
+from codrl_mj.identify.prediction import Prediction, fitted_traces, predict
 from codrl_mj.identify.result import Identified, missing
 from codrl_mj.identify.segments import SEGMENT, moves, shifted
-from codrl_mj.identify.stages import Fitted, chosen_friction, fitted
 
 INPUTS = "torque", "current", "voltage"
 """What drives the shaft: the nearest to it that all logs that move have."""
 OUTPUTS = "position", "velocity"
 """What a simulation is compared with."""
-STEPS_OF_A_STAGE = 8 + 4
+STEPS_OF_A_PART = 8 + 4
 RAREST = 0.05
 """Rows that are farther apart [s] say too little within the time that is foretold."""
 
@@ -62,52 +62,66 @@ def identify(
     """
     given = checked(logs, rig, known or {}, friction, estimated, segment, base)
     rig = rig or ("pendulum" if "mgl" in given else "free")
-    moving, electrical = [log for log in logs if moves(log)], _electrical(logs)
-    driven_by, output = _common(moving, *INPUTS), _common(moving, *OUTPUTS) or ""
-    total = STEPS_OF_A_STAGE * max(bool(electrical) + bool(moving), 1) + 4 * len(moving) * (friction == "auto")
+    electrical, moving, driven_by, output = _uses(logs)
+    total = STEPS_OF_A_PART * max(bool(electrical) + bool(moving), 1) + 4 * len(moving) * (friction == "auto")
     done = itertools.count(1)
 
     def step(what: str) -> Callable[[], None]:
         return lambda: on_progress(what, min(next(done), total), total)
 
-    # the winding, and the shaft by the torque constant that the winding tells; then each again, beside the other
-    winding = shaft = None
-    constant: dict[str, float] = {}
-    if electrical:
-        winding = fitted(WindingStage(given), electrical, step("winding"))
-    if driven_by is not None:
-        constant = _constant(given, winding, driven_by, estimated)
-        stage = ShaftStage(rig, "coulomb", driven_by, {**given, **constant}, tuple(estimated), segment, output)
-        shaft = fitted(chosen_friction(stage, moving, friction, step("friction")), moving, step("shaft"))
-        if winding is not None and driven_by != "voltage":
-            winding = winding.refitted(WindingStage(given, shaft))
-        constant = _constant(given, winding, driven_by, estimated)
-        shaft = shaft.refitted(dataclasses.replace(shaft.stage, known={**shaft.stage.known, **constant}))
-
-    parts = {name: one for name, one in (("winding", winding), ("shaft", shaft)) if one is not None}
-    estimates, warnings, unexplained = judged(parts, given, bool(constant), seed, step)
-    foretold, foretold_too = (
-        tuple(predict(shaft.model, shaft.fit.values, shifted(log, shaft.model.driven_by, shaft.delay))
-              for log in several if shaft is not None and moves(log) and log.has(shaft.model.driven_by, output))
-        for several in (moving, held_out)
-    )  # fmt: skip
+    shaft = ShaftModel(rig=rig, friction="coulomb", driven_by=driven_by or "", output=output, known=given,
+                       estimated=tuple(estimated), segment=segment)  # fmt: skip
+    parts = _parts(WindingModel(known=given), electrical, shaft, moving, friction, step)
+    estimates, warnings, unexplained = judged(parts, given, seed, step)
     volts = [log.signals[name] for log in logs for name in ("voltage", "bus") if log.has(name)]
     return Identified(
         tuple(log.name for log in logs),
         rig,
-        friction if shaft is None else shaft.stage.friction,
+        parts["shaft"].fit.model.friction if "shaft" in parts else friction,
         driven_by,
         {name: part.delay for name, part in parts.items()},
         tuple(estimates),
-        foretold,
-        foretold_too,
+        _foretold(parts.get("shaft"), moving),
+        _foretold(parts.get("shaft"), held_out),
         tuple(warnings),
         base,
-        tuple(one for name, part in parts.items() for one in fitted_traces(name, part)),
+        tuple(one for name, part in parts.items() for one in fitted_traces(name, part.fit, part.logs)),
         {name: honesty.correlations(parts[name].fit) if name in parts else {} for name in ("winding", "shaft")},
         max((float(np.abs(one).max()) for one in volts), default=None),
         unexplained,
     )
+
+
+def _parts(
+    winding: WindingModel,
+    electrical: Sequence[Log],
+    shaft: ShaftModel,
+    moving: Sequence[Log],
+    friction: str,
+    step: Callable[[str], Callable[[], None]],
+) -> dict[str, Fitted]:
+    """The winding, and the shaft by the torque constant that the winding tells; then each again, beside the other."""
+    parts: dict[str, Fitted] = {}
+    if electrical:
+        parts["winding"] = fitted(winding, electrical, step("winding"))
+    if not shaft.driven_by:
+        return parts
+    told = with_friction(_told(shaft, parts.get("winding")), moving, friction, step("friction"))
+    parts["shaft"] = fitted(told, moving, step("shaft"))
+    if electrical and shaft.driven_by != "voltage":
+        parts["winding"] = parts["winding"].refitted(dataclasses.replace(winding, shaft=parts["shaft"]))
+    told = _told(dataclasses.replace(shaft, friction=told.friction), parts.get("winding"))
+    parts["shaft"] = parts["shaft"].refitted(told)
+    return parts
+
+
+def _told(shaft: ShaftModel, winding: Fitted | None) -> ShaftModel:
+    """The shaft, with the back-EMF constant for a torque constant that is not known: but for losses they are equal."""
+    numbers = shaft.known if winding is None else winding.fit.model.all_values(winding.fit.values)
+    constant = numbers.get("back_emf_constant", 0.0)
+    if shaft.driven_by != "current" or "torque_constant" in (*shaft.known, *shaft.estimated) or not constant > 0.0:
+        return shaft
+    return dataclasses.replace(shaft, known={**shaft.known, "torque_constant": constant})
 
 
 def checked(
@@ -126,8 +140,7 @@ def checked(
     # of a motor with a gear that too: otherwise its numbers would be those of the output
     ratio = drive.motor.gear_ratio if isinstance(drive, Drive) else 1.0
     known = {**({} if ratio == 1.0 else {"gear_ratio": ratio}), **(known or {})}
-    moving = [log for log in logs if moves(log)]
-    driven_by = _common(moving, *INPUTS)
+    electrical, moving, driven_by, output = _uses(logs)
     if not segment >= 0.05:
         raise ValueError(f"segment = {segment!r}: must be >= 0.05 s; {SEGMENT:g} is the default")
     if not logs:
@@ -143,7 +156,7 @@ def checked(
                 f"known {name} = {value!r}: must be from {parameter.least:g} to {parameter.most:g} "
                 f"{parameter.unit}; give {parameter.what}".strip()
             )
-    if not _electrical(logs) and driven_by is None:
+    if not electrical and driven_by is None:
         have = "; ".join(f"{log.name}: {', '.join(log.signals) or 'nothing'}" for log in logs)
         raise ValueError(
             f"logs tell nothing ({have}): give voltage and current for the winding, or torque, current or voltage with "
@@ -155,7 +168,7 @@ def checked(
     possible = [name for name, only in ESTIMABLE.items() if only is None or only == driven_by]
     if driven_by is not None or estimated:
         check_names(estimated, possible, f"parameter of a shaft under a {driven_by}", "estimated.")
-    if moving and _common(moving, *OUTPUTS) is None:
+    if moving and not output:
         have = "; ".join(f"{log.name}: {'position' if log.has('position') else 'velocity'}" for log in moving)
         raise ValueError(f"logs tell different things ({have}): give all that move a position, or all a velocity")
     rare = [log for log in moving if log.step > RAREST]
@@ -168,39 +181,36 @@ def checked(
             "rig is not given (--rig on the command line, rig= in Python): what the output moves decides what is "
             "fitted, must be pendulum, free or load; a motor on its own is free, with load_inertia=0 known"
         )
-    return known
+    return {name: float(value) for name, value in known.items()}
 
 
 def foreseen(logs: Sequence[Log], known: Mapping[str, float], base: Mapping[str, Any] | None) -> str | None:
     """What will be missing for an actuator however well logs are fitted, by their signals; None: nothing."""
-    moving = [log for log in logs if moves(log)]
-    driven_by = _common(moving, *INPUTS)
-    names = {*known, *(("resistance", "inductance") if _electrical(logs) else ())}
+    electrical, moving, driven_by, _ = _uses(logs)
+    names = {*known, *(("resistance", "inductance") if electrical else ())}
     names |= {"resistance"} if driven_by == "voltage" else set()
     constants = {"torque_constant", "back_emf_constant"}
-    if names & constants or driven_by == "voltage" or (_electrical(logs) and moving):
+    if names & constants or driven_by == "voltage" or (electrical and moving):
         names |= constants
     if "load_inertia" in known and driven_by is not None:
         names |= {"rotor_inertia"}
     return missing(names, base)
 
 
-def _electrical(logs: Sequence[Log]) -> list[Log]:
-    return [log for log in logs if log.has("voltage", "current")]
+def _uses(logs: Sequence[Log]) -> tuple[list[Log], list[Log], str | None, str]:
+    """Logs that tell the winding, logs that tell the shaft; by which input, and by which output if they have one."""
+    moving = [log for log in logs if moves(log)]
+    driven_by, output = (
+        next((name for name in names if moving and all(log.has(name) for log in moving)), None)
+        for names in (INPUTS, OUTPUTS)
+    )
+    return [log for log in logs if log.has("voltage", "current")], moving, driven_by, output or ""
 
 
-def _common(logs: Sequence[Log], *names: str) -> str | None:
-    """The first of these signals that all logs have."""
-    return next((name for name in names if logs and all(log.has(name) for log in logs)), None)
-
-
-def _constant(
-    given: Mapping[str, float], winding: Fitted | None, driven_by: str, estimated: Sequence[str]
-) -> dict[str, float]:
-    """The back-EMF constant where it stands for the torque constant, which it is in SI units but for losses."""
-    if driven_by != "current" or "torque_constant" in {*given, *estimated}:
-        return {}
-    if "back_emf_constant" in given:
-        return {"torque_constant": given["back_emf_constant"]}
-    found = {} if winding is None else winding.model.all_values(winding.fit.values)
-    return {"torque_constant": found["back_emf_constant"]} if found.get("back_emf_constant", 0.0) > 0.0 else {}
+def _foretold(shaft: Fitted | None, logs: Sequence[Log]) -> tuple[Prediction, ...]:
+    """What the shaft makes of those of the logs that it is told by."""
+    if shaft is None:
+        return ()
+    driven_by, output = shaft.fit.model.driven_by, shaft.fit.model.output
+    told = [log for log in logs if moves(log) and log.has(driven_by, output)]
+    return tuple(predict(shaft.fit, shifted(log, driven_by, shaft.delay)) for log in told)

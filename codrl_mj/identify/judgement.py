@@ -3,16 +3,17 @@
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from codrl_mj.identify import honesty
-from codrl_mj.identify.models import ShaftStage, WindingStage
+from codrl_mj.identify.estimate import Fit
+from codrl_mj.identify.fitting import Fitted
+from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import DEFAULTS, FRICTION, PARAMETERS
 from codrl_mj.identify.result import Estimate, Status
 from codrl_mj.identify.segments import BLOCK
-from codrl_mj.identify.stages import PART, Fitted
 
 WIDEST = 0.3
 """An interval of more than this share of the value to either side is too wide; of the whole friction, for friction."""
@@ -45,160 +46,146 @@ UNLIKE = 0.02
 
 
 def judged(
-    parts: Mapping[str, Fitted], given: Mapping[str, float], by_constant: bool, seed: int, step: Callable[[str], Any]
+    parts: Mapping[str, Fitted], given: Mapping[str, float], seed: int, step: Callable[[str], Any]
 ) -> tuple[list[Estimate], list[str], float]:
-    """Every number that was found, given or follows, warnings, and the largest share of a log that is not explained.
-
-    `by_constant`: the shaft's torque constant is the back-EMF constant.
-    """
+    """Every number that was found, given or follows, warnings, and the largest share of a log that is not explained."""
     estimates: list[Estimate] = []
     warnings: list[str] = []
     unlike: dict[str, float] = {}
     for name, part in parts.items():
-        constant = next((one for one in estimates if by_constant and one.name == "back_emf_constant"), None)
-        found = _of_part(part, seed, step(name))
-        estimates += found if constant is None else _with_constant(found, constant, part.stage)
+        found, known = _of_part(part, seed, step(name)), part.fit.model.known
+        if "torque_constant" in known and "torque_constant" not in given:  # it is the back-EMF constant
+            constant = [one for one in estimates if one.name == "back_emf_constant"]
+            found = _with_constant(found, constant[0], known) if constant else found
+        estimates += found
         warnings += _warnings(part, unlike)
     return _completed(estimates, given), warnings, max(unlike.values(), default=0.0)
 
 
 def _of_part(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estimate]:
-    """Every free parameter of a stage with its interval and status, and their sum where they are friction."""
-    fit, model = part.fit, part.model
-    if not fit.names:
+    """Every free parameter of a part with its interval and status, and their sum where they are friction."""
+    fit, model, names = part.fit, part.fit.model, part.fit.model.names
+    if not names:
         return []
-    friction, electrical = _Friction.of(part), isinstance(part.stage, WindingStage)
+    friction, slopes_of, all_of = _friction(fit)
     # what a change is measured by: the value itself or, of friction, what would be all of it
-    scales = [
-        friction.all_of(name) if name in FRICTION else abs(value)
-        for name, value in zip(fit.names, fit.values, strict=True)
-    ]
-    scales = np.maximum(scales, 1e-6 * model.scales)
-    slopes = np.array([friction.slopes.get(name, 0.0) for name in fit.names])
-    names, of = fit.names, np.eye(len(fit.names))
+    own = [all_of[name] if name in FRICTION else abs(fit.values[place]) for place, name in enumerate(names)]
+    scales = np.maximum(own, 1e-6 * model.scales)
+    slopes, of = np.array([slopes_of.get(name, 0.0) for name in names]), np.eye(len(names))
     values, sizes, units = fit.values, scales, model.scales
     if any(slopes):
-        names, of = (*names, "friction_torque"), np.vstack([of, slopes])
-        values = np.append(values, friction.torque)
-        sizes, units = (np.append(one, friction.all_of("friction_torque")) for one in (sizes, units))
+        names, of, values = (*names, "friction_torque"), np.vstack([of, slopes]), np.append(values, friction)
+        sizes, units = (np.append(one, all_of["friction_torque"]) for one in (sizes, units))
     causes, tested = _causes(part, values, scales, of, seed, on_step)
-    directions = part.unknown_directions(scales)
+    directions = honesty.unknown_directions(fit, scales)
     on_step()
-    together = [
-        {**one, "friction_torque": change}
-        for one in directions
-        if abs(change := float(slopes * scales @ [one.get(name, 0.0) for name in fit.names] / sizes[-1])) > PART
+    changes = [slopes * scales @ [one.get(name, 0.0) for name in model.names] / sizes[-1] for one in directions]
+    summed = [
+        {**one, "friction_torque": float(change)}
+        for one, change in zip(directions, changes, strict=True)
+        if abs(change) > honesty.PART
     ]
-    made = []
     halves = np.hypot(honesty.total(causes), [NARROWEST_OF.get(name, NARROWEST) for name in names] * values)
-    summed = any(slopes) and bool(halves[-1] <= NARROW * values[-1])
+    widest = {name: WIDEST_OF.get(name, WIDEST) if isinstance(model, WindingModel) else WIDEST for name in names}
+    if any(slopes) and halves[-1] <= NARROW * values[-1]:  # what one takes too little of, the other takes
+        widest |= {name: 1.0 for name in names if name in FRICTION}
+    made = []
     for place, (name, value, half) in enumerate(zip(names, map(float, values), map(float, halves), strict=True)):
-        widest = WIDEST_OF.get(name, WIDEST) if electrical else WIDEST
-        if name in FRICTION and summed:  # what one takes too little of, the other takes
-            widest = 1.0
-        least, most = PARAMETERS[name].least, PARAMETERS[name].most
+        ends = max(value - half, PARAMETERS[name].least), min(value + half, PARAMETERS[name].most)
         by_cause = {cause: float(several[place]) for cause, several in causes.items()}
-        share = half / sizes[place]
-        own = together if name == "friction_torque" else [one for one in directions if name in one]
-        none = most if name == "gear_efficiency" else least
-        nothing = name in FRICTION and abs(value - none) <= AT_BOUND * units[place]
-        at_bound = min(value - least, most - value) <= AT_BOUND * units[place]
-        worst = CAUSES[max(by_cause, key=lambda cause: by_cause[cause])]
-        status: Status = "identified"
-        why = ""
-        if own and (len(own[0]) > 1):
-            status, why = "ratio", _text(own[0])
-        elif own:
+        estimate = Estimate(name, value, *ends, "identified", "", by_cause)
+        together = summed if name == "friction_torque" else [one for one in directions if name in one]
+        status: Status = "ratio"
+        if together and len(together[0]) > 1:
+            why = _text(together[0])
+        elif together:
             status, why = "unidentifiable", "the logs are as likely whatever it is"
-        elif at_bound and not nothing:
-            status, why = "refused", f"it ended at its bound, {value:g} {PARAMETERS[name].unit}".strip()
-        elif math.isinf(by_cause["resampling"]):
-            status, why = "refused", f"there are no two stretches of {BLOCK:g} s to resample: give a longer log"
-        elif not by_cause["self_test"] <= BIASED * widest * sizes[place]:
-            status = "refused"
-            why = f"the self-test finds {tested[place]:.4g} where the fit that it simulates has {value:.4g}"
-        elif not share <= widest:
-            status = "refused"
-            whole = "all friction" if name in FRICTION else "it"
-            why = f"its interval is {100.0 * share:.3g} % of {whole} to either side, mostly because {worst}"
-        elif name in FRICTION and not half <= NARROW * abs(value - none):
-            status = "rough"
-            why = f"its interval is {100.0 * share:.3g} % of all friction to either side"
-            why += ", and more of itself" if name != "friction_torque" else ""
-        made.append(Estimate(name, value, max(value - half, least), min(value + half, most), status, why, by_cause))
+        else:
+            status, why = _verdict(estimate, half, sizes[place], units[place], widest[name], tested[place])
+        made.append(dataclasses.replace(estimate, status=status, why=why))
     return made
+
+
+def _verdict(
+    found: Estimate, half: float, size: float, unit: float, widest: float, tested: float
+) -> tuple[Status, str]:
+    """Status of a number and why; half its interval is held against `size`, its nearness to a bound against `unit`."""
+    name, value, least, most = found.name, found.value, PARAMETERS[found.name].least, PARAMETERS[found.name].most
+    none, share = most if name == "gear_efficiency" else least, 100.0 * half / size
+    at_bound = min(value - least, most - value) <= AT_BOUND * unit
+    if at_bound and not (name in FRICTION and abs(value - none) <= AT_BOUND * unit):
+        return "refused", f"it ended at its bound, {value:g} {found.unit}".strip()
+    if math.isinf(found.causes["resampling"]):
+        return "refused", f"there are no two stretches of {BLOCK:g} s to resample: give a longer log"
+    if not found.causes["self_test"] <= BIASED * widest * size:
+        return "refused", f"the self-test finds {tested:.4g} where the fit that it simulates has {value:.4g}"
+    if not half / size <= widest:
+        whole, worst = "all friction" if name in FRICTION else "it", max(found.causes, key=found.causes.__getitem__)
+        why = f"its interval is {share:.3g} % of {whole} to either side, mostly because {CAUSES[worst]}"
+        return "refused", why
+    if name in FRICTION and not half <= NARROW * abs(value - none):
+        more = ", and more of itself" if name != "friction_torque" else ""
+        return "rough", f"its interval is {share:.3g} % of all friction to either side{more}"
+    return "identified", ""
 
 
 def _causes(
     part: Fitted, values: np.ndarray, scales: np.ndarray, of: np.ndarray, seed: int, on_step: Callable[[], None]
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Half-widths by cause of `values`, which are `of` @ the parameters, and what the self-test finds for them."""
-    fit, electrical = part.fit, isinstance(part.stage, WindingStage)
-    causes = honesty.half_widths(fit, part.segments, scales, of, seed)
+    fit, electrical = part.fit, isinstance(part.fit.model, WindingModel)
+    causes = honesty.half_widths(fit, scales, of, seed)
     on_step()
-    tested = values + of @ (part.self_test() - fit.values)
+    tested = values + of @ (honesty.self_test(part) - fit.values)
     on_step()
     # an error that goes with a row's time is half as large at the rate of the logs, one with its root more than that
-    causes["half_rate"] = (2.0 if electrical else 1.0) * np.abs(of @ (part.half_rate() - fit.values))
+    causes["half_rate"] = (2.0 if electrical else 1.0) * np.abs(of @ (honesty.half_rate(part) - fit.values))
     on_step()
     causes["self_test"] = np.abs(tested - values)
-    causes["unexplained"] = np.abs(values) * (honesty.unexplained(fit, part.segments) if electrical else 0.0)
+    causes["unexplained"] = np.abs(values) * (honesty.unexplained(fit) if electrical else 0.0)
     return causes, tested
 
 
-def _with_constant(found: list[Estimate], constant: Estimate, stage: ShaftStage) -> list[Estimate]:
+def _with_constant(found: list[Estimate], constant: Estimate, known: Mapping[str, float]) -> list[Estimate]:
     """Estimates of a shaft under a current whose torque constant was itself found: they are no better than that."""
-    made = [
-        Estimate("torque_constant", constant.value, constant.low, constant.high, constant.status,
-                 f"taken as the back-EMF constant{': ' + constant.why if constant.why else ''}", constant.causes)
-    ]  # fmt: skip
+    made = []
     relative = max(constant.high - constant.value, constant.value - constant.low) / max(constant.value, 1e-12)
-    anchored = "mgl" in stage.known or "inertia" in stage.known
+    anchored = "mgl" in known or "inertia" in known
     for one in found:
         own = one.value * relative if one.name not in ("gear_efficiency", "stribeck_speed") and not anchored else 0.0
-        low, high = one.value - math.hypot(one.value - one.low, own), one.value + math.hypot(one.high - one.value, own)
-        status, why = one.status, one.why
-        if status in ("identified", "rough") and constant.status not in ("identified", "given"):
-            status, why = "refused", f"the torque constant that it is in proportion to is {constant.status}"
-        ends = max(low, PARAMETERS[one.name].least), min(high, PARAMETERS[one.name].most)
-        made.append(Estimate(one.name, one.value, *ends, status, why, {**one.causes, "torque_constant": own}))
+        low = max(one.value - math.hypot(one.value - one.low, own), PARAMETERS[one.name].least)
+        high = min(one.value + math.hypot(one.high - one.value, own), PARAMETERS[one.name].most)
+        one = dataclasses.replace(one, low=low, high=high, causes={**one.causes, "torque_constant": own})
+        if one.status in ("identified", "rough") and constant.status not in ("identified", "given"):
+            why = f"the torque constant that it is in proportion to is {constant.status}"
+            one = dataclasses.replace(one, status="refused", why=why)
+        made.append(one)
     return made
 
 
-class _Friction(NamedTuple):
-    """All friction at the root mean square of a shaft's speeds and torques, at the rotor."""
+def _friction(fit: Fit) -> tuple[float, dict[str, float], dict[str, float]]:
+    """All friction [N*m] at the rotor, how it changes with each kind, and how much of a kind would be all of it.
 
-    torque: float
-    """[N*m]"""
-    slopes: Mapping[str, float]
-    """How it changes with each kind of friction."""
-    least: float
-    """Torque [N*m] that is little beside what drives: less friction is as good as none."""
-
-    def all_of(self, name: str) -> float:
-        """How much of one kind would be all of it."""
-        found = (self.torque + self.least) / abs(self.slopes.get(name, 1.0))
-        return min(found, 1.0) if name == "gear_efficiency" else found
-
-    @classmethod
-    def of(cls, part: Fitted) -> "_Friction":
-        """That of what was fitted; of a winding none."""
-        if isinstance(part.stage, WindingStage):
-            return cls(0.0, {}, 0.0)
-        model, number = part.model, part.model.all_values(part.fit.values)
-        every = [slice(None, None, max(len(one.times) // 20, 1)) for one in part.segments]
-        speeds = np.concatenate(
-            [
-                one.measured if model.output == "velocity" else np.diff(one.measured[rows]) / np.diff(one.times[rows])
-                for one, rows in zip(part.segments, every, strict=True)
-            ]
-        )
-        speed = max(float(np.sqrt(np.mean(speeds**2))), 1e-9) * number["gear_ratio"]
-        inputs = np.concatenate([one.inputs for one in part.segments])
-        torque = float(np.sqrt(np.mean(inputs**2))) * model.moved(part.fit.values).gain / number["gear_ratio"]
-        slopes = {"coulomb_friction": 1.0, "viscous_friction": speed, "gear_efficiency": -torque}
-        lost = slopes["gear_efficiency"] * (number["gear_efficiency"] - 1.0)
-        return cls(number["coulomb_friction"] + number["viscous_friction"] * speed + lost, slopes, 1e-2 * torque)
+    At the root mean square of a shaft's speeds and torques; a hundredth of what drives is as good as none.
+    """
+    if not isinstance(model := fit.model, ShaftModel):
+        return 0.0, {}, {}
+    number = model.all_values(fit.values)
+    every = [slice(None, None, max(len(one.times) // 20, 1)) for one in fit.segments]
+    speeds = np.concatenate(
+        [
+            one.measured if model.output == "velocity" else np.diff(one.measured[rows]) / np.diff(one.times[rows])
+            for one, rows in zip(fit.segments, every, strict=True)
+        ]
+    )
+    speed = max(float(np.sqrt(np.mean(speeds**2))), 1e-9) * number["gear_ratio"]
+    inputs = np.concatenate([one.inputs for one in fit.segments])
+    torque = float(np.sqrt(np.mean(inputs**2))) * model.moved(fit.values).gain / number["gear_ratio"]
+    slopes = {"coulomb_friction": 1.0, "viscous_friction": speed, "gear_efficiency": -torque}
+    lost = slopes["gear_efficiency"] * (number["gear_efficiency"] - 1.0)
+    friction = number["coulomb_friction"] + number["viscous_friction"] * speed + lost
+    all_of = {name: (friction + 1e-2 * torque) / max(abs(slopes.get(name, 1.0)), 1e-300) for name in FRICTION}
+    return friction, slopes, all_of | {"gear_efficiency": min(all_of["gear_efficiency"], 1.0)}
 
 
 def _text(direction: Mapping[str, float]) -> str:
@@ -235,12 +222,12 @@ def _completed(estimates: list[Estimate], given: Mapping[str, float]) -> list[Es
 
 def _warnings(part: Fitted, shares: dict[str, float]) -> list[str]:
     """What is wrong with logs, or with the model of them; `shares` gets what is unexplained of each such log."""
-    unlike = {}
+    unlike, fit = {}, part.fit
     for place, log in enumerate(part.logs):
-        own = [index for index, segment in enumerate(part.segments) if segment.log == place]
-        sizes = np.concatenate([np.abs(part.fit.residuals[index]) for index in own])
-        rest = np.concatenate([part.fit.residuals[i] * part.segments[i].deviation for i in own])
-        swing = np.concatenate([part.segments[i].measured - part.segments[i].measured.mean() for i in own])
+        own = [pair for pair in zip(fit.segments, fit.residuals, strict=True) if pair[0].log == place]
+        sizes = np.concatenate([np.abs(residuals) for _, residuals in own])
+        rest = np.concatenate([residuals * segment.deviation for segment, residuals in own])
+        swing = np.concatenate([segment.measured - segment.measured.mean() for segment, _ in own])
         share = float(np.std(rest) / max(np.std(swing), 1e-12))
         if sizes.mean() / 0.8 > UNEXPLAINED and share > UNLIKE:
             shares[log.name] = max(share, shares.get(log.name, 0.0))
@@ -262,8 +249,8 @@ def _warnings(part: Fitted, shares: dict[str, float]) -> list[str]:
     values = np.array([one.values for one in part.tried])
     costs = np.array([np.mean(np.abs(np.concatenate(one.residuals))) for one in part.tried])
     near = costs < 1.1 * costs.min()
-    apart = np.ptp(values[near], axis=0) / np.maximum(np.abs(part.fit.values), part.model.scales)
+    apart = np.ptp(values[near], axis=0) / np.maximum(np.abs(fit.values), fit.model.scales)
     if np.any(apart > 0.2):
-        names = ", ".join(name for name, one in zip(part.fit.names, apart, strict=True) if one > 0.2)
+        names = ", ".join(name for name, one in zip(fit.model.names, apart, strict=True) if one > 0.2)
         found.append(f"several minima: starts ended within 10 % of the best cost, but apart in {names}")
     return found

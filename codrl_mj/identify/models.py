@@ -3,16 +3,16 @@
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from codrl_mj.identify import simulation
-from codrl_mj.identify.estimate import Model, Simulate, settled
+from codrl_mj.identify.estimate import Model, Simulate, settled_state
 from codrl_mj.identify.log import Log
 from codrl_mj.identify.parameters import DEFAULTS, ELECTRICAL, FRICTION, OF_FRICTION, OF_RIG, PARAMETERS
 from codrl_mj.identify.segments import (
     SEGMENT,
+    SHAFT_STEP,
     Segment,
     moves,
     shaft_segments,
@@ -23,73 +23,36 @@ from codrl_mj.identify.segments import (
 )
 
 
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class WindingModel(Model):
     """L di/dt = u - R i - kE n w, exactly over each interval of a held voltage; the speed is its mean there."""
+
+    driven_by: str = "voltage"
+    output: str = "current"
+    shaft: Any = None
+    """The `Fitted` shaft under the current, where it is known: what an encoder does not see between its rows."""
 
     steps: ClassVar = np.array([1e-3])
 
     def at(self, values: np.ndarray) -> Simulate:
         """Of currents [A]."""
-        number, simulate = self.all_values(values), simulation.winding()
+        from codrl_mj.identify.simulation import winding
+
+        number = self.all_values(values)
         resistance, inductance = number["resistance"], number["inductance"]
-        constant = number["back_emf_constant"] * number["gear_ratio"]
+        constant = number.get("back_emf_constant", 0.0) * number["gear_ratio"]
 
         def currents(segment: Segment, state: np.ndarray) -> np.ndarray:
-            return simulate(segment.times, segment.inputs, segment.speeds, state[0], resistance, inductance, constant)
+            return winding(segment.times, segment.inputs, segment.speeds, state[0], resistance, inductance, constant)
 
         return currents
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class ShaftModel(Model):
-    """Inertia, gravity, load and friction under a torque, a current or a voltage."""
-
-    driven_by: str
-    """`torque`, `current`, or `voltage`: then the winding is taken to be settled, and kE to be kT unless known."""
-    output: str
-    """`position` or `velocity`."""
-
-    steps: ClassVar = np.array([1e-4, 1e-3])
-
-    def moved(self, values: np.ndarray) -> simulation.Moved:
-        """What a simulation takes."""
-        number = self.all_values(values)
-        ratio = number["gear_ratio"]
-        gain, braking = number["torque_gain"], 0.0
-        if self.driven_by != "torque":
-            gain = number["torque_constant"] * ratio
-        if self.driven_by == "voltage":
-            gain /= number["resistance"]
-            braking = gain * ratio * number.get("back_emf_constant", number["torque_constant"])
-        return simulation.moved(number, gain, braking)
-
-    def at(self, values: np.ndarray) -> Simulate:
-        """Of positions [rad] or speeds [rad/s]."""
-        moved, simulate, output = self.moved(values), simulation.moving(), int(self.output == "velocity")
-
-        def motion(segment: Segment, state: np.ndarray) -> np.ndarray:
-            return simulate(segment.times, segment.inputs, segment.slopes, state[0], state[1], moved)[output]
-
-        return motion
-
-
-@dataclasses.dataclass(frozen=True)
-class WindingStage:
-    """Voltage and speed drive the current."""
-
-    driven_by: ClassVar = "voltage"
-    output: ClassVar = "current"
-
-    known: Mapping[str, float]
-    shaft: Any = None
-    """The fitted shaft under the current, where it is known: what an encoder does not see between its rows."""
 
     def segments(self, logs: Sequence[Log]) -> list[Segment]:
         """The logs, cut."""
         return winding_segments(logs, [self._turning(log) for log in logs])
 
-    def model(self, segments: Sequence[Segment]) -> tuple[WindingModel, list[np.ndarray]]:
-        """A winding, and starts: regressions of the voltage's integral over windows of several lengths.
+    def begun(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
+        """With starts by regressions of the voltage's integral over windows of several lengths.
 
         The integral over a window is R times that of the current, L times its change and kE times the turn.
         """
@@ -97,31 +60,29 @@ class WindingStage:
         free = tuple(name for name in ELECTRICAL if name not in self.known and (moving or name != "back_emf_constant"))
         given = {**DEFAULTS, "back_emf_constant": 0.0, **self.known}
         starts = []
-        for count in (2, 8, 32):
+        for count in (2, 8, 32):  # rows of a window
             rows = np.concatenate([_winding_rows(one, count, given["gear_ratio"]) for one in segments])
             starts.append(_regressed(rows[:, :3], rows[:, 3], ELECTRICAL, free, given))
         magnitudes = np.abs(np.median(starts, axis=0))
         volts = np.concatenate([one.inputs for one in segments])
         amperes = np.concatenate([one.measured for one in segments])
         fallback = {"resistance": np.std(volts) / max(np.std(amperes), 1e-9) + 1e-6, "inductance": 1e-4}
-        floor = np.array([fallback.get(name, 1e-3) for name in free])
-        scales = np.maximum(magnitudes, 0.03 * floor)
+        scales = np.maximum(magnitudes, 0.03 * np.array([fallback.get(name, 1e-3) for name in free]))
         starts = [np.where(one > 0.02 * scales, one, scales) for one in starts]
-        return WindingModel(free, {name: float(value) for name, value in given.items()}, scales), starts
+        return dataclasses.replace(self, names=free, scales=scales), starts
 
     def _turning(self, log: Log) -> np.ndarray:
         """Mean speeds till the next row: of positions, smoothed; or what the shaft does, and what it leaves, smoothed.
 
         A smoothed speed lags behind a light rotor, and the back-EMF that it misses would be taken for inductance.
         """
-        found = turning(log)
-        part = self.shaft
-        if part is None or not moves(log) or not log.has("position", part.stage.driven_by):
+        found, part = turning(log), self.shaft
+        if part is None or not moves(log) or not log.has("position", part.fit.model.driven_by):
             return found
-        stage = part.stage
-        late = shifted(log, stage.driven_by, part.delay)
-        segments = shaft_segments([late], stage.driven_by, "position", stage.segment, 0.0)
-        for segment, positions in zip(segments, settled(part.model, part.fit.values, segments), strict=True):
+        model, values = dataclasses.replace(part.fit.model, output="position"), part.fit.values
+        simulate = model.at(values)
+        for segment in model.segments([shifted(log, model.driven_by, part.delay)], 0.0):
+            positions = simulate(segment, settled_state(model, values, segment))
             left = log.signals["position"][segment.rows] - positions
             middles = 0.5 * (segment.times[1:] + segment.times[:-1])
             rest = speeds(segment.times, left, middles)
@@ -149,26 +110,53 @@ def _regressed(
     return np.asarray(found / norms)
 
 
-@dataclasses.dataclass(frozen=True)
-class ShaftStage:
-    """A torque, a current or a voltage drives the shaft."""
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class ShaftModel(Model):
+    """Inertia, gravity, load and friction under a torque, a current or a voltage.
+
+    Under a voltage the winding is taken to be settled, and kE to be kT unless known.
+    """
 
     rig: str
     friction: str
-    driven_by: str
-    known: Mapping[str, float]
     estimated: tuple[str, ...] = ()
+    """What is fitted besides."""
     segment: float = SEGMENT
     """Time [s] that is simulated at once."""
-    output: str = "position"
-    """What is compared: `position` or `velocity`."""
 
-    def segments(self, logs: Sequence[Log]) -> list[Segment]:
-        """The logs, cut."""
-        return shaft_segments(logs, self.driven_by, self.output, self.segment)
+    steps: ClassVar = np.array([1e-4, 1e-3])
 
-    def model(self, segments: Sequence[Segment]) -> tuple[ShaftModel, list[np.ndarray]]:
-        """A shaft, and starts: a regression of the input's integral, and changes of it."""
+    def moved(self, values: np.ndarray) -> Any:
+        """What a simulation takes, a `Moved`."""
+        from codrl_mj.identify.simulation import moved
+
+        number = self.all_values(values)
+        ratio = number["gear_ratio"]
+        gain, braking = number["torque_gain"], 0.0
+        if self.driven_by != "torque":
+            gain = number["torque_constant"] * ratio
+        if self.driven_by == "voltage":
+            gain /= number["resistance"]
+            braking = gain * ratio * number.get("back_emf_constant", number["torque_constant"])
+        return moved(number, gain, braking)
+
+    def at(self, values: np.ndarray) -> Simulate:
+        """Of positions [rad] or speeds [rad/s]."""
+        from codrl_mj.identify.simulation import moving
+
+        moved, output = self.moved(values), int(self.output == "velocity")
+
+        def motion(segment: Segment, state: np.ndarray) -> np.ndarray:
+            return moving(segment.times, segment.inputs, segment.slopes, state[0], state[1], moved)[output]
+
+        return motion
+
+    def segments(self, logs: Sequence[Log], shortest: float = SHAFT_STEP) -> list[Segment]:
+        """The logs, cut; rows that are nearer than `shortest` [s] are taken together."""
+        return shaft_segments(logs, self.driven_by, self.output, self.segment, shortest)
+
+    def begun(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
+        """With starts by a regression of the input's integral, and changes of it."""
         driven_by, known = self.driven_by, self.known
         wanted = [*OF_RIG[self.rig], *OF_FRICTION[self.friction], *self.estimated]
         if driven_by != "torque":
@@ -176,11 +164,10 @@ class ShaftStage:
         if driven_by == "voltage":
             wanted.insert(0, "resistance")
         free = tuple(name for name in dict.fromkeys(wanted) if name not in known)
-        given = {**DEFAULTS, **known}
         firsts = []
         for window in (0.02, 0.004):
             factors, drive, speed = _shaft_regression(segments, self.rig, self.output, window)
-            firsts.append(_shaft_start(factors, drive, speed, driven_by, given, known))
+            firsts.append(_shaft_start(factors, drive, speed, driven_by, known))
         start, floors = firsts[0]
         scales = np.array(
             [floors[name] if name in FRICTION else max(abs(start[name]), floors.get(name, 1e-9)) for name in free]
@@ -190,29 +177,23 @@ class ShaftStage:
         starts = [np.where(positive & ~(one > 0.02 * scales), 0.3 * scales, one) for one in starts]
         changes = np.random.default_rng(0).uniform(-0.7, 0.7, (2, len(free)))
         starts += [starts[0] * np.exp(change) for change in changes]
-        fixed = {name: float(value) for name, value in given.items()}
-        fixed |= {name: 0.0 for name in ("coulomb_friction", "viscous_friction") if name not in known}
-        return ShaftModel(free, fixed, scales, driven_by, self.output), starts
+        return dataclasses.replace(self, names=free, scales=scales), starts
 
 
 def _shaft_start(
-    factors: Mapping[str, float],
-    drive: float,
-    speed: float,
-    driven_by: str,
-    given: Mapping[str, float],
-    known: Mapping[str, float],
+    factors: Mapping[str, float], drive: float, speed: float, driven_by: str, known: Mapping[str, float]
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Every parameter of a shaft by the factors that its input was regressed by, and sizes that matter of some."""
+    given = {**DEFAULTS, **known}
     ratio = given["gear_ratio"]
     # torque at the output for one of the input, where that is not known
     gain, braking, resistance = given["torque_gain"], 0.0, given.get("resistance", 1.0)
     if driven_by != "torque":
-        gain = given.get("torque_constant", _gain_of(factors, given, known) / ratio) * ratio
+        gain = given.get("torque_constant", _gain_of(factors, known) / ratio) * ratio
     start = dict(given)
     if driven_by == "voltage":
         if "torque_constant" in known or "resistance" in known:
-            per_volt = _gain_of(factors, given, known, gain / resistance if "torque_constant" in known else gain)
+            per_volt = _gain_of(factors, known, gain / resistance if "torque_constant" in known else gain)
             resistance = resistance if "resistance" in known else gain / max(per_volt, 1e-9)
         else:  # as if all of what brakes were the back-EMF
             per_volt = gain
@@ -246,13 +227,11 @@ def _shaft_start(
     return start, floors
 
 
-def _gain_of(
-    factors: Mapping[str, float], given: Mapping[str, float], known: Mapping[str, float], otherwise: float = 1.0
-) -> float:
+def _gain_of(factors: Mapping[str, float], known: Mapping[str, float], otherwise: float = 1.0) -> float:
     """Torque at the output for one of the input, by whatever torque or inertia is known."""
     for name in ("mgl", "constant_torque", "inertia"):
-        if name in known and given[name] != 0.0 and factors[name] > 0.0:
-            return given[name] / factors[name]
+        if known.get(name, 0.0) != 0.0 and factors[name] > 0.0:
+            return known[name] / factors[name]
     return otherwise
 
 

@@ -16,12 +16,12 @@ import numpy as np
 
 from codrl_mj.actuators import Drive
 from codrl_mj.fields import check, check_names, real
-from codrl_mj.identify.estimate import Model, estimate
+from codrl_mj.identify.estimate import Model, refit
 from codrl_mj.identify.log import Log
-from codrl_mj.identify.models import ShaftStage, WindingStage
+from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import ELECTRICAL, PARAMETERS
 from codrl_mj.identify.segments import Segment, winding_segments
-from codrl_mj.identify.synthetic import EXCITATIONS, FREE, Excitation, Load, Sampler, logged, run, sample_times
+from codrl_mj.identify.synthetic import EXCITATIONS, FREE, Excitation, Load, Sampler, run, sample_times, simulate
 from codrl_mj.runs.files import writing
 
 GOALS = {
@@ -159,35 +159,35 @@ def _options(
             if excess <= 1.0:
                 break
             amplitude *= 0.98 / excess
-        else:
-            course = run(drive, amplitude * shape, held)
-        log = logged(drive, course, sampler=Sampler(rate, mean_voltage=sensing.voltage == "mean"))
-        errors = _electrical(drive, log, sensing.current_noise)
-        if not held.locked:
-            constant_error = errors.get("back_emf_constant", 0.0)  # which the torque is known by
-            by_position = _mechanical(drive, log, held, sensing.encoder)
-            errors |= {name: math.hypot(error, constant_error) for name, error in by_position.items()}
-        options.append(Option(dataclasses.replace(excitation, amplitude=amplitude), rate, peak, rms, errors))
+        log = simulate(drive, amplitude * shape, held, sampler=Sampler(rate, mean_voltage=sensing.voltage == "mean"))
+        excitation = dataclasses.replace(excitation, amplitude=amplitude)
+        options.append(Option(excitation, rate, peak, rms, _expected(drive, held, sensing, log)))
     return options
 
 
-def _electrical(drive: Drive, log: Log, noise: float) -> dict[str, float]:
-    """Relative errors of a winding by the current, at the speed that is: see `Winding` for how it is found."""
+def _expected(drive: Drive, load: Load, sensing: Sensing, log: Log) -> dict[str, float]:
+    """Relative errors of a winding by the current, at the speed that is, and of a shaft by the position.
+
+    The torque is known by the back-EMF constant; what the datasheet leaves at 0 is left out.
+    """
+    motor, deviation = drive.motor, sensing.current_noise * float(np.abs(log.signals["current"]).max())
     turned = np.append(np.diff(log.signals["position"]) / np.diff(log.time), 0.0)
     segments = winding_segments([log], [turned])
-    model, _ = WindingStage({"gear_ratio": drive.motor.gear_ratio}).model(segments)
-    return _errors(drive, FREE, model, segments, noise * float(np.abs(log.signals["current"]).max()), True)
-
-
-def _mechanical(drive: Drive, log: Log, load: Load, encoder: float) -> dict[str, float]:
-    """Relative errors of a shaft by the position; what the datasheet leaves at 0 is left out."""
-    known = {name: value for name, value in vars(drive.motor).items() if name in PARAMETERS and name != "rotor_inertia"}
+    winding, _ = WindingModel(known={"gear_ratio": motor.gear_ratio}).begun(segments)
+    errors = _errors(drive, FREE, winding, segments, deviation, True)
+    if load.locked:
+        return errors
+    known = {name: value for name, value in vars(motor).items() if name in PARAMETERS and name != "rotor_inertia"}
     known |= {"mgl": load.gravity, "constant_torque": load.torque}
     known = {name: value for name, value in known.items() if name not in GOALS or value == 0.0}
-    stage = ShaftStage("free", "coulomb", "current", known, segment=_SEGMENT)
-    segments = stage.segments([log])
-    model, _ = stage.model(segments)
-    return _errors(drive, load, model, segments, 2.0 * math.pi / encoder / math.sqrt(12.0), False)
+    shaft = ShaftModel(
+        rig="free", friction="coulomb", driven_by="current", output="position", known=known, segment=_SEGMENT
+    )
+    segments = shaft.segments([log])
+    shaft, _ = shaft.begun(segments)
+    by_position = _errors(drive, load, shaft, segments, 2.0 * math.pi / sensing.encoder / math.sqrt(12.0), False)
+    constant = errors.get("back_emf_constant", 0.0)
+    return errors | {name: math.hypot(error, constant) for name, error in by_position.items()}
 
 
 def _errors(
@@ -195,7 +195,7 @@ def _errors(
 ) -> dict[str, float]:
     """Relative errors of a fit by noise of a deviation, and by what it cannot explain; those above 1 are left out."""
     truth = np.array([_value(drive, load, name) for name in model.names])
-    fit, _ = estimate(model, [one._replace(deviation=deviation) for one in segments], [truth], most=0)
+    fit = refit(model, [one._replace(deviation=deviation) for one in segments], truth, 0)
     inverse = np.linalg.pinv(np.concatenate(fit.jacobians) * truth)
     found = np.linalg.norm(inverse, axis=1)
     if biased:

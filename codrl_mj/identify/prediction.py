@@ -2,15 +2,14 @@
 
 import dataclasses
 import math
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from codrl_mj.identify import simulation
-from codrl_mj.identify.estimate import settled_state
+from codrl_mj.identify.estimate import Fit, settled_state
 from codrl_mj.identify.log import Log, usable
-from codrl_mj.identify.models import ShaftModel
-from codrl_mj.identify.segments import initial_state, shaft_segments
+from codrl_mj.identify.segments import Segment, initial_state, shaft_segments
 
 HORIZON = 0.5
 """Time [s] that is foretold at once,"""
@@ -36,11 +35,11 @@ class Trace(NamedTuple):
     """Rows at which pieces begin."""
 
 
-def trace(log: str, part: str, output: str, pieces: Any) -> Trace:
-    """A trace of some (times, measured, simulated), each of shape (m,)."""
-    times, measured, simulated = (np.concatenate(column) for column in zip(*pieces, strict=True))
-    starts = np.cumsum([0, *(len(piece[0]) for piece in pieces)])[:-1]
-    return Trace(log, part, output, times, measured, simulated, starts)
+def traced(log: str, part: str, output: str, segments: Sequence[Segment], made: Sequence[np.ndarray]) -> Trace:
+    """A trace of segments of a log, beside what a simulation made of each, of shape (m,)."""
+    times, measured = (np.concatenate([getattr(one, name) for one in segments]) for name in ("times", "measured"))
+    starts = np.cumsum([0, *(len(one.times) for one in segments)])[:-1]
+    return Trace(log, part, output, times, measured, np.concatenate(made), starts)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,25 +57,27 @@ class Prediction:
     """What `open_loop` is the error of; in no file."""
 
 
-def predict(model: ShaftModel, values: np.ndarray, log: Log) -> Prediction:
-    """Errors of a model's simulations of a log."""
-    simulate, found, pieces = model.at(values), [], []
-    for segment in shaft_segments([log], model.driven_by, model.output, HORIZON):
+def predict(fit: Fit, log: Log) -> Prediction:
+    """Errors of a fitted shaft's simulations of a log."""
+    model, simulate, errors, made = fit.model, fit.model.at(fit.values), [], []
+    segments = shaft_segments([log], model.driven_by, model.output, HORIZON)
+    for segment in segments:
         known = max(int(np.searchsorted(segment.times, segment.times[0] + KNOWN)), 5)
-        state = settled_state(model, values, segment.first(known))
-        simulated = simulate(segment, state)
-        found.append(np.abs(simulated - segment.measured)[known:])
-        pieces.append((segment.times, segment.measured, simulated))
-    errors, foretold = np.concatenate(found), trace(log.name, "shaft", model.output, pieces)
-    return Prediction(log.name, model.output, float(errors.mean()), closed_loop_error(model, values, log), foretold)
+        made.append(simulate(segment, settled_state(model, fit.values, segment.first(known))))
+        errors.append(np.abs(made[-1] - segment.measured)[known:])
+    foretold, error = traced(log.name, "shaft", model.output, segments, made), float(np.concatenate(errors).mean())
+    return Prediction(log.name, model.output, error, closed_loop_error(fit, log), foretold)
 
 
-def closed_loop_error(model: ShaftModel, values: np.ndarray, log: Log) -> float | None:
+def closed_loop_error(fit: Fit, log: Log) -> float | None:
     """Mean absolute error [rad] of a whole log under its own command, by a proportional law found in the log.
 
     The law is the straight line through the origin from the command's error to the input, where the input is not at
     its limit: `bus`, or the largest that the log has. None where the log has no command that explains its input.
     """
+    from codrl_mj.identify.simulation import served
+
+    model = fit.model
     if model.output != "position" or not log.has("command", model.driven_by):
         return None
     wanted, given = log.signals["command"], log.signals[model.driven_by]
@@ -89,22 +90,19 @@ def closed_loop_error(model: ShaftModel, values: np.ndarray, log: Log) -> float 
     lawful = np.clip(law * error, -limits, limits)
     if not np.mean((given - lawful) ** 2) < 0.25 * np.mean(given**2):
         return None
-    moved, found = model.moved(values), []
+    moved, found = model.moved(fit.values), []
     for stretch in usable(log):
         position, speed = initial_state(log, stretch)
-        simulated = simulation.served()(
-            log.time[stretch], wanted[stretch], limits[stretch], law, position, speed, moved
-        )
+        simulated = served(log.time[stretch], wanted[stretch], limits[stretch], law, position, speed, moved)
         found.append(np.abs(simulated - log.signals["position"][stretch]))
     total = float(np.concatenate(found).mean())
     return total if math.isfinite(total) else None
 
 
-def fitted_traces(name: str, part: Any) -> tuple[Trace, ...]:
-    """The fit of each log of a `Fitted` part."""
-    pieces: dict[int, list[Any]] = {}
-    for segment, residuals in zip(part.segments, part.fit.residuals, strict=True):
-        simulated = segment.measured + residuals * segment.deviation
-        pieces.setdefault(segment.log, []).append((segment.times, segment.measured, simulated))
-    output = "current" if name == "winding" else part.model.output
-    return tuple(trace(part.logs[place].name, name, output, several) for place, several in pieces.items())
+def fitted_traces(part: str, fit: Fit, logs: Sequence[Log]) -> Iterator[Trace]:
+    """The fit of `winding` or `shaft` to each of its logs."""
+    for place, log in enumerate(logs):
+        pairs = zip(fit.segments, fit.residuals, strict=True)
+        own = [(one, one.measured + residuals * one.deviation) for one, residuals in pairs if one.log == place]
+        if own:
+            yield traced(log.name, part, fit.model.output, *zip(*own, strict=True))

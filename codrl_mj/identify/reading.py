@@ -33,11 +33,9 @@ class Cells(NamedTuple):
 
     def numbers(self, name: str) -> np.ndarray:
         """A column as numbers, NaN where it is empty."""
-        lines = self.lines or range(1, len(self.columns[name]) + 1)
-        pairs = zip(lines, self.columns[name], strict=True)
-        return np.array([self._number(name, line, one) for line, one in pairs])
+        return np.array([self._number(name, place, one) for place, one in enumerate(self.columns[name])])
 
-    def _number(self, name: str, line: int, one: Any) -> float:
+    def _number(self, name: str, place: int, one: Any) -> float:
         if isinstance(one, int | float):
             return float(one)
         text = "" if one is None else str(one).strip()
@@ -51,8 +49,8 @@ class Cells(NamedTuple):
             return float(text.replace(",", ".") if self.commas else text)
         except ValueError:
             remedy = "write a decimal point" if "," in text else "leave such rows out, or map another column"
-            where = "line" if self.lines else "row"
-            raise ValueError(f"column {name} in {where} {line} is {text!r}, must be a number; {remedy}") from None
+            where = f"line {self.lines[place]}" if self.lines else f"row {place + 1}"
+            raise ValueError(f"column {name} in {where} is {text!r}, must be a number; {remedy}") from None
 
 
 def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
@@ -75,37 +73,25 @@ def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
         ValueError: it is none of these, lacks a column, has text where a number is needed, or too few rows are left.
     """
     path, mapping = Path(path), parse_columns(columns)
-    name = path.name.removesuffix(".gz").rpartition(".")[0]
     if not path.is_file():
         raise FileNotFoundError(f"no log at {path}")
     try:
-        table = read_table(path)
-        count = len(next(iter(table.columns.values()), ()))
-        needed = set().union(*(one.names for one in mapping.values())) & table.columns.keys()
-        values: dict[str, Any] = {
-            **dict.fromkeys(table.columns),
-            **table.constants,
-            **{name: table.numbers(name) for name in needed},
-        }
-        signals = {
-            signal: np.broadcast_to(np.asarray(one.value(values), float), (count,)) for signal, one in mapping.items()
-        }
-        return _log(name, signals, mapping, table, _unsigned(values, mapping))
+        return _log(path.name.removesuffix(".gz").rpartition(".")[0], read_table(path), mapping)
     except (ValueError, UnicodeDecodeError, gzip.BadGzipFile, EOFError) as error:
         raise ValueError(f"log {path}: {error}") from None
 
 
-def _log(
-    name: str, signals: dict[str, np.ndarray], mapping: Mapping[str, Column], table: Cells, first: Iterator[Finding]
-) -> Log:
-    time, only = signals.pop("time"), signals.pop("only", None)
-    wanted = np.ones(len(time), bool) if only is None else only != 0.0
+def _log(name: str, table: Cells, mapping: Mapping[str, Column]) -> Log:
+    count = len(next(iter(table.columns.values()), ()))
+    needed = set().union(*(one.names for one in mapping.values())) & table.columns.keys()
+    read = {**dict.fromkeys(table.columns), **table.constants, **{one: table.numbers(one) for one in needed}}
+    signals = {one: np.broadcast_to(np.asarray(made.value(read), float), (count,)) for one, made in mapping.items()}
+    time, wanted = signals.pop("time"), signals.pop("only", np.ones(count)) != 0.0
     finite = np.isfinite(time) & np.all([np.isfinite(values) for values in signals.values()], axis=0)
     rows = np.flatnonzero(wanted & finite)
-    latest = np.maximum.accumulate(time[rows]) if rows.size else time[rows]
-    forward = np.concatenate([[True], time[rows][1:] > latest[:-1]]) if rows.size else np.zeros(0, bool)
+    forward = time[rows] > np.append(-np.inf, np.maximum.accumulate(time[rows])[:-1])
     findings = [
-        *first,
+        *_unsigned(read, mapping),
         *_left_out(np.flatnonzero(wanted & ~finite), "missing", "have no number in some column, and are left out"),
         *_left_out(rows[~forward], "stamps", "have a time that is not after the rows before, and are left out"),
         *(
@@ -124,17 +110,10 @@ def _log(
             + "; check the columns"
         )
     kept = {signal: np.ascontiguousarray(values[rows]) for signal, values in signals.items()}
-    numbers = np.setdiff1d(np.arange(1, len(time) + len(table.ragged) + 1), table.ragged)[rows]
-    return Log(
-        name,
-        time[rows] - time[rows[0]],
-        kept,
-        {signal: find_resolution(values) for signal, values in kept.items()},
-        "voltage" in mapping and mapping["voltage"].mean,
-        table.constants,
-        numbers,
-        tuple(findings),
-    )
+    resolution = {signal: find_resolution(values) for signal, values in kept.items()}
+    mean = "voltage" in mapping and mapping["voltage"].mean
+    numbers = np.setdiff1d(np.arange(1, count + len(table.ragged) + 1), table.ragged)[rows]
+    return Log(name, time[rows] - time[rows[0]], kept, resolution, mean, table.constants, numbers, tuple(findings))
 
 
 def _unsigned(values: Mapping[str, Any], mapping: Mapping[str, Column]) -> Iterator[Finding]:
@@ -153,12 +132,11 @@ def _unsigned(values: Mapping[str, Any], mapping: Mapping[str, Column]) -> Itera
 
 
 def _left_out(rows: np.ndarray, check: str, what: str) -> Iterator[Finding]:
-    if not rows.size:
-        return
-    text = f"{rows.size} row{'s' if rows.size > 1 else ''}, the first one {rows[0] + 1}, {what}"
-    severity = "error" if check == "stamps" else "warning"
-    remedy = "find out why the logger wrote them; sort the file, or cut it, if its clock was set back"
-    yield Finding(severity, check, int(rows[0]) + 1, text, remedy if check == "stamps" else "")
+    if rows.size:
+        text = f"{rows.size} row{'s' if rows.size > 1 else ''}, the first one {rows[0] + 1}, {what}"
+        remedy = "find out why the logger wrote them; sort the file, or cut it, if its clock was set back"
+        severity, remedy = ("error", remedy) if check == "stamps" else ("warning", "")
+        yield Finding(severity, check, int(rows[0]) + 1, text, remedy)
 
 
 def read_table(path: Path) -> Cells:

@@ -189,11 +189,8 @@ def shaft_segments(
                 drive = np.append(totals / np.diff(times[edges]), drive[-1])
                 rows = slice(rows.start, rows.start + int(edges[-1]) + 1, together)
                 times, slopes = times[edges], np.zeros(len(edges))
-            state = (
-                initial_state(log, rows)
-                if output == "position"
-                else np.array([angle[rows.start], measured[rows.start]])
-            )
+            state = np.array([angle[rows.start], measured[rows.start]])
+            state = initial_state(log, rows) if output == "position" else state
             made.append(Segment(place, block, rows, times, drive, slopes, slopes, measured[rows], deviation, state))
     return made
 

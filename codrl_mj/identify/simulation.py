@@ -1,18 +1,19 @@
-"""A motor's winding and shaft, stepped by the time stamps of a log; compiled at the first use.
+"""A motor's winding and shaft, stepped by the time stamps of a log, for fits and for logs that are made alike.
 
 Friction is that of `GearMotor`: what `codrl_mj.actuators.shaft.friction` takes from the motor's torque, and then
 Coulomb friction, which stops the shaft and holds it, as MuJoCo's constraint does. So fitted numbers mean there what
 they mean here.
 """
 
-import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 
 from codrl_mj.actuators import shaft
+from codrl_mj.kept import njit
 
 LONGEST_SUBSTEP = 1e-3
 """Longer intervals between rows are cut into pieces of at most this [s]."""
@@ -66,121 +67,113 @@ def moved(number: Mapping[str, float], gain: float, braking: float = 0.0) -> Mov
     )
 
 
-@functools.cache
-def winding() -> Callable[..., np.ndarray]:
-    """The compiled (times, volts, speeds, current, resistance, inductance, constant) -> currents at the times, (n,)."""
-    from codrl_mj.kept import njit
-
-    @njit(nogil=True, error_model="numpy")
-    def simulate(
-        times: np.ndarray,
-        volts: np.ndarray,
-        speeds: np.ndarray,
-        current: float,
-        resistance: float,
-        inductance: float,
-        constant: float,
-    ) -> np.ndarray:
-        currents = np.empty(len(times))
-        currents[0] = current
-        for row in range(len(times) - 1):
-            lost = -math.expm1(-resistance * (times[row + 1] - times[row]) / inductance)
-            final = (volts[row] - constant * speeds[row]) / resistance
-            currents[row + 1] = currents[row] + (final - currents[row]) * lost
-        return currents
-
-    return simulate  # type: ignore[no-any-return]
+@njit(nogil=True, error_model="numpy")
+def winding(
+    times: np.ndarray,
+    volts: np.ndarray,
+    speeds: np.ndarray,
+    current: float,
+    resistance: float,
+    inductance: float,
+    constant: float,
+) -> np.ndarray:
+    """Currents [A] at the times, (n,), exactly: voltages and speeds hold till the next row."""
+    currents = np.empty(len(times))
+    currents[0] = current
+    for row in range(len(times) - 1):
+        lost = -math.expm1(-resistance * (times[row + 1] - times[row]) / inductance)
+        final = (volts[row] - constant * speeds[row]) / resistance
+        currents[row + 1] = currents[row] + (final - currents[row]) * lost
+    return currents
 
 
-@functools.cache
-def turned() -> Any:
-    """The compiled shaft over one interval: (duration, input, slope, position, speed, moved) -> position, speed."""
-    import numba
-
-    from codrl_mj.kept import njit
-
-    taken: Any = numba.njit(shaft.friction)
-    make: Any = shaft.Shaft
-
-    @njit(nogil=True, error_model="numpy")
-    def turn(
-        duration: float, given: float, slope: float, position: float, speed: float, moved: Any
-    ) -> tuple[float, float]:
-        pieces = max(math.ceil(duration / LONGEST_SUBSTEP - 1e-6), 1)
-        step = duration / pieces
-        damped = 0.5 * step * (moved.viscous + moved.braking) / moved.inertia
-        inertia = moved.inertia * (1.0 + damped)  # as dry friction finds it, so that it ends where torques balance
-        for piece in range(pieces):
-            position += 0.5 * step * speed
-            driving = moved.gain * (given + slope * (piece + 0.5) * step)
-            others = -moved.constant_torque
-            if moved.gravity != 0.0:  # a sine takes as long as all the rest
-                others -= moved.gravity * math.sin(position)
-            free = (speed * (1.0 - damped) + step * (driving + others) / moved.inertia) / (1.0 + damped)
-            if moved.gear_efficiency < 1.0 or moved.stribeck_friction > 0.0:  # of the torque after back-EMF
-                torque = driving - 0.5 * moved.braking * (speed + free)
-                rest = (free - speed) / step - torque / inertia
-                free -= step * taken(moved, step, torque, make(inertia, rest, speed)) / inertia
-            most = step * moved.coulomb / inertia
-            speed = 0.0 if abs(free) <= most else free - math.copysign(most, free)
-            position += 0.5 * step * speed
-        return position, speed
-
-    return turn
+_friction: Any = numba.njit(shaft.friction)
+_Shaft: Any = shaft.Shaft
 
 
-@functools.cache
-def moving() -> Callable[..., tuple[np.ndarray, np.ndarray]]:
-    """The compiled (times, inputs, slopes, position, speed, moved) -> positions and speeds at the times, each (n,).
+@njit(nogil=True, error_model="numpy")
+def turned(
+    duration: float, given: float, slope: float, position: float, speed: float, moved: Any
+) -> tuple[float, float]:
+    """Position [rad] and speed [rad/s] after a duration [s] under an input that grows by `slope` [1/s].
 
-    Between two rows the input is inputs[k] + slopes[k]*(t - times[k]). Gravity acts in the middle of a substep, and
-    viscous friction by its mean speed: both to second order; dry friction is an implicit step, and never chatters.
+    Gravity acts in the middle of a substep, and viscous friction by its mean speed: both to second order; dry friction
+    is an implicit step, and never chatters.
     """
-    from codrl_mj.kept import njit
+    pieces = max(math.ceil(duration / LONGEST_SUBSTEP - 1e-6), 1)
+    step = duration / pieces
+    damped = 0.5 * step * (moved.viscous + moved.braking) / moved.inertia
+    inertia = moved.inertia * (1.0 + damped)  # as dry friction finds it, so that it ends where torques balance
+    for piece in range(pieces):
+        position += 0.5 * step * speed
+        driving = moved.gain * (given + slope * (piece + 0.5) * step)
+        others = -moved.constant_torque
+        if moved.gravity != 0.0:  # a sine takes as long as all the rest
+            others -= moved.gravity * math.sin(position)
+        free = (speed * (1.0 - damped) + step * (driving + others) / moved.inertia) / (1.0 + damped)
+        if moved.gear_efficiency < 1.0 or moved.stribeck_friction > 0.0:  # of the torque after back-EMF
+            torque = driving - 0.5 * moved.braking * (speed + free)
+            rest = (free - speed) / step - torque / inertia
+            free -= step * _friction(moved, step, torque, _Shaft(inertia, rest, speed)) / inertia
+        most = step * moved.coulomb / inertia
+        speed = 0.0 if abs(free) <= most else free - math.copysign(most, free)
+        position += 0.5 * step * speed
+    return position, speed
 
-    turn = turned()
 
-    @njit(nogil=True, error_model="numpy")
-    def simulate(
-        times: np.ndarray, inputs: np.ndarray, slopes: np.ndarray, position: float, speed: float, moved: Any
-    ) -> tuple[np.ndarray, np.ndarray]:
-        positions, speeds = np.empty(len(times)), np.empty(len(times))
-        positions[0], speeds[0] = position, speed
-        for row in range(len(times) - 1):
-            duration = times[row + 1] - times[row]
-            position, speed = turn(duration, inputs[row], slopes[row], position, speed, moved)
-            positions[row + 1], speeds[row + 1] = position, speed
-        return positions, speeds
-
-    return simulate  # type: ignore[no-any-return]
+@njit(nogil=True, error_model="numpy")
+def moving(
+    times: np.ndarray, inputs: np.ndarray, slopes: np.ndarray, position: float, speed: float, moved: Any
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and speeds at the times, each (n,), under inputs[k] + slopes[k]*(t - times[k]) between two rows."""
+    positions, speeds = np.empty(len(times)), np.empty(len(times))
+    positions[0], speeds[0] = position, speed
+    for row in range(len(times) - 1):
+        position, speed = turned(times[row + 1] - times[row], inputs[row], slopes[row], position, speed, moved)
+        positions[row + 1], speeds[row + 1] = position, speed
+    return positions, speeds
 
 
-@functools.cache
-def served() -> Callable[..., np.ndarray]:
-    """The compiled (times, targets, limits, law, position, speed, moved) -> positions at the times under P control.
+@njit(nogil=True, error_model="numpy")
+def served(
+    times: np.ndarray,
+    targets: np.ndarray,
+    limits: np.ndarray,
+    law: float,
+    position: float,
+    speed: float,
+    moved: Any,
+) -> np.ndarray:
+    """Positions at the times, (n,), where an input of law*(target - position), within its limit, holds for a row."""
+    positions = np.empty(len(times))
+    positions[0] = position
+    for row in range(len(times) - 1):
+        given = min(max(law * (targets[row] - position), -limits[row]), limits[row])
+        position, speed = turned(times[row + 1] - times[row], given, 0.0, position, speed, moved)
+        positions[row + 1] = position
+    return positions
 
-    The input at a row is law*(target - position), within the row's limit, and holds till the next.
+
+@njit(nogil=True, error_model="numpy")
+def driven(
+    period: float, shares: np.ndarray, limit: float, sag: float, parts: Any, locked: bool, position: float
+) -> np.ndarray:
+    """Voltage, current, speed and position of the output, and bus voltage of a drive at each sample, shape (n, 5).
+
+    The winding is exact between the samples, at the speed in their middle; the shaft moves half a sample before and
+    half a sample after it (Strang's splitting, of second order). `parts` are (R, L, kE at the output), and a `Moved`.
     """
-    from codrl_mj.kept import njit
-
-    turn = turned()
-
-    @njit(nogil=True, error_model="numpy")
-    def simulate(
-        times: np.ndarray,
-        targets: np.ndarray,
-        limits: np.ndarray,
-        law: float,
-        position: float,
-        speed: float,
-        moved: Any,
-    ) -> np.ndarray:
-        positions = np.empty(len(times))
-        positions[0] = position
-        for row in range(len(times) - 1):
-            given = min(max(law * (targets[row] - position), -limits[row]), limits[row])
-            position, speed = turn(times[row + 1] - times[row], given, 0.0, position, speed, moved)
-            positions[row + 1] = position
-        return positions
-
-    return simulate  # type: ignore[no-any-return]
+    states = np.empty((len(shares), 5))
+    (resistance, inductance, constant), moved = parts
+    current, speed, decay = 0.0, 0.0, math.exp(-resistance * period / inductance)
+    for row in range(len(shares)):
+        bus = limit - sag * shares[row] * current
+        voltage = shares[row] * bus
+        states[row] = voltage, current, speed, position, bus
+        if not locked:
+            position, speed = turned(0.5 * period, current, 0.0, position, speed, moved)
+        reached = (voltage - constant * speed) / resistance
+        current = reached + (current - reached) * decay
+        if not locked:
+            position, speed = turned(0.5 * period, current, 0.0, position, speed, moved)
+    return states

@@ -1,8 +1,5 @@
 """Logs that are computed: a drive of ours under a voltage, through sensors and a sampler, with faults to order.
 
-The winding is exact between the drive's samples, at the speed in their middle; the shaft moves half a sample before and
-half a sample after it (Strang's splitting, of second order).
-
 Voltages are pure functions of time. Slow turning shows resistance, back-EMF and friction; only what changes within the
 winding's time constant L/R shows the inductance. PRBS: a pseudo-random binary sequence, white up to its clock. Source:
 Ljung, *System Identification* (2nd ed. 1999), sec. 13.3.
@@ -13,13 +10,12 @@ import functools
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from codrl_mj.actuators import Drive
 from codrl_mj.fields import check, check_names, real
-from codrl_mj.identify import simulation
 from codrl_mj.identify.columns import KINDS
 from codrl_mj.identify.log import Log
 from codrl_mj.runs.files import writing
@@ -132,6 +128,14 @@ class Sensor:
         """Validate."""
         check(self)
 
+    def seen(self, values: np.ndarray, random: np.random.Generator) -> np.ndarray:
+        """What is read of values, shape (n,), that are as old as they are."""
+        seen = self.gain * values + self.bias + self.noise * random.standard_normal(len(values))
+        wrong = random.random(len(values)) < self.outliers
+        off = random.uniform(3.0, 10.0, len(values)) * random.choice([-1.0, 1.0], len(values))
+        seen = seen + np.where(wrong, off * float(np.std(seen)), 0.0)
+        return seen if self.resolution == 0.0 else self.resolution * np.round(seen / self.resolution)
+
 
 @dataclasses.dataclass(frozen=True)
 class Sampler:
@@ -175,6 +179,8 @@ def run(drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, po
 
     A bridge makes the voltage u of a share d = u/V of the supply, which sags by its resistance times d*i.
     """
+    from codrl_mj.identify.simulation import driven, moved
+
     period, limit, motor = 1.0 / drive.controller.sample_rate, drive.voltage_limit, drive.motor
     locked = load.locked
     if isinstance(excitation, Excitation):
@@ -184,7 +190,15 @@ def run(drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, po
     sag = 0.0 if drive.supply is None else drive.supply.resistance
     shares = np.sign(commanded) * np.maximum(np.abs(commanded) - drive.controller.deadband, 0.0) / limit
     winding = motor.resistance, motor.inductance, motor.back_emf_constant * motor.gear_ratio
-    states = _compiled()(period, shares, float(limit), float(sag), winding, moved(drive, load), locked, float(position))
+    inertia = motor.rotor_inertia * motor.gear_ratio**2 + load.inertia
+    if not inertia > 0.0 and not load.locked:
+        raise ValueError(
+            f"motor.rotor_inertia = {motor.rotor_inertia:g} and load.inertia = {load.inertia:g}: one must be > 0; "
+            "give the load its inertia, or lock the shaft"
+        )
+    numbers = {**vars(motor), "inertia": inertia, "mgl": load.gravity, "constant_torque": load.torque}
+    parts = winding, moved(numbers, motor.torque_constant * motor.gear_ratio)
+    states = driven(period, shares, float(limit), float(sag), parts, locked, float(position))
     return Course(period * np.arange(len(shares)), states[:, 0], commanded, *states[:, 1:].T)
 
 
@@ -192,19 +206,6 @@ def sample_times(drive: Drive, duration: float) -> np.ndarray:
     """The times [s] of the drive's samples from 0 to a duration, shape (n + 1,)."""
     period = 1.0 / drive.controller.sample_rate
     return period * np.arange(math.ceil(duration / period - 1e-9) + 1)
-
-
-def moved(drive: Drive, load: Load) -> simulation.Moved:
-    """The shaft under the motor's current."""
-    motor = drive.motor
-    inertia = motor.rotor_inertia * motor.gear_ratio**2 + load.inertia
-    if not inertia > 0.0 and not load.locked:
-        raise ValueError(
-            f"motor.rotor_inertia = {motor.rotor_inertia:g} and load.inertia = {load.inertia:g}: one must be > 0; "
-            "give the load its inertia, or lock the shaft"
-        )
-    of_load = {"inertia": inertia, "mgl": load.gravity, "constant_torque": load.torque}
-    return simulation.moved({**vars(motor), **of_load}, motor.torque_constant * motor.gear_ratio)
 
 
 def simulate(
@@ -217,68 +218,44 @@ def simulate(
     position: float = 0.0,
     name: str = "synthetic",
 ) -> Log:
-    """A log of a drive with all that can be logged, from a `position` [rad] on, under a voltage as `run` takes it."""
-    return logged(drive, run(drive, excitation, load, position), sensors, sampler, seed, name)
-
-
-def logged(
-    drive: Drive,
-    course: Course,
-    sensors: Mapping[str, Sensor] | None = None,
-    sampler: Sampler = Sampler(),
-    seed: int = 0,
-    name: str = "synthetic",
-) -> Log:
-    """What is logged of a drive's course.
+    """A log of a drive with all that can be logged, from a `position` [rad] on, under a voltage as `run` takes it.
 
     Signals without a sensor show what is. The voltage is the one asked for, without sag; the torque n*kT*i.
     """
-    sensors = dict(sensors or {})
-    signals = ("voltage", "current", "position", "velocity", "torque", "bus", "duty")
-    check_names(sensors, signals, "signal")
+    course = run(drive, excitation, load, position)
+    check_names(sensors or {}, ("voltage", "current", "position", "velocity", "torque", "bus", "duty"), "signal")
     random = np.random.default_rng(seed)
     period = 1.0 / sampler.rate
     time = period * np.arange(math.floor(course.time[-1] / period + 1e-9) + 1)
     time[1:-1] += period * sampler.jitter * np.clip(random.standard_normal(max(len(time) - 2, 0)), -3.0, 3.0)
     time = np.maximum.accumulate(time + 1e-9 * period * np.arange(len(time)))  # rows never swap
     torque = drive.motor.gear_ratio * drive.motor.torque_constant * course.current
-    smooth = (course.current, course.position, course.speed, torque, course.bus)
+    smooth = {"current": course.current, "position": course.position, "velocity": course.speed, "torque": torque,
+              "bus": course.bus}  # fmt: skip
     found = {}
-    for signal, values in zip(("current", "position", "velocity", "torque", "bus"), smooth, strict=True):
-        late = time - sensors.get(signal, Sensor()).delay
-        found[signal] = _seen(np.interp(late, course.time, values), sensors.get(signal), random)
-    for signal, scale in (("voltage", 1.0), ("duty", 1.0 / drive.voltage_limit)):
-        late = time - sensors.get(signal, Sensor()).delay
-        held = _mean(course, late) if sampler.mean_voltage else course.commanded[_sample(course, late)]
-        found[signal] = _seen(scale * held, sensors.get(signal), random)
+    for signal in (*smooth, "voltage", "duty"):
+        sensor = (sensors or {}).get(signal, Sensor())
+        if signal in smooth:
+            values = np.interp(time - sensor.delay, course.time, smooth[signal])
+        else:
+            values = _held(course, time - sensor.delay, sampler.mean_voltage)
+            values = values if signal == "voltage" else 1.0 / drive.voltage_limit * values
+        found[signal] = sensor.seen(values, random) if signal in (sensors or {}) else values
     kept = random.random(len(time)) >= sampler.dropped
     kept[[0, -1]] = True
     found = {signal: values[kept] for signal, values in found.items()}
-    resolution = {signal: sensors.get(signal, Sensor()).resolution for signal in found}
+    resolution = {signal: (sensors or {}).get(signal, Sensor()).resolution for signal in found}
     return Log(name, time[kept], found, resolution, sampler.mean_voltage, rows=np.flatnonzero(kept) + 1)
 
 
-def _sample(course: Course, time: np.ndarray) -> np.ndarray:
-    """Which of the drive's samples a time is in."""
+def _held(course: Course, time: np.ndarray, mean: bool) -> np.ndarray:
+    """The voltage asked for at each time or, but for the last one, its mean to the next."""
     period = course.time[1] - course.time[0]
-    return np.clip(np.floor(time / period + 1e-6).astype(int), 0, len(course.time) - 1)
-
-
-def _mean(course: Course, time: np.ndarray) -> np.ndarray:
-    """The mean voltage asked for from each row to the next; in the last row what holds."""
-    flux = np.concatenate([[0.0], np.cumsum(np.diff(course.time) * course.commanded[:-1])])
-    means = np.diff(np.interp(time, course.time, flux)) / np.diff(time)
-    return np.append(means, course.commanded[_sample(course, time[-1:])])
-
-
-def _seen(values: np.ndarray, sensor: Sensor | None, random: np.random.Generator) -> np.ndarray:
-    if sensor is None:
-        return values
-    seen = sensor.gain * values + sensor.bias + sensor.noise * random.standard_normal(len(values))
-    wrong = random.random(len(values)) < sensor.outliers
-    off = random.uniform(3.0, 10.0, len(values)) * random.choice([-1.0, 1.0], len(values))
-    seen = seen + np.where(wrong, off * float(np.std(seen)), 0.0)
-    return seen if sensor.resolution == 0.0 else sensor.resolution * np.round(seen / sensor.resolution)
+    values = course.commanded[np.clip(np.floor(time / period + 1e-6).astype(int), 0, len(course.time) - 1)]
+    if mean:
+        flux = np.concatenate([[0.0], np.cumsum(np.diff(course.time) * course.commanded[:-1])])
+        values[:-1] = np.diff(np.interp(time, course.time, flux)) / np.diff(time)
+    return values
 
 
 def write_log(path: Path, log: Log) -> str:
@@ -289,33 +266,3 @@ def write_log(path: Path, log: Log) -> str:
         np.savetxt(temporary, table, fmt="%.9g", delimiter=",", header=",".join(names), comments="")
     texts = {name: f"mean({name})" if log.mean_voltage and name == "voltage" else name for name in names}
     return ",".join(f"{name}={text}:{KINDS[name] or '1'}" for name, text in texts.items())
-
-
-@functools.cache
-def _compiled() -> Callable[..., np.ndarray]:
-
-    from codrl_mj.kept import njit
-
-    turn = simulation.turned()
-
-    @njit(nogil=True, error_model="numpy")
-    def course(
-        period: float, shares: Any, limit: float, sag: float, winding: Any, moved: Any, locked: bool, position: float
-    ) -> np.ndarray:
-        """Voltage, current, speed and position of the output, and bus voltage, at each sample, shape (n, 5)."""
-        states = np.empty((len(shares), 5))
-        current, speed, (resistance, inductance, constant) = 0.0, 0.0, winding
-        decay = math.exp(-resistance * period / inductance)
-        for row in range(len(shares)):
-            bus = limit - sag * shares[row] * current
-            voltage = shares[row] * bus
-            states[row] = voltage, current, speed, position, bus
-            if not locked:
-                position, speed = turn(0.5 * period, current, 0.0, position, speed, moved)
-            reached = (voltage - constant * speed) / resistance
-            current = reached + (current - reached) * decay
-            if not locked:
-                position, speed = turn(0.5 * period, current, 0.0, position, speed, moved)
-        return states
-
-    return course  # type: ignore[no-any-return]

@@ -68,7 +68,7 @@ def geared_pendulum(efficiency):
     time = np.linspace(0.0, 6.0, 12001)
     torque = np.sum([1.5 * np.sin(2.0 * np.pi * rate * time + rate) for rate in (0.25, 0.6, 0.95, 1.4)], axis=0)
     moved = Moved(0.19, 3.6, 0.0, 0.05, 0.01, efficiency, 0.0, 1.0, 2.0, 0.0, 1.0, 0.0)
-    position = np.round(moving()(time, torque, np.zeros(12001), 0.0, 0.0, moved)[0][::4] / 3e-3) * 3e-3
+    position = np.round(moving(time, torque, np.zeros(12001), 0.0, 0.0, moved)[0][::4] / 3e-3) * 3e-3
     return Log("geared", time[::4], {"position": position, "torque": torque[::4]}, {"position": 3e-3})
 
 

@@ -222,9 +222,11 @@ def test_what_is_known_worst_is_not_lost_beside_what_is_known_best():
     jacobian = np.zeros((2 * rows, 2))
     jacobian[:rows, 0], jacobian[rows:, 1] = 1e6 / np.sqrt(rows), 20.0 / np.sqrt(rows)
     residuals = random.standard_normal(2 * rows)
-    fit = Fit(("a", "b"), np.ones(2), 0.0, 1e9, (residuals,), (jacobian,), (np.zeros(1),))
     segment = SimpleNamespace(block=0, log=0)
-    found = honesty.half_widths(fit, [segment], np.ones(2), np.eye(2), 0)["curvature"]
+    fit = Fit(
+        SimpleNamespace(names=("a", "b")), (segment,), np.ones(2), 0.0, 1e9, (residuals,), (jacobian,), (np.zeros(1),)
+    )
+    found = honesty.half_widths(fit, np.ones(2), np.eye(2), 0)["curvature"]
     np.testing.assert_allclose(found, [1.96e-6, 1.96 * 0.05], rtol=0.05)
 
 

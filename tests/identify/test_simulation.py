@@ -10,7 +10,7 @@ STILL = Moved(0.2, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 2.0, 0.0, 1.0, 0.0)
 
 
 def simulate(moved, times, inputs, position=0.0, speed=0.0):
-    return moving()(
+    return moving(
         times, np.broadcast_to(inputs, times.shape).astype(float), np.zeros(len(times)), position, speed, moved
     )
 
@@ -19,7 +19,7 @@ def test_the_winding_is_exact_over_uneven_steps():
     random = np.random.default_rng(0)
     times = np.cumsum(random.uniform(1e-4, 2e-3, 40))
     volts, speeds = random.uniform(-5.0, 5.0, 40), random.uniform(-50.0, 50.0, 40)
-    currents = winding()(times, volts, speeds, 0.3, 1.2, 6e-4, 0.05)
+    currents = winding(times, volts, speeds, 0.3, 1.2, 6e-4, 0.05)
     here = 0.3
     for row in range(39):
         duration = times[row + 1] - times[row]
@@ -77,5 +77,5 @@ def test_a_servo_holds_what_its_law_says():
     times = np.linspace(0.0, 20.0, 4001)
     moved = STILL._replace(gravity=1.0, viscous=1.0)
     targets, limits = np.full(4001, 0.5), np.full(4001, 5.0)
-    position = served()(times, targets, limits, 4.0, 0.0, 0.0, moved)[-1]
+    position = served(times, targets, limits, 4.0, 0.0, 0.0, moved)[-1]
     assert 4.0 * (0.5 - position) == pytest.approx(np.sin(position), rel=1e-6)

@@ -304,7 +304,7 @@ def pushed(name, seed=0):
     (inertia, mgl, coulomb, viscous), torque, signals = PUSHED[name]
     time, random = np.arange(0.0, 4.0, 1e-3), np.random.default_rng(seed)
     moved = Moved(inertia, mgl, 0.0, coulomb, viscous, 1.0, 0.0, 1.0, 2.0, 0.0, 1.0, 0.0)
-    position, velocity = moving()(time, torque(time), 0.0 * time, 0.0, 0.0, moved)
+    position, velocity = moving(time, torque(time), 0.0 * time, 0.0, 0.0, moved)
     noisy = {"position": STEP * np.round(position / STEP), "velocity": velocity + 0.02 * random.standard_normal(4000)}
     given = torque(time) + 0.005 * random.standard_normal(4000)
     return Log(name, time, {"torque": given, **{one: noisy[one] for one in signals}}, {"position": STEP})
