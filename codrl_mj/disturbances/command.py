@@ -8,12 +8,7 @@ _NEAR = 1e-9  # of an integration step: nearer to a whole number of steps is tha
 
 
 def whole_and_fraction(delay: float, timestep: float) -> tuple[int, float]:
-    """A delay in integration steps: the whole number below it, and the rest in [0, 1).
-
-    Args:
-        delay: [s].
-        timestep: integration step [s].
-    """
+    """A delay [s] in integration steps [s]: the whole number below it, and the rest in [0, 1)."""
     steps = delay / timestep
     nearest = round(steps)
     if abs(steps - nearest) <= _NEAR * max(1.0, steps):
@@ -22,33 +17,15 @@ def whole_and_fraction(delay: float, timestep: float) -> tuple[int, float]:
 
 
 def delayed(newer: float, older: float, fraction: float) -> float:
-    """The command between two that were given an integration step apart.
-
-    Args:
-        newer: [N or N*m].
-        older: [N or N*m].
-        fraction: of a step, in [0, 1]: how far the result lies from the newer towards the older.
-    """
+    """The command a `fraction` in [0, 1] of the way from a newer to an older one, given an integration step before."""
     return newer + fraction * (older - newer)
 
 
 def quantised(command: float, quantum: float, limit: float) -> float:
-    """The nearest multiple of the quantum, half to even, within +-limit.
-
-    Args:
-        command: [N or N*m].
-        quantum: [N or N*m], > 0.
-        limit: the largest force [N or N*m].
-    """
+    """The nearest multiple of the quantum > 0, half to even, within the largest force +-limit, all in [N or N*m]."""
     return np.minimum(np.maximum(quantum * np.rint(command / quantum), -limit), limit)
 
 
 def rate_limited(command: float, before: float, change: float) -> float:
-    """The command, at most `change` away from the one before.
-
-    Args:
-        command: [N or N*m].
-        before: the result one integration step earlier [N or N*m].
-        change: largest change in one integration step [N or N*m].
-    """
+    """The command, at most `change` away from the result one integration step earlier, all in [N or N*m]."""
     return np.minimum(np.maximum(command, before - change), before + change)

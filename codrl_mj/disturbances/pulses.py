@@ -15,14 +15,9 @@ KEY, STEP, INDEX, START = range(len(PULSE_NAMES))
 def pulse_load(memory: np.ndarray, timestep: float, force: float, duration: float, interval: float) -> float:
     """The mean load [N or N*m] over an environment's next integration step; moves the memory on by that step.
 
-    A pulse that covers part of a step counts in proportion, so that its impulse does not depend on the step.
-
-    Args:
-        memory: shape (4,), entries as in `PULSE_NAMES`; (key, 0, 0, 0) at the start of an episode. Changed.
-        timestep: integration step [s].
-        force: size of a pulse [N or N*m].
-        duration: of a pulse [s].
-        interval: mean time between pulses [s].
+    Pulses of a force [N or N*m] and a duration [s] come after a mean interval [s]. One that covers part of a step
+    counts in proportion, so that its impulse does not depend on the step. The memory, shape (4,), has entries as in
+    `PULSE_NAMES`: (key, 0, 0, 0) at the start of an episode.
     """
     key, step = int(memory[KEY]), memory[STEP]
     begin, end = step * timestep, (step + 1.0) * timestep
