@@ -142,7 +142,7 @@ class SARSA(BaseAlgorithm):
     _last_obs: Any
 
     def __init__(self, policy: str | type[TileCodingPolicy], env: Any, config: Any = None, **settings: Any) -> None:
-        """Take what `BaseAlgorithm` takes, for one environment, and a `SARSAConfig`, which a saved model brings along."""
+        """Take what `BaseAlgorithm` takes, for one environment, and a `SARSAConfig`: a saved model brings its own."""
         self.config = config
         self._episodes: CompiledEpisodes | None = None
         self.exploration_rate = getattr(config, "epsilon", 0.0)  # in the present episode
