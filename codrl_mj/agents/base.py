@@ -87,7 +87,8 @@ class DeepAgentConfig(AgentConfig):
 
     def make_policy(self, observation_space: spaces.Box, action_space: spaces.Space[Any]) -> Any:
         """See `AgentConfig.make_policy`."""
-        arguments = {**self._policy_arguments(), "optimizer_class": _no_optimizer}
+        # no optimiser: torch's first takes almost two seconds to import a compiler
+        arguments = {**self._policy_arguments(), "optimizer_class": lambda *_, **__: None}
         return self._policy_class()(observation_space, action_space, lambda _: 0.0, **arguments)
 
     def _policy_class(self) -> Any:
@@ -104,7 +105,3 @@ class DeepAgentConfig(AgentConfig):
             "features_extractor_class": ScaledObservation,
             "features_extractor_kwargs": {"factors": self.input_scale},
         }
-
-
-def _no_optimizer(*_arguments: Any, **_settings: Any) -> None:
-    """In the place of one, in policies that only act: torch's first takes almost two seconds to import a compiler."""

@@ -203,22 +203,21 @@ class TwoRateSAC(_CriticRate, SAC):
 
 
 class EpisodicDQN(DQN):
-    """DQN whose exploration shrinks by a factor with every episode."""
+    """DQN whose exploration shrinks by a factor with every episode, unless that is None."""
 
-    def __init__(self, *args: Any, exploration_decay: float, **kwargs: Any) -> None:
-        """Take what `DQN` takes, of which `exploration_fraction` has no effect, and that factor."""
+    def __init__(self, *args: Any, exploration_decay: float | None, **kwargs: Any) -> None:
+        """Take what `DQN` takes, of which `exploration_fraction` has no effect beside a factor, and that factor."""
         self.exploration_decay = exploration_decay
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        self.exploration_schedule = self._decayed
-
-    def _decayed(self, _progress: float) -> float:
-        """Epsilon in the present episode."""
-        return max(self.exploration_final_eps, self.exploration_initial_eps * self.exploration_decay**self._episode_num)
+        if (decay := self.exploration_decay) is not None:
+            first, least = self.exploration_initial_eps, self.exploration_final_eps
+            self.exploration_schedule = lambda _: max(least, first * decay**self._episode_num)
 
     def _sample_action(self, *args: Any, **kwargs: Any) -> Any:
         # DQN refreshes epsilon before it counts an episode as ended: the next would start with the last one's
-        self.exploration_rate = self._decayed(self._current_progress_remaining)
+        if self.exploration_decay is not None:
+            self.exploration_rate = self.exploration_schedule(self._current_progress_remaining)
         return super()._sample_action(*args, **kwargs)

@@ -13,6 +13,9 @@ from codrl_mj.fields import flag, integer, real, units
 class OffPolicyConfig(DeepAgentConfig):
     """Settings of an agent that learns from a replay buffer."""
 
+    algorithm: ClassVar[str]
+    """Name of its class in `codrl_mj.agents.models`."""
+
     learning_rate: float = real(1e-3, above=0, most=1)
     """Adam's step size, in (0, 1]."""
     gamma: float = real(0.99, above=0, most=1)
@@ -31,18 +34,16 @@ class OffPolicyConfig(DeepAgentConfig):
     """Gradient steps of a training, >= 1; None: one for each environment step since the last training."""
 
     def make_model(self, env: Any, seed: int) -> Any:
-        """See `AgentConfig.make_model`.
-
-        Raises:
-            ValueError: `train_every` is None, and there is more than one environment.
-        """
+        """See `AgentConfig.make_model`."""
         if self.train_every is None and env.num_envs > 1:
             raise ValueError(
                 f"{type(self).__name__}.train_every = None: training at the end of every episode needs num_envs = 1, "
                 f"not {env.num_envs}; set train_every to a number of steps"
             )
-        return self._algorithm()(
-            self._policy_class(),
+        from codrl_mj.agents import models
+
+        return getattr(models, self.algorithm)(
+            "MlpPolicy",
             env,
             learning_rate=self.learning_rate,
             gamma=self.gamma,
@@ -58,16 +59,14 @@ class OffPolicyConfig(DeepAgentConfig):
             **self._algorithm_arguments(env.action_space),
         )
 
-    def _algorithm(self) -> Any:
-        """The class of the Stable-Baselines3 model."""
-        raise NotImplementedError
-
     def _algorithm_arguments(self, action_space: Any) -> dict[str, Any]:
-        """Keyword arguments of that class that not all of these agents have."""
+        """Keyword arguments of the algorithm that not all of these agents have."""
         raise NotImplementedError
 
     def _policy_class(self) -> Any:
-        return self._algorithm().policy_aliases["MlpPolicy"]
+        from codrl_mj.agents import models
+
+        return getattr(models, self.algorithm).policy_aliases["MlpPolicy"]
 
     def _policy_arguments(self) -> dict[str, Any]:
         # one call for all tensors of a network: a tenth more steps per second
@@ -123,6 +122,7 @@ class DDPGConfig(ActorCriticConfig):
     """
 
     name: ClassVar[str] = "ddpg"
+    algorithm: ClassVar[str] = "TwoRateDDPG"
 
     noise_sigma: float = real(0.2, least=0)
     """Scale sigma of the exploration noise, >= 0, in shares of half the action's range; 0: none."""
@@ -135,11 +135,6 @@ class DDPGConfig(ActorCriticConfig):
     joint_units: tuple[int, ...] = units((256, 256))
     """Units of the critic's hidden layers after both are joined. The paper: 256-256 (pendulum), 64 (car)."""
 
-    def _algorithm(self) -> Any:
-        from codrl_mj.agents.models import TwoRateDDPG
-
-        return TwoRateDDPG
-
     def _policy_arguments(self) -> dict[str, Any]:
         streams = {name: getattr(self, name) for name in ("state_units", "action_units", "joint_units")}
         return {"net_arch": list(self.actor_units), "n_critics": 1, **streams, **super()._policy_arguments()}
@@ -150,6 +145,7 @@ class TD3Config(ActorCriticConfig):
     """Twin delayed DDPG (Fujimoto et al., 2018), on Stable-Baselines3. The paper does not use it."""
 
     name: ClassVar[str] = "td3"
+    algorithm: ClassVar[str] = "TwoRateTD3"
 
     noise_sigma: float = real(0.1, least=0)
     """Scale sigma of the exploration noise, >= 0, in shares of half the action's range; 0: none."""
@@ -160,11 +156,6 @@ class TD3Config(ActorCriticConfig):
     target_noise: float = real(0.2, least=0)
     """Standard deviation of the noise on the target actions, >= 0, in shares of half the action's range; clipped at 2.5
     times that."""
-
-    def _algorithm(self) -> Any:
-        from codrl_mj.agents.models import TwoRateTD3
-
-        return TwoRateTD3
 
     def _algorithm_arguments(self, action_space: Any) -> dict[str, Any]:
         return {
@@ -183,6 +174,7 @@ class SACConfig(ActorCriticConfig):
     """Soft actor-critic (Haarnoja et al., 2018), on Stable-Baselines3. The paper does not use it."""
 
     name: ClassVar[str] = "sac"
+    algorithm: ClassVar[str] = "TwoRateSAC"
 
     hidden: tuple[int, ...] = units((64, 64))
     """Units of the hidden layers of the actor and of each critic (ReLU)."""
@@ -192,11 +184,6 @@ class SACConfig(ActorCriticConfig):
     """Explore by noise that is a function of the state, drawn anew at every training (Raffin et al., 2021)."""
     log_std_init: float = real(-3.0)
     """State-dependent noise: natural logarithm of its standard deviation at the start."""
-
-    def _algorithm(self) -> Any:
-        from codrl_mj.agents.models import TwoRateSAC
-
-        return TwoRateSAC
 
     def _algorithm_arguments(self, action_space: Any) -> dict[str, Any]:
         return {
@@ -219,6 +206,7 @@ class DQNConfig(OffPolicyConfig):
     """Deep Q-learning with a target network, on Stable-Baselines3 (Huber loss, gradients clipped to norm 10)."""
 
     name: ClassVar[str] = "dqn"
+    algorithm: ClassVar[str] = "EpisodicDQN"
     action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (spaces.Discrete,)
 
     hidden: tuple[int, ...] = units((64, 128))
@@ -234,13 +222,6 @@ class DQNConfig(OffPolicyConfig):
     exploration_fraction: float = real(0.2, above=0, most=1)
     """Share of all steps over which epsilon falls linearly, in (0, 1], if `exploration_decay` is None."""
 
-    def _algorithm(self) -> Any:
-        from stable_baselines3 import DQN
-
-        from codrl_mj.agents.models import EpisodicDQN
-
-        return DQN if self.exploration_decay is None else EpisodicDQN
-
     def _algorithm_arguments(self, action_space: Any) -> dict[str, Any]:
         del action_space
         return {
@@ -248,7 +229,7 @@ class DQNConfig(OffPolicyConfig):
             "exploration_initial_eps": self.exploration_start,
             "exploration_final_eps": self.exploration_end,
             "exploration_fraction": self.exploration_fraction,
-            **({} if self.exploration_decay is None else {"exploration_decay": self.exploration_decay}),
+            "exploration_decay": self.exploration_decay,
         }
 
     def _policy_arguments(self) -> dict[str, Any]:

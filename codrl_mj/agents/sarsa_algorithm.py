@@ -101,9 +101,8 @@ class CompiledEpisodes:
     def run(self, learner: Learner, generator: np.random.Generator) -> tuple[Any, ...] | None:
         """Learn from an episode; None, with nothing done, if the environment stands in the middle of one.
 
-        Returns:
-            Steps, first observation (1, k) of the next episode, sum of the rewards (1,), that the episode ended (1,),
-            infos as the last step would return them, and the actuator's signals, each an array of shape (steps,).
+        What `SARSA._count` takes: steps, first observation (1, k) of the next episode, sum of the rewards (1,), that
+        the episode ended (1,), infos of its last step, and the actuator's signals, each of shape (steps,).
         """
         vector: Any = self.env.env
         setup, start = vector.setup, vector.snapshot()
@@ -143,17 +142,7 @@ class SARSA(BaseAlgorithm):
     _last_obs: Any
 
     def __init__(self, policy: str | type[TileCodingPolicy], env: Any, config: Any = None, **settings: Any) -> None:
-        """Make the algorithm.
-
-        Args:
-            policy: `TileCodingPolicy`.
-            env: a Gymnasium environment, or a `VecEnv` of one.
-            config: the agent's settings, a `SARSAConfig`; None only for a saved model, which brings its own.
-            **settings: `BaseAlgorithm`'s.
-
-        Raises:
-            ValueError: the environment is more than one, or its spaces do not go with tiles.
-        """
+        """Take what `BaseAlgorithm` takes, for one environment, and a `SARSAConfig`: a saved model brings its own."""
         self.config = config
         self._episodes: CompiledEpisodes | None = None
         self.exploration_rate = getattr(config, "epsilon", 0.0)  # in the present episode

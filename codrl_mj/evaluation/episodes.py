@@ -55,6 +55,11 @@ class Episode:
     """What the environment said of it in the end (`is_success` or `success` in its info), if anything."""
 
     @property
+    def actuators(self) -> tuple[Any, ...]:
+        """What it ran on, always as a tuple."""
+        return self.actuator if isinstance(self.actuator, tuple) else (self.actuator,)
+
+    @property
     def total(self) -> float:
         """The return: the sum of the rewards."""
         return float(self.reward.sum())
@@ -196,13 +201,15 @@ class _Recording:
         """What has happened."""
         recorder = self._recorder
         said = self._signals[-1].get("is_success", self._signals[-1].get("success"))
+        whole = np.concatenate(self._traces)
+        columns = whole[:, 0].T if whole.shape[1] == 1 else np.moveaxis(whole, 2, 0)
         return Episode(
             time=recorder.step_duration * np.arange(1, len(self._rewards) + 1),
             state=np.array(self._states),
             observation=np.array(self.observations),
             action=np.array(self._actions),
             reward=np.array(self._rewards),
-            trace=self._trace(),
+            trace=dict(zip(recorder.trace_names, columns.copy(), strict=True)),
             signals={name: np.array([info[name] for info in self._signals]) for name in recorder.signal_names},
             terminated=self._terminated,
             actuator=recorder.actuator,
@@ -211,11 +218,6 @@ class _Recording:
             first_speeds=self._first_speeds,
             succeeded=None if said is None else bool(said),
         )
-
-    def _trace(self) -> dict[str, np.ndarray]:
-        whole = np.concatenate(self._traces)
-        columns = whole[:, 0].T if whole.shape[1] == 1 else np.moveaxis(whole, 2, 0)
-        return dict(zip(self._recorder.trace_names, columns.copy(), strict=True))
 
 
 @contextlib.contextmanager

@@ -261,12 +261,11 @@ def _driven(episode: Episode) -> list[_Driven]:
     """What each motor did."""
     several = isinstance(episode.actuator, tuple)
     made = []
-    for number, actuator in enumerate(episode.actuator if several else (episode.actuator,)):
+    for number, actuator in enumerate(episode.actuators):
         own = {name: values[:, number] if several else values for name, values in episode.trace.items()}
         asked = episode.signals["desired_force"][:, number] if several else episode.signals["desired_force"]
         arm, force, speed = actuator.arm_radius, own.pop("actual_force"), own.pop("speed")
-        known: Any = actuator
-        shown = {name: own[name] for name in known.Signals._fields if name in own}  # others are of other families
+        shown = {name: own[name] for name in actuator.Signals._fields if name in own}  # others are of other families
         made.append(
             _Driven(
                 actuator,
@@ -281,15 +280,12 @@ def _driven(episode: Episode) -> list[_Driven]:
     return made
 
 
-def _tracks(episode: Episode) -> bool:
-    """Whether the agent asked for a force."""
-    actuator = episode.actuator[0] if isinstance(episode.actuator, tuple) else episode.actuator
-    return episode.command == "force" or actuator.commands()[episode.command].actuator.tracks
-
-
 def _tracking(episodes: Sequence[Episode], driven: Sequence[Sequence[_Driven]]) -> dict[str, Any]:
     """The measures of how well the torque follows the desired one, which is held over an environment step."""
-    if not all(map(_tracks, episodes)):
+    asked_for_forces = (
+        one.command == "force" or one.actuators[0].commands()[one.command].actuator.tracks for one in episodes
+    )
+    if not all(asked_for_forces):
         return dict.fromkeys(("tracking_rms", "tracking_percent", "tracking_max", "tracking_lag"))
     desired = [one.desired for each in driven for one in each]
     actual = [one.actual for each in driven for one in each]

@@ -36,7 +36,7 @@ def writing(path: Path) -> Iterator[Path]:
 
 def leftovers(folder: Path) -> list[tuple[Path, str]]:
     """What `writing` leaves in a folder if its process is killed, and the names that it was to become."""
-    found = ((path, _TEMPORARY.fullmatch(path.name)) for path in (folder.iterdir() if folder.is_dir() else ()))
+    found = ((path, _TEMPORARY.fullmatch(path.name)) for path in folder.glob("*"))
     return [(path, match[1] + (match[2] or "")) for path, match in found if match is not None]
 
 

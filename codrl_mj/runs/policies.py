@@ -48,16 +48,7 @@ def _make_space(described: dict[str, Any]) -> spaces.Space[Any]:
 
 
 def save_policy(policy: Any, agent: AgentConfig, folder: Path) -> None:
-    """Write a policy into `folder`.
-
-    Args:
-        policy: the Stable-Baselines3 policy of a model that `agent` made.
-        agent: the settings.
-        folder: gets `policy.safetensors` and `policy.json`, which has digests of both.
-
-    Raises:
-        ValueError: the spaces are of a kind that cannot be saved.
-    """
+    """Write the policy of a model that `agent` made: `policy.safetensors` and `policy.json`, with digests of both."""
     from safetensors.torch import save
 
     weights = save({name: tensor.contiguous() for name, tensor in policy.state_dict().items()})
@@ -122,19 +113,9 @@ def load_policy(folder: Path, trust: bool = False) -> Any:
 
 
 def load_sb3_zip(path: Path, agent: str, trust: bool) -> Any:
-    """Load the policy of a model that Stable-Baselines3 saved.
+    """The policy of a model that Stable-Baselines3 saved, of an algorithm such as `ppo`: the file does not say which.
 
-    Args:
-        path: the zip file.
-        agent: the algorithm that it was trained with, such as `ppo`; the file does not say.
-        trust: that whoever made the file may execute code on this machine, which loading it allows.
-
-    Returns:
-        The policy (`predict(observations, deterministic=...)`).
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: `trust` is False (the file is not opened), or Stable-Baselines3 has no such agent or cannot read it.
+    It is not opened without `trust` that whoever made it may execute code on this machine, which loading it allows.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no model at {path}")

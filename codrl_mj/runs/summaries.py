@@ -7,7 +7,7 @@ import datetime
 import itertools
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -81,38 +81,21 @@ class RunSummary:
 
 
 def find_runs(root: Path) -> list[RunSummary]:
-    """Every run folder at or below a folder, by name. Hidden folders and folders within runs are passed over.
-
-    Raises:
-        FileNotFoundError: there is no such folder.
-    """
+    """Every run folder at or below a folder, by name. Hidden folders and folders within runs are passed over."""
     if not root.is_dir():
         raise FileNotFoundError(f"no folder {root} to look for runs in")
-    return sorted((read_run(path, _name(path, root)) for path in _run_folders(root)), key=lambda run: run.name)
-
-
-def _run_folders(root: Path) -> Iterator[Path]:
+    found = []
     for folder, below, files in os.walk(root):
         if CONFIG in files:
             below.clear()
-            yield Path(folder)
+            path = Path(folder)
+            found.append(read_run(path, path.relative_to(root).as_posix() if path != root else None))
         below[:] = [name for name in below if not name.startswith(".")]
-
-
-def _name(path: Path, root: Path) -> str:
-    return root.resolve().name if path == root else path.relative_to(root).as_posix()
+    return sorted(found, key=lambda run: run.name)
 
 
 def read_run(path: Path, name: str | None = None) -> RunSummary:
-    """What a run folder says.
-
-    Args:
-        path: the folder.
-        name: what to call it; the folder's own name by default.
-
-    Raises:
-        FileNotFoundError: it is no run folder.
-    """
+    """What a run folder says; it is called by its own name unless another is given."""
     if not (path / CONFIG).is_file():
         raise FileNotFoundError(f"no run at {path}: there is no {CONFIG}")
     problems: list[str] = []
@@ -132,15 +115,14 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
         problems.append(f"it is finished, but {' and '.join(missing)} is missing: copy the folder anew")
     for folder in (path, path / BEST):
         _check_policy(folder, problems)
-    reported, learned = _first(progress, None, "steps"), _first(result, None, "steps")
+    reported, learned = _first("steps", progress), _first("steps", result)
     if None not in (reported, learned) and reported != learned:
         problems.append(f"{path / PROGRESS} ends at step {reported:.0f} of {learned:.0f}: copy it anew")
     agent = config.get("agent")
     task = env["task"] if isinstance(env.get("task"), str) else None
-    steps = _first(result, progress, "steps")
-    pace = _first(progress, None, "steps_per_second")
+    steps, pace = _first("steps", result, progress), _first("steps_per_second", progress)
     uninterrupted = steps / pace if steps is not None and pace else None
-    seconds = _first(result, progress, "seconds")
+    seconds = _first("seconds", result, progress)
     return RunSummary(
         path=path,
         name=path.resolve().name if name is None else name,
@@ -152,7 +134,7 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
         seed=_whole(config.get("seed")),
         steps=_whole(steps),
         total_steps=_whole(config.get("total_steps")),
-        mean_return=_first(progress, result, "mean_return"),
+        mean_return=_first("mean_return", progress, result),
         seconds=uninterrupted if seconds is None else seconds,
         modified=_modified(path),
         evaluation=evaluation,
@@ -231,9 +213,9 @@ def _modified(folder: Path) -> float | None:
     return max(times, default=None)
 
 
-def _first(one: Mapping[str, Any] | None, other: Mapping[str, Any] | None, name: str) -> float | None:
-    """The first of two sources' numbers of that name; None if neither has one."""
-    numbers = [_number((source or {}).get(name)) for source in (one, other)]
+def _first(name: str, *sources: Mapping[str, Any] | None) -> float | None:
+    """The first of some sources' numbers of that name; None if none has one."""
+    numbers = (_number((source or {}).get(name)) for source in sources)
     return next((number for number in numbers if number is not None), None)
 
 
@@ -271,12 +253,7 @@ _HIGHEST_FIRST = ("steps", "return", "seconds", "modified")
 def sort_runs(runs: Sequence[RunSummary], key: str) -> list[RunSummary]:
     """The runs in another order: names from A, numbers and times from the highest. Runs without a value come last.
 
-    Args:
-        runs: the runs.
-        key: one of `SORT_KEYS`; `return` is the evaluation's, or the training's where there was none.
-
-    Raises:
-        ValueError: unknown key.
+    `return`, of `SORT_KEYS`, is the evaluation's, or the training's where there was none.
     """
     if key not in SORT_KEYS:
         raise ValueError(f"sort = {key!r}: must be one of {', '.join(SORT_KEYS)}")
@@ -307,14 +284,7 @@ class Comparison:
 
 
 def compare(runs: Sequence[RunSummary]) -> Comparison:
-    """What differs in the configuration of runs, and their results.
-
-    Args:
-        runs: two or more.
-
-    Raises:
-        ValueError: fewer than two.
-    """
+    """What differs in the configuration of two or more runs, and their results."""
     if len(runs) < 2:
         raise ValueError(f"runs: {len(runs)}: there must be two or more to compare")
     named = [{**run.configuration, "env.actuator": run.actuator} for run in runs]

@@ -23,11 +23,7 @@ MEASURE = "measure it"
 
 
 def delivered(actuator: Any, task: str) -> Delivery:
-    """What an actuator makes of the commands of a task, on the bench.
-
-    Raises:
-        ValueError: the study has no such task, or the actuator is not asked for forces.
-    """
+    """What an actuator makes of the commands of a task, on the bench."""
     check_chosen("task", [task], REFERENCE_SPEEDS)
     if actuator.MOTION:
         raise ValueError(
@@ -38,14 +34,10 @@ def delivered(actuator: Any, task: str) -> Delivery:
 
 
 def doses(found: Delivery, task: str) -> dict[str, float]:
-    """The dose of every axis that does to a command what the actuator does, by axis.
+    """The dose of every axis that does to a command what the actuator does, as it was `found` on the task, by axis.
 
     Weakness g and a supply that lacks a share d leave g*min(1, 2*(1 - d)) of the largest force at rest, and
-    g*(1 - 2*d) at the reference speed (`levels.supply`): solved for both, with g at most 1.
-
-    Args:
-        found: of the actuator, on the task.
-        task: task name.
+    g*(1 - 2*d) at the reference speed (`doses.supply`): solved for both, with g at most 1.
     """
     rest, speed = max(found.at_rest, 0.0), min(found.at_speed, found.at_rest)
     strength = rest if speed >= 0.0 else rest - speed
@@ -89,11 +81,7 @@ class Advice(NamedTuple):
 
 
 def redesign(actuator: Any, task: str) -> Drive | None:
-    """The same motor and supply under a designed loop; None if it has one, or no loop that could be designed.
-
-    Raises:
-        ValueError: the motor does not allow one.
-    """
+    """The same motor and supply under a designed loop; None if it has one, or no loop that could be designed."""
     if isinstance(actuator, Actuator):  # what a sensor gets wrong no loop makes right
         wrong = actuator.controller.current_noise or actuator.controller.current_bias
         return None if wrong else redesigned(actuator, task)
@@ -124,16 +112,7 @@ def redesigned(actuator: Actuator, task: str) -> Drive:
 
 
 def advise(actuator: Any, task: str, evidence: Evidence) -> Advice:
-    """What to do about an actuator on a task, by the study's results.
-
-    Args:
-        actuator: any family's.
-        task: task name.
-        evidence: the results.
-
-    Raises:
-        ValueError: the study has no such task.
-    """
+    """What to do about an actuator, of any family, on a task, by the study's results."""
     found = delivered(actuator, task)
     known = [evidence.loss(task, axis, dose) for axis, dose in doses(found, task).items()]
     losses = tuple(one for one in known if one is not None)
@@ -156,11 +135,8 @@ def advise(actuator: Any, task: str, evidence: Evidence) -> Advice:
 def decide(losses: Sequence[Loss], redesigned: Sequence[Loss] | None) -> str:
     """The verdict: one of `IDEAL`, `LOOP`, `THROUGH` and `BUY`, or `MEASURE`: more than was tested, which cost little.
 
-    It goes by means; their intervals are in `Loss`.
-
-    Args:
-        losses: of the actuator, at least one.
-        redesigned: with a designed loop; None where there is none to design.
+    It goes by means; their intervals are in `Loss`. `redesigned` are those with a designed loop; None where there is
+    none to design.
     """
     if _within(losses):
         return IDEAL

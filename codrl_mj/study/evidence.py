@@ -54,22 +54,13 @@ class Evidence:
     """The study's answers: its file hypotheses.csv."""
 
     def __init__(self, rows: Sequence[Mapping[str, str]]) -> None:
-        """Index them.
-
-        Args:
-            rows: of the file.
-        """
+        """Index the rows of the file."""
         self._rows = {row["compared"]: row for row in rows if row["effect"]}  # empty: without runs
         self._curves: dict[tuple[str, str], _Curve | None] = {}
 
     @classmethod
     def read(cls, file: Path | None = None) -> "Evidence":
-        """Read a file; that of the checkout or the wheel unless one is given, and none if there is none.
-
-        Raises:
-            FileNotFoundError: the file that is given is not there.
-            ValueError: a file is none of the study's.
-        """
+        """Read a file; that of the checkout or the wheel unless one is given, and none if there is none."""
         there = [file] if file is not None else [folder / HYPOTHESES for folder in EVIDENCE]
         for path in there:
             if path.is_file() or file is not None:
@@ -92,13 +83,7 @@ class Evidence:
         return row["name"], Interval(*(float(row[key]) for key in ("effect", "low", "high")))
 
     def loss(self, task: str, axis: str, dose: float) -> Loss | None:
-        """What ideal-trained policies lose by a dose; None if it is not known.
-
-        Args:
-            task: task name.
-            axis: name of an axis of the study.
-            dose: in its unit, >= 0.
-        """
+        """What ideal-trained policies lose by a dose >= 0, in the axis' unit; None if it is not known."""
         if (task, axis) not in self._curves:
             self._curves[task, axis] = self._curve(task, axis)
         curve, tested = self._curves[task, axis], AXES[axis].doses

@@ -44,16 +44,7 @@ class Deployment:
 
 
 def check_chosen(field: str, given: Sequence[str], known: Iterable[str]) -> None:
-    """Refuse a choice of nothing, or of what is not known.
-
-    Args:
-        field: what to call the choice.
-        given: the names that were chosen.
-        known: what they may be.
-
-    Raises:
-        ValueError: none is given, or one is unknown; the nearest known one is suggested.
-    """
+    """Refuse a choice, called `field`, of nothing, or of what is not known: the nearest known one is suggested."""
     known = list(known)
     for name in given:
         if name not in known:
@@ -68,11 +59,7 @@ def cell_folder(root: Path, config: TrainConfig) -> Path:
 
 
 def read_failure(cell: Path | Deployment) -> str | None:
-    """Why a cell was not finished when it was tried last, in a line; None if it did not fail.
-
-    Args:
-        cell: run folder of a training, or a test.
-    """
+    """Why a cell (run folder or test) was not finished when it was tried last, in a line; None if it did not fail."""
     record = failure_record(cell)
     return str(read_json(record, "record of a failure")["error"]) if record.is_file() else None
 
@@ -84,48 +71,22 @@ def failure_record(cell: Path | Deployment) -> Path:
     return cell.parent / _FAILURES / f"{cell.name}.json"
 
 
-def _note(cell: Path | Deployment, error: Exception | None, about: dict[str, Any]) -> str | None:
-    """Keep a record of what went wrong with a cell, and say it; forget the last one if nothing did."""
-    record = failure_record(cell)
-    if error is None:
-        record.unlink(missing_ok=True)
-        return None
-    line = " ".join(str(error).split()) or type(error).__name__
-    write_json(record, {"error": line, "traceback": "".join(traceback.format_exception(error)), **about})
-    return line
-
-
 def train_runs(
     runs: Mapping[Path, TrainConfig],
     workers: Workers = Workers(),  # noqa: B008 - frozen
     on_run: Callable[[Path], None] = lambda _: None,
     **options: Any,
 ) -> dict[Path, str]:
-    """Train every run that is not finished; one that fails does not stop the others.
+    """Train every run that is not finished; what went wrong, by run folder. `options` are those of `training.train`.
 
-    Args:
-        runs: configurations by their run folders.
-        workers: what computes them.
-        on_run: called with a folder when it is finished or has failed; those finished before come first.
-        **options: `accept_changes` and `tensorboard`, as for `codrl_mj.training.train`.
-
-    Returns:
-        What went wrong, by run folder. A failure's record stays in `failures` beside it until the run is finished.
-
-    Raises:
-        ValueError: Ray is asked for and not installed.
-        TrainingStoppedError: a signal asked to stop.
+    `on_run` is called with a folder when it is finished or has failed; those finished before come first.
     """
-    waiting = [folder for folder in runs if not finished(folder)]
-    for folder in runs:
-        if folder not in waiting:
-            on_run(folder)
-    failures = {}
-    for folder, failure in compute(_train_run, [(runs[folder], folder, options) for folder in waiting], workers):
-        if failure is not None:
-            failures[folder] = failure
-        on_run(folder)
-    return failures
+    work = {
+        folder: (folder, {"train": config.as_mapping()}, _train, config, folder, options)
+        for folder, config in runs.items()
+        if not finished(folder)
+    }
+    return _compute(runs, work, workers, on_run)
 
 
 def deploy_cells(
@@ -133,64 +94,71 @@ def deploy_cells(
     workers: Workers = Workers(),  # noqa: B008 - frozen
     on_cell: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Evaluate policies; what was evaluated before is not evaluated again, and one that fails does not stop the others.
+    """Evaluate policies, by names of their tests, that were not evaluated before: records of `Evaluation.as_mapping()`.
 
-    The record of a result has `Evaluation.as_mapping()`; a failure's stays in `failures` beside the run folders until
-    the evaluation succeeds.
-
-    Args:
-        deployments: by name.
-        workers: what computes them.
-        on_cell: called with a deployment's name when it is evaluated or has failed; those evaluated before come first.
-
-    Raises:
-        ValueError: Ray is asked for and not installed.
+    `on_cell` is called with a name when its policy is evaluated or that failed; those evaluated before come first.
     """
-    waiting = {name: deployment for name, deployment in deployments.items() if not deployment.record.is_file()}
-    for name in deployments:
-        if name not in waiting:
-            on_cell(name)
-    for name in compute(_deploy_cell, waiting.items(), workers):
-        on_cell(name)
+    work = {
+        name: (test, {"test": name, "run": test.run.name}, _deploy, test)
+        for name, test in deployments.items()
+        if not test.record.is_file()
+    }
+    _compute(deployments, work, workers, on_cell)
 
 
-def _train_run(config: TrainConfig, folder: Path, options: Mapping[str, Any]) -> tuple[Path, str | None]:
-    """Train one run: its folder, and what went wrong, of which a record is kept."""
-    return folder, _note(folder, _try_to_train(config, folder, options), {"train": config.as_mapping()})
+def _compute(
+    cells: Iterable[Any], work: Mapping[Any, tuple[Any, ...]], workers: Workers, on_cell: Callable[[Any], None]
+) -> dict[Any, str]:
+    """Do the work that there is for cells, arguments of `_attempt`; what went wrong. A failure stops no other cell."""
+    for cell in cells:
+        if cell not in work:
+            on_cell(cell)
+    failures = {}
+    for cell, failure in compute(_attempt, ((cell, *arguments) for cell, arguments in work.items()), workers):
+        if failure is not None:
+            failures[cell] = failure
+        on_cell(cell)
+    return failures
 
 
-def _try_to_train(config: TrainConfig, folder: Path, options: Mapping[str, Any]) -> Exception | None:
-    """Train, waiting for a folder that somebody else holds; what went wrong."""
+def _attempt(
+    name: Any, cell: Path | Deployment, about: Mapping[str, Any], function: Callable[..., None], *arguments: Any
+) -> tuple[Any, str | None]:
+    """Call a function: the name, and what went wrong in a line, of which a record is kept until nothing does."""
+    record = failure_record(cell)
+    try:
+        function(*arguments)
+    except TrainingStoppedError:
+        raise
+    except Exception as error:
+        line = " ".join(str(error).split()) or type(error).__name__
+        write_json(record, {"error": line, "traceback": "".join(traceback.format_exception(error)), **about})
+        return name, line
+    record.unlink(missing_ok=True)
+    return name, None
+
+
+def _train(config: TrainConfig, folder: Path, options: Mapping[str, Any]) -> None:
+    """Train one run, waiting for a folder that somebody else holds."""
     start = time.monotonic()
     while True:
         try:
             train(config, folder, resume=True, **options)
-            return None
-        except TrainingStoppedError:
-            raise
-        except RunInUseError as error:
+            return
+        except RunInUseError:
             if time.monotonic() - start > _PATIENCE:
-                return error
+                raise
             time.sleep(1.0)
-        except Exception as error:
-            return error
 
 
-def _deploy_cell(name: str, deployment: Deployment) -> str:
-    """Evaluate one policy: its name. Of what goes wrong a record is kept."""
+def _deploy(test: Deployment) -> None:
+    """Evaluate one policy."""
     from codrl_mj.evaluation import evaluate
     from codrl_mj.runs.policies import load_policy
 
-    error = None
-    try:
-        config = load_config(deployment.run, trust=True)  # ours: found by its configuration
-        env = deployment.env.seen_as(config.env)
-        result = evaluate(load_policy(deployment.run), env, deployment.episodes, deployment.seed)
-        write_json(deployment.record, result.as_mapping())
-    except Exception as caught:
-        error = caught
-    _note(deployment, error, {"test": name, "run": deployment.run.name})
-    return name
+    config = load_config(test.run, trust=True)  # ours: found by its configuration
+    result = evaluate(load_policy(test.run), test.env.seen_as(config.env), test.episodes, test.seed)
+    write_json(test.record, result.as_mapping())
 
 
 def _digest(content: Any) -> str:

@@ -41,7 +41,10 @@ def effect(strata: Sequence[Stratum], confidence: float = 0.95) -> Interval:
     """
     from scipy.stats import t
 
-    parts = [part for stratum in strata for part in _variances(stratum)]
+    samples: list[np.ndarray] = []
+    for one, other, paired in strata:
+        samples += [one - other] if paired else [one, other]
+    parts = [(float(np.var(sample, ddof=1)) / len(sample), len(sample) - 1) for sample in samples]
     variance = sum(part for part, _ in parts)
     mean = float(np.mean([stratum.difference for stratum in strata]))
     if variance == 0:
@@ -49,12 +52,6 @@ def effect(strata: Sequence[Stratum], confidence: float = 0.95) -> Interval:
     freedom = variance**2 / sum(part**2 / degrees for part, degrees in parts)
     half = t.ppf(0.5 + confidence / 2, freedom) * np.sqrt(variance) / len(strata)
     return Interval(mean, mean - float(half), mean + float(half))
-
-
-def _variances(stratum: Stratum) -> list[tuple[float, int]]:
-    """Squared standard errors of the stratum's means, and their degrees of freedom."""
-    samples = [stratum.one - stratum.other] if stratum.paired else [stratum.one, stratum.other]
-    return [(float(np.var(sample, ddof=1)) / len(sample), len(sample) - 1) for sample in samples]
 
 
 def permutation_p(strata: Sequence[Stratum], least: float = 0.0, two_sided: bool = True) -> float:
@@ -132,12 +129,9 @@ def false_discovery(p: Sequence[float]) -> np.ndarray:
 
 
 def power(runs: int, difference: float, level: float = 0.05) -> float:
-    """Chance that a two-sided t-test of two kinds of runs finds a difference, by the noncentral t distribution.
+    """Chance that a two-sided t-test of two kinds of at least 2 `runs` each finds a difference of their means.
 
-    Args:
-        runs: of each kind, >= 2.
-        difference: of the means, in standard deviations of a run.
-        level: of the test.
+    It is in standard deviations of a run. By the noncentral t distribution.
     """
     from scipy.stats import nct, t
 

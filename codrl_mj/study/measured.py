@@ -19,15 +19,7 @@ from codrl_mj.study.trials import Collected, Grid, Trial
 def measured_grid(actuator: Any, task: str, seeds: int, root: Path, episodes: int = 50) -> Grid:
     """The trainings and tests that show what an actuator costs on a task, and what training through it buys.
 
-    Args:
-        actuator: any family's.
-        task: task name.
-        seeds: training runs of either kind, >= 2.
-        root: folder of the run folders.
-        episodes: test episodes of every policy.
-
-    Raises:
-        ValueError: the study has no such task, the actuator is ideal, or fewer than two seeds are asked for.
+    Of either kind there are so many runs as `seeds`, >= 2, in folders below `root`.
     """
     check_chosen("task", [task], REFERENCE_SPEEDS)
     if actuator == IDEAL_ACTUATOR:
@@ -57,16 +49,7 @@ class Measured(NamedTuple):
 
 
 def measured(actuator: Any, task: str, collected: Collected) -> Measured:
-    """The verdict of what `measured_grid` found.
-
-    Args:
-        actuator: the same.
-        task: the same.
-        collected: of the grid, without anything missing.
-
-    Raises:
-        ValueError: the ideal-trained policies are no better than random actions, or something is missing.
-    """
+    """The verdict of what `measured_grid` found for the same actuator and task, of which nothing may be missing."""
     trials = _measured(actuator, task)
     home = np.array(list(collected.scores(trials.pop("home")).values()))
     found = {name: np.array(list(collected.scores(trial).values())) for name, trial in trials.items()}

@@ -46,20 +46,10 @@ class Workers:
 
 
 def compute(function: Callable[..., Any], work: Iterable[tuple[Any, ...]], workers: Workers) -> Iterator[Any]:
-    """Results of calls, as they come; those of a Ray cluster when all are there.
+    """Results of calls, all of it picklable, as they come; those of a Ray cluster when all are there.
 
     After a Ctrl-C no call is begun any more, trainings write their checkpoints, and other calls end; a second one stops
-    at once. Processes end with this one, however it ends.
-
-    Args:
-        function: what is called; it and all else must be picklable.
-        work: the arguments of each call.
-        workers: what computes them.
-
-    Raises:
-        ValueError: Ray is asked for and not installed.
-        TrainingStoppedError: a signal asked to stop.
-        Exception: whatever a call raises; the others are broken off.
+    at once. What a call raises breaks the others off. Processes end with this one, however it ends.
     """
     calls = list(work)
     if not calls:
@@ -111,11 +101,7 @@ def _serve(parent: int) -> None:
 
 @contextlib.contextmanager
 def _backend(workers: Workers) -> Iterator[str]:
-    """The name in joblib of the backend, which is up while the block runs.
-
-    Raises:
-        ValueError: Ray is asked for and not installed.
-    """
+    """The name in joblib of the backend, which is up while the block runs."""
     if workers.backend == "local":
         yield "loky"
         return

@@ -362,11 +362,7 @@ def plain(value: Any) -> Any:
 
 
 def training_seconds(folder: Path) -> float:
-    """What a finished training took [s].
-
-    Raises:
-        ValueError: its result is damaged.
-    """
+    """What a finished training took [s]."""
     return float(read_json(folder / RESULT, "result of a run")["seconds"])
 
 

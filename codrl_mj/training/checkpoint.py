@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import re
 import warnings
 from pathlib import Path
 
@@ -24,15 +25,16 @@ def save_checkpoint(folder: Path, state: State, run: str) -> Path:
     continued from another's checkpoint.
     """
     content = save(state.arrays, metadata={"run": run, "facts": json.dumps(state.facts)})
-    path = folder / f"step-{state.facts['num_timesteps']:012d}-{_digest(content)}.safetensors"
+    step = f"{state.facts['num_timesteps']:012d}"
+    path = folder / f"step-{step}-{_digest(content)}.safetensors"
     with writing(path) as temporary, temporary.open("wb") as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())  # on the disk before the last but one is deleted
-    others = [other for other in _checkpoints(folder) if other != path]
-    before = [other for other in others if _named(other, "step") < _named(path, "step")]
+    there = _checkpoints(folder)
+    before = [other for other, named in there.items() if named["step"] < step]
     # the rest is of the same step or, damaged, of a later one, from which the run fell back
-    for superfluous in set(others) - set(before[1 - KEPT :]):
+    for superfluous in there.keys() - {path, *before[1 - KEPT :]}:
         superfluous.unlink(missing_ok=True)
     return path
 
@@ -40,20 +42,19 @@ def save_checkpoint(folder: Path, state: State, run: str) -> Path:
 def load_checkpoint(folder: Path, run: str) -> State | None:
     """The last checkpoint of a run that is intact; None if there is none. Of damaged ones it warns."""
     checkpoints = _checkpoints(folder)
-    for path in reversed(checkpoints):
+    for left, (path, named) in reversed(list(enumerate(checkpoints.items()))):
         try:
-            return _read(path, run)
+            return _read(path, named["digest"], run)
         except (ValueError, OSError) as error:
-            earlier = path != checkpoints[0]
-            remedy = "going back to the one before" if earlier else "no other is left: starting anew"
+            remedy = "going back to the one before" if left else "no other is left: starting anew"
             warnings.warn(f"checkpoint {path} cannot be used ({error}): {remedy}", stacklevel=2)
     return None
 
 
-def _read(path: Path, run: str) -> State:
+def _read(path: Path, digest: str, run: str) -> State:
     """Read one checkpoint, refused if it is not what was written, or another run's."""
     content = path.read_bytes()
-    if _digest(content) != _named(path, "digest"):
+    if _digest(content) != digest:
         raise ValueError("it is damaged: its content does not have the digest in its name")
     try:
         with safe_open(path, framework="numpy") as file:
@@ -65,17 +66,10 @@ def _read(path: Path, run: str) -> State:
         raise ValueError(f"it is no checkpoint: {error!r}") from None
 
 
-def _checkpoints(folder: Path) -> list[Path]:
-    """The checkpoints of a folder, the oldest first."""
-    if not folder.is_dir():
-        return []
-    return sorted(path for path in folder.iterdir() if CHECKPOINT.fullmatch(path.name))
-
-
-def _named(checkpoint: Path, part: str) -> str:
-    match = CHECKPOINT.fullmatch(checkpoint.name)
-    assert match is not None
-    return match[part]
+def _checkpoints(folder: Path) -> dict[Path, re.Match[str]]:
+    """The checkpoints of a folder, the oldest first, and what their names say."""
+    named = {path: CHECKPOINT.fullmatch(path.name) for path in sorted(folder.glob("*"))}
+    return {path: match for path, match in named.items() if match is not None}
 
 
 def _digest(content: bytes) -> str:

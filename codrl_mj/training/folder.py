@@ -84,10 +84,6 @@ def unused(run: Path) -> bool:
     return {path.name for path in run.iterdir()} <= {LOCK, *(path.name for path in _leftovers(run))}
 
 
-def _files_of(folder: Path) -> list[Path]:
-    return list(folder.iterdir()) if folder.is_dir() else []
-
-
 def remove_leftovers(run: Path) -> None:
     """Delete what a killed process left half-written. Only for who owns the folder: others' are in use."""
     for path in [*_leftovers(run), *_leftovers(run / BEST), *_leftovers(run / CHECKPOINTS)]:
@@ -97,7 +93,7 @@ def remove_leftovers(run: Path) -> None:
 def clear(run: Path) -> None:
     """Delete what a training has written that failed before it kept anything; nothing once there is a policy of it."""
     remove_leftovers(run)
-    if _files_of(run / CHECKPOINTS) or _files_of(run / BEST):
+    if [*run.glob(f"{CHECKPOINTS}/*"), *run.glob(f"{BEST}/*")]:
         return
     for name in (CONFIG, PROGRESS, EPISODES, LOCK):
         (run / name).unlink(missing_ok=True)
@@ -109,7 +105,8 @@ def clear(run: Path) -> None:
 
 def standing(run: Path) -> str:
     """What there is to go on from in the folder of a training that was broken off, and how."""
-    steps = [int(match["step"]) for path in _files_of(run / CHECKPOINTS) if (match := CHECKPOINT.fullmatch(path.name))]
+    names = (CHECKPOINT.fullmatch(path.name) for path in run.glob(f"{CHECKPOINTS}/*"))
+    steps = [int(match["step"]) for match in names if match is not None]
     if steps:
         return f"Its last checkpoint is of step {max(steps):,}: continue with codrl-mj train --resume {run}"
     if (run / BEST / EVALUATION).exists():

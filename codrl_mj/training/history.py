@@ -118,10 +118,6 @@ class GrowingTable:
         """The rows, shape (n, columns)."""
         return np.array(self._rows, dtype=np.float64).reshape(-1, len(self._columns))
 
-    def last(self, column: str) -> float:
-        """The last row's entry; NaN if there is none."""
-        return self.last_mean(column, 1)
-
     def last_mean(self, column: str, count: int = WINDOW) -> float:
         """Mean over the last rows; NaN if there are none."""
         index = self._columns.index(column)

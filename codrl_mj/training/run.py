@@ -27,11 +27,10 @@ class TrainingStoppedError(Exception):
 
 
 class Stop:
-    """Whether a signal has asked to stop."""
+    """A wish to stop."""
 
-    def __init__(self) -> None:
-        """Begin with no signal."""
-        self.signal: int | None = None
+    signal: int | None = None
+    """The signal that it came with; None before."""
 
 
 def train(

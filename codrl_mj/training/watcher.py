@@ -72,18 +72,14 @@ class Watcher(BaseCallback):
             self.num_timesteps = self.model.num_timesteps
         self.episodes = GrowingTable(self._out / EPISODES, EPISODE_COLUMNS, rows["episodes"])
         self.reports = GrowingTable(self._out / PROGRESS, REPORT_COLUMNS, rows["reports"])
-        self.model.set_logger(Logger(str(self._out), self._writers()))
+        writers: list[KVWriter] = []
+        if self._tensorboard:
+            with contextlib.suppress(AssertionError, ImportError):  # TensorBoard is not installed
+                from stable_baselines3.common.logger import TensorBoardOutputFormat
+
+                writers.append(TensorBoardOutputFormat(str(self._out / TENSORBOARD)))
+        self.model.set_logger(Logger(str(self._out), writers))
         self._start = time.perf_counter()
-
-    def _writers(self) -> list[KVWriter]:
-        if not self._tensorboard:
-            return []
-        try:
-            from stable_baselines3.common.logger import TensorBoardOutputFormat
-
-            return [TensorBoardOutputFormat(str(self._out / TENSORBOARD))]
-        except (AssertionError, ImportError):  # TensorBoard is not installed
-            return []
 
     def _on_rollout_start(self) -> None:
         if self.complete:
@@ -171,12 +167,8 @@ class Watcher(BaseCallback):
 
     def _evaluate(self) -> None:
         config = self._config
-        self.evaluation = evaluate(
-            self.model.policy,
-            config.evaluation_env,
-            config.evaluation_episodes,
-            EVALUATION_SEED,
-        )
+        env, episodes = config.evaluation_env, config.evaluation_episodes
+        self.evaluation = evaluate(self.model.policy, env, episodes, EVALUATION_SEED)
         if self.evaluation.returns.mean > self._best["return"]:
             self._best = {"return": self.evaluation.returns.mean, "steps": self.model.num_timesteps}
             best = self._out / BEST
@@ -184,7 +176,7 @@ class Watcher(BaseCallback):
             write_json(best / EVALUATION, sealed(self.evaluation.as_mapping()))
 
     def _report(self, evaluated: bool) -> None:
-        if self.reports.last("steps") == self.model.num_timesteps:
+        if self.reports.last_mean("steps", 1) == self.model.num_timesteps:
             return  # killed after the last report, before the run was marked as finished
         elapsed = time.perf_counter() - self._start
         progress = Progress(
