@@ -1,12 +1,19 @@
 """`codrl-mj validate`."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
+from rich import box
+from rich.text import Text
 
+from codrl_mj.cli.terminal import console, print_table, progress_bar, say
 from codrl_mj.tasks import TASKS, find_task
+
+if TYPE_CHECKING:
+    from codrl_mj.validation import Caught, Certificate, Check
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,8 +43,6 @@ class Validate:
 
     def run(self) -> int:
         """Validate and print a table for each group."""
-        from codrl_mj.cli.certificate import print_certificate, print_mutations
-        from codrl_mj.cli.terminal import progress_bar
         from codrl_mj.validation import own_model, try_mutations, validate, validate_model
         from codrl_mj.validation.mutations import faulty, unfailed
 
@@ -68,3 +73,58 @@ class Validate:
             for file in write(certificate, self.out, caught):
                 print(f"wrote {file}")
         return 0 if certificate.passed and not blind and all(outcome.failed for outcome in caught) else 1
+
+
+_FRAMED: dict[str, Any] = {"box": box.HEAVY_HEAD, "pad_edge": True, "padding": (0, 1)}
+
+
+def print_checks(checks: "Sequence[Check]", title: str = "MuJoCo against Gymnasium") -> None:
+    """Print one table, a row for each check, and under it where those that failed did so."""
+    columns = "check", "samples", "worst", "allowed", "margin", "unit", "verdict"
+    rows: list[Any] = []
+    for check in checks:
+        numbers = f"{check.samples:,}", f"{check.worst:.1e}", f"{check.tolerance:.0e}", check.margin
+        verdict = Text("passed", "green") if check.passed else Text("FAILED", "red")
+        rows.append((check.name, *numbers, check.unit, verdict))
+    print_table(title, columns, rows, right=columns[1:5], whole=("worst", "allowed", "verdict"), **_FRAMED)
+    for check in checks:
+        if not check.passed:
+            say(f"{check.name}, against {check.oracle}: FAILED at {check.where}", style="red")
+
+
+def print_certificate(certificate: "Certificate") -> None:
+    """Print a table for each group and task, what was not checked, and the verdict."""
+    from codrl_mj.validation import GROUPS
+
+    for group, description in GROUPS.items():
+        checks = [check for check in certificate.checks if check.group == group]
+        for task in dict.fromkeys(check.task for check in checks):
+            title = f"{group}, {task}" if task else f"{group}: {description}"
+            print_checks([check for check in checks if check.task == task], title)
+    for skip in certificate.skipped:
+        say(f"not checked: {skip.group}, {skip.name}: {skip.reason}")
+    colour = "green" if certificate.passed else "red"
+    form = " (the quick form)" if certificate.quick else ""
+    console().print(
+        f"[{colour}]{certificate.verdict}[/] of {certificate.subject}{form}, in {certificate.seconds:.0f} s",
+        highlight=False,
+    )
+
+
+def print_mutations(caught: "Sequence[Caught]", blind: "Sequence[Check]") -> None:
+    """Print one table, a row for each fault made on purpose, and the checks that none of them fails."""
+    from codrl_mj.validation.mutations import margin
+
+    columns = "fault", "in", "failed", "clearest check", "worst", "allowed", "beyond"
+    rows: list[Any] = []
+    for outcome in caught:
+        check = outcome.clearest
+        shown: list[Any] = [Text("MISSED", "red"), "", "", ""]
+        if check is not None:
+            numbers = f"{check.worst:.1e}", f"{check.tolerance:.0e}", f"{margin(check):.1e}"
+            shown = [f"{check.group}: {check.name}", *numbers]
+        failed = f"{len(outcome.failed)} of {outcome.made}"
+        rows.append((outcome.mutation, outcome.task or "the motor", failed, *shown))
+    print_table("Faults made on purpose", columns, rows, right=("failed", *columns[4:]), **_FRAMED)
+    for check in blind:
+        say(f"no fault fails {check.group}, {check.task}: {check.name}", style="red")
