@@ -98,7 +98,7 @@ class TrainConfig:
         Args:
             task: task name.
             agent: the agent's name.
-            settings: `default`; where the paper has this agent, `paper` and, where that fails, `repaired`.
+            settings: one of `SETTINGS`: `default`, for some pairs `paper`, `repaired` or `fast`.
             actuator: what to train through.
             env: other fields of the environment, and options of the task, to set otherwise.
             **changes: fields to set otherwise.
