@@ -76,7 +76,7 @@ def place(tmp_path, monkeypatch):
     return tmp_path / "kept"
 
 
-def process(folder, actuator="maxon-ec45-flat-50w", env="InvertedPendulum-v5", cache=None, **variables):
+def process(folder, actuator="lag", env="InvertedPendulum-v5", cache=None, **variables):
     """How much a new process compiled, and what it saw."""
     (folder / "steps.py").write_text(STEPS)
     environment = {**os.environ, **({} if cache is None else {"CODRL_MJ_CACHE": str(cache)}), **variables}

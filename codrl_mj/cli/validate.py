@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import tyro
 from rich import box
@@ -11,9 +11,7 @@ from rich.text import Text
 
 from codrl_mj.cli.terminal import console, print_table, progress_bar, say
 from codrl_mj.tasks import TASKS, find_task
-
-if TYPE_CHECKING:
-    from codrl_mj.validation import Caught, Certificate, Check
+from codrl_mj.validation import GROUPS, Caught, Certificate, Check
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +76,7 @@ class Validate:
 _FRAMED: dict[str, Any] = {"box": box.HEAVY_HEAD, "pad_edge": True, "padding": (0, 1)}
 
 
-def print_checks(checks: "Sequence[Check]", title: str = "MuJoCo against Gymnasium") -> None:
+def print_checks(checks: Sequence[Check], title: str = "MuJoCo against Gymnasium") -> None:
     """Print one table, a row for each check, and under it where those that failed did so."""
     columns = "check", "samples", "worst", "allowed", "margin", "unit", "verdict"
     rows: list[Any] = []
@@ -92,10 +90,8 @@ def print_checks(checks: "Sequence[Check]", title: str = "MuJoCo against Gymnasi
             say(f"{check.name}, against {check.oracle}: FAILED at {check.where}", style="red")
 
 
-def print_certificate(certificate: "Certificate") -> None:
+def print_certificate(certificate: Certificate) -> None:
     """Print a table for each group and task, what was not checked, and the verdict."""
-    from codrl_mj.validation import GROUPS
-
     for group, description in GROUPS.items():
         checks = [check for check in certificate.checks if check.group == group]
         for task in dict.fromkeys(check.task for check in checks):
@@ -111,7 +107,7 @@ def print_certificate(certificate: "Certificate") -> None:
     )
 
 
-def print_mutations(caught: "Sequence[Caught]", blind: "Sequence[Check]") -> None:
+def print_mutations(caught: Sequence[Caught], blind: Sequence[Check]) -> None:
     """Print one table, a row for each fault made on purpose, and the checks that none of them fails."""
     from codrl_mj.validation.mutations import margin
 
