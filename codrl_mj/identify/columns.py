@@ -58,31 +58,30 @@ class Column:
         check_names([self.signal], KINDS, "signal")
         for node in ast.walk(self._tree):
             if not isinstance(node, _ALLOWED) or (isinstance(node, ast.BinOp) and type(node.op) not in _OPERATORS):
-                raise ValueError(
-                    f"columns: {self.text}: {type(node).__name__} is not allowed; write names, numbers, + - * / and "
-                    f"{', '.join(FUNCTIONS)}"
-                )
+                known = ", ".join(FUNCTIONS)
+                raise self._wrong(f"{type(node).__name__} is not allowed; write names, numbers, + - * / and {known}")
         for call in (node for node in ast.walk(self._tree) if isinstance(node, ast.Call)):
             name = call.func.id if isinstance(call.func, ast.Name) else "?"
             check_names([name], FUNCTIONS, "function")
             needed = FUNCTIONS[name][0]
             if len(call.args) != needed:
-                raise ValueError(f"columns: {self.text}: {name} takes {needed} arguments, not {len(call.args)}")
+                raise self._wrong(f"{name} takes {needed} arguments, not {len(call.args)}")
             if needed == 2 and _names(call.args[1]):
-                raise ValueError(f"columns: {self.text}: the second argument of {name} must be a number, such as 16")
+                raise self._wrong(f"the second argument of {name} must be a number, such as 16")
         kind = KINDS[self.signal]
         if self.unit is not None:
             self._quantity(1.0)
         elif kind and isinstance(self._tree.body, ast.Name | ast.Constant):
-            raise ValueError(
-                f"columns: {self.text}: has no unit, must have one that is of {kind}; write "
-                f"{self.signal}={self.formula}:{kind} if it is in {kind}"
-            )
+            remedy = f"write {self.signal}={self.formula}:{kind} if it is in {kind}"
+            raise self._wrong(f"has no unit, must have one that is of {kind}; {remedy}")
 
     @property
     def text(self) -> str:
         """As it is written, for messages."""
         return f"{self.signal}={self.formula}" + (f":{self.unit}" if self.unit is not None else "")
+
+    def _wrong(self, what: str) -> ValueError:
+        return ValueError(f"columns: {self.text}: {what}")
 
     @property
     def names(self) -> set[str]:
@@ -116,13 +115,13 @@ class Column:
         try:
             quantity = registry.Quantity(value, respelled(unit))
         except Exception as error:  # pint raises what its parser stumbles over
-            raise ValueError(f"columns: {self.text}: the unit {unit!r} is not known; write {kind or '1'}") from error
+            raise self._wrong(f"the unit {unit!r} is not known; write {kind or '1'}") from error
         if kind is None:
             return quantity.to_base_units().magnitude
         if not quantity.check(registry.Quantity(1.0, kind).dimensionality):
-            raise ValueError(f"columns: {self.text}: {unit!r} is no unit of {self.signal}, must be of {kind or '1'}")
+            raise self._wrong(f"{unit!r} is no unit of {self.signal}, must be of {kind or '1'}")
         if leaves_angle_open(registry.Quantity(1.0, respelled(unit)), kind):
-            raise ValueError(f"columns: {self.text}: turns or radians? Write rad, deg, turn, rad/s or rpm")
+            raise self._wrong("turns or radians? Write rad, deg, turn, rad/s or rpm")
         return quantity.to(kind or "dimensionless").magnitude
 
 

@@ -115,9 +115,6 @@ class _Settled(NamedTuple):
     columns: np.ndarray
     """How these change with the state, shape (m, s)."""
 
-    def cost(self, scale: float) -> float:
-        return robust_cost(self.residuals, scale)
-
 
 def _settle(
     simulate: Simulate, segment: Segment, state: np.ndarray, steps: np.ndarray, scale: float, most: int = 4
@@ -175,7 +172,8 @@ class _Problem:
     def reconsider(self, values: np.ndarray) -> None:
         """Begin each segment from where it fits best: what is known, or its own guess."""
         both = zip(self.solve(values), self.settle(values, [one.state for one in self.segments]), strict=True)
-        self.at = values.tobytes(), [min(pair, key=lambda one: one.cost(self.scale)) for pair in both]
+        best = [min(pair, key=lambda one: robust_cost(one.residuals, self.scale)) for pair in both]
+        self.at = values.tobytes(), best
 
     def residuals(self, values: np.ndarray) -> np.ndarray:
         return np.concatenate([one.residuals for one in self.solve(values)])
@@ -195,9 +193,6 @@ class _Problem:
             self.slopes.append(-np.linalg.lstsq(root * own, root * columns, rcond=1e-9)[0])
             made.append(columns + own @ self.slopes[-1])
         return made
-
-    def jacobian(self, values: np.ndarray) -> np.ndarray:
-        return np.concatenate(self.jacobians(values))
 
 
 def robust_scale(residuals: np.ndarray) -> float:
@@ -255,7 +250,7 @@ def _refined(
         values = least_squares(
             problem.residuals,
             np.clip(values, model.lower + 1e-9 * model.scales, model.upper - 1e-9 * model.scales),
-            problem.jacobian,
+            lambda values: np.concatenate(problem.jacobians(values)),
             bounds=(model.lower, model.upper),
             x_scale=model.scales,
             loss="soft_l1",

@@ -72,9 +72,8 @@ def propose_columns(path: Path | str) -> Proposal:
         entries["voltage"] = f"{duty}{part}*{bus}:V"
         doubts.append("voltage: taken as the duty's share of the bus")
     if "time" not in entries or len(entries) < 2:
-        raise ValueError(
-            f"log {path}: no time, or nothing else, can be told by its columns: {', '.join(table.columns)}"
-        )
+        known = ", ".join(table.columns)
+        raise ValueError(f"log {path}: no time, or nothing else, can be told by its columns: {known}")
     return Proposal(",".join(f"{signal}={entry}" for signal, entry in entries.items()), tuple(doubts))
 
 
