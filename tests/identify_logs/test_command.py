@@ -37,6 +37,14 @@ def test_a_simulated_log_is_checked_by_the_columns_that_are_printed(capsys, tmp_
     assert "error" not in text
 
 
+def test_a_log_that_is_there_is_simulated_anew_and_a_folder_is_refused(capsys, tmp_path):
+    for _ in range(2):
+        said(capsys, "simulate quanser-qube-servo-2 --out log.csv --duration 1")
+    (tmp_path / "logs").mkdir()
+    error = said(capsys, "simulate quanser-qube-servo-2 --out logs --duration 1", 2)
+    assert "cannot write logs: it is a folder: name a file" in error
+
+
 def test_errors_are_an_exit_status_and_json(capsys):
     said(capsys, "simulate quanser-qube-servo-2 --out log.csv --duration 1 --sensor current:gain=-1")
     columns = "--columns time=time:s,voltage=voltage:V,current=current:A,position=position:rad"
