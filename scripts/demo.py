@@ -17,6 +17,7 @@ from codrl_mj.cli.validate import print_checks
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes, summarize
 from codrl_mj.films.film import Panel, film
+from codrl_mj.runs.layout import CONFIG
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.study.grid import failure_record, train_runs
 from codrl_mj.tasks import named_actuator
@@ -56,10 +57,10 @@ def main() -> int:
     }
     waiting = {}
     for actuator, (config, out) in runs.items():
-        if out.exists() and load_config(out) != config:
+        if (out / CONFIG).is_file() and load_config(out) != config:
             print(f"demo: {out} holds a run with other settings: choose another --out, or delete it", file=sys.stderr)
             return 2
-        if out.exists() and finished(out):
+        if finished(out):
             print(f"     {out} is trained already (delete it to train anew)")
         else:
             waiting[f"trained on {actuator}"] = (config, out)
