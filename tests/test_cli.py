@@ -203,10 +203,10 @@ def test_several_policies_have_a_row_each_in_the_environment_of_their_own_traini
     assert "POLICY: none was given" in refused(capsys, "evaluate")
 
 
-def test_what_the_study_does_not_know_is_advised_to_be_compared(capsys):
+def test_what_the_study_does_not_know_is_advised_to_be_measured(capsys):
     said = refused(capsys, "advise", "re25", "Hopper-v5")
     assert "knows pendulum, cartpole" in said
-    assert "codrl-mj evaluate RUN RUN --actuator re25" in said
+    assert "--measure 5" in said
 
 
 def test_a_policy_is_evaluated_on_any_actuator(trained, tmp_path):

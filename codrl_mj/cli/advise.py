@@ -24,10 +24,10 @@ _DELIVERED = {
 
 @dataclasses.dataclass(frozen=True)
 class Advise:
-    """Say whether to train on ideal forces, design the loop, train through an actuator, or buy another: docs/advise.md.
+    """Say what to do about an actuator: train on ideal forces, tune, randomise, train through it, or buy another.
 
     A bench measures how late, how much and how noisily the actuator delivers the task's largest force; the study's
-    results say what policies that were trained on ideal forces lose by that. --measure trains some, on ideal forces
+    results say what policies lose by that (docs/advise.md). --measure trains some, on ideal forces, on random actuators
     and through it, and tests them on it, which takes minutes; killed, it goes on where it was.
 
     Example: codrl-mj advise maxon-ec45-flat-50w pendulum --gear-ratio 20, or codrl-mj advise paper cartpole --measure 5
@@ -43,7 +43,11 @@ class Advise:
     ]
     task: Annotated[
         tyro.conf.Positional[str],
-        tyro.conf.arg(metavar="TASK", help="One of the study's tasks, such as pendulum."),
+        tyro.conf.arg(
+            metavar="TASK",
+            help="One of the study's tasks, such as pendulum; with --measure also a task of your own (module:NAME), an "
+            "environment (HalfCheetah-v5), or the folder of a run, whose environment, agent and budget are taken.",
+        ),
     ]
     gear_ratio: float | None = None
     """Turns of the rotor for a turn of the joint, or radians for a metre; the motor's own unless given."""
@@ -56,39 +60,41 @@ class Advise:
     jobs: int = -1
     """Trainings at once; -1 for one on each CPU."""
     evidence: Path | None = None
-    """The study's hypotheses.csv, unless that of the installation is meant."""
+    """The study's runs.csv, unless that of the installation is meant."""
     as_json: Annotated[
         bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(name="json", help="Print JSON instead of tables.")
     ] = False
 
     def run(self) -> int:
-        """Print the doses, what they cost, and the verdict last."""
+        """Print the doses, what is known of what can be done, and the verdict last."""
         from codrl_mj.cli.terminal import say
         from codrl_mj.study.advice import advise
         from codrl_mj.study.doses import REFERENCE_SPEEDS, posed
         from codrl_mj.study.evidence import Evidence
 
-        if self.task not in REFERENCE_SPEEDS:
+        known = self.task in REFERENCE_SPEEDS
+        if not known and self.measure is None:
             raise ValueError(
-                f"TASK = {self.task!r}: {did_you_mean(self.task, REFERENCE_SPEEDS)}The study, and so --measure, knows "
-                f"{', '.join(REFERENCE_SPEEDS)}; for any other train a policy on ideal forces and one through the "
-                f"actuator, and compare them on it: codrl-mj evaluate RUN RUN --actuator {self.actuator}"
+                f"TASK = {self.task!r}: {did_you_mean(self.task, REFERENCE_SPEEDS)}The study knows "
+                f"{', '.join(REFERENCE_SPEEDS)}; for any other, and for a run, train and test: --measure 5"
             )
         if self.measure is not None and self.measure < 2:
             raise ValueError(f"--measure {self.measure}: must be >= 2, or there is no interval")
-        try:
-            actuator = posed(self.task, self._named()).actuator
-        except ValueError as error:
-            given = {"--gear-ratio": self.gear_ratio, "--voltage": self.voltage}
-            about = ", ".join(flag for flag, value in given.items() if value is not None)
-            raise ValueError(f"{about}: {error}" if about else str(error)) from error
-        found = advise(actuator, self.task, Evidence.read(self.evidence))
-        if not self.as_json:
-            _print(self.actuator, found)
-            say(actuator.assumed)
-        measured = None if self.measure is None else self._measured(actuator, self.measure)
+        found = None
+        if known:
+            try:
+                actuator = posed(self.task, self._named()).actuator
+            except ValueError as error:
+                given = {"--gear-ratio": self.gear_ratio, "--voltage": self.voltage}
+                about = ", ".join(flag for flag, value in given.items() if value is not None)
+                raise ValueError(f"{about}: {error}" if about else str(error)) from error
+            found = advise(actuator, self.task, Evidence.read(self.evidence))
+            if not self.as_json:
+                _print(self.actuator, found)
+                say(actuator.assumed)
+        measured = None if self.measure is None else self._measured(self.measure)
         if self.as_json:
-            print(json.dumps({"advice": _plain(found), "measured": measured and _plain(measured)}, indent=2))
+            print(json.dumps({"advice": _plain(found), "measured": _plain(measured)}, indent=2))
         return 0
 
     def _named(self) -> Any:
@@ -99,31 +105,26 @@ class Advise:
             changed["supply"] = {"voltage": self.voltage}
         return {"name": self.actuator, **changed} if changed else self.actuator
 
-    def _measured(self, actuator: Any, seeds: int) -> Any:
-        from codrl_mj.cli.terminal import print_table, say
-        from codrl_mj.study.measured import measured, measured_grid
+    def _measured(self, seeds: int) -> Any:
+        from codrl_mj.cli.terminal import say
+        from codrl_mj.study.measured import measurement
         from codrl_mj.study.parallel import Workers
         from codrl_mj.study.program import compute
 
-        grid = measured_grid(actuator, self.task, seeds, self.root)
+        asked = measurement(self._named(), self.task, seeds, self.root)
         if self.as_json:
-            grid.compute(Workers(self.jobs))
+            asked.grid.compute(Workers(self.jobs))
         else:
-            compute(grid, Workers(self.jobs))
-        found = measured(actuator, self.task, grid.collect())
+            compute(asked.grid, Workers(self.jobs))
+        found = asked.judged(asked.grid.collect())
         if not self.as_json:
-            rows = [
-                (name, f"{mean:.2f}", f"{low:.2f} to {high:.2f}") for name, (mean, low, high) in found.scores.items()
-            ]
-            title = f"Measured: {seeds} policies of either kind, 50 episodes each"
-            print_table(title, ("what is done", "score on it", "95 %"), rows)
-            say(f"measured: {found.verdict}")
+            _print_options(f"Measured: {seeds} policies of either kind, 50 episodes each", found.options)
+            say(f"measured: {found.verdict}" + " by more policies (--measure)" * (found.verdict == "measure it"))
         return found
 
 
 def _print(name: str, found: Any) -> None:
     from codrl_mj.cli.terminal import print_table, say
-    from codrl_mj.study.advice import LOOP
     from codrl_mj.study.doses import AXES
 
     columns = "what it does to the largest force", "value", "unit"
@@ -134,23 +135,48 @@ def _print(name: str, found: Any) -> None:
     print_table(f"{name} on {found.task}, on the bench", columns, rows, right=("value",))
     if found.losses:
         rows = []
-        for loss in found.losses:
-            mean = f"{'at least ' if loss.beyond else ''}{loss.loss.mean:z.2f}"
-            bounds = f"{loss.loss.low:z.2f} to {loss.loss.high:z.2f}"
-            rows.append((loss.axis, f"{loss.dose:.3g}", AXES[loss.axis].unit, mean, bounds, ", ".join(loss.rows)))
+        for one in found.losses:
+            dose = f"{one.dose:.3g}", AXES[one.axis].unit
+            rows.append((one.axis, *dose, *_lost(one.outcome, "at least " * one.beyond), ", ".join(one.between)))
         title = "What policies lose by it that were trained on ideal forces [shares of the task's span]"
-        print_table(title, ("by", "dose", "unit", "loss", "95 %", "rows"), rows, right=("dose", "loss"))
-    better = found.redesigned
-    if better is not None and better.verdict is not None and found.verdict != LOOP:
-        say(f"the same motor under a designed loop: {better.verdict}, {better.reason}")
+        print_table(title, ("by", "dose", "unit", *_LOST, "tested at"), rows, right=("dose", *_LOST))
+        _print_options("What is known of what can be done", found.options)
     say(f"{found.verdict}: {found.reason}" if found.verdict else f"no verdict: {found.reason} (--measure 5)")
 
 
+_LOST = "loss", "95 %", "fail", "success lost"
+
+
+def _print_options(title: str, options: Any) -> None:
+    from codrl_mj.cli.terminal import print_table
+    from codrl_mj.study.advice import OPTIONS
+
+    rows = []
+    for name in OPTIONS:
+        if name in options:
+            told = options[name].most or options[name].least
+            rows.append((name, *(_lost(told, options[name].bound) if told else ("not tested", "", "", ""))))
+    print_table(f"{title} [shares of the task's span]", ("what is done", *_LOST), rows, right=_LOST)
+
+
+def _lost(outcome: Any, bound: str) -> tuple[str, ...]:
+    mean, low, high = outcome.loss
+    count = len(outcome.lost)
+    failed = f"{round(outcome.failed * count)} of {count}"
+    return (
+        f"{bound}{mean:z.2f}",
+        f"{low:z.2f} to {high:z.2f}",
+        failed,
+        f"{100 * outcome.success_lost.mean:z.0f} %",
+    )
+
+
 def _plain(value: Any) -> Any:
-    """Named tuples as mappings, recursively."""
+    """Named tuples as mappings, outcomes by their summaries, recursively."""
+    if hasattr(value, "summary"):
+        return _plain(value.summary())
     if hasattr(value, "_asdict"):
-        extra = {"lost": _plain(value.lost)} if getattr(value, "losses", ()) else {}
-        return {name: _plain(part) for name, part in value._asdict().items()} | extra
+        return _plain(value._asdict())
     if isinstance(value, dict):
         return {name: _plain(part) for name, part in value.items()}
     if isinstance(value, float) and not math.isfinite(value):

@@ -1,7 +1,7 @@
 """Studies: arms that are trained with many seeds, trials that test them, questions that are judged, and a page."""
 
 from codrl_mj.study.inference import Stratum, detectable, effect, equivalence_p, false_discovery, holm, permutation_p
-from codrl_mj.study.pages import conclusions_section, markdown_table, read_csv, write_csv, write_page
+from codrl_mj.study.pages import conclusions, markdown_table, read_csv, write_csv, write_page
 from codrl_mj.study.parallel import Workers
 from codrl_mj.study.program import Program, main
 from codrl_mj.study.questions import Contrast, Question, Scores, Verdict, judge
@@ -26,7 +26,7 @@ __all__ = [
     "write_csv",
     "write_page",
     "markdown_table",
-    "conclusions_section",
+    "conclusions",
     "Stratum",
     "effect",
     "permutation_p",

@@ -127,6 +127,24 @@ def noise(task: str, dose: float) -> EnvConfig:
     return posed(task, Actuator(Motor(1.0, inductance, constant, constant), loop))
 
 
+_LOOPS = {"weaker": "weaker", "paper": "paper"}
+REAL: Mapping[str, Mapping[str, Any]] = {
+    "pendulum": {"marginal motor": {"name": "quanser-srv02", "motor": {"gear_ratio": 70.0}}, **_LOOPS},
+    "cartpole": {"marginal motor": {"name": "lego-ev3-large", "motor": {"gear_ratio": 44.2}}, **_LOOPS},
+    "acrobot": {"marginal motor": {"name": "pololu-37d-30", "motor": {"gear_ratio": 30.0}}},
+    "furuta": {
+        "marginal motor": {
+            "name": "quanser-qube-servo-2",
+            "motor": {"gear_ratio": 1.0},
+            "supply": {"voltage": 6.0},
+        }
+    },
+}
+"""Task -> drives that policies were trained through, each by the name of its arm and of its test: a motor that
+`codrl-mj motor choose` calls `try it`, for some bound says that it does not suffice (on the cars there is none), and
+the paper's under two loops."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Axis:
     """One thing that an actuator may do to a command."""
@@ -209,9 +227,21 @@ def ideal(task: str) -> Arm:
     return arm(task, "ideal", posed(task))
 
 
-def matched(task: str, axis: str) -> Arm:
-    """Trained through one dose of one thing."""
-    return arm(task, axis, AXES[axis].at(task, AXES[axis].trained[task]))
+def generic(base: Arm) -> Arm:
+    """Trained without a model of the motor, as is common: random strength, lag, delay, and random pushes.
+
+    Args:
+        base: the arm of a task of ours on ideal forces, of which all else is kept.
+    """
+    env, definition = base.config.env, find_task(base.task)
+    step, pulse = definition.step_duration, 0.25 * definition.max_force
+    ranges = f"time_constant=uniform(0, {2 * step:g})", f"delay=uniform(0, {8 * timestep(base.task):g})"
+    pushes = Disturbances(pulse_force=pulse, pulse_duration=step, pulse_interval=10 * step)
+    randomized = dataclasses.replace(
+        env, actuator=Lag(), randomize=(*ranges, "gain=uniform(0.5, 1.25)"), disturbances=pushes
+    )
+    config = dataclasses.replace(base.config, env=randomized)
+    return dataclasses.replace(base, name=f"{base.task}: generic", config=config)
 
 
 def dosed(arm: Arm, axis: str, dose: float) -> Trial:
@@ -222,8 +252,3 @@ def dosed(arm: Arm, axis: str, dose: float) -> Trial:
 def at_home(arm: Arm) -> Trial:
     """Policies tested on ideal forces."""
     return Trial(arm, "ideal", posed(arm.task))
-
-
-def undosed(arm: Arm, axis: str) -> Trial:
-    """Policies tested on none of it: on ideal forces, or on the axis' motor."""
-    return dosed(arm, axis, 0.0) if AXES[axis].own_motor else at_home(arm)

@@ -1,129 +1,186 @@
-"""What ideal-trained policies lose by a dose of one thing, as the study measured it: read from its results."""
+"""What policies lost when the study tested them, policy by policy: read from the rows that it publishes."""
 
 import csv
+import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from codrl_mj.evaluation.measures import Interval
-from codrl_mj.study.doses import AXES, dosed, ideal, matched, undosed
-from codrl_mj.study.questions import MARGIN, Contrast
+from codrl_mj.study.doses import AXES
+from codrl_mj.study.inference import Stratum, effect
+from codrl_mj.study.questions import MARGIN
+from codrl_mj.study.trials import FAILED, RUNS
 
-HYPOTHESES = "hypotheses.csv"
-"""A row for every question of the study."""
+SPARED = 0.1
+"""Share of policies that may fail, and of success that may be lost, where nothing is said to be lost."""
 _PACKAGE = Path(__file__).parents[1]
 EVIDENCE = (_PACKAGE / "_assets" / "study", _PACKAGE.parent / "docs" / "results" / "actuators")
-"""Where the study's results lie: in a wheel, in a checkout."""
-_COLUMNS = ("name", "compared", "effect", "low", "high")
+"""Where the study's rows lie: in a wheel, in a checkout."""
+_COLUMNS = ("task", "trained", "tested", "seed", "score", "success")
+
+
+class Outcome(NamedTuple):
+    """What policies of one kind lose, each of them, beside those that meet ideal forces."""
+
+    lost: np.ndarray
+    """Shares of the task's span, shape (policies,)."""
+    missed: np.ndarray
+    """Shares of episodes that no longer succeed, shape (policies,); 0 where the task knows no success."""
+
+    @property
+    def loss(self) -> Interval:
+        """Mean, and its 95 % interval by Student's t over policies."""
+        return _interval(self.lost)
+
+    @property
+    def success_lost(self) -> Interval:
+        """Mean share of episodes that no longer succeed, with its interval."""
+        return _interval(self.missed)
+
+    @property
+    def failed(self) -> float:
+        """Share of policies that lose more than `FAILED`."""
+        return float(np.mean(self.lost > FAILED))
+
+    @property
+    def spared(self) -> bool:
+        """Whether nothing that matters is lost.
+
+        No more than `MARGIN` of the score on the mean, and surely no more than `FAILED`; by no more than a tenth of the
+        policies more than that; and no more than a tenth of the success.
+        """
+        within = self.loss.mean <= MARGIN and self.loss.high <= FAILED
+        return within and self.failed <= SPARED and self.success_lost.mean <= SPARED
+
+    @property
+    def hurt(self) -> bool:
+        """Whether surely more is lost than `FAILED` of the score, or a tenth of the success: by 95 % intervals."""
+        return self.loss.low > FAILED or self.success_lost.low > SPARED
+
+    def summary(self) -> dict[str, Any]:
+        """What to say of it: numbers in shares."""
+        return {
+            "policies": len(self.lost),
+            "loss": self.loss._asdict(),
+            "median": float(np.median(self.lost)),
+            "worst": float(np.max(self.lost)),
+            "failed": self.failed,
+            "success_lost": self.success_lost._asdict(),
+        }
+
+
+def total(outcomes: Iterable[Outcome]) -> Outcome:
+    """Losses added up, policy by policy, as if they were of one thing each; no more than everything."""
+    several = list(outcomes)
+    fewest = min(len(one.lost) for one in several)
+    lost, missed = (sum(part[:fewest] for part in parts) for parts in zip(*several, strict=True))
+    return Outcome(np.minimum(lost, 1.0), np.minimum(missed, 1.0))
 
 
 class Loss(NamedTuple):
-    """What ideal-trained policies lose by one thing, in shares of the task's span."""
+    """What ideal-trained policies lose by one thing."""
 
     axis: str
     """What it is."""
     dose: float
     """How much of it."""
-    loss: Interval
-    """With its 95 % interval; of the nearest dose that was tested if it is `beyond`."""
+    outcome: Outcome
+    """Policy by policy; of the largest dose that was tested if it is `beyond`."""
     beyond: bool
     """Whether no dose as large was tested, so that it loses at least as much."""
-    rows: tuple[str, ...]
-    """Names of the hypotheses that it is between."""
-    kept: float | None
-    """What policies that are trained through it lose at the dose that was trained through; None if none was."""
-    trained: float
-    """The dose that was trained through; infinite if none was."""
-
-    @property
-    def lasting(self) -> bool:
-        """Whether training through it buys it back, as far as is known, is to be denied.
-
-        So it is where it costs more than `MARGIN`, and no dose as large was tested, or policies that were trained
-        through no more of it still lose as much.
-        """
-        if self.loss.mean <= MARGIN:
-            return False
-        return self.beyond or (self.dose >= self.trained and self.kept is not None and self.kept > MARGIN)
+    between: tuple[str, ...]
+    """The tests that it was interpolated between."""
 
 
 class Evidence:
-    """The study's answers: its file hypotheses.csv."""
+    """The study's rows: what every policy scored in every test."""
 
-    def __init__(self, rows: Sequence[Mapping[str, str]]) -> None:
-        """Index the rows of the file."""
-        self._rows = {row["compared"]: row for row in rows if row["effect"]}  # empty: without runs
-        self._curves: dict[tuple[str, str], _Curve | None] = {}
+    def __init__(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        """Index the rows: `task`, `trained`, `tested`, `seed`, `score` [share of the span], `success`; or empty."""
+        self.rows = [row for row in rows if row["score"]]  # empty: the task's span was not known
+        self._tested: dict[tuple[str, str, str], dict[int, tuple[float, float]]] = {}
+        for row in self.rows:
+            found = self._tested.setdefault((row["task"], row["trained"], row["tested"]), {})
+            found[int(row["seed"])] = float(row["score"]), float(row["success"] or math.nan)
+        self._curve = functools.cache(self._curve_of)
 
     @classmethod
     def read(cls, file: Path | None = None) -> "Evidence":
         """Read a file; that of the checkout or the wheel unless one is given, and none if there is none."""
-        there = [file] if file is not None else [folder / HYPOTHESES for folder in EVIDENCE]
-        for path in there:
-            if path.is_file() or file is not None:
-                with path.open(newline="", encoding="utf-8") as opened:
-                    rows = list(csv.DictReader(opened))
-                if lacking := [name for name in _COLUMNS if rows and name not in rows[0]]:
-                    raise ValueError(f"{path}: has no column {lacking[0]!r}: give the {HYPOTHESES} of the study")
-                for number, row in enumerate(rows, start=2):
-                    for key in _COLUMNS[2:]:
-                        if row["effect"] and not _finite(row[key]):
-                            raise ValueError(f"{path}, line {number}: {key} = {row[key]!r}: must be a finite number")
-                return cls(rows)
-        return cls([])
+        there = [file] if file is not None else [folder / RUNS for folder in EVIDENCE]
+        path = next((path for path in there if path.is_file() or file is not None), None)
+        if path is None:
+            return cls([])
+        with path.open(newline="", encoding="utf-8") as opened:
+            rows = list(csv.DictReader(opened))
+        if lacking := [name for name in _COLUMNS if rows and name not in rows[0]]:
+            raise ValueError(f"{path}: has no column {lacking[0]!r}: give the {RUNS} of the study")
+        for number, row in enumerate(rows, start=2):
+            for key in ("score", "success"):
+                if row[key] and not _finite(row[key]):
+                    raise ValueError(f"{path}, line {number}: {key} = {row[key]!r}: must be a finite number")
+        return cls(rows)
 
-    def effect(self, contrast: Contrast) -> tuple[str, Interval] | None:
-        """Name and effect of the hypothesis that has this comparison alone; None if it was not answered."""
-        row = self._rows.get(contrast.name)
-        if row is None:
-            return None
-        return row["name"], Interval(*(float(row[key]) for key in ("effect", "low", "high")))
+    def without(self, *tested: str) -> "Evidence":
+        """The same without some tests, such as `lag 2` or `marginal motor`."""
+        return Evidence(row for row in self.rows if row["tested"] not in tested)
+
+    def outcome(self, task: str, trained: str, tested: str, besides: str | None = None) -> Outcome | None:
+        """What policies lost in a test, by seed; None with fewer than two policies.
+
+        `trained` is an arm, without the task. Each policy is compared with itself in another test, or, unless that is
+        given, with the mean of those that were trained and tested on ideal forces.
+        """
+        found, home = self._tested.get((task, trained, tested), {}), self._tested.get((task, "ideal", "ideal"), {})
+        if besides is not None:
+            paired = self._tested.get((task, trained, besides), {})
+            values = [np.subtract(paired[seed], found[seed]) for seed in sorted(found.keys() & paired.keys())]
+        else:
+            level = np.mean(list(home.values()), axis=0) if home else np.full(2, math.nan)
+            values = [level - found[seed] for seed in sorted(found)] if home else []
+        return Outcome(*np.nan_to_num(np.transpose(values))) if len(values) >= 2 else None
 
     def loss(self, task: str, axis: str, dose: float) -> Loss | None:
-        """What ideal-trained policies lose by a dose >= 0, in the axis' unit; None if it is not known."""
-        if (task, axis) not in self._curves:
-            self._curves[task, axis] = self._curve(task, axis)
-        curve, tested = self._curves[task, axis], AXES[axis].doses
-        if curve is None:
+        """What ideal-trained policies lose by a dose >= 0, in the axis' unit; None if the study does not know.
+
+        Every policy's own losses are interpolated between the doses that were tested.
+        """
+        curve = self._curve(task, axis)
+        if len(curve) < 2:
             return None
-        between = Interval(*(float(np.interp(dose, tested, values)) for values in zip(*curve.lost, strict=True)))
-        index = min(int(np.searchsorted(tested, dose)), len(tested) - 1)
-        places = (index,) if tested[index] == dose else (index - 1, index)
-        rows = tuple(curve.rows[place - 1] for place in places if place >= 1)
-        return Loss(axis, dose, between, dose > 1.005 * tested[-1], rows, curve.kept, curve.trained)
+        tested = list(curve)
+        index = min(max(int(np.searchsorted(tested, dose)), 1), len(tested) - 1)
+        low, high = tested[index - 1], tested[index]
+        share = min((dose - low) / (high - low), 1.0)
+        outcome = Outcome(
+            *((1.0 - share) * one + share * other for one, other in zip(curve[low], curve[high], strict=True))
+        )
+        between = {f"{axis} {at:g}" for at, weight in ((low, 1.0 - share), (high, share)) if at and weight}
+        return Loss(axis, dose, outcome, dose > 1.005 * tested[-1], tuple(sorted(between)))
 
-    def _curve(self, task: str, axis: str) -> "_Curve | None":
-        home, tested = ideal(task), AXES[axis].doses
-        none = undosed(home, axis)
-        found = {dose: self.effect(Contrast(dosed(home, axis, dose), none)) for dose in tested[1:]}
-        known = {dose: effect for dose, effect in found.items() if effect is not None}
-        if len(known) < len(found):
-            return None
-        lost = [Interval(0.0, 0.0, 0.0), *(Interval(-e.mean, -e.high, -e.low) for _, e in known.values())]
-        rows = [name for name, _ in known.values()]
-        if task not in AXES[axis].trained:
-            return _Curve(lost, rows, None, math.inf)
-        at = AXES[axis].trained[task]
-        won = self.effect(Contrast(dosed(matched(task, axis), axis, at), dosed(home, axis, at)))
-        return _Curve(lost, rows, None if won is None else lost[tested.index(at)].mean - won[1].mean, at)
+    def _curve_of(self, task: str, axis: str) -> dict[float, Outcome]:
+        """Dose -> what ideal-trained policies lose by it, of those that were tested, none first."""
+        doses, none = AXES[axis].doses, f"{axis} 0" if AXES[axis].own_motor else "ideal"
+        outcomes = {dose: self.outcome(task, "ideal", f"{axis} {dose:g}", none) for dose in doses[1:]}
+        found = {dose: outcome for dose, outcome in outcomes.items() if outcome is not None}
+        if not found:
+            return {}
+        fewest = min(len(one.lost) for one in found.values())
+        cut = {dose: Outcome(one.lost[:fewest], one.missed[:fewest]) for dose, one in found.items()}
+        return {0.0: Outcome(np.zeros(fewest), np.zeros(fewest))} | cut
 
 
-def _finite(text: str) -> bool:
+def _interval(values: Sequence[float] | np.ndarray) -> Interval:
+    sample = np.asarray(values, dtype=float)
+    return effect([Stratum(sample, np.zeros_like(sample), paired=True)])
+
+
+def _finite(text: str | None) -> bool:
     try:
-        return math.isfinite(float(text))
-    except (TypeError, ValueError):  # None where a row is too short
+        return math.isfinite(float(text or "nan"))
+    except ValueError:
         return False
-
-
-class _Curve(NamedTuple):
-    """Dose and response of an axis on a task."""
-
-    lost: list[Interval]
-    """By dose, of ideal-trained policies."""
-    rows: list[str]
-    """Hypotheses, of all doses but none."""
-    kept: float | None
-    trained: float

@@ -30,18 +30,16 @@ def write_page(path: Path, parts: Iterable[str]) -> None:
         temporary.write_text("\n".join(part for part in parts if part), encoding="utf-8")
 
 
-def conclusions_section(page: Path) -> str:
-    """A page's section of conclusions, which a person writes: what its file says, or that there is none yet.
+def conclusions(page: Path) -> str:
+    """A page's conclusions, which a person writes: what its file says, or that there is none yet.
 
     Args:
         page: the page; the file of `actuators.md` is `actuators_conclusions.md` beside it, which nothing here writes.
     """
     file = page.with_name(f"{page.stem}_conclusions.md")
     if file.is_file():
-        text = file.read_text(encoding="utf-8").strip()
-    else:
-        text = f"None are written yet: they belong into `{file.name}` beside this page, which includes them."
-    return f"## Conclusions\n\n{text}\n"
+        return file.read_text(encoding="utf-8").strip() + "\n"
+    return f"No conclusions are written yet: they belong into `{file.name}` beside this page, which includes them.\n"
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], numbers: int = 0) -> str:

@@ -26,6 +26,8 @@ from codrl_mj.training.folder import RESULT
 
 TEST_SECONDS = 1.0
 """What a test takes [s of one core], about."""
+FAILED = 0.1
+"""A policy that scores less than one by more than this has failed."""
 RUNS, TOTALS = "runs.csv", "totals.json"
 """What is published of a study: a row for every policy and test; what its trainings took in all."""
 MEASURES = (
@@ -342,6 +344,8 @@ def trial_rows(collected: Collected, score: Callable[[Trial], Mapping[int, float
             "score": mean.mean,
             "low": mean.low,
             "high": mean.high,
+            "median": np.median(scores),
+            "failed": np.mean(scores < 1.0 - FAILED),
             "worst": scores.min(),
             "best": scores.max(),
             **{name: np.mean(found) if found else None for name, found in measured.items()},

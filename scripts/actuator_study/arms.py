@@ -3,13 +3,11 @@
 import dataclasses
 from typing import Any
 
-from codrl_mj.actuators import Drive, Lag
-from codrl_mj.disturbances import Disturbances
-from codrl_mj.envs.config import EnvConfig
+from codrl_mj.actuators import Drive
 from codrl_mj.study.advice import redesigned
-from codrl_mj.study.doses import AXES, arm, posed, timestep
-from codrl_mj.study.trials import Arm
-from codrl_mj.tasks import find_task, named_actuator
+from codrl_mj.study.doses import AXES, REAL, arm, at_home, dosed
+from codrl_mj.study.trials import Arm, Trial
+from codrl_mj.tasks import named_actuator
 
 TRAINED = ("pendulum", "furuta")
 """The tasks on which doses are trained through: those whose score every dose moves, and that have no ceiling nearby.
@@ -19,21 +17,16 @@ LOOPED = ("pendulum", "cartpole")
 DRAWN = ("lag", "weakness", "supply", "noise")
 """The axes that can be drawn anew for every episode; delay and friction are none of an actuator's numbers."""
 GOOD: dict[str, dict[str, Any]] = {
-    "pendulum": {"name": "maxon-dcx22l", "gear": 59.0},
-    "cartpole": {"name": "maxon-dcx22l", "gear": 605.0},
-    "acrobot": {"name": "cubemars-ak80-6", "gear": 6.0},
-    "furuta": {"name": "quanser-qube-servo-2", "gear": 1.0},
-    "mountain_car": {"name": "faulhaber-1331-006", "gear": 1039.0},
-    "mountain_car_continuous": {"name": "faulhaber-1331-006", "gear": 1038.0},
+    "pendulum": {"name": "maxon-dcx22l", "motor": {"gear_ratio": 59.0}},
+    "cartpole": {"name": "maxon-dcx22l", "motor": {"gear_ratio": 605.0}},
+    "acrobot": {"name": "cubemars-ak80-6", "motor": {"gear_ratio": 6.0}},
+    "furuta": {"name": "quanser-qube-servo-2", "motor": {"gear_ratio": 1.0}},
+    "mountain_car": {"name": "faulhaber-1331-006", "motor": {"gear_ratio": 1039.0}},
+    "mountain_car_continuous": {"name": "faulhaber-1331-006", "motor": {"gear_ratio": 1038.0}},
 }
 """Task -> the smallest motor of the catalogue that `codrl-mj motor choose` finds sufficient, with its gear."""
-MARGINAL: dict[str, dict[str, Any]] = {
-    "pendulum": {"name": "quanser-srv02", "gear": 70.0},
-    "cartpole": {"name": "lego-ev3-large", "gear": 44.2},
-    "acrobot": {"name": "pololu-37d-30", "gear": 30.0},
-    "furuta": {"name": "quanser-qube-servo-2", "gear": 1.0, "voltage": 6.0},
-}
-"""Task -> a motor that it calls `try it`: some bound says that it does not suffice. On the cars there is none."""
+MARGINAL: dict[str, dict[str, Any]] = {task: known["marginal motor"] for task, known in REAL.items()}
+"""Task -> a motor that it calls `try it`."""
 
 
 def drawn(task: str, axis: str) -> Arm:
@@ -54,35 +47,16 @@ def drawn_up_to(task: str, axis: str) -> float:
     return min(2.0 * AXES[axis].trained[task], AXES[axis].doses[-1])
 
 
-def generic(task: str) -> Arm:
-    """Trained without any model of a motor, as is common: random strength, lag and delay, and random pushes."""
-    definition = find_task(task)
-    step, pulse = definition.step_duration, 0.25 * definition.max_force
-
-    return arm(
-        task,
-        "generic",
-        posed(
-            task,
-            Lag(),
-            randomize=(
-                f"time_constant=uniform(0, {2 * step:g})",
-                f"delay=uniform(0, {8 * timestep(task):g})",
-                "gain=uniform(0.5, 1.25)",
-            ),
-            disturbances=Disturbances(pulse_force=pulse, pulse_duration=step, pulse_interval=10 * step),
-        ),
-    )
-
-
 def designed(task: str) -> Drive:
     """The paper's motor and supply under a designed loop."""
     return redesigned(named_actuator("paper", task), task)
 
 
-def motor(task: str, chosen: dict[str, Any]) -> EnvConfig:
-    """A motor of the catalogue under the drive that it gets there, at a gear, on its nominal or another voltage."""
-    named = {"name": chosen["name"], "motor": {"gear_ratio": chosen["gear"]}}
-    if "voltage" in chosen:
-        named["supply"] = {"voltage": chosen["voltage"]}
-    return posed(task, named)
+def matched(task: str, axis: str) -> Arm:
+    """Trained through one dose of one thing."""
+    return arm(task, axis, AXES[axis].at(task, AXES[axis].trained[task]))
+
+
+def undosed(arm: Arm, axis: str) -> Trial:
+    """Policies tested on none of it: on ideal forces, or on the axis' motor."""
+    return dosed(arm, axis, 0.0) if AXES[axis].own_motor else at_home(arm)

@@ -7,52 +7,83 @@ from typing import Any
 import numpy as np
 
 from actuator_study import arms
-from actuator_study.questions import on_loop, on_motor
 from codrl_mj.evaluation.measures import bootstrap_mean
-from codrl_mj.study.advice import BUY, IDEAL, LOOP, MEASURE, THROUGH, advise, decide
-from codrl_mj.study.doses import AXES, SECONDS, at_home, dosed, ideal, matched, undosed
+from codrl_mj.study.advice import BUY, IDEAL, MEASURE, RANDOMISE, THROUGH, decide, known, tests_through
+from codrl_mj.study.doses import AXES, SECONDS
 from codrl_mj.study.evidence import Evidence
 from codrl_mj.study.pages import COLOURS, MARKERS, TITLES, legend, save
-from codrl_mj.study.questions import MARGIN, Scores
+from codrl_mj.study.questions import Scores
 from codrl_mj.study.trials import Trial
 
 _LOWEST = -0.1  # of the span; what is worse is as lost
-_REGIONS = {IDEAL: "#d9f0e3", LOOP: "#dbe9f6", THROUGH: "#fdebc8", BUY: "#f6d5cc", MEASURE: "#eeeeee"}
+_REGIONS = {IDEAL: "#d9f0e3", RANDOMISE: "#dbe9f6", THROUGH: "#fdebc8", BUY: "#f6d5cc", MEASURE: "#eeeeee"}
 
 
-def doses(path: Path, scores: Scores) -> None:
-    """Draw what ideal-trained policies score over every axis, a panel each, a line for each task.
+def losses(path: Path, evidence: Evidence) -> bool:
+    """Draw what ideal-trained policies lose, a panel for each axis, a row for each task, a column for each dose.
 
-    Where it is trained through, what policies score there that were: a star in the task's colour.
+    A cell has the mean loss, and below it how many policies lose more than `FAILED`, where any does.
+
+    Returns:
+        Whether anything could be drawn.
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10.0, 6.4), layout="constrained")
-    panels: Any = figure.subplots(2, 3, sharey=True).ravel()
-    for panel, (name, axis) in zip(panels, AXES.items(), strict=True):
-        for number, task in enumerate(SECONDS):
-            colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
-            trials = [undosed(ideal(task), name), *(dosed(ideal(task), name, x) for x in axis.doses[1:])]
-            there = [(place, found) for place, one in enumerate(trials) if (found := _values(scores, one)).size]
-            if there:
-                means = [bootstrap_mean(found) for _, found in there]
-                places = np.array([place for place, _ in there]) + 0.06 * (number - 2.5)
-                panel.plot(places, [max(one.mean, _LOWEST) for one in means], color=colour, lw=1.3)
-                _bars(panel, places, means, colour, marker, TITLES[task])
-            if task in axis.trained:
-                place = axis.doses.index(axis.trained[task]) + 0.06 * (number - 2.5)
-                through = _values(scores, dosed(matched(task, name), name, axis.trained[task]))
-                if through.size:
-                    panel.plot(place, through.mean(), "*", color=colour, markersize=13, markeredgecolor="white")
-        panel.set_xticks(range(len(axis.doses)), [f"{dose:g}" for dose in axis.doses])
-        panel.set(xlabel=axis.unit, title=axis.title, ylim=(_LOWEST - 0.04, 1.12))
+    figure = Figure(figsize=(10.0, 7.0), layout="constrained")
+    panels: Any = figure.subplots(2, 3).ravel()
+    drawn = False
+    for number, (panel, (name, axis)) in enumerate(zip(panels, AXES.items(), strict=True)):
+        means = np.full((len(SECONDS), len(axis.doses) - 1), np.nan)
+        for row, task in enumerate(SECONDS):
+            for column, dose in enumerate(axis.doses[1:]):
+                if (found := evidence.loss(task, name, dose)) is None:
+                    continue
+                outcome, drawn = found.outcome, True
+                means[row, column] = outcome.loss.mean
+                text = f"{outcome.loss.mean:z.2f}" + (f"\n{outcome.failed:.0%} fail" if outcome.failed else "")
+                dark = "white" if outcome.loss.mean > 0.45 else "0.15"
+                panel.text(column, row, text, ha="center", va="center", fontsize=6.5, color=dark)
+        shown = panel.imshow(np.clip(means, 0.0, 1.0), cmap="YlOrBr", vmin=0.0, vmax=1.0, aspect="auto")
+        panel.set_xticks(range(len(axis.doses) - 1), [f"{dose:g}" for dose in axis.doses[1:]])
+        panel.set_yticks(range(len(SECONDS)), [TITLES[task] for task in SECONDS] if number % 3 == 0 else [])
+        panel.set(xlabel=axis.unit, title=axis.title)
+    figure.colorbar(shown, ax=panels, label="lost [share of the span]", shrink=0.6)
+    save(figure, path)
+    return drawn
+
+
+def insured(path: Path, evidence: Evidence) -> bool:
+    """Draw what policies score at the doses that were trained through, by what they were trained on; every one a dot.
+
+    Returns:
+        Whether anything could be drawn.
+    """
+    from matplotlib.figure import Figure
+
+    kinds = {"ideal": "ideal forces", "generic": "random actuators", "drawn": "drawn doses", "matched": "that dose"}
+    figure = Figure(figsize=(10.0, 5.2), layout="constrained")
+    panels: Any = figure.subplots(2, 1, sharey=True)
+    drawn = False
+    for panel, task in zip(panels, arms.TRAINED, strict=True):
+        for place, (name, axis) in enumerate(AXES.items()):
+            trained = {"drawn": f"{name}, drawn", "matched": name}
+            for number, (kind, label) in enumerate(kinds.items()):
+                found = evidence.outcome(task, trained.get(kind, kind), f"{name} {axis.trained[task]:g}")
+                if found is not None:
+                    drawn, at, scores = True, place + 0.19 * (number - 1.5), np.maximum(1.0 - found.lost, _LOWEST)
+                    colour = COLOURS[number]
+                    dots = np.linspace(-0.05, 0.05, len(scores))
+                    panel.plot(at + dots, np.sort(scores), ".", color=colour, markersize=3.5, alpha=0.7, label=label)
+                    panel.plot([at - 0.07, at + 0.07], [np.mean(scores)] * 2, color=colour, lw=1.5)
+        named = [f"{axis.title} {axis.trained[task]:g}" for axis in AXES.values()]
+        panel.set_xticks(range(len(AXES)), named)
+        panel.set(title=TITLES[task], ylabel="score [share of the span]")
         panel.grid(axis="y", color="0.9")
         panel.set_axisbelow(True)
-    for panel in panels[::3]:
-        panel.set_ylabel("score [share of the span]")
-    panels[-1].plot([], [], "*", color="0.4", markersize=12, label="trained through it")
-    legend(figure, 4)
+    if drawn:
+        legend(figure, 4)
     save(figure, path)
+    return drawn
 
 
 def bars(path: Path, scores: Scores, groups: Mapping[str, Sequence[tuple[str, Trial]]], title: str) -> None:
@@ -90,34 +121,37 @@ def bars(path: Path, scores: Scores, groups: Mapping[str, Sequence[tuple[str, Tr
 def chart(path: Path, evidence: Evidence) -> bool:
     """Draw what to do about an actuator that is late or short of voltage and nothing else, a panel for each task.
 
+    A task on which nothing was trained through a dose is hatched.
+
     Returns:
         Whether anything could be drawn: the results of a task are all there.
     """
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
-    from scipy.ndimage import distance_transform_edt
 
-    lags, lacks = np.geomspace(0.05, 8.0, 120), np.linspace(0.0, 0.8, 81)
+    lags, lacks = np.geomspace(0.05, 8.0, 41), np.linspace(0.0, 0.8, 33)
     tasks = [task for task in SECONDS if all(evidence.loss(task, axis, 0.0) for axis in ("lag", "supply"))]
     if not tasks:
         return False
     figure = Figure(figsize=(10.0, 6.4), layout="constrained")
     panels: Any = figure.subplots(2, 3, sharex=True, sharey=True).ravel()
+    none = dict.fromkeys(AXES, 0.0)
     for panel, task in zip(panels, tasks, strict=False):
-        late, short = (
-            [found for dose in doses if (found := evidence.loss(task, axis, dose))]
-            for axis, doses in (("lag", lags), ("supply", lacks))
+        points = tests_through(evidence, task)
+        regions = np.array(
+            [
+                [
+                    list(_REGIONS).index(decide(known(evidence, task, none | {"lag": lag, "supply": lack}, points)))
+                    for lag in lags
+                ]
+                for lack in lacks
+            ]
         )
-        regions = np.array([[list(_REGIONS).index(decide([one, other], [other])) for one in late] for other in short])
         colours = ListedColormap(list(_REGIONS.values()))
-        panel.pcolormesh(lags, 1.0 - lacks, regions, cmap=colours, vmin=-0.5, vmax=4.5, rasterized=True)
-        for number, name in enumerate(_REGIONS):  # in words too, for print without colours
-            room = distance_transform_edt(np.pad(regions == number, 1))[1:-1, 1:-1]
-            row, column = np.unravel_index(np.argmax(room), room.shape)
-            if room[row, column] > 5:
-                words = {"ha": "center", "va": "center", "fontsize": 7, "color": "0.25"}
-                panel.text(lags[column], 1.0 - lacks[row], name.replace(" ", "\n", 1), **words)
+        panel.pcolormesh(lags, 1.0 - lacks, regions, cmap=colours, vmin=-0.5, vmax=len(_REGIONS) - 0.5, rasterized=True)
+        if task not in arms.TRAINED:
+            panel.contourf(lags, 1.0 - lacks, regions, levels=[0.5, 99], colors="none", hatches=["//"])
         panel.set(title=TITLES[task], xscale="log")
         panel.set_xticks([0.1, 0.3, 1.0, 3.0], ["0.1", "0.3", "1", "3"])
         panel.minorticks_off()
@@ -126,38 +160,10 @@ def chart(path: Path, evidence: Evidence) -> bool:
     for panel in panels[::3]:
         panel.set_ylabel("voltage there is [needed voltage]")
     handles = [Patch(facecolor=colour, edgecolor="0.6", label=name) for name, colour in _REGIONS.items()]
-    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize="small")
+    handles.append(Patch(facecolor="white", edgecolor="0.4", hatch="//", label="nothing was trained through a dose"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize="small")
     save(figure, path)
     return True
-
-
-def foretold(path: Path, scores: Scores, evidence: Evidence) -> None:
-    """Draw what the bench and the doses foretell that ideal-trained policies lose, over what they lost in tests."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(5.4, 4.6), layout="constrained")
-    axes: Any = figure.subplots()
-    for number, task in enumerate(SECONDS):
-        arm = ideal(task)
-        home = _values(scores, at_home(arm))
-        tested = [on_motor(arm, "good"), *([on_motor(arm, "marginal")] if task in arms.MARGINAL else [])]
-        tested += [on_loop(arm, loop) for loop in ("weaker", "paper", "designed") if task in arms.LOOPED]
-        for trial in tested:
-            values, advice = _values(scores, trial), advise(trial.env.actuator, task, evidence)
-            if values.size and advice.losses:
-                at = min(float(np.mean(home) - np.mean(values)), 1.0)
-                colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
-                axes.plot(at, advice.lost.mean, marker, color=colour, label=TITLES[task])
-                if max(at, advice.lost.mean) > MARGIN:
-                    name = trial.test.removesuffix(" motor")
-                    where = {"xytext": (4, 4), "textcoords": "offset points", "fontsize": 7}
-                    axes.annotate(name, (at, advice.lost.mean), **where)
-    axes.plot([-0.1, 1.05], [-0.1, 1.05], color="0.7", lw=1, zorder=0)
-    axes.set(xlabel="lost in tests [share of the span]", ylabel="foretold by bench and doses")
-    axes.grid(color="0.92")
-    axes.set_axisbelow(True)
-    legend(figure, 3)
-    save(figure, path)
 
 
 def _values(scores: Scores, trial: Trial) -> np.ndarray:

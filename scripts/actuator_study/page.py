@@ -4,24 +4,27 @@ import itertools
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from actuator_study import arms, figures
+from actuator_study import advised, arms, figures
 from actuator_study.exploration import around_the_paper, paper_loops, windup
 from actuator_study.questions import on_loop, on_motor, primary, secondary, through_loop, through_motor
 from codrl_mj.runs.files import write_json
-from codrl_mj.study.doses import AXES, FLOORS, SECONDS, at_home, dosed, ideal
-from codrl_mj.study.evidence import HYPOTHESES, Evidence
+from codrl_mj.study.advice import IDEAL, THROUGH
+from codrl_mj.study.doses import AXES, FLOORS, SECONDS, at_home, ideal
+from codrl_mj.study.evidence import Evidence, Outcome
 from codrl_mj.study.inference import detectable
-from codrl_mj.study.pages import TITLES, conclusions_section, markdown_table, write_csv, write_page
+from codrl_mj.study.pages import TITLES, conclusions, markdown_table, write_csv, write_page
 from codrl_mj.study.questions import LEVEL, MARGIN, Scores, Verdict, judge
-from codrl_mj.study.trials import RUNS, TOTALS, Collected, Trial, run_rows, trial_rows
+from codrl_mj.study.trials import FAILED, RUNS, TOTALS, Collected, Trial, run_rows, trial_rows
+from codrl_mj.tasks import find_task
 
 PAGE, FOLDER = "actuators.md", "actuators"
 """The page, and the folder beside it with its figures and tables."""
-TRIALS = "trials.csv"
-"""A row for every trial."""
+TRIALS, HYPOTHESES, ADVISED = "trials.csv", "hypotheses.csv", "advised.csv"
+"""A row for every trial, for every question, and for every actuator that advice was asked about."""
 QUESTIONS: Mapping[str, str] = {
     "matters": "When does an actuator matter?",
     "tune": "Tune or train?",
@@ -44,7 +47,6 @@ def write(collected: Collected, out: Path) -> list[Path]:
     """
     folder, scores = out / FOLDER, Scores(collected, FLOORS, [at_home(ideal(task)) for task in SECONDS])
     first, others = judge(scores, primary(), primary=True), judge(scores, secondary())
-    drawn = _draw(scores, folder)
     rows = {
         RUNS: run_rows(collected, scores.of),
         TRIALS: trial_rows(collected, scores.of),
@@ -52,26 +54,34 @@ def write(collected: Collected, out: Path) -> list[Path]:
     }
     for name, table in rows.items():
         write_csv(folder / name, list(table))
+    evidence = Evidence.read(folder / RUNS)
+    said = list(advised.rows(evidence))
+    write_csv(folder / ADVISED, said)
     write_json(folder / TOTALS, collected.totals._asdict())
-    advice = _advice(folder, scores)
+    drawn = _draw(scores, evidence, folder)
     parts = [
+        "# What does an actuator cost?\n",
+        conclusions(out / PAGE),
+        _borne(evidence, drawn),
+        _insured(drawn),
+        _motors(evidence, drawn),
+        _advised(evidence, said, drawn),
         _head(collected),
-        conclusions_section(out / PAGE),
-        _verdicts(first),
+        _verdicts(first, others),
         *(_question(name, title, others, drawn) for name, title in QUESTIONS.items()),
-        _yours(advice),
         _explored(scores),
         _missing(collected),
         _method(collected, scores),
     ]
     write_page(out / PAGE, parts)
-    return [out / PAGE, *drawn.values(), *(folder / name for name in (*rows, TOTALS)), *advice]
+    return [out / PAGE, *drawn.values(), *(folder / name for name in (*rows, ADVISED, TOTALS))]
 
 
-def _draw(scores: Scores, folder: Path) -> dict[str, Path]:
-    """The figures by question."""
-    found = {name: folder / f"{name}.svg" for name in ("matters", "tune", "motors")}
-    figures.doses(found["matters"], scores)
+def _draw(scores: Scores, evidence: Evidence, folder: Path) -> dict[str, Path]:
+    """The figures by name, of which there is something to draw."""
+    made = {"losses": figures.losses, "insured": figures.insured, "chart": figures.chart}
+    found = {name: path for name, draw in made.items() if draw(path := folder / f"{name}.svg", evidence)}
+    found |= {name: folder / f"{name}.svg" for name in ("tune", "motors")}
     loops: dict[str, list[tuple[str, Trial]]] = {
         f"{TITLES[task]},\n{loop}": [
             ("ideal-trained", on_loop(ideal(task), loop)),
@@ -100,32 +110,111 @@ def _draw(scores: Scores, folder: Path) -> dict[str, Path]:
     return found
 
 
-def _advice(folder: Path, scores: Scores) -> list[Path]:
-    """Draw what is advised, and how well it was foretold; nothing where results are missing."""
-    evidence, files = Evidence.read(folder / HYPOTHESES), [folder / "chart.svg", folder / "foretold.svg"]
-    if not figures.chart(files[0], evidence):
-        return []
-    figures.foretold(files[1], scores, evidence)
-    return files
+def _figure(drawn: Mapping[str, Path], name: str, says: str) -> str:
+    return f"![{says}]({FOLDER}/{drawn[name].name})\n" if name in drawn else ""
 
 
-def _yours(drawn: Sequence[Path]) -> str:
-    if not drawn:
+def _borne(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
+    """A table of what ideal-trained policies bear in a task's own units, and the map of all losses."""
+    rows = []
+    for task in SECONDS:
+        step, force = find_task(task).step_duration, find_task(task).max_force
+        unit = "N" if task in ("cartpole", "mountain_car", "mountain_car_continuous") else "N·m"
+        rows.append([f"{TITLES[task]}: {1000 * step:g} ms, {force:g} {unit}"])
+        for name, axis in AXES.items():
+            known = [(dose, one.outcome) for dose in axis.doses[1:] if (one := evidence.loss(task, name, dose))]
+            borne = [dose for dose, _ in itertools.takewhile(lambda pair: pair[1].spared, known)]
+            hurt = next(((dose, one) for dose, one in known if one.hurt), None)
+            scale, of = {"lag": (1000 * step, "ms"), "delay": (1000 * step, "ms"), "supply": (100.0, "%")}.get(
+                name, (force, unit)
+            )
+            text = f"≤ {_short(scale * borne[-1] if borne else 0.0)} {of}"
+            if hurt is not None:
+                failed = round(hurt[1].failed * len(hurt[1].lost))
+                text += f"; ≥ {_short(scale * hurt[0])} {of}: {failed} of {len(hurt[1].lost)} fail"
+            rows[-1].append(text if known else "–")
+    header = ["task: policy step, largest force", "lag", "missing force", "missing voltage", "delay", "friction"]
+    return f"""## What is borne
+
+Left: harmless. Policies that were trained on ideal forces lose at most {MARGIN:g} of the span on the mean, surely at
+most {FAILED:g}, and a tenth of their success. Right: it hurts. They surely lose more than {FAILED:g}, or a tenth of
+their success. Between the two, measure. A policy fails where it loses more than {FAILED:g}.
+
+{markdown_table([*header, "noise"], rows)}
+{_figure(drawn, "losses", "What ideal-trained policies lose, by task and dose")}"""
+
+
+def _short(value: float) -> str:
+    return f"{float(f'{value:.2g}'):g}"
+
+
+def _insured(drawn: Mapping[str, Path]) -> str:
+    if "insured" not in drawn:
         return ""
-    chart, foretold = (path.name for path in drawn)
-    return f"""## What to do about yours
+    return f"""## Train through it, or randomise?
 
-`codrl-mj advise ACTUATOR TASK` measures an actuator on a bench and says it for yours ([how](../advise.md)). By the same
-rules, of one that is late or short of voltage and nothing else:
+Twenty policies a column, tested at one dose of each thing, that was chosen to hurt. *Random actuators* means random
+strength, lag and delay, and pushes: no model of the motor, though three of the six things are of its kind. Its ranges
+reach 1 times the tested lag and delay on Pendulum, and 4 times on Furuta, so that the two tasks differ in that, too.
 
-![Train on ideal, design the loop, train through it, or buy another]({FOLDER}/{chart})
+{_figure(drawn, "insured", "Scores by what policies were trained on")}"""
 
-Training through a dose was tried on Pendulum and Furuta alone. Losses of several things at once are added up. How well
-that foretells what ideal-trained policies lose on the motors and loops of this study, none of which the doses were
-taken from:
 
-![Foretold and measured losses]({FOLDER}/{foretold})
-"""
+def _motors(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
+    """A row for every motor and task: what policies lose on it, with those that fail and success."""
+    rows = []
+    for task in SECONDS:
+        for test, (name, _) in advised.tested(task).items():
+            if test.endswith("motor"):
+                told = advised.measured(evidence, task, test)
+                cells = [_lost(told[kind].most) if kind in told else "–" for kind in (IDEAL, THROUGH)]
+                rows.append([TITLES[task], name, test.removesuffix(" motor"), *cells])
+    header = ["task", "motor, gear", "", "trained on ideal forces", "trained through it"]
+    return f"""## Off-the-shelf motors
+
+*Good* is the smallest that `codrl-mj motor choose` finds sufficient, *marginal* one that it calls `try it`. What
+policies lose on them, how many fail, and what of their success is lost:
+
+{markdown_table(header, rows)}
+{_figure(drawn, "motors", "Scores on motors of the catalogue")}"""
+
+
+def _lost(outcome: Outcome | None) -> str:
+    if outcome is None:
+        return "–"
+    mean, low, high = outcome.loss
+    count = len(outcome.lost)
+    failed = f"{round(outcome.failed * count)} of {count} fail"
+    return f"{mean:z.2f} [{low:z.2f}, {high:z.2f}], {failed}, {100 * outcome.success_lost.mean:z.0f} %"
+
+
+def _advised(evidence: Evidence, said: Sequence[Mapping[str, Any]], drawn: Mapping[str, Path]) -> str:
+    """What `codrl-mj advise` says of every actuator that was tested, and how far off it is."""
+    if not said:
+        return ""
+    rows = []
+    for one in said:
+        numbers = f"{'≥ ' * one['beyond']}{one['predicted_mean']:z.2f}", f"{one['measured_mean']:z.2f}"
+        rows.append([TITLES[one["task"]], one["actuator"], *numbers, one["said"], one["measured"], one["judged"]])
+    errors = [abs(one["predicted_mean"] - one["measured_mean"]) for one in said]
+    large = [error for error, one in zip(errors, said, strict=True) if one["measured_mean"] > MARGIN] or [0.0]
+    told = [one["judged"] for one in said]
+    left = advised.left_out(evidence)
+    header = ["task", "actuator", "predicted", "measured", "advise says", "measurement says", ""]
+    return f"""## What `advise` says, and how right it is
+
+`codrl-mj advise ACTUATOR TASK` ([how](../advise.md)) predicts what ideal-trained policies lose, here on actuators that
+none of the doses was taken from, and without what was measured on the one that is asked about:
+
+{markdown_table(header, rows)}
+Of {len(told)} answers {told.count("right")} are right, {told.count("wrong")} wrong; {told.count("not tested")} name
+something that was not tested there, and {told.count("says nothing")} say to measure. The mean error of the prediction
+is {np.mean(errors):.2f}, and {np.mean(large):.2f} over those that lose more than {MARGIN:g}. Of
+{left["doses"]} doses, each predicted from its neighbours, {left["off"]} are off by more than {MARGIN:g} (mean
+{left["mean_error"]:.3f}), and {left["flips"]} change sides between harmless and not. The numbers are in
+[advised]({FOLDER}/{ADVISED}).
+
+{_figure(drawn, "chart", "What to do about an actuator that is late or short of voltage")}"""
 
 
 def _explored(scores: Scores) -> str:
@@ -169,7 +258,7 @@ def _head(collected: Collected) -> str:
     done, wanted = totals.trainings, len(grid.cells())
     tested, tests = sum(map(len, collected.evaluations.values())), len(grid.deployments())
     codes = ", ".join(f"`{code}` ({count})" for code, count in sorted(totals.codes.items())) or "none"
-    return f"""# What does an actuator cost?
+    return f"""## How it was measured
 
 {done} of {wanted} trainings are finished ({totals.seconds / 3600:.1f} hours of one core), and {tested} of {tests}
 tests. [The plan](plan.md) was written before the first of them: questions, hypotheses, tests.
@@ -177,12 +266,13 @@ Versions of the code that trained, with the number of runs: {codes}.
 
 `python scripts/study_actuators.py` writes this page, its figures and its tables; do not edit it
 ([how to run it](../studies.md)). The numbers are files: [hypotheses]({FOLDER}/{HYPOTHESES}),
-[trials]({FOLDER}/{TRIALS}), [runs]({FOLDER}/{RUNS}).
+[trials]({FOLDER}/{TRIALS}), [runs]({FOLDER}/{RUNS}); `examples/recompute.py` recomputes the conclusions from the last
+without this package.
 """
 
 
-def _verdicts(verdicts: Sequence[Verdict]) -> str:
-    """The primary hypotheses, one row each."""
+def _verdicts(verdicts: Sequence[Verdict], others: Sequence[Verdict]) -> str:
+    """The primary hypotheses, one row each, and what those are worth that hold."""
     rows = []
     for verdict in verdicts:
         says = verdict.question.statement
@@ -195,7 +285,16 @@ def _verdicts(verdicts: Sequence[Verdict]) -> str:
         name = verdict.question.name
         rows.append([name, verdict.outcome, _effect(verdict), _p(verdict.corrected), policies, says])
     header = ["", "holds", "effect [95 %]", "corrected p", "policies", "says"]
-    return f"## The twelve hypotheses\n\n{markdown_table(header, rows)}"
+    wrong = [one for one in others if " 25 % over nominal" in one.question.statement.replace("-", "").replace("+", "")]
+    sizes = [abs(one.effect.mean) for one in wrong if not np.isnan(one.effect.mean)] or [0.0]
+    return f"""## The twelve hypotheses
+
+{markdown_table(header, rows)}
+Seven of those that hold could hardly fail. P1 to P5: their doses were chosen in a pilot, so that ideal-trained policies
+lose. P9: the loop was badly detuned. P10: errors of both signs cancel in its mean; their mean *size* is
+{np.mean(sizes):.3f} over {len(wrong)} cases, the largest {np.max(sizes):.3f}. P6, P7, P8, P11 and P12 could have gone
+either way.
+"""
 
 
 def _effect(verdict: Verdict) -> str:
@@ -208,40 +307,18 @@ def _p(value: float) -> str:
 
 
 def _question(name: str, title: str, verdicts: Sequence[Verdict], drawn: Mapping[str, Path]) -> str:
-    """A question: its figure, and how many of its secondary comparisons were decided, with the largest effects."""
+    """A question: its figure, and how many of its secondary comparisons were decided."""
     mine = [verdict for verdict in verdicts if verdict.question.section == name and verdict.runs != (0, 0)]
     decided = [verdict for verdict in mine if verdict.outcome != "open"]
     lines = [f"## {title}", ""]
-    if name in drawn:
+    if name == "tune":
         lines += [f"![{title}]({FOLDER}/{drawn[name].name})", ""]
-    if name == "matters":
-        lines.append(_harm(mine))
     beyond = sum(one.effect.low > MARGIN or one.effect.high < -MARGIN for one in decided)
     lines.append(
         f"Of {len(mine)} secondary comparisons {len(decided) or 'none'} differ with a false discovery rate of 5 %, "
-        f"{beyond or 'none'} by more than {MARGIN:g} of the span (its 95 % interval)." + " The largest:" * bool(decided)
+        f"{beyond or 'none'} by more than {MARGIN:g} of the span (its 95 % interval, Student's t)."
     )
-    largest = sorted(decided, key=lambda verdict: -abs(verdict.effect.mean))[:3]
-    lines += ["", *(f"- {one.question.statement}: {_effect(one)}" for one in largest)] if largest else []
     return "\n".join(lines) + "\n"
-
-
-def _harm(verdicts: Sequence[Verdict]) -> str:
-    """A table of the doses that do no harm, and of those that do, to ideal-trained policies."""
-    effects = {pair.one.name: one.effect for one in verdicts for pair in one.question.contrasts}
-    rows = []
-    for task in SECONDS:
-        rows.append([TITLES[task]])
-        for name, axis in AXES.items():
-            known = [effects.get(dosed(ideal(task), name, dose).name) for dose in axis.doses[1:]]
-            borne = list(itertools.takewhile(lambda one: one is not None and one.low > -MARGIN, known))
-            beyond = [dose for dose, one in zip(axis.doses[1:], known, strict=True) if one and one.high < -MARGIN]
-            rows[-1].append(f"{axis.doses[len(borne)]:g}, {format(beyond[0], 'g') if beyond else '–'}")
-    return f"""\
-What policies bear that were trained on ideal forces: the largest dose up to which the 95 % intervals of what they lose
-lie within {MARGIN:g} of the span, and the smallest whose interval lies beyond it.
-
-{markdown_table(["", *(f"{axis.title}: {axis.unit}" for axis in AXES.values())], rows)}"""
 
 
 def _missing(collected: Collected) -> str:

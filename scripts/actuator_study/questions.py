@@ -5,10 +5,10 @@ from collections.abc import Iterable
 from typing import Any
 
 from actuator_study import arms
-from actuator_study.arms import DRAWN, GOOD, LOOPED, MARGINAL, TRAINED
+from actuator_study.arms import DRAWN, GOOD, LOOPED, MARGINAL, TRAINED, matched, undosed
 from codrl_mj.disturbances import Disturbances, Joint
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.study.doses import AXES, SECONDS, arm, at_home, dosed, ideal, matched, posed, undosed
+from codrl_mj.study.doses import AXES, SECONDS, arm, at_home, dosed, generic, ideal, posed
 from codrl_mj.study.questions import Contrast, Question
 from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import find_task
@@ -21,6 +21,10 @@ def _trained_dose(arm: Arm, axis: str) -> Trial:
 def _contrasts(axis: str, one: Any, other: Any) -> tuple[Contrast, ...]:
     """At the axis' trained dose, on every task: arms made by functions of the task."""
     return tuple(Contrast(_trained_dose(one(task), axis), _trained_dose(other(task), axis)) for task in TRAINED)
+
+
+def _generic(task: str) -> Arm:
+    return generic(ideal(task))
 
 
 def on_loop(arm: Arm, loop: str) -> Trial:
@@ -36,13 +40,13 @@ def through_loop(task: str, loop: str) -> Arm:
 def on_motor(arm: Arm, kind: str) -> Trial:
     """Policies tested on a motor of the catalogue."""
     chosen = {"good": GOOD, "marginal": MARGINAL}[kind]
-    return Trial(arm, f"{kind} motor", arms.motor(arm.task, chosen[arm.task]))
+    return Trial(arm, f"{kind} motor", posed(arm.task, chosen[arm.task]))
 
 
 def through_motor(task: str, otherwise: str = "", **changes: Any) -> Arm:
     """Trained through the marginal motor of the catalogue, with changes that have a name."""
     named = ", ".join(filter(None, ["marginal motor", otherwise]))
-    return arm(task, named, dataclasses.replace(arms.motor(task, MARGINAL[task]), **changes))
+    return arm(task, named, posed(task, MARGINAL[task], **changes))
 
 
 WRONG: dict[str, tuple[str, float]] = {
@@ -124,7 +128,7 @@ def primary() -> list[Question]:
             tuple(
                 pair
                 for axis in AXES
-                for pair in _contrasts(axis, lambda task, axis=axis: matched(task, axis), arms.generic)
+                for pair in _contrasts(axis, lambda task, axis=axis: matched(task, axis), _generic)
             ),
         ),
         Question(
@@ -189,7 +193,7 @@ def secondary() -> list[Question]:
                 found.append(("matters", says, dosed(home, axis, dose), undosed(home, axis)))
     for task in TRAINED:
         for axis in AXES:
-            through, generic = matched(task, axis), arms.generic(task)
+            through, generic = matched(task, axis), _generic(task)
             for one, other in ((through, ideal(task)), (through, generic), (generic, ideal(task))):
                 pair = _trained_dose(one, axis), _trained_dose(other, axis)
                 found.append(("matters", f"{pair[0].name}, over {other.name}", *pair))

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from codrl_mj.actuators import IDEAL
-from codrl_mj.study.pages import TITLES, conclusions_section, markdown_table, write_page
+from codrl_mj.study.pages import TITLES, conclusions, markdown_table, write_page
 from codrl_mj.study.trials import numbers_as_text
 from reproduction import figures
 from reproduction.arms import ARMS
@@ -36,7 +36,7 @@ def write(findings: Findings, out: Path) -> list[Path]:
     drawn = {task: _figures(task, folder) for task in rows["plan"]["tasks"]}
     parts = [
         _head(findings),
-        conclusions_section(out / PAGE),
+        f"## Conclusions\n\n{conclusions(out / PAGE)}",
         _missing(rows),
         verdicts_section(rows["claims"]),
         *_tasks(rows, drawn),
