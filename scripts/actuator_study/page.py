@@ -172,8 +172,9 @@ def _motors(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
     header = ["task", "motor, gear", "", "trained on ideal forces", "trained through it"]
     return f"""## Off-the-shelf motors
 
-*Good* is the smallest that `codrl-mj motor choose` finds sufficient, *marginal* one that it calls `try it`. What
-policies lose on them, how many fail, and what of their success is lost:
+*Good* is the smallest that `codrl-mj motor choose` found sufficient, *marginal* one that it called `try it`. On the
+cars the good one rubs away an eighth of the largest force; since then `motor choose` allows a twentieth, by another
+gear. What policies lose on them, how many fail, and what of their success is lost:
 
 {markdown_table(header, rows)}
 {_figure(drawn, "motors", "Scores on motors of the catalogue")}"""
