@@ -34,7 +34,8 @@ def _watch_process() -> None:
         for renderer in list(_open):
             renderer.close()
 
-    os.register_at_fork(after_in_child=_leave_to_parent)
+    if hasattr(os, "register_at_fork"):  # not on Windows
+        os.register_at_fork(after_in_child=_leave_to_parent)
 
 
 def _leave_to_parent() -> None:

@@ -1,7 +1,6 @@
 """A run folder: what is in it under which name, what it was made with, and whose it is while it grows."""
 
 import contextlib
-import fcntl
 import functools
 import hashlib
 import importlib.metadata
@@ -11,6 +10,8 @@ import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock, Timeout
 
 from codrl_mj.actuators import label_of, labelled, trusting
 from codrl_mj.runs.files import check_writable, leftovers, read_json, sealed, write_json
@@ -185,9 +186,12 @@ def _code_digest(*others: str | Path) -> str:
 def owned(run: Path) -> Iterator[None]:
     """Hold a run folder for oneself while the block runs; the system lets go of it if the process dies."""
     run.mkdir(parents=True, exist_ok=True)
-    with (run / LOCK).open("a") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise RunInUseError(f"{run}: another process is training in it; wait for it, or stop it") from None
+    lock = FileLock(run / LOCK)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        raise RunInUseError(f"{run}: another process is training in it; wait for it, or stop it") from None
+    try:
         yield
+    finally:
+        lock.release()
