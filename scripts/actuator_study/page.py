@@ -130,15 +130,14 @@ def _borne(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
             )
             text = f"≤ {_short(scale * borne[-1] if borne else 0.0)} {of}"
             if hurt is not None:
-                failed = round(hurt[1].failed * len(hurt[1].lost))
-                text += f"; ≥ {_short(scale * hurt[0])} {of}: {failed} of {len(hurt[1].lost)} fail"
+                text += f"; ≥ {_short(scale * hurt[0])} {of} ({round(hurt[1].failed * len(hurt[1].lost))})"
             rows[-1].append(text if known else "–")
     header = ["task: policy step, largest force", "lag", "missing force", "missing voltage", "delay", "friction"]
     return f"""## What is borne
 
 Left: harmless. Policies that were trained on ideal forces lose at most {MARGIN:g} of the span on the mean, surely at
 most {FAILED:g}, and a tenth of their success. Right: it hurts. They surely lose more than {FAILED:g}, or a tenth of
-their success. Between the two, measure. A policy fails where it loses more than {FAILED:g}.
+their success; in brackets how many of the 20 policies fail there, by losing more than {FAILED:g}. Between the two, measure.
 
 {markdown_table([*header, "noise"], rows)}
 {_figure(drawn, "losses", "What ideal-trained policies lose, by task and dose")}"""
