@@ -137,7 +137,8 @@ def _borne(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
 
 Left: harmless. Policies that were trained on ideal forces lose at most {MARGIN:g} of the span on the mean, surely at
 most {FAILED:g}, and a tenth of their success. Right: it hurts. They surely lose more than {FAILED:g}, or a tenth of
-their success; in brackets how many of the 20 policies fail there, by losing more than {FAILED:g}. Between the two, measure.
+their success; in brackets how many of the 20 policies fail there, by losing more than {FAILED:g}. Between the two,
+measure.
 
 {markdown_table([*header, "noise"], rows)}
 {_figure(drawn, "losses", "What ideal-trained policies lose, by task and dose")}"""
