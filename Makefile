@@ -6,7 +6,7 @@ STAMP := .venv/.installed-dev
 DOCS := .venv/.installed-docs
 INSTALL = $(BIN)/pip install --quiet --constraint constraints.txt --editable
 
-.PHONY: install demo test check browser lint bench soak results docs clean
+.PHONY: install demo test check browser lint bench soak results docs pictures clean
 
 install: $(STAMP)
 
@@ -64,6 +64,9 @@ docs: $(DOCS)  ## the site in build/site, and the pages that are written from th
 	@$(BIN)/python scripts/actuator_numbers.py
 	@$(BIN)/python scripts/command_line_page.py
 	@$(BIN)/zensical build --strict --config-file zensical.toml
+
+pictures: $(STAMP)  ## the README's pictures of what comes out; it takes Chromium
+	@$(BIN)/python scripts/pictures.py
 
 clean:  ## everything but what was trained
 	rm -rf .venv .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist
