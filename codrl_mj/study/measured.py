@@ -75,7 +75,7 @@ def measurement(actuator: Any, subject: str, seeds: int, root: Path, episodes: i
     if seeds < 2:
         raise ValueError(f"seeds = {seeds}: an interval needs at least 2")
     base = _ideal_arm(subject)
-    untouched = base.config.env.as_posed
+    untouched = base.config.env  # and its reward: it is what policies were trained for
     here = dataclasses.replace(untouched, actuator=actuator)
     if all(one == IDEAL_ACTUATOR for one in here.actuators):
         raise ValueError("actuator = 'ideal': training through it is training on ideal forces: name another")

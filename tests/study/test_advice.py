@@ -406,6 +406,17 @@ def test_the_verdict_of_a_measurement(tmp_path, ideal, designed, randomised, thr
     assert mean - low == pytest.approx(3.18245 * 0.001 * math.sqrt(4 / 3) / 2, rel=1e-4)
 
 
+@pytest.mark.parametrize("task", ["cartpole", "pendulum"])
+def test_the_study_s_tasks_are_measured_as_the_study_has_them(task, tmp_path):
+    """By the reward that its floors are of: on CartPole the paper's."""
+    asked = measurement("weaker", task, 2, tmp_path)
+    assert asked.home.env == posed(task)
+    assert {trial.env for trial in asked.options.values()} == {
+        posed(task, "weaker"),
+        posed(task, redesign(named_actuator("weaker", task), task)),
+    }
+
+
 def test_a_measurement_that_is_not_finished_says_so(tmp_path):
     asked = measurement(named_actuator("weaker", "cartpole"), "cartpole", 2, tmp_path)
     pretend(asked.grid, lambda *_: 100.0, leaving_out=[("cartpole: through it", 1)])
