@@ -1,9 +1,8 @@
 """What is wrong with a log before anything is fitted to it: a table of checks, each with what it needs of the log."""
 
-import functools
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,27 +34,19 @@ _DROWNED = 0.1  # noise over the motion, beyond which no error of speeds is clai
 _TILTED = 0.03  # rad, by which a pendulum hangs beside position 0
 
 
-class Examined:
+class Seen(NamedTuple):
     """A log under examination, beside a datasheet's `GearMotor` and on a rig, where given."""
 
-    def __init__(self, log: Log, motor: Any, rig: str | None) -> None:
-        """See what it holds."""
-        self.log, self.motor, self.rig = log, motor, rig
-        self.effort = next((name for name in ("torque", "current", "voltage") if log.has(name)), "")
-        self.holds = {*log.signals, *(["effort"] if self.effort else []), *(["datasheet"] if motor else [])}
-        """What a check may need: signals, and what is known of them."""
-        if log.has("position") or log.has("velocity"):
-            self.holds |= {"motion", "moves" if moves(log) else "stands"}
-        self.holds |= {"hangs"} if rig in (None, "pendulum") else set()
-
-    @functools.cached_property
-    def winding(self) -> Balance | None:
-        """R, L and kE by the voltage; None where it does not change."""
-        return voltage_balance(self.log) if self.log.has("voltage", "current") else None
+    log: Log
+    motor: Any
+    rig: str | None
+    effort: str  # what drives it, the nearest to the shaft that it has
+    holds: set[str]  # words of `CHECKS`: signals, and what is known of them
+    winding: Balance | None  # R, L and kE by the voltage; None where it does not change
 
 
-CHECKS: list[tuple[set[str], Callable[[Examined], Iterator[Finding]]]] = []
-"""What a check needs of a log, by words of `Examined.holds`, and what finds and words what it finds; in this order."""
+CHECKS: list[tuple[set[str], Callable[[Seen], Iterator[Finding]]]] = []
+"""What a check needs of a log, and what finds and words what it finds; in this order."""
 
 
 def _needs(words: str) -> Callable[[Any], Any]:
@@ -68,10 +59,14 @@ def _needs(words: str) -> Callable[[Any], Any]:
 
 def check(log: Log, motor: Any = None, rig: str | None = None) -> list[Finding]:
     """What is noteworthy about a log, errors first; beside a datasheet's `GearMotor` and on a rig, where given."""
-    seen, findings = Examined(log, motor, rig), [*log.findings]
-    for needs, found in CHECKS:
-        if needs <= seen.holds:
-            findings += found(seen)
+    effort = next((name for name in ("torque", "current", "voltage") if log.has(name)), "")
+    holds = {*log.signals, *(["effort"] if effort else []), *(["datasheet"] if motor else [])}
+    if log.has("position") or log.has("velocity"):
+        holds |= {"motion", "moves" if moves(log) else "stands"}
+    holds |= {"hangs"} if rig in (None, "pendulum") else set()
+    winding = voltage_balance(log) if log.has("voltage", "current") else None
+    seen = Seen(log, motor, rig, effort, holds, winding)
+    findings = [*log.findings, *(one for needs, found in CHECKS if needs <= holds for one in found(seen))]
     order = ("error", "warning", "info")
     return sorted(findings, key=lambda one: order.index(one.severity))
 
@@ -88,7 +83,7 @@ def name_of_factor(ratio: float, angle: bool = True) -> str:
 
 
 @_needs("")
-def _times(seen: Examined) -> Iterator[Finding]:
+def _times(seen: Seen) -> Iterator[Finding]:
     """Gaps, dropped rows, jitter, and stamps in another unit."""
     log, usual, rows = seen.log, seen.log.step, seen.log.row_numbers
     steps = np.diff(log.time)
@@ -119,7 +114,7 @@ def _times(seen: Examined) -> Iterator[Finding]:
 
 
 @_needs("")
-def _signals(seen: Examined) -> Iterator[Finding]:
+def _signals(seen: Seen) -> Iterator[Finding]:
     """Each signal by itself; only what a sensor sees is clipped or spoiled, others rest where they like."""
     for signal in seen.log.signals:
         yield from _resolution(seen.log, signal)
@@ -186,7 +181,7 @@ def _outliers(log: Log, signal: str) -> Iterator[Finding]:
 
 
 @_needs("position")
-def _wrapped(seen: Examined) -> Iterator[Finding]:
+def _wrapped(seen: Seen) -> Iterator[Finding]:
     """A position that jumps by a turn."""
     steps = np.diff(seen.log.signals["position"])
     jumps = np.flatnonzero(np.abs(np.abs(steps) - 2.0 * np.pi) < 0.1 * 2.0 * np.pi)
@@ -197,7 +192,7 @@ def _wrapped(seen: Examined) -> Iterator[Finding]:
 
 
 @_needs("")
-def _sizes(seen: Examined) -> Iterator[Finding]:
+def _sizes(seen: Seen) -> Iterator[Finding]:
     """Values that no bench has."""
     for signal in _MOST.keys() & seen.log.signals.keys():
         largest, unit = float(np.quantile(np.abs(seen.log.signals[signal]), 0.99)), SIGNALS[signal]  # not an outlier
@@ -207,7 +202,7 @@ def _sizes(seen: Examined) -> Iterator[Finding]:
 
 
 @_needs("voltage")
-def _supply(seen: Examined) -> Iterator[Finding]:
+def _supply(seen: Seen) -> Iterator[Finding]:
     """More voltage than the supply has, and what looks like a duty."""
     log, voltage = seen.log, np.abs(seen.log.signals["voltage"])
     if log.has("bus"):
@@ -224,7 +219,7 @@ def _supply(seen: Examined) -> Iterator[Finding]:
 
 
 @_needs("position")
-def _degrees(seen: Examined) -> Iterator[Finding]:
+def _degrees(seen: Seen) -> Iterator[Finding]:
     """A position in degrees: gravity pulls as at a fraction of it, or its encoder divides 360 and not 2 pi."""
     log, effort, remedy = seen.log, seen.effort, "write position=column:deg"
     if {"effort", "moves", "hangs"} <= seen.holds:
@@ -247,7 +242,7 @@ def _degrees(seen: Examined) -> Iterator[Finding]:
 
 
 @_needs("position velocity moves")
-def _velocity(seen: Examined) -> Iterator[Finding]:
+def _velocity(seen: Seen) -> Iterator[Finding]:
     """The velocity against the differentiated position."""
     found = velocity_lag(seen.log)
     if found is None:
@@ -275,7 +270,7 @@ def _velocity(seen: Examined) -> Iterator[Finding]:
 
 
 @_needs("voltage current")
-def _electrical(seen: Examined) -> Iterator[Finding]:
+def _electrical(seen: Seen) -> Iterator[Finding]:
     """Signs and certainty of R, L and kE."""
     balance = seen.winding
     if balance is None:
@@ -305,7 +300,7 @@ def _electrical(seen: Examined) -> Iterator[Finding]:
 
 
 @_needs("voltage current")
-def _delay(seen: Examined) -> Iterator[Finding]:
+def _delay(seen: Seen) -> Iterator[Finding]:
     """The current against the voltage."""
     log, found = seen.log, effort_lag(seen.log, "voltage")
     if found is None or found.unexplained > 0.3:
@@ -325,7 +320,7 @@ def _delay(seen: Examined) -> Iterator[Finding]:
 
 
 @_needs("voltage current")
-def _sag(seen: Examined) -> Iterator[Finding]:
+def _sag(seen: Seen) -> Iterator[Finding]:
     """A supply that gives way, where the share of its voltage changes; at one share it looks as the winding does."""
     balance, share = seen.winding, np.abs(seen.log.signals["voltage"])
     sagging = voltage_balance(seen.log, sag=True) if float(np.std(share)) > 0.1 * float(share.max()) else None
@@ -339,7 +334,7 @@ def _sag(seen: Examined) -> Iterator[Finding]:
 
 
 @_needs("effort moves")
-def _mechanical(seen: Examined) -> Iterator[Finding]:
+def _mechanical(seen: Seen) -> Iterator[Finding]:
     """Signs of inertia and gravity; whether the motion follows from the torque."""
     log, effort, rig = seen.log, seen.effort, seen.rig
     # where it shakes, shorter windows show more of the inertia
@@ -398,7 +393,7 @@ def _zero(balance: Balance | None, effort: str) -> Iterator[Finding]:
 
 
 @_needs("motion")
-def _motion(seen: Examined) -> Iterator[Finding]:
+def _motion(seen: Seen) -> Iterator[Finding]:
     """Whether it moves back and forth."""
     signals, remedy = seen.log.signals, "leave position and velocity out if it is"
     speed = signals["velocity"] if "velocity" in signals else np.diff(signals["position"])
@@ -410,7 +405,7 @@ def _motion(seen: Examined) -> Iterator[Finding]:
 
 
 @_needs("voltage current torque")
-def _two_constants(seen: Examined) -> Iterator[Finding]:
+def _two_constants(seen: Seen) -> Iterator[Finding]:
     """The torque constant against the back-EMF constant, which in SI are equal but for losses and star or delta."""
     # the steps of an encoder take less from the speed of longer windows
     balance = seen.winding and (voltage_balance(seen.log, 0.1) or seen.winding)
@@ -431,7 +426,7 @@ def _two_constants(seen: Examined) -> Iterator[Finding]:
 
 
 @_needs("voltage current datasheet")
-def _datasheet(seen: Examined) -> Iterator[Finding]:
+def _datasheet(seen: Seen) -> Iterator[Finding]:
     """Resistance and back-EMF constant against what is printed."""
     motor, balance = seen.motor, seen.winding
     constant = motor.back_emf_constant * motor.gear_ratio
