@@ -153,8 +153,8 @@ def _options(
             excitation.voltage(np.floor(time * rate + 1e-6) / rate if together else time + _PHASE / rate) / amplitude
         )
         for _ in range(8):  # the response is nearly in proportion to the voltage
-            course = run(drive, amplitude * shape, held)
-            peak, rms = float(np.abs(course.current).max()), float(np.sqrt(np.mean(course.current**2)))
+            current = run(drive, amplitude * shape, held).signals["current"]
+            peak, rms = float(np.abs(current).max()), float(np.sqrt(np.mean(current**2)))
             excess = max(peak / limits[0], rms / limits[1])
             if excess <= 1.0:
                 break

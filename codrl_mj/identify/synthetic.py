@@ -6,11 +6,9 @@ Ljung, *System Identification* (2nd ed. 1999), sec. 13.3.
 """
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -59,7 +57,10 @@ def _slow_sine(excitation: Excitation, time: np.ndarray) -> np.ndarray:
 
 
 def _bits(excitation: Excitation, time: np.ndarray) -> np.ndarray:
-    bits = _sequence()
+    """-1 and 1 in a sequence of 2^13 - 1 by a shift register."""
+    from scipy.signal import max_len_seq
+
+    bits = 2.0 * max_len_seq(13)[0].astype(float) - 1.0
     return bits[np.floor(time / excitation.clock + 1e-9).astype(int) % len(bits)]
 
 
@@ -75,14 +76,6 @@ EXCITATIONS: dict[str, Callable[[Excitation, np.ndarray], np.ndarray]] = {
     "locked_prbs": _bits,  # with the shaft held
 }
 """Kind -> function of amplitude 1."""
-
-
-@functools.cache
-def _sequence() -> np.ndarray:
-    """-1 and 1 in a sequence of 2^13 - 1 by a shift register, shape (8191,)."""
-    from scipy.signal import max_len_seq
-
-    return 2.0 * max_len_seq(13)[0].astype(float) - 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,6 +98,8 @@ class Load:
 
 FREE = Load()
 """Nothing but the rotor."""
+SEEN = "current", "position", "velocity", "torque", "bus", "voltage", "duty"
+"""What a simulated log has."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,29 +150,11 @@ class Sampler:
         check(self)
 
 
-class Course(NamedTuple):
-    """What happens, at the drive's every sample; each of shape (n + 1,)."""
-
-    time: np.ndarray
-    """[s]"""
-    voltage: np.ndarray
-    """At the terminals from each time on [V]."""
-    commanded: np.ndarray
-    """What was asked for [V]."""
-    current: np.ndarray
-    """[A]"""
-    speed: np.ndarray
-    """Of the output [rad/s]."""
-    position: np.ndarray
-    """Of the output [rad]."""
-    bus: np.ndarray
-    """Of the supply [V]."""
-
-
-def run(drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, position: float = 0.0) -> Course:
+def run(drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, position: float = 0.0) -> Log:
     """What a drive does, without its loop, under a voltage, or its values [V] in each sample, from standstill.
 
-    A bridge makes the voltage u of a share d = u/V of the supply, which sags by its resistance times d*i.
+    A row is a sample of the drive, its `command` the voltage [V] asked for. A bridge makes the voltage u of a share
+    d = u/V of the supply, which sags by its resistance times d*i.
     """
     from codrl_mj.identify.simulation import driven, moved
 
@@ -199,7 +176,9 @@ def run(drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, po
     numbers = {**vars(motor), "inertia": inertia, "mgl": load.gravity, "constant_torque": load.torque}
     parts = winding, moved(numbers, motor.torque_constant * motor.gear_ratio)
     states = driven(period, shares, float(limit), float(sag), parts, locked, float(position))
-    return Course(period * np.arange(len(shares)), states[:, 0], commanded, *states[:, 1:].T)
+    names = "voltage", "current", "velocity", "position", "bus"
+    signals = dict(zip(names, states.T, strict=True))
+    return Log("course", period * np.arange(len(shares)), {**signals, "command": commanded})
 
 
 def sample_times(drive: Drive, duration: float) -> np.ndarray:
@@ -223,19 +202,17 @@ def simulate(
     Signals without a sensor show what is. The voltage is the one asked for, without sag; the torque n*kT*i.
     """
     course = run(drive, excitation, load, position)
-    check_names(sensors or {}, ("voltage", "current", "position", "velocity", "torque", "bus", "duty"), "signal")
+    check_names(sensors or {}, SEEN, "signal")
     random = np.random.default_rng(seed)
     period = 1.0 / sampler.rate
     time = period * np.arange(math.floor(course.time[-1] / period + 1e-9) + 1)
     time[1:-1] += period * sampler.jitter * np.clip(random.standard_normal(max(len(time) - 2, 0)), -3.0, 3.0)
     time = np.maximum.accumulate(time + 1e-9 * period * np.arange(len(time)))  # rows never swap
-    torque = drive.motor.gear_ratio * drive.motor.torque_constant * course.current
-    smooth = {"current": course.current, "position": course.position, "velocity": course.speed, "torque": torque,
-              "bus": course.bus}  # fmt: skip
-    found = {}
-    for signal in (*smooth, "voltage", "duty"):
+    torque = drive.motor.gear_ratio * drive.motor.torque_constant * course.signals["current"]
+    smooth, found = {**course.signals, "torque": torque}, {}
+    for signal in SEEN:
         sensor = (sensors or {}).get(signal, Sensor())
-        if signal in smooth:
+        if signal not in ("voltage", "duty"):
             values = np.interp(time - sensor.delay, course.time, smooth[signal])
         else:
             values = _held(course, time - sensor.delay, sampler.mean_voltage)
@@ -248,12 +225,12 @@ def simulate(
     return Log(name, time[kept], found, resolution, sampler.mean_voltage, rows=np.flatnonzero(kept) + 1)
 
 
-def _held(course: Course, time: np.ndarray, mean: bool) -> np.ndarray:
+def _held(course: Log, time: np.ndarray, mean: bool) -> np.ndarray:
     """The voltage asked for at each time or, but for the last one, its mean to the next."""
-    period = course.time[1] - course.time[0]
-    values = course.commanded[np.clip(np.floor(time / period + 1e-6).astype(int), 0, len(course.time) - 1)]
+    period, commanded = course.time[1] - course.time[0], course.signals["command"]
+    values = commanded[np.clip(np.floor(time / period + 1e-6).astype(int), 0, len(course.time) - 1)]
     if mean:
-        flux = np.concatenate([[0.0], np.cumsum(np.diff(course.time) * course.commanded[:-1])])
+        flux = np.concatenate([[0.0], np.cumsum(np.diff(course.time) * commanded[:-1])])
         values[:-1] = np.diff(np.interp(time, course.time, flux)) / np.diff(time)
     return values
 

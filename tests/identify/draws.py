@@ -78,7 +78,7 @@ def logged(draw, kind="prbs", rate=5000.0, voltage="mean", jitter=0.0, dropped=0
     if voltage == "together":
         clock = 2 * max(round(0.5 * clock * rate), 1) / rate
     excitation = Excitation(kind, 0.5 * VOLTS, 3.0, frequency=2.0 if kind == "square" else 0.5, clock=clock)
-    peak = float(np.abs(run(drive, excitation).current).max())
+    peak = float(np.abs(run(drive, excitation).signals["current"]).max())
     seen = {"current": Sensor(0.01 * peak), "position": Sensor(resolution=2.0 * math.pi / encoder)}
     for name, changes in sensors.items():
         seen[name] = dataclasses.replace(seen.get(name, Sensor()), **changes)

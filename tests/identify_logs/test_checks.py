@@ -37,7 +37,7 @@ def logged(motor="small", kind="prbs", sag=0.0, jitter=0.0, dropped=0.0, seed=0,
     one, drive = MOTORS[motor], drive_of(motor, sag)
     load = Load(3.0 * one.rotor_inertia * one.gear_ratio**2 + 1e-4)
     course = run(drive, excitation_of(motor, kind), load)
-    peak, fastest = np.abs(course.current).max(), np.abs(course.speed).max()
+    peak, fastest = np.abs(course.signals["current"]).max(), np.abs(course.signals["velocity"]).max()
     sensors = {
         "current": Sensor(0.01 * peak),
         "torque": Sensor(0.01 * peak * one.torque_constant * one.gear_ratio),

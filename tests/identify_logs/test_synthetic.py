@@ -35,9 +35,11 @@ def test_motion_is_what_scipy_integrates(load):
     state, found = np.array([0.0, 0.0, 0.3 * ratio]), []
     for row in range(3000):
         found.append(state)
-        state = solve_ivp(slope, course.time[row : row + 2], state, args=(course.voltage[row],), rtol=1e-8).y[:, -1]
+        state = solve_ivp(
+            slope, course.time[row : row + 2], state, args=(course.signals["voltage"][row],), rtol=1e-8
+        ).y[:, -1]
     expected = np.array(found) / [1.0, ratio, ratio]
-    actual = np.column_stack([course.current, course.speed, course.position])[:3000]
+    actual = np.column_stack([course.signals["current"], course.signals["velocity"], course.signals["position"]])[:3000]
     np.testing.assert_allclose(
         actual / np.abs(expected).max(axis=0), expected / np.abs(expected).max(axis=0), atol=2e-4
     )
@@ -47,32 +49,32 @@ def test_a_locked_winding_is_exact():
     course = run(DRIVE, Excitation("square", 6.0, 0.4, frequency=2.0), Load(locked=True))
     half = course.time < 0.25
     expected = 6.0 / 0.9 * -np.expm1(-course.time[half] * 0.9 / 4e-4)
-    np.testing.assert_allclose(course.current[half], expected, rtol=1e-12)
-    assert not course.position.any()
+    np.testing.assert_allclose(course.signals["current"][half], expected, rtol=1e-12)
+    assert not course.signals["position"].any()
 
 
 def test_friction_holds_slows_and_heats_what_it_has_to():
     held = run(DRIVE, Excitation("square", 0.07, 0.4, frequency=1.0), LOAD)  # 0.07/0.9*0.036 < 3e-3
-    assert not held.position.any()
+    assert not held.signals["position"].any()
     course = run(DRIVE, Excitation("square", 6.0, 4.0, frequency=0.1), LOAD)
     # steady: kT*i = c + b*omega and u = R*i + kE*omega
     speed = (6.0 - 0.9 * 3e-3 / 0.036) / (0.036 + 0.9 * 2e-5 / 0.036)
-    assert course.speed[-1] * 5.0 == pytest.approx(speed, rel=1e-6)
-    assert course.current[-1] == pytest.approx((3e-3 + 2e-5 * speed) / 0.036, rel=1e-6)
+    assert course.signals["velocity"][-1] * 5.0 == pytest.approx(speed, rel=1e-6)
+    assert course.signals["current"][-1] == pytest.approx((3e-3 + 2e-5 * speed) / 0.036, rel=1e-6)
 
 
 def test_a_gear_loses_its_share():
     drive = changed(gear_efficiency=0.8, coulomb_friction=0.0, viscous_friction=0.0)
     course = run(drive, Excitation("square", 6.0, 4.0, frequency=0.1), Load(1e-3, torque=0.3))
-    assert course.current[-1] * 0.036 * 5.0 * 0.8 == pytest.approx(0.3, rel=1e-6)
+    assert course.signals["current"][-1] * 0.036 * 5.0 * 0.8 == pytest.approx(0.3, rel=1e-6)
 
 
 def test_a_supply_sags_by_what_it_gives():
     drive = dataclasses.replace(DRIVE, supply=Supply(24.0, 0.3))
     course = run(drive, Excitation("square", 12.0, 0.2, frequency=1.0), Load(locked=True))
-    current = course.current[-2]
-    assert course.bus[-2] == pytest.approx(24.0 - 0.3 * 0.5 * current)
-    assert current == pytest.approx(0.5 * course.bus[-2] / 0.9)
+    current = course.signals["current"][-2]
+    assert course.signals["bus"][-2] == pytest.approx(24.0 - 0.3 * 0.5 * current)
+    assert current == pytest.approx(0.5 * course.signals["bus"][-2] / 0.9)
 
 
 def test_sensors_show_what_they_are_told():
@@ -109,7 +111,7 @@ def test_samplers_jitter_drop_and_average():
     course = run(DRIVE, excitation, LOAD)
     for row in np.flatnonzero(np.diff(log.row_numbers) == 1)[::97]:  # the mean, by sums over a fine grid
         fine = np.linspace(log.time[row], log.time[row + 1], 2001)[:-1]
-        expected = course.commanded[np.floor(fine * 20e3 + 1e-6).astype(int)].mean()
+        expected = course.signals["command"][np.floor(fine * 20e3 + 1e-6).astype(int)].mean()
         assert log.signals["voltage"][row] == pytest.approx(expected, abs=0.02)
 
 
