@@ -87,6 +87,12 @@ class Fit:
     """Of each segment, what its states cannot do taken out, shape (m, p)."""
     states: tuple[np.ndarray, ...]
     """At the beginning of each segment."""
+    logs: tuple[Log, ...] = ()
+    """Of the segments, with the input in time."""
+    delay: float = 0
+    """Rows by which it was late."""
+    tried: tuple["Fit", ...] = ()
+    """What each start led to."""
 
     def costs(self, scale: float) -> np.ndarray:
         """Robust cost of each segment."""

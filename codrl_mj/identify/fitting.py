@@ -22,25 +22,14 @@ SURE = 3.0
 """lowers that of the segments by more, in the mean, than so many standard deviations of that mean."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Fitted:
-    """A part with its logs, and what came of it."""
-
-    logs: tuple[Log, ...]
-    """With the input in time."""
-    delay: float
-    """Rows by which it was late."""
-    fit: Fit
-    tried: tuple[Fit, ...]
-    """What each start led to."""
-
-    def refitted(self, model: Model) -> "Fitted":
-        """Another model of the same logs, from where this ended."""
-        segments = model.segments(self.logs)
-        return dataclasses.replace(self, fit=refit(model.begun(segments)[0], segments, self.fit.values))
+def refitted(fit: Fit, model: Model) -> Fit:
+    """Another model of the same logs, from where a fit ended."""
+    segments = model.segments(fit.logs)
+    found = refit(model.begun(segments)[0], segments, fit.values)
+    return dataclasses.replace(found, logs=fit.logs, delay=fit.delay, tried=fit.tried)
 
 
-def fitted(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lambda: None) -> Fitted:
+def fitted(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lambda: None) -> Fit:
     """Fit a model to logs: several starts, then the delays.
 
     A voltage whose mean between two rows fits worse than itself is shown to hold from row to row: then it is also the
@@ -51,7 +40,7 @@ def fitted(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lamb
     if not model.names:
         fit = refit(model, segments, starts[0])
         on_step()
-        return Fitted(tuple(logs), 0, fit, (fit,))
+        return dataclasses.replace(fit, logs=tuple(logs), tried=(fit,))
     fit, tried = search(model, segments, starts[:STARTS], on_step)
     costs: dict[float, np.ndarray] = {0: fit.costs(fit.scale)}
 
@@ -81,7 +70,7 @@ def fitted(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lamb
         segments = model.segments(told)
         model, starts = model.begun(segments)
         fit, tried = search(model, segments, [fit.values, starts[0]])
-    return Fitted(tuple(told), delay, fit, tried)
+    return dataclasses.replace(fit, logs=tuple(told), delay=delay, tried=tried)
 
 
 def _better(these: np.ndarray, those: np.ndarray) -> bool:

@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from codrl_mj.identify.estimate import Fit, refit
-from codrl_mj.identify.fitting import Fitted
 from codrl_mj.identify.log import Log
 from codrl_mj.identify.models import WindingModel
 from codrl_mj.identify.segments import halved, moves, replaced
@@ -164,18 +163,18 @@ def _noticed(fit: Fit) -> float:
     return 3.84 * noise * together + SLACK * fit.cost
 
 
-def half_rate(part: Fitted) -> np.ndarray:
+def half_rate(fit: Fit) -> np.ndarray:
     """The parameters at half the rate."""
-    return _again(part.fit, [halved(log) for log in part.logs])
+    return _again(fit, [halved(log) for log in fit.logs])
 
 
-def self_test(part: Fitted) -> np.ndarray:
+def self_test(fit: Fit) -> np.ndarray:
     """The parameters found in what the fit would have made of its logs: the mean of two such, of opposed residuals.
 
     Residuals keep their order and size, stretch by stretch with a random sign, so that they belong together as they
     do in the logs; in the mean of a draw and its opposite what they do at random cancels.
     """
-    return np.asarray(0.5 * sum(_again(part.fit, _pretended(part, sign)) for sign in (1.0, -1.0)))
+    return np.asarray(0.5 * sum(_again(fit, _pretended(fit, sign)) for sign in (1.0, -1.0)))
 
 
 def _again(fit: Fit, logs: Sequence[Log]) -> np.ndarray:
@@ -183,11 +182,11 @@ def _again(fit: Fit, logs: Sequence[Log]) -> np.ndarray:
     return refit(fit.model, fit.model.segments(logs), fit.values, 20).values
 
 
-def _pretended(part: Fitted, sign: float) -> list[Log]:
+def _pretended(fit: Fit, sign: float) -> list[Log]:
     """The logs as the fit would have made them, rounded anew; of a winding also what it took for the motion."""
-    fit, output, simulate = part.fit, part.fit.model.output, part.fit.model.at(part.fit.values)
-    signals = [log.signals[output].copy() for log in part.logs]
-    speeds = [np.zeros(len(log.time)) for log in part.logs]
+    output, simulate = fit.model.output, fit.model.at(fit.values)
+    signals = [log.signals[output].copy() for log in fit.logs]
+    speeds = [np.zeros(len(log.time)) for log in fit.logs]
     signs = np.random.default_rng(1).choice([-1.0, 1.0], len(fit.segments)) * sign
     for place, segment in enumerate(fit.segments):
         # what is far off is an outlier of the logs, and no noise of the sensor
@@ -195,7 +194,7 @@ def _pretended(part: Fitted, sign: float) -> list[Log]:
         signals[segment.log][segment.rows] = simulate(segment, fit.states[place]) + signs[place] * noise
         speeds[segment.log][segment.rows] = segment.speeds
     made = []
-    for log, values, speed in zip(part.logs, signals, speeds, strict=True):
+    for log, values, speed in zip(fit.logs, signals, speeds, strict=True):
         made.append(_rounded(log, output, values))
         if isinstance(fit.model, WindingModel) and log.has("position") and moves(log):
             turns = np.append(0.0, np.cumsum(speed[:-1] * np.diff(log.time)))

@@ -10,7 +10,8 @@ import numpy as np
 
 from codrl_mj.fields import check_names
 from codrl_mj.identify import honesty
-from codrl_mj.identify.fitting import Fitted, fitted, with_friction
+from codrl_mj.identify.estimate import Fit
+from codrl_mj.identify.fitting import fitted, refitted, with_friction
 from codrl_mj.identify.judgement import judged
 from codrl_mj.identify.log import Log
 from codrl_mj.identify.models import ShaftModel, WindingModel
@@ -77,7 +78,7 @@ def identify(
     return Identified(
         tuple(log.name for log in logs),
         rig,
-        parts["shaft"].fit.model.friction if "shaft" in parts else friction,
+        parts["shaft"].model.friction if "shaft" in parts else friction,
         driven_by,
         {name: part.delay for name, part in parts.items()},
         tuple(estimates),
@@ -85,8 +86,8 @@ def identify(
         _foretold(parts.get("shaft"), held_out),
         tuple(warnings),
         base,
-        tuple(one for name, part in parts.items() for one in fitted_traces(name, part.fit, part.logs)),
-        {name: honesty.correlations(parts[name].fit) if name in parts else {} for name in ("winding", "shaft")},
+        tuple(one for name, part in parts.items() for one in fitted_traces(name, part)),
+        {name: honesty.correlations(parts[name]) if name in parts else {} for name in ("winding", "shaft")},
         max((float(np.abs(one).max()) for one in volts), default=None),
         unexplained,
     )
@@ -99,9 +100,9 @@ def _parts(
     moving: Sequence[Log],
     friction: str,
     step: Callable[[str], Callable[[], None]],
-) -> dict[str, Fitted]:
+) -> dict[str, Fit]:
     """The winding, and the shaft by the torque constant that the winding tells; then each again, beside the other."""
-    parts: dict[str, Fitted] = {}
+    parts: dict[str, Fit] = {}
     if electrical:
         parts["winding"] = fitted(winding, electrical, step("winding"))
     if not shaft.driven_by:
@@ -109,15 +110,15 @@ def _parts(
     told = with_friction(_told(shaft, parts.get("winding")), moving, friction, step("friction"))
     parts["shaft"] = fitted(told, moving, step("shaft"))
     if electrical and shaft.driven_by != "voltage":
-        parts["winding"] = parts["winding"].refitted(dataclasses.replace(winding, shaft=parts["shaft"]))
+        parts["winding"] = refitted(parts["winding"], dataclasses.replace(winding, shaft=parts["shaft"]))
     told = _told(dataclasses.replace(shaft, friction=told.friction), parts.get("winding"))
-    parts["shaft"] = parts["shaft"].refitted(told)
+    parts["shaft"] = refitted(parts["shaft"], told)
     return parts
 
 
-def _told(shaft: ShaftModel, winding: Fitted | None) -> ShaftModel:
+def _told(shaft: ShaftModel, winding: Fit | None) -> ShaftModel:
     """The shaft, with the back-EMF constant for a torque constant that is not known: but for losses they are equal."""
-    numbers = shaft.known if winding is None else winding.fit.model.all_values(winding.fit.values)
+    numbers = shaft.known if winding is None else winding.model.all_values(winding.values)
     constant = numbers.get("back_emf_constant", 0.0)
     if shaft.driven_by != "current" or "torque_constant" in (*shaft.known, *shaft.estimated) or not constant > 0.0:
         return shaft
@@ -207,10 +208,10 @@ def _uses(logs: Sequence[Log]) -> tuple[list[Log], list[Log], str | None, str]:
     return [log for log in logs if log.has("voltage", "current")], moving, driven_by, output or ""
 
 
-def _foretold(shaft: Fitted | None, logs: Sequence[Log]) -> tuple[Prediction, ...]:
+def _foretold(shaft: Fit | None, logs: Sequence[Log]) -> tuple[Prediction, ...]:
     """What the shaft makes of those of the logs that it is told by."""
     if shaft is None:
         return ()
-    driven_by, output = shaft.fit.model.driven_by, shaft.fit.model.output
+    driven_by, output = shaft.model.driven_by, shaft.model.output
     told = [log for log in logs if moves(log) and log.has(driven_by, output)]
-    return tuple(predict(shaft.fit, shifted(log, driven_by, shaft.delay)) for log in told)
+    return tuple(predict(shaft, shifted(log, driven_by, shaft.delay)) for log in told)

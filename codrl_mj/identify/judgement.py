@@ -9,7 +9,6 @@ import numpy as np
 
 from codrl_mj.identify import honesty
 from codrl_mj.identify.estimate import Fit
-from codrl_mj.identify.fitting import Fitted
 from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import DEFAULTS, FRICTION, PARAMETERS
 from codrl_mj.identify.result import Estimate, Status
@@ -46,25 +45,25 @@ UNLIKE = 0.02
 
 
 def judged(
-    parts: Mapping[str, Fitted], given: Mapping[str, float], seed: int, step: Callable[[str], Any]
+    parts: Mapping[str, Fit], given: Mapping[str, float], seed: int, step: Callable[[str], Any]
 ) -> tuple[list[Estimate], list[str], float]:
     """Every number that was found, given or follows, warnings, and the largest share of a log that is not explained."""
     estimates: list[Estimate] = []
     warnings: list[str] = []
     unlike: dict[str, float] = {}
-    for name, part in parts.items():
-        found, known = _of_part(part, seed, step(name)), part.fit.model.known
+    for name, fit in parts.items():
+        found, known = _of_part(fit, seed, step(name)), fit.model.known
         if "torque_constant" in known and "torque_constant" not in given:  # it is the back-EMF constant
             constant = [one for one in estimates if one.name == "back_emf_constant"]
             found = _with_constant(found, constant[0], known) if constant else found
         estimates += found
-        warnings += _warnings(part, unlike)
+        warnings += _warnings(fit, unlike)
     return _completed(estimates, given), warnings, max(unlike.values(), default=0.0)
 
 
-def _of_part(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estimate]:
+def _of_part(fit: Fit, seed: int, on_step: Callable[[], None]) -> list[Estimate]:
     """Every free parameter of a part with its interval and status, and their sum where they are friction."""
-    fit, model, names = part.fit, part.fit.model, part.fit.model.names
+    model, names = fit.model, fit.model.names
     if not names:
         return []
     friction, slopes_of, all_of = _friction(fit)
@@ -76,7 +75,7 @@ def _of_part(part: Fitted, seed: int, on_step: Callable[[], None]) -> list[Estim
     if any(slopes):
         names, of, values = (*names, "friction_torque"), np.vstack([of, slopes]), np.append(values, friction)
         sizes, units = (np.append(one, all_of["friction_torque"]) for one in (sizes, units))
-    causes, tested = _causes(part, values, scales, of, seed, on_step)
+    causes, tested = _causes(fit, values, scales, of, seed, on_step)
     directions = honesty.unknown_directions(fit, scales)
     on_step()
     changes = [slopes * scales @ [one.get(name, 0.0) for name in model.names] / sizes[-1] for one in directions]
@@ -130,16 +129,16 @@ def _verdict(
 
 
 def _causes(
-    part: Fitted, values: np.ndarray, scales: np.ndarray, of: np.ndarray, seed: int, on_step: Callable[[], None]
+    fit: Fit, values: np.ndarray, scales: np.ndarray, of: np.ndarray, seed: int, on_step: Callable[[], None]
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Half-widths by cause of `values`, which are `of` @ the parameters, and what the self-test finds for them."""
-    fit, electrical = part.fit, isinstance(part.fit.model, WindingModel)
+    electrical = isinstance(fit.model, WindingModel)
     causes = honesty.half_widths(fit, scales, of, seed)
     on_step()
-    tested = values + of @ (honesty.self_test(part) - fit.values)
+    tested = values + of @ (honesty.self_test(fit) - fit.values)
     on_step()
     # an error that goes with a row's time is half as large at the rate of the logs, one with its root more than that
-    causes["half_rate"] = (2.0 if electrical else 1.0) * np.abs(of @ (honesty.half_rate(part) - fit.values))
+    causes["half_rate"] = (2.0 if electrical else 1.0) * np.abs(of @ (honesty.half_rate(fit) - fit.values))
     on_step()
     causes["self_test"] = np.abs(tested - values)
     causes["unexplained"] = np.abs(values) * (honesty.unexplained(fit) if electrical else 0.0)
@@ -220,10 +219,10 @@ def _completed(estimates: list[Estimate], given: Mapping[str, float]) -> list[Es
     return [named[name] for name in PARAMETERS if name in named]
 
 
-def _warnings(part: Fitted, shares: dict[str, float]) -> list[str]:
+def _warnings(fit: Fit, shares: dict[str, float]) -> list[str]:
     """What is wrong with logs, or with the model of them; `shares` gets what is unexplained of each such log."""
-    unlike, fit = {}, part.fit
-    for place, log in enumerate(part.logs):
+    unlike: dict[str, str] = {}
+    for place, log in enumerate(fit.logs):
         own = [pair for pair in zip(fit.segments, fit.residuals, strict=True) if pair[0].log == place]
         sizes = np.concatenate([np.abs(residuals) for _, residuals in own])
         rest = np.concatenate([residuals * segment.deviation for segment, residuals in own])
@@ -235,7 +234,7 @@ def _warnings(part: Fitted, shares: dict[str, float]) -> list[str]:
                 f"{sizes.mean() / 0.8:.1f} standard deviations of the sensor, {100.0 * share:.2g} % of what moves"
             )
     found = []
-    if 1 < len(unlike) == len(part.logs):
+    if 1 < len(unlike) == len(fit.logs):
         found.append(
             "the model does not explain any of the logs within what their sensors see: of the first, residuals are "
             f"{next(iter(unlike.values()))}. Fit more friction, or find out what else moved"
@@ -246,8 +245,8 @@ def _warnings(part: Fitted, shares: dict[str, float]) -> list[str]:
             "else moved, or fit more friction"
             for name, text in unlike.items()
         ]
-    values = np.array([one.values for one in part.tried])
-    costs = np.array([np.mean(np.abs(np.concatenate(one.residuals))) for one in part.tried])
+    values = np.array([one.values for one in fit.tried])
+    costs = np.array([np.mean(np.abs(np.concatenate(one.residuals))) for one in fit.tried])
     near = costs < 1.1 * costs.min()
     apart = np.ptp(values[near], axis=0) / np.maximum(np.abs(fit.values), fit.model.scales)
     if np.any(apart > 0.2):

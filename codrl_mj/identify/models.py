@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Self
 
@@ -11,15 +12,18 @@ from codrl_mj.identify.estimate import Model, Simulate, settled_state
 from codrl_mj.identify.log import Log
 from codrl_mj.identify.parameters import DEFAULTS, ELECTRICAL, FRICTION, OF_FRICTION, OF_RIG, PARAMETERS
 from codrl_mj.identify.segments import (
+    BLOCK,
     SEGMENT,
     SHAFT_STEP,
     Segment,
+    cut,
+    initial_state,
     moves,
-    shaft_segments,
+    sensor_deviation,
     shifted,
     speeds,
     turning,
-    winding_segments,
+    without_spikes,
 )
 
 
@@ -30,7 +34,7 @@ class WindingModel(Model):
     driven_by: str = "voltage"
     output: str = "current"
     shaft: Any = None
-    """The `Fitted` shaft under the current, where it is known: what an encoder does not see between its rows."""
+    """The `Fit` of a shaft under the current, where it is known: what an encoder does not see between its rows."""
 
     steps: ClassVar = np.array([1e-3])
 
@@ -47,9 +51,17 @@ class WindingModel(Model):
 
         return currents
 
-    def segments(self, logs: Sequence[Log]) -> list[Segment]:
-        """The logs, cut."""
-        return winding_segments(logs, [self._turning(log) for log in logs])
+    def segments(self, logs: Sequence[Log], turned: Sequence[np.ndarray] | None = None) -> list[Segment]:
+        """The logs, cut into a block each, in which voltage and speed drive the current; speeds may be given."""
+        made: list[Segment] = []
+        for place, log in enumerate(logs):
+            volts, deviation = log.signals["voltage"], sensor_deviation(log, "current")
+            speed = self._turning(log) if turned is None else turned[place]
+            for rows in cut(log, BLOCK):
+                times, current = log.time[rows], log.signals["current"][rows]
+                drive = times, volts[rows], np.zeros(len(times)), speed[rows]
+                made.append(Segment(place, len(made), rows, *drive, current, deviation, current[:1]))
+        return made
 
     def begun(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
         """With starts by regressions of the voltage's integral over windows of several lengths.
@@ -77,9 +89,9 @@ class WindingModel(Model):
         A smoothed speed lags behind a light rotor, and the back-EMF that it misses would be taken for inductance.
         """
         found, part = turning(log), self.shaft
-        if part is None or not moves(log) or not log.has("position", part.fit.model.driven_by):
+        if part is None or not moves(log) or not log.has("position", part.model.driven_by):
             return found
-        model, values = dataclasses.replace(part.fit.model, output="position"), part.fit.values
+        model, values = dataclasses.replace(part.model, output="position"), part.values
         simulate = model.at(values)
         for segment in model.segments([shifted(log, model.driven_by, part.delay)], 0.0):
             positions = simulate(segment, settled_state(model, values, segment))
@@ -153,7 +165,37 @@ class ShaftModel(Model):
 
     def segments(self, logs: Sequence[Log], shortest: float = SHAFT_STEP) -> list[Segment]:
         """The logs, cut; rows that are nearer than `shortest` [s] are taken together."""
-        return shaft_segments(logs, self.driven_by, self.output, self.segment, shortest)
+        from scipy.integrate import cumulative_trapezoid
+
+        made: list[Segment] = []
+        driven_by, output, block = self.driven_by, self.output, -1
+        for place, log in enumerate(logs):
+            given = log.signals[driven_by]
+            if driven_by != "voltage":
+                given = without_spikes(given)
+            measured, deviation = log.signals[output], sensor_deviation(log, output)
+            # without a position a log begins at 0: it turns on from there
+            angle = cumulative_trapezoid(measured, log.time, initial=0.0)
+            together = max(int(shortest / log.step * (1.0 + 1e-6)), 1)
+            began = -math.inf
+            for rows in cut(log, self.segment):
+                times, drive = log.time[rows], given[rows]
+                if times[0] - began >= BLOCK - 1e-3:
+                    block, began = block + 1, times[0]
+                slopes = np.zeros(len(times))
+                if driven_by != "voltage":
+                    slopes[:-1] = np.diff(drive) / np.diff(times)
+                if together > 1:
+                    means = drive[:-1] + 0.5 * slopes[:-1] * np.diff(times)
+                    edges = np.arange(0, len(times), together)
+                    totals = np.diff(np.append(0.0, np.cumsum(means * np.diff(times)))[edges])
+                    drive = np.append(totals / np.diff(times[edges]), drive[-1])
+                    rows = slice(rows.start, rows.start + int(edges[-1]) + 1, together)
+                    times, slopes = times[edges], np.zeros(len(edges))
+                state = np.array([angle[rows.start], measured[rows.start]])
+                state = initial_state(log, rows) if output == "position" else state
+                made.append(Segment(place, block, rows, times, drive, slopes, slopes, measured[rows], deviation, state))
+        return made
 
     def begun(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
         """With starts by a regression of the input's integral, and changes of it."""

@@ -20,7 +20,7 @@ from codrl_mj.identify.estimate import Model, refit
 from codrl_mj.identify.log import Log
 from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import ELECTRICAL, PARAMETERS
-from codrl_mj.identify.segments import Segment, winding_segments
+from codrl_mj.identify.segments import Segment
 from codrl_mj.identify.synthetic import EXCITATIONS, FREE, Excitation, Load, Sampler, run, sample_times, simulate
 from codrl_mj.runs.files import writing
 
@@ -172,8 +172,9 @@ def _expected(drive: Drive, load: Load, sensing: Sensing, log: Log) -> dict[str,
     """
     motor, deviation = drive.motor, sensing.current_noise * float(np.abs(log.signals["current"]).max())
     turned = np.append(np.diff(log.signals["position"]) / np.diff(log.time), 0.0)
-    segments = winding_segments([log], [turned])
-    winding, _ = WindingModel(known={"gear_ratio": motor.gear_ratio}).begun(segments)
+    winding = WindingModel(known={"gear_ratio": motor.gear_ratio})
+    segments = winding.segments([log], [turned])
+    winding, _ = winding.begun(segments)
     errors = _errors(drive, FREE, winding, segments, deviation, True)
     if load.locked:
         return errors

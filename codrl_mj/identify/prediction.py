@@ -9,7 +9,7 @@ import numpy as np
 
 from codrl_mj.identify.estimate import Fit, settled_state
 from codrl_mj.identify.log import Log, usable
-from codrl_mj.identify.segments import Segment, initial_state, shaft_segments
+from codrl_mj.identify.segments import Segment, initial_state
 
 HORIZON = 0.5
 """Time [s] that is foretold at once,"""
@@ -60,7 +60,7 @@ class Prediction:
 def predict(fit: Fit, log: Log) -> Prediction:
     """Errors of a fitted shaft's simulations of a log."""
     model, simulate, errors, made = fit.model, fit.model.at(fit.values), [], []
-    segments = shaft_segments([log], model.driven_by, model.output, HORIZON)
+    segments = dataclasses.replace(model, segment=HORIZON).segments([log])
     for segment in segments:
         known = max(int(np.searchsorted(segment.times, segment.times[0] + KNOWN)), 5)
         made.append(simulate(segment, settled_state(model, fit.values, segment.first(known))))
@@ -99,9 +99,9 @@ def closed_loop_error(fit: Fit, log: Log) -> float | None:
     return total if math.isfinite(total) else None
 
 
-def fitted_traces(part: str, fit: Fit, logs: Sequence[Log]) -> Iterator[Trace]:
+def fitted_traces(part: str, fit: Fit) -> Iterator[Trace]:
     """The fit of `winding` or `shaft` to each of its logs."""
-    for place, log in enumerate(logs):
+    for place, log in enumerate(fit.logs):
         pairs = zip(fit.segments, fit.residuals, strict=True)
         own = [(one, one.measured + residuals * one.deviation) for one, residuals in pairs if one.log == place]
         if own:

@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -144,55 +143,6 @@ def turning(log: Log) -> np.ndarray:
             velocity = log.signals["velocity"][rows]
             found[rows] = 0.5 * (velocity + np.append(velocity[1:], velocity[-1]))
     return found
-
-
-def winding_segments(logs: Sequence[Log], turned: Sequence[np.ndarray]) -> list[Segment]:
-    """Segments of a block each, in which voltage and speed drive the current."""
-    made: list[Segment] = []
-    for place, (log, speed) in enumerate(zip(logs, turned, strict=True)):
-        volts, deviation = log.signals["voltage"], sensor_deviation(log, "current")
-        for rows in cut(log, BLOCK):
-            times, current = log.time[rows], log.signals["current"][rows]
-            drive = times, volts[rows], np.zeros(len(times)), speed[rows]
-            made.append(Segment(place, len(made), rows, *drive, current, deviation, current[:1]))
-    return made
-
-
-def shaft_segments(
-    logs: Sequence[Log], driven_by: str, output: str, longest: float = SEGMENT, shortest: float = SHAFT_STEP
-) -> list[Segment]:
-    """Segments in which a torque, a current or a voltage drives the shaft."""
-    from scipy.integrate import cumulative_trapezoid
-
-    made: list[Segment] = []
-    block = -1
-    for place, log in enumerate(logs):
-        given = log.signals[driven_by]
-        if driven_by != "voltage":
-            given = without_spikes(given)
-        measured, deviation = log.signals[output], sensor_deviation(log, output)
-        # without a position a log begins at 0: it turns on from there
-        angle = cumulative_trapezoid(measured, log.time, initial=0.0)
-        together = max(int(shortest / log.step * (1.0 + 1e-6)), 1)
-        began = -math.inf
-        for rows in cut(log, longest):
-            times, drive = log.time[rows], given[rows]
-            if times[0] - began >= BLOCK - 1e-3:
-                block, began = block + 1, times[0]
-            slopes = np.zeros(len(times))
-            if driven_by != "voltage":
-                slopes[:-1] = np.diff(drive) / np.diff(times)
-            if together > 1:
-                means = drive[:-1] + 0.5 * slopes[:-1] * np.diff(times)
-                edges = np.arange(0, len(times), together)
-                totals = np.diff(np.append(0.0, np.cumsum(means * np.diff(times)))[edges])
-                drive = np.append(totals / np.diff(times[edges]), drive[-1])
-                rows = slice(rows.start, rows.start + int(edges[-1]) + 1, together)
-                times, slopes = times[edges], np.zeros(len(edges))
-            state = np.array([angle[rows.start], measured[rows.start]])
-            state = initial_state(log, rows) if output == "position" else state
-            made.append(Segment(place, block, rows, times, drive, slopes, slopes, measured[rows], deviation, state))
-    return made
 
 
 def initial_state(log: Log, rows: slice) -> np.ndarray:
