@@ -14,32 +14,24 @@ import numpy as np
 from codrl_mj.identify.log import Log, usable
 from codrl_mj.identify.segments import sensor_deviation
 
-_ROWS = 12
-"""Rows of a window, at least."""
-_LONGEST = 20_000
-"""Rows of a log beyond which a lag is not looked for."""
-_WINDOWS = 400
-"""More tell no more of a lag."""
+_ROWS = 12  # rows of a window, at least
+_LONGEST = 20_000  # rows of a log beyond which a lag is not looked for
+_WINDOWS = 400  # more tell no more of a lag
 _BUMP = np.polynomial.Polynomial([0.0, 1.0, -1.0]) ** 5
 """s - s^2 to a power so high that the trapezoidal rule is good for phi'' too."""
 _UNIT = _BUMP / _BUMP.integ()(1.0)
 _PHI = {-1: _UNIT.integ(), 0: _UNIT, 1: _UNIT.deriv(), 2: _UNIT.deriv(2)}
 """Order of the derivative by the phase -> polynomial; -1: its integral."""
-BODY = "inertia", "viscous", "coulomb"
-"""Terms of a torque balance that no body and no friction has negative."""
+BODY = "inertia", "viscous", "coulomb"  # terms of a torque balance that no body and no friction has negative
 
 
 class Balance(NamedTuple):
     """A regression over the windows of a log."""
 
-    values: Mapping[str, float]
-    """Term -> its coefficient."""
-    certainty: Mapping[str, float]
-    """Term -> its coefficient over its standard error."""
-    unexplained: float
-    """Root mean square of the residual over that of what was to be explained."""
-    residual: float
-    """Root mean square of the residual, in the unit of what was to be explained."""
+    values: Mapping[str, float]  # term -> its coefficient
+    certainty: Mapping[str, float]  # term -> its coefficient over its standard error
+    unexplained: float  # root mean square of the residual over that of what was to be explained
+    residual: float  # root mean square of the residual, in the unit of what was to be explained
 
 
 class Windows:
@@ -174,16 +166,11 @@ def torque_balance(
 class Shift(NamedTuple):
     """The shift of time by which two signals agree best."""
 
-    lag: float
-    """[s]"""
-    improvement: float
-    """Residual at that shift over the one without."""
-    gain: float = 1.0
-    """Factor between the two."""
-    unexplained: float = 0.0
-    """Residual at that shift over what was to be explained, root mean squares."""
-    noise: float = 0.0
-    """Noise or step of the worse sensor over what it sees."""
+    lag: float  # [s]
+    improvement: float  # residual at that shift over the one without
+    gain: float = 1.0  # factor between the two
+    unexplained: float = 0.0  # residual at that shift over what was to be explained, root mean squares
+    noise: float = 0.0  # noise or step of the worse sensor over what it sees
 
 
 def velocity_lag(log: Log) -> Shift | None:

@@ -26,8 +26,7 @@ FACTORS = {
     "rpm for turn/s": 60.0,
 }
 """What a factor between two numbers that should be equal may tell, one for the other or the other way round."""
-_RESISTANCES = 5e-3, 1e4
-"""Of motors on a bench [ohm]: at 5 V the least would draw 1 kA; micromotors have some hundreds."""
+_RESISTANCES = 5e-3, 1e4  # of motors on a bench [ohm]: at 5 V the least would draw 1 kA; micromotors have some hundreds
 _CERTAIN = 10.0  # coefficient over its standard error
 _TURNED = 2.0 / 3.0  # of the residual, that a sign must leave at most to be the right one
 _DROWNED = 0.1  # noise over the motion, beyond which no error of speeds is claimed

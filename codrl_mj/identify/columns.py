@@ -13,8 +13,7 @@ import numpy as np
 from codrl_mj.fields import check_names
 from codrl_mj.identify.log import SIGNALS
 
-KINDS: dict[str, str | None] = {"time": "s", **SIGNALS, "only": ""}
-"""What columns may be -> its SI unit; None: any."""
+KINDS: dict[str, str | None] = {"time": "s", **SIGNALS, "only": ""}  # what columns may be -> its SI unit; None: any
 _EXAMPLE = "time=t:s,voltage=duty*vbus:V,current=i:A,position=q:rad"
 
 
@@ -44,14 +43,10 @@ _OPERATORS: dict[type, Callable[[Any, Any], Any]] = {
 class Column:
     """A signal as a formula of a file's columns."""
 
-    signal: str
-    """`time`, one of `SIGNALS`, or `only`: rows where it is 0 are left out."""
-    formula: str
-    """Columns (one with spaces in quotes), numbers, `pi`, + - * / and `FUNCTIONS`."""
-    unit: str | None
-    """Of the formula's value; None: SI, which only a formula of more than a name may leave out."""
-    mean: bool = False
-    """Of a voltage: whether it is the mean from its row to the next, not what holds from its row on."""
+    signal: str  # `time`, one of `SIGNALS`, or `only`: rows where it is 0 are left out
+    formula: str  # columns (one with spaces in quotes), numbers, `pi`, + - * / and `FUNCTIONS`
+    unit: str | None  # of the formula's value; None: SI, which only a formula of more than a name may leave out
+    mean: bool = False  # of a voltage: whether it is the mean from its row to the next, not what holds from its row on
 
     def __post_init__(self) -> None:
         """Validate, without a file."""

@@ -16,11 +16,9 @@ from codrl_mj.identify.log import Log
 from codrl_mj.identify.parameters import DEFAULTS, PARAMETERS
 from codrl_mj.identify.segments import Segment
 
-DIFFERENCE = 1e-4
-"""Step of finite differences, in the parameters' scales: dry friction makes smaller ones rough."""
+DIFFERENCE = 1e-4  # step of finite differences, in the parameters' scales: dry friction makes smaller ones rough
 FAR = 1e30
-SCREENING = 12
-"""Evaluations from each of several starts."""
+SCREENING = 12  # evaluations from each of several starts
 Simulate = Callable[[Segment, np.ndarray], np.ndarray]
 
 
@@ -28,18 +26,13 @@ Simulate = Callable[[Segment, np.ndarray], np.ndarray]
 class Model(abc.ABC):
     """A part of a motor: what drives it, what is known of it and what is fitted; how it does so is a subclass's."""
 
-    driven_by: str
-    """Signal of a log."""
-    output: str
-    """Signal that a simulation is compared with."""
-    known: Mapping[str, float]
-    """Values of parameters that are not fitted."""
-    names: tuple[str, ...] = ()
-    """Free parameters; none before `begun`."""
+    driven_by: str  # signal of a log
+    output: str  # signal that a simulation is compared with
+    known: Mapping[str, float]  # values of parameters that are not fitted
+    names: tuple[str, ...] = ()  # free parameters; none before `begun`
     scales: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(0))
     """What a change of each is measured by, > 0, shape (p,)."""
-    steps: ClassVar[np.ndarray]
-    """Steps of finite differences of the state, shape (s,)."""
+    steps: ClassVar[np.ndarray]  # steps of finite differences of the state, shape (s,)
 
     @property
     def lower(self) -> np.ndarray:
@@ -72,27 +65,17 @@ class Model(abc.ABC):
 class Fit:
     """Parameters that fit, and what is needed to judge them."""
 
-    model: Any
-    """A `Model`."""
+    model: Any  # a `Model`
     segments: Sequence[Segment]
-    values: np.ndarray
-    """Shape (p,)."""
-    cost: float
-    """Robust cost, in squares of the sensors' standard deviations."""
-    scale: float
-    """Residuals beyond this, in standard deviations of the sensor, count less."""
-    residuals: tuple[np.ndarray, ...]
-    """Of each segment, in standard deviations of the sensor, shape (m,)."""
-    jacobians: tuple[np.ndarray, ...]
-    """Of each segment, what its states cannot do taken out, shape (m, p)."""
-    states: tuple[np.ndarray, ...]
-    """At the beginning of each segment."""
-    logs: tuple[Log, ...] = ()
-    """Of the segments, with the input in time."""
-    delay: float = 0
-    """Rows by which it was late."""
-    tried: tuple["Fit", ...] = ()
-    """What each start led to."""
+    values: np.ndarray  # shape (p,)
+    cost: float  # robust cost, in squares of the sensors' standard deviations
+    scale: float  # residuals beyond this, in standard deviations of the sensor, count less
+    residuals: tuple[np.ndarray, ...]  # of each segment, in standard deviations of the sensor, shape (m,)
+    jacobians: tuple[np.ndarray, ...]  # of each segment, what its states cannot do taken out, shape (m, p)
+    states: tuple[np.ndarray, ...]  # at the beginning of each segment
+    logs: tuple[Log, ...] = ()  # of the segments, with the input in time
+    delay: float = 0  # rows by which it was late
+    tried: tuple["Fit", ...] = ()  # what each start led to
 
     def costs(self, scale: float) -> np.ndarray:
         """Robust cost of each segment."""
@@ -118,8 +101,7 @@ class _Settled(NamedTuple):
 
     state: np.ndarray
     residuals: np.ndarray
-    columns: np.ndarray
-    """How these change with the state, shape (m, s)."""
+    columns: np.ndarray  # how these change with the state, shape (m, s)
 
 
 def _settle(

@@ -11,15 +11,11 @@ from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.prediction import predict
 from codrl_mj.identify.segments import shifted
 
-DELAYS = (-1, 1, 2, 3)
-"""Rows that the input is tried to be late by, besides 0;"""
-LONGEST = 20
-"""and on to so many, while that is better."""
+DELAYS = (-1, 1, 2, 3)  # rows that the input is tried to be late by, besides 0;
+LONGEST = 20  # and on to so many, while that is better
 STARTS = 4
-BETTER = 0.8
-"""A delay is believed where it takes the robust cost to less than this share, and"""
-SURE = 3.0
-"""lowers that of the segments by more, in the mean, than so many standard deviations of that mean."""
+BETTER = 0.8  # a delay is believed where it takes the robust cost to less than this share, and
+SURE = 3.0  # lowers that of the segments by more, in the mean, than so many standard deviations of that mean
 
 
 def refitted(fit: Fit, model: Model) -> Fit:

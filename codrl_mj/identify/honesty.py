@@ -15,19 +15,14 @@ from codrl_mj.identify.log import Log
 from codrl_mj.identify.models import WindingModel
 from codrl_mj.identify.segments import halved, moves, replaced
 
-LEAST_LOGS = 5
-"""From so many logs on whole logs are resampled; below, blocks of them."""
+LEAST_LOGS = 5  # from so many logs on whole logs are resampled; below, blocks of them
 DRAWS = 500
-FLAT = 1e-12
-"""Of parameters in units in which each alone is known to 1, a direction counts as known to 1e6 at worst."""
+FLAT = 1e-12  # of parameters in units in which each alone is known to 1, a direction counts as known to 1e6 at worst
 ATTENUATION = 6.0
 """How much larger than the share of variance that is not explained the bias by errors of the input may be."""
-SLACK = 1e-3
-"""Share of the cost that a fit may be better by luck: dry friction has many minima."""
-UNKNOWN = 0.5
-"""A direction in which the parameters may go by so much of themselves, unnoticed, is not identified."""
-PART = 0.1
-"""Share of such a direction from which a parameter belongs to it."""
+SLACK = 1e-3  # share of the cost that a fit may be better by luck: dry friction has many minima
+UNKNOWN = 0.5  # a direction in which the parameters may go by so much of themselves, unnoticed, is not identified
+PART = 0.1  # share of such a direction from which a parameter belongs to it
 
 
 def total(causes: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -20,13 +20,10 @@ from codrl_mj.identify.prediction import Prediction, fitted_traces, predict
 from codrl_mj.identify.result import Identified, missing
 from codrl_mj.identify.segments import SEGMENT, moves, shifted
 
-INPUTS = "torque", "current", "voltage"
-"""What drives the shaft: the nearest to it that all logs that move have."""
-OUTPUTS = "position", "velocity"
-"""What a simulation is compared with."""
+INPUTS = "torque", "current", "voltage"  # what drives the shaft: the nearest to it that all logs that move have
+OUTPUTS = "position", "velocity"  # what a simulation is compared with
 STEPS_OF_A_PART = 8 + 4
-RAREST = 0.05
-"""Rows that are farther apart [s] say too little within the time that is foretold."""
+RAREST = 0.05  # rows that are farther apart [s] say too little within the time that is foretold
 
 
 def identify(

@@ -16,16 +16,14 @@ from codrl_mj.identify.segments import BLOCK
 
 WIDEST = 0.3
 """An interval of more than this share of the value to either side is too wide; of the whole friction, for friction."""
-WIDEST_OF = {"resistance": 0.05, "back_emf_constant": 0.05, "inductance": 0.15}
-"""For what a current sensor tells."""
+WIDEST_OF = {"resistance": 0.05, "back_emf_constant": 0.05, "inductance": 0.15}  # for what a current sensor tells
 NARROWEST = 0.002
 """No interval is narrower than this share of the value to either side: nobody's sensors are better calibrated."""
 NARROWEST_OF = {"inductance": 0.02}
 """What comes of a fifth of a row's time: neither stamps nor a held back-EMF are better."""
 NARROW = 0.1
 """Friction whose interval is a larger share of itself is a rough number: what is sure is how much of all it may be."""
-BIASED = 0.5
-"""The self-test fails where it is off by more than this share of the widest interval."""
+BIASED = 0.5  # the self-test fails where it is off by more than this share of the widest interval
 CAUSES = {
     "curvature": "the logs hardly depend on it",
     "resampling": "parts of the logs disagree",
@@ -36,10 +34,8 @@ CAUSES = {
     "torque_constant": "the torque constant is not known better",
 }
 """What widens an interval, in words."""
-AT_BOUND = 1e-3
-"""Nearer to a bound, in the parameter's scale, a value is at it."""
-UNEXPLAINED = 8.0
-"""Residuals of more standard deviations of the sensor in the mean are no noise,"""
+AT_BOUND = 1e-3  # nearer to a bound, in the parameter's scale, a value is at it
+UNEXPLAINED = 8.0  # residuals of more standard deviations of the sensor in the mean are no noise,
 UNLIKE = 0.02
 """and more than this share of what moves within a segment is not explained: the log is bad, or the model is."""
 

@@ -18,8 +18,7 @@ SIGNALS = {
     "command": None,  # in any unit: what a controller was asked for
 }
 """What a log may hold -> its SI unit; None: any."""
-LONGEST_STEP = 5.0
-"""A longer step, in median steps, is a gap, across which nothing is simulated."""
+LONGEST_STEP = 5.0  # a longer step, in median steps, is a gap, across which nothing is simulated
 _MOST_LEVELS = 1_000_000  # of a converter: what has more is as good as continuous
 
 

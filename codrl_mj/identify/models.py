@@ -131,10 +131,8 @@ class ShaftModel(Model):
 
     rig: str
     friction: str
-    estimated: tuple[str, ...] = ()
-    """What is fitted besides."""
-    segment: float = SEGMENT
-    """Time [s] that is simulated at once."""
+    estimated: tuple[str, ...] = ()  # what is fitted besides
+    segment: float = SEGMENT  # time [s] that is simulated at once
 
     steps: ClassVar = np.array([1e-4, 1e-3])
 

@@ -33,10 +33,8 @@ GOALS = {
     "viscous_friction": 0.05,
 }
 """Relative error of each parameter that a plan is to reach."""
-MARGIN = 3.0
-"""By which a plan's errors are below the goals, because a bench has more faults than noise."""
-RATES = (1e3, 2e3, 5e3, 10e3, 20e3)
-"""Rows a second [Hz] that are tried."""
+MARGIN = 3.0  # by which a plan's errors are below the goals, because a bench has more faults than noise
+RATES = (1e3, 2e3, 5e3, 10e3, 20e3)  # rows a second [Hz] that are tried
 _SEGMENT = 0.25  # [s]
 _PHASE = 0.37  # of a row, by which the rows miss the excitation's clock
 
@@ -63,14 +61,10 @@ class Option(NamedTuple):
     """An excitation at a sample rate, and what it would tell."""
 
     excitation: Excitation
-    rate: float
-    """Rows a second [Hz]."""
-    peak_current: float
-    """[A]"""
-    rms_current: float
-    """Root mean square [A]."""
-    errors: dict[str, float]
-    """Parameter -> relative error expected; what cannot be seen is left out."""
+    rate: float  # rows a second [Hz]
+    peak_current: float  # [A]
+    rms_current: float  # root mean square [A]
+    errors: dict[str, float]  # parameter -> relative error expected; what cannot be seen is left out
 
     @property
     def worst(self) -> float:
@@ -84,12 +78,9 @@ class Plan(NamedTuple):
     """All options, and the one to play."""
 
     options: list[Option]
-    best: Option
-    """That of the lowest rate that is below all goals by `MARGIN`; else that which comes closest."""
-    missed: list[str]
-    """Parameters that it does not reach the goals of."""
-    unknown: list[str]
-    """Parameters that the datasheet leaves at 0, of which nothing can be said."""
+    best: Option  # that of the lowest rate that is below all goals by `MARGIN`; else that which comes closest
+    missed: list[str]  # parameters that it does not reach the goals of
+    unknown: list[str]  # parameters that the datasheet leaves at 0, of which nothing can be said
 
 
 def plan(

@@ -11,28 +11,20 @@ from codrl_mj.identify.estimate import Fit, settled_state
 from codrl_mj.identify.log import Log, usable
 from codrl_mj.identify.segments import Segment, initial_state
 
-HORIZON = 0.5
-"""Time [s] that is foretold at once,"""
-KNOWN = 0.03
-"""from where and how fast the shaft was in its first so many [s], five rows at least."""
+HORIZON = 0.5  # time [s] that is foretold at once,
+KNOWN = 0.03  # from where and how fast the shaft was in its first so many [s], five rows at least
 
 
 class Trace(NamedTuple):
     """A simulation beside what was measured, in pieces that each begin from a state of their own."""
 
     log: str
-    part: str
-    """`winding` or `shaft`."""
-    output: str
-    """What is compared: `current` [A], `position` [rad] or `velocity` [rad/s]."""
-    time: np.ndarray
-    """[s], shape (n,)."""
-    measured: np.ndarray
-    """Shape (n,)."""
-    simulated: np.ndarray
-    """Shape (n,)."""
-    starts: np.ndarray
-    """Rows at which pieces begin."""
+    part: str  # `winding` or `shaft`
+    output: str  # what is compared: `current` [A], `position` [rad] or `velocity` [rad/s]
+    time: np.ndarray  # [s], shape (n,)
+    measured: np.ndarray  # shape (n,)
+    simulated: np.ndarray  # shape (n,)
+    starts: np.ndarray  # rows at which pieces begin
 
 
 def traced(log: str, part: str, output: str, segments: Sequence[Segment], made: Sequence[np.ndarray]) -> Trace:

@@ -7,8 +7,7 @@ from typing import Any
 from codrl_mj.fields import did_you_mean
 from codrl_mj.tasks.assets import asset_path
 
-LAYOUT = "bench_logs"
-"""Where in a folder of data the sets are."""
+LAYOUT = "bench_logs"  # where in a folder of data the sets are
 
 
 def published() -> dict[str, dict[str, Any]]:

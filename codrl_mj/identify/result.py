@@ -10,10 +10,8 @@ from codrl_mj.identify.prediction import Prediction, Trace
 from codrl_mj.runs.files import write_json, writing
 
 Status = Literal["identified", "rough", "given", "ratio", "unidentifiable", "refused"]
-ACTUATOR = "actuator.yaml"
-"""Name of the file in a folder of results."""
-MISUNDERSTOOD = 0.2
-"""Share of the motion beyond which it is not single numbers that are amiss."""
+ACTUATOR = "actuator.yaml"  # name of the file in a folder of results
+MISUNDERSTOOD = 0.2  # share of the motion beyond which it is not single numbers that are amiss
 USABLE = ("identified", "rough", "given")
 OF_MOTOR = (
     *("resistance", "inductance", "torque_constant", "back_emf_constant", "rotor_inertia", "gear_ratio"),

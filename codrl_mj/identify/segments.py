@@ -11,41 +11,28 @@ from codrl_mj.identify.log import Log, usable
 
 SEGMENT = 0.5
 """Time [s] that a shaft is simulated for at once: longer ones meet friction that no model has, and several minima."""
-BLOCK = 1.0
-"""Shortest stretch [s] of a log that is resampled as a whole: residuals within it belong together."""
+BLOCK = 1.0  # shortest stretch [s] of a log that is resampled as a whole: residuals within it belong together
 SHAFT_STEP = 5e-4
 """Rows that are nearer [s] are taken together for a shaft, which is slower: their mean input, their first position."""
-SPIKE = 50.0
-"""A row is a spike where it sticks out by more than so many times what nine of ten rows do at most."""
+SPIKE = 50.0  # a row is a spike where it sticks out by more than so many times what nine of ten rows do at most
 WINDOW = 4e-3
 """Time [s] that positions are smoothed over: short beside what a shaft does, long beside an encoder's steps."""
-STILL = 10.0
-"""A shaft that moves by no more than so many steps of its encoder is locked."""
+STILL = 10.0  # a shaft that moves by no more than so many steps of its encoder is locked
 
 
 class Segment(NamedTuple):
     """Rows that are simulated at once."""
 
-    log: int
-    """Place of its log among those fitted."""
-    block: int
-    """Number of the stretch that it is resampled with, unique over all logs."""
-    rows: slice
-    """Of its log."""
-    times: np.ndarray
-    """[s], shape (m,)."""
-    inputs: np.ndarray
-    """What drives it, at the times, shape (m,)."""
-    slopes: np.ndarray
-    """How that changes till the next row [1/s], shape (m,)."""
-    speeds: np.ndarray
-    """Mean speed [rad/s] till the next row, shape (m,): of a winding."""
-    measured: np.ndarray
-    """What a simulation is compared with, shape (m,)."""
-    deviation: float
-    """Standard deviation of the sensor, in the unit of `measured`."""
-    state: np.ndarray
-    """A guess of the state at the first row."""
+    log: int  # place of its log among those fitted
+    block: int  # number of the stretch that it is resampled with, unique over all logs
+    rows: slice  # of its log
+    times: np.ndarray  # [s], shape (m,)
+    inputs: np.ndarray  # what drives it, at the times, shape (m,)
+    slopes: np.ndarray  # how that changes till the next row [1/s], shape (m,)
+    speeds: np.ndarray  # mean speed [rad/s] till the next row, shape (m,): of a winding
+    measured: np.ndarray  # what a simulation is compared with, shape (m,)
+    deviation: float  # standard deviation of the sensor, in the unit of `measured`
+    state: np.ndarray  # a guess of the state at the first row
 
     def first(self, count: int) -> "Segment":
         """Its first rows."""

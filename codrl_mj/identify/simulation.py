@@ -15,37 +15,24 @@ import numpy as np
 from codrl_mj.actuators import shaft
 from codrl_mj.kept import njit
 
-LONGEST_SUBSTEP = 1e-3
-"""Longer intervals between rows are cut into pieces of at most this [s]."""
+LONGEST_SUBSTEP = 1e-3  # longer intervals between rows are cut into pieces of at most this [s]
 
 
 class Moved(NamedTuple):
     """What is moved, and what brakes it, all at the motor's output."""
 
-    inertia: float
-    """[kg*m^2], > 0."""
-    gravity: float
-    """Largest torque of gravity [N*m], m*g*l, against sin(position)."""
-    constant_torque: float
-    """Held load [N*m], against positive speeds."""
-    coulomb: float
-    """[N*m]"""
-    viscous: float
-    """[N*m*s/rad]"""
-    gear_efficiency: float
-    """In (0, 1]."""
-    stribeck_friction: float
-    """[N*m]"""
-    stribeck_speed: float
-    """[rad/s]"""
-    stribeck_exponent: float
-    """What `GearMotor.stribeck_exponent` is."""
-    rotor_inertia: float
-    """Not used where the inertia is known; `shaft.friction` asks for it."""
-    gain: float
-    """Torque [N*m] for one of the input."""
-    braking: float
-    """Torque [N*m] that the motor loses for one [rad/s]: kT*kE/R where the input is a voltage, else 0."""
+    inertia: float  # [kg*m^2], > 0
+    gravity: float  # largest torque of gravity [N*m], m*g*l, against sin(position)
+    constant_torque: float  # held load [N*m], against positive speeds
+    coulomb: float  # [N*m]
+    viscous: float  # [N*m*s/rad]
+    gear_efficiency: float  # in (0, 1]
+    stribeck_friction: float  # [N*m]
+    stribeck_speed: float  # [rad/s]
+    stribeck_exponent: float  # what `GearMotor.stribeck_exponent` is
+    rotor_inertia: float  # not used where the inertia is known; `shaft.friction` asks for it
+    gain: float  # torque [N*m] for one of the input
+    braking: float  # torque [N*m] that the motor loses for one [rad/s]: kT*kE/R where the input is a voltage, else 0
 
 
 def moved(number: Mapping[str, float], gain: float, braking: float = 0.0) -> Moved:

@@ -96,10 +96,8 @@ class Load:
         check(self)
 
 
-FREE = Load()
-"""Nothing but the rotor."""
-SEEN = "current", "position", "velocity", "torque", "bus", "voltage", "duty"
-"""What a simulated log has."""
+FREE = Load()  # nothing but the rotor
+SEEN = "current", "position", "velocity", "torque", "bus", "voltage", "duty"  # what a simulated log has
 
 
 @dataclasses.dataclass(frozen=True)
