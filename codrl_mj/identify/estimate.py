@@ -188,20 +188,13 @@ def robust_scale(residuals: np.ndarray) -> float:
     return 1.5 * max(1.4826 * float(np.median(np.abs(residuals))), 1.0)
 
 
-def refit(
-    model: Model, segments: Sequence[Segment], start: np.ndarray, most: int = 40, scale: float | None = None
-) -> Fit:
-    """A fit from parameters that are about right, and from the states that they fit best from."""
-    return _refined(model, segments, start, [settled_state(model, start, one) for one in segments], most, scale)
-
-
 def search(
     model: Model, segments: Sequence[Segment], starts: Sequence[np.ndarray], on_start: Callable[[], None] = lambda: None
 ) -> tuple[Fit, tuple[Fit, ...]]:
     """The best fit from any of several starts, and what each of them led to, the best first."""
     found = []
     for start in starts:
-        found.append(_refined(model, segments, start, [segment.state for segment in segments], SCREENING))
+        found.append(refit(model, segments, start, SCREENING, states=[segment.state for segment in segments]))
         on_start()
     least = min(one.scale for one in found)
 
@@ -209,25 +202,23 @@ def search(
         return robust_cost(np.concatenate(fit.residuals), least)
 
     found.sort(key=cost)
-    polished = [_refined(model, segments, one.values, one.states, 40, one.scale) for one in found[:2]]
+    polished = [refit(model, segments, one.values, 40, one.scale, one.states) for one in found[:2]]
     return min(polished, key=cost), tuple(found)
 
 
-def _refined(
+def refit(
     model: Model,
     segments: Sequence[Segment],
     start: np.ndarray,
-    states: Sequence[np.ndarray],
-    most: int,
+    most: int = 40,
     scale: float | None = None,
+    states: Sequence[np.ndarray] | None = None,
 ) -> Fit:
-    """A fit from a start and states; without a scale that of what they leave.
-
-    In the end each state is also looked for from the segment's own guess: dry friction gives a segment several minima,
-    and the one that it was in under other parameters need not be the best.
-    """
+    """A fit from a start, and from states or those that fit it best; without a scale that of what they leave."""
     from scipy.optimize import least_squares
 
+    if states is None:
+        states = [settled_state(model, start, one) for one in segments]
     values = np.clip(start, model.lower, model.upper)
     if scale is None:
         simulate = model.at(values)
@@ -249,9 +240,9 @@ def _refined(
             gtol=1e-10,
         ).x
     problem.scale = robust_scale(problem.residuals(values))
-    problem.reconsider(values)
+    problem.reconsider(values)  # dry friction gives a segment several minima: that under other parameters may be worse
     jacobians = problem.jacobians(values)
     found = problem.solve(values)
     residuals = tuple(one.residuals for one in found)
-    cost, states = robust_cost(np.concatenate(residuals), problem.scale), [one.state for one in found]
-    return Fit(model, segments, values, cost, problem.scale, residuals, tuple(jacobians), tuple(states))
+    cost, settled = robust_cost(np.concatenate(residuals), problem.scale), tuple(one.state for one in found)
+    return Fit(model, segments, values, cost, problem.scale, residuals, tuple(jacobians), settled)

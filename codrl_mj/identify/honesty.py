@@ -6,7 +6,7 @@ simulated and fitted again, and by what is found at half the rate.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -31,7 +31,7 @@ def total(causes: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.asarray(np.hypot(wide, causes["half_rate"]) + causes["self_test"] + causes["unexplained"])
 
 
-def unexplained(fit: Fit) -> float:
+def _unexplained(fit: Fit) -> float:
     """Share by which a factor of the input may be off for what is not explained.
 
     Errors of the input, as of a voltage that changes between the rows, attenuate its factor by a multiple of their
@@ -65,6 +65,27 @@ def _inverse(matrix: np.ndarray, scales: np.ndarray) -> np.ndarray:
     units = scales / np.sqrt(np.maximum(known, 1e-16 * known.max() + 1e-300))
     values, vectors = np.linalg.eigh(matrix * np.outer(units, units))
     return np.asarray((vectors / np.maximum(values, FLAT)) @ vectors.T * np.outer(units, units))
+
+
+def causes(
+    fit: Fit, values: np.ndarray, scales: np.ndarray, of: np.ndarray, seed: int, on_step: Callable[[], None]
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Half-widths by cause of `values` (q,), which are `of` @ the parameters, and what the self-test finds for them."""
+    electrical = isinstance(fit.model, WindingModel)
+    found = half_widths(fit, scales, of, seed)
+    on_step()
+    # two fits to what the fit would have made of its logs, of opposed residuals: in their mean what is random cancels
+    tested = values + of @ (
+        np.asarray(0.5 * sum(_again(fit, _pretended(fit, sign)) for sign in (1.0, -1.0))) - fit.values
+    )
+    on_step()
+    # an error that goes with a row's time is half as large at the rate of the logs, one with its root more than that
+    halves = _again(fit, [halved(log) for log in fit.logs])
+    found["half_rate"] = (2.0 if electrical else 1.0) * np.abs(of @ (halves - fit.values))
+    on_step()
+    found["self_test"] = np.abs(tested - values)
+    found["unexplained"] = np.abs(values) * (_unexplained(fit) if electrical else 0.0)
+    return found, tested
 
 
 def half_widths(fit: Fit, scales: np.ndarray, of: np.ndarray, seed: int) -> dict[str, np.ndarray]:
@@ -158,27 +179,16 @@ def _noticed(fit: Fit) -> float:
     return 3.84 * noise * together + SLACK * fit.cost
 
 
-def half_rate(fit: Fit) -> np.ndarray:
-    """The parameters at half the rate."""
-    return _again(fit, [halved(log) for log in fit.logs])
-
-
-def self_test(fit: Fit) -> np.ndarray:
-    """The parameters found in what the fit would have made of its logs: the mean of two such, of opposed residuals.
-
-    Residuals keep their order and size, stretch by stretch with a random sign, so that they belong together as they
-    do in the logs; in the mean of a draw and its opposite what they do at random cancels.
-    """
-    return np.asarray(0.5 * sum(_again(fit, _pretended(fit, sign)) for sign in (1.0, -1.0)))
-
-
 def _again(fit: Fit, logs: Sequence[Log]) -> np.ndarray:
     """The parameters that other logs give, from where a fit ended."""
     return refit(fit.model, fit.model.segments(logs), fit.values, 20).values
 
 
 def _pretended(fit: Fit, sign: float) -> list[Log]:
-    """The logs as the fit would have made them, rounded anew; of a winding also what it took for the motion."""
+    """The logs as the fit would have made them, rounded anew; of a winding also what it took for the motion.
+
+    Residuals keep order and size, stretch by stretch with a random sign, so that they belong together as in the logs.
+    """
     output, simulate = fit.model.output, fit.model.at(fit.values)
     signals = [log.signals[output].copy() for log in fit.logs]
     speeds = [np.zeros(len(log.time)) for log in fit.logs]

@@ -71,7 +71,7 @@ def _of_part(fit: Fit, seed: int, on_step: Callable[[], None]) -> list[Estimate]
     if any(slopes):
         names, of, values = (*names, "friction_torque"), np.vstack([of, slopes]), np.append(values, friction)
         sizes, units = (np.append(one, all_of["friction_torque"]) for one in (sizes, units))
-    causes, tested = _causes(fit, values, scales, of, seed, on_step)
+    causes, tested = honesty.causes(fit, values, scales, of, seed, on_step)
     directions = honesty.unknown_directions(fit, scales)
     on_step()
     changes = [slopes * scales @ [one.get(name, 0.0) for name in model.names] / sizes[-1] for one in directions]
@@ -122,23 +122,6 @@ def _verdict(
         more = ", and more of itself" if name != "friction_torque" else ""
         return "rough", f"its interval is {share:.3g} % of all friction to either side{more}"
     return "identified", ""
-
-
-def _causes(
-    fit: Fit, values: np.ndarray, scales: np.ndarray, of: np.ndarray, seed: int, on_step: Callable[[], None]
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Half-widths by cause of `values`, which are `of` @ the parameters, and what the self-test finds for them."""
-    electrical = isinstance(fit.model, WindingModel)
-    causes = honesty.half_widths(fit, scales, of, seed)
-    on_step()
-    tested = values + of @ (honesty.self_test(fit) - fit.values)
-    on_step()
-    # an error that goes with a row's time is half as large at the rate of the logs, one with its root more than that
-    causes["half_rate"] = (2.0 if electrical else 1.0) * np.abs(of @ (honesty.half_rate(fit) - fit.values))
-    on_step()
-    causes["self_test"] = np.abs(tested - values)
-    causes["unexplained"] = np.abs(values) * (honesty.unexplained(fit) if electrical else 0.0)
-    return causes, tested
 
 
 def _with_constant(found: list[Estimate], constant: Estimate, known: Mapping[str, float]) -> list[Estimate]:

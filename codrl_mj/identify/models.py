@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from codrl_mj.identify.estimate import Model, Simulate, settled_state
-from codrl_mj.identify.log import Log
+from codrl_mj.identify.log import Log, usable
 from codrl_mj.identify.parameters import DEFAULTS, ELECTRICAL, FRICTION, OF_FRICTION, OF_RIG, PARAMETERS
 from codrl_mj.identify.segments import (
     BLOCK,
@@ -22,7 +22,6 @@ from codrl_mj.identify.segments import (
     sensor_deviation,
     shifted,
     speeds,
-    turning,
     without_spikes,
 )
 
@@ -84,11 +83,19 @@ class WindingModel(Model):
         return dataclasses.replace(self, names=free, scales=scales), starts
 
     def _turning(self, log: Log) -> np.ndarray:
-        """Mean speeds till the next row: of positions, smoothed; or what the shaft does, and what it leaves, smoothed.
+        """Mean speeds till the next row, (n,), 0 if locked: of smoothed positions, or what the shaft does and leaves.
 
         A smoothed speed lags behind a light rotor, and the back-EMF that it misses would be taken for inductance.
         """
-        found, part = turning(log), self.shaft
+        found, part = np.zeros(len(log.time)), self.shaft
+        for rows in usable(log) if moves(log) else ():
+            times = log.time[rows]
+            if log.has("position"):
+                middles = times + 0.5 * np.diff(times, append=2.0 * times[-1] - times[-2])
+                found[rows] = speeds(times, log.signals["position"][rows], middles)
+            else:
+                velocity = log.signals["velocity"][rows]
+                found[rows] = 0.5 * (velocity + np.append(velocity[1:], velocity[-1]))
         if part is None or not moves(log) or not log.has("position", part.model.driven_by):
             return found
         model, values = dataclasses.replace(part.model, output="position"), part.values

@@ -118,20 +118,6 @@ def cut(log: Log, longest: float) -> list[slice]:
     return found
 
 
-def turning(log: Log) -> np.ndarray:
-    """Mean speed [rad/s] from each row to the next, shape (n,), by positions around it or velocities; 0 if locked."""
-    found = np.zeros(len(log.time))
-    for rows in usable(log) if moves(log) else ():
-        times = log.time[rows]
-        if log.has("position"):
-            middles = times + 0.5 * np.diff(times, append=2.0 * times[-1] - times[-2])
-            found[rows] = speeds(times, log.signals["position"][rows], middles)
-        else:
-            velocity = log.signals["velocity"][rows]
-            found[rows] = 0.5 * (velocity + np.append(velocity[1:], velocity[-1]))
-    return found
-
-
 def initial_state(log: Log, rows: slice) -> np.ndarray:
     """Position and speed at the first row, from the rows around it: a parabola within 15 ms, or five rows."""
     time = log.time[rows.start]
