@@ -67,15 +67,26 @@ def identify(
     def step(what: str) -> Callable[[], None]:
         return lambda: on_progress(what, min(next(done), total), total)
 
-    shaft = ShaftModel(rig=rig, friction="coulomb", driven_by=driven_by or "", output=output, known=given,
-                       estimated=tuple(estimated), segment=segment)  # fmt: skip
-    parts = _parts(WindingModel(known=given), electrical, shaft, moving, friction, step)
+    # the winding, and the shaft by the torque constant that the winding tells; then each again, beside the other
+    parts: dict[str, Fit] = {}
+    if electrical:
+        parts["winding"] = fitted(WindingModel(known=given), electrical, step("winding"))
+    if driven_by:
+        shaft = ShaftModel(rig=rig, friction="coulomb", driven_by=driven_by, output=output, known=given,
+                           estimated=tuple(estimated), segment=segment)  # fmt: skip
+        shaft = with_friction(_told(shaft, parts.get("winding")), moving, friction, step("friction"))
+        friction = shaft.friction
+        parts["shaft"] = fitted(shaft, moving, step("shaft"))
+        if electrical and driven_by != "voltage":
+            parts["winding"] = refitted(parts["winding"], WindingModel(known=given, shaft=parts["shaft"]))
+        shaft = _told(dataclasses.replace(shaft, known=given), parts.get("winding"))
+        parts["shaft"] = refitted(parts["shaft"], shaft)
     estimates, warnings, unexplained = judged(parts, given, seed, step)
     volts = [log.signals[name] for log in logs for name in ("voltage", "bus") if log.has(name)]
     return Identified(
         tuple(log.name for log in logs),
         rig,
-        parts["shaft"].model.friction if "shaft" in parts else friction,
+        friction,
         driven_by,
         {name: part.delay for name, part in parts.items()},
         tuple(estimates),
@@ -88,29 +99,6 @@ def identify(
         max((float(np.abs(one).max()) for one in volts), default=None),
         unexplained,
     )
-
-
-def _parts(
-    winding: WindingModel,
-    electrical: Sequence[Log],
-    shaft: ShaftModel,
-    moving: Sequence[Log],
-    friction: str,
-    step: Callable[[str], Callable[[], None]],
-) -> dict[str, Fit]:
-    """The winding, and the shaft by the torque constant that the winding tells; then each again, beside the other."""
-    parts: dict[str, Fit] = {}
-    if electrical:
-        parts["winding"] = fitted(winding, electrical, step("winding"))
-    if not shaft.driven_by:
-        return parts
-    told = with_friction(_told(shaft, parts.get("winding")), moving, friction, step("friction"))
-    parts["shaft"] = fitted(told, moving, step("shaft"))
-    if electrical and shaft.driven_by != "voltage":
-        parts["winding"] = refitted(parts["winding"], dataclasses.replace(winding, shaft=parts["shaft"]))
-    told = _told(dataclasses.replace(shaft, friction=told.friction), parts.get("winding"))
-    parts["shaft"] = refitted(parts["shaft"], told)
-    return parts
 
 
 def _told(shaft: ShaftModel, winding: Fit | None) -> ShaftModel:
