@@ -8,7 +8,7 @@ Ljung, *System Identification* (2nd ed. 1999), sec. 7.4 and 13.2.
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -102,13 +102,17 @@ def plan(
     for name, value in (("max_current", max_current), ("continuous_current", continuous_current)):
         if not value > 0.0:
             raise ValueError(f"{name} = {value!r}: must be above 0 A; leave it out if there is no limit")
-    options = []
-    for kind in EXCITATIONS:
-        options += _options(drive, kind, duration, load, sensing or Sensing(), (limit, continuous_current))
+    motor, rates = drive.motor, [rate for rate in RATES if rate <= drive.controller.sample_rate]
+    truth = {**vars(motor), "inertia": motor.rotor_inertia + load.inertia / motor.gear_ratio**2}
+    options = [
+        _option(drive, kind, rate, duration, load, sensing or Sensing(), (limit, continuous_current), truth)
+        for kind in EXCITATIONS
+        for rate in rates
+    ]
     reached = [option for option in options if option.worst <= 1.0 / MARGIN]
     best = min(reached, key=lambda one: (one.rate, one.worst)) if reached else min(options, key=lambda one: one.worst)
-    names = {name: GOALS[name] for name in GOALS if _value(drive, load, name) > 0.0}
-    missed = [name for name, goal in names.items() if best.errors.get(name, math.inf) > goal]
+    names = [name for name in GOALS if truth[name] > 0.0]
+    missed = [name for name in names if best.errors.get(name, math.inf) > GOALS[name]]
     return Plan(options, best, missed, [name for name in GOALS if name not in names])
 
 
@@ -120,83 +124,73 @@ def write_excitation(path: Path, option: Option) -> None:
         np.savetxt(temporary, table, fmt="%.7g", delimiter=",", header="time,voltage", comments="")
 
 
-def _options(
-    drive: Drive, kind: str, duration: float, load: Load, sensing: Sensing, limits: tuple[float, float]
-) -> list[Option]:
-    """An excitation at every rate, as large as the supply, the largest and the continuous current allow."""
+def _option(
+    drive: Drive,
+    kind: str,
+    rate: float,
+    duration: float,
+    load: Load,
+    sensing: Sensing,
+    limits: tuple[float, float],
+    truth: Mapping[str, float],
+) -> Option:
+    """An excitation at a rate, as large as the supply, the largest and the continuous current allow."""
     constant, together = drive.motor.electrical_time_constant, sensing.voltage == "together"
-    options = []
-    for rate in RATES:
-        if rate > drive.controller.sample_rate:
-            continue
-        excitation = Excitation(
-            kind,
-            drive.voltage_limit,
-            duration,
-            frequency=2.0 if kind == "square" else 0.5,
-            highest=min(200.0, 0.5 / constant),
-            # an even number of rows, so that a fit of every second one still has the voltage
-            clock=2 * max(round(2.0 * constant * rate), 1) / rate if together else 4.0 * constant,
-        )
-        held = dataclasses.replace(load, locked=load.locked or excitation.locked)
-        time, amplitude = sample_times(drive, duration), excitation.amplitude
-        shape = (
-            excitation.voltage(np.floor(time * rate + 1e-6) / rate if together else time + _PHASE / rate) / amplitude
-        )
-        for _ in range(8):  # the response is nearly in proportion to the voltage
-            current = run(drive, amplitude * shape, held).signals["current"]
-            peak, rms = float(np.abs(current).max()), float(np.sqrt(np.mean(current**2)))
-            excess = max(peak / limits[0], rms / limits[1])
-            if excess <= 1.0:
-                break
-            amplitude *= 0.98 / excess
-        log = simulate(drive, amplitude * shape, held, sampler=Sampler(rate, mean_voltage=sensing.voltage == "mean"))
-        excitation = dataclasses.replace(excitation, amplitude=amplitude)
-        options.append(Option(excitation, rate, peak, rms, _expected(drive, held, sensing, log)))
-    return options
+    excitation = Excitation(
+        kind,
+        drive.voltage_limit,
+        duration,
+        frequency=2.0 if kind == "square" else 0.5,
+        highest=min(200.0, 0.5 / constant),
+        # an even number of rows, so that a fit of every second one still has the voltage
+        clock=2 * max(round(2.0 * constant * rate), 1) / rate if together else 4.0 * constant,
+    )
+    held = dataclasses.replace(load, locked=load.locked or excitation.locked)
+    time, amplitude = sample_times(drive, duration), excitation.amplitude
+    shape = excitation.voltage(np.floor(time * rate + 1e-6) / rate if together else time + _PHASE / rate) / amplitude
+    for _ in range(8):  # the response is nearly in proportion to the voltage
+        current = run(drive, amplitude * shape, held).signals["current"]
+        peak, rms = float(np.abs(current).max()), float(np.sqrt(np.mean(current**2)))
+        excess = max(peak / limits[0], rms / limits[1])
+        if excess <= 1.0:
+            break
+        amplitude *= 0.98 / excess
+    log = simulate(drive, amplitude * shape, held, sampler=Sampler(rate, mean_voltage=sensing.voltage == "mean"))
+    excitation = dataclasses.replace(excitation, amplitude=amplitude)
+    return Option(excitation, rate, peak, rms, _expected(truth, held, sensing, log))
 
 
-def _expected(drive: Drive, load: Load, sensing: Sensing, log: Log) -> dict[str, float]:
+def _expected(truth: Mapping[str, float], load: Load, sensing: Sensing, log: Log) -> dict[str, float]:
     """Relative errors of a winding by the current, at the speed that is, and of a shaft by the position.
 
     The torque is known by the back-EMF constant; what the datasheet leaves at 0 is left out.
     """
-    motor, deviation = drive.motor, sensing.current_noise * float(np.abs(log.signals["current"]).max())
+    deviation = sensing.current_noise * float(np.abs(log.signals["current"]).max())
     turned = np.append(np.diff(log.signals["position"]) / np.diff(log.time), 0.0)
-    winding = WindingModel(known={"gear_ratio": motor.gear_ratio})
-    segments = winding.segments([log], [turned])
-    winding, _ = winding.begun(segments)
-    errors = _errors(drive, FREE, winding, segments, deviation, True)
+    winding = WindingModel(known={"gear_ratio": truth["gear_ratio"]})
+    errors = _errors(truth, winding, winding.segments([log], [turned]), deviation)
     if load.locked:
         return errors
-    known = {name: value for name, value in vars(motor).items() if name in PARAMETERS and name != "rotor_inertia"}
+    known = {name: truth[name] for name in PARAMETERS if name in truth and name not in ("inertia", "rotor_inertia")}
     known |= {"mgl": load.gravity, "constant_torque": load.torque}
     known = {name: value for name, value in known.items() if name not in GOALS or value == 0.0}
     shaft = ShaftModel(
         rig="free", friction="coulomb", driven_by="current", output="position", known=known, segment=_SEGMENT
     )
-    segments = shaft.segments([log])
-    shaft, _ = shaft.begun(segments)
-    by_position = _errors(drive, load, shaft, segments, 2.0 * math.pi / sensing.encoder / math.sqrt(12.0), False)
+    by_position = _errors(truth, shaft, shaft.segments([log]), 2.0 * math.pi / sensing.encoder / math.sqrt(12.0))
     constant = errors.get("back_emf_constant", 0.0)
     return errors | {name: math.hypot(error, constant) for name, error in by_position.items()}
 
 
 def _errors(
-    drive: Drive, load: Load, model: Model, segments: Sequence[Segment], deviation: float, biased: bool
+    truth: Mapping[str, float], model: Model, segments: Sequence[Segment], deviation: float
 ) -> dict[str, float]:
-    """Relative errors of a fit by noise of a deviation, and by what it cannot explain; those above 1 are left out."""
-    truth = np.array([_value(drive, load, name) for name in model.names])
-    fit = refit(model, [one._replace(deviation=deviation) for one in segments], truth, 0)
-    inverse = np.linalg.pinv(np.concatenate(fit.jacobians) * truth)
+    """Relative errors of a fit by noise, and of a winding by what it cannot explain; those above 1 are left out."""
+    model, _ = model.begun(segments)
+    values = np.array([truth[name] for name in model.names])
+    fit = refit(model, [one._replace(deviation=deviation) for one in segments], values, 0)
+    inverse = np.linalg.pinv(np.concatenate(fit.jacobians) * values)
     found = np.linalg.norm(inverse, axis=1)
-    if biased:
+    if isinstance(model, WindingModel):
         found = np.hypot(found, inverse @ np.concatenate(fit.residuals))
     return {name: float(error) for name, error in zip(model.names, found, strict=True) if 0.0 < error < 1.0}
-
-
-def _value(drive: Drive, load: Load, name: str) -> float:
-    motor = drive.motor
-    if name == "inertia":
-        return motor.rotor_inertia + load.inertia / motor.gear_ratio**2
-    return float(getattr(motor, name))
