@@ -14,11 +14,16 @@ import numpy as np
 
 from codrl_mj.identify.log import Log
 from codrl_mj.identify.parameters import DEFAULTS, PARAMETERS
-from codrl_mj.identify.segments import Segment
+from codrl_mj.identify.segments import Segment, shifted
 
 DIFFERENCE = 1e-4  # step of finite differences, in the parameters' scales: dry friction makes smaller ones rough
 FAR = 1e30
 SCREENING = 12  # evaluations from each of several starts
+DELAYS = (-1, 1, 2, 3)  # rows that the input is tried to be late by, besides 0;
+LONGEST = 20  # and on to so many, while that is better
+STARTS = 4
+BETTER = 0.8  # a delay is believed where it takes the robust cost to less than this share, and
+SURE = 3.0  # lowers that of the segments by more, in the mean, than so many standard deviations of that mean
 Simulate = Callable[[Segment, np.ndarray], np.ndarray]
 
 
@@ -246,3 +251,61 @@ def refit(
     residuals = tuple(one.residuals for one in found)
     cost, settled = robust_cost(np.concatenate(residuals), problem.scale), tuple(one.state for one in found)
     return Fit(model, segments, values, cost, problem.scale, residuals, tuple(jacobians), settled)
+
+
+def refitted(fit: Fit, model: Model) -> Fit:
+    """Another model of the same logs, from where a fit ended."""
+    segments = model.segments(fit.logs)
+    found = refit(model.begun(segments)[0], segments, fit.values)
+    return dataclasses.replace(found, logs=fit.logs, delay=fit.delay, tried=fit.tried)
+
+
+def fitted(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lambda: None) -> Fit:
+    """Fit a model to logs: several starts, then the delays.
+
+    A voltage whose mean between two rows fits worse than itself is shown to hold from row to row: then it is also the
+    mean, which fewer rows can be given. One that fits better is that of the rows' times, and taken half a row later.
+    """
+    segments = model.segments(logs)
+    model, starts = model.begun(segments)
+    if not model.names:
+        fit = refit(model, segments, starts[0])
+        on_step()
+        return dataclasses.replace(fit, logs=tuple(logs), tried=(fit,))
+    fit, tried = search(model, segments, starts[:STARTS], on_step)
+    costs: dict[float, np.ndarray] = {0: fit.costs(fit.scale)}
+
+    def late(delay: float) -> list[Log]:
+        return [shifted(log, model.driven_by, delay) for log in logs]
+
+    def measure(*delays: float) -> float:
+        """Their costs; returns the best delay that is believed."""
+        for one in delays:
+            costs[one] = refit(model, model.segments(late(one)), fit.values, 20, fit.scale).costs(fit.scale)
+            on_step()
+        best = min(costs, key=lambda one: costs[one].sum())
+        return best if _better(costs[best], costs[0]) else 0
+
+    delay = measure(*DELAYS)
+    while delay != 0 and delay in (min(costs), max(costs)) and abs(delay) < LONGEST:
+        delay = measure(delay + (1 if delay > 0 else -1))
+    told = late(delay)
+    if model.output == "current" and not all(log.mean_voltage for log in logs):
+        whole = costs[delay]
+        measure(delay - 0.5, delay + 0.5)
+        half = min(delay - 0.5, delay + 0.5, key=lambda one: costs[one].sum())
+        delay = half if _better(costs[half], whole) else delay
+        if delay == half or _better(whole, costs[half]):
+            told = [dataclasses.replace(log, mean_voltage=True) for log in late(delay)]
+    if delay != 0:
+        segments = model.segments(told)
+        model, starts = model.begun(segments)
+        fit, tried = search(model, segments, [fit.values, starts[0]])
+    return dataclasses.replace(fit, logs=tuple(told), delay=delay, tried=tried)
+
+
+def _better(these: np.ndarray, those: np.ndarray) -> bool:
+    """Whether costs of segments are lower than others, by more than chance."""
+    gained = those - these
+    error = gained.std(ddof=1) / np.sqrt(len(gained)) if len(gained) > 1 else 0.0
+    return bool(these.sum() < BETTER * those.sum() and gained.mean() > SURE * error)

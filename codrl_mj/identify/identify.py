@@ -10,13 +10,12 @@ import numpy as np
 
 from codrl_mj.fields import check_names
 from codrl_mj.identify import honesty
-from codrl_mj.identify.estimate import Fit
-from codrl_mj.identify.fitting import fitted, refitted, with_friction
+from codrl_mj.identify.estimate import Fit, fitted, refitted
 from codrl_mj.identify.judgement import judged
 from codrl_mj.identify.log import Log
 from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import ESTIMABLE, OF_RIG, PARAMETERS
-from codrl_mj.identify.prediction import Prediction, fitted_traces, predict
+from codrl_mj.identify.prediction import Prediction, fitted_traces, predict, with_friction
 from codrl_mj.identify.result import Identified, missing
 from codrl_mj.identify.segments import SEGMENT, moves, shifted
 

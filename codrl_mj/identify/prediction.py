@@ -2,13 +2,14 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from codrl_mj.identify.estimate import Fit, settled_state
+from codrl_mj.identify.estimate import Fit, refit, search, settled_state
 from codrl_mj.identify.log import Log, usable
+from codrl_mj.identify.models import ShaftModel
 from codrl_mj.identify.segments import Segment, initial_state
 
 HORIZON = 0.5  # time [s] that is foretold at once,
@@ -98,3 +99,35 @@ def fitted_traces(part: str, fit: Fit) -> Iterator[Trace]:
         own = [(one, one.measured + residuals * one.deviation) for one, residuals in pairs if one.log == place]
         if own:
             yield traced(log.name, part, fit.model.output, *zip(*own, strict=True))
+
+
+def foretold(model: ShaftModel, logs: Sequence[Log], on_step: Callable[[], None]) -> np.ndarray:
+    """Mean absolute error on each log of the fit to all others, from that to all, shape (n,)."""
+    segments = model.segments(logs)
+    model, starts = model.begun(segments)
+    whole, errors = search(model, segments, starts[:2])[0].values, []
+    for place, log in enumerate(logs):
+        found = predict(refit(model, model.segments([*logs[:place], *logs[place + 1 :]]), whole, 12), log)
+        errors.append(found.open_loop if found.closed_loop is None else found.closed_loop)
+        on_step()
+    return np.array(errors)
+
+
+def with_friction(model: ShaftModel, logs: Sequence[Log], wanted: str, on_step: Callable[[], None]) -> ShaftModel:
+    """The model with the friction that is wanted or, for `auto`, with what leaving out one log at a time speaks for.
+
+    More than viscous and Coulomb friction is kept where the errors on the logs left out fall by more, in the mean, than
+    two standard deviations of that mean. With fewer than three logs none is.
+    """
+    if wanted != "auto":
+        return dataclasses.replace(model, friction=wanted)
+    if len(logs) < 3:
+        return model
+    best, least = model, foretold(model, logs, on_step)
+    for friction in ("load", "stribeck", "both"):
+        tried = dataclasses.replace(model, friction=friction)
+        errors = foretold(tried, logs, on_step)
+        gained = least - errors
+        if gained.mean() > 2.0 * gained.std(ddof=1) / np.sqrt(len(gained)):
+            best, least = tried, errors
+    return best
