@@ -9,15 +9,14 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.fields import check_names
-from codrl_mj.identify import honesty
 from codrl_mj.identify.estimate import Fit, fitted, refitted
-from codrl_mj.identify.judgement import judged
 from codrl_mj.identify.log import Log
 from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import ESTIMABLE, OF_RIG, PARAMETERS
 from codrl_mj.identify.prediction import Prediction, fitted_traces, predict, with_friction
 from codrl_mj.identify.result import Identified, missing
 from codrl_mj.identify.segments import SEGMENT, moves, shifted
+from codrl_mj.identify.trust import correlations, judged
 
 INPUTS = "torque", "current", "voltage"  # what drives the shaft: the nearest to it that all logs that move have
 OUTPUTS = "position", "velocity"  # what a simulation is compared with
@@ -94,7 +93,7 @@ def identify(
         tuple(warnings),
         base,
         tuple(one for name, part in parts.items() for one in fitted_traces(name, part)),
-        {name: honesty.correlations(parts[name]) if name in parts else {} for name in ("winding", "shaft")},
+        {name: correlations(parts[name]) if name in parts else {} for name in ("winding", "shaft")},
         max((float(np.abs(one).max()) for one in volts), default=None),
         unexplained,
     )

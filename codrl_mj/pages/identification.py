@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 
-from codrl_mj.identify.judgement import CAUSES
 from codrl_mj.identify.log import SIGNALS
 from codrl_mj.identify.prediction import Trace
 from codrl_mj.identify.result import USABLE, Identified
+from codrl_mj.identify.trust import CAUSES
 from codrl_mj.pages import page
 from codrl_mj.pages.plots import Curve, Plot
 

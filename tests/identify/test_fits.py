@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from codrl_mj.identify import Log, honesty, identify
+from codrl_mj.identify import Log, identify, trust
 from codrl_mj.identify.estimate import Fit
 from codrl_mj.identify.segments import moves, replaced
 from tests.identify import bench, draws
@@ -226,7 +226,7 @@ def test_what_is_known_worst_is_not_lost_beside_what_is_known_best():
     fit = Fit(
         SimpleNamespace(names=("a", "b")), (segment,), np.ones(2), 0.0, 1e9, (residuals,), (jacobian,), (np.zeros(1),)
     )
-    found = honesty.half_widths(fit, np.ones(2), np.eye(2), 0)["curvature"]
+    found = trust.half_widths(fit, np.ones(2), np.eye(2), 0)["curvature"]
     np.testing.assert_allclose(found, [1.96e-6, 1.96 * 0.05], rtol=0.05)
 
 
