@@ -247,7 +247,8 @@ def _shaft_start(
             resistance = (max(factors["viscous"], 0.0) + 1e-6) / max(per_volt, 1e-9)
         start["torque_constant"] = given.get("torque_constant", per_volt * resistance / ratio)
         start["resistance"] = resistance
-        braking = per_volt * ratio * given.get("back_emf_constant", start["torque_constant"])
+        start["back_emf_constant"] = given.get("back_emf_constant", start["torque_constant"])
+        braking = per_volt * ratio * start["back_emf_constant"]
         gain = per_volt
     else:
         start["torque_constant"] = gain / ratio

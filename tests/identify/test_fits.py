@@ -216,6 +216,15 @@ def test_a_resistance_that_a_voltage_changing_within_the_rows_spoils_is_not_beli
     assert found.low < truth
 
 
+def test_a_back_emf_constant_can_be_asked_of_a_shaft_under_a_voltage():
+    motor, log = draws.motor_of(3), draws.only(draws.logged(3), "voltage", "position")
+    names = "resistance", "torque_constant", "coulomb_friction", "viscous_friction"
+    known = {name: getattr(motor, name) for name in names}
+    found = identify([log], "free", known, estimated=["back_emf_constant"])["back_emf_constant"]
+    assert found.status == "identified"
+    assert found.value == pytest.approx(motor.back_emf_constant, rel=1e-3)
+
+
 def test_what_is_known_worst_is_not_lost_beside_what_is_known_best():
     """Two parameters of independent rows, known to 1e-6 and to 0.05: intervals are 1.96 times that."""
     random, rows = np.random.default_rng(0), 1000
