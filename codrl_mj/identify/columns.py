@@ -31,6 +31,7 @@ FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
     "sqrt": (1, np.sqrt),
 }
 """What a formula may call -> number of arguments, function. The second is a number: of bits, the period."""
+_Value = Callable[[Mapping[str, Any]], Any]
 _OPERATORS: dict[type, Callable[[Any, Any], Any]] = {
     ast.Add: np.add,
     ast.Sub: np.subtract,
@@ -51,22 +52,11 @@ class Column:
     def __post_init__(self) -> None:
         """Validate, without a file."""
         check_names([self.signal], KINDS, "signal")
-        for node in ast.walk(self._tree):
-            if not isinstance(node, _ALLOWED) or (isinstance(node, ast.BinOp) and type(node.op) not in _OPERATORS):
-                known = ", ".join(FUNCTIONS)
-                raise self._wrong(f"{type(node).__name__} is not allowed; write names, numbers, + - * / and {known}")
-        for call in (node for node in ast.walk(self._tree) if isinstance(node, ast.Call)):
-            name = call.func.id if isinstance(call.func, ast.Name) else "?"
-            check_names([name], FUNCTIONS, "function")
-            needed = FUNCTIONS[name][0]
-            if len(call.args) != needed:
-                raise self._wrong(f"{name} takes {needed} arguments, not {len(call.args)}")
-            if needed == 2 and _names(call.args[1]):
-                raise self._wrong(f"the second argument of {name} must be a number, such as 16")
+        bare = self._formula[2]
         kind = KINDS[self.signal]
         if self.unit is not None:
             self._quantity(1.0)
-        elif kind and isinstance(self._tree.body, ast.Name | ast.Constant):
+        elif kind and bare:
             remedy = f"write {self.signal}={self.formula}:{kind} if it is in {kind}"
             raise self._wrong(f"has no unit, must have one that is of {kind}; {remedy}")
 
@@ -81,23 +71,51 @@ class Column:
     @property
     def names(self) -> set[str]:
         """The columns and constants that it reads."""
-        return _names(self._tree)
+        return self._formula[1]
 
     def value(self, table: Mapping[str, Any]) -> Any:
         """The signal in SI, by a table of columns and constants."""
         check_names(self.names, table, "column")
         with np.errstate(divide="ignore", invalid="ignore"):
-            return self._quantity(_evaluate(self._tree.body, {"pi": math.pi, **table}))
+            return self._quantity(self._formula[0]({"pi": math.pi, **table}))
 
     @functools.cached_property
-    def _tree(self) -> ast.Expression:
+    def _formula(self) -> tuple[_Value, set[str], bool]:
+        """Its value by a table, before the unit; the names that it reads; whether it is but a name or number."""
         try:
-            return ast.parse(self.formula.strip(), mode="eval")
+            body = ast.parse(self.formula.strip(), mode="eval").body
         except SyntaxError as error:
             raise ValueError(
                 f"columns: {self.signal}={self.formula}: no formula ({error.msg}); write a column's name, in quotes if "
                 f"it has spaces, as in {_EXAMPLE}"
             ) from None
+        value, names = self._made(body)
+        return value, names - {"pi"}, isinstance(body, ast.Name | ast.Constant)
+
+    def _made(self, node: ast.AST) -> tuple[_Value, set[str]]:
+        """A part of the formula: its value by a table, and the names that it reads."""
+        match node:
+            case ast.Constant(value=str(name)) | ast.Name(id=name):
+                return lambda table: table[name], {name}
+            case ast.Constant(value=number):
+                return lambda _: number, set()
+            case ast.UnaryOp(op=ast.USub() | ast.UAdd() as sign, operand=inner):
+                value, names = self._made(inner)
+                return (lambda table: -value(table)) if isinstance(sign, ast.USub) else value, names
+            case ast.BinOp(left=left, op=operator, right=right) if type(operator) in _OPERATORS:
+                (one, names), (other, more), apply = self._made(left), self._made(right), _OPERATORS[type(operator)]
+                return lambda table: apply(one(table), other(table)), names | more
+            case ast.Call(func=ast.Name(id=called), args=arguments, keywords=[]):
+                check_names([called], FUNCTIONS, "function")
+                needed, function = FUNCTIONS[called]
+                if len(arguments) != needed:
+                    raise self._wrong(f"{called} takes {needed} arguments, not {len(arguments)}")
+                values, read = zip(*map(self._made, arguments), strict=True)
+                if needed == 2 and read[1] - {"pi"}:
+                    raise self._wrong(f"the second argument of {called} must be a number, such as 16")
+                return lambda table: function(*(one(table) for one in values)), set().union(*read)
+        known = ", ".join(FUNCTIONS)
+        raise self._wrong(f"{type(node).__name__} is not allowed; write names, numbers, + - * / and {known}")
 
     def _quantity(self, value: Any) -> Any:
         """A value in SI."""
@@ -118,38 +136,6 @@ class Column:
         if leaves_angle_open(registry.Quantity(1.0, respelled(unit)), kind):
             raise self._wrong("turns or radians? Write rad, deg, turn, rad/s or rpm")
         return quantity.to(kind or "dimensionless").magnitude
-
-
-_ALLOWED = (
-    *(ast.Expression, ast.BinOp, ast.UnaryOp, ast.USub, ast.UAdd, ast.Call, ast.Name, ast.Load, ast.Constant),
-    *_OPERATORS,
-)
-
-
-def _names(tree: ast.AST) -> set[str]:
-    """What a formula reads: names that are not called, and texts."""
-    nodes = list(ast.walk(tree))
-    called = [node.func for node in nodes if isinstance(node, ast.Call)]
-    plain = {node.id for node in nodes if isinstance(node, ast.Name) and node not in called}
-    return (plain | {one.value for one in nodes if isinstance(one, ast.Constant) and isinstance(one.value, str)}) - {
-        "pi"
-    }
-
-
-def _evaluate(node: ast.AST, table: Mapping[str, Any]) -> Any:
-    match node:
-        case ast.Constant(value=str(name)) | ast.Name(id=name):
-            return table[name]
-        case ast.Constant(value=number):
-            return number
-        case ast.UnaryOp(op=operator, operand=inner):
-            value = _evaluate(inner, table)
-            return -value if isinstance(operator, ast.USub) else value
-        case ast.BinOp(left=left, op=operator, right=right):
-            return _OPERATORS[type(operator)](_evaluate(left, table), _evaluate(right, table))
-        case ast.Call(func=ast.Name(id=name), args=arguments):
-            return FUNCTIONS[name][1](*(_evaluate(one, table) for one in arguments))
-    raise AssertionError(ast.dump(node))
 
 
 def parse_columns(given: str | Mapping[str, str]) -> dict[str, Column]:
