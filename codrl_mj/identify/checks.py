@@ -192,17 +192,14 @@ def _wrapped(seen: Seen) -> Iterator[Finding]:
 
 @_needs("")
 def _sizes(seen: Seen) -> Iterator[Finding]:
-    """Values that no bench has."""
+    """Values that no bench has: more voltage than the supply has, too, and what looks like a duty."""
     for signal in _MOST.keys() & seen.log.signals.keys():
         largest, unit = float(np.quantile(np.abs(seen.log.signals[signal]), 0.99)), SIGNALS[signal]  # not an outlier
         if largest > _MOST[signal]:
             text = f"the {signal} is up to {largest:.4g} {unit}, must be at most {_MOST[signal]:g} {unit} on a bench"
             yield Finding("error", "unit", None, text, f"correct its unit, such as {signal}=column:m{unit}")
-
-
-@_needs("voltage")
-def _supply(seen: Seen) -> Iterator[Finding]:
-    """More voltage than the supply has, and what looks like a duty."""
+    if not seen.log.has("voltage"):
+        return
     log, voltage = seen.log, np.abs(seen.log.signals["voltage"])
     if log.has("bus"):
         excess = voltage / np.maximum(np.abs(log.signals["bus"]), 1e-9)

@@ -72,8 +72,15 @@ class WindingModel(Model):
         given = {**DEFAULTS, "back_emf_constant": 0.0, **self.known}
         starts = []
         for count in (2, 8, 32):  # rows of a window
-            rows = np.concatenate([_winding_rows(one, count, given["gear_ratio"]) for one in segments])
-            starts.append(_regressed(rows[:, :3], rows[:, 3], ELECTRICAL, free, given))
+            rows = []
+            for one in segments:
+                steps, current, turns = np.diff(one.times), one.measured, one.speeds[:-1] * given["gear_ratio"]
+                edges = np.arange(0, len(current), min(count, len(current) - 1))
+                rates = 0.5 * (current[1:] + current[:-1]), turns, one.inputs[:-1]
+                charge, turn, flux = (np.diff(np.append(0.0, np.cumsum(rate * steps))[edges]) for rate in rates)
+                rows.append(np.stack([charge, np.diff(current[edges]), turn, flux], axis=1))
+            table = np.concatenate(rows)
+            starts.append(_regressed(table[:, :3], table[:, 3], ELECTRICAL, free, given))
         magnitudes = np.abs(np.median(starts, axis=0))
         volts = np.concatenate([one.inputs for one in segments])
         amperes = np.concatenate([one.measured for one in segments])
@@ -107,15 +114,6 @@ class WindingModel(Model):
             rest = speeds(segment.times, left, middles)
             found[segment.rows][:-1] = np.diff(positions) / np.diff(segment.times) + rest
         return found
-
-
-def _winding_rows(segment: Segment, count: int, ratio: float) -> np.ndarray:
-    """Integral and change of the current, turn of the rotor, and integral of the voltage, of windows of some rows."""
-    steps, current = np.diff(segment.times), segment.measured
-    edges = np.arange(0, len(current), min(count, len(current) - 1))
-    parts = 0.5 * (current[1:] + current[:-1]) * steps, segment.speeds[:-1] * ratio * steps, segment.inputs[:-1] * steps
-    charge, turn, flux = (np.diff(np.concatenate([[0.0], np.cumsum(one)])[edges]) for one in parts)
-    return np.stack([charge, np.diff(current[edges]), turn, flux], axis=1)
 
 
 def _regressed(

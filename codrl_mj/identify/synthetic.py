@@ -207,30 +207,26 @@ def simulate(
     time[1:-1] += period * sampler.jitter * np.clip(random.standard_normal(max(len(time) - 2, 0)), -3.0, 3.0)
     time = np.maximum.accumulate(time + 1e-9 * period * np.arange(len(time)))  # rows never swap
     torque = drive.motor.gear_ratio * drive.motor.torque_constant * course.signals["current"]
-    smooth, found = {**course.signals, "torque": torque}, {}
+    commanded, known = course.signals["command"], {**course.signals, "torque": torque}
+    flux = np.concatenate([[0.0], np.cumsum(np.diff(course.time) * commanded[:-1])])
+    found = {}
     for signal in SEEN:
         sensor = (sensors or {}).get(signal, Sensor())
-        if signal not in ("voltage", "duty"):
-            values = np.interp(time - sensor.delay, course.time, smooth[signal])
-        else:
-            values = _held(course, time - sensor.delay, sampler.mean_voltage)
+        past = time - sensor.delay
+        if signal in ("voltage", "duty"):  # what was asked for holds for a sample of the drive
+            places = np.clip(np.floor(past / course.time[1] + 1e-6).astype(int), 0, len(commanded) - 1)
+            values = commanded[places]
+            if sampler.mean_voltage:
+                values[:-1] = np.diff(np.interp(past, course.time, flux)) / np.diff(past)
             values = values if signal == "voltage" else 1.0 / drive.voltage_limit * values
+        else:
+            values = np.interp(past, course.time, known[signal])
         found[signal] = sensor.seen(values, random) if signal in (sensors or {}) else values
     kept = random.random(len(time)) >= sampler.dropped
     kept[[0, -1]] = True
     found = {signal: values[kept] for signal, values in found.items()}
     resolution = {signal: (sensors or {}).get(signal, Sensor()).resolution for signal in found}
     return Log(name, time[kept], found, resolution, sampler.mean_voltage, rows=np.flatnonzero(kept) + 1)
-
-
-def _held(course: Log, time: np.ndarray, mean: bool) -> np.ndarray:
-    """The voltage asked for at each time or, but for the last one, its mean to the next."""
-    period, commanded = course.time[1] - course.time[0], course.signals["command"]
-    values = commanded[np.clip(np.floor(time / period + 1e-6).astype(int), 0, len(course.time) - 1)]
-    if mean:
-        flux = np.concatenate([[0.0], np.cumsum(np.diff(course.time) * commanded[:-1])])
-        values[:-1] = np.diff(np.interp(time, course.time, flux)) / np.diff(time)
-    return values
 
 
 def write_log(path: Path, log: Log) -> str:

@@ -246,17 +246,6 @@ def _warnings(fit: Fit, shares: dict[str, float]) -> list[str]:
     return found
 
 
-def _unexplained(fit: Fit) -> float:
-    """Share by which a factor of the input may be off for what is not explained.
-
-    Errors of the input, as of a voltage that changes between the rows, attenuate its factor by a multiple of their
-    share of the variance: 2 to 4.6 of PRBS whose clock is 1 to 4 rows; no fit of fewer rows shows it.
-    """
-    rest = sum(one.deviation**2 * float(fit.weights(i) @ fit.residuals[i] ** 2) for i, one in enumerate(fit.segments))
-    swing = sum(float(np.var(one.measured)) * len(one.measured) for one in fit.segments)
-    return ATTENUATION * rest / max(swing, 1e-300)
-
-
 def _sums(fit: Fit, groups: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Gradient (c, p) and Gauss-Newton matrix (c, p, p) of each group of segments."""
     count, size = len(set(groups)), len(fit.values)
@@ -299,7 +288,11 @@ def causes(
     found["half_rate"] = (2.0 if electrical else 1.0) * np.abs(of @ (halves - fit.values))
     on_step()
     found["self_test"] = np.abs(tested - values)
-    found["unexplained"] = np.abs(values) * (_unexplained(fit) if electrical else 0.0)
+    # errors of the input, as of a voltage that changes between the rows, attenuate its factor by a multiple of their
+    # share of the variance: 2 to 4.6 of PRBS whose clock is 1 to 4 rows; no fit of fewer rows shows it
+    rest = sum(one.deviation**2 * float(fit.weights(i) @ fit.residuals[i] ** 2) for i, one in enumerate(fit.segments))
+    swing = sum(float(np.var(one.measured)) * len(one.measured) for one in fit.segments)
+    found["unexplained"] = np.abs(values) * (ATTENUATION * rest / max(swing, 1e-300) if electrical else 0.0)
     return found, tested
 
 
