@@ -168,8 +168,8 @@ class Shift(NamedTuple):
 
     lag: float  # [s]
     improvement: float  # residual at that shift over the one without
-    gain: float = 1.0  # factor between the two
-    unexplained: float = 0.0  # residual at that shift over what was to be explained, root mean squares
+    gain: float  # factor between the two
+    unexplained: float  # residual at that shift over what was to be explained, root mean squares
     noise: float = 0.0  # noise or step of the worse sensor over what it sees
 
 
@@ -182,19 +182,18 @@ def velocity_lag(log: Log) -> Shift | None:
     if not np.any(rate) or not np.any(velocity):
         return None
 
-    def compare(lag: float) -> tuple[float, float]:
+    def compare(lag: float) -> tuple[float, float, float]:
         seen = windows.mean(np.interp(time + lag, time, velocity))
         gain = float(seen @ rate / (rate @ rate))
-        return float(np.linalg.norm(seen - gain * rate)) / max(float(np.linalg.norm(seen)), 1e-300), gain
+        left = float(np.linalg.norm(seen - gain * rate)) / max(float(np.linalg.norm(seen)), 1e-300)
+        return left, gain, left
 
     longest = min(0.1, 0.1 * float(time[-1]))
-    lag = _least(compare, log.step, longest, longest)
-    (best, gain), (now, _) = compare(lag), compare(0.0)
     size, seen = (float(np.sqrt(np.mean(one**2))) for one in (rate, windows.mean("velocity")))
     noisy = sensor_deviation(log, "velocity") * math.sqrt(2.0 / windows.rows.shape[1])
     blurred = 4.0 * sensor_deviation(log, "position") / float(windows.length.mean())
     noise = max(noisy / max(seen, 1e-300), blurred / size)
-    return Shift(lag, best / max(now, 1e-300), gain, best, noise)
+    return _least(compare, log.step, longest, longest)._replace(noise=noise)
 
 
 def effort_lag(log: Log, effort: str) -> Shift | None:
@@ -210,23 +209,21 @@ def effort_lag(log: Log, effort: str) -> Shift | None:
         windows, ahead, behind = Windows(log, 0.3, _WINDOWS), 0.06, 0.06
         terms = _torque_terms(log, windows)
 
-    def compare(lag: float) -> tuple[float, float]:
+    def compare(lag: float) -> tuple[float, float, float]:
         balance = regress(windows.mean_held(effort, lag), terms)
         # of a nearly sinusoidal current a delay looks like more inductance, and too long a one like less than none
         if balance is None or (lag > 0.0 and balance.certainty.get("inductance", 0.0) < -3.0):
-            return np.inf, 1.0
-        return balance.residual, balance.unexplained
+            return np.inf, 1.0, 1.0
+        return balance.residual, 1.0, balance.unexplained
 
-    now = compare(0.0)[0]
-    if not np.isfinite(now):
-        return None
-    lag = _least(compare, log.step, ahead, behind)
-    best, unexplained = compare(lag)
-    return Shift(lag, best / max(now, 1e-300), 1.0, unexplained)
+    return _least(compare, log.step, ahead, behind) if np.isfinite(compare(0.0)[0]) else None
 
 
-def _least(compare: Callable[[float], tuple[float, float]], step: float, ahead: float, behind: float) -> float:
-    """The lag of the least residual, to a quarter of a step: by long steps, then by shorter ones beside the best."""
+def _least(compare: Callable[[float], tuple[float, float, float]], step: float, ahead: float, behind: float) -> Shift:
+    """The shift of the least residual, to a quarter of a step: by long steps, then by shorter ones beside the best.
+
+    Of a lag `compare` says residual, gain and what is left unexplained.
+    """
     shift = step
     while ahead + behind > 40.0 * shift:
         shift *= 2.0
@@ -234,6 +231,7 @@ def _least(compare: Callable[[float], tuple[float, float]], step: float, ahead: 
     while True:
         best = min((compare(place)[0], abs(place), place) for place in places)[2]
         if shift <= 0.3 * step:
-            return float(best)
+            residual, gain, unexplained = compare(best)
+            return Shift(float(best), residual / max(compare(0.0)[0], 1e-300), gain, unexplained)
         shift /= 2.0
         places = best + shift * np.arange(-2, 3)

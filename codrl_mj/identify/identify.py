@@ -82,20 +82,20 @@ def identify(
     estimates, warnings, unexplained = judged(parts, given, seed, step)
     volts = [log.signals[name] for log in logs for name in ("voltage", "bus") if log.has(name)]
     return Identified(
-        tuple(log.name for log in logs),
-        rig,
-        friction,
-        driven_by,
-        {name: part.delay for name, part in parts.items()},
-        tuple(estimates),
-        _foretold(parts.get("shaft"), moving),
-        _foretold(parts.get("shaft"), held_out),
-        tuple(warnings),
-        base,
-        tuple(one for name, part in parts.items() for one in fitted_traces(name, part)),
-        {name: correlations(parts[name]) if name in parts else {} for name in ("winding", "shaft")},
-        max((float(np.abs(one).max()) for one in volts), default=None),
-        unexplained,
+        logs=tuple(log.name for log in logs),
+        rig=rig,
+        friction=friction,
+        driven_by=driven_by,
+        delays={name: part.delay for name, part in parts.items()},
+        estimates=tuple(estimates),
+        fitted=_foretold(parts.get("shaft"), moving),
+        held_out=_foretold(parts.get("shaft"), held_out),
+        warnings=tuple(warnings),
+        base=base,
+        traces=tuple(one for name, part in parts.items() for one in fitted_traces(name, part)),
+        correlations={name: correlations(parts[name]) if name in parts else {} for name in ("winding", "shaft")},
+        supply=max((float(np.abs(one).max()) for one in volts), default=None),
+        unexplained=unexplained,
     )
 
 
