@@ -5,7 +5,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from codrl_mj.identify.parameters import PARAMETERS
+from codrl_mj.identify.parameters import OF_MOTOR, PARAMETERS
 from codrl_mj.identify.prediction import Prediction, Trace
 from codrl_mj.runs.files import write_json, writing
 
@@ -13,11 +13,6 @@ Status = Literal["identified", "rough", "given", "ratio", "unidentifiable", "ref
 ACTUATOR = "actuator.yaml"  # name of the file in a folder of results
 MISUNDERSTOOD = 0.2  # share of the motion beyond which it is not single numbers that are amiss
 USABLE = ("identified", "rough", "given")
-OF_MOTOR = (
-    *("resistance", "inductance", "torque_constant", "back_emf_constant", "rotor_inertia", "gear_ratio"),
-    *("gear_efficiency", "coulomb_friction", "viscous_friction", "stribeck_friction", "stribeck_speed"),
-)
-"""Fields of `GearMotor` that are identified or known."""
 
 
 def missing(names: Collection[str], base: object) -> str | None:
