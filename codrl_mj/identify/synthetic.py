@@ -166,7 +166,7 @@ def run(drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, po
     shares = np.sign(commanded) * np.maximum(np.abs(commanded) - drive.controller.deadband, 0.0) / limit
     winding = motor.resistance, motor.inductance, motor.back_emf_constant * motor.gear_ratio
     inertia = motor.rotor_inertia * motor.gear_ratio**2 + load.inertia
-    if not inertia > 0.0 and not load.locked:
+    if not inertia > 0.0 and not locked:
         raise ValueError(
             f"motor.rotor_inertia = {motor.rotor_inertia:g} and load.inertia = {load.inertia:g}: one must be > 0; "
             "give the load its inertia, or lock the shaft"

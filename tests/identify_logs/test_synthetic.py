@@ -53,6 +53,13 @@ def test_a_locked_winding_is_exact():
     assert not course.signals["position"].any()
 
 
+def test_a_held_shaft_needs_no_inertia():
+    bare = changed(rotor_inertia=0.0)
+    assert not run(bare, Excitation("locked_prbs", 6.0, 0.1)).signals["position"].any()
+    with pytest.raises(ValueError, match="one must be > 0"):
+        run(bare, Excitation("prbs", 6.0, 0.1))
+
+
 def test_friction_holds_slows_and_heats_what_it_has_to():
     held = run(DRIVE, Excitation("square", 0.07, 0.4, frequency=1.0), LOAD)  # 0.07/0.9*0.036 < 3e-3
     assert not held.signals["position"].any()
