@@ -49,6 +49,7 @@ ALLOWED = {
         *("actuators", "envs", "envs.config", "envs.worlds", "evaluation.measures", "physics", "runs.files"),
         *("runs.policies", "tasks"),
     },
+    "deploy": {"actuators", "envs.config", "evaluation", "fields", "runs.files", "runs.policies"},
     "films": {"actuators", "envs", "envs.config", "evaluation", "physics", "runs.files", "tasks"},
     "replay": {"envs", "envs.config", "evaluation", "runs.files"},
     "view": {"actuators", "envs.config", "evaluation", "fields", "replay"},
@@ -76,7 +77,7 @@ ALLOWED = {
     },
     "cli": {
         *("actuators", "agents", "catalogue", "disturbances", "envs.config", "envs.worlds", "evaluation"),
-        *("evaluation.measures", "fields", "films", "kept"),
+        *("deploy", "evaluation.measures", "fields", "films", "kept"),
         *(
             "foreign",
             "identify",

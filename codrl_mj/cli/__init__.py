@@ -34,6 +34,7 @@ VERBS: dict[str, tuple[str, str, str]] = {
     "identify": ("identify:Identify", "Identify a motor from its bench logs.", "check swing.csv --columns time=t:s"),
     "data": ("data:Data", "List or fetch measurements of real motors that others have published.", "dfki_pendulum"),
     "cache": ("cache:Cache", "Show or clear the compiled code that is kept on disk.", "--clear"),
+    "export": ("export:Export", "Take a policy out: ONNX, and all that it assumes.", "runs/mine --out mine"),
     "validate": ("validate:Validate", "Certify that the port is right.", "cartpole --out certificate"),
 }
 """The verbs by name; the module of one is imported when it is called."""

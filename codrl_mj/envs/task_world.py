@@ -9,10 +9,11 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
 from codrl_mj.actuators import ActuatorModel
-from codrl_mj.envs.worlds import COMMON, World, patterns_of, world_of
+from codrl_mj.envs.worlds import COMMON, World, described, patterns_of, world_of
 from codrl_mj.fields import did_you_mean, field_docs
 from codrl_mj.tasks import TASKS, Task, find_task, reference_of, register, resolve_actuators
 from codrl_mj.tasks.assets import asset_path
@@ -180,6 +181,25 @@ class TaskWorld(World):
     def state_names(self, config: Any) -> tuple[str, ...]:  # noqa: ARG002
         """The task's."""
         return self.task.state_names
+
+    def interface(self, config: Any) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+        """By the task's names, and the units of its state and of the actuators' signals and commands."""
+        from codrl_mj.envs.commands import command_of
+        from codrl_mj.envs.setup import Setup
+
+        setup, view = Setup.build(config), Setup.build(config).view
+        of_sensors = [setup.actuators[0].SIGNAL_UNITS.get(name.rpartition(".")[2]) for name in view.sensors]
+        seen = described(view.observation_names, view.observation_space, [*self.task.observation_units, *of_sensors])
+        at_joint = ["N*m" if unit == "rad" else "N" for unit in self.task.joint_units]
+        forced = config.action == "force"
+        units = at_joint if forced else [command_of(one, config.action).unit for one in setup.actuators]
+        commands = setup.commands
+        if isinstance(commands.action_space, spaces.Box):
+            return seen, described(self.task.motors, commands.action_space, units)
+        table: Any = commands.action_forces if forced else commands.levels
+        names = [{"name": name, "unit": unit} for name, unit in zip(self.task.motors, units, strict=True)]
+        columns = np.reshape(table, (len(table), -1)).T.tolist()
+        return seen, [{**one, "levels": levels} for one, levels in zip(names, columns, strict=True)]
 
     def at_goal(self, episode: Any) -> np.ndarray | None:
         """By the task's goal; where that is to last, the whole of an episode that is not terminated."""

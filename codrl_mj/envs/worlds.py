@@ -11,7 +11,7 @@ import functools
 import importlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -238,9 +238,34 @@ class World(abc.ABC):
                 made += [f"{joint}{f' {k}' if len(units) > 1 else ''} [{one}]" for k, one in enumerate(units)]
         return (*positions, *speeds)
 
+    def interface(self, config: Any) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+        """What passes between a policy and its environment, for whoever builds the other side of it.
+
+        Returns:
+            Entries of the observation, and of the action, in their order: `name`, `unit` (None where nobody knows) and
+            the bounds `least` and `most`, None where there are none. A discrete action is one entry, with the `levels`
+            that its indices stand for, if they are known.
+        """
+        with contextlib.closing(config.make()) as env:
+            seen, acts = env.observation_space, env.action_space
+            motors = env.get_wrapper_attr("recorder").motors
+        if not isinstance(seen, spaces.Box) or len(seen.shape) != 1:
+            raise ValueError(f"{self.name}: observations are {seen}: must be vectors")
+        if isinstance(acts, spaces.Discrete):
+            return described([f"observation {k}" for k in range(seen.shape[0])], seen), [{"name": "action"}]
+        names = motors if len(motors) == acts.shape[0] else [f"action {k}" for k in range(acts.shape[0])]
+        return described([f"observation {k}" for k in range(seen.shape[0])], seen), described(names, acts)
+
     def at_goal(self, episode: Any) -> np.ndarray | None:
         """Whether an episode is at the goal, before its first step and after each, (T+1,); None where nobody knows."""
         return None if episode.succeeded is None else np.full(len(episode.state), episode.succeeded)
+
+
+def described(names: Sequence[str], box: spaces.Box, units: Sequence[str | None] | None = None) -> list[dict[str, Any]]:
+    """Entries of a box of vectors, as `World.interface` has them."""
+    ends = ([float(end) if np.isfinite(end) else None for end in side] for side in (box.low, box.high))
+    columns = zip(names, units or [None] * len(names), *ends, strict=True)
+    return [{"name": name, "unit": unit, "least": least, "most": most} for name, unit, least, most in columns]
 
 
 @functools.cache

@@ -218,6 +218,25 @@ class Task:
         joints = [model.actuator_trnid[model.actuator(name).id, 0] for name in self.motors]
         return tuple(self.qvel[model.jnt_dofadr[joint]] for joint in joints)
 
+    @property
+    def joint_units(self) -> tuple[str, ...]:
+        """Units of the positions of the joints that the motors drive, `rad` or `m`; empty texts where none are told."""
+        half = dict(zip(self.qvel, self.qpos, strict=True))
+        return tuple(_unit(self.state_names[half[speed]]) for speed in self.speeds)
+
+    @property
+    def observation_units(self) -> tuple[str | None, ...]:
+        """Units of the observation's entries: the state's, where an entry is one of its; 1, within +-1; else None."""
+        states = np.random.default_rng(0).uniform(0.1, 1.0, (len(self.state_names), 5))
+        units: list[str | None] = []
+        for entry, least, most in zip(
+            self.observation(states), self.observation_space.low, self.observation_space.high, strict=True
+        ):
+            same = [k for k, one in enumerate(states) if np.array_equal(entry, one)]
+            plain = "1" if (least, most) == (-1.0, 1.0) else None
+            units.append(_unit(self.state_names[same[0]]) or None if same else plain)
+        return tuple(units)
+
     def bounds(self, options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
         """`initial_bounds` under a reset's options.
 
@@ -241,6 +260,11 @@ class Task:
         for column, entry in zip(states.T, self.initial_state(draws.T), strict=True):
             column[:] = entry
         return states
+
+
+def _unit(name: str) -> str:
+    """The unit that a name such as `x_dot [m/s]` ends in; an empty text where it has none."""
+    return name.partition("[")[2].rstrip("]")
 
 
 class _Asked(UserDict[str, Any]):

@@ -1,0 +1,178 @@
+"""What a policy and its controller assume of each other, in one file: `contract.json`.
+
+A policy on a board fails quietly where an angle comes in degrees, two entries change places or the loop runs at another
+rate. So all of it is written down, and a reader refuses what differs.
+"""
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+import platform
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codrl_mj.actuators import mapping_of
+from codrl_mj.deploy.network import Network
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.evaluation import run_episodes
+from codrl_mj.fields import did_you_mean, leaves
+from codrl_mj.runs.files import read_json, sealed, write_json
+from codrl_mj.runs.policies import Policy
+
+FORMAT = "codrl_mj contract 1"
+FILE = "contract.json"
+GOLDEN = 200
+"""Observations of episodes that are kept with their actions, for whoever computes them elsewhere."""
+LATE = 1.5
+"""Periods after which a command that has not come is late."""
+_PACKAGES = ("codrl-mj", "mujoco", "gymnasium", "numpy", "stable-baselines3", "torch")
+_ENTRIES = ("task", "agent", "rate", "observations", "actions", "actuators", "assumed", "late", "golden", "versions")
+
+
+@dataclasses.dataclass(frozen=True)
+class Contract:
+    """What stands in the file."""
+
+    task: str
+    """The environment's name."""
+    agent: str
+    """Who was trained."""
+    rate: float
+    """Actions a second [Hz]."""
+    observations: list[dict[str, Any]]
+    """Entries of an observation in their order: `name`, `unit`, bounds `least` and `most`, `scale` and `offset` before
+    the first layer (done by the policy itself), and `seen`, the least and the most of the golden episodes."""
+    actions: list[dict[str, Any]]
+    """Entries of an action, likewise; a discrete one has the `levels` that its indices stand for."""
+    actuators: dict[str, dict[str, Any]]
+    """Motor, or pattern of motors -> its fields, None for an ideal one, and their `sha256`."""
+    assumed: dict[str, Any]
+    """The rest of the environment: command, delays, quanta and noise, joints, what was drawn."""
+    late: dict[str, Any]
+    """What to do when no observation or command comes."""
+    golden: dict[str, Any]
+    """`observations` (n, k) of episodes and `actions` (n, m) or (n,) of the policy, and how far others may be off."""
+    versions: dict[str, str]
+    """Of what made it."""
+
+    @classmethod
+    def of(cls, policy: Policy, env: EnvConfig, agent: str, episodes: int = 5, seed: int = 0) -> "Contract":
+        """What a policy assumes that was trained in an environment.
+
+        Args:
+            policy: as `codrl_mj.runs.policies.load_policy` returns it.
+            env: what it was trained in.
+            agent: the name of what trained it.
+            episodes: how many are run for golden numbers, each to its end; as many more if they end too soon.
+            seed: of the first of them.
+
+        Raises:
+            ValueError: the policy cannot be exported, or `episodes` is below 1.
+        """
+        network = Network.of(policy)
+        run = run_episodes(policy, env.make, episodes, seed)
+        while sum(len(one.time) for one in run) < GOLDEN:  # some fail at once
+            run += run_episodes(policy, env.make, episodes, seed + len(run))
+        period = float(run[0].time[0])
+        seen = np.concatenate([one.observation[:-1] for one in run])
+        chosen = seen[np.unique(np.linspace(0, len(seen) - 1, GOLDEN).astype(int))]
+        observations, actions = env.world.interface(env)
+        for place, entry in enumerate(observations):
+            entry |= {"scale": float(network.factors[place]), "offset": 0.0}
+            entry["seen"] = [float(seen[:, place].min()), float(seen[:, place].max())]
+        acted = policy.predict(chosen, deterministic=True)[0]
+        kept = env.as_mapping()
+        assumed = {name: kept[name] for name in ("action", "physics", "joint", "disturbances", "randomize", "options")}
+        return cls(
+            task=env.task,
+            agent=agent,
+            rate=1.0 / period,
+            observations=observations,
+            actions=actions,
+            actuators={name: _told(mapping_of(one)) for name, one in env.driven.items()},
+            assumed=json.loads(json.dumps(assumed)),
+            late={"after": LATE * period, "unit": "s", "command": [0.0] * len(actions)},
+            golden={"observations": chosen.tolist(), "actions": acted.tolist(), "tolerance": 1e-5},
+            versions={
+                "python": platform.python_version(),
+                **{one: importlib.metadata.version(one) for one in _PACKAGES},
+            },
+        )
+
+    @classmethod
+    def read(cls, folder: Path) -> "Contract":
+        """The contract of an exported folder, or a file itself.
+
+        Raises:
+            FileNotFoundError: there is none.
+            ValueError: it is damaged, edited, or no contract.
+        """
+        path = folder / FILE if folder.is_dir() else folder
+        content = read_json(path, "contract")
+        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            raise ValueError(f"{path}: not a contract of this program: its format must be {FORMAT!r}")
+        if missing := [name for name in _ENTRIES if name not in content]:
+            raise ValueError(f"{path}: has no {', '.join(missing)}: export it anew")
+        return cls(**{name: content[name] for name in _ENTRIES})
+
+    def write(self, folder: Path) -> None:
+        """Write `contract.json` into a folder, whole or not at all, with a digest of itself."""
+        write_json(folder / FILE, sealed({"format": FORMAT, **dataclasses.asdict(self)}))
+
+    def admit(self, observations: Sequence[tuple[str, str | None]], rate: float | None = None) -> None:
+        """Refuse observations that are not those of the policy.
+
+        Args:
+            observations: name and unit of each entry, in the order in which they come; a unit of None is not compared.
+            rate: how many come in a second [Hz]; None is not compared.
+
+        Raises:
+            ValueError: entries are missing, unknown, in another order or unit, or come at another rate.
+        """
+        names, given = [one["name"] for one in self.observations], [name for name, _ in observations]
+        if unknown := [name for name in given if name not in names]:
+            raise ValueError(
+                f"observation {unknown[0]!r}: the policy knows none; {did_you_mean(unknown[0], names)}it has "
+                f"{', '.join(names)}"
+            )
+        if missing := [name for name in names if name not in given]:
+            raise ValueError(f"observations: {', '.join(missing)} missing: the policy takes {', '.join(names)}")
+        if given != names:
+            raise ValueError(
+                f"observations: their order is {', '.join(given)}, must be {', '.join(names)}: reorder the columns"
+            )
+        for (name, unit), one in zip(observations, self.observations, strict=True):
+            if unit is not None and one["unit"] is not None and unit != one["unit"]:
+                raise ValueError(f"observation {name!r}: its unit is {unit}, must be {one['unit']}: convert it")
+        if rate is not None and abs(rate / self.rate - 1.0) > 0.01:
+            raise ValueError(
+                f"rate: observations come at {rate:.4g} Hz, must be {self.rate:.4g} Hz, at which the policy was "
+                "trained: it knows no other"
+            )
+
+    def admit_actuators(self, actuators: Mapping[str, Any]) -> None:
+        """Refuse actuators that are not those of the training; by motor or pattern, each an `ActuatorModel`.
+
+        Raises:
+            ValueError: one differs; the message names the first number that does.
+        """
+        for name, mine in self.actuators.items():
+            if name not in actuators:
+                raise ValueError(f"actuator {name!r}: missing: the policy was trained through {mine['fields']}")
+            theirs = _told(mapping_of(actuators[name]))
+            if theirs["sha256"] != mine["sha256"]:
+                one, other = (leaves(side["fields"] or {}) for side in (mine, theirs))
+                where = next((path for path in {**one, **other} if one.get(path) != other.get(path)), "family")
+                raise ValueError(
+                    f"actuator {name!r}: {where} = {other.get(where)}, must be {one.get(where)}, through which the "
+                    "policy was trained; evaluate it on yours, or train through that"
+                )
+
+
+def _told(fields: Mapping[str, Any] | None) -> dict[str, Any]:
+    digest = hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()
+    return {"fields": fields, "sha256": digest}

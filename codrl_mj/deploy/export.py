@@ -1,0 +1,116 @@
+"""A folder with all that a controller needs of a policy: an ONNX model, which any runtime reads, and its contract."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codrl_mj.deploy.contract import Contract
+from codrl_mj.deploy.network import Network
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.runs.files import writing_folder
+from codrl_mj.runs.policies import Policy
+
+ONNX = "policy.onnx"
+OPSET = 17
+IR = 9  # read by onnxruntime 1.16 and later
+
+
+def onnx_model(network: Network, about: Mapping[str, Any]) -> Any:
+    """The model: `observation`, float32 (N, k), to `action`, float32 (N, m) or int64 (N,).
+
+    Args:
+        network: the policy.
+        about: its metadata, by name; what is no text is kept as JSON.
+
+    Returns:
+        An `onnx.ModelProto` that `onnx.checker` accepts.
+    """
+    import onnx
+    from onnx import TensorProto, helper, numpy_helper
+
+    constants: dict[str, Any] = {}
+    nodes: list[Any] = []
+    at = "observation"
+
+    def then(kind: str, *others: tuple[str, Any], **attributes: Any) -> None:
+        nonlocal at
+        for name, value in others:
+            constants[name] = numpy_helper.from_array(value, name)
+        after = f"values_{len(nodes)}"
+        nodes.append(helper.make_node(kind, [at, *(name for name, _ in others)], [after], **attributes))
+        at = after
+
+    then("Mul", ("factors", network.factors))
+    for place, layer in enumerate(network.layers):
+        then("Gemm", (f"weight_{place}", layer.weight), (f"bias_{place}", layer.bias), transB=1)
+        if layer.activation != "Identity":
+            then({"Tanh": "Tanh", "ReLU": "Relu"}[layer.activation])
+    then("Mul", ("gains", network.gains))
+    if network.low is None or network.high is None:
+        then("ArgMax", axis=1, keepdims=0)
+    elif network.squashed:
+        half = network.low.dtype.type(0.5)
+        then("Add", ("one", network.low.dtype.type(1.0)))
+        then("Mul", ("half", half))
+        then("Mul", ("span", network.high - network.low))
+        then("Add", ("low", network.low))
+    else:
+        then("Max", ("low", network.low))
+        then("Min", ("high", network.high))
+    nodes[-1].output[0] = "action"
+    kind, shape = (TensorProto.INT64, ["N"]) if network.low is None else (TensorProto.FLOAT, ["N", len(network.low)])
+    graph = helper.make_graph(
+        nodes,
+        "policy",
+        [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["N", len(network.factors)])],
+        [helper.make_tensor_value_info("action", kind, shape)],
+        list(constants.values()),
+    )
+    model = helper.make_model(
+        graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR, producer_name="codrl_mj"
+    )
+    texts = {name: value if isinstance(value, str) else json.dumps(value) for name, value in about.items()}
+    helper.set_model_props(model, texts)
+    onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+def export(policy: Policy, env: EnvConfig, agent: str, out: Path, episodes: int = 5, seed: int = 0) -> Contract:
+    """Write `policy.onnx` and `contract.json` into a new folder, whole or not at all.
+
+    Args:
+        policy: as `codrl_mj.runs.policies.load_policy` returns it, of PPO, SAC, TD3, DDPG or DQN.
+        env: what it was trained in.
+        agent: the name of what trained it.
+        out: the folder; it must not exist, or be empty.
+        episodes: how many are run for the golden numbers.
+        seed: of the first of them.
+
+    Returns:
+        The contract, as it was written.
+
+    Raises:
+        FileExistsError: the folder holds something.
+        ValueError: the policy cannot be exported, or what was written does not act as it does.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise FileExistsError(f"--out {out}: it exists, and is no empty folder: name another, or delete it")
+    network = Network.of(policy)
+    contract = Contract.of(policy, env, agent, episodes, seed)
+    about: dict[str, Any] = {
+        name: getattr(contract, name) for name in ("task", "agent", "rate", "observations", "actions", "versions")
+    }
+    golden = contract.golden
+    acted = network(np.array(golden["observations"], np.float32))
+    if (worst := np.abs(acted - np.array(golden["actions"])).max()) > golden["tolerance"]:
+        raise ValueError(
+            f"the exported policy's actions differ by {worst:.3g} from the policy's own, must be at most "
+            f"{golden['tolerance']:g}: it is not what its class says"
+        )
+    with writing_folder(out) as folder:
+        (folder / ONNX).write_bytes(onnx_model(network, about).SerializeToString())
+        contract.write(folder)
+    return contract

@@ -1,0 +1,132 @@
+"""A trained policy as what it computes, without the library that trained it: factors, dense layers, and an end.
+
+Imports nothing heavy: torch's tensors come in, numpy's arrays stay.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from codrl_mj.runs.policies import Policy
+
+ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "Tanh": np.tanh,
+    "ReLU": lambda values: np.maximum(values, 0.0),
+    "Identity": lambda values: values,
+}
+"""By the name of torch's class."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Layer:
+    """activation(weight @ x + bias)."""
+
+    weight: np.ndarray
+    """Shape (out, in), float32."""
+    bias: np.ndarray
+    """Shape (out,), float32."""
+    activation: str
+    """One of `ACTIVATIONS`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Network:
+    """A policy that takes its most likely action: an observation (k,) to an action.
+
+    The observation is multiplied by `factors`, goes through the layers, and what they give is multiplied by `gains`.
+    Of a box it is then brought between `low` and `high`: clipped or, `squashed`, by (y + 1)/2 of the way. Without
+    bounds the action is the index of the largest.
+    """
+
+    factors: np.ndarray
+    """Shape (k,), float32."""
+    layers: tuple[Layer, ...]
+    """From the observation to the action."""
+    gains: np.ndarray
+    """Shape (m,), float32."""
+    low: np.ndarray | None
+    """Least action, shape (m,), float32; None where actions are discrete."""
+    high: np.ndarray | None
+    """Largest action, likewise."""
+    squashed: bool
+    """Whether the layers end in -1 to 1, which stand for `low` and `high`."""
+
+    @classmethod
+    def of(cls, policy: Policy) -> "Network":
+        """What a policy computes that Stable-Baselines3's PPO, SAC, TD3, DDPG or DQN trained.
+
+        Args:
+            policy: as `codrl_mj.runs.policies.load_policy` returns it.
+
+        Raises:
+            ValueError: it is none of these, or has parts that are no factors and dense layers.
+        """
+        from stable_baselines3.common.policies import ActorCriticPolicy
+        from stable_baselines3.dqn.policies import DQNPolicy
+        from stable_baselines3.sac.policies import SACPolicy
+        from stable_baselines3.td3.policies import TD3Policy
+
+        one: Any = policy
+        squashed = isinstance(one, SACPolicy | TD3Policy)
+        if isinstance(one, ActorCriticPolicy) and not one.squash_output:
+            extractor, parts = one.pi_features_extractor, [*one.mlp_extractor.policy_net, one.action_net]
+        elif isinstance(one, SACPolicy):
+            extractor, parts = one.actor.features_extractor, [*one.actor.latent_pi, one.actor.mu]
+        elif isinstance(one, TD3Policy):
+            extractor, parts = one.actor.features_extractor, [*one.actor.mu]
+        elif isinstance(one, DQNPolicy):
+            extractor, parts = one.q_net.features_extractor, [*one.q_net.q_net]
+        else:
+            raise ValueError(
+                f"policy: a {type(one).__name__} cannot be exported: it must be of PPO, SAC, TD3, DDPG or DQN, which "
+                "are dense layers"
+            )
+        seen, acts = one.observation_space, one.action_space
+        if not isinstance(seen, spaces.Box) or len(seen.shape) != 1:
+            raise ValueError(f"policy: observations are {seen}: must be vectors")
+        layers = _layers(parts)
+        if isinstance(one, SACPolicy):  # its distribution ends in it
+            layers[-1] = dataclasses.replace(layers[-1], activation="Tanh")
+        factors, gains = getattr(extractor, "factors", None), getattr(one, "largest", None)
+        outputs = len(layers[-1].bias)
+        return cls(
+            np.ones(seen.shape, np.float32) if factors is None else factors.numpy().copy(),
+            tuple(layers),
+            np.ones(outputs, np.float32) if gains is None else gains.numpy().astype(np.float32),
+            acts.low.astype(np.float32) if isinstance(acts, spaces.Box) else None,
+            acts.high.astype(np.float32) if isinstance(acts, spaces.Box) else None,
+            squashed,
+        )
+
+    def __call__(self, observations: np.ndarray, kind: Any = np.float32) -> np.ndarray:
+        """Actions (N, m), or their indices (N,), of observations (N, k), computed in numbers of a `kind`."""
+        values = observations.astype(kind) * self.factors.astype(kind)
+        for layer in self.layers:
+            values = ACTIVATIONS[layer.activation](values @ layer.weight.astype(kind).T + layer.bias.astype(kind))
+        values = values * self.gains.astype(kind)
+        if self.low is None or self.high is None:
+            return values.argmax(axis=1)
+        low, high = self.low.astype(kind), self.high.astype(kind)
+        return low + kind(0.5) * (values + kind(1.0)) * (high - low) if self.squashed else np.clip(values, low, high)
+
+    @property
+    def size(self) -> int:
+        """How many weights and biases there are."""
+        return sum(layer.weight.size + layer.bias.size for layer in self.layers)
+
+
+def _layers(parts: list[Any]) -> list[Layer]:
+    """Dense layers with the activations that follow them."""
+    found: list[Layer] = []
+    for part in parts:
+        kind = type(part).__name__
+        if kind == "Linear":
+            found.append(Layer(part.weight.detach().numpy().copy(), part.bias.detach().numpy().copy(), "Identity"))
+        elif kind in ACTIVATIONS and found and found[-1].activation == "Identity":
+            found[-1] = dataclasses.replace(found[-1], activation=kind)
+        else:
+            raise ValueError(f"policy: a layer is {part}: must be Linear, or {', '.join(ACTIVATIONS)} after one")
+    return found

@@ -1,0 +1,241 @@
+"""A policy outside of the simulator: what other runtimes compute of it, and what its contract refuses."""
+
+import dataclasses
+import json
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from onnx.reference import ReferenceEvaluator
+
+from codrl_mj.actuators import Actuator
+from codrl_mj.agents import AGENTS
+from codrl_mj.agents.models import ScaledObservation
+from codrl_mj.cli import main
+from codrl_mj.deploy import Contract, Network, export, onnx_model
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.runs.policies import load_policy, save_policy
+
+TASKS = {"cartpole": "ppo", "pendulum": "ddpg", "acrobot": "dqn", "mountain_car_continuous": "td3", "furuta": "sac"}
+SMALL = {"hidden": (16, 16)}
+
+
+def trained(task, agent, **settings):
+    """A policy with random weights that tell observations apart, and its settings."""
+    torch.manual_seed(0)
+    torch.set_num_threads(1)
+    env = EnvConfig(task)
+    with_env = env.make()
+    config = AGENTS[agent](**settings)
+    policy = config.make_policy(with_env.observation_space, with_env.action_space)
+    with_env.close()
+    with torch.no_grad():
+        for parameter in policy.parameters():
+            parameter.mul_(1.5).add_(0.02 * torch.randn_like(parameter))
+    policy.set_training_mode(False)
+    return policy, config
+
+
+def observed(space, count=10_000):
+    """Observations (count, k), of which many are far out."""
+    return np.random.default_rng(1).normal(0.0, 2.0, (count, *space.shape)).astype(np.float32)
+
+
+def runtimes(model):
+    """Two that others wrote."""
+    session = onnxruntime.InferenceSession(model.SerializeToString())
+    return (
+        lambda seen: session.run(None, {"observation": seen})[0],
+        lambda seen: ReferenceEvaluator(model).run(None, {"observation": seen})[0],
+    )
+
+
+EACH = [
+    *((task, agent, {}) for task, agent in TASKS.items()),
+    ("pendulum", "ppo", {"unit_actions": True}),
+    ("furuta", "ppo", {"activation": "relu", "input_scale": (1.0, 1.0, 1.0, 1.0, 0.05, 0.05)}),
+]
+
+
+@pytest.mark.parametrize(("task", "agent", "settings"), EACH)
+def test_other_runtimes_act_as_the_policy_does(task, agent, settings):
+    policy, _ = trained(task, agent, **settings)
+    seen = observed(policy.observation_space)
+    acted = policy.predict(seen, deterministic=True)[0]
+    for run in runtimes(onnx_model(Network.of(policy), {})):
+        other = run(seen)
+        assert other.dtype == acted.dtype
+        if acted.dtype == np.int64:
+            assert (other != acted).sum() <= 1  # two that are equally good but for rounding
+        else:
+            np.testing.assert_allclose(other, acted, atol=1e-6, rtol=0)
+    assert len(np.unique(acted.round(6))) > 1
+
+
+def test_the_policy_that_is_exported_takes_its_most_likely_action():
+    policy, _ = trained("pendulum", "ppo")
+    seen = observed(policy.observation_space, 100)
+    drawn = policy.predict(seen, deterministic=False)[0]
+    assert np.abs(Network.of(policy)(seen) - drawn).max() > 0.1
+
+
+def test_factors_of_the_observation_are_inside():
+    plain, _ = trained("furuta", "ppo")
+    scaled, _ = trained("furuta", "ppo", input_scale=(2.0,))
+    assert isinstance(scaled.features_extractor, ScaledObservation)
+    scaled.load_state_dict(plain.state_dict())
+    seen = observed(plain.observation_space, 50)
+    twice = seen * np.array([2.0, 1.0, 1.0, 1.0, 1.0, 1.0], np.float32)
+    np.testing.assert_allclose(Network.of(scaled)(seen), Network.of(plain)(twice), atol=1e-6)
+
+
+def test_a_table_of_tiles_is_no_network():
+    policy, _ = trained("mountain_car", "sarsa")
+    with pytest.raises(ValueError, match="TileCodingPolicy cannot be exported: it must be of PPO, SAC, TD3, DDPG or"):
+        Network.of(policy)
+
+
+def test_a_layer_of_another_kind_is_named():
+    policy, _ = trained("pendulum", "ppo")
+    policy.mlp_extractor.policy_net[1] = torch.nn.ELU()
+    with pytest.raises(ValueError, match="a layer is ELU"):
+        Network.of(policy)
+
+
+# -- the folder ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """A folder of a policy for Furuta behind its motor, and the policy."""
+    policy, _ = trained("furuta", "ppo")
+    folder = tmp_path_factory.mktemp("out") / "furuta"
+    export(policy, EnvConfig("furuta", observe_actuator=False), "ppo", folder, episodes=2)
+    return folder, policy
+
+
+def test_the_golden_actions_are_those_of_the_file(exported):
+    folder, _ = exported
+    golden = Contract.read(folder).golden
+    seen = np.array(golden["observations"], np.float32)
+    model = onnx.load(folder / "policy.onnx")
+    onnx.checker.check_model(model, full_check=True)
+    assert seen.shape == (200, 6)
+    for run in runtimes(model):
+        np.testing.assert_allclose(run(seen), golden["actions"], atol=golden["tolerance"])
+
+
+def test_the_contract_says_what_passes_to_and_fro(exported):
+    contract = Contract.read(exported[0])
+    assert contract.rate == pytest.approx(50.0)
+    assert [one["unit"] for one in contract.observations] == ["1", "1", "1", "1", "rad/s", "rad/s"]
+    assert [one["name"] for one in contract.actions] == ["motor"]
+    assert contract.actions[0]["unit"] == "N*m"
+    assert contract.actions[0]["most"] == pytest.approx(0.084)
+    assert contract.actuators["motor"]["fields"]["motor"]["resistance"] == 8.4
+    least, most = np.array([one["seen"] for one in contract.observations]).T
+    assert (least <= most).all()
+    assert contract.late == {"after": pytest.approx(0.03), "unit": "s", "command": [0.0]}
+    metadata = {one.key: one.value for one in onnx.load(exported[0] / "policy.onnx").metadata_props}
+    assert json.loads(metadata["observations"])[4]["name"] == "arm_velocity"
+
+
+@pytest.mark.parametrize(
+    ("task", "changes", "units", "actions"),
+    [
+        ("cartpole", {}, ["m", "m/s", "rad", "rad/s"], [("N", [-10.0, 10.0])]),
+        ("pendulum", {"action": "current", "observe_actuator": True}, ["1", "1", "rad/s", "A", "A"], [("A", None)]),
+        ("acrobot", {}, ["1"] * 4 + ["rad/s"] * 2, [("N*m", [-1.0, 0.0, 1.0])]),
+        ("mountain_car", {}, ["m", "m/s"], [("N", [-1.0, 0.0, 1.0])]),
+    ],
+)
+def test_units_are_those_of_state_signals_and_commands(task, changes, units, actions):
+    config = EnvConfig(task, **changes)
+    seen, acts = config.world.interface(config)
+    assert [one["unit"] for one in seen] == units
+    assert [(one["unit"], one.get("levels")) for one in acts] == actions
+
+
+def test_an_environment_of_others_has_bounds_and_no_units():
+    config = EnvConfig("InvertedPendulum-v5")
+    seen, acts = config.world.interface(config)
+    assert [one["unit"] for one in seen] == [None] * 4
+    assert [(one["name"], one["most"]) for one in acts] == [("slide", 3.0)]
+
+
+def rows(contract):
+    return [(one["name"], one["unit"]) for one in contract.observations]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda seen: [seen[1], seen[0], *seen[2:]], "their order is sin_arm, cos_arm"),
+        (lambda seen: seen[:-1], "rod_velocity missing"),
+        (lambda seen: [*seen[:4], ("arm_velocity", "deg/s"), seen[5]], "its unit is deg/s, must be rad/s"),
+        (lambda seen: [*seen[:5], ("rod_velocty", "rad/s")], "did you mean 'rod_velocity'"),
+    ],
+)
+def test_observations_of_another_kind_are_refused(exported, change, message):
+    contract = Contract.read(exported[0])
+    contract.admit(rows(contract), 50.0)
+    with pytest.raises(ValueError, match=message):
+        contract.admit(change(rows(contract)))
+
+
+def test_another_rate_is_refused(exported):
+    contract = Contract.read(exported[0])
+    with pytest.raises(ValueError, match="at 100 Hz, must be 50 Hz"):
+        contract.admit(rows(contract), 100.0)
+
+
+def test_another_actuator_is_refused_by_the_number_that_differs(exported):
+    contract = Contract.read(exported[0])
+    mine = EnvConfig("furuta").driven
+    contract.admit_actuators(mine)
+    (drive,) = mine.values()
+    weaker = dataclasses.replace(drive, supply=dataclasses.replace(drive.supply, voltage=6.0))
+    with pytest.raises(ValueError, match=r"supply\.voltage = 6\.0, must be 18\.0"):
+        contract.admit_actuators({"motor": weaker})
+    with pytest.raises(ValueError, match="must be drive"):
+        contract.admit_actuators({"motor": Actuator()})
+
+
+def test_an_edited_contract_is_refused(exported, tmp_path):
+    text = (exported[0] / "contract.json").read_text()
+    (tmp_path / "contract.json").write_text(text.replace('"rate": 50.0', '"rate": 51.0'))
+    with pytest.raises(ValueError, match="sha256"):
+        Contract.read(tmp_path)
+
+
+def test_a_folder_that_holds_something_is_left_alone(exported):
+    folder, policy = exported
+    with pytest.raises(FileExistsError, match="is no empty folder"):
+        export(policy, EnvConfig("furuta"), "ppo", folder)
+
+
+def test_what_fails_leaves_nothing(tmp_path):
+    policy, _ = trained("mountain_car", "sarsa")
+    with pytest.raises(ValueError, match="cannot be exported"):
+        export(policy, EnvConfig("mountain_car"), "sarsa", tmp_path / "out")
+    assert not list(tmp_path.iterdir())
+
+
+def test_from_the_command_line(tmp_path, capsys):
+    policy, config = trained("pendulum", "ppo", **SMALL)
+    save_policy(policy, config, tmp_path / "policy")
+    out = tmp_path / "out"
+    line = ["export", str(tmp_path / "policy"), "--task", "pendulum", "--agent", "ppo", "--episodes", "1"]
+    assert main([*line, "--out", str(out)]) == 0
+    told = capsys.readouterr().out
+    assert "angular_velocity" in told
+    assert "20 Hz" in told
+    contract = Contract.read(out)
+    assert (contract.task, contract.agent) == ("pendulum", "ppo")
+    again = load_policy(tmp_path / "policy")
+    seen = np.array(contract.golden["observations"], np.float32)
+    np.testing.assert_array_equal(again.predict(seen, deterministic=True)[0], contract.golden["actions"])
+    assert main([*line, "--out", str(out)]) == 2
+    assert "is no empty folder" in capsys.readouterr().err
