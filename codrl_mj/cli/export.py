@@ -11,7 +11,7 @@ from codrl_mj.cli.subject import Source
 
 @dataclasses.dataclass(frozen=True)
 class Export:
-    """Take a trained policy out of the simulator: policy.onnx, and contract.json with all that it assumes.
+    """Take a trained policy out of the simulator: as ONNX, as C99, and contract.json with all that it assumes.
 
     The contract has names, units, order and range of observations and actions, rate, actuator, delays, what to do when
     late, and 200 observations of episodes with the policy's actions, to be computed again elsewhere (docs/deploy.md).
@@ -30,6 +30,10 @@ class Export:
     """Episodes that are run for the contract's ranges and golden numbers."""
     seed: int = 0
     """Seed of the first of them."""
+    float64: bool = False
+    """Compute in double in the C, not in float."""
+    board: str | None = None
+    """What it is to fit: arduino-uno, arduino-due, nucleo-f446re, raspberry-pi-pico or teensy-4.1."""
 
     def run(self) -> int:
         """Write the folder, and say what is in it."""
@@ -42,7 +46,8 @@ class Export:
             from codrl_mj.training.folder import load_config
 
             agent = load_config(subject.run, self.source.trust).agent.known_as()
-        contract = export(subject.policy, subject.env, agent, self.out, self.episodes, self.seed)
+        given = self.out, self.episodes, self.seed, self.float64, self.board
+        contract = export(subject.policy, subject.env, agent, *given)
         rows = [
             (side, one["name"], one.get("unit") or "?", _bounds(one))
             for side, several in (("observation", contract.observations), ("action", contract.actions))
@@ -50,7 +55,7 @@ class Export:
         ]
         print_table(f"{contract.task}, {agent}, {contract.rate:g} Hz", ("", "name", "unit", "range"), rows)
         weights = Network.of(subject.policy).size
-        say(f"wrote {self.out}/policy.onnx ({weights} numbers) and {self.out}/contract.json; golden actions: the same")
+        say(f"wrote {self.out}: policy.onnx, contract.json, controller.c ({weights} numbers); try: cc -std=c99 *.c -lm")
         return 0
 
 

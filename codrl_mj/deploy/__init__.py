@@ -1,7 +1,8 @@
-"""A trained policy, taken out of the simulator: as ONNX, and with what it and its controller assume of each other."""
+"""A trained policy, taken out of the simulator: as ONNX, as C, and with all that it assumes of its controller."""
 
+from codrl_mj.deploy.c_code import c_files, current_loop
 from codrl_mj.deploy.contract import Contract
 from codrl_mj.deploy.export import export, onnx_model
 from codrl_mj.deploy.network import Network
 
-__all__ = ["Contract", "Network", "export", "onnx_model"]
+__all__ = ["Contract", "Network", "c_files", "current_loop", "export", "onnx_model"]

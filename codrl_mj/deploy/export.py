@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from codrl_mj.deploy.c_code import c_files, check_board, current_loop
 from codrl_mj.deploy.contract import Contract
 from codrl_mj.deploy.network import Network
 from codrl_mj.envs.config import EnvConfig
@@ -78,8 +79,20 @@ def onnx_model(network: Network, about: Mapping[str, Any]) -> Any:
     return model
 
 
-def export(policy: Policy, env: EnvConfig, agent: str, out: Path, episodes: int = 5, seed: int = 0) -> Contract:
-    """Write `policy.onnx` and `contract.json` into a new folder, whole or not at all.
+def export(
+    policy: Policy,
+    env: EnvConfig,
+    agent: str,
+    out: Path,
+    episodes: int = 5,
+    seed: int = 0,
+    double: bool = False,
+    board: str | None = None,
+) -> Contract:
+    """Write `policy.onnx`, `contract.json` and C99 into a new folder, whole or not at all.
+
+    The C is `controller.h`, `controller.c` and `main.c`, which computes the golden commands again; a current loop is in
+    it where all motors have the same `codrl_mj.actuators.Drive`, and are asked for forces or currents.
 
     Args:
         policy: as `codrl_mj.runs.policies.load_policy` returns it, of PPO, SAC, TD3, DDPG or DQN.
@@ -88,17 +101,21 @@ def export(policy: Policy, env: EnvConfig, agent: str, out: Path, episodes: int 
         out: the folder; it must not exist, or be empty.
         episodes: how many are run for the golden numbers.
         seed: of the first of them.
+        double: whether the C computes in double, not float.
+        board: what it is to fit, one of `codrl_mj.deploy.c_code.BOARDS`; None for any.
 
     Returns:
         The contract, as it was written.
 
     Raises:
         FileExistsError: the folder holds something.
-        ValueError: the policy cannot be exported, or what was written does not act as it does.
+        ValueError: the policy cannot be exported, does not fit the board, or what was written does not act as it does.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FileExistsError(f"--out {out}: it exists, and is no empty folder: name another, or delete it")
     network = Network.of(policy)
+    if board is not None:
+        check_board(board, network, double)
     contract = Contract.of(policy, env, agent, episodes, seed)
     about: dict[str, Any] = {
         name: getattr(contract, name) for name in ("task", "agent", "rate", "observations", "actions", "versions")
@@ -113,4 +130,6 @@ def export(policy: Policy, env: EnvConfig, agent: str, out: Path, episodes: int 
     with writing_folder(out) as folder:
         (folder / ONNX).write_bytes(onnx_model(network, about).SerializeToString())
         contract.write(folder)
+        for name, content in c_files(network, contract, current_loop(env), double).items():
+            (folder / name).write_text(content)
     return contract

@@ -1,0 +1,122 @@
+"""A policy, and the current loop behind it, as C99 for a microcontroller: no malloc, and of libm tanh alone."""
+
+from typing import Any
+
+import numpy as np
+
+import codrl_mj
+from codrl_mj.actuators import Drive, sampled
+from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
+from codrl_mj.deploy.contract import Contract
+from codrl_mj.deploy.network import Network
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.fields import check_names
+from codrl_mj.tasks.assets import asset_path
+
+FILES = ("controller.h", "controller.c", "main.c")
+BOARDS = {  # name -> bytes of flash memory for a program, and of RAM
+    "arduino-uno": (32_256, 2_048),
+    "arduino-due": (524_288, 98_304),
+    "nucleo-f446re": (524_288, 131_072),
+    "raspberry-pi-pico": (2_097_152, 270_336),
+    "teensy-4.1": (8_126_464, 1_048_576),
+}
+CODE = 6_000  # bytes beside the weights: 2,400 with tanhf, of a Cortex-M4 by gcc -O2; the rest for start-up and drivers
+
+
+def current_loop(env: EnvConfig) -> dict[str, Any] | None:
+    """The numbers of the current loop that all motors share; None where there is none to be computed on a board.
+
+    Those of `codrl_mj.actuators.Drive` at 25 degC: designed gains are computed as it computes them.
+    """
+    first = env.actuators[0]
+    if type(first) is not Drive or any(one != first for one in env.actuators) or env.action not in ("force", "current"):
+        return None
+    drive: Any = first
+    motor, loop = drive.motor, drive.controller
+    kp, ki = loop.kp, loop.ki / loop.sample_rate
+    if loop.kp == 0.0 and loop.ki == 0.0:
+        bandwidth = 2.0 * np.pi * (loop.bandwidth or DEFAULT_BANDWIDTH * loop.sample_rate)
+        kp, ki = sampled.designed_gains(motor.resistance, motor.inductance, 1.0 / loop.sample_rate, bandwidth)
+    forced = env.action == "force"
+    return {
+        "rate": loop.sample_rate,
+        "unit": "N or N*m" if forced else "A",
+        "amperes": drive.arm_radius / motor.torque_constant if forced else 1.0,
+        "most": loop.max_current if np.isfinite(loop.max_current) else None,
+        "voltage": drive.voltage_limit,
+        "sag": 0.0 if drive.supply is None else drive.supply.resistance,
+        "kp": kp,
+        "ki": ki,
+        "tracking": ki / (kp + ki) if kp + ki > 0.0 else 0.0,
+        "back_emf": motor.back_emf_constant if loop.bemf_compensation else 0.0,
+        "anti_windup": loop.anti_windup,
+        "delayed": loop.delayed,
+    }
+
+
+def c_files(network: Network, contract: Contract, loop: dict[str, Any] | None, double: bool = False) -> dict[str, str]:
+    """Name -> content of the C files, in float or `double`."""
+    import jinja2
+
+    kind, suffix = ("double", "") if double else ("float", "f")
+
+    def number(value: float) -> str:
+        text = repr(float(value)) if double else f"{float(np.float32(value)):.9g}"
+        return (text if set(text) & set(".en") else f"{text}.0") + suffix
+
+    def array(values: Any) -> str:
+        return "{" + ", ".join(number(value) for value in np.ravel(values)) + "}"
+
+    golden = contract.golden
+    levels = None
+    if network.low is None:  # of an environment of others nobody knows what they stand for but their index
+        unknown = list(range(len(network.layers[-1].bias)))
+        levels = np.array([one.get("levels", unknown) for one in contract.actions], dtype=np.float64).T
+    acted = np.array(golden["actions"])
+    size = 8 if double else 4
+    width = max(len(network.factors), *(len(layer.bias) for layer in network.layers))
+    known = {
+        "version": codrl_mj.__version__,
+        "real": kind,
+        "number": number,
+        "array": array,
+        "current": loop,
+        "tanh": f"tanh{suffix}",
+        "fabs": f"fabs{suffix}",
+        "width": width,
+        "levels": levels,
+        **{name: getattr(network, name) for name in ("factors", "layers", "gains", "low", "high", "squashed")},
+        **{name: getattr(contract, name) for name in ("task", "agent", "rate", "observations")},
+        "commands": contract.actions,
+        "choices": len(network.layers[-1].bias),
+        "tolerance": golden["tolerance"],
+        "golden_seen": golden["observations"],
+        "golden_commands": acted.reshape(len(acted), -1) if levels is None else levels[acted],
+        "constants": size
+        * (network.size + len(network.factors) + (3 * len(acted[0]) if levels is None else levels.size)),
+        "stack": 2 * size * width,
+        "state": 2 * size,
+        "products": sum(layer.weight.size for layer in network.layers),
+        "tanhs": sum(len(layer.bias) for layer in network.layers if layer.activation == "Tanh"),
+    }
+    made = jinja2.Environment(undefined=jinja2.StrictUndefined, keep_trailing_newline=True, autoescape=False)
+    return {name: made.from_string(asset_path(f"deploy/{name}.jinja").read_text()).render(known) for name in FILES}
+
+
+def check_board(board: str, network: Network, double: bool = False) -> None:
+    """Refuse a policy that does not fit a board of `BOARDS`.
+
+    Raises:
+        ValueError: the board is unknown, or its memory too small; the message has both sizes.
+    """
+    check_names([board], BOARDS, "board")
+    size = 8 if double else 4
+    flash, ram = BOARDS[board]
+    width = max(len(network.factors), *(len(layer.bias) for layer in network.layers))
+    for what, needed, there in (("flash", size * network.size + CODE, flash), ("RAM", 2 * size * width, ram)):
+        if needed > there:
+            raise ValueError(
+                f"board {board}: the policy needs about {needed} bytes of {what}, must be at most {there}: train a "
+                "smaller network (--agent.hidden 32 32), or name a larger board"
+            )

@@ -1,0 +1,150 @@
+"""The C of a policy and of its current loop, compiled and held against Python's."""
+
+import ctypes
+import dataclasses
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+from codrl_mj.actuators import Drive
+from codrl_mj.actuators.drive import State
+from codrl_mj.actuators.model import Inputs
+from codrl_mj.actuators.parameters import parameters_type
+from codrl_mj.deploy import Contract, Network
+from codrl_mj.deploy.c_code import c_files, check_board, current_loop
+from codrl_mj.envs.config import EnvConfig
+from tests.deploy.test_export import EACH, observed, trained
+
+STRICT = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-Wconversion", "-Wpedantic")
+COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
+pytestmark = pytest.mark.skipif(not COMPILERS, reason="NOT RUN: no C compiler: apt-get install gcc")
+KINDS = {False: ctypes.c_float, True: ctypes.c_double}
+
+
+def compiled(folder, *flags):
+    """The controller of a folder as a library."""
+    library = folder / "controller.so"
+    files = [str(folder / "controller.c"), "-lm", "-o", str(library)]
+    subprocess.run([COMPILERS[0], *STRICT, *flags, "-shared", "-fPIC", *files], check=True)
+    return ctypes.CDLL(str(library))
+
+
+def written(folder, task, agent, settings, double, **changes):
+    """The C files of a policy with random weights, the policy, and its contract."""
+    env = EnvConfig(task, **changes)
+    policy, _ = trained(task, agent, **settings)
+    contract = Contract.of(policy, env, agent, 1)
+    for name, content in c_files(Network.of(policy), contract, current_loop(env), double).items():
+        (folder / name).write_text(content)
+    return policy, contract
+
+
+@pytest.mark.parametrize("double", [False, True])
+@pytest.mark.parametrize(("task", "agent", "settings"), EACH)
+def test_the_policy_in_c_is_the_policy(tmp_path, task, agent, settings, double):
+    policy, contract = written(tmp_path, task, agent, settings, double)
+    library, kind = compiled(tmp_path), KINDS[double]
+    seen = observed(policy.observation_space)
+    network = Network.of(policy)
+    expected = network(seen, np.float64) if double else policy.predict(seen, deterministic=True)[0]
+    command = (kind * len(contract.actions))()
+    got = np.empty((len(seen), len(contract.actions)))
+    for row, one in enumerate(seen):
+        library.policy_step((kind * len(one))(*one.tolist()), command)
+        got[row] = command[:]
+    if network.low is None:
+        levels = np.array([one["levels"] for one in contract.actions]).T
+        assert (got != levels[expected]).any(axis=1).sum() <= 1
+    else:
+        np.testing.assert_allclose(got, expected, atol=1e-12 if double else 1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("compiler", COMPILERS)
+@pytest.mark.parametrize(("task", "agent"), [("furuta", "sac"), ("acrobot", "dqn")])
+def test_golden_commands_are_computed_again_without_a_warning(tmp_path, compiler, task, agent):
+    written(tmp_path, task, agent, {}, double=False)
+    program = str(tmp_path / "main")
+    files = [str(tmp_path / name) for name in ("controller.c", "main.c")]
+    subprocess.run([compiler, *STRICT, "-fsanitize=undefined", *files, "-lm", "-o", program], check=True)
+    done = subprocess.run([program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    assert float(done.stdout.split(": ")[1]) < 1e-6
+    assert not done.stderr
+
+
+def test_a_weight_that_is_changed_in_the_c_is_found_by_the_golden_commands(tmp_path):
+    written(tmp_path, "furuta", "ppo", {}, double=False)
+    source = tmp_path / "controller.c"
+    first = source.read_text().partition("bias_0[64] = {")[2].partition(",")[0]
+    source.write_text(source.read_text().replace(f"bias_0[64] = {{{first},", "bias_0[64] = {1.5f,"))
+    program = str(tmp_path / "main")
+    subprocess.run([COMPILERS[0], str(source), str(tmp_path / "main.c"), "-lm", "-o", program], check=True)
+    assert subprocess.run([program], capture_output=True, check=False).returncode == 1
+
+
+LOOPS = {
+    "as designed": {},
+    "late": {"delayed": True},
+    "clamping": {"anti_windup": "clamping"},
+    "winding up": {"anti_windup": "none", "bandwidth": 300.0},
+    "own gains": {"kp": 8.0, "ki": 2000.0, "bemf_compensation": False},
+}
+
+
+@pytest.mark.parametrize("double", [False, True])
+@pytest.mark.parametrize("name", LOOPS)
+def test_the_current_loop_in_c_is_the_drive_s_sample_by_sample(tmp_path, name, double):
+    (usual,) = EnvConfig("furuta").driven.values()
+    controller = dataclasses.replace(usual.controller, **LOOPS[name])
+    motor = dataclasses.replace(usual.motor, load_inertia=np.inf)  # a held speed, as the engine gives it
+    drive = dataclasses.replace(usual, controller=controller, motor=motor)
+    written(tmp_path, "furuta", "ppo", {}, double, actuator=drive)
+    library, kind = compiled(tmp_path), KINDS[double]
+    library.current_step.restype = library.current_reference.restype = kind
+    state = (kind * 2)()
+    library.current_reset(state)
+    parameters, period = parameters_type(Drive)(*drive.numbers), 1.0 / controller.sample_rate
+    ours, decay = State(*[0.0] * 9), np.exp(-motor.resistance * period / motor.inductance)
+    random = np.random.default_rng(0)
+    saturated = 0
+    for sample in range(3000):
+        if sample % 60 == 0:
+            torque, speed = random.uniform(-0.12, 0.12), random.uniform(-250.0, 250.0)
+        inputs = Inputs(torque, 0.0, speed, sample * period, 0.0)
+        after, _, signals = Drive.advance(parameters, period, ours, inputs)
+        reference = library.current_reference(kind(torque))
+        if not double:  # from equal states: rounding adds up in an integral
+            state[:] = ours.integral, ours.pending
+        volts = library.current_step(state, kind(reference), kind(ours.current), kind(speed))
+        tolerance = 1e-11 if double else 1e-6  # of the supply
+        assert reference == pytest.approx(signals.reference_current, abs=tolerance * 10)
+        assert volts == pytest.approx(signals.voltage, abs=tolerance * drive.voltage_limit)
+        reached = (signals.voltage - motor.back_emf_constant * speed) / motor.resistance
+        assert after.current == pytest.approx(reached + (ours.current - reached) * decay, abs=1e-9)  # the winding's
+        saturated += signals.voltage_saturated
+        ours = after
+    assert 20 < saturated < 2900
+
+
+@pytest.mark.parametrize(
+    ("task", "changes"),
+    [("cartpole", {}), ("furuta", {"actuator": "ideal"}), ("furuta", {"action": "voltage"})],
+)
+def test_without_a_drive_s_loop_there_is_the_policy_alone(tmp_path, task, changes):
+    assert current_loop(EnvConfig(task, **changes)) is None
+    written(tmp_path, task, "ppo", {}, False, **changes)
+    assert "current_step" not in (tmp_path / "controller.h").read_text()
+
+
+def test_a_policy_that_does_not_fit_is_refused_with_both_sizes():
+    policy, _ = trained("pendulum", "ppo", hidden=(128, 128))
+    network = Network.of(policy)
+    check_board("nucleo-f446re", network, double=False)
+    with pytest.raises(
+        ValueError, match=r"arduino-uno: the policy needs about \d+ bytes of flash, must be at most 32256"
+    ):
+        check_board("arduino-uno", network)
+    with pytest.raises(ValueError, match="did you mean arduino-uno"):
+        check_board("arduino-un", network)
