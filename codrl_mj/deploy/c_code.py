@@ -27,7 +27,8 @@ CODE = 6_000  # bytes beside the weights: 2,400 with tanhf, of a Cortex-M4 by gc
 def current_loop(env: EnvConfig) -> dict[str, Any] | None:
     """The numbers of the current loop that all motors share; None where there is none to be computed on a board.
 
-    Those of `codrl_mj.actuators.Drive` at 25 degC: designed gains are computed as it computes them.
+    Those of `codrl_mj.actuators.Drive` at 25 degC: designed gains are computed as it computes them. Amperes for a
+    command, limits [A] and [V], gains [V/A] for a sample, and its rate [Hz].
     """
     first = env.actuators[0]
     if type(first) is not Drive or any(one != first for one in env.actuators) or env.action not in ("force", "current"):
@@ -56,7 +57,17 @@ def current_loop(env: EnvConfig) -> dict[str, Any] | None:
 
 
 def c_files(network: Network, contract: Contract, loop: dict[str, Any] | None, double: bool = False) -> dict[str, str]:
-    """Name -> content of the C files, in float or `double`."""
+    """The C files of a policy, and of the current loop behind it.
+
+    Args:
+        network: the policy.
+        contract: what it assumes, with the golden numbers.
+        loop: what `current_loop` says; None for the policy alone.
+        double: whether to compute in double, not float.
+
+    Returns:
+        Name -> content, of `FILES`.
+    """
     import jinja2
 
     kind, suffix = ("double", "") if double else ("float", "f")
@@ -105,11 +116,7 @@ def c_files(network: Network, contract: Contract, loop: dict[str, Any] | None, d
 
 
 def check_board(board: str, network: Network, double: bool = False) -> None:
-    """Refuse a policy that does not fit a board of `BOARDS`.
-
-    Raises:
-        ValueError: the board is unknown, or its memory too small; the message has both sizes.
-    """
+    """Refuse a policy that does not fit a board of `BOARDS`, with both sizes."""
     check_names([board], BOARDS, "board")
     size = 8 if double else 4
     flash, ram = BOARDS[board]
