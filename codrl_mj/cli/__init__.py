@@ -35,6 +35,7 @@ VERBS: dict[str, tuple[str, str, str]] = {
     "data": ("data:Data", "List or fetch measurements of real motors that others have published.", "dfki_pendulum"),
     "cache": ("cache:Cache", "Show or clear the compiled code that is kept on disk.", "--clear"),
     "export": ("export:Export", "Take a policy out: ONNX, and all that it assumes.", "runs/mine --out mine"),
+    "board": ("board:BoardTools", "Run the exported C as a controller, or check its log.", "test mine"),
     "validate": ("validate:Validate", "Certify that the port is right.", "cartpole --out certificate"),
 }
 """The verbs by name; the module of one is imported when it is called."""

@@ -55,7 +55,8 @@ class Export:
         ]
         print_table(f"{contract.task}, {agent}, {contract.rate:g} Hz", ("", "name", "unit", "range"), rows)
         weights = Network.of(subject.policy).size
-        say(f"wrote {self.out}: policy.onnx, contract.json, controller.c ({weights} numbers); try: cc -std=c99 *.c -lm")
+        written = f"wrote {self.out}: policy.onnx, contract.json, controller.c ({weights} numbers)"
+        say(f"{written}; try: codrl-mj board test {self.out}")
         return 0
 
 

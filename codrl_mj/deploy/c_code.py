@@ -13,7 +13,7 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import check_names
 from codrl_mj.tasks.assets import asset_path
 
-FILES = ("controller.h", "controller.c", "main.c")
+FILES = ("controller.h", "controller.c", "main.c", "wire.h", "wire.c", "board.c", "board.ld")
 BOARDS = {  # name -> bytes of flash memory for a program, and of RAM
     "arduino-uno": (32_256, 2_048),
     "arduino-due": (524_288, 98_304),
@@ -102,6 +102,8 @@ def c_files(network: Network, contract: Contract, loop: dict[str, Any] | None, d
         "commands": contract.actions,
         "choices": len(network.layers[-1].bias),
         "tolerance": golden["tolerance"],
+        "late_after": f"{round(1e6 * contract.late['after'])}u",
+        "safe": contract.late["command"],
         "golden_seen": golden["observations"],
         "golden_commands": acted.reshape(len(acted), -1) if levels is None else levels[acted],
         "constants": size

@@ -51,7 +51,7 @@ class Contract:
     actuators: dict[str, dict[str, Any]]
     """Motor, or pattern of motors -> its fields, None for an ideal one, and their `sha256`."""
     assumed: dict[str, Any]
-    """The rest of the environment: command, delays, quanta and noise, joints, what was drawn."""
+    """The environment, as `EnvConfig.from_mapping` reads it: command, delays, quanta, joints, what was drawn."""
     late: dict[str, Any]
     """What to do when no observation or command comes."""
     golden: dict[str, Any]
@@ -85,8 +85,6 @@ class Contract:
             entry |= {"scale": float(network.factors[place]), "offset": 0.0}
             entry["seen"] = [float(seen[:, place].min()), float(seen[:, place].max())]
         acted = policy.predict(chosen, deterministic=True)[0]
-        kept = env.as_mapping()
-        assumed = {name: kept[name] for name in ("action", "physics", "joint", "disturbances", "randomize", "options")}
         return cls(
             task=env.task,
             agent=agent,
@@ -94,7 +92,7 @@ class Contract:
             observations=observations,
             actions=actions,
             actuators={name: _told(mapping_of(one)) for name, one in env.driven.items()},
-            assumed=json.loads(json.dumps(assumed)),
+            assumed=json.loads(json.dumps(env.as_mapping())),
             late={"after": LATE * period, "unit": "s", "command": [0.0] * len(actions)},
             golden={"observations": chosen.tolist(), "actions": acted.tolist(), "tolerance": 1e-5},
             versions={

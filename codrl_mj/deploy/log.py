@@ -1,0 +1,107 @@
+"""What a controller saw and did, as a table of columns, and whether its contract was kept."""
+
+import csv
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from codrl_mj.deploy.board import OnnxPolicy
+from codrl_mj.deploy.contract import Contract
+from codrl_mj.evaluation import Episode
+from codrl_mj.runs.files import writing
+
+TIME = ("time", "s")
+
+
+@dataclasses.dataclass(frozen=True)
+class LogCheck:
+    """How a recorded log keeps its contract."""
+
+    rows: int
+    """Observations in it."""
+    rate: float
+    """Median of how many came in a second [Hz]."""
+    late: int
+    """How many came later after the one before than the contract allows."""
+    outside: dict[str, int]
+    """Observation -> in how many rows it is outside of what the golden episodes had, by more than a tenth."""
+    differing: int
+    """Rows whose command is not the policy's, by more than the contract's tolerance."""
+    worst: float
+    """Largest difference of a command, in its unit."""
+
+
+def write_log(path: Path, contract: Contract, episode: Episode) -> None:
+    """Write an episode as a log: a column `time:s`, one of every observation and one of every action, `name:unit`."""
+    columns = [TIME, *((one["name"], one["unit"]) for one in (*contract.observations, *contract.actions))]
+    with writing(path) as part, part.open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(f"{name}:{unit}" if unit else name for name, unit in columns)
+        commands = _commands(contract, episode.action)
+        for step, row in enumerate(np.hstack([episode.observation[:-1], commands]).tolist()):
+            table.writerow([step / contract.rate, *row])
+
+
+def check_log(folder: Path, path: Path) -> LogCheck:
+    """Hold a log that a controller recorded against its contract.
+
+    Args:
+        folder: what `codrl_mj.deploy.export` wrote.
+        path: comma-separated columns `name:unit`: `time:s`, the observations in the order in which they came, and the
+            commands that were sent. Columns are known by their names; a unit that is left out is not compared.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        ValueError: the table cannot be read, or its observations are not those of the policy: permuted, missing,
+            unknown, of another unit, at another rate.
+    """
+    contract = Contract.read(folder)
+    with path.open(newline="") as file:
+        header, *rows = list(csv.reader(file)) or [[]]
+    columns = [(name.strip(), unit.strip() or None) for name, _, unit in (one.partition(":") for one in header)]
+    names = [name for name, _ in columns]
+    where = {name: place for place, name in enumerate(names)}  # of equal names the last
+    if missing := [one for one in ("time", *(one["name"] for one in contract.actions)) if one not in names]:
+        raise ValueError(f"{path}: has no column {missing[0]!r}, only {', '.join(names)}: call the columns name:unit")
+    if columns[where["time"]][1] not in (None, "s"):
+        raise ValueError(f"{path}: column 'time': its unit is {columns[names.index('time')][1]}, must be s: convert it")
+    for place, row in enumerate(rows, 2):
+        if len(row) != len(header):
+            raise ValueError(f"{path}: line {place} has {len(row)} cells, must have {len(header)}")
+    try:
+        table = np.array(rows, dtype=np.float64)
+    except ValueError as error:
+        raise ValueError(f"{path}: every cell must be a number: {error}") from None
+    if len(table) < 2 or not np.isfinite(table).all():
+        raise ValueError(f"{path}: must have at least two rows of finite numbers, has {len(table)}")
+    if (steps := np.diff(table[:, where["time"]])).min() <= 0.0:
+        raise ValueError(f"{path}: line {int(steps.argmin()) + 3}: time must increase from row to row")
+    sent = [where[one["name"]] for one in contract.actions]
+    seen = [place for place in range(len(names)) if place not in (*sent, where["time"])]
+    rate = 1.0 / float(np.median(steps))
+    contract.admit([columns[place] for place in seen], rate)
+    for one, place in zip(contract.actions, sent, strict=True):
+        if None not in (columns[place][1], one["unit"]) and columns[place][1] != one["unit"]:
+            raise ValueError(
+                f"{path}: action {one['name']!r}: its unit is {columns[place][1]}, must be {one['unit']}: convert it"
+            )
+    observed, commands = table[:, seen], table[:, sent]
+    off = np.abs(commands - _commands(contract, OnnxPolicy(folder).predict(observed)[0])).max(axis=1)
+    low, high = np.array([one["seen"] for one in contract.observations]).T
+    beyond = (observed < low - 0.1 * (high - low)) | (observed > high + 0.1 * (high - low))
+    return LogCheck(
+        rows=len(table),
+        rate=rate,
+        late=int((steps > contract.late["after"]).sum()),
+        outside={one["name"]: int(beyond[:, place].sum()) for place, one in enumerate(contract.observations)},
+        differing=int((off > contract.golden["tolerance"]).sum()),
+        worst=float(off.max()),
+    )
+
+
+def _commands(contract: Contract, actions: np.ndarray) -> np.ndarray:
+    """Commands in their units, shape (n, m), for actions, of which discrete ones are indices of levels."""
+    if actions.ndim > 1 or "levels" not in contract.actions[0]:
+        return actions.reshape(len(actions), -1)
+    return np.array([one["levels"] for one in contract.actions]).T[actions]

@@ -1,0 +1,204 @@
+"""The exported C as the controller of the simulation: over its wire, on this machine and on an emulated board."""
+
+import binascii
+import ctypes
+import struct
+import subprocess
+
+import numpy as np
+import pytest
+
+from codrl_mj.cli import main
+from codrl_mj.deploy import Board, Contract, OnnxPolicy, board_test, check_log, export, write_log
+from codrl_mj.deploy.board import TARGETS, missing_tools
+from codrl_mj.envs.config import EnvConfig
+from tests.deploy.test_export import trained
+
+pytestmark = pytest.mark.skipif(bool(missing_tools("host")), reason="NOT RUN: no C compiler: apt-get install gcc")
+ON = [
+    pytest.param(name, marks=pytest.mark.skipif(bool(missing_tools(name)), reason=f"NOT RUN: {missing_tools(name)}"))
+    for name in TARGETS
+]
+OK, DAMAGED, OLD, NOT_FINITE, LATE = 0, 1, 2, 4, 8
+
+
+@pytest.fixture(scope="module", params=[("furuta", "ppo", False), ("cartpole", "dqn", True)], ids=lambda one: one[0])
+def folder(request, tmp_path_factory):
+    """A policy with random weights, exported in float and in double."""
+    task, agent, double = request.param
+    out = tmp_path_factory.mktemp("exported") / task
+    export(trained(task, agent)[0], EnvConfig(task), agent, out, 1, double=double)
+    return out
+
+
+@pytest.mark.parametrize("target", ON)
+def test_episodes_on_the_board_are_those_of_onnxruntime(folder, target):
+    done = board_test(folder, target, 3, seed=5)
+    assert done.frames == sum(len(one.time) for one in done.on_board)
+    assert (done.refused, done.unanswered, done.alike) == (0, 0, 3)
+    np.testing.assert_allclose(done.returns[:, 0], done.returns[:, 1], rtol=1e-3)
+
+
+@pytest.mark.parametrize("target", ON)
+def test_golden_commands_come_back_over_the_wire(folder, target):
+    golden = Contract.read(folder).golden
+    with Board(folder, target) as board:
+        got, _ = board.predict(np.array(golden["observations"], np.float32))
+    np.testing.assert_allclose(got, golden["actions"], atol=1e-6)
+
+
+def test_a_weight_changed_in_the_c_changes_what_the_simulation_does(folder, tmp_path):
+    for one in folder.iterdir():
+        (tmp_path / one.name).write_bytes(one.read_bytes())
+    source = tmp_path / "controller.c"
+    begin, _, rest = source.read_text().partition("bias_0[64] = {")
+    source.write_text(f"{begin}bias_0[64] = {{9.0f + {rest}")
+    done = board_test(tmp_path, episodes=3)
+    assert not np.array_equal(done.on_board[0].action, done.in_python[0].action)
+
+
+def test_lost_and_damaged_frames_are_answered_for_safety(folder):
+    done = board_test(folder, episodes=2, lost=0.1, damaged=0.1)
+    assert done.refused > 0
+    assert done.unanswered > 0
+    with Board(folder, damaged=1.0) as board:  # whichever bit it is: never a command of the policy
+        for row in Contract.read(folder).golden["observations"]:
+            assert not board.command(np.array(row)).any()
+        assert board.refused == board.frames
+
+
+def asked(folder, program, sent):
+    """Statuses and commands that the program answers to bytes, read as frames with a checksum of their own."""
+    contract = Contract.read(folder)
+    kind = "d" if contract.task == "cartpole" else "f"
+    form = struct.Struct(f"<HBBI{len(contract.actions)}{kind}H")
+    got = subprocess.run([program], input=sent, capture_output=True, check=True, timeout=20).stdout
+    answers = []
+    for one in range(0, len(got), form.size):
+        start, sequence, status, stamp, *command, check = form.unpack(got[one : one + form.size])
+        assert start == 0x5AA5
+        assert check == binascii.crc_hqx(got[one + 2 : one + form.size - 2], 0xFFFF)
+        answers.append((sequence, status, stamp, command))
+    return answers
+
+
+@pytest.fixture
+def program(folder, tmp_path):
+    """The controller for this machine, with gcc's sanitizers."""
+    built = str(tmp_path / "controller")
+    sources = [str(folder / name) for name in ("controller.c", "wire.c", "board.c")]
+    strict = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-Wconversion", "-Wpedantic", "-fsanitize=address,undefined"]
+    subprocess.run(["cc", *strict, *sources, "-lm", "-o", built], check=True)
+    return built
+
+
+def frame(folder, sequence, stamp, row):
+    kind = "d" if Contract.read(folder).task == "cartpole" else "f"
+    content = struct.pack(f"<BBI{len(row)}{kind}", sequence, 0, stamp % 2**32, *row)
+    return b"\xa5\x5a" + content + struct.pack("<H", binascii.crc_hqx(content, 0xFFFF))
+
+
+def test_every_frame_damaged_doubled_late_or_old_is_told_and_the_next_is_understood(folder, program):
+    rows = Contract.read(folder).golden["observations"]
+    good = [frame(folder, n, 2**32 - 40_000 + 20_000 * n, rows[n]) for n in range(6)]  # the clock comes around
+    want = [command for *_, command in asked(folder, program, b"".join(good))]
+    flipped = bytearray(good[1])
+    flipped[11] ^= 4
+    hours = frame(folder, 7, 3_600_000_000, rows[5])
+    infinite = frame(folder, 8, 60_000, [np.inf, *rows[5][1:]])
+    sent = [b"\xa5noise\xa5\x5a", good[0], bytes(flipped), good[1], good[1], good[0], good[4], infinite, hours]
+    got = asked(folder, program, b"".join(sent[1:]))
+    safe = [0.0] * len(want[0])
+    assert [status for _, status, *_ in got] == [OK, DAMAGED, OK, OLD, OLD, LATE, NOT_FINITE, OLD]
+    assert [command for *_, command in got] == [want[0], safe, want[1], want[1], want[1], want[4], safe, safe]
+    # noise that begins like a frame takes the next one with it; the one after is understood
+    after = asked(folder, program, sent[0] + b"".join(good))
+    assert [command for _, status, _, command in after if status == OK] == want
+
+
+@pytest.mark.parametrize("lacking", [1, 9])
+def test_a_frame_of_which_bytes_are_lost_is_refused_and_those_after_it_come_through(folder, program, lacking):
+    rows = Contract.read(folder).golden["observations"]
+    good = [frame(folder, n, 20_000 * n + 1, rows[n]) for n in range(8)]
+    want = [command for *_, command in asked(folder, program, b"".join(good))]
+    got = asked(folder, program, good[0] + good[1][:-lacking] + b"".join(good[2:]))
+    fine = {sequence: command for sequence, status, _, command in got if status in (OK, LATE)}
+    assert fine == {n: want[n] for n in (0, 2, 3, 4, 5, 6, 7)}
+
+
+def test_the_watchdog_sets_the_command_to_zero(folder, tmp_path):
+    library = tmp_path / "wire.so"
+    sources = [str(folder / name) for name in ("controller.c", "wire.c")]
+    subprocess.run(["cc", "-std=c99", "-shared", "-fPIC", *sources, "-lm", "-o", str(library)], check=True)
+    wire, contract = ctypes.CDLL(str(library)), Contract.read(folder)
+    state, answer = (ctypes.c_ubyte * 1024)(), (ctypes.c_ubyte * 256)()
+    wire.wire_reset(state)
+    assert wire.wire_late(state, 0)  # nothing came yet
+    row = contract.golden["observations"][0]
+    for byte in frame(folder, 1, 1_000, row):
+        wire.wire_byte(state, byte, answer)
+    late = round(1e6 * contract.late["after"])
+    assert not wire.wire_late(state, 1_000 + late)
+    before = bytes(state)
+    assert wire.wire_late(state, 1_001 + late)
+    changed = [after for after, one in zip(bytes(state), before, strict=True) if after != one]
+    assert changed  # the command, and nothing else
+    assert not any(changed)
+
+
+def test_a_log_of_the_board_keeps_its_contract_and_one_that_is_changed_does_not(folder, tmp_path, capsys):
+    log = tmp_path / "log.csv"
+    assert main(["board", "test", str(folder), "--episodes", "1", "--log", str(log)]) == 0
+    assert "1 of 1" in capsys.readouterr().out
+    assert main(["board", "check", str(folder), str(log)]) == 0
+    contract = Contract.read(folder)
+    found = check_log(folder, log)
+    assert (found.late, found.differing) == (0, 0)
+    assert found.rate == pytest.approx(contract.rate)
+    header, *rows = [line.split(",") for line in log.read_text().splitlines()]
+    refused = {
+        "order": ([header[0], header[2], header[1], *header[3:]], rows),
+        "missing": ([header[0], *header[2:]], [[row[0], *row[2:]] for row in rows]),
+        "unit": ([*header[:1], header[1].partition(":")[0] + ":deg", *header[2:]], rows),
+        "knows none": ([*header[:1], "height:m", *header[2:]], rows),
+        "rate": (header, [[str(2.0 * float(row[0])), *row[1:]] for row in rows]),
+        "convert it": ([*header[:-1], header[-1].partition(":")[0] + ":kg"], rows),
+        "increase": (header, [rows[1], rows[0], *rows[2:]]),
+        "cells": (header, [rows[0][:-1], *rows[1:]]),
+        "a number": (header, [["soon", *rows[0][1:]], *rows[1:]]),
+        "no column 'motor'": (header[:-1], [row[:-1] for row in rows]),
+    }
+    for says, table in refused.items():
+        log.write_text("\n".join(",".join(row) for row in (table[0], *table[1])))
+        with pytest.raises(ValueError, match=says):
+            check_log(folder, log)
+    for row in rows:
+        row[-1] = str(float(row[-1]) + 0.01)
+    log.write_text("\n".join(",".join(row) for row in (header, *rows)))
+    assert check_log(folder, log).differing == len(rows)
+    assert main(["board", "check", str(folder), str(log)]) == 1
+
+
+def test_what_cannot_be_run_is_said(folder, tmp_path, monkeypatch, capsys):
+    for line, says in {
+        ("test", str(folder), "--lost", "1.5"): "lost = 1.5: must be a share",
+        ("test", str(folder), "--target", "avr"): "avr",
+        ("test", str(tmp_path)): "contract.json",
+    }.items():
+        assert main(["board", *line]) == 2
+        assert says in capsys.readouterr().err
+    (folder / "board.c").rename(folder / "elsewhere.c")
+    assert main(["board", "test", str(folder)]) == 2
+    assert "board.c: missing: write the folder with codrl-mj export" in capsys.readouterr().err
+    (folder / "elsewhere.c").rename(folder / "board.c")
+    monkeypatch.setenv("PATH", "")
+    assert main(["board", "test", str(folder), "--target", "cortex-m4f"]) == 2
+    assert "apt-get install gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm" in capsys.readouterr().err
+
+
+def test_a_log_is_written_from_an_episode(folder, tmp_path):
+    done = board_test(folder, episodes=1)
+    write_log(tmp_path / "one.csv", Contract.read(folder), done.on_board[0])
+    assert check_log(folder, tmp_path / "one.csv").rows == len(done.on_board[0].time)
+    actions, _ = OnnxPolicy(folder).predict(done.on_board[0].observation[:-1])
+    np.testing.assert_allclose(done.on_board[0].action, actions, atol=1e-6)
