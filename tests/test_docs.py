@@ -124,9 +124,9 @@ SHORTER = {
 """Verb -> flags with which a command takes seconds."""
 NEEDING_MORE = (
     r"identify|data |view|validate (--model|--mutations|--out)|validate *(#.*)?$|.*policies/theirs|.*model.zip"
-    "|.*--backend ray|.*motor/actuator.yaml"
+    "|.*--backend ray|.*motor/actuator.yaml" + ("" if shutil.which("cc") else "|board")
 )
-"""Commands that have logs, a browser, a cluster, somebody else's files or minutes before them: they are only parsed."""
+"""Commands that have logs, a browser, a cluster, a compiler, others' files or minutes before them: they are only parsed."""
 RUNNER = """
 import json, runpy, sys
 from gymnasium.envs.registration import registry
