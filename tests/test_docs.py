@@ -126,7 +126,7 @@ NEEDING_MORE = (
     r"identify|data |view|validate (--model|--mutations|--out)|validate *(#.*)?$|.*policies/theirs|.*model.zip"
     "|.*--backend ray|.*motor/actuator.yaml" + ("" if shutil.which("cc") else "|board")
 )
-"""Commands that have logs, a browser, a cluster, a compiler, others' files or minutes before them: they are only parsed."""
+"""Commands that need logs, a browser, a cluster, a compiler, others' files or minutes: they are only parsed."""
 RUNNER = """
 import json, runpy, sys
 from gymnasium.envs.registration import registry
