@@ -143,12 +143,13 @@ class Board:
         assert self.process.stdin is not None
         self.process.stdin.write(frame)
         self.process.stdin.flush()
-        if (answer := self._read()) is None:
-            self.unanswered += 1
-            return safe
-        _, status, _, *command = self._answer.unpack(answer)
-        self.refused += bool(status & 7)  # damaged, old, or not finite
-        return np.array(command)
+        while (answer := self._read()) is not None:
+            answered, status, _, *command = self._answer.unpack(answer)
+            if answered == sequence or status & 1:  # and not one that came too late; a damaged sequence is sent back
+                self.refused += bool(status & 7)  # damaged, old, or not finite
+                return np.array(command)
+        self.unanswered += 1
+        return safe
 
     def _read(self) -> bytes | None:
         """The next answer without what frames it, None where none comes in time or it is damaged."""
