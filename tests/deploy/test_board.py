@@ -2,6 +2,7 @@
 
 import binascii
 import ctypes
+import os
 import struct
 import subprocess
 
@@ -114,6 +115,30 @@ def test_every_frame_damaged_doubled_late_or_old_is_told_and_the_next_is_underst
     # noise that begins like a frame takes the next one with it; the one after is understood
     after = asked(folder, program, sent[0] + b"".join(good))
     assert [command for _, status, _, command in after if status == OK] == want
+
+
+def test_frames_come_through_a_pseudo_terminal_in_pieces(folder, program):
+    tty = pytest.importorskip("tty")
+    rows = Contract.read(folder).golden["observations"][:20]
+    sent = [frame(folder, n, 20_000 * n + 1, row) for n, row in enumerate(rows)]
+    want = [command for *_, command in asked(folder, program, b"".join(sent))]
+    ours, theirs = os.openpty()
+    tty.setraw(theirs)
+    kind = "d" if Contract.read(folder).task == "cartpole" else "f"
+    form = struct.Struct(f"<HBBI{len(want[0])}{kind}H")
+    with subprocess.Popen([program], stdin=theirs, stdout=theirs) as running:
+        got = []
+        for one in sent:
+            os.write(ours, one[:7])
+            os.write(ours, one[7:])
+            answer = b""
+            while len(answer) < form.size:
+                answer += os.read(ours, form.size - len(answer))
+            got.append(list(form.unpack(answer)[4:-1]))
+        running.kill()
+    os.close(ours)
+    os.close(theirs)
+    assert got == want
 
 
 @pytest.mark.parametrize("lacking", [1, 9])
