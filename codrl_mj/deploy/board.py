@@ -105,7 +105,6 @@ class Board:
         self._request = struct.Struct(f"<BBI{len(self.contract.observations)}{kind}")
         self._answer = struct.Struct(f"<BBI{len(self.contract.actions)}{kind}")
         self._period = round(1e6 / self.contract.rate)
-        self._levels = np.array([one["levels"] for one in self.contract.actions if "levels" in one]).T
         self._discrete = np.ndim(self.contract.golden["actions"]) == 1
 
     def __enter__(self) -> "Board":
@@ -124,9 +123,9 @@ class Board:
         commands = np.array([self.command(row) for row in observation])
         if not self._discrete:
             return commands.astype(np.float32), None
-        if not len(self._levels):  # an environment of others: the index itself
+        if (levels := self.contract.levels) is None:  # an environment of others: the index itself
             return commands[:, 0].round().astype(np.int64), None
-        return np.abs(commands[:, None, :] - self._levels).sum(axis=2).argmin(axis=1), None
+        return np.abs(commands[:, None, :] - levels).sum(axis=2).argmin(axis=1), None
 
     def command(self, observation: np.ndarray) -> np.ndarray:
         """The command for an observation, in the units of the contract; that for safety if no good answer comes."""

@@ -80,13 +80,11 @@ def c_files(network: Network, contract: Contract, loop: dict[str, Any] | None, d
         return "{" + ", ".join(number(value) for value in np.ravel(values)) + "}"
 
     golden = contract.golden
-    levels = None
-    if network.low is None:  # of an environment of others nobody knows what they stand for but their index
-        unknown = list(range(len(network.layers[-1].bias)))
-        levels = np.array([one.get("levels", unknown) for one in contract.actions], dtype=np.float64).T
+    levels = contract.levels
+    if network.low is None and levels is None:  # an environment of others: what they stand for is their index
+        levels = np.arange(len(network.gains), dtype=np.float64)[:, None]
     acted = np.array(golden["actions"])
     size = 8 if double else 4
-    width = max(len(network.factors), *(len(layer.bias) for layer in network.layers))
     known = {
         "version": codrl_mj.__version__,
         "real": kind,
@@ -95,7 +93,7 @@ def c_files(network: Network, contract: Contract, loop: dict[str, Any] | None, d
         "current": loop,
         "tanh": f"tanh{suffix}",
         "fabs": f"fabs{suffix}",
-        "width": width,
+        "width": network.width,
         "levels": levels,
         **{name: getattr(network, name) for name in ("factors", "layers", "gains", "low", "high", "squashed")},
         **{name: getattr(contract, name) for name in ("task", "agent", "rate", "observations")},
@@ -105,10 +103,10 @@ def c_files(network: Network, contract: Contract, loop: dict[str, Any] | None, d
         "late_after": f"{round(1e6 * contract.late['after'])}u",
         "safe": contract.late["command"],
         "golden_seen": golden["observations"],
-        "golden_commands": acted.reshape(len(acted), -1) if levels is None else levels[acted],
+        "golden_commands": contract.commands(acted),
         "constants": size
         * (network.size + len(network.factors) + (3 * len(acted[0]) if levels is None else levels.size)),
-        "stack": 2 * size * width,
+        "stack": 2 * size * network.width,
         "state": 2 * size,
         "products": sum(layer.weight.size for layer in network.layers),
         "tanhs": sum(len(layer.bias) for layer in network.layers if layer.activation == "Tanh"),
@@ -122,8 +120,7 @@ def check_board(board: str, network: Network, double: bool = False) -> None:
     check_names([board], BOARDS, "board")
     size = 8 if double else 4
     flash, ram = BOARDS[board]
-    width = max(len(network.factors), *(len(layer.bias) for layer in network.layers))
-    for what, needed, there in (("flash", size * network.size + CODE, flash), ("RAM", 2 * size * width, ram)):
+    for what, needed, there in (("flash", size * network.size + CODE, flash), ("RAM", 2 * size * network.width, ram)):
         if needed > there:
             raise ValueError(
                 f"board {board}: the policy needs about {needed} bytes of {what}, must be at most {there}: train a "

@@ -121,6 +121,16 @@ class Contract:
         """Write `contract.json` into a folder, whole or not at all, with a digest of itself."""
         write_json(folder / FILE, sealed({"format": FORMAT, **dataclasses.asdict(self)}))
 
+    @property
+    def levels(self) -> np.ndarray | None:
+        """What discrete actions stand for, (choices, m) in the units of `actions`; None of others, or if not known."""
+        levels = [one["levels"] for one in self.actions if "levels" in one]
+        return np.array(levels, dtype=np.float64).T if levels else None
+
+    def commands(self, actions: np.ndarray) -> np.ndarray:
+        """Commands (n, m) in the units of `actions`, for actions (n, m), or indices (n,) of the levels."""
+        return actions.reshape(len(actions), -1) if self.levels is None else self.levels[actions]
+
     def admit(self, observations: Sequence[tuple[str, str | None]], rate: float | None = None) -> None:
         """Refuse observations that are not those of the policy.
 

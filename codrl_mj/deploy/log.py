@@ -38,7 +38,7 @@ def write_log(path: Path, contract: Contract, episode: Episode) -> None:
     with writing(path) as part, part.open("w", newline="") as file:
         table = csv.writer(file)
         table.writerow(f"{name}:{unit}" if unit else name for name, unit in columns)
-        commands = _commands(contract, episode.action)
+        commands = contract.commands(episode.action)
         for step, row in enumerate(np.hstack([episode.observation[:-1], commands]).tolist()):
             table.writerow([step / contract.rate, *row])
 
@@ -87,7 +87,7 @@ def check_log(folder: Path, path: Path) -> LogCheck:
                 f"{path}: action {one['name']!r}: its unit is {columns[place][1]}, must be {one['unit']}: convert it"
             )
     observed, commands = table[:, seen], table[:, sent]
-    off = np.abs(commands - _commands(contract, OnnxPolicy(folder).predict(observed)[0])).max(axis=1)
+    off = np.abs(commands - contract.commands(OnnxPolicy(folder).predict(observed)[0])).max(axis=1)
     low, high = np.array([one["seen"] for one in contract.observations]).T
     beyond = (observed < low - 0.1 * (high - low)) | (observed > high + 0.1 * (high - low))
     return LogCheck(
@@ -98,10 +98,3 @@ def check_log(folder: Path, path: Path) -> LogCheck:
         differing=int((off > contract.golden["tolerance"]).sum()),
         worst=float(off.max()),
     )
-
-
-def _commands(contract: Contract, actions: np.ndarray) -> np.ndarray:
-    """Commands in their units, shape (n, m), for actions, of which discrete ones are indices of levels."""
-    if actions.ndim > 1 or "levels" not in contract.actions[0]:
-        return actions.reshape(len(actions), -1)
-    return np.array([one["levels"] for one in contract.actions]).T[actions]

@@ -113,6 +113,11 @@ class Network:
         return low + kind(0.5) * (values + kind(1.0)) * (high - low) if self.squashed else np.clip(values, low, high)
 
     @property
+    def width(self) -> int:
+        """The most numbers between two layers."""
+        return max(len(self.factors), *(len(layer.bias) for layer in self.layers))
+
+    @property
     def size(self) -> int:
         """How many weights and biases there are."""
         return sum(layer.weight.size + layer.bias.size for layer in self.layers)

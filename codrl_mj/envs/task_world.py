@@ -187,7 +187,8 @@ class TaskWorld(World):
         from codrl_mj.envs.commands import command_of
         from codrl_mj.envs.setup import Setup
 
-        setup, view = Setup.build(config), Setup.build(config).view
+        setup = Setup.build(config)
+        view = setup.view
         of_sensors = [setup.actuators[0].SIGNAL_UNITS.get(name.rpartition(".")[2]) for name in view.sensors]
         seen = described(view.observation_names, view.observation_space, [*self.task.observation_units, *of_sensors])
         at_joint = ["N*m" if unit == "rad" else "N" for unit in self.task.joint_units]

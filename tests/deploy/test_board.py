@@ -68,11 +68,14 @@ def test_lost_and_damaged_frames_are_answered_for_safety(folder):
         assert board.refused == board.frames
 
 
+def kind_of(folder):
+    """The numbers of a folder's C, as `struct` calls them."""
+    return "d" if Contract.read(folder).task == "cartpole" else "f"
+
+
 def asked(folder, program, sent):
     """Statuses and commands that the program answers to bytes, read as frames with a checksum of their own."""
-    contract = Contract.read(folder)
-    kind = "d" if contract.task == "cartpole" else "f"
-    form = struct.Struct(f"<HBBI{len(contract.actions)}{kind}H")
+    form = struct.Struct(f"<HBBI{len(Contract.read(folder).actions)}{kind_of(folder)}H")
     got = subprocess.run([program], input=sent, capture_output=True, check=True, timeout=20).stdout
     answers = []
     for one in range(0, len(got), form.size):
@@ -94,8 +97,7 @@ def program(folder, tmp_path):
 
 
 def frame(folder, sequence, stamp, row):
-    kind = "d" if Contract.read(folder).task == "cartpole" else "f"
-    content = struct.pack(f"<BBI{len(row)}{kind}", sequence, 0, stamp % 2**32, *row)
+    content = struct.pack(f"<BBI{len(row)}{kind_of(folder)}", sequence, 0, stamp % 2**32, *row)
     return b"\xa5\x5a" + content + struct.pack("<H", binascii.crc_hqx(content, 0xFFFF))
 
 
@@ -124,8 +126,7 @@ def test_frames_come_through_a_pseudo_terminal_in_pieces(folder, program):
     want = [command for *_, command in asked(folder, program, b"".join(sent))]
     ours, theirs = os.openpty()
     tty.setraw(theirs)
-    kind = "d" if Contract.read(folder).task == "cartpole" else "f"
-    form = struct.Struct(f"<HBBI{len(want[0])}{kind}H")
+    form = struct.Struct(f"<HBBI{len(want[0])}{kind_of(folder)}H")
     with subprocess.Popen([program], stdin=theirs, stdout=theirs) as running:
         got = []
         for one in sent:
