@@ -140,8 +140,9 @@ class Board:
             bit = int(self.random.integers(8 * len(_START), 8 * len(frame)))
             frame[bit // 8] ^= 1 << bit % 8
         assert self.process.stdin is not None
-        self.process.stdin.write(frame)
-        self.process.stdin.flush()
+        with contextlib.suppress(BrokenPipeError):  # reading says that the program ended
+            self.process.stdin.write(frame)
+            self.process.stdin.flush()
         while (answer := self._read()) is not None:
             answered, status, _, *command = self._answer.unpack(answer)
             if answered == sequence or status & 1:  # and not one that came too late; a damaged sequence is sent back

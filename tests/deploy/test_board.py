@@ -205,6 +205,14 @@ def test_a_log_of_the_board_keeps_its_contract_and_one_that_is_changed_does_not(
     assert main(["board", "check", str(folder), str(log)]) == 1
 
 
+def test_a_program_that_ends_is_an_error(folder, tmp_path, capsys):
+    for one in folder.iterdir():
+        (tmp_path / one.name).write_bytes(one.read_bytes())
+    (tmp_path / "board.c").write_text("int main(void) { return 3; }\n")
+    assert main(["board", "test", str(tmp_path), "--episodes", "1"]) == 2
+    assert "the board's program ended at frame 1" in capsys.readouterr().err
+
+
 def test_what_cannot_be_run_is_said(folder, tmp_path, monkeypatch, capsys):
     for line, says in {
         ("test", str(folder), "--lost", "1.5"): "lost = 1.5: must be a share",
