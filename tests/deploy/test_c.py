@@ -2,13 +2,14 @@
 
 import ctypes
 import dataclasses
+import math
 import shutil
 import subprocess
 
 import numpy as np
 import pytest
 
-from codrl_mj.actuators import Drive
+from codrl_mj.actuators import Actuator, Drive, Servo, ServoLoop, Supply, electrical_step
 from codrl_mj.actuators.drive import State
 from codrl_mj.actuators.model import Inputs
 from codrl_mj.actuators.parameters import parameters_type
@@ -128,9 +129,91 @@ def test_the_current_loop_in_c_is_the_drive_s_sample_by_sample(tmp_path, name, d
     assert 20 < saturated < 2900
 
 
+PID = {
+    "the paper's": {},
+    "filtered": {"kp": 3.0, "ki": 15.0, "kd": 1e-3, "integral_leak": 0.4, "derivative_time_constant": 5e-3},
+    "fed forward": {"kff": 0.7, "bemf_compensation": False, "max_voltage": math.inf},
+    "sagging": {"max_voltage": 9.0, "substeps": 4},
+}
+
+
+@pytest.mark.parametrize("double", [False, True])
+@pytest.mark.parametrize("name", PID)
+def test_the_paper_s_loop_in_c_is_the_actuator_s_sample_by_sample(tmp_path, name, double):
+    (usual,) = EnvConfig("cartpole").driven.values()
+    controller = dataclasses.replace(usual.controller, **PID[name])
+    supply = Supply(12.0, 0.5) if name == "sagging" else usual.supply
+    actuator = dataclasses.replace(usual, controller=controller, supply=supply)
+    written(tmp_path, "cartpole", "dqn", {}, double, actuator=actuator)
+    library, kind = compiled(tmp_path), KINDS[double]
+    library.current_step.restype = library.current_reference.restype = kind
+    parameters = parameters_type(Actuator)(*actuator.numbers)
+    header = (tmp_path / "controller.h").read_text()
+    period = 1.0 / float(header.partition("CONTROLLER_CURRENT_RATE ")[2].partition(" ")[0].rstrip("f"))
+    assert period == pytest.approx(EnvConfig("cartpole").make().unwrapped.model.opt.timestep / controller.substeps)
+    state, random, saturated = (kind * 2)(), np.random.default_rng(0), 0
+    library.current_reset(state)
+    current = integral = error = 0.0
+    for sample in range(2000):
+        if sample % 20 == 0:
+            force, speed = random.uniform(-60.0, 60.0), random.uniform(-4.0, 4.0)
+        if not double:  # from equal states: rounding adds up in an integral
+            state[:] = integral, error
+        available = min(controller.max_voltage, math.inf if supply is None else supply.voltage)
+        if name == "sagging":
+            available = min(controller.max_voltage, max(supply.voltage - supply.resistance * abs(current), 0.0))
+        reference = kind(library.current_reference(kind(force)))
+        volts = library.current_step(state, reference, kind(current), kind(speed))
+        torque = force * actuator.arm_radius
+        given = parameters, period, current, integral, error, torque, speed, 0.0, available
+        current, integral, error, wanted = electrical_step(*given)
+        assert volts == pytest.approx(wanted, rel=1e-12 if double else 1e-5, abs=1e-11 if double else 2e-5)
+        saturated += abs(wanted) == available
+    assert (saturated > 20) == (name != "fed forward")
+    assert list(state) == pytest.approx([integral, error], rel=1e-9 if double else 1e-4, abs=1e-9 if double else 1e-4)
+
+
+SERVOS = {
+    "position": {"velocity_gain": 0.02, "position_gain": 15.0, "velocity_integral_gain": 3.0, "max_torque": 0.2},
+    "ahead": {"velocity_gain": 0.005, "position_gain": 4.0, "velocity_feed_forward": 0.9, "max_velocity": 8.0},
+    "velocity": {"controls": "velocity", "velocity_gain": 0.01, "inertia_feed_forward": 2e-5, "max_torque": 0.1},
+}
+
+
+@pytest.mark.parametrize("double", [False, True])
+@pytest.mark.parametrize("name", SERVOS)
+def test_the_servo_s_loops_in_c_are_the_servo_s_sample_by_sample(tmp_path, name, double):
+    (drive,) = EnvConfig("furuta").driven.values()
+    loop = ServoLoop(servo_rate=500.0, **SERVOS[name])
+    servo = Servo(dataclasses.replace(drive.motor, gear_ratio=3.0), drive.controller, drive.supply, loop)
+    written(tmp_path, "furuta", "ppo", {}, double, actuator=servo, action=loop.controls)
+    library, kind = compiled(tmp_path), KINDS[double]
+    library.servo_step.restype = library.servo_target.restype = kind
+    assert library.servo_target(kind(0.5)) == pytest.approx(0.5 * 3.0)
+    state, random, limited, free = (kind * 1)(), np.random.default_rng(0), 0, 0
+    library.servo_reset(state)
+    parameters, period = parameters_type(Servo)(*servo.numbers), 1.0 / loop.servo_rate
+    ours, position, speed = Servo.State(*[0.0] * len(Servo.State._fields)), 0.0, 0.0
+    for sample in range(2000):
+        if sample % 50 == 0:
+            target = random.uniform(-6.0, 6.0) if loop.controls == "position" else random.uniform(-30.0, 30.0)
+        target += random.uniform(-0.01, 0.01)
+        position, speed = 0.9 * position + random.uniform(-1.0, 1.0), random.uniform(-20.0, 20.0)
+        rate = (target - ours.target) / period if ours.due > 0.0 else 0.0
+        if not double:
+            state[0] = ours.velocity_integral
+        ours, _, signals = Servo.advance(parameters, period, ours, Inputs(target, position, speed, sample * period, 0.0))
+        reference = library.servo_step(state, kind(target), kind(rate), kind(position), kind(speed))
+        assert reference == pytest.approx(signals.reference_current, rel=0, abs=1e-12 if double else 5e-6)
+        assert state[0] == pytest.approx(ours.velocity_integral, rel=0, abs=1e-12 if double else 1e-7)
+        limited += signals.current_saturated
+        free += not signals.current_saturated
+    assert min(limited, free) > (50 if loop.max_torque < math.inf else -1)
+
+
 @pytest.mark.parametrize(
     ("task", "changes"),
-    [("cartpole", {}), ("furuta", {"actuator": "ideal"}), ("furuta", {"action": "voltage"})],
+    [("cartpole", {"actuator": "ideal"}), ("mountain_car_continuous", {"action": "voltage"}), ("furuta", {"action": "voltage"})],
 )
 def test_without_a_drive_s_loop_there_is_the_policy_alone(tmp_path, task, changes):
     assert current_loop(EnvConfig(task, **changes)) is None
