@@ -202,7 +202,9 @@ def test_the_servo_s_loops_in_c_are_the_servo_s_sample_by_sample(tmp_path, name,
         rate = (target - ours.target) / period if ours.due > 0.0 else 0.0
         if not double:
             state[0] = ours.velocity_integral
-        ours, _, signals = Servo.advance(parameters, period, ours, Inputs(target, position, speed, sample * period, 0.0))
+        ours, _, signals = Servo.advance(
+            parameters, period, ours, Inputs(target, position, speed, sample * period, 0.0)
+        )
         reference = library.servo_step(state, kind(target), kind(rate), kind(position), kind(speed))
         assert reference == pytest.approx(signals.reference_current, rel=0, abs=1e-12 if double else 5e-6)
         assert state[0] == pytest.approx(ours.velocity_integral, rel=0, abs=1e-12 if double else 1e-7)
@@ -213,7 +215,11 @@ def test_the_servo_s_loops_in_c_are_the_servo_s_sample_by_sample(tmp_path, name,
 
 @pytest.mark.parametrize(
     ("task", "changes"),
-    [("cartpole", {"actuator": "ideal"}), ("mountain_car_continuous", {"action": "voltage"}), ("furuta", {"action": "voltage"})],
+    [
+        ("cartpole", {"actuator": "ideal"}),
+        ("mountain_car_continuous", {"action": "voltage"}),
+        ("furuta", {"action": "voltage"}),
+    ],
 )
 def test_without_a_drive_s_loop_there_is_the_policy_alone(tmp_path, task, changes):
     assert current_loop(EnvConfig(task, **changes)) is None
