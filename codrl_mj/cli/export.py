@@ -32,6 +32,9 @@ class Export:
     """Seed of the first of them."""
     float64: bool = False
     """Compute in double in the C, not in float."""
+    limit: tuple[str, ...] = ()
+    """Largest safe size of observations, as arm_velocity=30 arm=1.8: beyond, the command is that for safety. An angle
+    that is observed as cos_arm and sin_arm is called arm."""
     board: str | None = None
     """What it is to fit: arduino-uno, arduino-due, nucleo-f446re, raspberry-pi-pico or teensy-4.1."""
 
@@ -46,7 +49,7 @@ class Export:
             from codrl_mj.training.folder import load_config
 
             agent = load_config(subject.run, self.source.trust).agent.known_as()
-        given = self.out, self.episodes, self.seed, self.float64, self.board
+        given = self.out, self.episodes, self.seed, self.float64, self.board, dict(map(_limit, self.limit))
         contract = export(subject.policy, subject.env, agent, *given)
         rows = [
             (side, one["name"], one.get("unit") or "?", _bounds(one))
@@ -58,6 +61,14 @@ class Export:
         written = f"wrote {self.out}: policy.onnx, contract.json, controller.c ({weights} numbers)"
         say(f"{written}; try: codrl-mj board test {self.out}")
         return 0
+
+
+def _limit(text: str) -> tuple[str, float]:
+    name, _, most = text.partition("=")
+    try:
+        return name, float(most)
+    except ValueError:
+        raise ValueError(f"--limit {text}: must be NAME=NUMBER, such as arm_velocity=30") from None
 
 
 def _bounds(entry: dict[str, Any]) -> str:

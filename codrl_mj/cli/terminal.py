@@ -1,7 +1,8 @@
 """What a person sees in a terminal: lines, tables and progress bars."""
 
+import contextlib
 import sys
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from typing import Any
 
 from rich import box
@@ -74,3 +75,22 @@ def progress_bar(*columns: str) -> Progress:
         TimeRemainingColumn(table_column=Column(no_wrap=True)),
         console=console(),
     )
+
+
+@contextlib.contextmanager
+def any_key() -> Iterator[Callable[[], bool]]:
+    """Gives a function that says whether a key was pressed since; never, where there is no terminal."""
+    if not sys.stdin.isatty():
+        yield lambda: False
+        return
+    import select
+    import termios
+    import tty
+
+    before = termios.tcgetattr(sys.stdin)
+    tty.setcbreak(sys.stdin)
+    try:
+        yield lambda: bool(select.select([sys.stdin], [], [], 0.0)[0])
+    finally:
+        termios.tcflush(sys.stdin, termios.TCIFLUSH)
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)

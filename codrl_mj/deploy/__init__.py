@@ -1,24 +1,32 @@
 """A trained policy, taken out of the simulator: as ONNX, as C, and with all that it assumes of its controller."""
 
-from codrl_mj.deploy.board import Board, BoardTest, OnnxPolicy, board_test
-from codrl_mj.deploy.c_code import c_files, current_loop
+from codrl_mj.deploy.board import Board, BoardTest, Link, OnnxPolicy, board_test, instructions
+from codrl_mj.deploy.c_code import c_files
 from codrl_mj.deploy.contract import Contract
 from codrl_mj.deploy.export import export, onnx_model
 from codrl_mj.deploy.log import LogCheck, check_log, write_log
+from codrl_mj.deploy.loops import current_loop
 from codrl_mj.deploy.network import Network
+from codrl_mj.deploy.run import BoardRun, run_board
+from codrl_mj.deploy.wire import Wire
 
 __all__ = [
     "Board",
+    "BoardRun",
     "BoardTest",
     "Contract",
+    "Link",
     "LogCheck",
     "Network",
     "OnnxPolicy",
+    "Wire",
     "board_test",
     "c_files",
     "check_log",
     "current_loop",
     "export",
+    "instructions",
     "onnx_model",
+    "run_board",
     "write_log",
 ]

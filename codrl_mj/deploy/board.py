@@ -1,25 +1,22 @@
 """The exported C as the controller of the simulation: compiled, run here or on an emulated board, asked over a wire."""
 
-import binascii
 import contextlib
 import dataclasses
-import os
-import select
 import shutil
-import struct
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from codrl_mj.deploy.contract import Contract
+from codrl_mj.deploy.wire import BEYOND, REFUSED, Wire
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import Episode, run_episodes
-from codrl_mj.fields import check_names
+from codrl_mj.fields import check, check_names, integer, real
 
 SOURCES = ("controller.c", "wire.c", "board.c")
 _STRICT = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-Wconversion"]
@@ -32,9 +29,9 @@ TARGETS = {  # name -> what it needs: program -> the package of Debian's that ha
         "qemu-system-arm": "qemu-system-arm",
     },
 }
-ANSWER_WITHIN = 5.0
-"""Seconds after which a frame counts as not answered."""
-_START = b"\xa5\x5a"
+NANOSECONDS = 64
+"""Of an emulated instruction, of which QEMU makes only powers of two, where instructions are counted."""
+_TICK = 40  # ns, of the emulated board's clock
 
 
 def missing_tools(target: str) -> str:
@@ -45,13 +42,14 @@ def missing_tools(target: str) -> str:
 
 
 class OnnxPolicy:
-    """The policy of an exported folder by onnxruntime, chosen as other policies are."""
+    """The policy of an exported folder by onnxruntime, chosen as other policies are; within the contract's limits."""
 
     def __init__(self, folder: Path) -> None:
         """Load what `codrl_mj.deploy.export` wrote into a folder."""
         import onnxruntime
 
         self.session = onnxruntime.InferenceSession(folder / "policy.onnx", providers=["CPUExecutionProvider"])
+        self.contract = Contract.read(folder)
 
     def predict(
         self,
@@ -60,58 +58,113 @@ class OnnxPolicy:
         deterministic: bool = True,  # noqa: ARG002 - the protocol's
     ) -> tuple[np.ndarray, Any]:
         """Actions (N, m) or (N,) for observations (N, k)."""
-        return self.session.run(None, {"observation": observation.astype(np.float32)})[0], None
+        actions = self.session.run(None, {"observation": observation.astype(np.float32)})[0]
+        beyond = ~self.contract.within(observation)
+        if beyond.any():
+            actions[beyond] = self.contract.actions_of(np.array([self.contract.late["command"]]))[0]
+        return actions, None
+
+
+@dataclasses.dataclass(frozen=True)
+class Link:
+    """What stands between a board and what it controls; nothing unless something is said.
+
+    Raises:
+        ValueError: a field is out of bounds.
+    """
+
+    lost: float = real(0.0, least=0.0, most=1.0)
+    """Share of the frames that never arrive at the board."""
+    damaged: float = real(0.0, least=0.0, most=1.0)
+    """Share of the frames in which a bit flips on the way."""
+    late: float = real(0.0, least=0.0, most=1.0)
+    """Share of the answers that come a period late: the command before holds."""
+    counts: int = integer(0, least=0)
+    """Steps of the encoders in a turn, in which observed angles come; speeds [rad/s] come as differences of them over a
+    period. 0: exact."""
+    current_bits: int = integer(0, least=0)
+    """Bits of the converter that measures the current, over the drive's range both ways. 0: exact."""
+    pwm_bits: int = integer(0, least=0)
+    """Bits of the bridge's voltages, over the supply both ways. 0: exact."""
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        check(self)
+
+    @property
+    def spoils(self) -> bool:
+        """Whether anything is between them."""
+        return self != Link()
+
+    def encoded(self, contract: Contract, observation: np.ndarray) -> np.ndarray:
+        """An observation (k,) as encoders with so many counts say it."""
+        if not self.counts:
+            return observation
+        seen, step = np.array(observation, np.float64), 2.0 * np.pi / self.counts
+        for place, one in enumerate(contract.observations):
+            size = {"rad": step, "rad/s": step * contract.rate}.get(one["unit"] or "")
+            if size:
+                seen[place] = size * np.round(seen[place] / size)
+            elif one["name"].startswith("cos_"):  # the sine follows it
+                angle = step * np.round(np.arctan2(seen[place + 1], seen[place]) / step)
+                seen[place : place + 2] = np.cos(angle), np.sin(angle)
+        return seen
 
 
 class Board:
     """A policy that is computed by the exported C, in a process of its own, and asked frame by frame in lock step.
 
     A context manager: the process ends with it. Where no answer comes, the contract's command for safety is taken.
+    While it is open, motors of this process ask another, of the same C, for the voltage of each sample of their loop.
     """
 
     def __init__(
-        self, folder: Path, target: str = "host", lost: float = 0.0, damaged: float = 0.0, seed: int = 0
+        self, folder: Path, target: str = "host", link: Link | None = None, seed: int = 0, loop: bool = True
     ) -> None:
         """Compile the C and start it.
 
         Args:
             folder: what `codrl_mj.deploy.export` wrote.
             target: `host`, or `cortex-m4f`, which QEMU emulates.
-            lost: share of the frames that never arrive.
-            damaged: share of them in which a bit has flipped.
-            seed: of which frames these are.
+            link: what stands between; None for nothing.
+            seed: of what is lost, damaged and late.
+            loop: whether the C closes the current loop too, where it has one; else the simulation does.
 
         Raises:
             FileNotFoundError: the folder has no contract or no C.
-            ValueError: the target is unknown, or a share not in [0, 1].
+            ValueError: the target is unknown, or bits are given where the C closes no loop, or has no limit for them.
             RuntimeError: a tool is missing (the message installs it), or the C does not compile.
         """
-        for name, share in (("lost", lost), ("damaged", damaged)):
-            if not 0.0 <= share <= 1.0:
-                raise ValueError(f"{name} = {share}: must be a share of the frames, from 0 to 1")
         if install := missing_tools(target):
             raise RuntimeError(f"target {target}: its tools are missing: {install}")
-        self.contract = Contract.read(folder)
-        self.lost, self.damaged, self.random = lost, damaged, np.random.default_rng(seed)
-        self.frames, self.refused, self.unanswered = 0, 0, 0
+        self.contract, self.link = Contract.read(folder), link or Link()
+        self.random = np.random.default_rng(seed)
+        self.frames, self.refused, self.stopped, self.unanswered = 0, 0, 0, 0
+        self._last = np.array(self.contract.late["command"])
+        self.loop = self.contract.controller["loop"] if loop else None
+        steps = self._converters()
         with contextlib.ExitStack() as held:
-            built = Path(held.enter_context(tempfile.TemporaryDirectory()))
-            self.process = subprocess.Popen(
-                _build(folder, target, built), stdin=subprocess.PIPE, stdout=subprocess.PIPE
-            )
-            held.callback(self._stop)
+            process = held.enter_context(_running(folder, target))
+            self._wire = Wire(self.contract, process.stdin.fileno(), process.stdout.fileno())
+            self._samples = np.zeros(2)
+            if self.loop is not None:
+                from codrl_mj.deploy.on_board import loop_on_board
+
+                family = type(EnvConfig.from_mapping(self.contract.assumed).actuators[0])
+                drive = held.enter_context(_running(folder, target, "BOARD_DRIVE"))
+                self._samples = held.enter_context(loop_on_board(family, drive, self.loop["amperes"], *steps))
             self._held = held.pop_all()
-        kind = "d" if "typedef double real" in (folder / "controller.h").read_text() else "f"
-        self._request = struct.Struct(f"<BBI{len(self.contract.observations)}{kind}")
-        self._answer = struct.Struct(f"<BBI{len(self.contract.actions)}{kind}")
-        self._period = round(1e6 / self.contract.rate)
-        self._discrete = np.ndim(self.contract.golden["actions"]) == 1
 
     def __enter__(self) -> "Board":
         return self
 
     def __exit__(self, *_: object) -> None:
         self._held.close()
+
+    @property
+    def samples(self) -> int:
+        """Samples of the current loop that the board computed."""
+        return int(self._samples[0])
 
     def predict(
         self,
@@ -120,56 +173,46 @@ class Board:
         deterministic: bool = True,  # noqa: ARG002 - the protocol's
     ) -> tuple[np.ndarray, Any]:
         """Actions (N, m) or (N,) for observations (N, k), each asked of the board in a frame of its own."""
-        commands = np.array([self.command(row) for row in observation])
-        if not self._discrete:
-            return commands.astype(np.float32), None
-        if (levels := self.contract.levels) is None:  # an environment of others: the index itself
-            return commands[:, 0].round().astype(np.int64), None
-        return np.abs(commands[:, None, :] - levels).sum(axis=2).argmin(axis=1), None
+        if self._samples[1]:
+            raise RuntimeError(f"the board's current loop did not answer at sample {self.samples}")
+        return self.contract.actions_of(np.array([self.command(row) for row in observation])), None
 
     def command(self, observation: np.ndarray) -> np.ndarray:
         """The command for an observation, in the units of the contract; that for safety if no good answer comes."""
         self.frames += 1
         safe = np.array(self.contract.late["command"])
-        sequence, stamp = self.frames % 256, self.frames * self._period % 2**32
-        frame = bytearray(_framed(self._request.pack(sequence, 0, stamp, *observation.tolist())))
-        if self.random.random() < self.lost:
+        observation = self.link.encoded(self.contract, observation)
+        frame = bytearray(self._wire.frame(self.frames, self.frames * self.contract.period_us, observation))
+        if self.random.random() < self.link.lost:
             self.unanswered += 1
             return safe
-        if self.random.random() < self.damaged:
-            bit = int(self.random.integers(8 * len(_START), 8 * len(frame)))
+        if self.random.random() < self.link.damaged:
+            bit = int(self.random.integers(16, 8 * len(frame)))  # its start is found again in any case
             frame[bit // 8] ^= 1 << bit % 8
-        assert self.process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # reading says that the program ended
-            self.process.stdin.write(frame)
-            self.process.stdin.flush()
-        while (answer := self._read()) is not None:
-            answered, status, _, *command = self._answer.unpack(answer)
-            if answered == sequence or status & 1:  # and not one that came too late; a damaged sequence is sent back
-                self.refused += bool(status & 7)  # damaged, old, or not finite
-                return np.array(command)
-        self.unanswered += 1
-        return safe
+        answer = self._wire.asked(bytes(frame), self.frames)
+        if answer is None:
+            self.unanswered += 1
+            return safe
+        self.refused += bool(answer.status & REFUSED)
+        self.stopped += bool(answer.status & BEYOND)
+        command, self._last = (
+            (self._last, answer.command) if self.random.random() < self.link.late else (answer.command,) * 2
+        )
+        return command
 
-    def _read(self) -> bytes | None:
-        """The next answer without what frames it, None where none comes in time or it is damaged."""
-        assert self.process.stdout is not None
-        size, got = self._answer.size + 4, b""
-        until = time.monotonic() + ANSWER_WITHIN
-        while len(got) < size:
-            ready = select.select([self.process.stdout], [], [], max(0.0, until - time.monotonic()))[0]
-            more = os.read(self.process.stdout.fileno(), size - len(got)) if ready else b""
-            if ready and not more:
-                raise RuntimeError(f"the board's program ended at frame {self.frames}")
-            if not ready:
-                return None
-            got += more
-        return got[2:-2] if got == _framed(got[2:-2]) else None
-
-    def _stop(self) -> None:
-        """End the process."""
-        self.process.kill()
-        self.process.communicate()
+    def _converters(self) -> tuple[float, float]:
+        """Steps of the measured current [A] and of the voltage [V]."""
+        bits = self.link.current_bits, self.link.pwm_bits
+        if not any(bits):
+            return 0.0, 0.0
+        if self.loop is None:
+            raise ValueError(f"current_bits = {bits[0]}, pwm_bits = {bits[1]}: must be 0: the C closes no current loop")
+        voltage = self.loop["voltage"]
+        if voltage is None:
+            raise ValueError("current_bits, pwm_bits: must be 0 where the drive's voltage has no limit")
+        (resistance, _) = EnvConfig.from_mapping(self.contract.assumed).actuators[0].winding or (1.0, 0.0)
+        ranges = self.loop["most"] or voltage / resistance, voltage
+        return tuple(2.0 * most / 2**bit if bit else 0.0 for most, bit in zip(ranges, bits, strict=True))  # type: ignore[return-value]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,15 +222,21 @@ class BoardTest:
     on_board: list[Episode]
     """Episodes with the board as the controller."""
     in_python: list[Episode]
-    """The same with the policy in Python."""
+    """The same with the policy, and the current loop, in Python."""
     frames: int
     """Observations that were sent."""
+    samples: int
+    """Samples of the current loop that the board computed."""
     refused: int
     """Frames that the board refused."""
+    stopped: int
+    """Observations beyond the limits."""
     unanswered: int
     """Frames without an answer."""
     rate: float
-    """Exchanges a second, with the simulation between them."""
+    """Exchanges a second, frames and samples, with the simulation between them."""
+    instructions: tuple[int, int] | None
+    """Most of a policy step and of a current step, of the golden observations; None where they are not counted."""
 
     @property
     def returns(self) -> np.ndarray:
@@ -208,8 +257,8 @@ def board_test(
     target: str = "host",
     episodes: int = 20,
     seed: int = 0,
-    lost: float = 0.0,
-    damaged: float = 0.0,
+    link: Link | None = None,
+    loop: bool = True,
     on_step: Callable[[int, int], None] | None = None,
 ) -> BoardTest:
     """Run the exported C as the controller of the simulation, and the exported ONNX model beside it.
@@ -219,8 +268,8 @@ def board_test(
         target: `host`, or `cortex-m4f`, which QEMU emulates.
         episodes: how many, each from its own seed.
         seed: of the first of them.
-        lost: share of the frames that never arrive at the board.
-        damaged: share of them in which a bit has flipped.
+        link: what stands between board and simulation; None for nothing.
+        loop: whether the C closes the current loop too, where it has one.
         on_step: called with (episodes running, episodes finished) after every step on the board.
 
     Raises:
@@ -228,32 +277,59 @@ def board_test(
         ValueError: an argument is out of bounds.
         RuntimeError: a tool is missing (the message installs it), or the C does not compile.
     """
-    with Board(folder, target, lost, damaged, seed) as board:
+    with Board(folder, target, link, seed, loop) as board:
         env = EnvConfig.from_mapping(board.contract.assumed)
         began = time.perf_counter()
         on_board = run_episodes(board, env.make, episodes, seed, on_step=on_step)
-        rate = board.frames / (time.perf_counter() - began)
-        counts = board.frames, board.refused, board.unanswered
-    return BoardTest(on_board, run_episodes(OnnxPolicy(folder), env.make, episodes, seed), *counts, rate)
+        rate = (board.frames + board.samples) / (time.perf_counter() - began)
+        counts = board.frames, board.samples, board.refused, board.stopped, board.unanswered
+    in_python = run_episodes(OnnxPolicy(folder), env.make, episodes, seed)
+    return BoardTest(on_board, in_python, *counts, rate, instructions(folder) if target == "cortex-m4f" else None)
 
 
-def _build(folder: Path, target: str, built: Path) -> list[str]:
+def instructions(folder: Path) -> tuple[int, int]:
+    """Most instructions of a policy step and of a current step on an emulated Cortex-M4F, of the golden observations.
+
+    Raises:
+        FileNotFoundError: the folder has no contract or no C.
+        RuntimeError: a tool is missing (the message installs it), or the C does not compile.
+    """
+    contract = Contract.read(folder)
+    rows = np.array(contract.golden["observations"], "<f8" if contract.controller["real"] == "double" else "<f4")
+    with _running(folder, "cortex-m4f", "BOARD_TICKS") as process:
+        got = process.communicate(rows.tobytes(), timeout=60)[0]
+    most = np.frombuffer(got, "<u4").reshape(len(rows), 2).max(axis=0) * _TICK / NANOSECONDS
+    return int(most[0]), int(most[1])
+
+
+@contextlib.contextmanager
+def _running(folder: Path, target: str, define: str = "") -> Iterator[Any]:
+    """The program of a folder, compiled and running, with pipes."""
+    with tempfile.TemporaryDirectory() as built:
+        command = _build(folder, target, Path(built), [f"-D{define}"] if define else [])
+        counted = ["-icount", f"shift={NANOSECONDS.bit_length() - 1}"] if define == "BOARD_TICKS" else []
+        process = subprocess.Popen([*command, *counted], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        try:
+            yield process
+        finally:
+            process.kill()
+            with contextlib.suppress(ValueError):  # its pipes are closed
+                process.communicate()
+
+
+def _build(folder: Path, target: str, built: Path, flags: list[str]) -> list[str]:
     """The command that runs the controller of a folder, compiled into another."""
-    sources = [str(folder / name) for name in SOURCES]
+    sources = [str(folder / name) for name in SOURCES if not flags or name != "wire.c"]  # frames, or samples
     if gone := [name for name in (*sources, str(folder / "controller.h")) if not Path(name).is_file()]:
         raise FileNotFoundError(f"{gone[0]}: missing: write the folder with codrl-mj export")
     program = str(built / "controller")
-    command = ["cc", *_STRICT, *sources, "-lm", "-o", program]
+    command = ["cc", *_STRICT, *flags, *sources, "-lm", "-o", program]
     if target == "cortex-m4f":
         linked = ["-T", str(folder / "board.ld"), *sources, "-lm", "-o", program]
-        command = ["arm-none-eabi-gcc", *_CORTEX.split(), *_STRICT, *linked]
+        command = ["arm-none-eabi-gcc", *_CORTEX.split(), *_STRICT, *flags, *linked]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        said = next((line for line in done.stderr.splitlines() if "error" in line), done.stderr.strip())
+        lines = done.stderr.splitlines()
+        said = next((line for line in lines if "error:" in line or "undefined" in line), done.stderr.strip())
         raise RuntimeError(f"{folder}: its C does not compile: {said}")
     return [program] if target == "host" else [*_QEMU.split(), "enable=on,target=native", "-kernel", program]
-
-
-def _framed(content: bytes) -> bytes:
-    """A frame of the wire: its start, what it says, and their checksum (CRC-16/CCITT, from 0xFFFF)."""
-    return _START + content + struct.pack("<H", binascii.crc_hqx(content, 0xFFFF))

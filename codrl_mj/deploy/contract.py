@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import mapping_of
+from codrl_mj.deploy.loops import current_loop
 from codrl_mj.deploy.network import Network
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes
-from codrl_mj.fields import did_you_mean, leaves
+from codrl_mj.fields import check_names, did_you_mean, leaves
 from codrl_mj.runs.files import read_json, sealed, write_json
 from codrl_mj.runs.policies import Policy
 
@@ -30,7 +31,10 @@ GOLDEN = 200
 LATE = 1.5
 """Periods after which a command that has not come is late."""
 _PACKAGES = ("codrl-mj", "mujoco", "gymnasium", "numpy", "stable-baselines3", "torch")
-_ENTRIES = ("task", "agent", "rate", "observations", "actions", "actuators", "assumed", "late", "golden", "versions")
+_ENTRIES = (
+    *("task", "agent", "rate", "observations", "actions", "actuators", "assumed", "controller", "limits", "late"),
+    *("golden", "versions"),
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,6 +56,10 @@ class Contract:
     """Motor, or pattern of motors -> its fields, None for an ideal one, and their `sha256`."""
     assumed: dict[str, Any]
     """The environment, as `EnvConfig.from_mapping` reads it: command, delays, quanta, joints, what was drawn."""
+    controller: dict[str, Any]
+    """What the C computes in, `real`, and the numbers of the `loop` behind the policy, None where it has none."""
+    limits: dict[str, list[float | None]]
+    """Observation -> least and most, beyond which the policy is not asked and the command is that for safety."""
     late: dict[str, Any]
     """What to do when no observation or command comes."""
     golden: dict[str, Any]
@@ -60,7 +68,16 @@ class Contract:
     """Of what made it."""
 
     @classmethod
-    def of(cls, policy: Policy, env: EnvConfig, agent: str, episodes: int = 5, seed: int = 0) -> "Contract":
+    def of(
+        cls,
+        policy: Policy,
+        env: EnvConfig,
+        agent: str,
+        episodes: int = 5,
+        seed: int = 0,
+        limits: Mapping[str, float] | None = None,
+        double: bool = False,
+    ) -> "Contract":
         """What a policy assumes that was trained in an environment.
 
         Args:
@@ -69,9 +86,12 @@ class Contract:
             agent: the name of what trained it.
             episodes: how many are run for golden numbers, each to its end; as many more if they end too soon.
             seed: of the first of them.
+            limits: observation -> largest size of it that is safe, in its unit; of an angle that is observed as
+                `cos_NAME` and `sin_NAME` by its NAME, below pi.
+            double: whether the C computes in double, not float.
 
         Raises:
-            ValueError: the policy cannot be exported, or `episodes` is below 1.
+            ValueError: the policy cannot be exported, `episodes` is below 1, or a limit is unknown or not positive.
         """
         network = Network.of(policy)
         run = run_episodes(policy, env.make, episodes, seed)
@@ -93,6 +113,8 @@ class Contract:
             actions=actions,
             actuators={name: _told(mapping_of(one)) for name, one in env.driven.items()},
             assumed=json.loads(json.dumps(env.as_mapping())),
+            controller={"real": "double" if double else "float", "loop": current_loop(env)},
+            limits=_limits([one["name"] for one in observations], limits or {}),
             late={"after": LATE * period, "unit": "s", "command": [0.0] * len(actions)},
             golden={"observations": chosen.tolist(), "actions": acted.tolist(), "tolerance": 1e-5},
             versions={
@@ -130,6 +152,29 @@ class Contract:
     def commands(self, actions: np.ndarray) -> np.ndarray:
         """Commands (n, m) in the units of `actions`, for actions (n, m), or indices (n,) of the levels."""
         return actions.reshape(len(actions), -1) if self.levels is None else self.levels[actions]
+
+    def actions_of(self, commands: np.ndarray) -> np.ndarray:
+        """The actions (n, m) for commands (n, m), or the indices (n,) of the levels that are nearest to them."""
+        if np.ndim(self.golden["actions"]) > 1:
+            return commands.astype(np.float32)
+        if (levels := self.levels) is None:  # an environment of others: the index itself
+            return commands[:, 0].round().astype(np.int64)
+        return np.abs(commands[:, None, :] - levels).sum(axis=2).argmin(axis=1)
+
+    @property
+    def period_us(self) -> int:
+        """Microseconds between two actions."""
+        return round(1e6 / self.rate)
+
+    def within(self, observations: np.ndarray) -> np.ndarray:
+        """Whether observations (N, k) are finite and within the limits, shape (N,)."""
+        fine = np.isfinite(observations).all(axis=1)
+        for place, one in enumerate(self.observations):
+            least, most = self.limits.get(one["name"], (None, None))
+            fine &= (least is None or observations[:, place] >= least) & (
+                most is None or observations[:, place] <= most
+            )
+        return fine
 
     def admit(self, observations: Sequence[tuple[str, str | None]], rate: float | None = None) -> None:
         """Refuse observations that are not those of the policy.
@@ -179,6 +224,19 @@ class Contract:
                     f"actuator {name!r}: {where} = {other.get(where)}, must be {one.get(where)}, through which the "
                     "policy was trained; evaluate it on yours, or train through that"
                 )
+
+
+def _limits(names: list[str], limits: Mapping[str, float]) -> dict[str, list[float | None]]:
+    """Least and most of observations, by the largest size of each or of an angle."""
+    angles = [name.removeprefix("cos_") for name in names if name.startswith("cos_")]
+    check_names(limits, [*names, *angles], "limit")
+    for name, most in limits.items():
+        if not 0.0 < most < (np.pi if name in angles else np.inf):
+            raise ValueError(f"limit {name} = {most:g}: must be > 0{' and < pi' if name in angles else ''}, and finite")
+    return {
+        f"cos_{name}" if name in angles else name: [float(np.cos(most)), None] if name in angles else [-most, most]
+        for name, most in limits.items()
+    }
 
 
 def _told(fields: Mapping[str, Any] | None) -> dict[str, Any]:

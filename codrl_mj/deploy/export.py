@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.deploy.c_code import c_files, check_board, current_loop
+from codrl_mj.deploy.c_code import c_files, check_board
 from codrl_mj.deploy.contract import Contract
 from codrl_mj.deploy.network import Network
 from codrl_mj.envs.config import EnvConfig
@@ -88,11 +88,12 @@ def export(
     seed: int = 0,
     double: bool = False,
     board: str | None = None,
+    limits: Mapping[str, float] | None = None,
 ) -> Contract:
     """Write `policy.onnx`, `contract.json` and C99 into a new folder, whole or not at all.
 
-    The C is `controller.h`, `controller.c` and `main.c`, which computes the golden commands again; a current loop is in
-    it where all motors have the same `codrl_mj.actuators.Drive`, and are asked for forces or currents.
+    The C is `controller.h`, `controller.c` and `main.c`, which computes the golden commands again; the loops are in
+    it where all motors have the same `codrl_mj.actuators.Drive`, `Servo` or the paper's `Actuator`.
 
     Args:
         policy: as `codrl_mj.runs.policies.load_policy` returns it, of PPO, SAC, TD3, DDPG or DQN.
@@ -103,6 +104,7 @@ def export(
         seed: of the first of them.
         double: whether the C computes in double, not float.
         board: what it is to fit, one of `codrl_mj.deploy.c_code.BOARDS`; None for any.
+        limits: as for `Contract.of`.
 
     Returns:
         The contract, as it was written.
@@ -116,7 +118,7 @@ def export(
     network = Network.of(policy)
     if board is not None:
         check_board(board, network, double)
-    contract = Contract.of(policy, env, agent, episodes, seed)
+    contract = Contract.of(policy, env, agent, episodes, seed, limits, double)
     about: dict[str, Any] = {
         name: getattr(contract, name) for name in ("task", "agent", "rate", "observations", "actions", "versions")
     }
@@ -130,6 +132,6 @@ def export(
     with writing_folder(out) as folder:
         (folder / ONNX).write_bytes(onnx_model(network, about).SerializeToString())
         contract.write(folder)
-        for name, content in c_files(network, contract, current_loop(env), double).items():
+        for name, content in c_files(network, contract).items():
             (folder / name).write_text(content)
     return contract

@@ -32,12 +32,23 @@ class LogCheck:
     """Largest difference of a command, in its unit."""
 
 
+def columns(contract: Contract) -> list[str]:
+    """What a log's columns are called: `time:s`, observations and commands, `name:unit`."""
+    named = [TIME, *((one["name"], one["unit"]) for one in (*contract.observations, *contract.actions))]
+    return [f"{name}:{unit}" if unit else name for name, unit in named]
+
+
+def motor_columns(contract: Contract) -> list[str]:
+    """What a board may tell besides, of each motor."""
+    units = {"voltage": "V", "current": "A", "position": "rad"}
+    return [f"{one['name']}_{name}:{unit}" for one in contract.actions for name, unit in units.items()]
+
+
 def write_log(path: Path, contract: Contract, episode: Episode) -> None:
     """Write an episode as a log: a column `time:s`, one of every observation and one of every action, `name:unit`."""
-    columns = [TIME, *((one["name"], one["unit"]) for one in (*contract.observations, *contract.actions))]
     with writing(path) as part, part.open("w", newline="") as file:
         table = csv.writer(file)
-        table.writerow(f"{name}:{unit}" if unit else name for name, unit in columns)
+        table.writerow(columns(contract))
         commands = contract.commands(episode.action)
         for step, row in enumerate(np.hstack([episode.observation[:-1], commands]).tolist()):
             table.writerow([step / contract.rate, *row])
@@ -49,7 +60,8 @@ def check_log(folder: Path, path: Path) -> LogCheck:
     Args:
         folder: what `codrl_mj.deploy.export` wrote.
         path: comma-separated columns `name:unit`: `time:s`, the observations in the order in which they came, and the
-            commands that were sent. Columns are known by their names; a unit that is left out is not compared.
+            commands that were sent. Columns are known by their names; a unit that is left out is not compared. Those
+            of `motor_columns` are passed over.
 
     Raises:
         FileNotFoundError: a file is missing.
@@ -59,13 +71,13 @@ def check_log(folder: Path, path: Path) -> LogCheck:
     contract = Contract.read(folder)
     with path.open(newline="") as file:
         header, *rows = list(csv.reader(file)) or [[]]
-    columns = [(name.strip(), unit.strip() or None) for name, _, unit in (one.partition(":") for one in header)]
-    names = [name for name, _ in columns]
+    told = [(name.strip(), unit.strip() or None) for name, _, unit in (one.partition(":") for one in header)]
+    names = [name for name, _ in told]
     where = {name: place for place, name in enumerate(names)}  # of equal names the last
     if missing := [one for one in ("time", *(one["name"] for one in contract.actions)) if one not in names]:
         raise ValueError(f"{path}: has no column {missing[0]!r}, only {', '.join(names)}: call the columns name:unit")
-    if columns[where["time"]][1] not in (None, "s"):
-        raise ValueError(f"{path}: column 'time': its unit is {columns[names.index('time')][1]}, must be s: convert it")
+    if told[where["time"]][1] not in (None, "s"):
+        raise ValueError(f"{path}: column 'time': its unit is {told[names.index('time')][1]}, must be s: convert it")
     for place, row in enumerate(rows, 2):
         if len(row) != len(header):
             raise ValueError(f"{path}: line {place} has {len(row)} cells, must have {len(header)}")
@@ -78,13 +90,14 @@ def check_log(folder: Path, path: Path) -> LogCheck:
     if (steps := np.diff(table[:, where["time"]])).min() <= 0.0:
         raise ValueError(f"{path}: line {int(steps.argmin()) + 3}: time must increase from row to row")
     sent = [where[one["name"]] for one in contract.actions]
-    seen = [place for place in range(len(names)) if place not in (*sent, where["time"])]
+    beside = {one.partition(":")[0] for one in motor_columns(contract)}
+    seen = [place for place, name in enumerate(names) if place not in (*sent, where["time"]) and name not in beside]
     rate = 1.0 / float(np.median(steps))
-    contract.admit([columns[place] for place in seen], rate)
+    contract.admit([told[place] for place in seen], rate)
     for one, place in zip(contract.actions, sent, strict=True):
-        if None not in (columns[place][1], one["unit"]) and columns[place][1] != one["unit"]:
+        if None not in (told[place][1], one["unit"]) and told[place][1] != one["unit"]:
             raise ValueError(
-                f"{path}: action {one['name']!r}: its unit is {columns[place][1]}, must be {one['unit']}: convert it"
+                f"{path}: action {one['name']!r}: its unit is {told[place][1]}, must be {one['unit']}: convert it"
             )
     observed, commands = table[:, seen], table[:, sent]
     off = np.abs(commands - contract.commands(OnnxPolicy(folder).predict(observed)[0])).max(axis=1)

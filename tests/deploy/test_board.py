@@ -9,8 +9,9 @@ import subprocess
 import numpy as np
 import pytest
 
+from codrl_mj.actuators import Actuator, CurrentLoop, Motor, Servo, ServoLoop
 from codrl_mj.cli import main
-from codrl_mj.deploy import Board, Contract, OnnxPolicy, board_test, check_log, export, write_log
+from codrl_mj.deploy import Board, Contract, Link, OnnxPolicy, board_test, check_log, export, instructions, write_log
 from codrl_mj.deploy.board import TARGETS, missing_tools
 from codrl_mj.envs.config import EnvConfig
 from tests.deploy.test_export import trained
@@ -20,7 +21,7 @@ ON = [
     pytest.param(name, marks=pytest.mark.skipif(bool(missing_tools(name)), reason=f"NOT RUN: {missing_tools(name)}"))
     for name in TARGETS
 ]
-OK, DAMAGED, OLD, NOT_FINITE, LATE = 0, 1, 2, 4, 8
+OK, DAMAGED, OLD, NOT_FINITE, LATE, BEYOND, NO_SENSORS = 0, 1, 2, 4, 8, 16, 32
 
 
 @pytest.fixture(scope="module", params=[("furuta", "ppo", False), ("cartpole", "dqn", True)], ids=lambda one: one[0])
@@ -58,11 +59,126 @@ def test_a_weight_changed_in_the_c_changes_what_the_simulation_does(folder, tmp_
     assert not np.array_equal(done.on_board[0].action, done.in_python[0].action)
 
 
+def test_a_gain_changed_in_the_c_changes_what_the_motor_does(folder, tmp_path):
+    for one in folder.iterdir():
+        (tmp_path / one.name).write_bytes(one.read_bytes())
+    source = tmp_path / "controller.c"
+    begin, line, rest = source.read_text().partition("  const real asked = ")
+    source.write_text(f"{begin}{line}0.001f * {rest}")
+    off = []
+    for where in (folder, tmp_path):
+        done = board_test(where, episodes=1)
+        assert done.samples > 0
+        currents = [side[0].signals["current"] for side in (done.on_board, done.in_python)]
+        off.append((np.abs(currents[0] - currents[1])[:20].max(), abs(done.returns[0, 0] - done.returns[0, 1])))
+    (same, alike), (changed, other) = off
+    assert same < 1e-4 < 1e-3 < changed
+    assert alike < other or kind_of(folder) == "d"  # a balanced pole returns 1 a step either way
+    assert board_test(tmp_path, episodes=1, loop=False).samples == 0
+
+
+FURUTA = EnvConfig("furuta")
+(DRIVE,) = FURUTA.driven.values()
+LOOPS = {
+    "late, with a dead band": DRIVE.replaced({"controller.delayed": True, "controller.deadband": 0.3}),
+    "sagging, clamping": DRIVE.replaced({"supply.resistance": 1.5, "controller.anti_windup": "clamping"}),
+    "own gains, warming, geared": DRIVE.replaced(
+        {
+            "controller.kp": 6.0,
+            "controller.ki": 900.0,
+            "motor.thermal_resistance_winding": 5.0,
+            "motor.gear_efficiency": 0.8,
+            "motor.stribeck_friction": 1e-3,
+        }
+    ),
+    "servo": Servo(DRIVE.motor, DRIVE.controller, DRIVE.supply, ServoLoop(servo_rate=500.0, velocity_gain=0.004)),
+    "the paper's": Actuator(Motor(), CurrentLoop(kp=2.0, ki=5.0, kd=1e-4, substeps=3, current_bias=0.02, kff=0.1)),
+}
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_a_motor_whose_loop_is_on_the_board_moves_as_it_does_in_the_simulation(name, tmp_path):
+    env = EnvConfig("furuta", actuator=LOOPS[name], action="position" if name == "servo" else "force")
+    policy, _ = trained("furuta", "ppo")
+    if name == "servo":
+        policy.action_space = env.make().action_space
+    export(policy, env, "ppo", tmp_path / "out", 1, double=True)
+    random = np.random.default_rng(0)
+    low, high = env.make().action_space.low, env.make().action_space.high
+    actions = random.uniform(low, high, (60, 1)).astype(np.float32)
+
+    def signals():
+        made = env.make()
+        seen = [made.reset(seed=0)[0]]
+        told = [made.step(action) for action in actions]
+        keys = ("current", "voltage", "actual_force")
+        return np.array([one for one, *_ in told]), np.array([[info[key] for key in keys] for *_, info in told]), seen
+
+    with Board(tmp_path / "out") as board:
+        observed, felt, _ = signals()
+        assert board.samples >= 60 * (30 if name == "the paper's" else 400)
+    expected, wanted, _ = signals()
+    np.testing.assert_allclose(felt, wanted, rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(observed, expected, rtol=1e-6, atol=1e-6)
+
+
+def test_converters_encoders_and_late_answers_come_between(tmp_path):
+    export(trained("cartpole", "dqn")[0], EnvConfig("cartpole"), "dqn", tmp_path / "cart", 1)
+    done = board_test(tmp_path / "cart", episodes=1, link=Link(pwm_bits=6, current_bits=8))
+    steps = done.on_board[0].signals["voltage"] / (2.0 * 24.0 / 2**6)
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
+    assert not np.allclose(done.in_python[0].signals["voltage"] % 0.75, 0.0)
+    export(trained("furuta", "ppo")[0], FURUTA, "ppo", tmp_path / "arm", 1)
+    contract, step = Contract.read(tmp_path / "arm"), 2.0 * np.pi / 2048
+    row = np.array(contract.golden["observations"][50])
+    seen = Link(counts=2048).encoded(contract, row)
+    for place in (0, 2):
+        angle = np.arctan2(seen[place + 1], seen[place])
+        assert angle / step == pytest.approx(round(angle / step), abs=1e-9)
+        assert abs(angle - np.arctan2(row[place + 1], row[place])) <= 0.51 * step
+    np.testing.assert_allclose(seen[4:] / (step * 50.0), np.round(row[4:] / (step * 50.0)), atol=1e-9)
+    rows = np.array(contract.golden["observations"])
+    with Board(tmp_path / "arm", link=Link(late=1.0)) as late, Board(tmp_path / "arm") as prompt:
+        held = [late.command(one) for one in rows]
+        given = [prompt.command(one) for one in rows]
+    np.testing.assert_array_equal(held[1:], given[:-1])
+    assert not held[0].any()
+
+
+def test_beyond_its_limits_a_policy_is_not_asked(tmp_path):
+    limits = {"arm_velocity": 4.0, "rod": 3.0}
+    policy, _ = trained("furuta", "ppo")
+    export(policy, FURUTA, "ppo", tmp_path / "out", 1, limits=limits)
+    contract, python = Contract.read(tmp_path / "out"), OnnxPolicy(tmp_path / "out")
+    angles = np.random.default_rng(0).uniform(-np.pi, np.pi, 200)
+    rows = np.array([[1.0, 0.0, np.cos(one), np.sin(one), 3.0 * one, 0.0] for one in angles])
+    fine = (np.abs(angles) < 3.0) & (np.abs(3.0 * angles) < 4.0)
+    assert 20 < fine.sum() < 180
+    np.testing.assert_array_equal(contract.within(rows), fine)
+    with Board(tmp_path / "out") as board:
+        commands = np.array([board.command(row) for row in rows])
+        assert board.stopped == (~fine).sum()
+    assert not commands[~fine].any()
+    assert commands[fine].all()
+    np.testing.assert_allclose(python.predict(rows)[0], commands, atol=1e-6)
+    for limit, says in {"arm_velocit": "did you mean arm_velocity", "rod": "must be > 0 and < pi"}.items():
+        with pytest.raises(ValueError, match=says):
+            export(policy, FURUTA, "ppo", tmp_path / "other", 1, limits={limit: 4.0})
+
+
+@pytest.mark.skipif(bool(missing_tools("cortex-m4f")), reason=f"NOT RUN: {missing_tools('cortex-m4f')}")
+def test_instructions_are_counted_on_the_emulated_board(folder):
+    policy, sample = instructions(folder)
+    products = 6 * 64 + 64 * 64 + 64
+    assert 2 * products < policy < (20 if kind_of(folder) == "f" else 400) * products  # a Cortex-M4F has no double
+    assert 10 < sample < 2000
+
+
 def test_lost_and_damaged_frames_are_answered_for_safety(folder):
-    done = board_test(folder, episodes=2, lost=0.1, damaged=0.1)
+    done = board_test(folder, episodes=2, link=Link(lost=0.1, damaged=0.1), loop=False)
     assert done.refused > 0
     assert done.unanswered > 0
-    with Board(folder, damaged=1.0) as board:  # whichever bit it is: never a command of the policy
+    with Board(folder, link=Link(damaged=1.0)) as board:  # whichever bit it is: never a command of the policy
         for row in Contract.read(folder).golden["observations"]:
             assert not board.command(np.array(row)).any()
         assert board.refused == board.frames
@@ -73,13 +189,26 @@ def kind_of(folder):
     return "d" if Contract.read(folder).task == "cartpole" else "f"
 
 
+def form_of(folder):
+    """An answer: of a controller with k observations and m commands k + 4 m numbers."""
+    contract = Contract.read(folder)
+    return struct.Struct(f"<HBBI{len(contract.observations) + 4 * len(contract.actions)}{kind_of(folder)}H")
+
+
+def command_of(folder, numbers):
+    contract = Contract.read(folder)
+    count = len(contract.observations)
+    return numbers[count : count + len(contract.actions)]
+
+
 def asked(folder, program, sent):
     """Statuses and commands that the program answers to bytes, read as frames with a checksum of their own."""
-    form = struct.Struct(f"<HBBI{len(Contract.read(folder).actions)}{kind_of(folder)}H")
+    form = form_of(folder)
     got = subprocess.run([program], input=sent, capture_output=True, check=True, timeout=20).stdout
     answers = []
     for one in range(0, len(got), form.size):
-        start, sequence, status, stamp, *command, check = form.unpack(got[one : one + form.size])
+        start, sequence, status, stamp, *numbers, check = form.unpack(got[one : one + form.size])
+        command = command_of(folder, numbers)
         assert start == 0x5AA5
         assert check == binascii.crc_hqx(got[one + 2 : one + form.size - 2], 0xFFFF)
         answers.append((sequence, status, stamp, command))
@@ -126,7 +255,7 @@ def test_frames_come_through_a_pseudo_terminal_in_pieces(folder, program):
     want = [command for *_, command in asked(folder, program, b"".join(sent))]
     ours, theirs = os.openpty()
     tty.setraw(theirs)
-    form = struct.Struct(f"<HBBI{len(want[0])}{kind_of(folder)}H")
+    form = form_of(folder)
     with subprocess.Popen([program], stdin=theirs, stdout=theirs) as running:
         got = []
         for one in sent:
@@ -135,11 +264,42 @@ def test_frames_come_through_a_pseudo_terminal_in_pieces(folder, program):
             answer = b""
             while len(answer) < form.size:
                 answer += os.read(ours, form.size - len(answer))
-            got.append(list(form.unpack(answer)[4:-1]))
+            got.append(list(command_of(folder, form.unpack(answer)[4:-1])))
         running.kill()
     os.close(ours)
     os.close(theirs)
     assert got == want
+
+
+def test_spoilt_frames_come_through_a_pseudo_terminal_as_they_do_through_a_pipe(folder, program):
+    tty = pytest.importorskip("tty")
+    rows = Contract.read(folder).golden["observations"][:40]
+    good = [frame(folder, n, 20_000 * n + 1, row) for n, row in enumerate(rows)]
+    random, sent = np.random.default_rng(1), []
+    for one in good:
+        flipped = bytearray(one)
+        flipped[int(random.integers(2, len(one)))] ^= 1 << int(random.integers(8))
+        sent.append([one, bytes(flipped), one + one, b"", one[:-3], bytes(one)][int(random.integers(6))])
+    sent = b"".join([*sent, *good[-3:]])
+    ours, theirs = os.openpty()
+    tty.setraw(theirs)
+    with subprocess.Popen([program], stdin=theirs, stdout=theirs) as running:
+        want = asked(folder, program, sent)
+        for one in range(0, len(sent), 50):
+            os.write(ours, sent[one : one + 50])
+        got, size = b"", form_of(folder).size
+        while len(got) < size * len(want):
+            got += os.read(ours, size * len(want) - len(got))
+        running.kill()
+    os.close(ours)
+    os.close(theirs)
+    answers = [form_of(folder).unpack(got[one : one + size]) for one in range(0, len(got), size)]
+    assert [(answer[1], answer[2], list(command_of(folder, answer[4:-1]))) for answer in answers] == [
+        (sequence, status, list(command)) for sequence, status, _, command in want
+    ]
+    assert {status for _, status, *_ in want} >= {OK, DAMAGED}
+    assert any(status & OLD for _, status, *_ in want)
+    assert any(status & LATE for _, status, *_ in want)
 
 
 @pytest.mark.parametrize("lacking", [1, 9])
@@ -154,7 +314,7 @@ def test_a_frame_of_which_bytes_are_lost_is_refused_and_those_after_it_come_thro
 
 def test_the_watchdog_sets_the_command_to_zero(folder, tmp_path):
     library = tmp_path / "wire.so"
-    sources = [str(folder / name) for name in ("controller.c", "wire.c")]
+    sources = [str(folder / name) for name in ("controller.c", "wire.c", "board.c")]
     subprocess.run(["cc", "-std=c99", "-shared", "-fPIC", *sources, "-lm", "-o", str(library)], check=True)
     wire, contract = ctypes.CDLL(str(library)), Contract.read(folder)
     state, answer = (ctypes.c_ubyte * 1024)(), (ctypes.c_ubyte * 256)()
@@ -208,14 +368,20 @@ def test_a_log_of_the_board_keeps_its_contract_and_one_that_is_changed_does_not(
 def test_a_program_that_ends_is_an_error(folder, tmp_path, capsys):
     for one in folder.iterdir():
         (tmp_path / one.name).write_bytes(one.read_bytes())
-    (tmp_path / "board.c").write_text("int main(void) { return 3; }\n")
-    assert main(["board", "test", str(tmp_path), "--episodes", "1"]) == 2
-    assert "the board's program ended at frame 1" in capsys.readouterr().err
+    source = (folder / "board.c").read_text()
+    for line, says in {
+        "wire_reset(&wire);": "the board's program ended at frame 1",
+        "current_state state;\n  while": "the board's current loop did not answer at sample",
+    }.items():
+        (tmp_path / "board.c").write_text(source.replace(line, f"if (sizeof(real) > 0) return 3;\n  {line}"))
+        assert main(["board", "test", str(tmp_path), "--episodes", "1"]) == 2
+        assert says in capsys.readouterr().err
 
 
 def test_what_cannot_be_run_is_said(folder, tmp_path, monkeypatch, capsys):
     for line, says in {
-        ("test", str(folder), "--lost", "1.5"): "lost = 1.5: must be a share",
+        ("test", str(folder), "--lost", "1.5"): "Link.lost = 1.5: must be a finite number >= 0 and <= 1",
+        ("test", str(folder), "--no-loop", "--pwm-bits", "8"): "pwm_bits = 8: must be 0: the C closes no current loop",
         ("test", str(folder), "--target", "avr"): "avr",
         ("test", str(tmp_path)): "contract.json",
     }.items():

@@ -14,7 +14,8 @@ from codrl_mj.actuators.drive import State
 from codrl_mj.actuators.model import Inputs
 from codrl_mj.actuators.parameters import parameters_type
 from codrl_mj.deploy import Contract, Network
-from codrl_mj.deploy.c_code import c_files, check_board, current_loop
+from codrl_mj.deploy.c_code import c_files, check_board
+from codrl_mj.deploy.loops import current_loop
 from codrl_mj.envs.config import EnvConfig
 from tests.deploy.test_export import EACH, observed, trained
 
@@ -36,8 +37,8 @@ def written(folder, task, agent, settings, double, **changes):
     """The C files of a policy with random weights, the policy, and its contract."""
     env = EnvConfig(task, **changes)
     policy, _ = trained(task, agent, **settings)
-    contract = Contract.of(policy, env, agent, 1)
-    for name, content in c_files(Network.of(policy), contract, current_loop(env), double).items():
+    contract = Contract.of(policy, env, agent, 1, double=double)
+    for name, content in c_files(Network.of(policy), contract).items():
         (folder / name).write_text(content)
     return policy, contract
 

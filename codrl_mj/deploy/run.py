@@ -1,0 +1,118 @@
+"""A real board behind a serial port: watched, or told to drive, over the exported wire. What it says becomes a log."""
+
+import csv
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from codrl_mj.deploy.contract import Contract
+from codrl_mj.deploy.log import columns, motor_columns
+from codrl_mj.deploy.wire import BEYOND, DAMAGED, DRIVE, LATE, NO_SENSORS, NOT_FINITE, WATCH, Answer, Wire
+from codrl_mj.runs.files import writing
+
+MOST_MISSED = 3
+"""Frames in a row without an answer, after which a board is no longer told to drive."""
+
+
+class BoardRun(NamedTuple):
+    """How it went."""
+
+    rows: int
+    """Answers that were logged."""
+    missed: int
+    """Frames without an answer."""
+    late: int
+    """Frames that came to the board later than its contract allows."""
+    why: str
+    """What ended it."""
+
+
+def run_board(
+    folder: Path,
+    port: str,
+    log: Path,
+    drive: bool = False,
+    seconds: float = math.inf,
+    baud: int = 115_200,
+    ended: Callable[[], bool] = lambda: False,
+    on_answer: Callable[[Answer], None] | None = None,
+) -> BoardRun:
+    """Ask a board for its observations and commands at the policy's rate, until told otherwise.
+
+    It ends with a frame that puts the command to that for safety. Told to drive, it ends by itself as soon as something
+    is wrong: here again, whatever the C finds.
+
+    Args:
+        folder: what `codrl_mj.deploy.export` wrote, and the board runs.
+        port: serial port, such as `/dev/ttyACM0`.
+        log: CSV file for what it says, as `check_log` reads it, with the motors' voltage, current and position.
+        drive: whether the board gives the commands to its drive; else it only says which they would be.
+        seconds: how long at most [s].
+        baud: bits a second.
+        ended: asked before each frame whether to end.
+        on_answer: told of each answer.
+
+    Raises:
+        FileNotFoundError: the folder has no contract.
+        RuntimeError: the board has no sensors, or there is none at the port.
+    """
+    import serial
+
+    contract = Contract.read(folder)
+    kind, late_after = DRIVE if drive else WATCH, float(contract.late["after"])
+    nothing, rows, missed, in_a_row, late, why = np.zeros(len(contract.observations)), 0, 0, 0, 0, ""
+    try:
+        line = serial.Serial(port, baud, timeout=0, exclusive=True)
+    except serial.SerialException as error:
+        raise RuntimeError(f"--port {port}: {error}; is the board plugged in, and may you open it?") from None
+    with line, writing(log) as part, part.open("w", newline="") as file:
+        table, wire = csv.writer(file), Wire(contract, line.fileno(), line.fileno())
+        table.writerow(columns(contract) + motor_columns(contract))
+        began = time.monotonic()
+        try:
+            for sequence in range(1, 10**9):
+                now = time.monotonic() - began
+                if ended() or now >= seconds:
+                    why = "told to"
+                    break
+                stamp = int(1e6 * now) + 1
+                answer = wire.asked(wire.frame(sequence, stamp, nothing, kind), sequence, late_after)
+                in_a_row = 0 if answer else in_a_row + 1
+                missed += answer is None
+                if answer is not None:
+                    if answer.status & NO_SENSORS:
+                        raise RuntimeError(f"{port}: the board has no sensors: give it wire_sense (docs/deploy.md)")
+                    rows, late = rows + 1, late + bool(answer.status & LATE)
+                    table.writerow([stamp / 1e6, *answer.observation, *answer.command, *answer.motors.ravel()])
+                    if on_answer is not None:
+                        on_answer(answer)
+                if drive and (why := _wrong(contract, answer, in_a_row)):
+                    break
+                time.sleep(max(0.0, began + sequence / contract.rate - time.monotonic()))
+        finally:
+            stamp = int(1e6 * (time.monotonic() - began)) + 2
+            wire.asked(wire.frame(sequence + 1, stamp, nothing, WATCH), sequence + 1, late_after)
+    return BoardRun(rows, missed, late, why)
+
+
+def _wrong(contract: Contract, answer: Answer | None, in_a_row: int) -> str:
+    """Why a board must not go on to drive; empty where it may."""
+    if answer is None:
+        return f"{in_a_row} frames in a row had no answer" if in_a_row >= MOST_MISSED else ""
+    if answer.status & (DAMAGED | NOT_FINITE):
+        return "the board took a frame for damaged" if answer.status & DAMAGED else "a sensor says no finite number"
+    if answer.status & BEYOND or not contract.within(answer.observation[np.newaxis])[0]:
+        return f"beyond the limits: {dict(zip(_names(contract), answer.observation.round(4).tolist(), strict=True))}"
+    bounds = [one.get("levels") or [one.get("least"), one.get("most")] for one in contract.actions]
+    most = [math.inf if None in some else max(map(abs, some)) for some in bounds]
+    if not (np.abs(answer.command) <= np.array(most) * (1.0 + 1e-6)).all():
+        return f"the command is {answer.command.tolist()}, beyond what the policy was trained with"
+    return ""
+
+
+def _names(contract: Contract) -> list[str]:
+    return [one["name"] for one in contract.observations]
