@@ -1,0 +1,142 @@
+"""A board at a serial port: here a program of the exported C, with sensors of its own, behind a pseudo-terminal."""
+
+import os
+import subprocess
+
+import numpy as np
+import pytest
+
+from codrl_mj.cli import main
+from codrl_mj.deploy import Contract, OnnxPolicy, check_log, export, run_board
+from codrl_mj.deploy.board import missing_tools
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.identify.reading import read_log
+from tests.deploy.test_export import trained
+
+pytestmark = pytest.mark.skipif(bool(missing_tools("host")), reason="NOT RUN: no C compiler: apt-get install gcc")
+SENSORS = """
+#include "wire.h"
+static int asked;
+static real given;
+int wire_sense(real observation[CONTROLLER_OBSERVATIONS]) {
+  asked++;
+  for (int k = 0; k < CONTROLLER_OBSERVATIONS; k++) observation[k] = 0.01f * (real)asked;
+  observation[0] = observation[2] = 1;
+  if (asked == BAD) observation[4] = WORSE;
+  return asked != GONE;
+}
+void wire_measure(real motors[3 * CONTROLLER_COMMANDS]) {
+  motors[0] = given;
+  motors[1] = 0.5f;
+  motors[2] = 0.1f * (real)asked;
+}
+void wire_apply(const real command[CONTROLLER_COMMANDS]) { given = command[0]; }
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    out = tmp_path_factory.mktemp("exported") / "furuta"
+    export(trained("furuta", "ppo")[0], EnvConfig("furuta"), "ppo", out, 1, limits={"arm_velocity": 20.0})
+    return out
+
+
+@pytest.fixture
+def port(folder, tmp_path):
+    """Starts a board, and says where it is; BAD is the question to which an arm's velocity of WORSE is the answer."""
+    tty = pytest.importorskip("tty")
+    running, opened = [], []
+
+    def start(bad=0, worse="0", gone=0):
+        (tmp_path / "sensors.c").write_text(SENSORS)
+        program = str(tmp_path / "board")
+        sources = [str(folder / name) for name in ("controller.c", "wire.c", "board.c")]
+        flags = ["-DBOARD_SENSORS", f"-DBAD={bad}", f"-DWORSE={worse}", f"-DGONE={gone}", f"-I{folder}"]
+        subprocess.run(["cc", *flags, *sources, str(tmp_path / "sensors.c"), "-lm", "-o", program], check=True)
+        ours, theirs = os.openpty()
+        tty.setraw(theirs)
+        tty.setraw(ours)
+        opened.extend((ours, theirs))
+        running.append(subprocess.Popen([program], stdin=ours, stdout=ours))
+        return os.ttyname(theirs)
+
+    yield start
+    for one in running:
+        one.kill()
+        one.wait()
+    for one in opened:
+        os.close(one)
+
+
+def table_of(log):
+    header, *rows = [line.split(",") for line in log.read_text().splitlines()]
+    return header, np.array(rows, float)
+
+
+@pytest.mark.parametrize("drive", [False, True])
+def test_a_board_is_watched_or_driven_and_what_it_says_is_a_log(folder, port, tmp_path, drive, capsys):
+    log = tmp_path / "swing.csv"
+    line = ["board", "run", str(folder), "--port", port(), "--out", str(log), "--seconds", "0.7"]
+    assert main([*line, "--drive"] if drive else line) == 0
+    assert "told to" in capsys.readouterr().out
+    header, rows = table_of(log)
+    assert 30 <= len(rows) <= 37  # 50 a second
+    assert header[-4:] == ["motor:N*m", "motor_voltage:V", "motor_current:A", "motor_position:rad"]
+    np.testing.assert_allclose(rows[:, 2], 0.01 * np.arange(1, len(rows) + 1), rtol=1e-6)
+    expected, _ = OnnxPolicy(folder).predict(rows[:, 1:7])
+    np.testing.assert_allclose(rows[:, 7], expected[:, 0], atol=1e-6)
+    given = np.append(0.0, rows[:-1, 7]) if drive else np.zeros(len(rows))  # what the drive got before
+    np.testing.assert_allclose(rows[:, 8], given, atol=1e-6)
+    found = check_log(folder, log)
+    assert (found.rows, found.differing) == (len(rows), 0)
+    columns = (
+        "time='time:s':s,voltage='motor_voltage:V':V,current='motor_current:A':A,position='motor_position:rad':rad"
+    )
+    read = read_log(log, columns)
+    np.testing.assert_allclose(read.signals["position"], 0.1 * np.arange(1, len(rows) + 1), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("worse", "why"), [("25", "beyond the limits"), ("-25", "beyond the limits"), ("(real)(1e30 * 1e30)", "no finite")]
+)
+def test_a_board_that_drives_is_stopped_when_something_is_wrong(folder, port, tmp_path, worse, why):
+    done = run_board(folder, port(10, worse), tmp_path / "log.csv", drive=True, seconds=5.0)
+    assert why in done.why
+    assert done.rows == 10
+    _, rows = table_of(tmp_path / "log.csv")
+    assert rows[:-1, 7].all()
+    assert rows[-1, 7] == 0.0  # in C
+    watched = run_board(folder, port(10, worse), tmp_path / "log.csv", seconds=0.5)
+    assert watched.why == "told to"
+
+
+def test_in_python_too_limits_are_kept(folder, port, tmp_path):
+    looser = tmp_path / "looser"
+    policy, _ = trained("furuta", "ppo")
+    export(policy, EnvConfig("furuta"), "ppo", looser, 1, limits={"arm_velocity": 0.05})
+    done = run_board(looser, port(), tmp_path / "log.csv", drive=True, seconds=5.0)  # whose C allows 20 rad/s
+    assert "beyond the limits" in done.why
+    _, rows = table_of(tmp_path / "log.csv")
+    assert len(rows) == 6
+    assert rows[-1, 7] != 0.0
+
+
+def test_a_board_without_sensors_an_answer_or_a_port_is_said(folder, port, tmp_path, capsys):
+    log = tmp_path / "log.csv"
+    with pytest.raises(RuntimeError, match="the board has no sensors: give it wire_sense"):
+        run_board(folder, port(gone=3), log, seconds=2.0)
+    assert not log.exists()
+    assert main(["board", "run", str(folder), "--port", str(tmp_path / "nothing"), "--out", str(log)]) == 2
+    assert "is the board plugged in" in capsys.readouterr().err
+    ours, theirs = os.openpty()  # nobody listens
+    done = run_board(folder, os.ttyname(theirs), log, drive=True, seconds=5.0)
+    assert done.why == "3 frames in a row had no answer"
+    assert (done.rows, done.missed) == (0, 3)
+    for one in (ours, theirs):
+        os.close(one)
+
+
+def test_the_contract_has_the_limits(folder):
+    contract = Contract.read(folder)
+    assert contract.limits == {"arm_velocity": [-20.0, 20.0]}
+    assert "arm_velocity, at least -20, at most 20" in (folder / "controller.h").read_text()
