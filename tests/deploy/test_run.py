@@ -2,6 +2,8 @@
 
 import os
 import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -89,10 +91,8 @@ def test_a_board_is_watched_or_driven_and_what_it_says_is_a_log(folder, port, tm
     np.testing.assert_allclose(rows[:, 8], given, atol=1e-6)
     found = check_log(folder, log)
     assert (found.rows, found.differing) == (len(rows), 0)
-    columns = (
-        "time='time:s':s,voltage='motor_voltage:V':V,current='motor_current:A':A,position='motor_position:rad':rad"
-    )
-    read = read_log(log, columns)
+    columns = "time='time:s':s,voltage='motor_voltage:V':V,current='motor_current:A':A,"
+    read = read_log(log, f"{columns}position='motor_position:rad':rad")
     np.testing.assert_allclose(read.signals["position"], 0.1 * np.arange(1, len(rows) + 1), rtol=1e-6)
 
 
@@ -108,6 +108,21 @@ def test_a_board_that_drives_is_stopped_when_something_is_wrong(folder, port, tm
     assert rows[-1, 7] == 0.0  # in C
     watched = run_board(folder, port(10, worse), tmp_path / "log.csv", seconds=0.5)
     assert watched.why == "told to"
+
+
+def test_any_key_ends_it(folder, port, tmp_path):
+    keys, terminal = os.openpty()
+    line = [sys.executable, "-m", "codrl_mj", "board", "run", str(folder), "--port", port()]
+    with subprocess.Popen(
+        [*line, "--out", str(tmp_path / "log.csv")], stdin=terminal, stdout=subprocess.PIPE
+    ) as running:
+        assert b"any key ends it" in running.stdout.readline()
+        time.sleep(1.0)
+        os.write(keys, b" ")
+        assert b"told to" in running.communicate(timeout=10)[0]
+    assert running.returncode == 0
+    for one in (keys, terminal):
+        os.close(one)
 
 
 def test_in_python_too_limits_are_kept(folder, port, tmp_path):
