@@ -49,7 +49,10 @@ ALLOWED = {
         *("actuators", "envs", "envs.config", "envs.worlds", "evaluation.measures", "physics", "runs.files"),
         *("runs.policies", "tasks"),
     },
-    "deploy": {"actuators", "engine", "envs.config", "evaluation", "fields", "runs.files", "runs.policies", "tasks.assets"},
+    "deploy": {
+        *("actuators", "engine", "envs.config", "evaluation", "fields", "kept", "runs.files", "runs.policies", "tasks"),
+        "tasks.assets",
+    },
     "films": {"actuators", "envs", "envs.config", "evaluation", "physics", "runs.files", "tasks"},
     "replay": {"envs", "envs.config", "evaluation", "runs.files"},
     "view": {"actuators", "envs.config", "evaluation", "fields", "replay"},
