@@ -41,7 +41,7 @@ class Export:
     def run(self) -> int:
         """Write the folder, and say what is in it."""
         from codrl_mj.cli.terminal import print_table, say
-        from codrl_mj.deploy import Network, export
+        from codrl_mj.deploy import export, network_of
 
         subject = self.source.load(self.run_folder)
         agent = self.source.agent or type(subject.policy).__name__
@@ -57,7 +57,7 @@ class Export:
             for one in several
         ]
         print_table(f"{contract.task}, {agent}, {contract.rate:g} Hz", ("", "name", "unit", "range"), rows)
-        weights = Network.of(subject.policy).size
+        weights = network_of(subject.policy).size
         written = f"wrote {self.out}: policy.onnx, contract.json, controller.c ({weights} numbers)"
         say(f"{written}; try: codrl-mj board test {self.out}")
         return 0

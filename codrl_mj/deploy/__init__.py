@@ -6,8 +6,9 @@ from codrl_mj.deploy.contract import Contract
 from codrl_mj.deploy.export import export, onnx_model
 from codrl_mj.deploy.log import LogCheck, check_log, write_log
 from codrl_mj.deploy.loops import current_loop
-from codrl_mj.deploy.network import Network
+from codrl_mj.deploy.network import Network, network_of
 from codrl_mj.deploy.run import BoardRun, run_board
+from codrl_mj.deploy.tiles import Tiles
 from codrl_mj.deploy.wire import Wire
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "LogCheck",
     "Network",
     "OnnxPolicy",
+    "Tiles",
     "Wire",
     "board_test",
     "c_files",
@@ -26,6 +28,7 @@ __all__ = [
     "current_loop",
     "export",
     "instructions",
+    "network_of",
     "onnx_model",
     "run_board",
     "write_log",

@@ -1,5 +1,6 @@
 """A policy, and the current loop behind it, as C99 for a microcontroller: no malloc, and of libm tanh alone."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 import codrl_mj
 from codrl_mj.deploy.contract import Contract
 from codrl_mj.deploy.network import Network
+from codrl_mj.deploy.tiles import Tiles
 from codrl_mj.fields import check_names
 from codrl_mj.tasks.assets import asset_path
 
@@ -21,7 +23,7 @@ BOARDS = {  # name -> bytes of flash memory for a program, and of RAM
 CODE = 6_000  # bytes beside the weights: 2,400 with tanhf, of a Cortex-M4 by gcc -O2; the rest for start-up and drivers
 
 
-def c_files(network: Network, contract: Contract) -> dict[str, str]:
+def c_files(network: Network | Tiles, contract: Contract) -> dict[str, str]:
     """The C files of a policy, and of the current loop behind it.
 
     Args:
@@ -40,13 +42,13 @@ def c_files(network: Network, contract: Contract) -> dict[str, str]:
         text = repr(float(value)) if double else f"{float(np.float32(value)):.9g}"
         return (text if set(text) & set(".en") else f"{text}.0") + suffix
 
-    def array(values: Any) -> str:
-        return "{" + ", ".join(number(value) for value in np.ravel(values)) + "}"
+    def array(values: Any, form: Callable[[float], str] = number) -> str:
+        return "{" + ", ".join(form(value) for value in np.ravel(values).tolist()) + "}"
 
     golden = contract.golden
     levels = contract.levels
     if network.low is None and levels is None:  # an environment of others: what they stand for is their index
-        levels = np.arange(len(network.gains), dtype=np.float64)[:, None]
+        levels = np.arange(network.choices, dtype=np.float64)[:, None]
     acted = np.array(golden["actions"])
     size = 8 if double else 4
     known = {
@@ -54,15 +56,17 @@ def c_files(network: Network, contract: Contract) -> dict[str, str]:
         "real": contract.controller["real"],
         "number": number,
         "array": array,
+        "exact": repr,
         "current": loop,
         "clamps": levels is None or bool(loop and (loop["voltage"] is not None or loop["most"] is not None)),
         "kept": "error" if loop and loop["kind"] == "pid" else "pending",
         "servo": loop and loop["servo"],
         "tanh": f"tanh{suffix}",
         "fabs": f"fabs{suffix}",
-        "width": network.width,
+        "network": network,
+        "tiles": isinstance(network, Tiles),
+        "angles": network.angles if isinstance(network, Tiles) else 0,
         "levels": levels,
-        **{name: getattr(network, name) for name in ("factors", "layers", "gains", "low", "high", "squashed")},
         **{name: getattr(contract, name) for name in ("task", "agent", "rate", "observations")},
         "commands": contract.actions,
         "limits": [
@@ -70,7 +74,6 @@ def c_files(network: Network, contract: Contract) -> dict[str, str]:
             for place, one in enumerate(contract.observations)
             if one["name"] in contract.limits
         ],
-        "choices": len(network.layers[-1].bias),
         "tolerance": golden["tolerance"],
         "late_after": f"{round(1e6 * contract.late['after'])}u",
         "safe": contract.late["command"],
@@ -78,21 +81,31 @@ def c_files(network: Network, contract: Contract) -> dict[str, str]:
         "golden_commands": contract.commands(acted),
         "constants": size
         * (network.size + len(network.factors) + (3 * len(acted[0]) if levels is None else levels.size)),
-        "stack": 2 * size * network.width,
+        "stack": size * network.working,
         "state": 2 * size,
-        "products": sum(layer.weight.size for layer in network.layers),
-        "tanhs": sum(len(layer.bias) for layer in network.layers if layer.activation == "Tanh"),
+        **_operations(network),
     }
     made = jinja2.Environment(undefined=jinja2.StrictUndefined, keep_trailing_newline=True, autoescape=False)
     return {name: made.from_string(asset_path(f"deploy/{name}.jinja").read_text()).render(known) for name in FILES}
 
 
-def check_board(board: str, network: Network, double: bool = False) -> None:
+def _operations(network: Network | Tiles) -> dict[str, int]:
+    """How many operations a step takes."""
+    if isinstance(network, Tiles):
+        tilings, axes = network.coder.displacements.shape
+        return {"products": tilings * (axes + network.choices), "tanhs": 0}
+    return {
+        "products": sum(layer.weight.size for layer in network.layers),
+        "tanhs": sum(len(layer.bias) for layer in network.layers if layer.activation == "Tanh"),
+    }
+
+
+def check_board(board: str, network: Network | Tiles, double: bool = False) -> None:
     """Refuse a policy that does not fit a board of `BOARDS`, with both sizes."""
     check_names([board], BOARDS, "board")
     size = 8 if double else 4
     flash, ram = BOARDS[board]
-    for what, needed, there in (("flash", size * network.size + CODE, flash), ("RAM", 2 * size * network.width, ram)):
+    for what, needed, there in (("flash", size * network.size + CODE, flash), ("RAM", size * network.working, ram)):
         if needed > there:
             raise ValueError(
                 f"board {board}: the policy needs about {needed} bytes of {what}, must be at most {there}: train a "

@@ -17,7 +17,7 @@ import numpy as np
 
 from codrl_mj.actuators import mapping_of
 from codrl_mj.deploy.loops import current_loop
-from codrl_mj.deploy.network import Network
+from codrl_mj.deploy.network import network_of
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes
 from codrl_mj.fields import check_names, did_you_mean, leaves
@@ -93,7 +93,7 @@ class Contract:
         Raises:
             ValueError: the policy cannot be exported, `episodes` is below 1, or a limit is unknown or not positive.
         """
-        network = Network.of(policy)
+        network = network_of(policy)
         run = run_episodes(policy, env.make, episodes, seed)
         while sum(len(one.time) for one in run) < GOLDEN:  # some fail at once
             run += run_episodes(policy, env.make, episodes, seed + len(run))

@@ -9,17 +9,18 @@ import numpy as np
 
 from codrl_mj.deploy.c_code import c_files, check_board
 from codrl_mj.deploy.contract import Contract
-from codrl_mj.deploy.network import Network
+from codrl_mj.deploy.network import Network, network_of
+from codrl_mj.deploy.tiles import Tiles
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.runs.files import writing_folder
 from codrl_mj.runs.policies import Policy
 
-ONNX = "policy.onnx"
+ONNX, TABLE = "policy.onnx", "table.csv"
 OPSET = 17
 IR = 9  # read by onnxruntime 1.16 and later
 
 
-def onnx_model(network: Network, about: Mapping[str, Any]) -> Any:
+def onnx_model(network: Network | Tiles, about: Mapping[str, Any]) -> Any:
     """The model: `observation`, float32 (N, k), to `action`, float32 (N, m) or int64 (N,).
 
     Args:
@@ -32,35 +33,20 @@ def onnx_model(network: Network, about: Mapping[str, Any]) -> Any:
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
-    constants: dict[str, Any] = {}
+    constants: list[Any] = []
     nodes: list[Any] = []
-    at = "observation"
 
-    def then(kind: str, *others: tuple[str, Any], **attributes: Any) -> None:
-        nonlocal at
-        for name, value in others:
-            constants[name] = numpy_helper.from_array(value, name)
-        after = f"values_{len(nodes)}"
-        nodes.append(helper.make_node(kind, [at, *(name for name, _ in others)], [after], **attributes))
-        at = after
+    def node(kind: str, *inputs: str | np.ndarray, **attributes: Any) -> str:
+        """Another node, by names of what goes in, or constants; the name of what it gives."""
+        names = []
+        for one in inputs:
+            names.append(one if isinstance(one, str) else f"constant_{len(constants)}")
+            if not isinstance(one, str):
+                constants.append(numpy_helper.from_array(np.ascontiguousarray(one), names[-1]))
+        nodes.append(helper.make_node(kind, names, [f"values_{len(nodes)}"], **attributes))
+        return str(nodes[-1].output[0])
 
-    then("Mul", ("factors", network.factors))
-    for place, layer in enumerate(network.layers):
-        then("Gemm", (f"weight_{place}", layer.weight), (f"bias_{place}", layer.bias), transB=1)
-        if layer.activation != "Identity":
-            then({"Tanh": "Tanh", "ReLU": "Relu"}[layer.activation])
-    then("Mul", ("gains", network.gains))
-    if network.low is None or network.high is None:
-        then("ArgMax", axis=1, keepdims=0)
-    elif network.squashed:
-        half = network.low.dtype.type(0.5)
-        then("Add", ("one", network.low.dtype.type(1.0)))
-        then("Mul", ("half", half))
-        then("Mul", ("span", network.high - network.low))
-        then("Add", ("low", network.low))
-    else:
-        then("Max", ("low", network.low))
-        then("Min", ("high", network.high))
+    network.graph(node)
     nodes[-1].output[0] = "action"
     kind, shape = (TensorProto.INT64, ["N"]) if network.low is None else (TensorProto.FLOAT, ["N", len(network.low)])
     graph = helper.make_graph(
@@ -68,7 +54,7 @@ def onnx_model(network: Network, about: Mapping[str, Any]) -> Any:
         "policy",
         [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["N", len(network.factors)])],
         [helper.make_tensor_value_info("action", kind, shape)],
-        list(constants.values()),
+        constants,
     )
     model = helper.make_model(
         graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR, producer_name="codrl_mj"
@@ -96,7 +82,8 @@ def export(
     it where all motors have the same `codrl_mj.actuators.Drive`, `Servo` or the paper's `Actuator`.
 
     Args:
-        policy: as `codrl_mj.runs.policies.load_policy` returns it, of PPO, SAC, TD3, DDPG or DQN.
+        policy: as `codrl_mj.runs.policies.load_policy` returns it, of PPO, SAC, TD3, DDPG, DQN
+            or SARSA, whose weights are written as `table.csv` too.
         env: what it was trained in.
         agent: the name of what trained it.
         out: the folder; it must not exist, or be empty.
@@ -115,7 +102,7 @@ def export(
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FileExistsError(f"--out {out}: it exists, and is no empty folder: name another, or delete it")
-    network = Network.of(policy)
+    network = network_of(policy)
     if board is not None:
         check_board(board, network, double)
     contract = Contract.of(policy, env, agent, episodes, seed, limits, double)
@@ -134,4 +121,6 @@ def export(
         contract.write(folder)
         for name, content in c_files(network, contract).items():
             (folder / name).write_text(content)
+        if isinstance(network, Tiles):
+            (folder / TABLE).write_text(network.as_csv([one["name"] for one in contract.observations]))
     return contract

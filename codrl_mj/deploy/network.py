@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from codrl_mj.deploy.tiles import Tiles
 from codrl_mj.runs.policies import Policy
 
 ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -82,7 +83,7 @@ class Network:
         else:
             raise ValueError(
                 f"policy: a {type(one).__name__} cannot be exported: it must be of PPO, SAC, TD3, DDPG or DQN, which "
-                "are dense layers"
+                "are dense layers, or SARSA's"
             )
         seen, acts = one.observation_space, one.action_space
         if not isinstance(seen, spaces.Box) or len(seen.shape) != 1:
@@ -101,6 +102,21 @@ class Network:
             squashed,
         )
 
+    def graph(self, node: Any) -> str:
+        """The name of what an ONNX graph gives that computes it, by `node(kind, *inputs, **attributes)`."""
+        values = node("Mul", "observation", self.factors)
+        for layer in self.layers:
+            values = node("Gemm", values, layer.weight, layer.bias, transB=1)
+            if layer.activation != "Identity":
+                values = node({"Tanh": "Tanh", "ReLU": "Relu"}[layer.activation], values)
+        values = node("Mul", values, self.gains)
+        if self.low is None or self.high is None:
+            return str(node("ArgMax", values, axis=1, keepdims=0))
+        if not self.squashed:
+            return str(node("Min", node("Max", values, self.low), self.high))
+        share = node("Mul", node("Add", values, np.ones(1, np.float32)), np.full(1, 0.5, np.float32))
+        return str(node("Add", node("Mul", share, self.high - self.low), self.low))
+
     def __call__(self, observations: np.ndarray, kind: Any = np.float32) -> np.ndarray:
         """Actions (N, m), or their indices (N,), of observations (N, k), computed in numbers of a `kind`."""
         values = observations.astype(kind) * self.factors.astype(kind)
@@ -118,9 +134,33 @@ class Network:
         return max(len(self.factors), *(len(layer.bias) for layer in self.layers))
 
     @property
+    def choices(self) -> int:
+        """How many numbers the last layer gives."""
+        return len(self.gains)
+
+    @property
+    def working(self) -> int:
+        """Numbers that a step keeps beside the weights."""
+        return 2 * self.width
+
+    @property
     def size(self) -> int:
         """How many weights and biases there are."""
         return sum(layer.weight.size + layer.bias.size for layer in self.layers)
+
+
+def network_of(policy: Policy) -> Network | Tiles:
+    """What a policy computes: dense layers, or the tiles of SARSA.
+
+    Raises:
+        ValueError: it cannot be taken out.
+    """
+    from codrl_mj.agents.sarsa_algorithm import TileCodingPolicy
+
+    if isinstance(policy, TileCodingPolicy):
+        factors = np.ones(policy.observation_space.shape or (), np.float32)
+        return Tiles(policy.coder, policy.table.copy(), factors)
+    return Network.of(policy)
 
 
 def _layers(parts: list[Any]) -> list[Layer]:

@@ -13,7 +13,7 @@ from codrl_mj.actuators import Actuator, Drive, Servo, ServoLoop, Supply, electr
 from codrl_mj.actuators.drive import State
 from codrl_mj.actuators.model import Inputs
 from codrl_mj.actuators.parameters import parameters_type
-from codrl_mj.deploy import Contract, Network
+from codrl_mj.deploy import Contract, network_of
 from codrl_mj.deploy.c_code import c_files, check_board
 from codrl_mj.deploy.loops import current_loop
 from codrl_mj.envs.config import EnvConfig
@@ -38,7 +38,7 @@ def written(folder, task, agent, settings, double, **changes):
     env = EnvConfig(task, **changes)
     policy, _ = trained(task, agent, **settings)
     contract = Contract.of(policy, env, agent, 1, double=double)
-    for name, content in c_files(Network.of(policy), contract).items():
+    for name, content in c_files(network_of(policy), contract).items():
         (folder / name).write_text(content)
     return policy, contract
 
@@ -49,7 +49,7 @@ def test_the_policy_in_c_is_the_policy(tmp_path, task, agent, settings, double):
     policy, contract = written(tmp_path, task, agent, settings, double)
     library, kind = compiled(tmp_path), KINDS[double]
     seen = observed(policy.observation_space)
-    network = Network.of(policy)
+    network = network_of(policy)
     expected = network(seen, np.float64) if double else policy.predict(seen, deterministic=True)[0]
     command = (kind * len(contract.actions))()
     got = np.empty((len(seen), len(contract.actions)))
@@ -64,7 +64,7 @@ def test_the_policy_in_c_is_the_policy(tmp_path, task, agent, settings, double):
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
-@pytest.mark.parametrize(("task", "agent"), [("furuta", "sac"), ("acrobot", "dqn")])
+@pytest.mark.parametrize(("task", "agent"), [("furuta", "sac"), ("acrobot", "dqn"), ("acrobot", "sarsa")])
 def test_golden_commands_are_computed_again_without_a_warning(tmp_path, compiler, task, agent):
     written(tmp_path, task, agent, {}, double=False)
     program = str(tmp_path / "main")
@@ -230,7 +230,7 @@ def test_without_a_drive_s_loop_there_is_the_policy_alone(tmp_path, task, change
 
 def test_a_policy_that_does_not_fit_is_refused_with_both_sizes():
     policy, _ = trained("pendulum", "ppo", hidden=(128, 128))
-    network = Network.of(policy)
+    network = network_of(policy)
     check_board("nucleo-f446re", network, double=False)
     with pytest.raises(
         ValueError, match=r"arduino-uno: the policy needs about \d+ bytes of flash, must be at most 32256"

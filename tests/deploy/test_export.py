@@ -1,5 +1,6 @@
 """A policy outside of the simulator: what other runtimes compute of it, and what its contract refuses."""
 
+import csv
 import dataclasses
 import json
 
@@ -14,7 +15,7 @@ from codrl_mj.actuators import Actuator
 from codrl_mj.agents import AGENTS
 from codrl_mj.agents.models import ScaledObservation
 from codrl_mj.cli import main
-from codrl_mj.deploy import Contract, Network, export, onnx_model
+from codrl_mj.deploy import Contract, Network, board_test, export, network_of, onnx_model
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.runs.policies import load_policy, save_policy
 
@@ -39,8 +40,11 @@ def trained(task, agent, **settings):
 
 
 def observed(space, count=10_000):
-    """Observations (count, k), of which many are far out."""
-    return np.random.default_rng(1).normal(0.0, 2.0, (count, *space.shape)).astype(np.float32)
+    """Observations (count, k), of which half are within the bounds and of the others many far out."""
+    random = np.random.default_rng(1)
+    far = random.normal(0.0, 2.0, (count, *space.shape))
+    near = random.uniform(np.maximum(space.low, -2.0), np.minimum(space.high, 2.0), far.shape)
+    return np.where(np.arange(count)[:, None] % 2, near, far).astype(np.float32)
 
 
 def runtimes(model):
@@ -52,8 +56,13 @@ def runtimes(model):
     )
 
 
+TABLES = [
+    ("mountain_car", "sarsa", {}),
+    ("acrobot", "sarsa", {"tilings": 16, "intervals": (6, 6, 4, 4), "angles": 2}),
+]
 EACH = [
     *((task, agent, {}) for task, agent in TASKS.items()),
+    *TABLES,
     ("pendulum", "ppo", {"unit_actions": True}),
     ("furuta", "ppo", {"activation": "relu", "input_scale": (1.0, 1.0, 1.0, 1.0, 0.05, 0.05)}),
 ]
@@ -64,7 +73,7 @@ def test_other_runtimes_act_as_the_policy_does(task, agent, settings):
     policy, _ = trained(task, agent, **settings)
     seen = observed(policy.observation_space)
     acted = policy.predict(seen, deterministic=True)[0]
-    for run in runtimes(onnx_model(Network.of(policy), {})):
+    for run in runtimes(onnx_model(network_of(policy), {})):
         other = run(seen)
         assert other.dtype == acted.dtype
         if acted.dtype == np.int64:
@@ -91,7 +100,24 @@ def test_factors_of_the_observation_are_inside():
     np.testing.assert_allclose(Network.of(scaled)(seen), Network.of(plain)(twice), atol=1e-6)
 
 
-def test_a_table_of_tiles_is_no_network():
+def test_the_table_is_the_policy(tmp_path):
+    policy, _ = trained("mountain_car", "sarsa")
+    export(policy, EnvConfig("mountain_car"), "sarsa", tmp_path / "out", 1)
+    header, *rows = csv.reader((tmp_path / "out/table.csv").open())
+    assert header == ["tiling", "position", "velocity", "action 0", "action 1", "action 2"]
+    weights = {tuple(map(int, row[:3])): np.array(row[3:], float) for row in rows}
+    assert len(weights) == 8 * 9 * 9
+    low, high = np.array([-1.2, -0.07]), np.array([0.6, 0.07])
+    seen = np.random.default_rng(0).uniform(low, high, (300, 2)).astype(np.float32)
+    for one, action in zip(seen, policy.predict(seen, deterministic=True)[0], strict=True):
+        eighths = np.floor((one.astype(float) - low) / (high - low) * 64)  # Sutton's displacements: 1 and 3 a tiling
+        tiles = [(tiling, *((eighths + tiling * np.array([1, 3]) % 8) // 8).astype(int)) for tiling in range(8)]
+        assert sum(weights[tile] for tile in tiles).argmax() == action
+    done = board_test(tmp_path / "out", episodes=2)
+    np.testing.assert_array_equal(done.on_board[1].action, done.in_python[1].action)
+
+
+def test_other_policies_are_refused():
     policy, _ = trained("mountain_car", "sarsa")
     with pytest.raises(ValueError, match="TileCodingPolicy cannot be exported: it must be of PPO, SAC, TD3, DDPG or"):
         Network.of(policy)
