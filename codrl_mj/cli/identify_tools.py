@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from codrl_mj.cli.compare import CompareLog
 from codrl_mj.cli.motor import AsJson, MotorName
 
 Columns = Annotated[
@@ -281,19 +282,26 @@ class ProposeColumns:
 
 
 _MOTION = "position", "velocity"
-TOOLS: dict[str, Any] = {"check": CheckLogs, "columns": ProposeColumns, "plan": PlanExperiment, "simulate": SimulateLog}
+TOOLS: dict[str, Any] = {
+    "check": CheckLogs,
+    "columns": ProposeColumns,
+    "plan": PlanExperiment,
+    "simulate": SimulateLog,
+    "compare": CompareLog,
+}
 """What `codrl-mj identify` does besides fitting, by its word."""
 
 
 @dataclasses.dataclass(frozen=True)
 class IdentifyTools:
-    """Motors from bench logs: check logs, plan experiments, simulate logs. docs/identify_logs.md has more."""
+    """Motors from bench logs: check logs, plan experiments, simulate logs, compare rigs. See docs/identify_logs.md."""
 
     verb: tyro.conf.OmitSubcommandPrefixes[
         Annotated[CheckLogs, tyro.conf.subcommand("check")]
         | Annotated[ProposeColumns, tyro.conf.subcommand("columns")]
         | Annotated[PlanExperiment, tyro.conf.subcommand("plan")]
         | Annotated[SimulateLog, tyro.conf.subcommand("simulate")]
+        | Annotated[CompareLog, tyro.conf.subcommand("compare")]
     ]
     """What to do; each has its own --help."""
 

@@ -4,6 +4,7 @@ A policy on a board fails quietly where an angle comes in degrees, two entries c
 rate. So all of it is written down, and a reader refuses what differs.
 """
 
+import contextlib
 import dataclasses
 import hashlib
 import importlib.metadata
@@ -38,20 +39,81 @@ _ENTRIES = (
 
 
 @dataclasses.dataclass(frozen=True)
-class Contract:
-    """What stands in the file."""
+class Interface:
+    """What passes between a policy and whatever it controls."""
 
     task: str
     """The environment's name."""
-    agent: str
-    """Who was trained."""
     rate: float
     """Actions a second [Hz]."""
     observations: list[dict[str, Any]]
-    """Entries of an observation in their order: `name`, `unit`, bounds `least` and `most`, `scale` and `offset` before
-    the first layer (done by the policy itself), and `seen`, the least and the most of the golden episodes."""
+    """Entries of an observation in their order: `name`, `unit`, bounds `least` and `most`; of a contract's also `scale`
+    and `offset` before the first layer (done by the policy itself), and `seen`, the least and the most of the golden
+    episodes."""
     actions: list[dict[str, Any]]
     """Entries of an action, likewise; a discrete one has the `levels` that its indices stand for."""
+
+    @classmethod
+    def between(cls, env: EnvConfig) -> "Interface":
+        """That of an environment."""
+        with contextlib.closing(env.make()) as made:
+            rate = 1.0 / made.get_wrapper_attr("recorder").step_duration
+        return cls(env.task, rate, *env.world.interface(env))
+
+    @property
+    def levels(self) -> np.ndarray | None:
+        """What discrete actions stand for, (choices, m) in the units of `actions`; None of others, or if not known."""
+        levels = [one["levels"] for one in self.actions if "levels" in one]
+        return np.array(levels, dtype=np.float64).T if levels else None
+
+    def commands(self, actions: np.ndarray) -> np.ndarray:
+        """Commands (n, m) in the units of `actions`, for actions (n, m), or indices (n,) of the levels."""
+        return actions.reshape(len(actions), -1) if self.levels is None else self.levels[actions]
+
+    def actions_of(self, commands: np.ndarray) -> np.ndarray:
+        """The actions (n, m) for commands (n, m), or the indices (n,) of the levels that are nearest to them."""
+        if (levels := self.levels) is None:  # of a discrete action of others nobody knows more than the index
+            return commands.astype(np.float32) if "least" in self.actions[0] else commands[:, 0].round().astype(int)
+        return np.abs(commands[:, None, :] - levels).sum(axis=2).argmin(axis=1)
+
+    def admit(self, observations: Sequence[tuple[str, str | None]], rate: float | None = None) -> None:
+        """Refuse observations that are not those of the policy.
+
+        Args:
+            observations: name and unit of each entry, in the order in which they come; a unit of None is not compared.
+            rate: how many come in a second [Hz]; None is not compared.
+
+        Raises:
+            ValueError: entries are missing, unknown, in another order or unit, or come at another rate.
+        """
+        names, given = [one["name"] for one in self.observations], [name for name, _ in observations]
+        if unknown := [name for name in given if name not in names]:
+            raise ValueError(
+                f"observation {unknown[0]!r}: the policy knows none; {did_you_mean(unknown[0], names)}it has "
+                f"{', '.join(names)}"
+            )
+        if missing := [name for name in names if name not in given]:
+            raise ValueError(f"observations: {', '.join(missing)} missing: the policy takes {', '.join(names)}")
+        if given != names:
+            raise ValueError(
+                f"observations: their order is {', '.join(given)}, must be {', '.join(names)}: reorder the columns"
+            )
+        for (name, unit), one in zip(observations, self.observations, strict=True):
+            if unit is not None and one["unit"] is not None and unit != one["unit"]:
+                raise ValueError(f"observation {name!r}: its unit is {unit}, must be {one['unit']}: convert it")
+        if rate is not None and abs(rate / self.rate - 1.0) > 0.01:
+            raise ValueError(
+                f"rate: observations come at {rate:.4g} Hz, must be {self.rate:.4g} Hz, at which the policy was "
+                "trained: it knows no other"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class Contract(Interface):
+    """What stands in the file."""
+
+    agent: str
+    """Who was trained."""
     actuators: dict[str, dict[str, Any]]
     """Motor, or pattern of motors -> its fields, None for an ideal one, and their `sha256`."""
     assumed: dict[str, Any]
@@ -97,25 +159,21 @@ class Contract:
         run = run_episodes(policy, env.make, episodes, seed)
         while sum(len(one.time) for one in run) < GOLDEN:  # some fail at once
             run += run_episodes(policy, env.make, episodes, seed + len(run))
-        period = float(run[0].time[0])
         seen = np.concatenate([one.observation[:-1] for one in run])
         chosen = seen[np.unique(np.linspace(0, len(seen) - 1, GOLDEN).astype(int))]
-        observations, actions = env.world.interface(env)
-        for place, entry in enumerate(observations):
+        between = Interface.between(env)
+        for place, entry in enumerate(between.observations):
             entry |= {"scale": float(network.factors[place]), "offset": 0.0}
             entry["seen"] = [float(seen[:, place].min()), float(seen[:, place].max())]
         acted = policy.predict(chosen, deterministic=True)[0]
         return cls(
-            task=env.task,
+            **vars(between),
             agent=agent,
-            rate=1.0 / period,
-            observations=observations,
-            actions=actions,
             actuators={name: _told(mapping_of(one)) for name, one in env.driven.items()},
             assumed=json.loads(json.dumps(env.as_mapping())),
             controller={"real": "double" if double else "float", "loop": current_loop(env)},
-            limits=_limits([one["name"] for one in observations], limits or {}),
-            late={"after": LATE * period, "unit": "s", "command": [0.0] * len(actions)},
+            limits=_limits([one["name"] for one in between.observations], limits or {}),
+            late={"after": LATE / between.rate, "unit": "s", "command": [0.0] * len(between.actions)},
             golden={"observations": chosen.tolist(), "actions": acted.tolist(), "tolerance": 1e-5},
             versions={
                 "python": platform.python_version(),
@@ -144,24 +202,6 @@ class Contract:
         write_json(folder / FILE, sealed({"format": FORMAT, **dataclasses.asdict(self)}))
 
     @property
-    def levels(self) -> np.ndarray | None:
-        """What discrete actions stand for, (choices, m) in the units of `actions`; None of others, or if not known."""
-        levels = [one["levels"] for one in self.actions if "levels" in one]
-        return np.array(levels, dtype=np.float64).T if levels else None
-
-    def commands(self, actions: np.ndarray) -> np.ndarray:
-        """Commands (n, m) in the units of `actions`, for actions (n, m), or indices (n,) of the levels."""
-        return actions.reshape(len(actions), -1) if self.levels is None else self.levels[actions]
-
-    def actions_of(self, commands: np.ndarray) -> np.ndarray:
-        """The actions (n, m) for commands (n, m), or the indices (n,) of the levels that are nearest to them."""
-        if np.ndim(self.golden["actions"]) > 1:
-            return commands.astype(np.float32)
-        if (levels := self.levels) is None:  # an environment of others: the index itself
-            return commands[:, 0].round().astype(np.int64)
-        return np.abs(commands[:, None, :] - levels).sum(axis=2).argmin(axis=1)
-
-    @property
     def period_us(self) -> int:
         """Microseconds between two actions."""
         return round(1e6 / self.rate)
@@ -175,37 +215,6 @@ class Contract:
                 most is None or observations[:, place] <= most
             )
         return fine
-
-    def admit(self, observations: Sequence[tuple[str, str | None]], rate: float | None = None) -> None:
-        """Refuse observations that are not those of the policy.
-
-        Args:
-            observations: name and unit of each entry, in the order in which they come; a unit of None is not compared.
-            rate: how many come in a second [Hz]; None is not compared.
-
-        Raises:
-            ValueError: entries are missing, unknown, in another order or unit, or come at another rate.
-        """
-        names, given = [one["name"] for one in self.observations], [name for name, _ in observations]
-        if unknown := [name for name in given if name not in names]:
-            raise ValueError(
-                f"observation {unknown[0]!r}: the policy knows none; {did_you_mean(unknown[0], names)}it has "
-                f"{', '.join(names)}"
-            )
-        if missing := [name for name in names if name not in given]:
-            raise ValueError(f"observations: {', '.join(missing)} missing: the policy takes {', '.join(names)}")
-        if given != names:
-            raise ValueError(
-                f"observations: their order is {', '.join(given)}, must be {', '.join(names)}: reorder the columns"
-            )
-        for (name, unit), one in zip(observations, self.observations, strict=True):
-            if unit is not None and one["unit"] is not None and unit != one["unit"]:
-                raise ValueError(f"observation {name!r}: its unit is {unit}, must be {one['unit']}: convert it")
-        if rate is not None and abs(rate / self.rate - 1.0) > 0.01:
-            raise ValueError(
-                f"rate: observations come at {rate:.4g} Hz, must be {self.rate:.4g} Hz, at which the policy was "
-                "trained: it knows no other"
-            )
 
     def admit_actuators(self, actuators: Mapping[str, Any]) -> None:
         """Refuse actuators that are not those of the training; by motor or pattern, each an `ActuatorModel`.

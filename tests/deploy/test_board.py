@@ -342,24 +342,26 @@ def test_a_log_of_the_board_keeps_its_contract_and_one_that_is_changed_does_not(
     assert (found.late, found.differing) == (0, 0)
     assert found.rate == pytest.approx(contract.rate)
     header, *rows = [line.split(",") for line in log.read_text().splitlines()]
+    sent = 1 + len(contract.observations)
+    assert header[sent + 1 :] == ["motor_voltage:V", "motor_current:A", "motor_position:rad"]
     refused = {
         "order": ([header[0], header[2], header[1], *header[3:]], rows),
         "missing": ([header[0], *header[2:]], [[row[0], *row[2:]] for row in rows]),
         "unit": ([*header[:1], header[1].partition(":")[0] + ":deg", *header[2:]], rows),
         "knows none": ([*header[:1], "height:m", *header[2:]], rows),
         "rate": (header, [[str(2.0 * float(row[0])), *row[1:]] for row in rows]),
-        "convert it": ([*header[:-1], header[-1].partition(":")[0] + ":kg"], rows),
+        "convert it": ([*header[:sent], "motor:kg", *header[sent + 1 :]], rows),
         "increase": (header, [rows[1], rows[0], *rows[2:]]),
         "cells": (header, [rows[0][:-1], *rows[1:]]),
         "a number": (header, [["soon", *rows[0][1:]], *rows[1:]]),
-        "no column 'motor'": (header[:-1], [row[:-1] for row in rows]),
+        "no column 'motor'": (header[:sent], [row[:sent] for row in rows]),
     }
     for says, table in refused.items():
         log.write_text("\n".join(",".join(row) for row in (table[0], *table[1])))
         with pytest.raises(ValueError, match=says):
             check_log(folder, log)
     for row in rows:
-        row[-1] = str(float(row[-1]) + 0.01)
+        row[sent] = str(float(row[sent]) + 0.01)
     log.write_text("\n".join(",".join(row) for row in (header, *rows)))
     assert check_log(folder, log).differing == len(rows)
     assert main(["board", "check", str(folder), str(log)]) == 1

@@ -1,0 +1,110 @@
+"""What a rig did beside what the simulation does under the same commands, in short windows."""
+
+import contextlib
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codrl_mj.deploy.contract import Interface
+from codrl_mj.deploy.log import Rows, read_rows
+from codrl_mj.envs.config import EnvConfig
+
+WINDOW, ROWS = 0.5, 10
+"""Time [s] after which the simulation begins again at what was observed, and after how many rows at least."""
+_STARTS = 8  # further states from which the one is searched that an observation tells
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """Observations of a log of n rows and of the simulation under its commands, which begins anew at some of them."""
+
+    names: list[str]
+    """What is observed."""
+    units: list[str | None]
+    """Of each of them."""
+    time: np.ndarray
+    """[s], shape (n,)."""
+    logged: np.ndarray
+    """Shape (n, k)."""
+    simulated: np.ndarray
+    """Shape (n, k)."""
+    starts: np.ndarray
+    """Rows at which the simulation begins at what was observed, shape (windows,)."""
+
+    @property
+    def errors(self) -> np.ndarray:
+        """Root of the mean square of simulated less logged, over all windows, shape (k,)."""
+        return np.sqrt(((self.simulated - self.logged) ** 2).mean(axis=0))
+
+    @property
+    def moved(self) -> np.ndarray:
+        """The same of a guess that nothing changes within a window, shape (k,), to hold the errors against."""
+        held = self.logged[self.starts[np.searchsorted(self.starts, np.arange(len(self.time)), "right") - 1]]
+        return np.sqrt(((held - self.logged) ** 2).mean(axis=0))
+
+
+def compare(env: EnvConfig, path: Path, window: float | None = None) -> Comparison:
+    """Simulate the commands of a log, and hold what is observed then against what was observed on the rig.
+
+    The simulation begins at the first row's observation and again after each window; its motors go on as they are, as
+    the commands before have left them. What is drawn in the environment is not drawn here.
+
+    Args:
+        env: the environment that the policy was trained in, with the actuator that is to be tried.
+        path: the log, as `codrl_mj.deploy.log.read_rows` reads it.
+        window: time [s] from one beginning to the next; None: half a second, and at least ten rows of the log.
+
+    Raises:
+        FileNotFoundError: there is no such log.
+        ValueError: the log cannot be read, or is of another environment; `window` is shorter than two rows; or the
+            environment's state does not follow from what is observed.
+    """
+    env = dataclasses.replace(env, randomize=None)
+    interface = Interface.between(env)
+    rows = read_rows(interface, path)
+    length = max(round(WINDOW * interface.rate), ROWS) if window is None else round(window * interface.rate)
+    if window is not None and length < 2:
+        raise ValueError(f"window = {window:g} s: must be at least {2 / interface.rate:g} s, two rows of the log")
+    starts = np.arange(0, len(rows.time), length)
+    with contextlib.closing(env.make()) as made:
+        simulated = _simulated(made.unwrapped, interface, rows, starts)
+    names, units = ([one[key] for one in interface.observations] for key in ("name", "unit"))
+    return Comparison(names, units, rows.time, rows.observed, simulated, starts)
+
+
+def _simulated(env: Any, interface: Interface, rows: Rows, starts: np.ndarray) -> np.ndarray:
+    """What an environment observes under the commands of a log, shape (n, k)."""
+    task = getattr(env, "task", None)
+    if task is None:
+        raise ValueError(f"{interface.task}: only a task's state can be set to what was observed: must be a task")
+    observation, _ = env.reset(seed=0)
+    seen, actions = [], interface.actions_of(rows.commands)
+    for row, action in enumerate(actions):
+        if row in starts:
+            env.state = _state_of(task, rows.observed[row], env.state)
+            observation = rows.observed[row]
+        seen.append(observation)
+        observation = env.step(action)[0]
+    return np.array(seen)
+
+
+def _state_of(task: Any, observed: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """The task's state at which it observes that, of several the one near another (n,)."""
+    from scipy.optimize import least_squares
+
+    seen = observed[: len(task.observation_names)]  # behind are the motors'
+
+    def off(state: np.ndarray) -> np.ndarray:
+        return np.array(task.observation(tuple(state)), dtype=float) - seen
+
+    random, found = np.random.default_rng(0), least_squares(off, near)
+    for _ in range(_STARTS):
+        if found.cost < 1e-9:
+            break
+        other = least_squares(off, near + random.uniform(-np.pi, np.pi, len(near)))
+        found = other if other.cost < found.cost else found
+    if np.linalg.matrix_rank(found.jac, tol=1e-6) < len(near):
+        raise ValueError(f"{task.name}: its state does not follow from its observation: the rig cannot be simulated")
+    return np.asarray(found.x)

@@ -1,0 +1,94 @@
+"""A log of a rig beside the simulation under its commands."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from codrl_mj.cli import main
+from codrl_mj.deploy import Contract, OnnxPolicy, compare, export, write_log
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.evaluation import run_episodes
+from tests.deploy.test_export import trained
+
+TASKS = {"furuta": "ppo", "acrobot": "dqn", "mountain_car_continuous": "td3"}
+
+
+def logged(folder, task, **changes):
+    """A log of an episode of a policy with random weights, its contract, the environment and the episode."""
+    env = EnvConfig(task, **changes)
+    export(trained(task, TASKS[task])[0], env, TASKS[task], folder / "out", 1)
+    (episode,) = run_episodes(OnnxPolicy(folder / "out"), env.make, 1, seed=3)
+    contract = Contract.read(folder / "out")
+    write_log(folder / "rig.csv", contract, episode)
+    return folder / "rig.csv", contract, env, episode
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_rig_that_is_the_simulation_does_what_it_does(tmp_path, task):
+    log, _, env, episode = logged(tmp_path, task)
+    found = compare(env, log)
+    assert found.simulated.shape == episode.observation[:-1].shape
+    np.testing.assert_array_equal(found.simulated[found.starts], found.logged[found.starts])
+    np.testing.assert_allclose(found.simulated, found.logged, atol=2e-4)  # observations are float32
+    assert (found.moved > 100.0 * found.errors).all()
+
+
+def test_another_motor_is_seen_and_what_identifies_it_takes_the_difference_away(tmp_path):
+    (drive,) = EnvConfig("furuta").driven.values()
+    real = drive.replaced({"motor.torque_constant": 0.03, "motor.viscous_friction": 3e-5})
+    log, _, env, _ = logged(tmp_path, "furuta", actuator=real)
+    same, other = (compare(one, log).errors for one in (env, EnvConfig("furuta")))
+    assert (other > 20.0 * same).all()
+
+
+def test_windows_begin_at_what_was_observed_and_the_motor_goes_on(tmp_path):
+    log, contract, env, episode = logged(tmp_path, "furuta")
+    found = compare(env, log, 0.2)
+    assert found.starts.tolist() == list(range(0, len(episode.time), round(0.2 * contract.rate)))
+    whole = compare(env, log, 1e3)
+    assert whole.starts.tolist() == [0]
+    np.testing.assert_allclose(whole.simulated, whole.logged, atol=1e-6)
+    held = found.logged[np.repeat(found.starts, 10)[: len(found.time)]]
+    np.testing.assert_allclose(found.moved, np.sqrt(((held - found.logged) ** 2).mean(axis=0)))
+
+
+def test_a_log_has_what_the_motor_did(tmp_path):
+    log, contract, _, episode = logged(tmp_path, "furuta")
+    rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(log.open())]
+    assert [row["motor_voltage:V"] for row in rows[1:]] == episode.signals["voltage"][:-1].tolist()
+    assert rows[0]["motor_current:A"] == 0.0
+    turned = np.array([row["motor_position:rad"] for row in rows])
+    arm = np.unwrap(episode.state[:-1, 0])
+    np.testing.assert_allclose(turned, arm - arm[0], atol=1e-4)
+    assert 1.0 / contract.rate == pytest.approx(rows[1]["time:s"])
+
+
+def test_from_the_command_line(tmp_path, capsys):
+    log, *_ = logged(tmp_path, "furuta")
+    line = ["identify", "compare", str(tmp_path / "out"), str(log)]
+    assert main([*line, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [one["name"] for one in told] == ["cos_arm", "sin_arm", "cos_rod", "sin_rod", "arm_velocity", "rod_velocity"]
+    assert all(one["error"] < 0.01 * one["if_nothing_changed"] for one in told)
+    picture = tmp_path / "compared.png"
+    assert main([*line, "--actuator", "ideal", "--out", str(picture)]) == 0
+    assert "arm_velocity" in capsys.readouterr().out
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_cannot_be_compared_is_said(tmp_path, capsys):
+    log, *_ = logged(tmp_path, "furuta")
+    line = ["identify", "compare", str(tmp_path / "out"), str(log)]
+    for more, says in {
+        ("--window", "0.01"): "window = 0.01 s: must be at least 0.04 s, two rows of the log",
+        ("--out", str(tmp_path / "a.pdf")): "the suffix must be .png",
+        ("--actuator", "weakest"): "weakest",
+    }.items():
+        assert main([*line, *more]) == 2
+        assert says in capsys.readouterr().err
+    assert main([*line[:3], str(tmp_path / "none.csv")]) == 2
+    capsys.readouterr()
+    with pytest.raises(ValueError, match="the policy knows none"):
+        compare(EnvConfig("cartpole"), log)
