@@ -19,7 +19,7 @@ Columns = Annotated[
         metavar="SIGNAL=COLUMN:UNIT,...",
         help="What the columns are, as time=t:s,voltage=duty*vbus:V,current=i:mA,position=q:deg. Signals are voltage, "
         "current, position, velocity, torque, bus, duty, temperature and command; formulas have + - * /, "
-        "twos_complement(column,16), unwrap(column,360), abs, sign and sqrt. docs/identify_logs.md has more.",
+        "twos_complement(column,16), unwrap(column,360), atan2(y,x), abs, sign, sqrt: docs/identify_logs.md.",
     ),
 ]
 """Type of a verb's flag `--columns`."""

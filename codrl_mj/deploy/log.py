@@ -69,7 +69,7 @@ def _measured(contract: Contract, episode: Episode) -> np.ndarray:
         return np.zeros((steps, 0))
     speeds = np.vstack([episode.first_speeds, np.reshape(episode.trace["speed"], (-1, count))])
     turned = np.cumsum(episode.timestep * (speeds[1:] + speeds[:-1]) / 2.0, axis=0)
-    turned = turned[episode.inner_steps - 1 :: episode.inner_steps]
+    turned = turned[episode.inner_steps - 1 :: episode.inner_steps] / [one.arm_radius for one in episode.actuators]
     ends = [np.reshape(one, (steps, count)) for one in (episode.signals["voltage"], episode.signals["current"], turned)]
     before = np.stack([np.vstack([np.zeros((1, count)), one[:-1]]) for one in ends], axis=2)
     return before.reshape(steps, -1)

@@ -26,11 +26,12 @@ def twos_complement(values: Any, bits: Any) -> Any:
 FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
     "twos_complement": (2, twos_complement),
     "unwrap": (2, lambda values, period: np.unwrap(values, period=float(period))),
+    "atan2": (2, np.arctan2),
     "abs": (1, np.abs),
     "sign": (1, np.sign),
     "sqrt": (1, np.sqrt),
 }
-"""What a formula may call -> number of arguments, function. The second is a number: of bits, the period."""
+"""What a formula may call -> number of arguments, function. A second one is a number, but of atan2."""
 _Value = Callable[[Mapping[str, Any]], Any]
 _OPERATORS: dict[type, Callable[[Any, Any], Any]] = {
     ast.Add: np.add,
@@ -111,7 +112,7 @@ class Column:
                 if len(arguments) != needed:
                     raise self._wrong(f"{called} takes {needed} arguments, not {len(arguments)}")
                 values, read = zip(*map(self._made, arguments), strict=True)
-                if needed == 2 and read[1] - {"pi"}:
+                if needed == 2 and called != "atan2" and read[1] - {"pi"}:
                     raise self._wrong(f"the second argument of {called} must be a number, such as 16")
                 return lambda table: function(*(one(table) for one in values)), set().union(*read)
         known = ", ".join(FUNCTIONS)

@@ -10,6 +10,8 @@ from codrl_mj.cli import main
 from codrl_mj.deploy import Contract, OnnxPolicy, compare, export, write_log
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes
+from codrl_mj.identify import identify, read_log
+from codrl_mj.motor_design import find_drive
 from tests.deploy.test_export import trained
 
 TASKS = {"furuta": "ppo", "acrobot": "dqn", "mountain_car_continuous": "td3"}
@@ -92,3 +94,32 @@ def test_what_cannot_be_compared_is_said(tmp_path, capsys):
     capsys.readouterr()
     with pytest.raises(ValueError, match="the policy knows none"):
         compare(EnvConfig("cartpole"), log)
+
+
+def test_identify_reads_what_a_board_logged(tmp_path):
+    drive = find_drive("maxon-ec45-flat-50w").replaced({"motor.gear_ratio": 20.0, "motor.coulomb_friction": 0.0})
+    env = EnvConfig("pendulum", actuator=drive, inner_steps=50)
+    export(trained("pendulum", "ddpg")[0], env, "ddpg", tmp_path / "out", 1)
+
+    class Slow:
+        random = np.random.default_rng(0)
+
+        def predict(self, *_, **__):
+            if self.random.random() < 0.2:
+                self.held = self.random.uniform(-2.0, 2.0, (1, 1)).astype(np.float32)
+            return self.held, None
+
+    Slow.held = np.zeros((1, 1), np.float32)
+    logs = []
+    for seed in (3, 4):
+        (episode,) = run_episodes(Slow(), env.make, 1, seed)
+        write_log(tmp_path / f"{seed}.csv", Contract.read(tmp_path / "out"), episode)
+        columns = (
+            'time="time:s":s,torque="motor:N*m":N*m,position=unwrap(atan2("sin_angle:1","cos_angle:1"),2*pi)+pi:rad'
+        )
+        logs.append(read_log(tmp_path / f"{seed}.csv", columns))
+    found = identify(logs, rig="pendulum", known={"viscous_friction": 0.0})
+    rotor = 20.0**2 * drive.motor.rotor_inertia
+    for name, value in {"inertia": 1.0 / 3.0 + rotor, "mgl": 5.0}.items():
+        assert found[name].low <= value <= found[name].high
+        assert found[name].value == pytest.approx(value, rel=0.2)
