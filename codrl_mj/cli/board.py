@@ -27,6 +27,8 @@ class Test:
     """Seed of the first of them."""
     loop: bool = True
     """Let the C close the motors' current loop too, sample by sample, where it has one."""
+    actuator: str | None = None
+    """Motor in the simulation, by name or file, where it is to be another than the policy's."""
     lost: float = 0.0
     """Share of the frames that never arrive at the board."""
     damaged: float = 0.0
@@ -60,7 +62,7 @@ class Test:
         link = Link(**{name: getattr(self, name) for name in names})
         with progress_bar("{task.completed}/{task.total} episodes") as bar:
             row = bar.add_task(f"on {self.target}", total=self.episodes)
-            given = self.folder, self.target, self.episodes, self.seed, link, self.loop
+            given = self.folder, self.target, self.episodes, self.seed, link, self.loop, self.actuator
             done = board_test(*given, on_step=lambda _, ended: bar.update(row, completed=ended))
         board, python = done.returns.mean(axis=0)
         taken = "not counted here" if done.instructions is None else "{} and {}".format(*done.instructions)
@@ -84,12 +86,11 @@ class Test:
 
     def _film(self, out: Path, link: Any) -> None:
         from codrl_mj.deploy import Board
-        from codrl_mj.envs.config import EnvConfig
         from codrl_mj.films.film import Panel, film
         from codrl_mj.films.record import record
 
-        with Board(self.folder, self.target, link, self.seed, self.loop) as board:
-            env = EnvConfig.from_mapping(board.contract.assumed)
+        with Board(self.folder, self.target, link, self.seed, self.loop, self.actuator) as board:
+            env = board.env
             episode, frames = record(board, env, self.seed, 640, 480, "fixed", False)
         title = f"{env.task} by its C on {self.target}: return {episode.total:.0f}"
         film([Panel(title, env.task, episode.actuator, episode, 0, frames)], out, 640, 480, "fixed", False)

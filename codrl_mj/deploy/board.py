@@ -119,7 +119,13 @@ class Board:
     """
 
     def __init__(
-        self, folder: Path, target: str = "host", link: Link | None = None, seed: int = 0, loop: bool = True
+        self,
+        folder: Path,
+        target: str = "host",
+        link: Link | None = None,
+        seed: int = 0,
+        loop: bool = True,
+        actuator: Any = None,
     ) -> None:
         """Compile the C and start it.
 
@@ -129,10 +135,12 @@ class Board:
             link: what stands between; None for nothing.
             seed: of what is lost, damaged and late.
             loop: whether the C closes the current loop too, where it has one; else the simulation does.
+            actuator: what the simulation has for motors, by name, file or object; None: those of the training.
 
         Raises:
             FileNotFoundError: the folder has no contract or no C.
-            ValueError: the target is unknown, or bits are given where the C closes no loop, or has no limit for them.
+            ValueError: the target or actuator is unknown, the actuator is of another family than the C's loop, or bits
+                are given where the C closes no loop, or has no limit for them.
             RuntimeError: a tool is missing (the message installs it), or the C does not compile.
         """
         if install := missing_tools(target):
@@ -142,6 +150,16 @@ class Board:
         self.frames, self.refused, self.stopped, self.unanswered = 0, 0, 0, 0
         self._last = np.array(self.contract.late["command"])
         self.loop = self.contract.controller["loop"] if loop else None
+        self.env = EnvConfig.from_mapping(self.contract.assumed)
+        trained = type(self.env.actuators[0])
+        if actuator is not None:
+            self.env = dataclasses.replace(self.env, actuator=dict.fromkeys(self.env.driven, actuator), randomize=None)
+        motor: Any = self.env.actuators[0]
+        if self.loop is not None and type(motor) is not trained:
+            raise ValueError(
+                f"actuator: a {type(motor).__name__}, must be a {trained.__name__}, for which the C closes the loop; "
+                "or let the simulation close it (--no-loop)"
+            )
         steps = self._converters()
         with contextlib.ExitStack() as held:
             process = held.enter_context(_running(folder, target))
@@ -150,9 +168,9 @@ class Board:
             if self.loop is not None:
                 from codrl_mj.deploy.on_board import loop_on_board
 
-                family = type(EnvConfig.from_mapping(self.contract.assumed).actuators[0])
+                amperes = motor.arm_radius / motor.motor.torque_constant if self.env.action == "force" else 1.0
                 drive = held.enter_context(_running(folder, target, "BOARD_DRIVE"))
-                self._samples = held.enter_context(loop_on_board(family, drive, self.loop["amperes"], *steps))
+                self._samples = held.enter_context(loop_on_board(trained, drive, amperes, *steps))
             self._held = held.pop_all()
 
     def __enter__(self) -> "Board":
@@ -210,7 +228,7 @@ class Board:
         voltage = self.loop["voltage"]
         if voltage is None:
             raise ValueError("current_bits, pwm_bits: must be 0 where the drive's voltage has no limit")
-        (resistance, _) = EnvConfig.from_mapping(self.contract.assumed).actuators[0].winding or (1.0, 0.0)
+        (resistance, _) = self.env.actuators[0].winding or (1.0, 0.0)
         ranges = self.loop["most"] or voltage / resistance, voltage
         return tuple(2.0 * most / 2**bit if bit else 0.0 for most, bit in zip(ranges, bits, strict=True))  # type: ignore[return-value]
 
@@ -259,6 +277,7 @@ def board_test(
     seed: int = 0,
     link: Link | None = None,
     loop: bool = True,
+    actuator: Any = None,
     on_step: Callable[[int, int], None] | None = None,
 ) -> BoardTest:
     """Run the exported C as the controller of the simulation, and the exported ONNX model beside it.
@@ -270,6 +289,7 @@ def board_test(
         seed: of the first of them.
         link: what stands between board and simulation; None for nothing.
         loop: whether the C closes the current loop too, where it has one.
+        actuator: as for `Board`.
         on_step: called with (episodes running, episodes finished) after every step on the board.
 
     Raises:
@@ -277,8 +297,8 @@ def board_test(
         ValueError: an argument is out of bounds.
         RuntimeError: a tool is missing (the message installs it), or the C does not compile.
     """
-    with Board(folder, target, link, seed, loop) as board:
-        env = EnvConfig.from_mapping(board.contract.assumed)
+    with Board(folder, target, link, seed, loop, actuator) as board:
+        env = board.env
         began = time.perf_counter()
         on_board = run_episodes(board, env.make, episodes, seed, on_step=on_step)
         rate = (board.frames + board.samples) / (time.perf_counter() - began)

@@ -145,6 +145,18 @@ def test_converters_encoders_and_late_answers_come_between(tmp_path):
     assert not held[0].any()
 
 
+def test_the_simulation_may_have_another_motor_than_the_one_the_loop_is_for(tmp_path):
+    export(trained("furuta", "ppo")[0], FURUTA, "ppo", tmp_path / "arm", 1)
+    real = DRIVE.replaced({"motor.torque_constant": 0.03, "motor.back_emf_constant": 0.03, "motor.resistance": 9.0})
+    done = board_test(tmp_path / "arm", episodes=1, actuator=real)
+    assert done.on_board[0].actuator == real
+    # the C asks for what its own motor would need, and gets 0.03/0.042 of the torque; Python knows the real one
+    board, python = (side[0].signals["current"][0] for side in (done.on_board, done.in_python))
+    assert board == pytest.approx(python * 0.03 / 0.042, rel=0.05)
+    with pytest.raises(ValueError, match="actuator: a Lag, must be a Drive"):
+        board_test(tmp_path / "arm", episodes=1, actuator={"family": "lag"})
+
+
 def test_beyond_its_limits_a_policy_is_not_asked(tmp_path):
     limits = {"arm_velocity": 4.0, "rod": 3.0}
     policy, _ = trained("furuta", "ppo")
