@@ -37,14 +37,10 @@ def fixed_by(command: Command, name: str) -> dict[str, str]:
     return {field: f"with action={name!r} {why}" for field, why in command.fixed.items()}
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class TaskCommands:
     """The way from an action to the forces that the physics is asked for; made by `build`."""
 
-    task: Task
-    """The task."""
-    name: str
-    """`force`, or one of the actuator's commands."""
     simulated: tuple[ActuatorModel, ...]
     """What is simulated, one for each motor: the actuator, or what a command leaves of it."""
     scales: np.ndarray
@@ -53,8 +49,10 @@ class TaskCommands:
     """Largest forces [N] or torques [N*m] that the physics is asked for, shape (n,)."""
     fixed: Mapping[str, str]
     """Fields of the actuator that cannot be drawn -> why."""
-    levels: np.ndarray | None
-    """Commands that a discrete task's actions choose from; None where the action is the command, or a force."""
+    action_space: spaces.Space[Any]
+    """The agent's actions: the task's, or a table's indices, or a box of commands."""
+    action_forces: np.ndarray | None
+    """Forces [N or N*m] of the discrete actions, in order, shape (k,) or (k, n); None where the space is a box."""
 
     @classmethod
     def build(
@@ -79,75 +77,38 @@ class TaskCommands:
         limits = [command.limit for command in chosen]
         if not all(limit is None or np.isfinite(limit) for limit in limits):
             raise ValueError(f"action = {name!r}: needs a finite controller.max_voltage, it is inf")
-        forces = [
-            most if limit is None else limit * scale
-            for limit, scale, most in zip(limits, scales, task.max_forces, strict=True)
-        ]
-        simulated, fixed = tuple(command.actuator for command in chosen), fixed_by(chosen[0], name)
-        made = cls(task, name, simulated, scales, np.array(forces), fixed, None)
-        return made if name == "force" else dataclasses.replace(made, levels=made._table(levels, chosen[0]))
-
-    def _table(self, levels: Sequence[float] | None, command: Command) -> np.ndarray | None:
-        """The table of levels, checked against the task's action space."""
-        task = self.task
-        if isinstance(task.action_space, spaces.Box):
+        most = np.array(
+            [
+                most if limit is None else limit * scale
+                for limit, scale, most in zip(limits, scales, task.max_forces, strict=True)
+            ]
+        )
+        space, forces = task.action_space, None if task.forces is None else np.array(task.forces, dtype=np.float64)
+        if name != "force" and isinstance(space, spaces.Box):
             if levels is not None:
                 raise ValueError(
                     f"levels = {levels!r}: only for tasks with discrete actions; {task.name}'s are continuous"
                 )
-            return None
-        if len(self.scales) > 1:
-            raise ValueError(
-                f"action = {self.name!r}: {task.name} has several motors and discrete actions: use 'force'"
-            )
-        limit = command.limit
-        if limit is None:
-            limit = float(task.max_forces[0]) * command.actuator.arm_radius / command.torque_per_unit
-        try:
-            table = np.array([] if levels is None else levels, dtype=np.float64)  # a copy
-        except (TypeError, ValueError):
-            table = np.array([np.nan])
-        if table.ndim != 1 or len(table) < 2 or not (np.abs(table) <= limit).all():
-            raise ValueError(
-                f"levels = {levels!r}: {task.name} has discrete actions, so action={self.name!r} needs two or more "
-                f"levels within +-{limit!r} {command.unit}, such as levels=({-limit!r}, 0, {limit!r})"
-            )
-        return table
+            bounds = (most / scales).astype(np.float32)
+            space = spaces.Box(-bounds, bounds, dtype=np.float32)
+        elif name != "force":
+            table = _table(task, name, levels, chosen)
+            space, forces = spaces.Discrete(len(table)), table * scales[0]
+        return cls(tuple(one.actuator for one in chosen), scales, most, fixed_by(chosen[0], name), space, forces)
 
     @functools.cached_property
     def tracks(self) -> bool:
         """Whether a force is asked for; otherwise what is delivered counts as desired."""
         return self.simulated[0].tracks
 
-    @property
-    def limits(self) -> np.ndarray:
-        """Largest commands, shape (n,), in float64: a float32 bound may lie beyond."""
-        return self.max_forces / self.scales
-
-    @functools.cached_property
-    def action_space(self) -> spaces.Space[Any]:
-        """The agent's actions: the task's, or a table's indices, or a box of commands."""
-        if self.levels is not None:
-            return spaces.Discrete(len(self.levels))
-        if self.name == "force":
-            return self.task.action_space
-        bounds = self.limits.astype(np.float32)
-        return spaces.Box(-bounds, bounds, dtype=np.float32)
-
-    @functools.cached_property
-    def action_forces(self) -> np.ndarray | None:
-        """Forces [N or N*m] of the discrete actions, in order, shape (k,) or (k, n); None where the space is a box."""
-        if self.levels is not None:
-            return self.levels * self.scales[0]
-        return None if self.task.forces is None else np.array(self.task.forces, dtype=np.float64)
-
     @functools.cached_property
     def _box(self) -> tuple[Any, Any, int]:
-        """The largest command of a box's action, the force [N or N*m] of a command of one, and the number of motors."""
-        limits = self.task.max_forces if self.name == "force" else self.limits
-        if len(limits) == 1:
-            return float(limits[0]), float(self.scales[0]), 1
-        return limits, self.scales, len(limits)
+        """The largest command of a box's action, the force [N or N*m] of a command of one, and the number of motors.
+
+        In float64: a float32 bound of the space may lie beyond.
+        """
+        limits = self.max_forces / self.scales
+        return (float(limits[0]), float(self.scales[0]), 1) if len(limits) == 1 else (limits, self.scales, len(limits))
 
     def force(self, action: Any) -> Any:
         """The force [N] or torque [N*m] that the physics is to ask the actuator for; with several motors an array (n,).
@@ -191,6 +152,26 @@ class TaskCommands:
         limit, scale, count = self._box
         commands = array[:, 0] if count == 1 else array
         return np.clip(commands.astype(np.float64), -limit, limit) * scale
+
+
+def _table(task: Task, name: str, levels: Sequence[float] | None, commands: Sequence[Command]) -> np.ndarray:
+    """The levels of a command that a task's discrete actions choose from, shape (k,), checked."""
+    if len(commands) > 1:
+        raise ValueError(f"action = {name!r}: {task.name} has several motors and discrete actions: use 'force'")
+    command = commands[0]
+    limit = command.limit
+    if limit is None:
+        limit = float(task.max_forces[0]) * command.actuator.arm_radius / command.torque_per_unit
+    try:
+        table = np.array([] if levels is None else levels, dtype=np.float64)  # a copy
+    except (TypeError, ValueError):
+        table = np.array([np.nan])
+    if table.ndim != 1 or len(table) < 2 or not (np.abs(table) <= limit).all():
+        raise ValueError(
+            f"levels = {levels!r}: {task.name} has discrete actions, so action={name!r} needs two or more "
+            f"levels within +-{limit!r} {command.unit}, such as levels=({-limit!r}, 0, {limit!r})"
+        )
+    return table
 
 
 class ControlCommands:

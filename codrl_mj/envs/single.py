@@ -14,7 +14,7 @@ from codrl_mj.envs.recording import Recorder
 from codrl_mj.envs.setup import Setup, alone
 from codrl_mj.envs.snapshots import check_snapshot, generator_of, letters
 from codrl_mj.envs.window import Window
-from codrl_mj.physics import MujocoPhysics, signal_names, trace_names
+from codrl_mj.physics import MujocoPhysics, Plant, signal_names, trace_names
 from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
 from codrl_mj.physics.streams import words_of
 from codrl_mj.tasks import Task
@@ -82,7 +82,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         if render_mode is not None:
             check_view(self._scene().scene[0], width, height, camera)
         self.action_space = self.setup.commands.action_space
-        self.observation_space = self.setup.view.observation_space
+        self.observation_space = self.setup.observation_space
         self._observation_shape = self.observation_space.shape
         self._compiled: tuple[Any, tuple[Any, ...]] | None = (
             None  # its step, and the arguments that are this simulation
@@ -97,12 +97,12 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     @property
     def actuator(self) -> Any:
         """The actuator, of the present episode where it is drawn; with several motors a tuple of them."""
-        return alone(self._draws.motors(0, self.setup.actuators))
+        return alone(self._draws.motors(0, self.setup.config.actuators))
 
     @property
     def motors(self) -> dict[int, Any]:
         """The actuators of the present episode, by the number of the task's motor."""
-        return dict(enumerate(self._draws.motors(0, self.setup.actuators)))
+        return dict(enumerate(self._draws.motors(0, self.setup.config.actuators)))
 
     @property
     def model(self) -> Any:
@@ -126,11 +126,11 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     @property
     def recorder(self) -> Recorder:
         """Reads the environment between its steps."""
-        family, physics = self.setup.family, self.physics
+        family, physics = self.setup.plant.family, self.physics
         return Recorder(
             signal_names(family),
             trace_names(family),
-            self.setup.commands.name,
+            self.setup.config.action,
             self.task.motors,
             present=lambda: self.actuator,
             state=lambda: physics.state,
@@ -142,7 +142,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     @property
     def observation_names(self) -> tuple[str, ...]:
         """Of the observation's entries."""
-        return self.setup.view.observation_names
+        return self.setup.observation_names
 
     @property
     def step_duration(self) -> float:
@@ -156,7 +156,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     @property
     def signal_names(self) -> tuple[str, ...]:
         """Of the actuators' signals in `info`."""
-        return signal_names(self.setup.family)
+        return signal_names(self.setup.plant.family)
 
     def _engine(self) -> tuple[Any, Any]:
         if self.physics.scene is None:
@@ -188,11 +188,10 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         """
         super().reset(seed=seed)
         self.setup.start(self.physics, self.np_random, options, self._draws)
-        seen = self.physics.observed(np.zeros_like(self.physics.trace[-1])) if self.setup.view.sensors else None
         if self.render_mode == "human":
             self.render()
         drawn = self.randomization
-        return self.setup.view.observation(self.physics.state, seen), {"randomization": drawn} if drawn else {}
+        return self.setup.observation(self.physics), {"randomization": drawn} if drawn else {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advance by one environment step.
@@ -221,15 +220,14 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
 
     def _step_apart(self, force: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """What the compiled step does, in parts, for a physics that is Python."""
-        view, physics = self.setup.view, self.physics
+        physics, setup = self.physics, self.setup
         before = physics.state
         physics.step(force)
         info, after = self._info(force), physics.state
-        seen = physics.observed(physics.trace[-1]) if view.sensors else None
-        reward = view.reward(before, info["actual_force"], after)
         if self.render_mode == "human":
             self.render()
-        return view.observation(after, seen), reward, view.terminated(after), False, info
+        reward, terminated = setup.outcome(before, info["actual_force"], after)
+        return setup.observation(physics, physics.trace[-1]), reward, terminated, False, info
 
     def _info(self, force: Any) -> dict[str, Any]:
         """What the actuators did in the last step, which asked for a force."""
@@ -299,7 +297,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         if self.physics.scene is not None:
             return self.physics
         if self._drawn is None:
-            self._drawn = MujocoPhysics(self.task, [IDEAL] * len(self.task.motors), 1, self.setup.integrator)
+            self._drawn = MujocoPhysics(Plant(self.task, [IDEAL] * len(self.task.motors)))
         return self._drawn
 
     def close(self) -> None:

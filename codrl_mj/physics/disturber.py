@@ -12,6 +12,7 @@ from codrl_mj.disturbances.command import delayed, quantised, rate_limited, whol
 from codrl_mj.disturbances.pulses import KEY, PULSE_NAMES, pulse_load
 from codrl_mj.engine.memory import internal, read
 from codrl_mj.kept import njit
+from codrl_mj.physics.base import Plant
 
 for _function in (delayed, quantised, rate_limited, philox, unit):
     register_jitable(_function)
@@ -100,11 +101,11 @@ KEY_COLUMN = KEY - len(PULSE_NAMES)
 """Where a row of a disturber's memory holds the key of the episode's random numbers."""
 
 
-def disturber(disturbances: Disturbances, timestep: float, limits: np.ndarray, simulations: int) -> Disturber | None:
-    """A `Disturber`, of its arguments, or None where neither commands nor loads are disturbed."""
-    if not (disturbances.of_command or disturbances.pulse_force):
+def disturber(plant: Plant, simulations: int) -> Disturber | None:
+    """A `Disturber` of simulations of a plant, or None where neither commands nor loads are disturbed."""
+    if not (plant.disturbances.of_command or plant.disturbances.pulse_force):
         return None
-    return Disturber(disturbances, timestep, limits, simulations)
+    return Disturber(plant.disturbances, plant.timestep, plant.max_forces, simulations)
 
 
 class Disturbance(NamedTuple):

@@ -11,6 +11,7 @@ import numpy as np
 from codrl_mj.actuators import IDEAL, ActuatorModel
 from codrl_mj.disturbances import PLAIN, Joint
 from codrl_mj.engine.hill import GRAVITY
+from codrl_mj.physics.base import Plant
 from codrl_mj.physics.mjcf import hills, task_model
 from codrl_mj.tasks import TASKS
 
@@ -58,7 +59,7 @@ def mounts_of(model: mujoco.MjModel, index: int) -> tuple[Mount | None, ...]:
 @functools.cache
 def bare_model(task: str, joint: Joint = PLAIN) -> mujoco.MjModel:
     """The model of the task of a name, with nothing on its actuated joints but what is given; read only."""
-    return task_model(TASKS[task], (IDEAL,) * len(TASKS[task].motors), TASKS[task].step_duration, joint=joint)
+    return task_model(Plant(TASKS[task], (IDEAL,) * len(TASKS[task].motors), joint=joint))
 
 
 def without_motors(model: mujoco.MjModel, motors: Mapping[int, ActuatorModel]) -> mujoco.MjModel:
