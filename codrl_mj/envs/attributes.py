@@ -107,7 +107,7 @@ def _write(name: str, value: Any, setup: Setup, model: Any) -> Setup:
     if attribute is Setting.INTEGRATOR:
         known = " or ".join(f"integrator={name!r}" for name in setup.task.integrators)
         raise AttributeError(f"it is compiled into the step: make an environment with {known}")
-    if setup.randomization.names:
+    if setup.randomization.distributions:
         raise AttributeError("actuator and model are drawn at every reset: give `randomize` a distribution of it")
     if isinstance(attribute, ModelNumber):
         _write_number(name, attribute, value, setup, model)

@@ -40,17 +40,8 @@ from codrl_mj.physics.compiled_task import Compiled, Outcomes, compiled_outcomes
 from codrl_mj.physics.rows import Lane, Rows, claim, complain, finish, load, store
 from codrl_mj.physics.stepping import Stepping
 
-
-class Interface(NamedTuple):
-    """What the vector `interface` begins with; the task's options follow."""
-
-    observes: float
-    """Whether the observation ends with what the actuators' sensors say."""
-    random: float
-    """Whether an episode's disturbances or sensors need a key."""
-
-
-OPTIONS, RANDOM = len(Interface._fields), Interface._fields.index("random")
+RANDOM, OPTIONS = 0, 1
+"""In `interface`: whether an episode's disturbances or sensors need a key, and the first of the task's options."""
 
 
 class VectorStep(NamedTuple):
@@ -119,7 +110,7 @@ def compiled_env(env: Any) -> CompiledEnv | None:
         actuator or model are drawn at resets, which is Python too.
     """
     setup, physics = env.setup, env.physics
-    if physics.compiled is None or setup.randomization.names:
+    if physics.compiled is None or setup.randomization.distributions:
         return None
     kernels, task = compiled_kernels(setup, physics), setup.task
     compiled_function(task.initial_state, task.state_names, "Task.state_names", types.float64[::1])
@@ -129,8 +120,7 @@ def compiled_env(env: Any) -> CompiledEnv | None:
 
 def arguments(setup: Setup, physics: Any) -> tuple[Any, ...]:
     """The last arguments of an environment's kernels, of a simulation whose steps are compiled."""
-    kind = Interface(bool(setup.sensors), setup.random)
-    return (np.array([*kind, *setup.config.options], dtype=np.float64), *physics.compiled.arguments)
+    return (np.array([setup.random, *setup.config.options], dtype=np.float64), *physics.compiled.arguments)
 
 
 def compiled_kernels(setup: Setup, physics: Any) -> Kernels:

@@ -91,11 +91,6 @@ class Randomization:
         )
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """The paths, in the order in which they are drawn."""
-        return tuple(self.distributions)
-
-    @property
     def draws_actuator(self) -> bool:
         """Whether a field of a motor is drawn, and so its stability must be checked at every draw."""
         return any(self.columns)
@@ -106,76 +101,6 @@ class Randomization:
         return any(
             {*columns.values()} & {*one.RANDOM} for one, columns in zip(self.families, self.columns, strict=True)
         )
-
-    def draw(self, random: Uniforms, nominal: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Draw for m simulations; whole sets are redrawn until their motors are stable.
-
-        `random` is asked for positions in `nominal`, which is as `fields_of` has it. Returned are the values (m, k),
-        and how many sets were rejected before, (m,).
-        """
-        count = len(nominal[0])
-        values, rejected = np.empty((count, len(self.distributions))), np.zeros(count, dtype=np.int64)
-        pending = np.arange(count)
-        while True:
-            draws = random(pending, len(self.distributions))
-            for column, distribution in enumerate(self.distributions.values()):
-                values[pending, column] = distribution.transform(draws[:, column].copy())
-            if self.allow_unstable or not self.draws_actuator:
-                return values, rejected
-            fields = self.drawn([each[pending] for each in nominal], values[pending])
-            unstable = self._unstable(fields)
-            if not unstable.any():
-                return values, rejected
-            pending = pending[unstable]
-            rejected[pending] += 1
-            if rejected[pending[0]] == LIMIT:
-                last = dict(zip(self.names, values[pending[0]].tolist(), strict=True))
-                reason = self._reason([each[unstable] for each in fields])
-                raise ValueError(
-                    f"randomize: {LIMIT} draws in a row have an unstable current loop at a step of "
-                    f"{self.timestep:g} s; the last was {last}{reason}. Narrow the bounds, shorten the step, or pass "
-                    "allow_unstable=True"
-                )
-
-    def _unstable(self, fields: Sequence[np.ndarray]) -> np.ndarray:
-        """Which simulations have a motor that is unstable, shape (m,)."""
-        unstable = np.zeros(len(fields[0]), dtype=bool)
-        for family, columns, each in zip(self.families, self.columns, fields, strict=True):
-            if columns:
-                unstable |= ~(family.instability(numbers_of(family, each), self.timestep) < 1.0)
-        return unstable
-
-    def _reason(self, fields: Sequence[np.ndarray]) -> str:
-        """What the first refused motor of the first simulation says of itself."""
-        for family, each in zip(self.families, fields, strict=True):
-            try:
-                family.from_numbers(numbers_of(family, each)[0]).check(self.timestep)
-            except ValueError as error:
-                return f": {error}"
-        return ""
-
-    def fields_of(self, motors: Sequence[Sequence[ActuatorModel]]) -> list[np.ndarray]:
-        """The fields of the motors of m simulations, for each motor (m, f), columns as in `field_paths`."""
-        return [np.array(list(map(field_values, each))) for each in zip(*motors, strict=True)]
-
-    def drawn(self, nominal: Sequence[np.ndarray], values: np.ndarray) -> list[np.ndarray]:
-        """Motors' fields, as `fields_of` has them, with drawn values (m, k) in place of theirs; NaN leaves them."""
-        fields = [each.copy() for each in nominal]
-        for family, columns, each in zip(self.families, self.columns, fields, strict=True):
-            for column, field in columns.items():
-                place, new = field_paths(family).index(field), values[:, column]
-                each[:, place] = np.where(np.isnan(new), each[:, place], new)
-        return fields
-
-    def replaced(self, motors: Sequence[ActuatorModel], values: np.ndarray) -> tuple[ActuatorModel, ...]:
-        """The motors of one simulation with its drawn values (k,) in place of theirs."""
-        changes = ({field: float(values[column]) for column, field in columns.items()} for columns in self.columns)
-        return tuple(one.replaced(new) for one, new in zip(motors, changes, strict=True))
-
-    def mounted(self, fields: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """The arms [m] of motors with these fields, shape (m, n), and what they add to the model, (m, n, 3)."""
-        rows = zip(*(each.tolist() for each in fields), strict=True)
-        return mounting_of([list(map(unchecked, self.families, each)) for each in rows])
 
 
 class Draws:
@@ -196,33 +121,86 @@ class Draws:
         """
         self.randomization, self._put = randomization, put
         self._motors = motors
-        self._nominal = randomization.fields_of(motors)
+        self._nominal = [np.array(list(map(field_values, each))) for each in zip(*motors, strict=True)]
+        """Fields of each motor, shape (N, f), columns as in `field_paths`."""
         self._mounting = mounting_of(motors)
-        self._values = np.full((len(motors), len(randomization.names)), np.nan)
+        self._values = np.full((len(motors), len(randomization.distributions)), np.nan)
         self._rejected = np.zeros(len(motors), dtype=np.int64)
 
     def draw(self, random: Uniforms, rows: np.ndarray) -> None:
-        """Draw anew for the simulations `rows` (m,), which are to be reset afterwards."""
-        if not self.randomization.names:
+        """Draw anew for the simulations `rows` (m,), which are to be reset afterwards.
+
+        Whole sets are redrawn until their motors are stable.
+        """
+        drawn = self.randomization
+        if not drawn.distributions:
             return
-        self._values[rows], self._rejected[rows] = self.randomization.draw(
-            lambda pending, count: random(rows[pending], count), [each[rows] for each in self._nominal]
-        )
+        values, rejected = np.empty((len(rows), len(drawn.distributions))), np.zeros(len(rows), dtype=np.int64)
+        pending = np.arange(len(rows))
+        while len(pending):
+            draws = random(rows[pending], len(drawn.distributions))
+            for column, distribution in enumerate(drawn.distributions.values()):
+                values[pending, column] = distribution.transform(draws[:, column].copy())
+            if drawn.allow_unstable or not drawn.draws_actuator:
+                break
+            pending = pending[self._unstable(rows[pending], values[pending])]
+            rejected[pending] += 1
+            if len(pending) and rejected[pending[0]] == LIMIT:
+                raise ValueError(
+                    f"randomize: {LIMIT} draws in a row have an unstable current loop at a step of "
+                    f"{drawn.timestep:g} s; the last was {self._last(rows[pending[:1]], values[pending[:1]])}. Narrow "
+                    "the bounds, shorten the step, or pass allow_unstable=True"
+                )
+        self._values[rows], self._rejected[rows] = values, rejected
         self._put(self, rows)
+
+    def _unstable(self, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Which simulations would have a motor that is unstable with drawn values (m, k), shape (m,)."""
+        drawn, unstable = self.randomization, np.zeros(len(rows), dtype=bool)
+        for family, columns, each in zip(drawn.families, drawn.columns, self._fields(rows, values), strict=True):
+            if columns:
+                unstable |= ~(family.instability(numbers_of(family, each), drawn.timestep) < 1.0)
+        return unstable
+
+    def _last(self, row: np.ndarray, values: np.ndarray) -> str:
+        """What a simulation was drawn with, and what the first refused motor says of itself."""
+        drawn = self.randomization
+        last = str(dict(zip(drawn.distributions, values[0].tolist(), strict=True)))
+        for family, each in zip(drawn.families, self._fields(row, values), strict=True):
+            try:
+                family.from_numbers(numbers_of(family, each)[0]).check(drawn.timestep)
+            except ValueError as error:
+                return f"{last}: {error}"
+        return last
+
+    def _fields(self, rows: np.ndarray, values: np.ndarray) -> list[np.ndarray]:
+        """The fields of some simulations' motors, each (m, f), with drawn values (m, k) for theirs; NaN leaves them."""
+        fields, drawn = [each[rows] for each in self._nominal], self.randomization
+        for family, columns, each in zip(drawn.families, drawn.columns, fields, strict=True):
+            for column, field in columns.items():
+                place, new = field_paths(family).index(field), values[:, column]
+                each[:, place] = np.where(np.isnan(new), each[:, place], new)
+        return fields
 
     def motors(self, row: int = 0, nominal: Sequence[ActuatorModel] | None = None) -> tuple[ActuatorModel, ...]:
         """What is drawn of a simulation's motors, or of others in their place."""
         nominal, values = self._motors[row] if nominal is None else nominal, self._values[row]
-        drawn = len(values) and not np.isnan(values).any()
-        return self.randomization.replaced(nominal, values) if drawn else tuple(nominal)
+        if not len(values) or np.isnan(values).any():
+            return tuple(nominal)
+        changes = (
+            {field: float(values[column]) for column, field in columns.items()}
+            for columns in self.randomization.columns
+        )
+        return tuple(one.replaced(new) for one, new in zip(nominal, changes, strict=True))
 
     def parameters(self, rows: np.ndarray) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
         """Of some simulations' motors: the numbers of each (m, p), arms [m] (m, n), and additions (m, n, 3)."""
-        fields = self.randomization.drawn([each[rows] for each in self._nominal], self._values[rows])
+        fields, families = self._fields(rows, self._values[rows]), self.randomization.families
         arms, additions = (each[rows] for each in self._mounting)
         if self.randomization.mounting:
-            arms, additions = self.randomization.mounted(fields)
-        return list(map(numbers_of, self.randomization.families, fields)), arms, additions
+            each = zip(*(one.tolist() for one in fields), strict=True)
+            arms, additions = mounting_of([list(map(unchecked, families, values)) for values in each])
+        return list(map(numbers_of, families, fields)), arms, additions
 
     def model_fields(
         self, rows: np.ndarray, additions: np.ndarray | None = None, drawn: bool = False
@@ -232,7 +210,8 @@ class Draws:
         if variation is None:
             return {}
         additions = self.parameters(rows)[2] if additions is None else additions
-        columns = np.array([self.randomization.names.index(name) for name in variation.names], dtype=int)
+        names = list(self.randomization.distributions)
+        columns = np.array([names.index(name) for name in variation.names], dtype=int)
         return variation.fields(self._values[np.ix_(rows, columns)], additions, drawn)
 
     def report(self, row: int = 0) -> dict[str, Any]:
@@ -245,7 +224,7 @@ class Draws:
 
     def infos(self, rows: np.ndarray) -> dict[str, Any]:
         """The same of a vector environment's simulations, as Gymnasium's vector infos: nested, with masks."""
-        if not self.randomization.names:
+        if not self.randomization.distributions:
             return {}
         mask = np.zeros(len(self._values), dtype=bool)
         mask[rows] = True
@@ -259,17 +238,17 @@ class Draws:
 
     def present(self) -> dict[str, np.ndarray]:
         """The values in use by path, and the number of rejected sets, each of shape (N,); NaN before a reset."""
-        columns = dict(zip(self.randomization.names, self._values.T.copy(), strict=True))
+        columns = dict(zip(self.randomization.distributions, self._values.T.copy(), strict=True))
         return columns | {"rejected": self._rejected.copy()} if columns else {}
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """What `restore` needs."""
         kept = {"drawn": self._values.copy(), "rejected": self._rejected.copy()}
-        return kept if self.randomization.names else {}
+        return kept if self.randomization.distributions else {}
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
         """Bring back the values, and the simulations to them; to be followed by a restoring of the simulations."""
-        if self.randomization.names:
+        if self.randomization.distributions:
             self._values[:], self._rejected[:] = snapshot["drawn"], snapshot["rejected"]
             self._put(self, np.arange(len(self._values)))
 

@@ -10,12 +10,10 @@ from codrl_mj.actuators import IDEAL
 from codrl_mj.envs.attributes import GymnasiumAttributes, checked_states, read, written
 from codrl_mj.envs.compiled import arguments, compiled_kernels
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.recording import Recorder
 from codrl_mj.envs.setup import Setup, alone
 from codrl_mj.envs.snapshots import check_snapshot, generator_of, letters
-from codrl_mj.envs.window import Window
 from codrl_mj.physics import MujocoPhysics, Plant, signal_names, trace_names
-from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
+from codrl_mj.physics.offscreen import OffscreenRenderer, Window, check_view
 from codrl_mj.physics.streams import words_of
 from codrl_mj.tasks import Task
 
@@ -124,20 +122,34 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         self.physics.state = checked_states(state, self.physics.state.shape)
 
     @property
-    def recorder(self) -> Recorder:
-        """Reads the environment between its steps."""
-        family, physics = self.setup.plant.family, self.physics
-        return Recorder(
-            signal_names(family),
-            trace_names(family),
-            self.setup.config.action,
-            self.task.motors,
-            present=lambda: self.actuator,
-            state=lambda: physics.state,
-            speeds=lambda: physics.state[list(self.task.speeds)],
-            trace=lambda: physics.trace.copy(),
-            duration=lambda: self.task.step_duration,
-        )
+    def recorder(self) -> "ActuatedEnv":
+        """What reads the environment between its steps: itself."""
+        return self
+
+    @property
+    def command(self) -> str:
+        """What the agent commands."""
+        return self.setup.config.action
+
+    @property
+    def motor_names(self) -> tuple[str, ...]:
+        """Names of the motors."""
+        return self.task.motors
+
+    @property
+    def speeds(self) -> np.ndarray:
+        """Velocities of the joints that the motors drive [m/s or rad/s], shape (motors,)."""
+        return self.physics.state[list(self.task.speeds)]
+
+    @property
+    def trace(self) -> np.ndarray:
+        """What the motors did in each integration step of the last step; see `codrl_mj.physics.Physics.trace`."""
+        return self.physics.trace.copy()
+
+    @property
+    def trace_names(self) -> tuple[str, ...]:
+        """Names of its columns."""
+        return trace_names(self.setup.plant.family)
 
     @property
     def observation_names(self) -> tuple[str, ...]:

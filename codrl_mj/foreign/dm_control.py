@@ -12,7 +12,7 @@ from dm_env import specs
 from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel
-from codrl_mj.disturbances import resolve_disturbances
+from codrl_mj.disturbances import OFF, resolve
 from codrl_mj.envs.motors import Motors, MotorSettings
 from codrl_mj.fields import did_you_mean
 from codrl_mj.foreign.building import Building
@@ -179,7 +179,7 @@ def make_dm_control(
             does not go with the actuators or the environment.
     """
     resolved = resolve_patterns(actuators, "an environment of dm_control")
-    settings = MotorSettings(resolved, action, False, randomize, resolve_disturbances(disturbances), allow_unstable)
+    settings = MotorSettings(resolved, action, False, randomize, resolve(disturbances, OFF), allow_unstable)
     if not isinstance(environment, str):
         return MotorisedEnvironment(lambda: environment(**options), settings, noise_seed)
     domain, _, task = environment.partition("/")

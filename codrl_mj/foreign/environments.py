@@ -15,10 +15,10 @@ from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.utils import RecordConstructorArgs
 
 from codrl_mj.actuators import ActuatorModel
-from codrl_mj.disturbances import resolve_disturbances
+from codrl_mj.disturbances import OFF, resolve
 from codrl_mj.engine.reading import bring_to_rest, motors, slots
 from codrl_mj.envs.motors import Motors, MotorSettings, longer
-from codrl_mj.envs.recording import Recorder, StepWatch
+from codrl_mj.envs.recording import StepWatch
 from codrl_mj.envs.snapshots import (
     check_snapshot,
     elapsed_steps,
@@ -85,7 +85,7 @@ def make(
         action,
         observe_actuator,
         randomize,
-        resolve_disturbances(disturbances),
+        resolve(disturbances, OFF),
         allow_unstable,
     )
     spec = copy.copy(entry)
@@ -197,10 +197,10 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         return tuple(self._motors.signals())
 
     @property
-    def recorder(self) -> Recorder:
+    def recorder(self) -> StepWatch:
         """Reads the environment between its steps; from now on every integration step is looked at."""
-        self._watch = self._watch or StepWatch(self._motors)
-        return self._watch.recorder(self._settings.action)
+        self._watch = self._watch or StepWatch(self._motors, self._settings.action)
+        return self._watch
 
     @property
     def sensor_names(self) -> tuple[str, ...]:

@@ -7,9 +7,17 @@ import numpy as np
 from numba.extending import register_jitable
 
 from codrl_mj.actuators.noise import philox, unit
-from codrl_mj.disturbances import Disturbances
-from codrl_mj.disturbances.command import delayed, quantised, rate_limited, whole_and_fraction
-from codrl_mj.disturbances.pulses import KEY, PULSE_NAMES, pulse_load
+from codrl_mj.disturbances import (
+    KEY,
+    OFF,
+    PULSE_NAMES,
+    Disturbances,
+    delayed,
+    pulse_load,
+    quantised,
+    rate_limited,
+    whole_and_fraction,
+)
 from codrl_mj.engine.memory import internal, read
 from codrl_mj.kept import njit
 from codrl_mj.physics.base import Plant
@@ -103,7 +111,7 @@ KEY_COLUMN = KEY - len(PULSE_NAMES)
 
 def disturber(plant: Plant, simulations: int) -> Disturber | None:
     """A `Disturber` of simulations of a plant, or None where neither commands nor loads are disturbed."""
-    if not (plant.disturbances.of_command or plant.disturbances.pulse_force):
+    if plant.disturbances == OFF:
         return None
     return Disturber(plant.disturbances, plant.timestep, plant.max_forces, simulations)
 
