@@ -110,7 +110,7 @@ def compiled_env(env: Any) -> CompiledEnv | None:
         actuator or model are drawn at resets, which is Python too.
     """
     setup, physics = env.setup, env.physics
-    if physics.compiled is None or setup.randomization.distributions:
+    if physics.stepping is None or setup.randomization.distributions:
         return None
     kernels, task = compiled_kernels(setup, physics), setup.task
     compiled_function(task.initial_state, task.state_names, "Task.state_names", types.float64[::1])
@@ -120,7 +120,7 @@ def compiled_env(env: Any) -> CompiledEnv | None:
 
 def arguments(setup: Setup, physics: Any) -> tuple[Any, ...]:
     """The last arguments of an environment's kernels, of a simulation whose steps are compiled."""
-    return (np.array([setup.random, *setup.config.options], dtype=np.float64), *physics.compiled.arguments)
+    return (np.array([setup.random, *setup.config.options], dtype=np.float64), *physics.arguments)
 
 
 def compiled_kernels(setup: Setup, physics: Any) -> Kernels:
@@ -128,7 +128,7 @@ def compiled_kernels(setup: Setup, physics: Any) -> Kernels:
     task = setup.task
     sensors = len(setup.plant.family.OBSERVED) if setup.sensors else 0
     single, size = len(task.motors) == 1, len(task.state_names)
-    return _kernels(physics.compiled.stepping, compiled_outcomes(task), task.initial_state, size, single, sensors)
+    return _kernels(physics.stepping, compiled_outcomes(task), task.initial_state, size, single, sensors)
 
 
 @internal

@@ -76,7 +76,7 @@ class Motors:
         fixed = [fixed_by(meant[index], settings.action) if index in meant else {} for index in nominal]
         distributions, timestep = paths_of(settings.randomize), model.opt.timestep
         bare = without_motors(model, nominal) if distributions else model
-        randomization = Randomization.build(
+        randomization = Randomization(
             distributions, bare, nominal, fixed, timestep, settings.allow_unstable, "the model"
         )
         self.draws = Draws(randomization, [list(nominal.values())], functools.partial(put_into, self))

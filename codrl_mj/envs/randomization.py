@@ -1,6 +1,5 @@
 """Motors and models drawn at every reset: what is drawn of them, and what present episodes were drawn with."""
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -20,7 +19,7 @@ from codrl_mj.actuators import (
 )
 from codrl_mj.envs.distributions import MODEL, Choice, Distribution, split_path
 from codrl_mj.fields import did_you_mean
-from codrl_mj.physics.variation import Variation, additions_of, mounts_of, variable
+from codrl_mj.physics.variation import Variation, mounting_of, mounts_of, variable
 from codrl_mj.specs import matched_by, names_of, refuse_unmatched
 
 LIMIT = 1000
@@ -29,32 +28,11 @@ Uniforms = Callable[[np.ndarray, int], np.ndarray]
 """(simulations (m,), count) -> the next `count` numbers in [0, 1) of each of their generators, shape (m, count)."""
 
 
-@dataclasses.dataclass(frozen=True)
 class Randomization:
-    """What is drawn at a reset, and what it does to motors and model; made by `build`."""
+    """What is drawn at a reset, and what it does to motors and model; never changed once it is made."""
 
-    distributions: Mapping[str, Distribution]
-    """Path, as `split_path` takes it apart -> what it is drawn from, in this order."""
-    types: Mapping[str, type]
-    """Path -> float, int or bool."""
-    families: tuple[Family, ...]
-    """Of each motor of a simulation."""
-    columns: tuple[Mapping[int, str], ...]
-    """Of each motor: column of the drawn values -> the field that it is."""
-    timestep: float
-    """Integration step [s], at which drawn motors must be stable."""
-    allow_unstable: bool
-    """Whether unstable ones are kept."""
-    variation: Variation | None
-    """What drawn fields do to the model; None if they do nothing."""
-    in_model: tuple[str, ...]
-    """The paths that the model, besides its motors' parameters, depends on."""
-    mounting: bool
-    """Whether motors' arms, or what they add to the model, depend on what is drawn."""
-
-    @classmethod
-    def build(
-        cls,
+    def __init__(
+        self,
         distributions: Mapping[str, Distribution],
         model: mujoco.MjModel,
         motors: Mapping[int, ActuatorModel],
@@ -62,45 +40,40 @@ class Randomization:
         timestep: float,
         allow_unstable: bool,
         whose: str,
-    ) -> "Randomization":
-        """Check the distributions against the fields that they are for.
+    ) -> None:
+        """Check the distributions, drawn in their order, against the fields that they are for.
 
         The `model` is without what its `motors`, by the indices of their actuators, add; `fixed` are the fields of
-        each that cannot be drawn, with the reason; the `timestep` is in [s]; messages call the model `whose`.
+        each that cannot be drawn, with the reason; motors must be stable at the `timestep` [s] unless `allow_unstable`;
+        messages call the model `whose`.
         """
+        self.distributions, self.timestep, self.allow_unstable = distributions, timestep, allow_unstable
         matched, simulated = _matched(distributions, model, motors, fixed, whose), list(motors.values())
         turned, added = (
             [path for path, own in matched.items() if any(_follows(of, simulated[at], path) for at in own)]
             for of in (lambda one: one.arm_radius, lambda one: one.additions)
         )
         of_model = [path for path, own in matched.items() if not own]
-        in_model = (*of_model, *added)
-        return cls(
-            distributions,
-            {path: _kind(type(simulated[own[0]]), path) if own else float for path, own in matched.items()},
-            tuple(map(type, simulated)),
-            tuple(
-                {column: split_path(path)[1] for column, (path, own) in enumerate(matched.items()) if at in own}
-                for at in range(len(simulated))
-            ),
-            timestep,
-            allow_unstable,
-            Variation(model, of_model, list(motors), mounting=bool(added)) if in_model else None,
-            in_model,
-            bool(turned or added),
-        )
-
-    @property
-    def draws_actuator(self) -> bool:
+        self.types = {path: _kind(type(simulated[own[0]]), path) if own else float for path, own in matched.items()}
+        """Path -> float, int or bool."""
+        self.families: list[Family] = list(map(type, simulated))
+        """Of each motor of a simulation."""
+        self.columns = [
+            {column: split_path(path)[1] for column, (path, own) in enumerate(matched.items()) if at in own}
+            for at in range(len(simulated))
+        ]
+        """Of each motor: column of the drawn values -> the field that it is."""
+        self.in_model = (*of_model, *added)
+        """The paths that the model, besides its motors' parameters, depends on."""
+        self.variation = Variation(model, of_model, list(motors), mounting=bool(added)) if self.in_model else None
+        """What drawn fields do to the model; None if they do nothing."""
+        self.mounting = bool(turned or added)
+        """Whether motors' arms, or what they add to the model, depend on what is drawn."""
+        self.draws_actuator = any(self.columns)
         """Whether a field of a motor is drawn, and so its stability must be checked at every draw."""
-        return any(self.columns)
-
-    @property
-    def random(self) -> bool:
+        drawn = zip(self.families, self.columns, strict=True)
+        self.random = any({*columns.values()} & {*family.RANDOM} for family, columns in drawn)
         """Whether motors may need an episode's key of random numbers for what is drawn of them."""
-        return any(
-            {*columns.values()} & {*one.RANDOM} for one, columns in zip(self.families, self.columns, strict=True)
-        )
 
 
 class Draws:
@@ -268,11 +241,6 @@ def put_into_batch(physics: Any, draws: Draws, rows: np.ndarray) -> None:
         physics.set_parameters(rows, np.stack(numbers, axis=1), arms)
     if draws.randomization.variation is not None:
         physics.set_model(rows, draws.model_fields(rows, additions))
-
-
-def mounting_of(motors: Sequence[Sequence[ActuatorModel]]) -> tuple[np.ndarray, np.ndarray]:
-    """The arms [m] of the motors of m simulations, shape (m, n), and what they add to the model, (m, n, 3)."""
-    return np.array([[one.arm_radius for one in each] for each in motors]), additions_of(motors)
 
 
 def numbers_of(family: Family, fields: np.ndarray) -> np.ndarray:

@@ -14,13 +14,13 @@ from codrl_mj.engine.reading import check_shafts
 from codrl_mj.envs.commands import TaskCommands
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.motors import longer, sensor_names
-from codrl_mj.envs.randomization import Draws, Randomization, put_into
+from codrl_mj.envs.randomization import Randomization
 from codrl_mj.physics import Physics, Plant, Signals, find_physics
 from codrl_mj.physics.base import named_signals
 from codrl_mj.physics.compiled_task import Outcomes, compiled_outcomes
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.variation import bare_model
-from codrl_mj.tasks import Task, find_task, resolve_actuators
+from codrl_mj.tasks import Task, find_task
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class Setup:
     @functools.cached_property
     def commands(self) -> TaskCommands:
         """What actions stand for."""
-        return TaskCommands.build(self.task, self.config.actuators, self.config.action, self.config.levels)
+        return TaskCommands(self.task, self.config.actuators, self.config.action, self.config.levels)
 
     @functools.cached_property
     def plant(self) -> Plant:
@@ -76,14 +76,9 @@ class Setup:
         bare = bare_model(self.task.name, config.joint)
         motors = {bare.actuator(name).id: one for name, one in zip(self.task.motors, plant.actuators, strict=True)}
         fixed = [self.commands.fixed] * len(motors)
-        return Randomization.build(
+        return Randomization(
             config.distributions, bare, motors, fixed, plant.timestep, config.allow_unstable, self.task.name
         )
-
-    @property
-    def actuator(self) -> Any:
-        """The actuator; with several motors a tuple of them."""
-        return alone(self.config.actuators)
 
     # -- simulations -----------------------------------------------------------------------------------------
 
@@ -97,21 +92,6 @@ class Setup:
                 "lengths and gravity, and have no damping, friction and rotors; use physics='mujoco'"
             )
         return made
-
-    def draws(self, physics: Physics) -> Draws:
-        """What a simulation is drawn with."""
-        return Draws(self.randomization, [self.plant.actuators], functools.partial(put_into, physics))
-
-    def start(
-        self, physics: Physics, generator: np.random.Generator, options: dict[str, Any] | None, draws: Draws
-    ) -> None:
-        """Start an episode: draw the initial state and then, if anything is randomised, actuator and model.
-
-        Disturbances and sensors that are random draw the key of their numbers last.
-        """
-        initial = self.task.initial(generator, options)
-        draws.draw(lambda rows, count: generator.random((len(rows), count)), np.zeros(1, dtype=int))
-        physics.reset(initial, float(self.keys(lambda count: generator.random((1, count)))[0]))
 
     @functools.cached_property
     def initial_bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -215,12 +195,13 @@ def set_up_many(
     every: list[tuple[ActuatorModel, ...]] = []
     for index, one in enumerate(actuator):
         try:
-            every.append(resolve_actuators(one, find_task(task)))
+            config = EnvConfig.of(task, one, arguments)
+            every.append(config.actuators)
             if every[-1] not in setups:
-                setups[every[-1]] = Setup.build(EnvConfig.of(task, every[-1], arguments))
+                setups[every[-1]] = Setup.build(config)
         except ValueError as error:
             raise ValueError(f"actuator[{index}]: {error}") from None
         if isinstance(every[-1][0], Ideal):
             raise ValueError(f"actuator[{index}] = {one!r}: must be an Actuator; the ideal one cannot be among others")
-    check_same_family([setup.config.actuators[0] for setup in setups.values()])
+    check_same_family([each[0] for each in setups])
     return setups[every[0]], every

@@ -1,5 +1,6 @@
 """One environment, as Gymnasium knows it."""
 
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,6 +11,7 @@ from codrl_mj.actuators import IDEAL
 from codrl_mj.envs.attributes import GymnasiumAttributes, checked_states, read, written
 from codrl_mj.envs.compiled import arguments, compiled_kernels
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.envs.randomization import Draws, put_into
 from codrl_mj.envs.setup import Setup, alone
 from codrl_mj.envs.snapshots import check_snapshot, generator_of, letters
 from codrl_mj.physics import MujocoPhysics, Plant, signal_names, trace_names
@@ -68,9 +70,11 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
             ValueError: an argument is unknown or out of bounds, or the current loop is unstable; the message names it.
             CallbackInUseError: another library's MuJoCo callback is installed.
         """
-        self.setup = Setup.build(EnvConfig.of(task, actuator, arguments))
+        config = EnvConfig.of(task, actuator, arguments)
+        self.setup = Setup.build(config)
         self.physics = self.setup.simulate(physics)
-        self._draws = self.setup.draws(self.physics)
+        into = functools.partial(put_into, self.physics)
+        self._draws = Draws(self.setup.randomization, [self.setup.plant.actuators], into)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.setup.task.render_fps}
         self._view = {"width": width, "height": height, "camera": camera, "pretty": pretty}
@@ -81,10 +85,13 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
             check_view(self._scene().scene[0], width, height, camera)
         self.action_space = self.setup.commands.action_space
         self.observation_space = self.setup.observation_space
+        self.observation_names, self.motor_names = self.setup.observation_names, self.task.motors
+        self.command = config.action
+        """What the agent commands."""
+        self.signal_names, self.trace_names = signal_names(family := self.setup.plant.family), trace_names(family)
+        """Of the actuators' signals in `info`; of the columns of `trace`."""
         self._observation_shape = self.observation_space.shape
-        self._compiled: tuple[Any, tuple[Any, ...]] | None = (
-            None  # its step, and the arguments that are this simulation
-        )
+        self._compiled: tuple[Any, tuple[Any, ...]] | None = None  # its step, and its simulation's arguments
         self._offer_attributes(self.task)
 
     @property
@@ -127,16 +134,6 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         return self
 
     @property
-    def command(self) -> str:
-        """What the agent commands."""
-        return self.setup.config.action
-
-    @property
-    def motor_names(self) -> tuple[str, ...]:
-        """Names of the motors."""
-        return self.task.motors
-
-    @property
     def speeds(self) -> np.ndarray:
         """Velocities of the joints that the motors drive [m/s or rad/s], shape (motors,)."""
         return self.physics.state[list(self.task.speeds)]
@@ -147,16 +144,6 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         return self.physics.trace.copy()
 
     @property
-    def trace_names(self) -> tuple[str, ...]:
-        """Names of its columns."""
-        return trace_names(self.setup.plant.family)
-
-    @property
-    def observation_names(self) -> tuple[str, ...]:
-        """Of the observation's entries."""
-        return self.setup.observation_names
-
-    @property
     def step_duration(self) -> float:
         """[s]."""
         return self.task.step_duration
@@ -164,11 +151,6 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     def pose(self) -> None:
         """Bring the bodies of `data` to the present state: the engine leaves them where its last step began."""
         self.physics.show(self.physics.state)
-
-    @property
-    def signal_names(self) -> tuple[str, ...]:
-        """Of the actuators' signals in `info`."""
-        return signal_names(self.setup.plant.family)
 
     def _engine(self) -> tuple[Any, Any]:
         if self.physics.scene is None:
@@ -199,7 +181,10 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
             options: Gymnasium's reset options for the task (CartPole: the bounds `low` and `high`).
         """
         super().reset(seed=seed)
-        self.setup.start(self.physics, self.np_random, options, self._draws)
+        generator, setup = self.np_random, self.setup
+        initial = setup.task.initial(generator, options)
+        self._draws.draw(lambda rows, count: generator.random((len(rows), count)), np.zeros(1, dtype=int))
+        self.physics.reset(initial, float(setup.keys(lambda count: generator.random((1, count)))[0]))
         if self.render_mode == "human":
             self.render()
         drawn = self.randomization
@@ -218,7 +203,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         """
         force = self.setup.commands.force(action)
         if self._compiled is None:
-            if self.physics.compiled is None:
+            if self.physics.stepping is None:
                 return self._step_apart(force)
             self._compiled = compiled_kernels(self.setup, self.physics).step, arguments(self.setup, self.physics)
         step, simulation = self._compiled

@@ -107,6 +107,8 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         self.single_observation_space = self.setup.observation_space
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.arm_radii = np.array([one.arm_radius for one in self.setup.config.actuators])
+        """Of the motors of an environment [m], shape (motors,)."""
         self._streams = Streams(self.num_envs)
         self._draws = Draws(self.setup.randomization, actuators, functools.partial(put_into_batch, self.physics))
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
@@ -120,11 +122,6 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         self._kernels: tuple[Kernels, Array] | None = None
         self._looks: dict[str, Array] = {}  # fields of the models, where attributes were written
         self._offer_attributes(self.task)
-
-    @property
-    def arm_radii(self) -> Array:
-        """Of the motors of an environment, shape (motors,)."""
-        return np.array([one.arm_radius for one in self.setup.config.actuators])
 
     @property
     def task(self) -> Task:

@@ -35,7 +35,8 @@ class MotorisedEnvironment(dm_env.Environment):
         with self._building.motorising():
             self._environment = build()
         self._building.check()
-        if settings.randomize is not None and _builds_at_resets(self._environment):
+        kinds = type(self._environment).__mro__  # of `dm_control.composer`, which need not have been imported?
+        if settings.randomize is not None and any(one.__module__.startswith("dm_control.composer") for one in kinds):
             raise ValueError(
                 f"randomize: {type(self._environment).__name__} builds its model anew at every reset; let its own "
                 "variations change it"
@@ -139,11 +140,6 @@ class MotorisedEnvironment(dm_env.Environment):
         if name.startswith("__") or name == "_environment":
             raise AttributeError(name)
         return getattr(self._environment, name)
-
-
-def _builds_at_resets(environment: dm_env.Environment) -> bool:
-    """Whether an environment is one of `dm_control.composer`, which need not have been imported."""
-    return any(kind.__module__.startswith("dm_control.composer") for kind in type(environment).__mro__)
 
 
 def make_dm_control(

@@ -7,13 +7,12 @@ import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, Inputs, parameters_type
 from codrl_mj.physics.base import Plant, check_finite
-from codrl_mj.physics.disturber import disturber
 
 
 class AnalyticPhysics:
     """A task on Gymnasium's own equations. See `codrl_mj.physics.base.Physics`."""
 
-    compiled = None
+    stepping, arguments = None, ()
     scene = None
 
     def __init__(self, plant: Plant) -> None:
@@ -37,7 +36,7 @@ class AnalyticPhysics:
         self.twin = task.twin()
         self._actuators: list[tuple[float, Any]] = []
         self.set_actuators(plant.actuators)
-        self._disturber = disturber(plant, 1)
+        self._disturber = plant.disturber()
         self.trace = plant.trace()
         self.reset(np.zeros(len(task.state_names)))
 
@@ -48,8 +47,7 @@ class AnalyticPhysics:
         self._states = [rest] * len(self._actuators)
         self._time = 0.0
         self._key = key
-        if self._disturber is not None:
-            self._disturber.reset(np.zeros(1, dtype=np.int64), key)
+        self._disturber.reset(np.zeros(1, dtype=np.int64), key)
 
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
         """Exchange the actuators for others of their family; to be followed by a reset."""
@@ -72,11 +70,11 @@ class AnalyticPhysics:
         desired = np.atleast_2d(np.asarray(desired_force, dtype=np.float64))
         several, speeds = len(self._actuators) > 1, list(self.plant.task.speeds)
         for rows in self.trace:
-            commands = desired[0] if self._disturber is None else self._disturber.commands(desired)[0]
+            commands = self._disturber.commands(desired)[0]
             for number, (row, command) in enumerate(zip(rows, commands.tolist(), strict=True)):
                 row[:-1] = command, *self._advance(number, command)
             force: Any = rows[:, 1] if several else float(rows[0, 1])
-            if self._disturber is not None:
+            if self._disturber.on:
                 loads = self._disturber.loads()[0]
                 force = force + (loads if several else float(loads[0]))
             self.state = self.twin(self.state, force, self.timestep, self.plant.integrator)
@@ -132,7 +130,7 @@ class AnalyticPhysics:
     @property
     def memory(self) -> np.ndarray:
         """What the disturbances remember, a live array; empty if nothing."""
-        return np.empty(0) if self._disturber is None else self._disturber.memory.reshape(-1)
+        return self._disturber.memory.reshape(-1)
 
     def show(self, state: np.ndarray) -> None:
         """Nothing: there is no scene."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, Family, Ideal, check_same_family
 from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint
+from codrl_mj.physics.disturber import Disturber
 from codrl_mj.tasks import Task
 
 Signals = dict[str, Any]
@@ -98,6 +99,10 @@ class Plant:
         """A new `Physics.trace`."""
         return np.zeros((self.inner_steps, len(self.actuators), len(trace_names(self.family))))
 
+    def disturber(self, simulations: int = 1) -> Disturber:
+        """What disturbs so many simulations."""
+        return Disturber(self.disturbances, self.timestep, self.max_forces, simulations)
+
 
 class Physics(Protocol):
     """One simulation of a plant.
@@ -111,8 +116,10 @@ class Physics(Protocol):
     trace: np.ndarray
     """What each actuator did in each integration step of the last environment step, shape (inner_steps, actuators,
     columns), float64; columns as in `trace_names`. A live array: the next step overwrites it."""
-    compiled: Any
-    """What a compiled loop needs (see `codrl_mj.physics.stepping.Compiled`); None where a step is Python."""
+    stepping: Any
+    """The compiled functions of a loop (see `codrl_mj.physics.stepping.Stepping`); None where a step is Python."""
+    arguments: tuple[Any, ...]
+    """Their last arguments; none where there are none."""
     scene: tuple[Any, Any] | None
     """The `mujoco.MjModel` and `mujoco.MjData` that it runs on; None where there are none."""
 
@@ -169,7 +176,7 @@ class Physics(Protocol):
         """
 
     def check_finite(self) -> None:
-        """Raise if the present state is not finite or too large to be trusted; where `compiled` steps, they ask it.
+        """Raise if the present state is not finite or too large to be trusted; where `stepping` steps, they ask it.
 
         Raises:
             SimulationDivergedError: as it says.

@@ -107,7 +107,11 @@ def task_model(plant: Plant) -> mujoco.MjModel:
             raise ValueError(f"{task.asset}: actuator {name!r} must drive a hinge or a slide joint")
         drive(motor, actuator, limit)
         for added in (joint, actuator.additions):
-            _add(spec, joint_driven, added)
+            joint_driven.armature += added.armature
+            joint_driven.damping[0] += added.damping
+            if added.friction:
+                joint_driven.frictionloss += added.friction
+                spec.option.disableflags = flags_with_friction(spec.option.disableflags)
     if all(texture.type != mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
         _add_sky(spec)
     model = spec.compile()
@@ -127,15 +131,6 @@ def _add_sky(spec: mujoco.MjSpec) -> None:
     kind, gradient = mujoco.mjtTexture.mjTEXTURE_SKYBOX, mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
     sky = spec.add_texture(type=kind, builtin=gradient, width=64, height=64)
     sky.rgb1, sky.rgb2 = [0.93, 0.95, 0.97], [0.76, 0.82, 0.88]
-
-
-def _add(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, added: JointAdditions) -> None:
-    """Add inertia, damping and friction to a joint."""
-    joint.armature += added.armature
-    joint.damping[0] += added.damping
-    if added.friction:
-        joint.frictionloss += added.friction
-        spec.option.disableflags = flags_with_friction(spec.option.disableflags)
 
 
 def flags_with_friction(flags: int) -> int:

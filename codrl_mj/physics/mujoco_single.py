@@ -1,7 +1,7 @@
 """One simulation of a task in MuJoCo, the actuators in the control callback."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -11,21 +11,11 @@ from codrl_mj.actuators import ActuatorModel
 from codrl_mj.engine.families import HEAD
 from codrl_mj.engine.library import addresses
 from codrl_mj.physics.base import Plant, check_finite
-from codrl_mj.physics.disturber import disturber
 from codrl_mj.physics.mjcf import flags_with_friction, needed_callbacks, task_model
-from codrl_mj.physics.stepping import Stepping, Wiring, compiled_stepping
+from codrl_mj.physics.stepping import Wiring, compiled_stepping
 from codrl_mj.physics.variation import write_fields
 
 ARM = Wiring._fields.index("arm")
-
-
-class Compiled(NamedTuple):
-    """What a compiled loop needs of a simulation."""
-
-    stepping: Stepping
-    """The functions."""
-    arguments: tuple[Any, ...]
-    """Their last arguments."""
 
 
 class MujocoPhysics:
@@ -44,20 +34,18 @@ class MujocoPhysics:
         self._flags = self.model.opt.disableflags
         task = plant.task
         self._qpos_order, self._qvel_order = _progression(task.qpos), _progression(task.qvel)
-        self._disturber = disturber(plant, 1)
+        self._disturber = plant.disturber()
         self.trace = plant.trace()
         rows = [[*one] for one in wiring(self.model, plant)]
-        numbers = np.empty((len(rows), 0)) if self._disturber is None else self._disturber.numbers
-        self._settings = np.hstack([rows, numbers])
+        self._settings = np.hstack([rows, self._disturber.numbers])
         self._bind()
         self.reset(np.zeros(len(task.state_names)))
 
     def _bind(self) -> None:
         """Take the views that a step uses, and make sure that the callbacks are there."""
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
-        memory = np.zeros((len(self._settings), 0)) if self._disturber is None else self._disturber.memory
-        stepping = compiled_stepping(self.plant, self._disturber is not None)
-        self.compiled = Compiled(stepping, (*addresses(self.data), self._settings, memory, self.trace))
+        self.stepping = compiled_stepping(self.plant)
+        self.arguments = *addresses(self.data), self._settings, self._disturber.memory, self.trace
         self.scene: tuple[Any, Any] | None = (self.model, self.data)
         self._callbacks = needed_callbacks(self.model)
         self.install()
@@ -92,8 +80,7 @@ class MujocoPhysics:
     def reset(self, state: np.ndarray, key: float = 0.0) -> None:
         """See `Physics.reset`."""
         self.install()  # raises if somebody replaced ours since the last episode
-        stepping, arguments = self.compiled
-        stepping.start(np.asarray(state, dtype=np.float64), float(key), *arguments)
+        self.stepping.start(np.asarray(state, dtype=np.float64), float(key), *self.arguments)
 
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
         """Exchange the actuators for others of their family; to be followed by a reset.
@@ -127,8 +114,7 @@ class MujocoPhysics:
 
     def step(self, desired_force: Any) -> None:
         """See `Physics.step`."""
-        stepping, arguments = self.compiled
-        if not stepping.step(desired_force, *arguments):
+        if not self.stepping.step(desired_force, *self.arguments):
             self.check_finite()
 
     def check_finite(self) -> None:
@@ -137,9 +123,8 @@ class MujocoPhysics:
 
     def observed(self, row: np.ndarray) -> np.ndarray:
         """See `Physics.observed`."""
-        stepping, arguments = self.compiled
         seen = np.empty((len(row), len(self.plant.family.OBSERVED)))
-        stepping.observed(row, seen, *arguments)
+        self.stepping.observed(row, seen, *self.arguments)
         return seen
 
     def snapshot(self) -> np.ndarray:
@@ -158,7 +143,7 @@ class MujocoPhysics:
     @property
     def memory(self) -> np.ndarray:
         """What the disturbances remember beside the engine's own state, a live array; empty if nothing."""
-        return np.empty(0) if self._disturber is None else self._disturber.memory.reshape(-1)
+        return self._disturber.memory.reshape(-1)
 
 
 def wiring(model: mujoco.MjModel, plant: Plant) -> list[Wiring]:
@@ -179,4 +164,4 @@ def _progression(entries: tuple[int, ...]) -> slice:
 
 
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-_VIEWS = ("model", "_qpos", "_qvel", "compiled", "scene")
+_VIEWS = ("model", "_qpos", "_qvel", "stepping", "arguments", "scene")

@@ -15,6 +15,7 @@ from numba import types
 from numba.extending import overload
 
 from codrl_mj.actuators import Family
+from codrl_mj.disturbances import OFF
 from codrl_mj.engine.doors import user_of
 from codrl_mj.engine.families import HEAD, Slot, compiled_observe, load_family, signals_at
 from codrl_mj.engine.layout import DATA, MODEL
@@ -60,12 +61,9 @@ class Stepping(NamedTuple):
     """(row of trace (n, c), seen (n, k), *arguments) -> nothing: fills `seen` with what the sensors say at present."""
 
 
-def compiled_stepping(plant: Plant, disturbed: bool) -> Stepping:
-    """The functions for simulations of a plant, which there is a disturber of if `disturbed`.
-
-    Compiled as they are used, once a process.
-    """
-    task = plant.task
+def compiled_stepping(plant: Plant) -> Stepping:
+    """The functions for simulations of a plant; compiled as they are used, once a process."""
+    task, disturbed = plant.task, plant.disturbances != OFF
     if plant.motorised:
         load_family(plant.family)
     kept, reader = compiled_constrain(task), compiled_reader(task)

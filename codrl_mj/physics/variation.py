@@ -72,9 +72,10 @@ def without_motors(model: mujoco.MjModel, motors: Mapping[int, ActuatorModel]) -
     return bare
 
 
-def additions_of(motors: Sequence[Sequence[ActuatorModel]]) -> np.ndarray:
-    """What the motors of m simulations add to their joints, shape (m, n, 3), entries as in `JointAdditions`."""
-    return np.array([[one.additions for one in each] for each in motors])
+def mounting_of(motors: Sequence[Sequence[ActuatorModel]]) -> tuple[np.ndarray, np.ndarray]:
+    """The arms [m] of the motors of m simulations, (m, n), and their `JointAdditions`, (m, n, 3)."""
+    arms = np.array([[one.arm_radius for one in each] for each in motors])
+    return arms, np.array([[one.additions for one in each] for each in motors])
 
 
 def variable(model: mujoco.MjModel) -> tuple[str, ...]:
@@ -134,7 +135,7 @@ class Variation:
         """The varied fields of the model, by name (`opt.` before an option's), shape (m, ...).
 
         `values`, shape (m, k), has a column for each of `names`, NaN where it is as it was; `additions` are as
-        `additions_of` has them; `drawn` includes the fields that only what is drawn depends on.
+        `mounting_of` has them; `drawn` includes the fields that only what is drawn depends on.
         """
         fields = {
             field: np.repeat(nominal[np.newaxis], len(values), axis=0)

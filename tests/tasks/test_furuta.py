@@ -146,8 +146,8 @@ def test_its_own_actuator_is_the_motor_of_the_catalogue_at_every_door():
     assert motor.motor.torque_constant * motor.controller.max_current == pytest.approx(MAX_TORQUE)
     assert EnvConfig("furuta").actuator == motor
     assert gymnasium.make(TASK.env_id).unwrapped.actuator == motor
-    assert batched("furuta", 2).unwrapped.setup.actuator == motor
-    assert make_sb3_vec_env(TASK.env_id, 2).env.setup.actuator == motor
+    assert batched("furuta", 2).unwrapped.setup.config.actuator == motor
+    assert make_sb3_vec_env(TASK.env_id, 2).env.setup.config.actuator == motor
     weaker = EnvConfig("furuta", {"name": "default", "supply": {"voltage": 10.0}}).actuator
     assert (weaker.supply.voltage, weaker.motor) == (10.0, motor.motor)
     assert EnvConfig("pendulum").actuator == EnvConfig("pendulum", "paper").actuator
