@@ -14,6 +14,7 @@ from mujoco.batch import Batch
 
 from codrl_mj import engine as callbacks
 from codrl_mj.actuators import IDEAL
+from codrl_mj.physics import Plant
 from codrl_mj.physics.mjcf import install_callbacks, task_model
 from codrl_mj.physics.offscreen import OffscreenRenderer
 from codrl_mj.tasks import TASKS, named_actuator
@@ -53,7 +54,7 @@ def engine(task: str, actuator: str | None = "paper") -> Subject:
     if actuator == "stepped":
         bench = Bench(one, timestep)
         one = one.replaced({"controller.kp": bench.kp, "controller.ki": bench.ki * one.controller.sample_rate})
-    model = task_model(definition, (one,), timestep)
+    model = task_model(Plant(definition, (one,), definition.motor_inner_steps))
     data = mujoco.MjData(model)
 
     def prepare() -> None:
@@ -196,7 +197,7 @@ def raw_batch(task: str, num_envs: int, threads: int, calls_apart: bool) -> Subj
     env.reset(seed=0)
     env.step(np.zeros(env.action_space.shape, env.action_space.dtype))
     physics = env.unwrapped.physics
-    batch, start, inner_steps = Batch(physics.model, num_envs, threads), physics.snapshot(), physics.inner_steps
+    batch, start, inner_steps = Batch(physics.model, num_envs, threads), physics.snapshot(), physics.plant.inner_steps
 
     def prepare() -> None:
         install_callbacks(physics.model)
@@ -224,7 +225,7 @@ def envpool(env_id: str, num_envs: int, threads: int) -> Subject:
 
 def drawing(task: str, fast: bool) -> Subject:
     """Frames of 480 x 480 of the task's scene, with our fast visual settings or with MuJoCo's defaults."""
-    model = task_model(TASKS[task], (IDEAL,), TASKS[task].step_duration)
+    model = task_model(Plant(TASKS[task], (IDEAL,)))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     if fast:

@@ -165,9 +165,10 @@ def test_every_face_is_built_from_it():
     )
     single, many, theirs = config.make(), make_sb3_vec_env(config, 2), suite.load(config)
     for setup in (single.unwrapped.setup, many.env.setup, theirs.setup):
-        assert (setup.actuators, setup.inner_steps) == (config.actuators, 2)
-        assert (setup.disturbances, setup.joint) == (config.disturbances, config.joint)
-        assert setup.view.options == (0.02, False)
+        plant = setup.plant
+        assert (plant.actuators, plant.inner_steps) == (config.actuators, 2)
+        assert (plant.disturbances, plant.joint) == (config.disturbances, config.joint)
+        assert setup.config.options == (0.02, False)
     assert single.spec.max_episode_steps == many.env.max_episode_steps == 7
     theirs.reset()
     assert [theirs.step(0).last() for _ in range(7)] == [False] * 6 + [True]

@@ -11,9 +11,8 @@ import codrl_mj
 from codrl_mj.actuators import resolve
 from codrl_mj.engine import load_family
 from codrl_mj.engine.families import compiled_observe
-from codrl_mj.envs.outcomes import compiled_outcomes
 from codrl_mj.foreign import environments
-from codrl_mj.physics.constrain import compiled_constrain
+from codrl_mj.physics.compiled_task import compiled_constrain, compiled_outcomes
 from tests import slips
 from tests.matrix import but
 

@@ -16,7 +16,7 @@ from safetensors.numpy import load_file
 import codrl_mj
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.physics.registry import PHYSICS
+from codrl_mj.physics import PHYSICS
 from codrl_mj.runs.summaries import read_run
 from codrl_mj.tasks import OURS, TASKS, find_task, reference_of
 from codrl_mj.tasks.attributes import Fixed

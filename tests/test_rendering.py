@@ -15,7 +15,7 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import Episode, RandomPolicy, run_episodes
 from codrl_mj.films.film import Panel, film
 from codrl_mj.films.strip import torque_label
-from codrl_mj.physics import signal_names
+from codrl_mj.physics import Plant, signal_names
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.offscreen import OffscreenRenderer
 from codrl_mj.tasks import TASKS, named_actuator
@@ -217,7 +217,7 @@ def test_a_model_without_a_sky_is_drawn_on_ours(tmp_path):
     bare.write_text(re.sub(r'<texture name="sky".*?/>', "", asset_path("pendulum.xml").read_text()))
     images = []
     for task in (TASKS["pendulum"], dataclasses.replace(TASKS["pendulum"], asset=str(bare))):
-        model = task_model(task, (IDEAL,), 0.01)
+        model = task_model(Plant(task, (IDEAL,)))
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         images.append(OffscreenRenderer(model, WIDTH, HEIGHT).render(data))

@@ -72,13 +72,13 @@ def test_every_task_is_offered():
 def test_options_are_set_over_a_configuration():
     config = EnvConfig("cartpole", "weak", inner_steps=4, options={"center_radius": 0.5}, max_episode_steps=7)
     same = suite.load(config)
-    assert (same.setup.actuator, same.setup.inner_steps) == (config.actuator, 4)
-    assert same.setup.view.options.center_radius == 0.5
+    assert (same.setup.config.actuator, same.setup.inner_steps) == (config.actuator, 4)
+    assert same.setup.config.options.center_radius == 0.5
     over = suite.load(config, actuator="weaker", inner_steps=2, sutton_barto_reward=True)
-    assert over.setup.actuator == named_actuator("weaker", "cartpole")
+    assert over.setup.config.actuator == named_actuator("weaker", "cartpole")
     assert over.setup.inner_steps == 2
-    assert over.setup.view.options == (0.5, True)
-    assert suite.load(config, actuator=None).setup.actuator == IDEAL
+    assert over.setup.config.options == (0.5, True)
+    assert suite.load(config, actuator=None).setup.config.actuator == IDEAL
     over.reset(), same.reset()
     assert [sum(not env.step(0).last() for _ in range(7)) for env in (over, same)] == [6, 6]
     with pytest.raises(ValueError, match=r"unknown key env\.innersteps; did you mean env\.inner_steps"):

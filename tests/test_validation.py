@@ -17,7 +17,7 @@ import codrl_mj
 from codrl_mj.actuators import IDEAL, Actuator, Lag, TorqueSpeed
 from codrl_mj.cli import main
 from codrl_mj.pages import certificate as page
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError, needed_callbacks
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Plant, SimulationDivergedError, needed_callbacks
 from codrl_mj.tasks import TASKS
 from codrl_mj.validation import (
     GROUPS,
@@ -382,7 +382,7 @@ def test_angles_are_compared_on_the_circle_only_where_both_were_wrapped():
 def test_the_growth_near_an_unstable_equilibrium_is_its_eigenvalue():
     """A pendulum upright: the semi-implicit map's larger eigenvalue, by hand."""
     task = TASKS["pendulum"]
-    run = AnalyticPhysics(task, [IDEAL], 1, "semi-implicit")
+    run = AnalyticPhysics(Plant(task, [IDEAL], 1, "semi-implicit"))
     growth = Growth(task, run, seed=0)
     for _ in range(100):
         run.step(0.0)

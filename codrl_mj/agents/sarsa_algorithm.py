@@ -93,7 +93,7 @@ class CompiledEpisodes:
             type(env) is ActuatedVecEnv
             and isinstance(env.env, ActuatedVectorEnv)
             and env.num_envs == 1
-            and not env.env.setup.randomization.names
+            and not env.env.setup.randomization.distributions
             and len(env.env.task.motors) == 1
             and env.env.max_episode_steps is not None
         )

@@ -14,7 +14,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from codrl_mj.actuators import Ideal
 from codrl_mj.disturbances import OFF
 from codrl_mj.envs.setup import Setup
 from codrl_mj.physics.analytic import AnalyticPhysics
@@ -36,7 +35,7 @@ def read(name: str, setup: Setup, model: Any) -> Any:
     if isinstance(attribute, Follows):
         return attribute.of(*(read(each, setup, model) for each in attribute.names))
     if isinstance(attribute, Setting):
-        value = getattr(setup if attribute is Setting.INTEGRATOR else setup.task, attribute.value)
+        value = getattr(setup.plant if attribute is Setting.INTEGRATOR else setup.task, attribute.value)
         return list(value) if attribute is Setting.FORCES else value
     if not isinstance(model, mujoco.MjModel):
         return getattr(_gymnasiums(model), name)
@@ -108,7 +107,7 @@ def _write(name: str, value: Any, setup: Setup, model: Any) -> Setup:
     if attribute is Setting.INTEGRATOR:
         known = " or ".join(f"integrator={name!r}" for name in setup.task.integrators)
         raise AttributeError(f"it is compiled into the step: make an environment with {known}")
-    if setup.randomization.names:
+    if setup.randomization.distributions:
         raise AttributeError("actuator and model are drawn at every reset: give `randomize` a distribution of it")
     if isinstance(attribute, ModelNumber):
         _write_number(name, attribute, value, setup, model)
@@ -138,7 +137,7 @@ def _write_number(name: str, attribute: ModelNumber, value: Any, setup: Setup, m
 def _write_forces(value: Any, setup: Setup, model: Any, each: bool) -> Setup:
     """The forces of the actions, each or the largest of them."""
     task = setup.task
-    if setup.commands.name != "force" or setup.disturbances != OFF or len(task.motors) > 1:
+    if setup.config.action != "force" or setup.config.disturbances != OFF or len(task.motors) > 1:
         raise AttributeError(
             "the forces are known to the current loop's table, to the drive's disturbances or to several motors: make "
             "an environment of one motor with action='force' and no disturbances"
@@ -154,25 +153,19 @@ def _write_forces(value: Any, setup: Setup, model: Any, each: bool) -> Setup:
         table = tuple(largest * (force / task.max_force) for force in table)
     if isinstance(model, mujoco.MjModel):
         model.actuator(task.motors[0]).ctrlrange[:] *= largest / task.max_force
-    return _of_task(setup, dataclasses.replace(task, max_force=largest, forces=table))
+    return dataclasses.replace(setup, task=dataclasses.replace(task, max_force=largest, forces=table))
 
 
 def _write_step(value: Any, setup: Setup, model: Any) -> Setup:
     duration = _number(value, positive=True)
-    if not issubclass(setup.family, Ideal) or setup.disturbances != OFF:
+    if setup.plant.motorised or setup.config.disturbances != OFF:
         raise AttributeError("motor and disturbances were checked for this step: make an environment without them")
     if isinstance(model, mujoco.MjModel):
         model.opt.timestep = duration / setup.inner_steps
     else:
         _gymnasiums(model)
         model.timestep = duration / setup.inner_steps
-    return _of_task(setup, dataclasses.replace(setup.task, step_duration=duration))
-
-
-def _of_task(setup: Setup, task: Task) -> Setup:
-    """The set-up with a changed task."""
-    commands = dataclasses.replace(setup.commands, task=task, max_forces=task.max_forces)
-    return dataclasses.replace(setup, task=task, commands=commands, view=dataclasses.replace(setup.view, task=task))
+    return dataclasses.replace(setup, task=dataclasses.replace(setup.task, step_duration=duration))
 
 
 class _Access:

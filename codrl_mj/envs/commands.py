@@ -1,7 +1,5 @@
 """What an agent's actions stand for: forces, or what its actuators take besides, such as currents and voltages."""
 
-import dataclasses
-import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -37,29 +35,12 @@ def fixed_by(command: Command, name: str) -> dict[str, str]:
     return {field: f"with action={name!r} {why}" for field, why in command.fixed.items()}
 
 
-@dataclasses.dataclass(frozen=True)
 class TaskCommands:
-    """The way from an action to the forces that the physics is asked for; made by `build`."""
+    """The way from an action to the forces that the physics is asked for."""
 
-    task: Task
-    """The task."""
-    name: str
-    """`force`, or one of the actuator's commands."""
-    simulated: tuple[ActuatorModel, ...]
-    """What is simulated, one for each motor: the actuator, or what a command leaves of it."""
-    scales: np.ndarray
-    """Forces [N] or torques [N*m] that stand for commands of one, shape (n,)."""
-    max_forces: np.ndarray
-    """Largest forces [N] or torques [N*m] that the physics is asked for, shape (n,)."""
-    fixed: Mapping[str, str]
-    """Fields of the actuator that cannot be drawn -> why."""
-    levels: np.ndarray | None
-    """Commands that a discrete task's actions choose from; None where the action is the command, or a force."""
-
-    @classmethod
-    def build(
-        cls, task: Task, actuators: tuple[ActuatorModel, ...], name: str, levels: Sequence[float] | None
-    ) -> "TaskCommands":
+    def __init__(
+        self, task: Task, actuators: tuple[ActuatorModel, ...], name: str, levels: Sequence[float] | None
+    ) -> None:
         """Resolve a command by its name; `levels` are for discrete tasks and other commands than `force`."""
         if name == "force" and actuators[0].MOTION:
             raise ValueError(
@@ -75,79 +56,36 @@ class TaskCommands:
                 f"action = 'position': {task.name} wraps {', '.join(wrapped)}, and a position that jumps by a turn "
                 "cannot be held; use a velocity servo, or another actuator"
             )
+        self.simulated = tuple(command.actuator for command in chosen)
+        """What is simulated, one for each motor: the actuator, or what a command leaves of it."""
+        self.tracks = self.simulated[0].tracks
+        """Whether a force is asked for; otherwise what is delivered counts as desired."""
+        self.fixed = fixed_by(chosen[0], name)
+        """Fields of the actuator that cannot be drawn -> why."""
         scales = np.array([command.torque_per_unit / command.actuator.arm_radius for command in chosen])
         limits = [command.limit for command in chosen]
         if not all(limit is None or np.isfinite(limit) for limit in limits):
             raise ValueError(f"action = {name!r}: needs a finite controller.max_voltage, it is inf")
-        forces = [
-            most if limit is None else limit * scale
-            for limit, scale, most in zip(limits, scales, task.max_forces, strict=True)
-        ]
-        simulated, fixed = tuple(command.actuator for command in chosen), fixed_by(chosen[0], name)
-        made = cls(task, name, simulated, scales, np.array(forces), fixed, None)
-        return made if name == "force" else dataclasses.replace(made, levels=made._table(levels, chosen[0]))
-
-    def _table(self, levels: Sequence[float] | None, command: Command) -> np.ndarray | None:
-        """The table of levels, checked against the task's action space."""
-        task = self.task
-        if isinstance(task.action_space, spaces.Box):
+        each = zip(limits, scales, task.max_forces, strict=True)
+        self.max_forces = np.array([most if limit is None else limit * scale for limit, scale, most in each])
+        """Largest forces [N] or torques [N*m] that the physics is asked for, shape (n,)."""
+        most = self.max_forces / scales  # in float64: a float32 bound of the space may lie beyond
+        self._box = (float(most[0]), float(scales[0]), 1) if len(most) == 1 else (most, scales, len(most))
+        """The largest command of a box's action, the force [N or N*m] of a command of one, and the number of motors."""
+        self.action_space: spaces.Space[Any] = task.action_space
+        """The agent's actions: the task's, or a table's indices, or a box of commands."""
+        self.action_forces = None if task.forces is None else np.array(task.forces, dtype=np.float64)
+        """Forces [N or N*m] of the discrete actions, in order, shape (k,) or (k, n); None where the space is a box."""
+        if name != "force" and isinstance(self.action_space, spaces.Box):
             if levels is not None:
                 raise ValueError(
                     f"levels = {levels!r}: only for tasks with discrete actions; {task.name}'s are continuous"
                 )
-            return None
-        if len(self.scales) > 1:
-            raise ValueError(
-                f"action = {self.name!r}: {task.name} has several motors and discrete actions: use 'force'"
-            )
-        limit = command.limit
-        if limit is None:
-            limit = float(task.max_forces[0]) * command.actuator.arm_radius / command.torque_per_unit
-        try:
-            table = np.array([] if levels is None else levels, dtype=np.float64)  # a copy
-        except (TypeError, ValueError):
-            table = np.array([np.nan])
-        if table.ndim != 1 or len(table) < 2 or not (np.abs(table) <= limit).all():
-            raise ValueError(
-                f"levels = {levels!r}: {task.name} has discrete actions, so action={self.name!r} needs two or more "
-                f"levels within +-{limit!r} {command.unit}, such as levels=({-limit!r}, 0, {limit!r})"
-            )
-        return table
-
-    @functools.cached_property
-    def tracks(self) -> bool:
-        """Whether a force is asked for; otherwise what is delivered counts as desired."""
-        return self.simulated[0].tracks
-
-    @property
-    def limits(self) -> np.ndarray:
-        """Largest commands, shape (n,), in float64: a float32 bound may lie beyond."""
-        return self.max_forces / self.scales
-
-    @functools.cached_property
-    def action_space(self) -> spaces.Space[Any]:
-        """The agent's actions: the task's, or a table's indices, or a box of commands."""
-        if self.levels is not None:
-            return spaces.Discrete(len(self.levels))
-        if self.name == "force":
-            return self.task.action_space
-        bounds = self.limits.astype(np.float32)
-        return spaces.Box(-bounds, bounds, dtype=np.float32)
-
-    @functools.cached_property
-    def action_forces(self) -> np.ndarray | None:
-        """Forces [N or N*m] of the discrete actions, in order, shape (k,) or (k, n); None where the space is a box."""
-        if self.levels is not None:
-            return self.levels * self.scales[0]
-        return None if self.task.forces is None else np.array(self.task.forces, dtype=np.float64)
-
-    @functools.cached_property
-    def _box(self) -> tuple[Any, Any, int]:
-        """The largest command of a box's action, the force [N or N*m] of a command of one, and the number of motors."""
-        limits = self.task.max_forces if self.name == "force" else self.limits
-        if len(limits) == 1:
-            return float(limits[0]), float(self.scales[0]), 1
-        return limits, self.scales, len(limits)
+            bounds = most.astype(np.float32)
+            self.action_space = spaces.Box(-bounds, bounds, dtype=np.float32)
+        elif name != "force":
+            table = _table(task, name, levels, chosen)
+            self.action_space, self.action_forces = spaces.Discrete(len(table)), table * scales[0]
 
     def force(self, action: Any) -> Any:
         """The force [N] or torque [N*m] that the physics is to ask the actuator for; with several motors an array (n,).
@@ -191,6 +129,26 @@ class TaskCommands:
         limit, scale, count = self._box
         commands = array[:, 0] if count == 1 else array
         return np.clip(commands.astype(np.float64), -limit, limit) * scale
+
+
+def _table(task: Task, name: str, levels: Sequence[float] | None, commands: Sequence[Command]) -> np.ndarray:
+    """The levels of a command that a task's discrete actions choose from, shape (k,), checked."""
+    if len(commands) > 1:
+        raise ValueError(f"action = {name!r}: {task.name} has several motors and discrete actions: use 'force'")
+    command = commands[0]
+    limit = command.limit
+    if limit is None:
+        limit = float(task.max_forces[0]) * command.actuator.arm_radius / command.torque_per_unit
+    try:
+        table = np.array([] if levels is None else levels, dtype=np.float64)  # a copy
+    except (TypeError, ValueError):
+        table = np.array([np.nan])
+    if table.ndim != 1 or len(table) < 2 or not (np.abs(table) <= limit).all():
+        raise ValueError(
+            f"levels = {levels!r}: {task.name} has discrete actions, so action={name!r} needs two or more "
+            f"levels within +-{limit!r} {command.unit}, such as levels=({-limit!r}, 0, {limit!r})"
+        )
+    return table
 
 
 class ControlCommands:

@@ -34,24 +34,14 @@ from numba import types
 from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.engine.families import compiled_function
 from codrl_mj.engine.memory import floats, internal, on_stack
-from codrl_mj.envs.outcomes import Outcomes, compiled_outcomes
 from codrl_mj.envs.setup import Setup
 from codrl_mj.kept import njit
-from codrl_mj.physics.constrain import Compiled
+from codrl_mj.physics.compiled_task import Compiled, Outcomes, compiled_outcomes
 from codrl_mj.physics.rows import Lane, Rows, claim, complain, finish, load, store
 from codrl_mj.physics.stepping import Stepping
 
-
-class Interface(NamedTuple):
-    """What the vector `interface` begins with; the task's options follow."""
-
-    observes: float
-    """Whether the observation ends with what the actuators' sensors say."""
-    random: float
-    """Whether an episode's disturbances or sensors need a key."""
-
-
-OPTIONS, RANDOM = len(Interface._fields), Interface._fields.index("random")
+RANDOM, OPTIONS = 0, 1
+"""In `interface`: whether an episode's disturbances or sensors need a key, and the first of the task's options."""
 
 
 class VectorStep(NamedTuple):
@@ -120,7 +110,7 @@ def compiled_env(env: Any) -> CompiledEnv | None:
         actuator or model are drawn at resets, which is Python too.
     """
     setup, physics = env.setup, env.physics
-    if physics.compiled is None or setup.randomization.names:
+    if physics.stepping is None or setup.randomization.distributions:
         return None
     kernels, task = compiled_kernels(setup, physics), setup.task
     compiled_function(task.initial_state, task.state_names, "Task.state_names", types.float64[::1])
@@ -130,16 +120,15 @@ def compiled_env(env: Any) -> CompiledEnv | None:
 
 def arguments(setup: Setup, physics: Any) -> tuple[Any, ...]:
     """The last arguments of an environment's kernels, of a simulation whose steps are compiled."""
-    kind = Interface(bool(setup.view.sensors), setup.random)
-    return (np.array([*kind, *setup.view.options], dtype=np.float64), *physics.compiled.arguments)
+    return (np.array([setup.random, *setup.config.options], dtype=np.float64), *physics.arguments)
 
 
 def compiled_kernels(setup: Setup, physics: Any) -> Kernels:
     """The functions for environments of one kind, whose simulation's steps are compiled; compiled once a process."""
     task = setup.task
-    sensors = len(setup.family.OBSERVED) if setup.view.sensors else 0
+    sensors = len(setup.plant.family.OBSERVED) if setup.sensors else 0
     single, size = len(task.motors) == 1, len(task.state_names)
-    return _kernels(physics.compiled.stepping, compiled_outcomes(task), task.initial_state, size, single, sensors)
+    return _kernels(physics.stepping, compiled_outcomes(task), task.initial_state, size, single, sensors)
 
 
 @internal

@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, mapping_of, names_of
-from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint, resolve_disturbances, resolve_joint
+from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint, resolve
 from codrl_mj.envs.distributions import Distribution, paths_of
 from codrl_mj.envs.worlds import World, find_world
 from codrl_mj.fields import check_names
@@ -77,8 +77,8 @@ class EnvConfig:
             self._set(field.name, _plain(getattr(self, field.name)))
         world = find_world(self.task)
         self._set("task", world.reference)
-        self._set("disturbances", resolve_disturbances(self.disturbances))
-        self._set("joint", resolve_joint(self.joint))
+        self._set("disturbances", resolve(self.disturbances, OFF))
+        self._set("joint", resolve(self.joint, PLAIN))
         for field in dataclasses.fields(self):
             if field.name not in world.fields and getattr(self, field.name) != field.default:
                 raise ValueError(f"{field.name} = {getattr(self, field.name)!r}: {world.name} has none: leave it out")
@@ -198,7 +198,7 @@ class EnvConfig:
         return {
             **{field.name: getattr(self, field.name) for field in dataclasses.fields(self)},
             "actuator": _described(self.actuator),
-            "disturbances": self.disturbances.as_mapping(),
+            "disturbances": dataclasses.asdict(self.disturbances),
             "joint": dataclasses.asdict(self.joint),
             "options": self.world.changed(self.options),
         }

@@ -1,5 +1,6 @@
 """The motors in one simulation of anybody's model: what is asked of them, what is drawn, and what is seen of them."""
 
+import dataclasses
 import functools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -10,14 +11,13 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel, Command, Family, Inputs, parameters_type
 from codrl_mj.actuators.noise import LARGEST_KEY
-from codrl_mj.disturbances import Disturbances
+from codrl_mj.disturbances import OFF, Disturbances
 from codrl_mj.engine.families import signals_at
 from codrl_mj.engine.plugin import PLUGIN_HEAD
 from codrl_mj.engine.reading import Readout, bring_to_rest, slots
-from codrl_mj.envs.commands import ControlCommands, fixed_by
+from codrl_mj.envs.commands import ControlCommands, command_of, fixed_by
 from codrl_mj.envs.distributions import paths_of
 from codrl_mj.envs.randomization import Draws, Randomization, put_into
-from codrl_mj.envs.views import sensor_names
 from codrl_mj.physics.base import diverged, named_signals
 from codrl_mj.physics.variation import without_motors, write_fields
 from codrl_mj.specs import matched_by, names_of
@@ -25,53 +25,68 @@ from codrl_mj.specs import matched_by, names_of
 _POSITION = int(mujoco.mjtWarning.mjWARN_BADQPOS)  # followed by those of speeds, accelerations and controls
 
 
+@dataclasses.dataclass(frozen=True)
+class MotorSettings:
+    """What an environment of others is to have of motors, as `codrl_mj.make` takes it."""
+
+    actuators: Mapping[str, ActuatorModel]
+    """Pattern -> actuator."""
+    action: str = "force"
+    """What actions stand for."""
+    observe_actuator: bool = False
+    """Whether observations end with what the motors' sensors say."""
+    randomize: Any = None
+    """What is drawn at every reset."""
+    disturbances: Disturbances = OFF
+    """Of commands, and load pulses."""
+    allow_unstable: bool = False
+    """As for `codrl_mj.motorise`."""
+
+    @functools.cached_property
+    def commands(self) -> dict[str, Command]:
+        """Pattern -> what an action means to its motors."""
+        return {pattern: command_of(one, self.action, pattern) for pattern, one in self.actuators.items()}
+
+    @property
+    def simulated(self) -> dict[str, ActuatorModel]:
+        """Pattern -> what a command leaves of its actuator."""
+        return {pattern: command.actuator for pattern, command in self.commands.items()}
+
+
 class Motors:
     """The motors in one simulation, of a model that was built with them; every face of others' environments has one."""
 
     def __init__(
-        self,
-        data: mujoco.MjData,
-        commands: Mapping[str, Command],
-        action: str,
-        actions: spaces.Space,
-        *,
-        randomize: Any,
-        disturbances: Disturbances,
-        step_duration: float | None,
-        allow_unstable: bool,
+        self, data: mujoco.MjData, settings: MotorSettings, actions: spaces.Space, step_duration: float | None
     ) -> None:
-        """Find the motors of a simulation.
-
-        `commands` say what an action of a name, `action`, means to the motors of a pattern, `actions` are the
-        environment's own. An environment step takes `step_duration` [s], if that is known. What else is given is as for
-        `codrl_mj.make`.
-        """
+        """Find the motors of a simulation, of an environment with these `actions` of its own, and steps so long [s]."""
         self.data, model = data, data.model
         self.readout = Readout(model)
         self.present = dict(self.readout.motors)
         """Those of the present episode, by the index of the actuator in the model."""
-        names = names_of(model)
-        meant = {index: one for pattern, one in commands.items() for index in matched_by(pattern, names)}
+        names, forced = names_of(model), settings.action == "force"
+        meant = {index: one for pattern, one in settings.commands.items() for index in matched_by(pattern, names)}
         nominal = {index: meant[index].actuator if index in meant else one for index, one in self.present.items()}
         self._slots = list(slots(data, self.present).values())
-        asked = {index: meant.get(index) if action != "force" else None for index in self.present}
-        self._commands = ControlCommands(data, actions, asked, disturbances, step_duration)
+        asked = {index: None if forced else meant.get(index) for index in self.present}
+        self._commands = ControlCommands(data, actions, asked, settings.disturbances, step_duration)
         self.action_space = self._commands.action_space
         self.controls = self._commands.controls
         """(one of `action_space`) -> the environment's own action, as it arrives."""
-        fixed = [fixed_by(meant[index], action) if index in meant else {} for index in nominal]
-        bare, timestep = without_motors(model, nominal) if randomize else model, model.opt.timestep
-        randomization = Randomization.build(
-            paths_of(randomize), bare, nominal, fixed, timestep, allow_unstable, "the model"
+        fixed = [fixed_by(meant[index], settings.action) if index in meant else {} for index in nominal]
+        distributions, timestep = paths_of(settings.randomize), model.opt.timestep
+        bare = without_motors(model, nominal) if distributions else model
+        randomization = Randomization(
+            distributions, bare, nominal, fixed, timestep, settings.allow_unstable, "the model"
         )
         self.draws = Draws(randomization, [list(nominal.values())], functools.partial(put_into, self))
-        self._random = disturbances.random or randomization.random or any(one.random for one in nominal.values())
+        drawn = settings.disturbances.random or randomization.random
+        self._random = drawn or any(one.random for one in nominal.values())
         self.names = motor_names(model, self.present)
         """What the motors are called."""
-        self.families = {name: _family(one) for name, one in zip(self.names, self.present.values(), strict=True)}
-        """Theirs, by name."""
-        self.sensors = sensor_names(self.families)
-        """Names of what `seen` returns."""
+        families = {name: _family(one) for name, one in zip(self.names, self.present.values(), strict=True)}
+        self.sensors = sensor_names(families) if settings.observe_actuator else ()
+        """Names of what `seen` returns, which an observation ends with."""
         self._parameters = list(map(_parameters, self.present.values()))
 
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
@@ -153,6 +168,27 @@ def motor_names(model: mujoco.MjModel, motors: Iterable[int]) -> tuple[str, ...]
     """What motors are called: as their actuators, or else as what these drive; or else by their indices."""
     every = [own[0] if own else "" for own in names_of(model)]
     return tuple(every[index] if every.count(every[index]) == 1 and every[index] else str(index) for index in motors)
+
+
+def sensor_names(motors: Mapping[str, Family]) -> tuple[str, ...]:
+    """Names of what the sensors of motors, by theirs, say; a motor without a name needs none. Refused if nothing."""
+    sensors = tuple(f"{motor}.{name}" if motor else name for motor, one in motors.items() for name in one.OBSERVED)
+    if not sensors:
+        kinds = ", ".join(sorted({one.family or one.__name__ for one in motors.values()}))
+        raise ValueError(
+            f"observe_actuator=True: the {kinds} actuator has no current to observe, and nothing else; choose another"
+        )
+    return sensors
+
+
+def longer(space: spaces.Space, count: int) -> spaces.Box:
+    """An observation space, which must be of vectors, with some unbounded entries more."""
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        raise ValueError(f"observe_actuator=True: observations are {space}, and only to vectors can be appended")
+    low, high = (
+        np.append(bound, np.full(count, value)) for bound, value in ((space.low, -np.inf), (space.high, np.inf))
+    )
+    return spaces.Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype.type)
 
 
 def _family(motor: ActuatorModel) -> Family:

@@ -1,6 +1,5 @@
 """Motors and models drawn at every reset: what is drawn of them, and what present episodes were drawn with."""
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -20,7 +19,7 @@ from codrl_mj.actuators import (
 )
 from codrl_mj.envs.distributions import MODEL, Choice, Distribution, split_path
 from codrl_mj.fields import did_you_mean
-from codrl_mj.physics.variation import Variation, additions_of, mounts_of, variable
+from codrl_mj.physics.variation import Variation, mounting_of, mounts_of, variable
 from codrl_mj.specs import matched_by, names_of, refuse_unmatched
 
 LIMIT = 1000
@@ -29,32 +28,11 @@ Uniforms = Callable[[np.ndarray, int], np.ndarray]
 """(simulations (m,), count) -> the next `count` numbers in [0, 1) of each of their generators, shape (m, count)."""
 
 
-@dataclasses.dataclass(frozen=True)
 class Randomization:
-    """What is drawn at a reset, and what it does to motors and model; made by `build`."""
+    """What is drawn at a reset, and what it does to motors and model; never changed once it is made."""
 
-    distributions: Mapping[str, Distribution]
-    """Path, as `split_path` takes it apart -> what it is drawn from, in this order."""
-    types: Mapping[str, type]
-    """Path -> float, int or bool."""
-    families: tuple[Family, ...]
-    """Of each motor of a simulation."""
-    columns: tuple[Mapping[int, str], ...]
-    """Of each motor: column of the drawn values -> the field that it is."""
-    timestep: float
-    """Integration step [s], at which drawn motors must be stable."""
-    allow_unstable: bool
-    """Whether unstable ones are kept."""
-    variation: Variation | None
-    """What drawn fields do to the model; None if they do nothing."""
-    in_model: tuple[str, ...]
-    """The paths that the model, besides its motors' parameters, depends on."""
-    mounting: bool
-    """Whether motors' arms, or what they add to the model, depend on what is drawn."""
-
-    @classmethod
-    def build(
-        cls,
+    def __init__(
+        self,
         distributions: Mapping[str, Distribution],
         model: mujoco.MjModel,
         motors: Mapping[int, ActuatorModel],
@@ -62,120 +40,40 @@ class Randomization:
         timestep: float,
         allow_unstable: bool,
         whose: str,
-    ) -> "Randomization":
-        """Check the distributions against the fields that they are for.
+    ) -> None:
+        """Check the distributions, drawn in their order, against the fields that they are for.
 
         The `model` is without what its `motors`, by the indices of their actuators, add; `fixed` are the fields of
-        each that cannot be drawn, with the reason; the `timestep` is in [s]; messages call the model `whose`.
+        each that cannot be drawn, with the reason; motors must be stable at the `timestep` [s] unless `allow_unstable`;
+        messages call the model `whose`.
         """
+        self.distributions, self.timestep, self.allow_unstable = distributions, timestep, allow_unstable
         matched, simulated = _matched(distributions, model, motors, fixed, whose), list(motors.values())
         turned, added = (
             [path for path, own in matched.items() if any(_follows(of, simulated[at], path) for at in own)]
             for of in (lambda one: one.arm_radius, lambda one: one.additions)
         )
         of_model = [path for path, own in matched.items() if not own]
-        in_model = (*of_model, *added)
-        return cls(
-            distributions,
-            {path: _kind(type(simulated[own[0]]), path) if own else float for path, own in matched.items()},
-            tuple(map(type, simulated)),
-            tuple(
-                {column: split_path(path)[1] for column, (path, own) in enumerate(matched.items()) if at in own}
-                for at in range(len(simulated))
-            ),
-            timestep,
-            allow_unstable,
-            Variation(model, of_model, list(motors), mounting=bool(added)) if in_model else None,
-            in_model,
-            bool(turned or added),
-        )
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The paths, in the order in which they are drawn."""
-        return tuple(self.distributions)
-
-    @property
-    def draws_actuator(self) -> bool:
+        self.types = {path: _kind(type(simulated[own[0]]), path) if own else float for path, own in matched.items()}
+        """Path -> float, int or bool."""
+        self.families: list[Family] = list(map(type, simulated))
+        """Of each motor of a simulation."""
+        self.columns = [
+            {column: split_path(path)[1] for column, (path, own) in enumerate(matched.items()) if at in own}
+            for at in range(len(simulated))
+        ]
+        """Of each motor: column of the drawn values -> the field that it is."""
+        self.in_model = (*of_model, *added)
+        """The paths that the model, besides its motors' parameters, depends on."""
+        self.variation = Variation(model, of_model, list(motors), mounting=bool(added)) if self.in_model else None
+        """What drawn fields do to the model; None if they do nothing."""
+        self.mounting = bool(turned or added)
+        """Whether motors' arms, or what they add to the model, depend on what is drawn."""
+        self.draws_actuator = any(self.columns)
         """Whether a field of a motor is drawn, and so its stability must be checked at every draw."""
-        return any(self.columns)
-
-    @property
-    def random(self) -> bool:
+        drawn = zip(self.families, self.columns, strict=True)
+        self.random = any({*columns.values()} & {*family.RANDOM} for family, columns in drawn)
         """Whether motors may need an episode's key of random numbers for what is drawn of them."""
-        return any(
-            {*columns.values()} & {*one.RANDOM} for one, columns in zip(self.families, self.columns, strict=True)
-        )
-
-    def draw(self, random: Uniforms, nominal: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Draw for m simulations; whole sets are redrawn until their motors are stable.
-
-        `random` is asked for positions in `nominal`, which is as `fields_of` has it. Returned are the values (m, k),
-        and how many sets were rejected before, (m,).
-        """
-        count = len(nominal[0])
-        values, rejected = np.empty((count, len(self.distributions))), np.zeros(count, dtype=np.int64)
-        pending = np.arange(count)
-        while True:
-            draws = random(pending, len(self.distributions))
-            for column, distribution in enumerate(self.distributions.values()):
-                values[pending, column] = distribution.transform(draws[:, column].copy())
-            if self.allow_unstable or not self.draws_actuator:
-                return values, rejected
-            fields = self.drawn([each[pending] for each in nominal], values[pending])
-            unstable = self._unstable(fields)
-            if not unstable.any():
-                return values, rejected
-            pending = pending[unstable]
-            rejected[pending] += 1
-            if rejected[pending[0]] == LIMIT:
-                last = dict(zip(self.names, values[pending[0]].tolist(), strict=True))
-                reason = self._reason([each[unstable] for each in fields])
-                raise ValueError(
-                    f"randomize: {LIMIT} draws in a row have an unstable current loop at a step of "
-                    f"{self.timestep:g} s; the last was {last}{reason}. Narrow the bounds, shorten the step, or pass "
-                    "allow_unstable=True"
-                )
-
-    def _unstable(self, fields: Sequence[np.ndarray]) -> np.ndarray:
-        """Which simulations have a motor that is unstable, shape (m,)."""
-        unstable = np.zeros(len(fields[0]), dtype=bool)
-        for family, columns, each in zip(self.families, self.columns, fields, strict=True):
-            if columns:
-                unstable |= ~(family.instability(numbers_of(family, each), self.timestep) < 1.0)
-        return unstable
-
-    def _reason(self, fields: Sequence[np.ndarray]) -> str:
-        """What the first refused motor of the first simulation says of itself."""
-        for family, each in zip(self.families, fields, strict=True):
-            try:
-                family.from_numbers(numbers_of(family, each)[0]).check(self.timestep)
-            except ValueError as error:
-                return f": {error}"
-        return ""
-
-    def fields_of(self, motors: Sequence[Sequence[ActuatorModel]]) -> list[np.ndarray]:
-        """The fields of the motors of m simulations, for each motor (m, f), columns as in `field_paths`."""
-        return [np.array(list(map(field_values, each))) for each in zip(*motors, strict=True)]
-
-    def drawn(self, nominal: Sequence[np.ndarray], values: np.ndarray) -> list[np.ndarray]:
-        """Motors' fields, as `fields_of` has them, with drawn values (m, k) in place of theirs; NaN leaves them."""
-        fields = [each.copy() for each in nominal]
-        for family, columns, each in zip(self.families, self.columns, fields, strict=True):
-            for column, field in columns.items():
-                place, new = field_paths(family).index(field), values[:, column]
-                each[:, place] = np.where(np.isnan(new), each[:, place], new)
-        return fields
-
-    def replaced(self, motors: Sequence[ActuatorModel], values: np.ndarray) -> tuple[ActuatorModel, ...]:
-        """The motors of one simulation with its drawn values (k,) in place of theirs."""
-        changes = ({field: float(values[column]) for column, field in columns.items()} for columns in self.columns)
-        return tuple(one.replaced(new) for one, new in zip(motors, changes, strict=True))
-
-    def mounted(self, fields: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """The arms [m] of motors with these fields, shape (m, n), and what they add to the model, (m, n, 3)."""
-        rows = zip(*(each.tolist() for each in fields), strict=True)
-        return mounting_of([list(map(unchecked, self.families, each)) for each in rows])
 
 
 class Draws:
@@ -196,33 +94,86 @@ class Draws:
         """
         self.randomization, self._put = randomization, put
         self._motors = motors
-        self._nominal = randomization.fields_of(motors)
+        self._nominal = [np.array(list(map(field_values, each))) for each in zip(*motors, strict=True)]
+        """Fields of each motor, shape (N, f), columns as in `field_paths`."""
         self._mounting = mounting_of(motors)
-        self._values = np.full((len(motors), len(randomization.names)), np.nan)
+        self._values = np.full((len(motors), len(randomization.distributions)), np.nan)
         self._rejected = np.zeros(len(motors), dtype=np.int64)
 
     def draw(self, random: Uniforms, rows: np.ndarray) -> None:
-        """Draw anew for the simulations `rows` (m,), which are to be reset afterwards."""
-        if not self.randomization.names:
+        """Draw anew for the simulations `rows` (m,), which are to be reset afterwards.
+
+        Whole sets are redrawn until their motors are stable.
+        """
+        drawn = self.randomization
+        if not drawn.distributions:
             return
-        self._values[rows], self._rejected[rows] = self.randomization.draw(
-            lambda pending, count: random(rows[pending], count), [each[rows] for each in self._nominal]
-        )
+        values, rejected = np.empty((len(rows), len(drawn.distributions))), np.zeros(len(rows), dtype=np.int64)
+        pending = np.arange(len(rows))
+        while len(pending):
+            draws = random(rows[pending], len(drawn.distributions))
+            for column, distribution in enumerate(drawn.distributions.values()):
+                values[pending, column] = distribution.transform(draws[:, column].copy())
+            if drawn.allow_unstable or not drawn.draws_actuator:
+                break
+            pending = pending[self._unstable(rows[pending], values[pending])]
+            rejected[pending] += 1
+            if len(pending) and rejected[pending[0]] == LIMIT:
+                raise ValueError(
+                    f"randomize: {LIMIT} draws in a row have an unstable current loop at a step of "
+                    f"{drawn.timestep:g} s; the last was {self._last(rows[pending[:1]], values[pending[:1]])}. Narrow "
+                    "the bounds, shorten the step, or pass allow_unstable=True"
+                )
+        self._values[rows], self._rejected[rows] = values, rejected
         self._put(self, rows)
+
+    def _unstable(self, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Which simulations would have a motor that is unstable with drawn values (m, k), shape (m,)."""
+        drawn, unstable = self.randomization, np.zeros(len(rows), dtype=bool)
+        for family, columns, each in zip(drawn.families, drawn.columns, self._fields(rows, values), strict=True):
+            if columns:
+                unstable |= ~(family.instability(numbers_of(family, each), drawn.timestep) < 1.0)
+        return unstable
+
+    def _last(self, row: np.ndarray, values: np.ndarray) -> str:
+        """What a simulation was drawn with, and what the first refused motor says of itself."""
+        drawn = self.randomization
+        last = str(dict(zip(drawn.distributions, values[0].tolist(), strict=True)))
+        for family, each in zip(drawn.families, self._fields(row, values), strict=True):
+            try:
+                family.from_numbers(numbers_of(family, each)[0]).check(drawn.timestep)
+            except ValueError as error:
+                return f"{last}: {error}"
+        return last
+
+    def _fields(self, rows: np.ndarray, values: np.ndarray) -> list[np.ndarray]:
+        """The fields of some simulations' motors, each (m, f), with drawn values (m, k) for theirs; NaN leaves them."""
+        fields, drawn = [each[rows] for each in self._nominal], self.randomization
+        for family, columns, each in zip(drawn.families, drawn.columns, fields, strict=True):
+            for column, field in columns.items():
+                place, new = field_paths(family).index(field), values[:, column]
+                each[:, place] = np.where(np.isnan(new), each[:, place], new)
+        return fields
 
     def motors(self, row: int = 0, nominal: Sequence[ActuatorModel] | None = None) -> tuple[ActuatorModel, ...]:
         """What is drawn of a simulation's motors, or of others in their place."""
         nominal, values = self._motors[row] if nominal is None else nominal, self._values[row]
-        drawn = len(values) and not np.isnan(values).any()
-        return self.randomization.replaced(nominal, values) if drawn else tuple(nominal)
+        if not len(values) or np.isnan(values).any():
+            return tuple(nominal)
+        changes = (
+            {field: float(values[column]) for column, field in columns.items()}
+            for columns in self.randomization.columns
+        )
+        return tuple(one.replaced(new) for one, new in zip(nominal, changes, strict=True))
 
     def parameters(self, rows: np.ndarray) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
         """Of some simulations' motors: the numbers of each (m, p), arms [m] (m, n), and additions (m, n, 3)."""
-        fields = self.randomization.drawn([each[rows] for each in self._nominal], self._values[rows])
+        fields, families = self._fields(rows, self._values[rows]), self.randomization.families
         arms, additions = (each[rows] for each in self._mounting)
         if self.randomization.mounting:
-            arms, additions = self.randomization.mounted(fields)
-        return list(map(numbers_of, self.randomization.families, fields)), arms, additions
+            each = zip(*(one.tolist() for one in fields), strict=True)
+            arms, additions = mounting_of([list(map(unchecked, families, values)) for values in each])
+        return list(map(numbers_of, families, fields)), arms, additions
 
     def model_fields(
         self, rows: np.ndarray, additions: np.ndarray | None = None, drawn: bool = False
@@ -232,7 +183,8 @@ class Draws:
         if variation is None:
             return {}
         additions = self.parameters(rows)[2] if additions is None else additions
-        columns = np.array([self.randomization.names.index(name) for name in variation.names], dtype=int)
+        names = list(self.randomization.distributions)
+        columns = np.array([names.index(name) for name in variation.names], dtype=int)
         return variation.fields(self._values[np.ix_(rows, columns)], additions, drawn)
 
     def report(self, row: int = 0) -> dict[str, Any]:
@@ -245,7 +197,7 @@ class Draws:
 
     def infos(self, rows: np.ndarray) -> dict[str, Any]:
         """The same of a vector environment's simulations, as Gymnasium's vector infos: nested, with masks."""
-        if not self.randomization.names:
+        if not self.randomization.distributions:
             return {}
         mask = np.zeros(len(self._values), dtype=bool)
         mask[rows] = True
@@ -259,17 +211,17 @@ class Draws:
 
     def present(self) -> dict[str, np.ndarray]:
         """The values in use by path, and the number of rejected sets, each of shape (N,); NaN before a reset."""
-        columns = dict(zip(self.randomization.names, self._values.T.copy(), strict=True))
+        columns = dict(zip(self.randomization.distributions, self._values.T.copy(), strict=True))
         return columns | {"rejected": self._rejected.copy()} if columns else {}
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """What `restore` needs."""
         kept = {"drawn": self._values.copy(), "rejected": self._rejected.copy()}
-        return kept if self.randomization.names else {}
+        return kept if self.randomization.distributions else {}
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
         """Bring back the values, and the simulations to them; to be followed by a restoring of the simulations."""
-        if self.randomization.names:
+        if self.randomization.distributions:
             self._values[:], self._rejected[:] = snapshot["drawn"], snapshot["rejected"]
             self._put(self, np.arange(len(self._values)))
 
@@ -289,11 +241,6 @@ def put_into_batch(physics: Any, draws: Draws, rows: np.ndarray) -> None:
         physics.set_parameters(rows, np.stack(numbers, axis=1), arms)
     if draws.randomization.variation is not None:
         physics.set_model(rows, draws.model_fields(rows, additions))
-
-
-def mounting_of(motors: Sequence[Sequence[ActuatorModel]]) -> tuple[np.ndarray, np.ndarray]:
-    """The arms [m] of the motors of m simulations, shape (m, n), and what they add to the model, (m, n, 3)."""
-    return np.array([[one.arm_radius for one in each] for each in motors]), additions_of(motors)
 
 
 def numbers_of(family: Family, fields: np.ndarray) -> np.ndarray:

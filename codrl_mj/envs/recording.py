@@ -1,8 +1,7 @@
-"""What an environment shows of an episode besides what Gymnasium's interface has: its `recorder`."""
+"""Looks at each integration step of anybody's environment: its `recorder`, as our own environments are theirs."""
 
 import contextlib
-import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import mujoco
@@ -12,68 +11,43 @@ from codrl_mj.envs.motors import Motors
 from codrl_mj.envs.setup import alone
 
 
-@dataclasses.dataclass(frozen=True)
-class Recorder:
-    """Reads an environment between its steps: `env.get_wrapper_attr("recorder")`, from which on it may step slower."""
+class StepWatch:
+    """Sees each integration step of an environment that calls `mujoco.mj_step`; of others the end of their steps.
 
-    signal_names: tuple[str, ...]
-    """Of the actuators' signals in `info`."""
-    trace_names: tuple[str, ...]
-    """Of the columns of `trace`, as `codrl_mj.physics.trace_names` has them."""
-    command: str
-    """What the agent commands."""
-    motors: tuple[str, ...]
-    """Names of the motors."""
-    present: Callable[[], Any]
-    """What the present episode runs on; with several motors a tuple of them."""
-    state: Callable[[], np.ndarray]
-    """The mechanical state, shape (k,)."""
-    speeds: Callable[[], np.ndarray]
-    """Velocities at the motors' side of the model's gears [m/s or rad/s], shape (motors,)."""
-    trace: Callable[[], np.ndarray]
-    """What the motors did in each integration step of the last step, shape (n, motors, columns)."""
-    duration: Callable[[], float]
-    """Environment step [s], known once a step was taken."""
+    What it has is what an `ActuatedEnv` has by the same names, states and speeds being the model's.
+    """
 
-    @property
-    def step_duration(self) -> float:
+    def __init__(self, motors: Motors, command: str) -> None:
+        """Look at their simulation, in which the agent gives a command."""
+        self._motors, self._data, model = motors, motors.data, motors.data.model
+        self._rows: list[np.ndarray] = []
+        self._outputs = model.actuator_outadr[list(motors.present)]
+        self._moments = np.empty((model.nout, model.nv))
+        self.step_duration = float(model.opt.timestep)
         """Environment step [s], known once a step was taken."""
-        return self.duration()
+        names = motors.readout.names
+        self.signal_names = (*(name for name in names if name != "saturated"), "saturated")
+        self.trace_names = (*names, "speed")
+        self.command, self.motor_names = command, motors.names
 
     @property
     def actuator(self) -> Any:
         """What the present episode runs on; with several motors a tuple of them."""
-        return self.present()
+        return alone(tuple(self._motors.present.values()))
 
+    @property
+    def state(self) -> np.ndarray:
+        """Positions and speeds of the model, shape (k,)."""
+        return np.concatenate([self._data.qpos, self._data.qvel])
 
-class StepWatch:
-    """Sees each integration step of an environment that calls `mujoco.mj_step`; of others the end of their steps."""
+    @property
+    def trace(self) -> np.ndarray:
+        """What the motors did in each integration step of the last step, shape (n, motors, columns)."""
+        return np.array(self._rows)
 
-    def __init__(self, motors: Motors) -> None:
-        """Look at their simulation."""
-        self._motors, self._data, model = motors, motors.data, motors.data.model
-        self._rows: list[np.ndarray] = []
-        self._duration = float(model.opt.timestep)
-        self._outputs = model.actuator_outadr[list(motors.present)]
-        self._moments = np.empty((model.nout, model.nv))
-
-    def recorder(self, command: str) -> Recorder:
-        """What it sees, where the agent gives a command."""
-        data, names = self._data, self._motors.readout.names
-        return Recorder(
-            (*(name for name in names if name != "saturated"), "saturated"),
-            (*names, "speed"),
-            command,
-            self._motors.names,
-            present=lambda: alone(tuple(self._motors.present.values())),
-            state=lambda: np.concatenate([data.qpos, data.qvel]),
-            speeds=self._speeds,
-            trace=lambda: np.array(self._rows),
-            duration=lambda: self._duration,
-        )
-
-    def _speeds(self) -> np.ndarray:
-        """Speeds of the shafts; the engine's own are those at the beginning of a step."""
+    @property
+    def speeds(self) -> np.ndarray:
+        """Speeds of the shafts [m/s or rad/s]; the engine's own are those at the beginning of a step."""
         data = self._data
         mujoco.mju_sparse2dense(
             self._moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
@@ -99,10 +73,10 @@ class StepWatch:
         finally:
             mujoco.mj_step = plain
         if self._rows:
-            self._duration = len(self._rows) * float(self._data.model.opt.timestep)
+            self.step_duration = len(self._rows) * float(self._data.model.opt.timestep)
         else:
-            self._duration = float(self._data.time - began)
+            self.step_duration = float(self._data.time - began)
             self._row()
 
     def _row(self) -> None:
-        self._rows.append(np.column_stack([*self._motors.readout.table(self._data), self._speeds()]))
+        self._rows.append(np.column_stack([*self._motors.readout.table(self._data), self.speeds]))

@@ -13,7 +13,6 @@ from codrl_mj.envs.serial import SerialVectorEnv
 from codrl_mj.envs.snapshots import check_snapshot
 from codrl_mj.envs.vector import ActuatedVectorEnv
 from codrl_mj.physics import Signals
-from codrl_mj.tasks import TASKS
 
 
 class ActuatedVecEnv(VecEnv):
@@ -25,13 +24,26 @@ class ActuatedVecEnv(VecEnv):
     """
 
     def __init__(self, env: ActuatedVectorEnv | SerialVectorEnv) -> None:
-        """Wrap a vector environment in `SAME_STEP` mode."""
+        """Wrap a vector environment in `SAME_STEP` mode; refused, and closed, if agents' networks do not take it."""
+        seen, acts, wrong = env.single_observation_space, env.single_action_space, ""
+        if not isinstance(seen, spaces.Box) or len(seen.shape) != 1:
+            wrong = (
+                f"observations are {seen}: must be a vector, which our agents' networks take: flatten them with a "
+                "wrapper of Gymnasium's (FlattenObservation), and register that environment"
+            )
+        elif not isinstance(acts, spaces.Box | spaces.Discrete):
+            wrong = f"actions are {acts}: must be a vector (Box) or a choice (Discrete)"
+        if wrong:
+            env.close()
+            raise ValueError(wrong)
         self.env = env
+        self.arm_radii: np.ndarray = env.arm_radii
+        """Of the motors of an environment [m], or 1 where a joint is driven directly; shape (motors,)."""
         self._actions: np.ndarray | None = None
         self._returns = np.zeros(env.num_envs)
         self._lengths = np.zeros(env.num_envs, dtype=np.int64)
         self._start = time.time()
-        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        super().__init__(env.num_envs, seen, acts)
 
     def reset(self) -> np.ndarray:
         """Start an episode in every environment, with the seeds given to `seed` since the last reset."""
@@ -46,11 +58,6 @@ class ActuatedVecEnv(VecEnv):
     def signals(self) -> Signals | None:
         """The actuators' signals of the last step, each an array of shape (N,); None before the first."""
         return self.env.signals
-
-    @property
-    def arm_radii(self) -> np.ndarray:
-        """Of the motors of an environment [m], or 1 where a joint is driven directly; shape (motors,)."""
-        return self.env.arm_radii
 
     @property
     def randomization(self) -> dict[str, np.ndarray]:
@@ -177,8 +184,9 @@ def make_sb3_vec_env(env_id: Any, num_envs: int = 64, **arguments: Any) -> Actua
     """Many environments as one Stable-Baselines3 `VecEnv`.
 
     Args:
-        env_id: Gymnasium id, such as `codrl_mj/Pendulum-v0`; an environment's whole configuration; or a function that
-            makes an environment with motors, such as `functools.partial(codrl_mj.make, "Hopper-v5", {".*": "lag"})`.
+        env_id: a Gymnasium id, such as `codrl_mj/Pendulum-v0`, or whatever else `EnvConfig.task` takes; an
+            environment's whole configuration; or a function that makes an environment with motors, such as
+            `functools.partial(codrl_mj.make, "Hopper-v5", {".*": "lag"})`.
         num_envs: how many, >= 1.
         **arguments: as for `codrl_mj.envs.ActuatedVectorEnv`; the time limit is Gymnasium's unless given. Whatever is
             no task of ours on `mujoco` is stepped one by one: a `SerialVectorEnv`.
@@ -188,32 +196,6 @@ def make_sb3_vec_env(env_id: Any, num_envs: int = 64, **arguments: Any) -> Actua
             actions neither a vector nor a choice.
     """
     if callable(env_id):
-        envs: Any = SerialVectorEnv(num_envs, env_id, **arguments)
-    else:
-        config = EnvConfig(_task_of(env_id)) if isinstance(env_id, str) else env_id
-        envs = config.world.vector(config, num_envs, **arguments)
-    try:
-        _check_spaces(envs.single_observation_space, envs.single_action_space)
-    except ValueError:
-        envs.close()
-        raise
-    return ActuatedVecEnv(envs)
-
-
-def _task_of(env_id: Any) -> str:
-    """The name of the task that Gymnasium has by an id."""
-    known = {one.env_id: name for name, one in TASKS.items()}
-    if env_id not in known:
-        raise ValueError(f"env_id = {env_id!r}: must be one of {', '.join(known)}")
-    return known[env_id]
-
-
-def _check_spaces(observed: Any, acted: Any) -> None:
-    """Refuse observations and actions that agents' networks do not take."""
-    if not isinstance(observed, spaces.Box) or len(observed.shape) != 1:
-        raise ValueError(
-            f"observations are {observed}: must be a vector, which our agents' networks take: flatten them with a "
-            "wrapper of Gymnasium's (FlattenObservation), and register that environment"
-        )
-    if not isinstance(acted, spaces.Box | spaces.Discrete):
-        raise ValueError(f"actions are {acted}: must be a vector (Box) or a choice (Discrete)")
+        return ActuatedVecEnv(SerialVectorEnv(num_envs, env_id, **arguments))
+    config = EnvConfig(env_id) if isinstance(env_id, str) else env_id
+    return ActuatedVecEnv(config.world.vector(config, num_envs, **arguments))

@@ -1,4 +1,4 @@
-"""A task made ready: its actuators, its options, and what the agent commands and sees. Shared by every face."""
+"""A task made ready: all that follows from an environment's configuration, in one place. Shared by every face."""
 
 import dataclasses
 import functools
@@ -6,109 +6,85 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 
-from codrl_mj.actuators import ActuatorModel, Family, Ideal, check_same_family
+from codrl_mj.actuators import ActuatorModel, Ideal, check_same_family
 from codrl_mj.actuators.noise import LARGEST_KEY
-from codrl_mj.disturbances import Disturbances, Joint
 from codrl_mj.engine.reading import check_shafts
 from codrl_mj.envs.commands import TaskCommands
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.randomization import Draws, Randomization, put_into
-from codrl_mj.envs.views import View
-from codrl_mj.physics import Physics, Signals
+from codrl_mj.envs.motors import longer, sensor_names
+from codrl_mj.envs.randomization import Randomization
+from codrl_mj.physics import Physics, Plant, Signals, find_physics
 from codrl_mj.physics.base import named_signals
+from codrl_mj.physics.compiled_task import Outcomes, compiled_outcomes
 from codrl_mj.physics.mjcf import task_model
-from codrl_mj.physics.registry import find_physics
 from codrl_mj.physics.variation import bare_model
-from codrl_mj.tasks import Task, find_task, resolve_actuators
+from codrl_mj.tasks import Task, find_task
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Setup:
-    """A task, its actuators and its interface to the agent; made by `build`."""
+    """An environment of a task as its configuration says; made by `build`.
 
+    It holds nothing twice: what follows from the fields is computed where it is first asked for. With another task, of
+    which attributes were written, all of it is that task's.
+    """
+
+    config: EnvConfig
+    """What was asked for."""
     task: Task
     """The task."""
-    actuators: tuple[ActuatorModel, ...]
-    """What stands between desired and delivered force, one for each of the task's motors, of one family."""
     inner_steps: int
     """Integration steps per environment step."""
-    integrator: str
-    """One of the task's integrators."""
-    commands: TaskCommands
-    """What actions stand for."""
-    view: View
-    """What the agent gets of states."""
-    randomization: Randomization
-    """What is drawn at every reset."""
-    disturbances: Disturbances
-    """Imperfections of the commands' way, and load pulses."""
-    joint: Joint
-    """What is added to the actuated joints."""
 
     @classmethod
     def build(cls, config: EnvConfig) -> "Setup":
-        """Make an environment's parts, and check what its configuration cannot."""
+        """The set-up of a configuration, checked for what its fields do not show one by one."""
         task = find_task(config.task)
-        steps = task.steps_within(config.actuators[0], config.inner_steps, config.timestep)
-        timestep, integrator = task.step_duration / steps, task.integrator(config.integrator)
-        commands = TaskCommands.build(task, config.actuators, config.action, config.levels)
-        simulated = commands.simulated
-        view = View.build(task, config.options, type(simulated[0]), config.observe_actuator)
+        made = cls(config, task, task.steps_within(config.actuators[0], config.inner_steps, config.timestep))
+        made._check()
+        return made
 
-        bare = bare_model(task.name, config.joint)
-        motors = {bare.actuator(name).id: one for name, one in zip(task.motors, simulated, strict=True)}
-        drawn, fixed = config.distributions, [commands.fixed] * len(motors)
-        randomization = Randomization.build(drawn, bare, motors, fixed, timestep, config.allow_unstable, task.name)
-
-        if not randomization.draws_actuator:  # else every draw is checked
-            for one in simulated:
-                one.check_at(timestep, config.allow_unstable)
-        if any(one.INERTIA for one in simulated):
-            model = task_model(task, simulated, timestep, commands.max_forces, joint=config.joint)
-            check_shafts(model, config.allow_unstable, held=config.physics == "analytic")
-        rest = config.disturbances, config.joint
-        return cls(task, config.actuators, steps, integrator, commands, view, randomization, *rest)
-
-    @property
-    def arm_radii(self) -> np.ndarray:
-        """Of the motors, shape (motors,)."""
-        return np.array([one.arm_radius for one in self.actuators])
-
-    @property
-    def actuator(self) -> Any:
-        """The actuator; with several motors a tuple of them."""
-        return alone(self.actuators)
+    def _check(self) -> None:
+        """Refuse what does not go together: with each other, with the step, with what the motors move."""
+        plant, _, unstable = self.plant, self.sensors, self.config.allow_unstable
+        if not self.randomization.draws_actuator:  # else every draw is checked
+            for one in plant.actuators:
+                one.check_at(plant.timestep, unstable)
+        if any(one.INERTIA for one in plant.actuators):
+            check_shafts(task_model(plant), unstable, held=self.config.physics == "analytic")
 
     @functools.cached_property
-    def family(self) -> Family:
-        """The family of what is simulated."""
-        return type(self.commands.simulated[0])
+    def commands(self) -> TaskCommands:
+        """What actions stand for."""
+        return TaskCommands(self.task, self.config.actuators, self.config.action, self.config.levels)
 
     @functools.cached_property
-    def _columns(self) -> tuple[str, ...]:
-        return ("desired_force", "actual_force", *self.family.Signals._fields)
+    def plant(self) -> Plant:
+        """What is simulated."""
+        integrator, commands = self.task.integrator(self.config.integrator), self.commands
+        disturbances, joint = self.config.disturbances, self.config.joint
+        return Plant(
+            self.task, commands.simulated, self.inner_steps, integrator, commands.max_forces, disturbances, joint
+        )
 
-    def signals(self, columns: Sequence[Any], desired: Any) -> Signals:
-        """A trace's columns, numbers or arrays, as signals: the force [N or N*m] that the agent `desired` is theirs.
+    @functools.cached_property
+    def randomization(self) -> Randomization:
+        """What is drawn at every reset."""
+        plant, config = self.plant, self.config
+        bare = bare_model(self.task.name, config.joint)
+        motors = {bare.actuator(name).id: one for name, one in zip(self.task.motors, plant.actuators, strict=True)}
+        fixed = [self.commands.fixed] * len(motors)
+        return Randomization(
+            config.distributions, bare, motors, fixed, plant.timestep, config.allow_unstable, self.task.name
+        )
 
-        Where an actuator tracks no force, what was delivered counts as desired.
-        """
-        signals = named_signals(self._columns, columns)
-        signals["desired_force"] = desired if self.commands.tracks else signals["actual_force"]
-        return signals
+    # -- simulations -----------------------------------------------------------------------------------------
 
     def simulate(self, physics: str) -> Physics:
         """A new simulation on the given physics."""
-        made = find_physics(physics)(
-            self.task,
-            self.commands.simulated,
-            self.inner_steps,
-            self.integrator,
-            max_forces=self.commands.max_forces,
-            disturbances=self.disturbances,
-            joint=self.joint,
-        )
+        made = find_physics(physics)(self.plant)
         if made.scene is None and self.randomization.variation is not None:
             names = ", ".join(self.randomization.in_model)
             raise ValueError(
@@ -116,21 +92,6 @@ class Setup:
                 "lengths and gravity, and have no damping, friction and rotors; use physics='mujoco'"
             )
         return made
-
-    def draws(self, physics: Physics) -> Draws:
-        """What a simulation is drawn with."""
-        return Draws(self.randomization, [self.commands.simulated], functools.partial(put_into, physics))
-
-    def start(
-        self, physics: Physics, generator: np.random.Generator, options: dict[str, Any] | None, draws: Draws
-    ) -> None:
-        """Start an episode: draw the initial state and then, if anything is randomised, actuator and model.
-
-        Disturbances and sensors that are random draw the key of their numbers last.
-        """
-        initial = self.task.initial(generator, options)
-        draws.draw(lambda rows, count: generator.random((len(rows), count)), np.zeros(1, dtype=int))
-        physics.reset(initial, float(self.keys(lambda count: generator.random((1, count)))[0]))
 
     @functools.cached_property
     def initial_bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -140,8 +101,8 @@ class Setup:
     @functools.cached_property
     def random(self) -> bool:
         """Whether an episode's disturbances or sensors need a key."""
-        drawn = self.randomization.random
-        return self.disturbances.random or drawn or any(one.random for one in self.commands.simulated)
+        drawn = self.config.disturbances.random or self.randomization.random
+        return drawn or any(one.random for one in self.plant.actuators)
 
     def keys(self, random: Callable[[int], np.ndarray]) -> np.ndarray:
         """Keys of the random numbers of m episodes' disturbances and sensors, shape (m,); 0 where none is needed.
@@ -151,6 +112,61 @@ class Setup:
         if not self.random:
             return np.zeros(1)
         return random(1)[:, 0] * LARGEST_KEY  # a multiple of 2**-53 times 2**53: a whole number, exactly
+
+    # -- what the agent gets of them -------------------------------------------------------------------------
+
+    @functools.cached_property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of what the actuators' sensors add to an observation; none if they are not observed."""
+        names = self.task.motors if len(self.task.motors) > 1 else ("",)
+        return sensor_names(dict.fromkeys(names, self.plant.family)) if self.config.observe_actuator else ()
+
+    @property
+    def observation_space(self) -> spaces.Box:
+        """The task's observation space, with unbounded entries for the sensors."""
+        space = self.task.observation_space
+        return longer(space, len(self.sensors)) if self.sensors else space
+
+    @property
+    def observation_names(self) -> tuple[str, ...]:
+        """Names of the observation's entries."""
+        return (*self.task.observation_names, *self.sensors)
+
+    @functools.cached_property
+    def _outcomes(self) -> tuple[Outcomes, np.ndarray]:
+        """The task's compiled functions, and its options as a vector."""
+        return compiled_outcomes(self.task), np.array(self.config.options, dtype=np.float64)
+
+    def observation(self, physics: Physics, row: np.ndarray | None = None) -> np.ndarray:
+        """What the agent sees of a simulation, shape (k,), float32, after the last `row` of its trace, if any."""
+        size = len(self.task.observation_names)
+        observation = np.empty(size + len(self.sensors), np.float32)
+        self._outcomes[0].observe(np.ascontiguousarray(physics.state), observation)
+        if self.sensors:
+            row = np.zeros_like(physics.trace[-1]) if row is None else row
+            observation[size:] = physics.observed(row).reshape(-1)
+        return observation
+
+    def outcome(self, before: np.ndarray, force: Any, after: np.ndarray) -> tuple[float, bool]:
+        """The reward of a step from one state to another under a force [N or N*m], or several; whether that ends it."""
+        outcomes, options = self._outcomes
+        before, after = np.ascontiguousarray(before), np.ascontiguousarray(after)
+        forces = np.ascontiguousarray(force, dtype=np.float64).reshape(-1)
+        reward = outcomes.reward(before, forces if len(forces) > 1 else forces[0], after, options)
+        return float(reward), bool(outcomes.terminated(after))
+
+    @functools.cached_property
+    def _columns(self) -> tuple[str, ...]:
+        return ("desired_force", "actual_force", *self.plant.family.Signals._fields)
+
+    def signals(self, columns: Sequence[Any], desired: Any) -> Signals:
+        """A trace's columns, numbers or arrays, as signals: the force [N or N*m] that the agent `desired` is theirs.
+
+        Where an actuator tracks no force, what was delivered counts as desired.
+        """
+        signals = named_signals(self._columns, columns)
+        signals["desired_force"] = desired if self.commands.tracks else signals["actual_force"]
+        return signals
 
 
 def alone(several: Sequence[Any]) -> Any:
@@ -179,12 +195,13 @@ def set_up_many(
     every: list[tuple[ActuatorModel, ...]] = []
     for index, one in enumerate(actuator):
         try:
-            every.append(resolve_actuators(one, find_task(task)))
+            config = EnvConfig.of(task, one, arguments)
+            every.append(config.actuators)
             if every[-1] not in setups:
-                setups[every[-1]] = Setup.build(EnvConfig.of(task, every[-1], arguments))
+                setups[every[-1]] = Setup.build(config)
         except ValueError as error:
             raise ValueError(f"actuator[{index}]: {error}") from None
         if isinstance(every[-1][0], Ideal):
             raise ValueError(f"actuator[{index}] = {one!r}: must be an Actuator; the ideal one cannot be among others")
-    check_same_family([setup.actuators[0] for setup in setups.values()])
-    return dataclasses.replace(setups[every[0]]), every
+    check_same_family([each[0] for each in setups])
+    return setups[every[0]], every

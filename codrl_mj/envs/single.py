@@ -1,5 +1,6 @@
 """One environment, as Gymnasium knows it."""
 
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,12 +11,11 @@ from codrl_mj.actuators import IDEAL
 from codrl_mj.envs.attributes import GymnasiumAttributes, checked_states, read, written
 from codrl_mj.envs.compiled import arguments, compiled_kernels
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.recording import Recorder
+from codrl_mj.envs.randomization import Draws, put_into
 from codrl_mj.envs.setup import Setup, alone
 from codrl_mj.envs.snapshots import check_snapshot, generator_of, letters
-from codrl_mj.envs.window import Window
-from codrl_mj.physics import MujocoPhysics, signal_names, trace_names
-from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
+from codrl_mj.physics import MujocoPhysics, Plant, signal_names, trace_names
+from codrl_mj.physics.offscreen import OffscreenRenderer, Window, check_view
 from codrl_mj.physics.streams import words_of
 from codrl_mj.tasks import Task
 
@@ -70,9 +70,11 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
             ValueError: an argument is unknown or out of bounds, or the current loop is unstable; the message names it.
             CallbackInUseError: another library's MuJoCo callback is installed.
         """
-        self.setup = Setup.build(EnvConfig.of(task, actuator, arguments))
+        config = EnvConfig.of(task, actuator, arguments)
+        self.setup = Setup.build(config)
         self.physics = self.setup.simulate(physics)
-        self._draws = self.setup.draws(self.physics)
+        into = functools.partial(put_into, self.physics)
+        self._draws = Draws(self.setup.randomization, [self.setup.plant.actuators], into)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.setup.task.render_fps}
         self._view = {"width": width, "height": height, "camera": camera, "pretty": pretty}
@@ -82,11 +84,14 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         if render_mode is not None:
             check_view(self._scene().scene[0], width, height, camera)
         self.action_space = self.setup.commands.action_space
-        self.observation_space = self.setup.view.observation_space
+        self.observation_space = self.setup.observation_space
+        self.observation_names, self.motor_names = self.setup.observation_names, self.task.motors
+        self.command = config.action
+        """What the agent commands."""
+        self.signal_names, self.trace_names = signal_names(family := self.setup.plant.family), trace_names(family)
+        """Of the actuators' signals in `info`; of the columns of `trace`."""
         self._observation_shape = self.observation_space.shape
-        self._compiled: tuple[Any, tuple[Any, ...]] | None = (
-            None  # its step, and the arguments that are this simulation
-        )
+        self._compiled: tuple[Any, tuple[Any, ...]] | None = None  # its step, and its simulation's arguments
         self._offer_attributes(self.task)
 
     @property
@@ -97,12 +102,12 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     @property
     def actuator(self) -> Any:
         """The actuator, of the present episode where it is drawn; with several motors a tuple of them."""
-        return alone(self._draws.motors(0, self.setup.actuators))
+        return alone(self._draws.motors(0, self.setup.config.actuators))
 
     @property
     def motors(self) -> dict[int, Any]:
         """The actuators of the present episode, by the number of the task's motor."""
-        return dict(enumerate(self._draws.motors(0, self.setup.actuators)))
+        return dict(enumerate(self._draws.motors(0, self.setup.config.actuators)))
 
     @property
     def model(self) -> Any:
@@ -124,25 +129,19 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         self.physics.state = checked_states(state, self.physics.state.shape)
 
     @property
-    def recorder(self) -> Recorder:
-        """Reads the environment between its steps."""
-        family, physics = self.setup.family, self.physics
-        return Recorder(
-            signal_names(family),
-            trace_names(family),
-            self.setup.commands.name,
-            self.task.motors,
-            present=lambda: self.actuator,
-            state=lambda: physics.state,
-            speeds=lambda: physics.state[list(self.task.speeds)],
-            trace=lambda: physics.trace.copy(),
-            duration=lambda: self.task.step_duration,
-        )
+    def recorder(self) -> "ActuatedEnv":
+        """What reads the environment between its steps: itself."""
+        return self
 
     @property
-    def observation_names(self) -> tuple[str, ...]:
-        """Of the observation's entries."""
-        return self.setup.view.observation_names
+    def speeds(self) -> np.ndarray:
+        """Velocities of the joints that the motors drive [m/s or rad/s], shape (motors,)."""
+        return self.physics.state[list(self.task.speeds)]
+
+    @property
+    def trace(self) -> np.ndarray:
+        """What the motors did in each integration step of the last step; see `codrl_mj.physics.Physics.trace`."""
+        return self.physics.trace.copy()
 
     @property
     def step_duration(self) -> float:
@@ -152,11 +151,6 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     def pose(self) -> None:
         """Bring the bodies of `data` to the present state: the engine leaves them where its last step began."""
         self.physics.show(self.physics.state)
-
-    @property
-    def signal_names(self) -> tuple[str, ...]:
-        """Of the actuators' signals in `info`."""
-        return signal_names(self.setup.family)
 
     def _engine(self) -> tuple[Any, Any]:
         if self.physics.scene is None:
@@ -187,12 +181,14 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
             options: Gymnasium's reset options for the task (CartPole: the bounds `low` and `high`).
         """
         super().reset(seed=seed)
-        self.setup.start(self.physics, self.np_random, options, self._draws)
-        seen = self.physics.observed(np.zeros_like(self.physics.trace[-1])) if self.setup.view.sensors else None
+        generator, setup = self.np_random, self.setup
+        initial = setup.task.initial(generator, options)
+        self._draws.draw(lambda rows, count: generator.random((len(rows), count)), np.zeros(1, dtype=int))
+        self.physics.reset(initial, float(setup.keys(lambda count: generator.random((1, count)))[0]))
         if self.render_mode == "human":
             self.render()
         drawn = self.randomization
-        return self.setup.view.observation(self.physics.state, seen), {"randomization": drawn} if drawn else {}
+        return self.setup.observation(self.physics), {"randomization": drawn} if drawn else {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advance by one environment step.
@@ -207,7 +203,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         """
         force = self.setup.commands.force(action)
         if self._compiled is None:
-            if self.physics.compiled is None:
+            if self.physics.stepping is None:
                 return self._step_apart(force)
             self._compiled = compiled_kernels(self.setup, self.physics).step, arguments(self.setup, self.physics)
         step, simulation = self._compiled
@@ -221,15 +217,14 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
 
     def _step_apart(self, force: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """What the compiled step does, in parts, for a physics that is Python."""
-        view, physics = self.setup.view, self.physics
+        physics, setup = self.physics, self.setup
         before = physics.state
         physics.step(force)
         info, after = self._info(force), physics.state
-        seen = physics.observed(physics.trace[-1]) if view.sensors else None
-        reward = view.reward(before, info["actual_force"], after)
         if self.render_mode == "human":
             self.render()
-        return view.observation(after, seen), reward, view.terminated(after), False, info
+        reward, terminated = setup.outcome(before, info["actual_force"], after)
+        return setup.observation(physics, physics.trace[-1]), reward, terminated, False, info
 
     def _info(self, force: Any) -> dict[str, Any]:
         """What the actuators did in the last step, which asked for a force."""
@@ -299,7 +294,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         if self.physics.scene is not None:
             return self.physics
         if self._drawn is None:
-            self._drawn = MujocoPhysics(self.task, [IDEAL] * len(self.task.motors), 1, self.setup.integrator)
+            self._drawn = MujocoPhysics(Plant(self.task, [IDEAL] * len(self.task.motors)))
         return self._drawn
 
     def close(self) -> None:

@@ -1,5 +1,6 @@
 """What snapshots of environments are made of: generators, time limits, MuJoCo's state; and whether one fits."""
 
+import itertools
 from collections.abc import Mapping
 from typing import Any
 
@@ -54,7 +55,10 @@ def check_snapshot(snapshot: Mapping[str, np.ndarray], expected: Mapping[str, np
     The entry of a `name`, if there is one, has the `letters` of what it is of.
     """
     for entry in [*expected, *(one for one in snapshot if one not in expected)]:
-        found, wanted = (_description(arrays.get(entry)) for arrays in (snapshot, expected))
+        found, wanted = (
+            f"of shape {arrays[entry].shape} and type {arrays[entry].dtype}" if entry in arrays else "missing"
+            for arrays in (snapshot, expected)
+        )
         if found != wanted:
             raise ValueError(
                 f"snapshot[{entry!r}] is {found}: must be {wanted}; it is of another task, other arguments or another "
@@ -65,22 +69,12 @@ def check_snapshot(snapshot: Mapping[str, np.ndarray], expected: Mapping[str, np
         raise ValueError(f"snapshot[{name!r}] is of {bytes(snapshot[name])!r}: must be of {whose!r}")
 
 
-def _description(array: np.ndarray | None) -> str:
-    return "missing" if array is None else f"of shape {array.shape} and type {array.dtype}"
-
-
-def _computed() -> tuple[str, ...]:
-    """The arrays of numbers in `MjData` whose sizes do not depend on contacts; in MuJoCo's order they come first."""
-    names = []
-    for field in STRUCTS["mjData"].fields:
-        if field.name == "contact":
-            break
-        if getattr(getattr(field.type, "inner_type", None), "name", "") == "mjtNum":
-            names.append(field.name)
-    return tuple(names)
-
-
-_COMPUTED = _computed()
+_COMPUTED = tuple(
+    field.name
+    for field in itertools.takewhile(lambda field: field.name != "contact", STRUCTS["mjData"].fields)
+    if getattr(getattr(field.type, "inner_type", None), "name", "") == "mjtNum"
+)
+"""The arrays of numbers in `MjData` whose sizes do not depend on contacts; in MuJoCo's order they come first."""
 
 
 def state_of(data: mujoco.MjData) -> dict[str, np.ndarray]:

@@ -187,17 +187,16 @@ class TaskWorld(World):
         from codrl_mj.envs.commands import command_of
         from codrl_mj.envs.setup import Setup
 
-        setup = Setup.build(config)
-        view = setup.view
-        of_sensors = [setup.actuators[0].SIGNAL_UNITS.get(name.rpartition(".")[2]) for name in view.sensors]
-        seen = described(view.observation_names, view.observation_space, [*self.task.observation_units, *of_sensors])
+        setup, motors = Setup.build(config), config.actuators
+        of_sensors = [motors[0].SIGNAL_UNITS.get(name.rpartition(".")[2]) for name in setup.sensors]
+        seen = described(setup.observation_names, setup.observation_space, [*self.task.observation_units, *of_sensors])
         at_joint = ["N*m" if unit == "rad" else "N" for unit in self.task.joint_units]
         forced = config.action == "force"
-        units = at_joint if forced else [command_of(one, config.action).unit for one in setup.actuators]
+        units = at_joint if forced else [command_of(one, config.action).unit for one in motors]
         commands = setup.commands
         if isinstance(commands.action_space, spaces.Box):
             return seen, described(self.task.motors, commands.action_space, units)
-        table: Any = commands.action_forces if forced else commands.levels
+        table: Any = commands.action_forces if forced else config.levels
         names = [{"name": name, "unit": unit} for name, unit in zip(self.task.motors, units, strict=True)]
         columns = np.reshape(table, (len(table), -1)).T.tolist()
         return seen, [{**one, "levels": levels} for one, levels in zip(names, columns, strict=True)]

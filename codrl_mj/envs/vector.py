@@ -94,16 +94,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             raise ValueError(f"render_mode = {render_mode!r}: must be one of None, {modes}")
         self.num_envs = int(num_envs)
         self.setup, actuators = set_up_many(self.num_envs, task, actuator, arguments)
-        self.physics = MujocoBatchPhysics(
-            self.setup.task,
-            actuators,
-            self.setup.inner_steps,
-            self.setup.integrator,
-            self.setup.commands.max_forces,
-            int(num_threads),
-            self.setup.disturbances,
-            self.setup.joint,
-        )
+        self.physics = MujocoBatchPhysics(self.setup.plant, actuators, int(num_threads))
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {
             **self.metadata,
@@ -113,9 +104,11 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         self.render_mode = render_mode
         self.max_episode_steps = max_episode_steps
         self.single_action_space = self.setup.commands.action_space
-        self.single_observation_space = self.setup.view.observation_space
+        self.single_observation_space = self.setup.observation_space
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.arm_radii = np.array([one.arm_radius for one in self.setup.config.actuators])
+        """Of the motors of an environment [m], shape (motors,)."""
         self._streams = Streams(self.num_envs)
         self._draws = Draws(self.setup.randomization, actuators, functools.partial(put_into_batch, self.physics))
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
@@ -129,11 +122,6 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         self._kernels: tuple[Kernels, Array] | None = None
         self._looks: dict[str, Array] = {}  # fields of the models, where attributes were written
         self._offer_attributes(self.task)
-
-    @property
-    def arm_radii(self) -> Array:
-        """Of the motors of an environment, shape (motors,)."""
-        return self.setup.arm_radii
 
     @property
     def task(self) -> Task:
@@ -297,7 +285,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
 
     def _steps(self, forces: Array, stepping: Array) -> VectorStep:
         """Where a step of all environments goes to."""
-        count, columns = self.num_envs, 1 + len(self.setup.family.Signals._fields)
+        count, columns = self.num_envs, 1 + len(self.setup.plant.family.Signals._fields)
         limit = np.inf if self.max_episode_steps is None else float(self.max_episode_steps)
         return VectorStep(
             forces,

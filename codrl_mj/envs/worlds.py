@@ -248,7 +248,7 @@ class World(abc.ABC):
         """
         with contextlib.closing(config.make()) as env:
             seen, acts = env.observation_space, env.action_space
-            motors = env.get_wrapper_attr("recorder").motors
+            motors = env.get_wrapper_attr("recorder").motor_names
         if not isinstance(seen, spaces.Box) or len(seen.shape) != 1:
             raise ValueError(f"{self.name}: observations are {seen}: must be vectors")
         if isinstance(acts, spaces.Discrete):

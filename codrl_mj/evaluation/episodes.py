@@ -15,7 +15,6 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import IDEAL, actuator_from_mapping, mapping_of, trusting
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.recording import Recorder
 from codrl_mj.runs.files import writing
 from codrl_mj.runs.policies import Policy
 
@@ -176,10 +175,10 @@ class _Recording:
     def __init__(self, env: gymnasium.Env[Any, Any], seed: int) -> None:
         """Reset the environment."""
         self.env = env
-        self._recorder: Recorder = env.get_wrapper_attr("recorder")
+        self._recorder: Any = env.get_wrapper_attr("recorder")
         self.observations = [env.reset(seed=seed)[0]]
-        self._states = [self._recorder.state()]
-        self._first_speeds = self._recorder.speeds()
+        self._states = [self._recorder.state]
+        self._first_speeds = self._recorder.speeds
         self._actions: list[Any] = []
         self._rewards: list[float] = []
         self._traces: list[np.ndarray] = []
@@ -190,10 +189,10 @@ class _Recording:
         """Take a step, and say whether the episode has ended."""
         observation, reward, self._terminated, truncated, info = self.env.step(action)
         self.observations.append(observation)
-        self._states.append(self._recorder.state())
+        self._states.append(self._recorder.state)
         self._actions.append(action)
         self._rewards.append(float(reward))
-        self._traces.append(self._recorder.trace())
+        self._traces.append(self._recorder.trace)
         self._signals.append(info)
         return self._terminated or truncated
 
@@ -214,7 +213,7 @@ class _Recording:
             terminated=self._terminated,
             actuator=recorder.actuator,
             command=recorder.command,
-            motors=recorder.motors if len(recorder.motors) > 1 else (),
+            motors=recorder.motor_names if len(recorder.motor_names) > 1 else (),
             first_speeds=self._first_speeds,
             succeeded=None if said is None else bool(said),
         )

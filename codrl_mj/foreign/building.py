@@ -17,9 +17,9 @@ from codrl_mj.tasks import TASKS
 class Building:
     """The actuators for models yet to be built, and what was met of these."""
 
-    def __init__(self, actuators: Mapping[str, Any], allow_unstable: bool = False) -> None:
-        """Check what needs no model; a pattern may match nothing in some of the models."""
-        self.actuators: dict[str, ActuatorModel] = resolve_patterns(actuators, "another's environment")
+    def __init__(self, actuators: Mapping[str, ActuatorModel], allow_unstable: bool = False) -> None:
+        """Take patterns and their actuators; a pattern may match nothing in some of the models."""
+        self.actuators = actuators
         self._allow_unstable = allow_unstable
         self._met: list[list[list[str]]] = []
 
@@ -94,7 +94,7 @@ def motorised(actuators: Mapping[str, Any], allow_unstable: bool = False) -> Ite
     Raises:
         ValueError: see `codrl_mj.motorise`; or, at the end, no model was built inside, or a pattern matched nothing.
     """
-    building = Building(actuators, allow_unstable)
+    building = Building(resolve_patterns(actuators, "another's environment"), allow_unstable)
     with building.motorising():
         yield
     building.check()

@@ -12,9 +12,8 @@ from dm_env import specs
 from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel
-from codrl_mj.disturbances import resolve_disturbances
-from codrl_mj.envs.commands import command_of
-from codrl_mj.envs.motors import Motors
+from codrl_mj.disturbances import OFF, resolve
+from codrl_mj.envs.motors import Motors, MotorSettings
 from codrl_mj.fields import did_you_mean
 from codrl_mj.foreign.building import Building
 from codrl_mj.specs import resolve_patterns
@@ -28,25 +27,16 @@ class MotorisedEnvironment(dm_env.Environment):
     """
 
     def __init__(
-        self,
-        build: Callable[[], dm_env.Environment],
-        actuators: Mapping[str, ActuatorModel],
-        action: str = "force",
-        randomize: Mapping[str, Any] | None = None,
-        disturbances: Any = None,
-        allow_unstable: bool = False,
-        noise_seed: int | None = None,
+        self, build: Callable[[], dm_env.Environment], settings: MotorSettings, noise_seed: int | None = None
     ) -> None:
         """Build it."""
-        self._action, self._commands = action, {name: command_of(one, action, name) for name, one in actuators.items()}
-        simulated = {pattern: command.actuator for pattern, command in self._commands.items()}
-        self._building = Building(simulated, allow_unstable)
-        self._randomize, self._disturbances = randomize, resolve_disturbances(disturbances)
-        self._allow_unstable = allow_unstable
+        self._settings = settings
+        self._building = Building(settings.simulated, settings.allow_unstable)
         with self._building.motorising():
             self._environment = build()
         self._building.check()
-        if randomize is not None and _builds_at_resets(self._environment):
+        kinds = type(self._environment).__mro__  # of `dm_control.composer`, which need not have been imported?
+        if settings.randomize is not None and any(one.__module__.startswith("dm_control.composer") for one in kinds):
             raise ValueError(
                 f"randomize: {type(self._environment).__name__} builds its model anew at every reset; let its own "
                 "variations change it"
@@ -58,7 +48,7 @@ class MotorisedEnvironment(dm_env.Environment):
 
     def reset(self) -> dm_env.TimeStep:
         """Start an episode, the motors at rest; composer environments build their model anew."""
-        if self._randomize is not None:
+        if self._settings.randomize is not None:
             self._motors.draw(self._generator)
         with self._building.motorising():
             timestep = self._environment.reset()
@@ -92,16 +82,8 @@ class MotorisedEnvironment(dm_env.Environment):
         if self._bound is None or self._bound[0] is not model:
             spec = self._environment.action_spec()
             low, high = (np.broadcast_to(bound, spec.shape) for bound in (spec.minimum, spec.maximum))
-            motors = Motors(
-                data,
-                self._commands,
-                self._action,
-                spaces.Box(low, high, dtype=np.float64),
-                randomize=self._randomize,
-                disturbances=self._disturbances,
-                step_duration=self._environment.control_timestep(),
-                allow_unstable=self._allow_unstable,
-            )
+            actions = spaces.Box(low, high, dtype=np.float64)
+            motors = Motors(data, self._settings, actions, self._environment.control_timestep())
             self._bound = model, motors
         return self._bound[1]
 
@@ -136,7 +118,7 @@ class MotorisedEnvironment(dm_env.Environment):
     def action_spec(self) -> Any:
         """The environment's, with the limits of the motors' commands where these are what an action stands for."""
         spec = self._environment.action_spec()
-        if self._action == "force":
+        if self._settings.action == "force":
             return spec
         space: Any = self._motors.action_space
         return specs.BoundedArray(spec.shape, spec.dtype, space.low, space.high, spec.name)
@@ -158,11 +140,6 @@ class MotorisedEnvironment(dm_env.Environment):
         if name.startswith("__") or name == "_environment":
             raise AttributeError(name)
         return getattr(self._environment, name)
-
-
-def _builds_at_resets(environment: dm_env.Environment) -> bool:
-    """Whether an environment is one of `dm_control.composer`, which need not have been imported."""
-    return any(kind.__module__.startswith("dm_control.composer") for kind in type(environment).__mro__)
 
 
 def make_dm_control(
@@ -198,9 +175,9 @@ def make_dm_control(
             does not go with the actuators or the environment.
     """
     resolved = resolve_patterns(actuators, "an environment of dm_control")
-    arguments = (resolved, action, randomize, disturbances, allow_unstable, noise_seed)
+    settings = MotorSettings(resolved, action, False, randomize, resolve(disturbances, OFF), allow_unstable)
     if not isinstance(environment, str):
-        return MotorisedEnvironment(lambda: environment(**options), *arguments)
+        return MotorisedEnvironment(lambda: environment(**options), settings, noise_seed)
     domain, _, task = environment.partition("/")
     if (domain, task) not in suite.ALL_TASKS:
         known = ["/".join(each) for each in suite.ALL_TASKS]
@@ -208,4 +185,4 @@ def make_dm_control(
             f"environment = {environment!r}: {did_you_mean(environment, known)}must be DOMAIN/TASK of "
             "dm_control.suite.ALL_TASKS, or a function"
         )
-    return MotorisedEnvironment(lambda: suite.load(domain, task, **options), *arguments)
+    return MotorisedEnvironment(lambda: suite.load(domain, task, **options), settings, noise_seed)

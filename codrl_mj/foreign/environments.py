@@ -14,12 +14,11 @@ from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.utils import RecordConstructorArgs
 
-from codrl_mj.actuators import ActuatorModel, Command
-from codrl_mj.disturbances import resolve_disturbances
+from codrl_mj.actuators import ActuatorModel
+from codrl_mj.disturbances import OFF, resolve
 from codrl_mj.engine.reading import bring_to_rest, motors, slots
-from codrl_mj.envs.commands import command_of
-from codrl_mj.envs.motors import Motors
-from codrl_mj.envs.recording import Recorder, StepWatch
+from codrl_mj.envs.motors import Motors, MotorSettings, longer
+from codrl_mj.envs.recording import StepWatch
 from codrl_mj.envs.snapshots import (
     check_snapshot,
     elapsed_steps,
@@ -29,7 +28,6 @@ from codrl_mj.envs.snapshots import (
     set_state_of,
     state_of,
 )
-from codrl_mj.envs.views import check_observed, longer
 from codrl_mj.foreign.building import Building
 from codrl_mj.physics.streams import words_of
 from codrl_mj.specs import resolve_patterns
@@ -82,10 +80,17 @@ def make(
         env_id = entry.id
     if str(entry.entry_point).startswith("codrl_mj.envs:"):
         raise ValueError(f"{env_id}: its actuators are its own: gymnasium.make({env_id!r}, actuator=...)")
-    resolved = resolve_patterns(actuators, f"the environment {env_id}")
+    settings = MotorSettings(
+        resolve_patterns(actuators, f"the environment {env_id}"),
+        action,
+        observe_actuator,
+        randomize,
+        resolve(disturbances, OFF),
+        allow_unstable,
+    )
     spec = copy.copy(entry)
-    spec.entry_point = Motorised(entry.entry_point, resolved, action, allow_unstable, env_id)
-    return MotorisedEnv(gymnasium.make(spec, **options), observe_actuator, randomize, disturbances)
+    spec.entry_point = Motorised(entry.entry_point, settings, env_id)
+    return MotorisedEnv(gymnasium.make(spec, **options))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,19 +99,10 @@ class Motorised:
 
     entry_point: Any
     """Makes it without."""
-    actuators: Mapping[str, ActuatorModel]
-    """Pattern -> actuator."""
-    action: str
-    """What actions stand for."""
-    allow_unstable: bool
-    """As for `codrl_mj.motorise`."""
-    env_id: str = ""
+    settings: MotorSettings
+    """Of the motors."""
+    env_id: str
     """The environment's, for messages."""
-
-    @functools.cached_property
-    def commands(self) -> dict[str, Command]:
-        """Pattern -> what an action means to its motors."""
-        return {pattern: command_of(one, self.action, pattern) for pattern, one in self.actuators.items()}
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -119,8 +115,7 @@ class Motorised:
 
     def __call__(self, **options: Any) -> gymnasium.Env:
         """Make it."""
-        simulated = {pattern: command.actuator for pattern, command in self.commands.items()}
-        creator, building = self._creator, Building(simulated, self.allow_unstable)
+        creator, building = self._creator, Building(self.settings.simulated, self.settings.allow_unstable)
         ours = isinstance(creator, type) and issubclass(creator, MujocoEnv)
         with building.motorising():
             env = _with_motors(creator)(**options) if ours else creator(**options)
@@ -165,17 +160,9 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
     the model's order.
     """
 
-    def __init__(
-        self,
-        env: gymnasium.Env,
-        observe_actuator: bool = False,
-        randomize: Mapping[str, Mapping[str, Any]] | None = None,
-        disturbances: Any = None,
-    ) -> None:
+    def __init__(self, env: gymnasium.Env) -> None:
         """Wrap an environment that `Motorised` made."""
-        RecordConstructorArgs.__init__(
-            self, observe_actuator=observe_actuator, randomize=randomize, disturbances=disturbances
-        )
+        RecordConstructorArgs.__init__(self)
         super().__init__(env)
         base, name = env.unwrapped, env.spec.id if env.spec else ""
         if not isinstance(getattr(base, "model", None), mujoco.MjModel) or not hasattr(base, "data"):
@@ -184,10 +171,7 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
                 "motors with codrl_mj.signals"
             )
         assert base.spec is not None
-        self._motorised: Motorised = base.spec.entry_point  # type: ignore[assignment]
-        self._disturbances = resolve_disturbances(disturbances)
-        self._randomize = randomize
-        self._observes = observe_actuator
+        self._settings: MotorSettings = base.spec.entry_point.settings  # type: ignore[union-attr]
         self._generator = np.random.default_rng()
         self._begun = False
         self._bind()
@@ -195,22 +179,11 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
     def _bind(self) -> None:
         """Find the motors of the environment's model."""
         base: Any = self.unwrapped
-        motorised = self._motorised
         self._watch: StepWatch | None = None
-        self._motors = Motors(
-            base.data,
-            motorised.commands,
-            motorised.action,
-            self.env.action_space,
-            randomize=self._randomize,
-            disturbances=self._disturbances,
-            step_duration=getattr(base, "dt", None),
-            allow_unstable=motorised.allow_unstable,
-        )
+        self._motors = Motors(base.data, self._settings, self.env.action_space, getattr(base, "dt", None))
         if self._motors.action_space is not self.env.action_space:
             self.action_space = self._motors.action_space
-        if self._observes:
-            check_observed(self._motors.sensors, self._motors.families)
+        if self._motors.sensors:
             self.observation_space = longer(self.env.observation_space, len(self._motors.sensors))
 
     @property
@@ -224,15 +197,15 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         return tuple(self._motors.signals())
 
     @property
-    def recorder(self) -> Recorder:
+    def recorder(self) -> StepWatch:
         """Reads the environment between its steps; from now on every integration step is looked at."""
-        self._watch = self._watch or StepWatch(self._motors)
-        return self._watch.recorder(self._motorised.action)
+        self._watch = self._watch or StepWatch(self._motors, self._settings.action)
+        return self._watch
 
     @property
     def sensor_names(self) -> tuple[str, ...]:
         """Names of what `observe_actuator` appends to the observation."""
-        return self._motors.sensors if self._observes else ()
+        return self._motors.sensors
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode, the motors at rest; a seed starts the generator of their draws too."""
@@ -261,7 +234,7 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         return self._observed(observation), reward, terminated, truncated, info | motors.signals()
 
     def _observed(self, observation: Any) -> Any:
-        if not self._observes:
+        if not self._motors.sensors:
             return observation
         return np.concatenate([observation, self._motors.seen()]).astype(observation.dtype)
 

@@ -1,8 +1,10 @@
 """Environments of Gymnasium's, or of anybody's who registers with it, as worlds."""
 
+import contextlib
 import functools
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -76,17 +78,19 @@ class GymnasiumWorld(World):
                 "never end: give one, in environment steps"
             )
         arguments = {**config.as_arguments(), "disable_env_checker": True, **view}
-        try:
+        with self._explaining(config):
             return make(self.spec.id, arguments.pop("actuator"), **arguments)
-        except TypeError as error:
-            raise ValueError(f"options = {config.options!r}: {self.name} does not take them: {error}") from None
-        except ValueError as error:
-            raise ValueError(f"{self.name}: {error}") from None
 
     def action_space(self, config: Any) -> "spaces.Space[Any]":
         """Its own actions."""
-        try:
+        with self._explaining(config):
             return _action_space(self.spec.id, json.dumps(config.options))
+
+    @contextlib.contextmanager
+    def _explaining(self, config: Any) -> Iterator[None]:
+        """Say whose it is that does not go together in the block."""
+        try:
+            yield
         except TypeError as error:
             raise ValueError(f"options = {config.options!r}: {self.name} does not take them: {error}") from None
         except ValueError as error:

@@ -1,17 +1,46 @@
-"""Simulation of a task: in MuJoCo or on Gymnasium's analytic dynamics, behind one small interface."""
+"""Simulation of a task: in MuJoCo or on Gymnasium's analytic dynamics, behind one small interface, by name."""
 
+from collections.abc import Callable
+from typing import Any
+
+from codrl_mj.own_code import look_up
 from codrl_mj.physics.analytic import AnalyticPhysics
-from codrl_mj.physics.base import Physics, Signals, SimulationDivergedError, signal_names, trace_names
+from codrl_mj.physics.base import Physics, Plant, Signals, SimulationDivergedError, signal_names, trace_names
 from codrl_mj.physics.mjcf import hills, install_callbacks, motors, needed_callbacks
 from codrl_mj.physics.mujoco_single import MujocoPhysics
-from codrl_mj.physics.registry import register_physics
+
+PHYSICS: dict[str, Callable[[Plant], Any]] = {"mujoco": MujocoPhysics, "analytic": AnalyticPhysics}
+"""The physics that an environment can be built on, by name: what makes a simulation of a plant."""
+
+
+def register_physics(name: str, make: Callable[[Plant], Physics]) -> None:
+    """Make a physics of one's own known: every face but the batched one takes its name as `physics`.
+
+    Args:
+        name: what to call it.
+        make: (`codrl_mj.physics.Plant`) -> a simulation of it, a `codrl_mj.physics.Physics`.
+
+    Raises:
+        ValueError: the name is taken by another.
+    """
+    if PHYSICS.setdefault(name, make) is not make:
+        raise ValueError(f"physics {name!r} is registered already, as {PHYSICS[name]!r}: choose another name")
+
+
+def find_physics(name: str) -> Callable[[Plant], Physics]:
+    """The physics called `name`."""
+    return look_up(name, PHYSICS, "physics", anybodys=False)
+
 
 __all__ = [
+    "PHYSICS",
     "AnalyticPhysics",
     "MujocoPhysics",
     "Physics",
+    "Plant",
     "Signals",
     "SimulationDivergedError",
+    "find_physics",
     "hills",
     "install_callbacks",
     "motors",

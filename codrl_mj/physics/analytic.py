@@ -5,69 +5,53 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.actuators import ActuatorModel, Inputs, check_same_family, parameters_type
-from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint
-from codrl_mj.physics.base import check_finite, trace_names
-from codrl_mj.physics.disturber import disturber
-from codrl_mj.tasks import Task
+from codrl_mj.actuators import ActuatorModel, Inputs, parameters_type
+from codrl_mj.physics.base import Plant, check_finite
 
 
 class AnalyticPhysics:
     """A task on Gymnasium's own equations. See `codrl_mj.physics.base.Physics`."""
 
-    compiled = None
+    stepping, arguments = None, ()
     scene = None
 
-    def __init__(
-        self,
-        task: Task,
-        actuators: Sequence[ActuatorModel],
-        inner_steps: int,
-        integrator: str,
-        max_forces: np.ndarray | None = None,
-        disturbances: Disturbances = OFF,
-        joint: Joint = PLAIN,
-    ) -> None:
-        """Make the Gymnasium environment; arguments as for `MujocoPhysics`, `joint` being plain.
+    def __init__(self, plant: Plant) -> None:
+        """Make the Gymnasium environment.
 
         Raises:
             ValueError: something is added to the joint, which Gymnasium's equations have no place for; or the task has
                 no Gymnasium environment.
         """
-        for added in (*(actuator.additions for actuator in actuators), joint):
-            for name, value in zip(("armature", "damping", "friction"), _added(added), strict=True):
-                if value:
+        for added in (*(actuator.additions for actuator in plant.actuators), plant.joint):
+            for name in ("armature", "damping", "friction"):
+                if value := getattr(added, name):
                     raise ValueError(
                         f"joint.{name} = {value:g}: the equations have no place for it; use physics='mujoco'"
                     )
+        task = plant.task
         if task.twin is None:
             raise ValueError(f"physics = 'analytic': {task.name} rebuilds no environment of Gymnasium's; use 'mujoco'")
-        self.task = task
-        self.family = check_same_family(actuators)
-        self.inner_steps = inner_steps
-        self._integrator = integrator
-        self.timestep = task.step_duration / inner_steps
+        self.plant = plant
+        self.timestep = plant.timestep
         self.twin = task.twin()
         self._actuators: list[tuple[float, Any]] = []
-        self.set_actuators(actuators)
-        limits = task.max_forces if max_forces is None else max_forces
-        self._disturber = disturber(disturbances, self.timestep, limits, 1)
-        self.trace = np.zeros((inner_steps, len(actuators), len(trace_names(self.family))))
+        self.set_actuators(plant.actuators)
+        self._disturber = plant.disturber()
+        self.trace = plant.trace()
         self.reset(np.zeros(len(task.state_names)))
 
     def reset(self, state: np.ndarray, key: float = 0.0) -> None:
         """See `Physics.reset`."""
         self.state = np.array(state, dtype=np.float64)
-        rest = self.family.State(*[0.0] * len(self.family.State._fields))  # type: ignore[attr-defined]
+        rest = self.plant.family.State(*[0.0] * len(self.plant.family.State._fields))  # type: ignore[attr-defined]
         self._states = [rest] * len(self._actuators)
         self._time = 0.0
         self._key = key
-        if self._disturber is not None:
-            self._disturber.reset(np.zeros(1, dtype=np.int64), key)
+        self._disturber.reset(np.zeros(1, dtype=np.int64), key)
 
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
         """Exchange the actuators for others of their family; to be followed by a reset."""
-        kind = parameters_type(self.family)
+        kind = parameters_type(self.plant.family)
         self._actuators = [(actuator.arm_radius, kind(*actuator.numbers)) for actuator in actuators]
 
     def set_model(self, fields: Mapping[str, np.ndarray]) -> None:
@@ -84,31 +68,31 @@ class AnalyticPhysics:
     def step(self, desired_force: Any) -> None:
         """See `Physics.step`."""
         desired = np.atleast_2d(np.asarray(desired_force, dtype=np.float64))
-        several, speeds = len(self._actuators) > 1, list(self.task.speeds)
+        several, speeds = len(self._actuators) > 1, list(self.plant.task.speeds)
         for rows in self.trace:
-            commands = desired[0] if self._disturber is None else self._disturber.commands(desired)[0]
+            commands = self._disturber.commands(desired)[0]
             for number, (row, command) in enumerate(zip(rows, commands.tolist(), strict=True)):
                 row[:-1] = command, *self._advance(number, command)
             force: Any = rows[:, 1] if several else float(rows[0, 1])
-            if self._disturber is not None:
+            if self._disturber.on:
                 loads = self._disturber.loads()[0]
                 force = force + (loads if several else float(loads[0]))
-            self.state = self.twin(self.state, force, self.timestep, self._integrator)
+            self.state = self.twin(self.state, force, self.timestep, self.plant.integrator)
             self._time += self.timestep
             rows[:, -1] = self.state[speeds]
         self.check_finite()
 
     def check_finite(self) -> None:
         """See `Physics.check_finite`."""
-        check_finite(self.task, self.state, self._time)
+        check_finite(self.plant.task, self.state, self._time)
 
     def _advance(self, number: int, command: float) -> tuple[float, ...]:
         """Advance an actuator by one integration step: the force that it delivers, and its signals."""
         arm, parameters = self._actuators[number]
-        at = self.task.speeds[number]
-        position, speed = self.state[[self.task.qpos[self.task.qvel.index(at)], at]].tolist()
+        at = self.plant.task.speeds[number]
+        position, speed = self.state[[self.plant.task.qpos[self.plant.task.qvel.index(at)], at]].tolist()
         inputs = Inputs(command * arm, position / arm, speed / arm, self._time, self._key + number)
-        self._states[number], torque, signals = self.family.advance(
+        self._states[number], torque, signals = self.plant.family.advance(
             parameters, self.timestep, self._states[number], inputs
         )
         return torque / arm, *signals
@@ -117,10 +101,10 @@ class AnalyticPhysics:
         """See `Physics.observed`."""
         return np.array(
             [
-                self.family.observe(
+                self.plant.family.observe(
                     parameters,
                     self.timestep,
-                    self.family.Signals(*signals[2:-1].tolist()),
+                    self.plant.family.Signals(*signals[2:-1].tolist()),
                     Inputs(0.0, 0.0, 0.0, self._time, self._key + number),
                 )
                 for number, ((_, parameters), signals) in enumerate(zip(self._actuators, row, strict=True))
@@ -137,7 +121,7 @@ class AnalyticPhysics:
 
     def restore(self, snapshot: np.ndarray) -> None:
         """Continue from what `snapshot` returned."""
-        size, kind = len(self.task.state_names), self.family.State
+        size, kind = len(self.plant.task.state_names), self.plant.family.State
         self.state = snapshot[:size].copy()
         *values, self._time, self._key = snapshot[size:].tolist()
         count = len(kind._fields)  # type: ignore[attr-defined]
@@ -146,11 +130,7 @@ class AnalyticPhysics:
     @property
     def memory(self) -> np.ndarray:
         """What the disturbances remember, a live array; empty if nothing."""
-        return np.empty(0) if self._disturber is None else self._disturber.memory.reshape(-1)
+        return self._disturber.memory.reshape(-1)
 
     def show(self, state: np.ndarray) -> None:
         """Nothing: there is no scene."""
-
-
-def _added(added: Any) -> tuple[float, float, float]:
-    return added.armature, added.damping, added.friction

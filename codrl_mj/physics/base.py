@@ -1,11 +1,15 @@
 """The small interface behind which a task is simulated."""
 
+import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 
-from codrl_mj.actuators import ActuatorModel, Family
+from codrl_mj.actuators import ActuatorModel, Family, Ideal, check_same_family
+from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint
+from codrl_mj.physics.disturber import Disturber
 from codrl_mj.tasks import Task
 
 Signals = dict[str, Any]
@@ -40,17 +44,82 @@ def named_signals(names: tuple[str, ...], columns: Any) -> Signals:
     return signals
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Plant:
+    """What is simulated: a task and its actuators, and how finely; every physics is made of one.
+
+    Raises:
+        ValueError: the actuators are of several families.
+    """
+
+    task: Task
+    """The task."""
+    actuators: Sequence[ActuatorModel]
+    """What stands between desired and delivered force, one for each of the task's motors, of one family."""
+    inner_steps: int = 1
+    """Integration steps per environment step."""
+    integrator: str = ""
+    """One of the task's integrators, the first of them unless told otherwise."""
+    max_forces: np.ndarray = None  # type: ignore[assignment]
+    """Limits of the desired forces [N] or torques [N*m], shape (n,); the task's unless told otherwise."""
+    disturbances: Disturbances = OFF
+    """Imperfections of the commands' way, and load pulses."""
+    joint: Joint = PLAIN
+    """What is added to the actuated joints."""
+
+    def __post_init__(self) -> None:
+        """Fill in what is the task's."""
+        check_same_family(self.actuators)
+        if not self.integrator:
+            object.__setattr__(self, "integrator", self.task.integrators[0])
+        if self.max_forces is None:
+            object.__setattr__(self, "max_forces", self.task.max_forces)
+
+    @functools.cached_property
+    def family(self) -> Family:
+        """The actuators' family."""
+        return type(self.actuators[0])
+
+    @property
+    def motorised(self) -> bool:
+        """Whether the actuators are any but the ideal one."""
+        return not issubclass(self.family, Ideal)
+
+    @property
+    def explicit(self) -> bool:
+        """Whether positions are moved by the old velocity."""
+        return self.integrator == "euler"
+
+    @property
+    def timestep(self) -> float:
+        """Integration step [s]."""
+        return self.task.step_duration / self.inner_steps
+
+    def trace(self) -> np.ndarray:
+        """A new `Physics.trace`."""
+        return np.zeros((self.inner_steps, len(self.actuators), len(trace_names(self.family))))
+
+    def disturber(self, simulations: int = 1) -> Disturber:
+        """What disturbs so many simulations."""
+        return Disturber(self.disturbances, self.timestep, self.max_forces, simulations)
+
+
 class Physics(Protocol):
-    """One simulation of one task.
+    """One simulation of a plant.
 
     Somebody's own is given to `codrl_mj.physics.register_physics`. What it cannot simulate it refuses when it is made.
     """
 
+    plant: Plant
+    """What is simulated."""
+
     trace: np.ndarray
     """What each actuator did in each integration step of the last environment step, shape (inner_steps, actuators,
     columns), float64; columns as in `trace_names`. A live array: the next step overwrites it."""
-    compiled: Any
-    """What a compiled loop needs (see `codrl_mj.physics.stepping.Compiled`); None where a step is Python."""
+    stepping: Any
+    """The compiled functions of a loop (see `codrl_mj.physics.stepping.Stepping`); None where a step is Python."""
+    arguments: tuple[Any, ...]
+    """Their last arguments; none where there are none."""
     scene: tuple[Any, Any] | None
     """The `mujoco.MjModel` and `mujoco.MjData` that it runs on; None where there are none."""
 
@@ -107,7 +176,7 @@ class Physics(Protocol):
         """
 
     def check_finite(self) -> None:
-        """Raise if the present state is not finite or too large to be trusted; where `compiled` steps, they ask it.
+        """Raise if the present state is not finite or too large to be trusted; where `stepping` steps, they ask it.
 
         Raises:
             SimulationDivergedError: as it says.

@@ -7,9 +7,17 @@ import numpy as np
 from numba.extending import register_jitable
 
 from codrl_mj.actuators.noise import philox, unit
-from codrl_mj.disturbances import Disturbances
-from codrl_mj.disturbances.command import delayed, quantised, rate_limited, whole_and_fraction
-from codrl_mj.disturbances.pulses import KEY, PULSE_NAMES, pulse_load
+from codrl_mj.disturbances import (
+    KEY,
+    OFF,
+    PULSE_NAMES,
+    Disturbances,
+    delayed,
+    pulse_load,
+    quantised,
+    rate_limited,
+    whole_and_fraction,
+)
 from codrl_mj.engine.memory import internal, read
 from codrl_mj.kept import njit
 
@@ -54,36 +62,40 @@ class Disturber:
     def __init__(self, disturbances: Disturbances, timestep: float, limits: np.ndarray, simulations: int) -> None:
         """Start with nothing remembered, for a number of simulations at a timestep [s].
 
-        `limits`, shape (n,), are the largest forces [N or N*m] of the actuators of one.
+        `limits`, shape (n,), are the largest forces [N or N*m] of the actuators of one. Where all is off, commands
+        arrive as they are, there are no loads, and rows are empty.
         """
+        self.on = disturbances != OFF
         whole, fraction = whole_and_fraction(disturbances.command_delay, timestep)
-        self.numbers = np.array(
-            [
-                Numbers(
-                    timestep,
-                    whole,
-                    fraction,
-                    disturbances.command_quantum,
-                    limit,
-                    disturbances.command_rate * timestep,
-                    disturbances.pulse_force,
-                    disturbances.pulse_duration,
-                    disturbances.pulse_interval,
-                )
-                for limit in limits.tolist()
-            ]
-        )
-        self.memory = np.zeros((simulations * len(limits), whole + 1 + (fraction > 0.0) + _AFTER_HISTORY))
+        rows = [
+            Numbers(
+                timestep,
+                whole,
+                fraction,
+                disturbances.command_quantum,
+                limit,
+                disturbances.command_rate * timestep,
+                disturbances.pulse_force,
+                disturbances.pulse_duration,
+                disturbances.pulse_interval,
+            )
+            for limit in limits.tolist()
+        ]
+        self.numbers = np.array(rows) if self.on else np.empty((len(rows), 0))
+        length = whole + 1 + (fraction > 0.0) + _AFTER_HISTORY if self.on else 0
+        self.memory = np.zeros((simulations * len(rows), length))
 
     def reset(self, rows: np.ndarray, keys: Any) -> None:
         """Forget everything at the start of episodes of some simulations, with these keys of random numbers."""
         count = len(self.numbers)
-        for actuator in range(count):
+        for actuator in range(count if self.on else 0):
             self.memory[rows * count + actuator] = 0.0
             self.memory[rows * count + actuator, KEY_COLUMN] = np.asarray(keys) + actuator
 
     def commands(self, desired: np.ndarray) -> np.ndarray:
         """The commands [N or N*m], shape (N, n), that arrive at the actuators in the next integration step."""
+        if not self.on:
+            return desired
         arrived = np.empty(desired.size)
         compiled_disturbance().commands(self.numbers, self.memory, np.ascontiguousarray(desired).reshape(-1), arrived)
         return arrived.reshape(desired.shape)
@@ -91,20 +103,13 @@ class Disturber:
     def loads(self) -> np.ndarray:
         """The mean loads on the joints [N or N*m] over the next integration step, shape (N, n); a new array."""
         loads = np.zeros(len(self.memory))
-        if self.numbers[0, Numbers._fields.index("pulse_force")]:
+        if self.on and self.numbers[0, Numbers._fields.index("pulse_force")]:
             compiled_disturbance().loads(self.numbers, self.memory, loads)
         return loads.reshape(-1, len(self.numbers))
 
 
 KEY_COLUMN = KEY - len(PULSE_NAMES)
 """Where a row of a disturber's memory holds the key of the episode's random numbers."""
-
-
-def disturber(disturbances: Disturbances, timestep: float, limits: np.ndarray, simulations: int) -> Disturber | None:
-    """A `Disturber`, of its arguments, or None where neither commands nor loads are disturbed."""
-    if not (disturbances.of_command or disturbances.pulse_force):
-        return None
-    return Disturber(disturbances, timestep, limits, simulations)
 
 
 class Disturbance(NamedTuple):

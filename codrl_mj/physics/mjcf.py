@@ -1,15 +1,13 @@
 """Puts actuators into a task's MJCF actuators, and reads them back."""
 
 import mujoco
-import numpy as np
 
 from codrl_mj import engine
 from codrl_mj.actuators import ActuatorModel, Ideal, JointAdditions
-from codrl_mj.disturbances import PLAIN, Joint
 from codrl_mj.engine import HILL_NAMES
 from codrl_mj.engine.families import SIGNATURE, slot_size, user_head
 from codrl_mj.engine.reading import motors
-from codrl_mj.tasks import Task
+from codrl_mj.physics.base import Plant
 from codrl_mj.tasks.assets import asset_path
 from codrl_mj.tasks.base import INTEGRATORS
 
@@ -78,20 +76,13 @@ def install_callbacks(model: mujoco.MjModel) -> None:
         engine.install(*parts)
 
 
-def task_model(
-    task: Task,
-    actuators: tuple[ActuatorModel, ...],
-    timestep: float,
-    max_forces: np.ndarray | None = None,
-    explicit: bool = False,
-    joint: Joint = PLAIN,
-) -> mujoco.MjModel:
-    """Compile a task's model.
+def task_model(plant: Plant) -> mujoco.MjModel:
+    """Compile a plant's model.
 
     A diverging simulation is left to diverge, so that it can be reported, instead of being reset by the engine. Where
-    the Euler integrator is made `explicit`, joint damping is explicit too. The integration step is in [s]; `max_forces`
-    [N or N*m], shape (n,), limit the desired forces in place of the task's; `joint` is added to the actuated joints.
+    the Euler integrator is made explicit, joint damping is explicit too.
     """
+    task = plant.task
     try:
         spec = mujoco.MjSpec.from_file(str(asset_path(task.asset)))
     except ValueError as error:
@@ -101,12 +92,12 @@ def task_model(
         raise ValueError(
             f"{task.asset}: its <option> has integrator {kind}, so Task.integrators cannot have {', '.join(other)}"
         )
-    spec.option.timestep = timestep
+    spec.option.timestep = plant.timestep
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    if explicit:
+    if plant.explicit:
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
-    limits = task.max_forces if max_forces is None else max_forces
-    for name, actuator, limit in zip(task.motors, actuators, limits.tolist(), strict=True):
+    joint = JointAdditions(plant.joint.armature, plant.joint.damping, plant.joint.friction)
+    for name, actuator, limit in zip(task.motors, plant.actuators, plant.max_forces.tolist(), strict=True):
         motor = spec.actuator(name)
         if motor is None:
             there = ", ".join(repr(a.name) for a in spec.actuators) or "none"
@@ -115,8 +106,12 @@ def task_model(
         if joint_driven is None or joint_driven.type not in _ALONG:
             raise ValueError(f"{task.asset}: actuator {name!r} must drive a hinge or a slide joint")
         drive(motor, actuator, limit)
-        for added in (JointAdditions(joint.armature, joint.damping, joint.friction), actuator.additions):
-            _add(spec, joint_driven, added)
+        for added in (joint, actuator.additions):
+            joint_driven.armature += added.armature
+            joint_driven.damping[0] += added.damping
+            if added.friction:
+                joint_driven.frictionloss += added.friction
+                spec.option.disableflags = flags_with_friction(spec.option.disableflags)
     if all(texture.type != mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
         _add_sky(spec)
     model = spec.compile()
@@ -136,15 +131,6 @@ def _add_sky(spec: mujoco.MjSpec) -> None:
     kind, gradient = mujoco.mjtTexture.mjTEXTURE_SKYBOX, mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
     sky = spec.add_texture(type=kind, builtin=gradient, width=64, height=64)
     sky.rgb1, sky.rgb2 = [0.93, 0.95, 0.97], [0.76, 0.82, 0.88]
-
-
-def _add(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, added: JointAdditions) -> None:
-    """Add inertia, damping and friction to a joint."""
-    joint.armature += added.armature
-    joint.damping[0] += added.damping
-    if added.friction:
-        joint.frictionloss += added.friction
-        spec.option.disableflags = flags_with_friction(spec.option.disableflags)
 
 
 def flags_with_friction(flags: int) -> int:

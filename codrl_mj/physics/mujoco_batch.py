@@ -8,17 +8,14 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from codrl_mj.actuators import ActuatorModel, Ideal, check_same_family
-from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint
+from codrl_mj.actuators import ActuatorModel
 from codrl_mj.engine.families import HEAD
-from codrl_mj.physics.base import LARGEST, SimulationDivergedError
-from codrl_mj.physics.disturber import disturber
+from codrl_mj.physics.base import LARGEST, Plant, SimulationDivergedError
 from codrl_mj.physics.mjcf import flags_with_friction
 from codrl_mj.physics.mujoco_single import MujocoPhysics, wiring
 from codrl_mj.physics.rows import Rows, compiled_set_const, lane, part, share
 from codrl_mj.physics.stepping import NOISE_KEY
-from codrl_mj.physics.variation import Variation, additions_of, bare_model, field_of, write_fields
-from codrl_mj.tasks import Task
+from codrl_mj.physics.variation import Variation, bare_model, field_of, mounting_of, write_fields
 
 DERIVED = (
     *("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "dof_length"),
@@ -33,44 +30,27 @@ class MujocoBatchPhysics:
     Every simulation has its own actuators: parameters are per-simulation model fields.
     """
 
-    def __init__(
-        self,
-        task: Task,
-        actuators: Sequence[Sequence[ActuatorModel]],
-        inner_steps: int,
-        integrator: str,
-        max_forces: np.ndarray | None = None,
-        num_threads: int = 0,
-        disturbances: Disturbances = OFF,
-        joint: Joint = PLAIN,
-    ) -> None:
-        """Compile the model and make the rows; arguments as for `MujocoPhysics`.
+    def __init__(self, plant: Plant, actuators: Sequence[Sequence[ActuatorModel]], num_threads: int = 0) -> None:
+        """Compile the model and make the rows, one for each of N tuples of `actuators` in place of the plant's.
 
-        But for `actuators`, which have one for each motor for each of N simulations, and `num_threads`; 0 uses every
-        CPU.
+        They are of its family; `num_threads` may be 0, for every CPU.
         """
-        self.task = task
-        self.family = check_same_family([one for each in actuators for one in each])
-        self.motorised = not issubclass(self.family, Ideal)
-        self.inner_steps = inner_steps
-        self.max_forces = task.max_forces if max_forces is None else max_forces
+        self.plant, task = plant, plant.task
         self.num_envs, self._num_threads = len(actuators), num_threads
-        self._nominal = MujocoPhysics(task, actuators[0], inner_steps, integrator, max_forces, disturbances, joint)
-        timestep = self._nominal.model.opt.timestep
-        self._disturber = disturber(disturbances, timestep, self.max_forces, self.num_envs)
-        motors = zip(task.motors, actuators[0], strict=True)
-        self._wiring = [wiring(self._nominal.model, name, one) for name, one in motors]
+        self._nominal = MujocoPhysics(plant)
+        self._disturber = plant.disturber(self.num_envs)
+        self._wiring = wiring(self._nominal.model, plant)
         self._positions, self._velocities = np.array(task.qpos), np.array(task.qvel)
         self._fields: dict[str, np.ndarray] = {}
         self._rest = self._nominal.snapshot()  # a simulation just reset, motor at rest
         self._states = np.repeat(self._rest[np.newaxis], self.num_envs, axis=0)
         self._arms = np.ones((self.num_envs, len(task.motors)))
         self._bind()
-        every, additions = np.arange(self.num_envs), additions_of(actuators)
-        self.set_actuators(every, actuators)
+        every, (arms, additions) = np.arange(self.num_envs), mounting_of(actuators)
+        self.set_parameters(every, np.array([[one.numbers for one in each] for each in actuators]), arms)
         if (additions != additions[0]).any():
             indices = [int(one.actuator) for one in self._wiring]
-            mounting = Variation(bare_model(task.name, joint), motors=indices, mounting=True)
+            mounting = Variation(bare_model(task.name, plant.joint), motors=indices, mounting=True)
             self.set_model(every, mounting.fields(np.empty((self.num_envs, 0)), additions))
 
     def _bind(self) -> None:
@@ -78,22 +58,18 @@ class MujocoBatchPhysics:
         threads = min(self._num_threads or os.cpu_count() or 1, self.num_envs)
         self._data = [mujoco.MjData(copy.copy(self._nominal.model)) for _ in range(threads)]
         self.model, self.data = self._nominal.model, self._nominal.data
+        self.stepping, self.arguments = self._nominal.stepping, self._nominal.arguments  # which compile for one of them
         self._lanes: list[tuple[Any, ...]] = []
         parts = {name: part(self.model, name) for name in ("time", "qpos", "qvel", "act")}
         self._time, self._qpos, self._qvel, self._act = (self._states[:, one] for one in parts.values())
-        length = 0 if self._disturber is None else self._disturber.memory.shape[1]
-        self._rows = tuple(Rows(self._states, self._arms, self.memory.reshape(*self._arms.shape, length)))
+        memory = self._disturber.memory
+        self._rows = tuple(Rows(self._states, self._arms, memory.reshape(*self._arms.shape, memory.shape[1])))
 
     def _lane(self, thread: int = 0) -> tuple[Any, ...]:
         """A thread's lane, for the fields of the models that differ at present."""
         if not self._lanes:
             self._lanes = [tuple(lane(self._nominal, data, self._fields)) for data in self._data]
         return self._lanes[thread]
-
-    @property
-    def compiled(self) -> Any:
-        """What compiles of a simulation, see `MujocoPhysics`."""
-        return self._nominal.compiled
 
     def field(self, name: str) -> np.ndarray:
         """A field of the model with a value for each simulation, shape (N, ...): live, to be written to."""
@@ -113,20 +89,15 @@ class MujocoBatchPhysics:
         self.__dict__.update(state)
         self._bind()
 
-    def set_actuators(self, rows: np.ndarray, actuators: Sequence[Sequence[ActuatorModel]]) -> None:
-        """Give some simulations other actuators of the family; to be followed by a reset of them.
+    def set_parameters(self, rows: np.ndarray, numbers: np.ndarray, arms: np.ndarray) -> None:
+        """Give m simulations other actuators: `numbers` (m, n, p), arms [m] (m, n); a reset of them follows.
 
         What they add to their joints is the models': see `set_model`.
         """
-        numbers = np.array([[one.numbers for one in each] for each in actuators])
-        self.set_parameters(rows, numbers, np.array([[one.arm_radius for one in each] for each in actuators]))
-
-    def set_parameters(self, rows: np.ndarray, numbers: np.ndarray, arms: np.ndarray) -> None:
-        """Do what `set_actuators` does, with their `numbers` as an array (m, n, p) and their arms [m] as one (m, n)."""
-        if not self.motorised:
+        if not self.plant.motorised:
             return
         user, gear, limits = map(self.field, ("actuator_user", "actuator_gear", "actuator_ctrlrange"))
-        for at, (one, limit) in enumerate(zip(self._wiring, self.max_forces, strict=True)):
+        for at, (one, limit) in enumerate(zip(self._wiring, self.plant.max_forces, strict=True)):
             index, arm = int(one.actuator), arms[:, at]
             user[rows, index, HEAD : HEAD + numbers.shape[2]] = numbers[:, at]
             gear[rows, index, 0] = 1.0 / arm
@@ -148,7 +119,7 @@ class MujocoBatchPhysics:
     @property
     def state(self) -> np.ndarray:
         """Mechanical states in the task's order, shape (N, n), float64; a new array."""
-        state = np.empty((self.num_envs, len(self.task.state_names)))
+        state = np.empty((self.num_envs, len(self.plant.task.state_names)))
         state[:, self._positions], state[:, self._velocities] = self._qpos, self._qvel
         return state
 
@@ -171,11 +142,10 @@ class MujocoBatchPhysics:
         self._nominal.install()  # raises if somebody replaced ours since the last episodes
         self._states[rows] = self._rest
         self._place(rows, states)
-        if self.motorised:
+        if self.plant.motorised:
             for at, one in enumerate(self._wiring):
                 self._act[rows, int(one.act) + NOISE_KEY] = keys + at
-        if self._disturber is not None:
-            self._disturber.reset(rows, keys)
+        self._disturber.reset(rows, keys)
 
     def step(self, kernel: Any, interface: np.ndarray, steps: Any) -> bool:
         """Take an environment step of every simulation; `kernel` is `Kernels.step_rows` of `codrl_mj.envs.compiled`.
@@ -183,7 +153,7 @@ class MujocoBatchPhysics:
         Returns whether one of them is no longer one of numbers.
         """
         self._lane()
-        return share(kernel, self._lanes, self.num_envs, self.inner_steps, self._rows, interface, tuple(steps))
+        return share(kernel, self._lanes, self.num_envs, self.plant.inner_steps, self._rows, interface, tuple(steps))
 
     def observe(self, kernel: Any, rows: np.ndarray, observations: np.ndarray) -> None:
         """Observe simulations where episodes start; `kernel` is `Kernels.observe_rows`."""
@@ -192,8 +162,6 @@ class MujocoBatchPhysics:
     @property
     def memory(self) -> np.ndarray:
         """What the disturbances remember beside the engine's own state, a live array (N, k); (N, 0) if nothing."""
-        if self._disturber is None:
-            return np.empty((self.num_envs, 0))
         return self._disturber.memory.reshape(self.num_envs, -1)
 
     def check_finite(self, states: np.ndarray, rows: np.ndarray) -> None:
@@ -203,10 +171,10 @@ class MujocoBatchPhysics:
         if len(broken) == 0:
             return
         first = broken[0]
-        entry = self.task.state_names[int(np.argmin(fine[first]))]
+        entry = self.plant.task.state_names[int(np.argmin(fine[first]))]
         value = states[first][np.argmin(fine[first])]
         raise SimulationDivergedError(
-            f"{self.task.name}: {len(broken)} of {len(states)} simulations diverged; environment {first} at "
+            f"{self.plant.task.name}: {len(broken)} of {len(states)} simulations diverged; environment {first} at "
             f"t = {self._time[first, 0]:g} s: {entry} = {value:g}. Reset them; if this repeats, shorten the "
             "integration step (inner_steps) or lower the gains"
         )
@@ -224,4 +192,4 @@ class MujocoBatchPhysics:
         self._nominal.show(self.state[index])
 
 
-_BOUND = ("model", "data", "_data", "_lanes", "_time", "_qpos", "_qvel", "_act", "_rows")
+_BOUND = ("model", "data", "stepping", "arguments", "_data", "_lanes", "_time", "_qpos", "_qvel", "_act", "_rows")

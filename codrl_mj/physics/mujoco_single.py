@@ -1,33 +1,21 @@
 """One simulation of a task in MuJoCo, the actuators in the control callback."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from codrl_mj import engine
-from codrl_mj.actuators import ActuatorModel, Ideal, check_same_family
-from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint
+from codrl_mj.actuators import ActuatorModel
 from codrl_mj.engine.families import HEAD
 from codrl_mj.engine.library import addresses
-from codrl_mj.physics.base import check_finite, trace_names
-from codrl_mj.physics.disturber import disturber
+from codrl_mj.physics.base import Plant, check_finite
 from codrl_mj.physics.mjcf import flags_with_friction, needed_callbacks, task_model
-from codrl_mj.physics.stepping import Stepping, Wiring, compiled_stepping
+from codrl_mj.physics.stepping import Wiring, compiled_stepping
 from codrl_mj.physics.variation import write_fields
-from codrl_mj.tasks import Task
 
 ARM = Wiring._fields.index("arm")
-
-
-class Compiled(NamedTuple):
-    """What a compiled loop needs of a simulation."""
-
-    stepping: Stepping
-    """The functions."""
-    arguments: tuple[Any, ...]
-    """Their last arguments."""
 
 
 class MujocoPhysics:
@@ -38,51 +26,26 @@ class MujocoPhysics:
     has bounds (`Task.constrain`), the state is put back inside them after every integration step.
     """
 
-    def __init__(
-        self,
-        task: Task,
-        actuators: Sequence[ActuatorModel],
-        inner_steps: int,
-        integrator: str,
-        max_forces: np.ndarray | None = None,
-        disturbances: Disturbances = OFF,
-        joint: Joint = PLAIN,
-    ) -> None:
-        """Compile the model and install the callbacks that it needs.
-
-        Args:
-            task: the task.
-            actuators: one for each of the task's motors, of one family.
-            inner_steps: integration steps per environment step.
-            integrator: one of the task's integrators.
-            max_forces: limits of the desired forces [N] or torques [N*m], shape (n,); None are the task's.
-            disturbances: imperfections of the commands' way, and load pulses.
-            joint: what is added to the actuated joints.
-        """
-        self.task = task
-        self.family = check_same_family(actuators)
-        self.inner_steps = inner_steps
-        self._explicit = integrator == "euler"
-        self._max_forces = task.max_forces if max_forces is None else max_forces
-        timestep = task.step_duration / inner_steps
-        self.model = task_model(task, tuple(actuators), timestep, max_forces, self._explicit, joint)
+    def __init__(self, plant: Plant) -> None:
+        """Compile the model and install the callbacks that it needs."""
+        self.plant = plant
+        self.model = task_model(plant)
         self.data = mujoco.MjData(self.model)
         self._flags = self.model.opt.disableflags
+        task = plant.task
         self._qpos_order, self._qvel_order = _progression(task.qpos), _progression(task.qvel)
-        self._disturber = disturber(disturbances, timestep, self._max_forces, 1)
-        self.trace = np.zeros((inner_steps, len(actuators), len(trace_names(self.family))))
-        rows = [[*wiring(self.model, name, one)] for name, one in zip(task.motors, actuators, strict=True)]
-        numbers = np.empty((len(rows), 0)) if self._disturber is None else self._disturber.numbers
-        self._settings = np.hstack([rows, numbers])
+        self._disturber = plant.disturber()
+        self.trace = plant.trace()
+        rows = [[*one] for one in wiring(self.model, plant)]
+        self._settings = np.hstack([rows, self._disturber.numbers])
         self._bind()
         self.reset(np.zeros(len(task.state_names)))
 
     def _bind(self) -> None:
         """Take the views that a step uses, and make sure that the callbacks are there."""
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
-        memory = np.zeros((len(self._settings), 0)) if self._disturber is None else self._disturber.memory
-        stepping = compiled_stepping(self.task, self.family, self._explicit, self._disturber is not None)
-        self.compiled = Compiled(stepping, (*addresses(self.data), self._settings, memory, self.trace))
+        self.stepping = compiled_stepping(self.plant)
+        self.arguments = *addresses(self.data), self._settings, self._disturber.memory, self.trace
         self.scene: tuple[Any, Any] | None = (self.model, self.data)
         self._callbacks = needed_callbacks(self.model)
         self.install()
@@ -105,7 +68,7 @@ class MujocoPhysics:
     @property
     def state(self) -> np.ndarray:
         """The mechanical state in the task's order, shape (n,), float64, as MuJoCo's data have it now; a new array."""
-        state = np.empty(len(self.task.state_names))
+        state = np.empty(len(self._qpos) + len(self._qvel))
         state[self._qpos_order] = self._qpos
         state[self._qvel_order] = self._qvel
         return state
@@ -117,17 +80,16 @@ class MujocoPhysics:
     def reset(self, state: np.ndarray, key: float = 0.0) -> None:
         """See `Physics.reset`."""
         self.install()  # raises if somebody replaced ours since the last episode
-        stepping, arguments = self.compiled
-        stepping.start(np.asarray(state, dtype=np.float64), float(key), *arguments)
+        self.stepping.start(np.asarray(state, dtype=np.float64), float(key), *self.arguments)
 
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
         """Exchange the actuators for others of their family; to be followed by a reset.
 
         What they add to their joints is the model's: see `set_model`.
         """
-        if issubclass(self.family, Ideal):
+        if not self.plant.motorised:
             return
-        for row, (one, limit) in enumerate(zip(actuators, self._max_forces, strict=True)):
+        for row, (one, limit) in enumerate(zip(actuators, self.plant.max_forces, strict=True)):
             index, arm, numbers = int(self._settings[row, 0]), one.arm_radius, one.numbers
             self.model.actuator_user[index, HEAD : HEAD + len(numbers)] = numbers
             self.model.actuator_gear[index, 0] = 1.0 / arm
@@ -152,19 +114,17 @@ class MujocoPhysics:
 
     def step(self, desired_force: Any) -> None:
         """See `Physics.step`."""
-        stepping, arguments = self.compiled
-        if not stepping.step(desired_force, *arguments):
+        if not self.stepping.step(desired_force, *self.arguments):
             self.check_finite()
 
     def check_finite(self) -> None:
         """See `Physics.check_finite`."""
-        check_finite(self.task, self.state, self.data.time)
+        check_finite(self.plant.task, self.state, self.data.time)
 
     def observed(self, row: np.ndarray) -> np.ndarray:
         """See `Physics.observed`."""
-        stepping, arguments = self.compiled
-        seen = np.empty((len(row), len(self.family.OBSERVED)))
-        stepping.observed(row, seen, *arguments)
+        seen = np.empty((len(row), len(self.plant.family.OBSERVED)))
+        self.stepping.observed(row, seen, *self.arguments)
         return seen
 
     def snapshot(self) -> np.ndarray:
@@ -183,15 +143,18 @@ class MujocoPhysics:
     @property
     def memory(self) -> np.ndarray:
         """What the disturbances remember beside the engine's own state, a live array; empty if nothing."""
-        return np.empty(0) if self._disturber is None else self._disturber.memory.reshape(-1)
+        return self._disturber.memory.reshape(-1)
 
 
-def wiring(model: mujoco.MjModel, name: str, actuator: ActuatorModel) -> Wiring:
-    """Where the numbers are of the actuator of a task's model that has a name."""
-    index = model.actuator(name).id
-    dof = model.jnt_dofadr[model.actuator_trnid[index, 0]]
-    address = max(int(model.actuator_actadr[index]), 0)
-    return Wiring(float(index), float(model.actuator_ctrladr[index]), float(address), float(dof), actuator.arm_radius)
+def wiring(model: mujoco.MjModel, plant: Plant) -> list[Wiring]:
+    """Where the numbers of a plant's actuators are in its model."""
+    found = []
+    for name, actuator in zip(plant.task.motors, plant.actuators, strict=True):
+        index = model.actuator(name).id
+        dof = model.jnt_dofadr[model.actuator_trnid[index, 0]]
+        control, first = float(model.actuator_ctrladr[index]), max(float(model.actuator_actadr[index]), 0.0)
+        found.append(Wiring(float(index), control, first, float(dof), actuator.arm_radius))
+    return found
 
 
 def _progression(entries: tuple[int, ...]) -> slice:
@@ -201,4 +164,4 @@ def _progression(entries: tuple[int, ...]) -> slice:
 
 
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-_VIEWS = ("model", "_qpos", "_qvel", "compiled", "scene")
+_VIEWS = ("model", "_qpos", "_qvel", "stepping", "arguments", "scene")

@@ -1,4 +1,4 @@
-"""Off-screen rendering of a MuJoCo model, with errors that say what to do."""
+"""Drawing a MuJoCo model: off-screen, with errors that say what to do; and what was drawn in a window."""
 
 import atexit
 import functools
@@ -10,6 +10,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from gymnasium.error import DependencyNotInstalled
 
 from codrl_mj.fields import did_you_mean
 
@@ -231,3 +232,29 @@ def _no_context(error: Exception) -> str:
         "install a software renderer (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri) and set MUJOCO_GL=egl "
         "before mujoco is first imported: in the shell, or by importing codrl_mj before mujoco"
     )
+
+
+class Window:
+    """Shows images one after another, no faster than a frame rate."""
+
+    def __init__(self, width: int, height: int) -> None:
+        """Open it, for images of a size [px]."""
+        try:
+            import pygame
+        except ImportError:
+            raise DependencyNotInstalled("render_mode = 'human' needs pygame: pip install pygame-ce") from None
+        self._pygame: Any = pygame
+        pygame.display.init()
+        self._screen = pygame.display.set_mode((width, height))
+        self._clock = pygame.time.Clock()
+
+    def show(self, image: np.ndarray, rate: float) -> None:
+        """Show an image (height, width, 3), uint8, at most at a rate [1/s]: waits as long as it must."""
+        self._screen.blit(self._pygame.surfarray.make_surface(image.swapaxes(0, 1)), (0, 0))
+        self._pygame.event.pump()
+        self._clock.tick(rate)
+        self._pygame.display.flip()
+
+    def close(self) -> None:
+        """Close it."""
+        self._pygame.display.quit()

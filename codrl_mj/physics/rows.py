@@ -74,7 +74,7 @@ def part(model: mujoco.MjModel, name: str) -> slice:
 
 def lane(physics: MujocoPhysics, data: mujoco.MjData, fields: Mapping[str, np.ndarray]) -> Lane:
     """The lane of other data, with a model of its own, for simulations like this one; the rows have these fields."""
-    _, _, settings, memory, trace = physics.compiled.arguments
+    _, _, settings, memory, trace = physics.arguments
     rows = [
         (_address(data.model, name), rows.ctypes.data, rows.strides[0], rows[0].nbytes) for name, rows in fields.items()
     ]

@@ -14,16 +14,17 @@ import numpy as np
 from numba import types
 from numba.extending import overload
 
-from codrl_mj.actuators import Family, Ideal
+from codrl_mj.actuators import Family
+from codrl_mj.disturbances import OFF
 from codrl_mj.engine.doors import user_of
 from codrl_mj.engine.families import HEAD, Slot, compiled_observe, load_family, signals_at
 from codrl_mj.engine.layout import DATA, MODEL
 from codrl_mj.engine.library import engine
 from codrl_mj.engine.memory import internal, on_stack, read
 from codrl_mj.kept import njit
-from codrl_mj.physics.constrain import Compiled, compiled_constrain, compiled_reader, is_fine
+from codrl_mj.physics.base import Plant
+from codrl_mj.physics.compiled_task import Compiled, compiled_constrain, compiled_reader, is_fine
 from codrl_mj.physics.disturber import KEY_COLUMN, compiled_disturbance, numbers_of
-from codrl_mj.tasks import Task
 
 TORQUE, NOISE_KEY = Slot._fields.index("torque"), Slot._fields.index("noise_key")
 
@@ -60,17 +61,13 @@ class Stepping(NamedTuple):
     """(row of trace (n, c), seen (n, k), *arguments) -> nothing: fills `seen` with what the sensors say at present."""
 
 
-def compiled_stepping(task: Task, family: Family, explicit: bool, disturbed: bool) -> Stepping:
-    """The functions for simulations of a task with actuators of a family; compiled as they are used, once a process.
-
-    Positions are moved by the old velocity if `explicit`, and there is a disturber if `disturbed`.
-    """
-    motorised = not issubclass(family, Ideal)
-    if motorised:
-        load_family(family)
-    return _stepping(
-        compiled_constrain(task), compiled_reader(task), task.qpos, task.qvel, explicit, disturbed, family, motorised
-    )
+def compiled_stepping(plant: Plant) -> Stepping:
+    """The functions for simulations of a plant; compiled as they are used, once a process."""
+    task, disturbed = plant.task, plant.disturbances != OFF
+    if plant.motorised:
+        load_family(plant.family)
+    kept, reader = compiled_constrain(task), compiled_reader(task)
+    return _stepping(kept, reader, task.qpos, task.qvel, plant.explicit, disturbed, plant.family, plant.motorised)
 
 
 def force_of(forces: Any, actuator: int) -> float:

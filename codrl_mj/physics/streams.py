@@ -1,6 +1,7 @@
 """Many NumPy generators drawn from at once, each exactly as if it were alone."""
 
 import ctypes
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -85,20 +86,15 @@ def set_words(generator: np.random.Generator, words: np.ndarray) -> None:
     }
 
 
-_fillers: dict[int, Any] = {}
-
-
-def _filler(next_double: int | None) -> Any:
+@functools.cache
+def _filler(next_double: int) -> Any:
     """A compiled function that fills rows from the generators at the given addresses."""
-    assert next_double is not None
-    if next_double not in _fillers:
-        draw = external("next_double", ctypes.c_void_p(next_double), types.float64(types.uintp))
+    draw = external("next_double", ctypes.c_void_p(next_double), types.float64(types.uintp))
 
-        @njit
-        def fill(addresses: np.ndarray, drawn: np.ndarray) -> None:
-            for row in range(len(addresses)):
-                for column in range(drawn.shape[1]):
-                    drawn[row, column] = draw(addresses[row])
+    @njit
+    def fill(addresses: np.ndarray, drawn: np.ndarray) -> None:
+        for row in range(len(addresses)):
+            for column in range(drawn.shape[1]):
+                drawn[row, column] = draw(addresses[row])
 
-        _fillers[next_double] = fill
-    return _fillers[next_double]
+    return fill

@@ -11,6 +11,7 @@ import numpy as np
 from codrl_mj.actuators import IDEAL, ActuatorModel
 from codrl_mj.disturbances import PLAIN, Joint
 from codrl_mj.engine.hill import GRAVITY
+from codrl_mj.physics.base import Plant
 from codrl_mj.physics.mjcf import hills, task_model
 from codrl_mj.tasks import TASKS
 
@@ -58,7 +59,7 @@ def mounts_of(model: mujoco.MjModel, index: int) -> tuple[Mount | None, ...]:
 @functools.cache
 def bare_model(task: str, joint: Joint = PLAIN) -> mujoco.MjModel:
     """The model of the task of a name, with nothing on its actuated joints but what is given; read only."""
-    return task_model(TASKS[task], (IDEAL,) * len(TASKS[task].motors), TASKS[task].step_duration, joint=joint)
+    return task_model(Plant(TASKS[task], (IDEAL,) * len(TASKS[task].motors), joint=joint))
 
 
 def without_motors(model: mujoco.MjModel, motors: Mapping[int, ActuatorModel]) -> mujoco.MjModel:
@@ -71,9 +72,10 @@ def without_motors(model: mujoco.MjModel, motors: Mapping[int, ActuatorModel]) -
     return bare
 
 
-def additions_of(motors: Sequence[Sequence[ActuatorModel]]) -> np.ndarray:
-    """What the motors of m simulations add to their joints, shape (m, n, 3), entries as in `JointAdditions`."""
-    return np.array([[one.additions for one in each] for each in motors])
+def mounting_of(motors: Sequence[Sequence[ActuatorModel]]) -> tuple[np.ndarray, np.ndarray]:
+    """The arms [m] of the motors of m simulations, (m, n), and their `JointAdditions`, (m, n, 3)."""
+    arms = np.array([[one.arm_radius for one in each] for each in motors])
+    return arms, np.array([[one.additions for one in each] for each in motors])
 
 
 def variable(model: mujoco.MjModel) -> tuple[str, ...]:
@@ -133,7 +135,7 @@ class Variation:
         """The varied fields of the model, by name (`opt.` before an option's), shape (m, ...).
 
         `values`, shape (m, k), has a column for each of `names`, NaN where it is as it was; `additions` are as
-        `additions_of` has them; `drawn` includes the fields that only what is drawn depends on.
+        `mounting_of` has them; `drawn` includes the fields that only what is drawn depends on.
         """
         fields = {
             field: np.repeat(nominal[np.newaxis], len(values), axis=0)

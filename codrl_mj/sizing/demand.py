@@ -163,7 +163,9 @@ def _gathered(source: str, env: EnvConfig, ran: list[Episode]) -> dict[str, Dema
             inertia, gravity = core.m * length**2 / 3.0 + env.joint.armature, core.m * core.g * length / 2.0
             swing = Swing(inertia, gravity, float(core.task.max_forces[0]), env.joint.damping, env.joint.friction)
         model = core.model
-        driven = list(motors(model)) or [model.actuator(name).id for name in made.get_wrapper_attr("recorder").motors]
+        driven = list(motors(model)) or [
+            model.actuator(name).id for name in made.get_wrapper_attr("recorder").motor_names
+        ]
     found = {}
     for number, index in enumerate(driven):
         name = ran[0].motors[number] if ran[0].motors else ""

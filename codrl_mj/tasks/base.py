@@ -47,7 +47,7 @@ class Task:
     A function of a state takes the state's entries, in Gymnasium's own order: `state[0]`, `state[1]` and so on, each a
     number, or an array with a number for each of N states (`states.T` of states (N, n)). What is the same for all
     states may be returned as a single number. These functions are plain Python that numba compiles as it stands
-    (`codrl_mj.envs.outcomes`); every face runs the compiled form.
+    (`codrl_mj.physics.compiled_task`); every face runs the compiled form.
 
     Raises:
         ValueError: a field is out of bounds, or a function, called once on plain numbers, does not return what others

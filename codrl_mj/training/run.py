@@ -80,12 +80,12 @@ def train(
     import torch
 
     importlib.import_module("matplotlib.figure")  # what is missing is missed now and not in the end
-    from codrl_mj.envs.sb3 import make_sb3_vec_env
+    from codrl_mj.envs.sb3 import ActuatedVecEnv
     from codrl_mj.training.watcher import LearningEnded, Watcher
 
     torch.set_num_threads(1)  # networks this small run several times slower on two
     with _taking(out, exists), stopping(signal.SIGINT, signal.SIGTERM) as stop:
-        envs = make_sb3_vec_env(config.env, config.num_envs)
+        envs = ActuatedVecEnv(config.env.world.vector(config.env, config.num_envs))
         with contextlib.closing(envs), _reporting_to(wandb, out, config):
             model = config.agent.make_model(envs, config.seed)
             watcher = Watcher(config, out, stop, on_progress, tensorboard)

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import Actuator, ActuatorModel, CurrentLoop, spectral_radius
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Plant
 from codrl_mj.tasks import Task, resolve_actuators
 
 NO_TWIN = "it rebuilds no environment of Gymnasium's: there is no second implementation of its mechanics"
@@ -38,10 +38,10 @@ def both(
 ) -> tuple[MujocoPhysics, AnalyticPhysics]:
     """The task in MuJoCo, and on Gymnasium's equations; `max_force` changes MuJoCo's limit of the desired force."""
     steps = task.steps_within(actuator, None, None)
-    limits = None if max_force is None else np.array([max_force])
+    limits = task.max_forces if max_force is None else np.array([max_force])
     return (
-        MujocoPhysics(task, [actuator], steps, integrator, limits),
-        AnalyticPhysics(task, [actuator], steps, integrator),
+        MujocoPhysics(Plant(task, [actuator], steps, integrator, limits)),
+        AnalyticPhysics(Plant(task, [actuator], steps, integrator)),
     )
 
 

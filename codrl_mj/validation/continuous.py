@@ -10,7 +10,7 @@ import numpy as np
 from scipy import integrate
 
 from codrl_mj.actuators import IDEAL, Actuator, ActuatorModel
-from codrl_mj.physics import install_callbacks
+from codrl_mj.physics import Plant, install_callbacks
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.tasks import Task
 
@@ -30,7 +30,7 @@ def equations_of(task: Task) -> tuple[Equations, str]:
 
 def engine_equations(task: Task) -> Equations:
     """The accelerations that MuJoCo's `mj_forward` finds, whatever its integrator makes of them."""
-    model = task_model(task, (IDEAL,) * len(task.motors), task.step_duration, np.full(len(task.motors), 1e9))
+    model = task_model(Plant(task, (IDEAL,) * len(task.motors), max_forces=np.full(len(task.motors), 1e9)))
     install_callbacks(model)
     data, qpos, qvel = mujoco.MjData(model), list(task.qpos), list(task.qvel)
     controls = [model.actuator_ctrladr[model.actuator(name).id] for name in task.motors]

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import IDEAL, Actuator, ActuatorModel, CurrentLoop, Motor
-from codrl_mj.physics import MujocoPhysics, SimulationDivergedError
+from codrl_mj.physics import MujocoPhysics, Plant, SimulationDivergedError
 from codrl_mj.tasks import OURS, Task, find_task
 from codrl_mj.validation.compare import NO_TWIN, actuators_of, forces_of, physics_of
 from codrl_mj.validation.continuous import equations_of, solve
@@ -47,7 +47,7 @@ def obstacle(task: Task) -> str:
         return ""
     start, forces, _ = free_run(task)
     free = dataclasses.replace(task, step_duration=task.step_duration / 16, constrain=None)
-    physics = MujocoPhysics(free, (IDEAL,) * len(task.motors), 1, task.integrators[0])
+    physics = MujocoPhysics(Plant(free, (IDEAL,) * len(task.motors)))
     physics.reset(start)
     for force in forces.repeat(16, axis=0):
         try:
@@ -68,7 +68,7 @@ def _states(
 ) -> np.ndarray:
     """Mechanical states after each environment step of the task's free run."""
     start, forces, _ = free_run(task)
-    physics = kind(task, actuators, inner_steps, integrator)
+    physics = kind(Plant(task, actuators, inner_steps, integrator))
     physics.reset(start)
     rows = []
     for force in forces:

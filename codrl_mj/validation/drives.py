@@ -21,7 +21,7 @@ from scipy.linalg import expm
 
 from codrl_mj.actuators import Drive, resolve
 from codrl_mj.catalogue import motor_names
-from codrl_mj.physics import MujocoPhysics, SimulationDivergedError
+from codrl_mj.physics import MujocoPhysics, Plant, SimulationDivergedError
 from codrl_mj.tasks import Task
 from codrl_mj.validation.compare import differences
 from codrl_mj.validation.continuous import gymnasium_equations
@@ -139,7 +139,7 @@ def fitted_run(task: Task, integrator: str, quick: bool) -> Iterator[Case]:
     longest = round((5e4 if quick else 5e5) / (task.step_duration * one.controller.sample_rate))
     steps = min(longest, task.max_episode_steps or longest, (task.trials and task.trials.horizon) or longest)
     timestep, state = task.step_duration / inner, task.initial(generator, None)
-    physics = MujocoPhysics(task, [one], inner, integrator)
+    physics = MujocoPhysics(Plant(task, [one], inner, integrator))
     physics.reset(state)
     bench, mechanics = Bench(one, timestep), Mechanics(task, one, timestep, integrator)
     gaps: list[np.ndarray] = []

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from codrl_mj.actuators import Actuator, ActuatorModel, Motor
-from codrl_mj.physics import hills, trace_names
+from codrl_mj.physics import Plant, hills, trace_names
 from codrl_mj.tasks import Task
 from codrl_mj.tasks.assets import asset_path
 from codrl_mj.validation.continuous import gymnasium_equations
@@ -119,7 +119,7 @@ def keep(
     """
     timestep = task.step_duration / inner_steps
     # an environment step of one integration step shows each of them, and leaves the motor as it is in between
-    physics = kind(dataclasses.replace(task, step_duration=timestep), actuators, 1, integrator)
+    physics = kind(Plant(dataclasses.replace(task, step_duration=timestep), actuators, 1, integrator))
     physics.reset(start)
     traces, states = [], [start]
     for desired in forces.repeat(inner_steps, axis=0):
@@ -127,7 +127,7 @@ def keep(
         traces.append(physics.trace[-1].T.copy())
         states.append(physics.state)
     columns = np.array(traces).swapaxes(0, 1)  # each of shape (steps, motors)
-    signals = dict(zip(trace_names(physics.family), columns, strict=True))
+    signals = dict(zip(trace_names(physics.plant.family), columns, strict=True))
     current, voltage, force = signals["current"], signals["voltage"], signals["actual_force"]
     current, state = np.vstack([np.zeros_like(current[:1]), current]), np.array(states)
 

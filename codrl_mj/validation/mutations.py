@@ -25,7 +25,7 @@ from codrl_mj.actuators import ActuatorModel, current_loop, drive
 from codrl_mj.engine import control
 from codrl_mj.engine.families import SLOT, replaced
 from codrl_mj.engine.hill import GRAVITY
-from codrl_mj.physics import MujocoPhysics, constrain, mjcf
+from codrl_mj.physics import MujocoPhysics, compiled_task, mjcf
 from codrl_mj.tasks import OURS, find_task
 from codrl_mj.validation.certificate import WITHOUT_TASK, unheard, validate
 from codrl_mj.validation.table import Check
@@ -195,17 +195,15 @@ def _stale_command() -> Fault:
 
 
 def _no_bounds() -> Fault:
-    return _everywhere("compiled_constrain", constrain.compiled_constrain, lambda *_, **__: None)
+    return _everywhere("compiled_constrain", compiled_task.compiled_constrain, lambda *_, **__: None)
 
 
 def _other_integrator() -> Fault:
     make = MujocoPhysics.__init__
 
-    def explicit(
-        self: Any, task: Any, actuators: Any, inner_steps: int, integrator: str, *more: Any, **named: Any
-    ) -> None:
-        other = "semi-implicit" if integrator == "euler" else "euler"
-        make(self, task, actuators, inner_steps, other, *more, **named)
+    def explicit(self: Any, plant: Any) -> None:
+        other = "semi-implicit" if plant.integrator == "euler" else "euler"
+        make(self, dataclasses.replace(plant, integrator=other))
 
     return mock.patch.object(MujocoPhysics, "__init__", explicit)
 

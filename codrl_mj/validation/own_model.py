@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from codrl_mj.actuators import Actuator, ActuatorModel, Ideal, spectral_radius
-from codrl_mj.physics import install_callbacks, motors
+from codrl_mj.physics import Plant, install_callbacks, motors
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.tasks import find_task, resolve_actuators
 from codrl_mj.validation import execution
@@ -128,7 +128,7 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     if not task.paper:
         yield Skipped("the paper's actuators", f"it has none: the {STAND_IN} is in their place", "motor", task.name)
     actuators = actuators_of(task) if task.actuator == "ideal" else resolve_actuators("default", task)
-    model = task_model(task, actuators, task.step_duration / task.motor_inner_steps)
+    model = task_model(Plant(task, actuators, task.motor_inner_steps))
     install_callbacks(model)
     yield from motor_checks(model, task.name, quick)
 

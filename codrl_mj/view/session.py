@@ -95,7 +95,7 @@ class Session:
     @property
     def motors(self) -> tuple[str, ...]:
         """Names of the motors."""
-        return tuple(self._recorder.motors)
+        return tuple(self._recorder.motor_names)
 
     @property
     def trace_names(self) -> tuple[str, ...]:
@@ -249,7 +249,7 @@ class Session:
         return any(self.data.warning[kind].number for kind in _DIVERGED)
 
     def _remember(self) -> None:
-        rows = self._recorder.trace()
+        rows = self._recorder.trace
         for row in rows:
             self.time += self.step_duration / len(rows)
             self.signals.append((self.time, row.copy()))

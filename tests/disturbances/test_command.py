@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from codrl_mj.disturbances import Disturbances
-from codrl_mj.disturbances.command import quantised, rate_limited, whole_and_fraction
+from codrl_mj.disturbances import Disturbances, quantised, rate_limited, whole_and_fraction
 from codrl_mj.physics.disturber import Disturber
 
 commands = st.lists(st.floats(-10, 10), min_size=1, max_size=30)

@@ -9,7 +9,7 @@ import pytest
 
 import codrl_mj
 from codrl_mj.cli import main
-from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint, resolve_disturbances, resolve_joint
+from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint, resolve
 from codrl_mj.envs.config import EnvConfig
 from tests.disturbances.everything import MOST, RUBBED
 
@@ -21,7 +21,7 @@ def test_everything_is_off_by_default_and_public():
     assert codrl_mj.Disturbances is Disturbances
     assert codrl_mj.Joint is Joint
     assert {*dataclasses.asdict(OFF).values(), *dataclasses.asdict(PLAIN).values()} == {0.0}
-    assert not any((OFF.of_command, OFF.random))
+    assert not OFF.random
     assert {*MOST} == {*FIELDS}
     assert {*RUBBED} == {*JOINT_FIELDS}
 
@@ -45,21 +45,21 @@ def test_pulses_need_a_duration_and_an_interval_and_these_need_pulses():
 
 
 def test_a_mapping_is_as_good_and_its_unknown_fields_are_refused():
-    assert resolve_disturbances(MOST) == Disturbances(**MOST)
-    assert resolve_disturbances(Disturbances(**MOST).as_mapping()) == Disturbances(**MOST)
-    assert resolve_disturbances(None) == OFF
+    assert resolve(MOST, OFF) == Disturbances(**MOST)
+    assert resolve(dataclasses.asdict(Disturbances(**MOST)), OFF) == Disturbances(**MOST)
+    assert resolve(None, OFF) == OFF
     with pytest.raises(
         ValueError, match=r"unknown field disturbances\.comand_delay; did you mean disturbances\.command_delay\?"
     ):
-        resolve_disturbances({"comand_delay": 1})
-    with pytest.raises(ValueError, match=r"disturbances = 3: must be a Disturbances or a mapping"):
-        resolve_disturbances(3)
-    assert resolve_joint(RUBBED) == resolve_joint(Joint(**RUBBED)) == Joint(**RUBBED)
-    assert resolve_joint(None) == PLAIN
+        resolve({"comand_delay": 1}, OFF)
+    with pytest.raises(ValueError, match=r"'disturbances' = 3: must be a mapping of Disturbances's fields"):
+        resolve(3, OFF)
+    assert resolve(RUBBED, PLAIN) == resolve(Joint(**RUBBED), PLAIN) == Joint(**RUBBED)
+    assert resolve(None, PLAIN) == PLAIN
     with pytest.raises(ValueError, match=r"unknown field joint\.frictoin; did you mean joint\.friction\?"):
-        resolve_joint({"frictoin": 1})
+        resolve({"frictoin": 1}, PLAIN)
     with pytest.raises(ValueError, match=r"'joint' = 3: must be a mapping of Joint's fields"):
-        resolve_joint(3)
+        resolve(3, PLAIN)
 
 
 REFUSED = {

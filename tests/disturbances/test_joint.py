@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 from codrl_mj.actuators import IDEAL
 from codrl_mj.disturbances import Joint
-from codrl_mj.physics import MujocoPhysics
+from codrl_mj.physics import MujocoPhysics, Plant
 from codrl_mj.tasks import TASKS
 from tests.tasks.faces import every_rebuilt
 
@@ -16,7 +16,7 @@ START = np.array([2.0, 1.0])
 
 
 def _pendulum(inner_steps, torque, **joint):
-    physics = MujocoPhysics(TASKS["pendulum"], [IDEAL], inner_steps, "semi-implicit", joint=Joint(**joint))
+    physics = MujocoPhysics(Plant(TASKS["pendulum"], [IDEAL], inner_steps, "semi-implicit", joint=Joint(**joint)))
     physics.reset(START)
     for _ in range(10):
         physics.step(torque)
@@ -51,7 +51,7 @@ def test_friction_is_a_constant_torque_against_the_motion():
 
 @pytest.mark.parametrize(("torque", "sticks"), [(0.9, True), (-0.9, True), (1.4, False)])
 def test_friction_holds_what_does_not_exceed_it(torque, sticks):
-    physics = MujocoPhysics(TASKS["pendulum"], [IDEAL], 10, "semi-implicit", joint=Joint(friction=1.0))
+    physics = MujocoPhysics(Plant(TASKS["pendulum"], [IDEAL], 10, "semi-implicit", joint=Joint(friction=1.0)))
     physics.reset(np.array([np.pi, 0.0]))
     for _ in range(40):
         physics.step(torque)
@@ -78,8 +78,8 @@ def test_the_solver_is_off_without_friction_and_starts_from_nothing_with_it():
 def test_the_explicit_integrator_stays_explicit():
     """CartPole: positions move by the old velocity, and damping is that of the old velocity: a force like any other."""
     damping, cartpole = 2.0, TASKS["cartpole"]
-    damped = MujocoPhysics(cartpole, [IDEAL], 1, "euler", np.array([1e6]), joint=Joint(damping=damping))
-    plain = MujocoPhysics(cartpole, [IDEAL], 1, "euler", np.array([1e6]))
+    damped = MujocoPhysics(Plant(cartpole, [IDEAL], 1, "euler", np.array([1e6]), joint=Joint(damping=damping)))
+    plain = MujocoPhysics(Plant(cartpole, [IDEAL], 1, "euler", np.array([1e6])))
     generator = np.random.default_rng(0)
     for _ in range(50):
         state, force = generator.normal(size=4), generator.normal() * 10
@@ -88,7 +88,7 @@ def test_the_explicit_integrator_stays_explicit():
         damped.step(force)
         plain.step(force - damping * state[1])
         np.testing.assert_allclose(damped.state, plain.state, rtol=1e-12, atol=1e-12)
-    rubbed = MujocoPhysics(cartpole, [IDEAL], 1, "euler", joint=Joint(damping=1.0, friction=1.0))
+    rubbed = MujocoPhysics(Plant(cartpole, [IDEAL], 1, "euler", joint=Joint(damping=1.0, friction=1.0)))
     rubbed.reset(state)
     rubbed.step(3.0)
     np.testing.assert_array_equal(rubbed.state[[0, 2]], state[[0, 2]] + 0.02 * state[[1, 3]])
@@ -97,7 +97,9 @@ def test_the_explicit_integrator_stays_explicit():
 @every_rebuilt
 def test_only_the_actuated_joint_is_rubbed(task):
     physics = MujocoPhysics(
-        TASKS[task], [IDEAL], 1, TASKS[task].integrators[0], joint=Joint(damping=0.5, friction=0.25, armature=0.125)
+        Plant(
+            TASKS[task], [IDEAL], 1, TASKS[task].integrators[0], joint=Joint(damping=0.5, friction=0.25, armature=0.125)
+        )
     )
     actuated = physics.model.actuator("motor").trnid[0]
     expected = np.where(np.arange(physics.model.nv) == actuated, 1.0, 0.0)
@@ -109,7 +111,7 @@ def test_only_the_actuated_joint_is_rubbed(task):
 def test_armature_is_an_inertia_of_the_joint():
     """From rest the pendulum turns by tau/(m l^2/3 + I) for a step of semi-implicit Euler, whatever gravity adds."""
     rotor, torque = 0.25, 1.5
-    physics = MujocoPhysics(TASKS["pendulum"], [IDEAL], 4, "semi-implicit", joint=Joint(armature=rotor))
+    physics = MujocoPhysics(Plant(TASKS["pendulum"], [IDEAL], 4, "semi-implicit", joint=Joint(armature=rotor)))
     physics.reset(np.zeros(2))
     physics.step(torque)
     timestep, speed, angle = 0.05 / 4, 0.0, 0.0

@@ -6,8 +6,7 @@ import pytest
 from scipy import stats
 
 from codrl_mj.actuators.noise import LARGEST_KEY
-from codrl_mj.disturbances import Disturbances
-from codrl_mj.disturbances.pulses import START
+from codrl_mj.disturbances import START, Disturbances
 from codrl_mj.physics.disturber import Disturber
 
 FORCE, DURATION, INTERVAL = 2.0, 0.33, 0.8

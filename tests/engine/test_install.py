@@ -5,7 +5,7 @@ import pytest
 
 from codrl_mj import engine
 from codrl_mj.actuators import IDEAL, Actuator
-from codrl_mj.physics import MujocoPhysics, trace_names
+from codrl_mj.physics import MujocoPhysics, Plant, trace_names
 from codrl_mj.tasks import TASKS
 
 pytestmark = pytest.mark.usefixtures("bare_engine")
@@ -84,14 +84,14 @@ def test_an_unknown_part_is_refused():
 
 
 def test_a_simulation_whose_callback_was_replaced_says_so_at_the_next_episode():
-    physics = MujocoPhysics(TASKS["cartpole"], [Actuator()], 1, "euler")
+    physics = MujocoPhysics(Plant(TASKS["cartpole"], [Actuator()], 1, "euler"))
     mujoco.set_mjcb_control(FOREIGN["control"])
     with pytest.raises(engine.CallbackInUseError):
         physics.reset(physics.state)
 
 
 def test_a_simulation_whose_callback_was_removed_works_again_at_the_next_episode():
-    physics = MujocoPhysics(TASKS["cartpole"], [Actuator()], 1, "euler")
+    physics = MujocoPhysics(Plant(TASKS["cartpole"], [Actuator()], 1, "euler"))
     engine.uninstall()
     physics.reset(physics.state)
     physics.step(5.0)
@@ -100,6 +100,6 @@ def test_a_simulation_whose_callback_was_removed_works_again_at_the_next_episode
 
 def test_an_ideal_actuator_needs_no_callback():
     mujoco.set_mjcb_act_bias(FOREIGN["act_bias"])
-    physics = MujocoPhysics(TASKS["cartpole"], [IDEAL], 1, "euler")
+    physics = MujocoPhysics(Plant(TASKS["cartpole"], [IDEAL], 1, "euler"))
     physics.step(10.0)
     assert physics.state[1] > 0.0

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from codrl_mj import make_sb3_vec_env, suite
-from codrl_mj.physics.registry import PHYSICS
+from codrl_mj.physics import PHYSICS
 
 SEEDS = range(20)
 

@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor
-from codrl_mj.physics.registry import PHYSICS
+from codrl_mj.physics import PHYSICS
 from codrl_mj.tasks import TASKS
 from codrl_mj.tasks.assets import asset_path
 from tests.engine.models import FULL, changed
@@ -45,7 +45,7 @@ def make(task, command="force", **options):
 
 def commanded(env, action):
     """The current or voltage that an action stands for."""
-    levels = env.unwrapped.setup.commands.levels
+    levels = env.unwrapped.setup.config.levels
     return float(action[0]) if levels is None else float(levels[action])
 
 
@@ -137,7 +137,7 @@ def test_a_voltage_drives_the_winding_and_that_the_task(task, physics):
         for _ in range(inner):
             current = winding(motor, dt, loop.substeps, loop.max_voltage, current, voltage, state[SPEED[task]])
             force = motor.torque_constant * current / motor.arm_radius
-            state = np.array(driver(state, force, dt, env.setup.integrator))
+            state = np.array(driver(state, force, dt, env.setup.plant.integrator))
         info = env.step(action)[-1]
         np.testing.assert_allclose(env.state, state, rtol=0, atol=1e-12)
         assert info["current"] == pytest.approx(current, rel=0, abs=1e-12)
@@ -409,7 +409,7 @@ def test_observed_currents_are_those_of_the_info_and_zero_at_the_start(task, com
     assert space.dtype == np.float32
     np.testing.assert_array_equal(space.low, [*plain.low, -np.inf, -np.inf])
     np.testing.assert_array_equal(space.high, [*plain.high, np.inf, np.inf])
-    assert env.unwrapped.setup.view.observation_names == (
+    assert env.unwrapped.setup.observation_names == (
         *TASKS[task].observation_names,
         "current",
         "reference_current",
@@ -516,4 +516,4 @@ def test_the_default_command_is_the_force():
         env = gymnasium.make(TASKS[task].env_id)
         assert env.action_space == TASKS[task].action_space
         assert env.observation_space == TASKS[task].observation_space
-        assert env.unwrapped.setup.commands.name == "force"
+        assert env.unwrapped.setup.config.action == "force"

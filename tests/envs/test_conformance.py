@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 from codrl_mj.actuators import NAMED
-from codrl_mj.physics.registry import PHYSICS
+from codrl_mj.physics import PHYSICS
 from codrl_mj.tasks import TASKS
 from tests.reference import MotorSimulation
 from tests.tasks.faces import every_rebuilt

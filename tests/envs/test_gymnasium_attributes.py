@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from codrl_mj.envs.distributions import Uniform
+from codrl_mj.physics import PHYSICS
 from codrl_mj.physics.analytic import AnalyticPhysics
-from codrl_mj.physics.registry import PHYSICS
 from codrl_mj.tasks import TASKS
 from tests.tasks.faces import every_rebuilt
 

@@ -8,8 +8,7 @@ import pytest
 
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.physics import SimulationDivergedError
-from codrl_mj.physics.registry import PHYSICS
+from codrl_mj.physics import PHYSICS, SimulationDivergedError
 from codrl_mj.tasks import TASKS
 
 UNSTABLE = Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=100.0, max_voltage=float("inf")))

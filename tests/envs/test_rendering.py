@@ -13,9 +13,8 @@ import pytest
 from gymnasium.error import DependencyNotInstalled
 
 from codrl_mj.envs.single import ActuatedEnv
-from codrl_mj.envs.window import Window
-from codrl_mj.physics.offscreen import OffscreenRenderer
-from codrl_mj.physics.registry import PHYSICS
+from codrl_mj.physics import PHYSICS
+from codrl_mj.physics.offscreen import OffscreenRenderer, Window
 from codrl_mj.tasks import TASKS
 from tests.tasks.faces import every_rebuilt
 

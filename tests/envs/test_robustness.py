@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor, spectral_radius
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.physics import SimulationDivergedError
-from codrl_mj.physics.registry import PHYSICS
+from codrl_mj.physics import PHYSICS, SimulationDivergedError
 from codrl_mj.tasks import TASKS
 from tests.actuators.strategies import between, zero_or
 from tests.matrix import but

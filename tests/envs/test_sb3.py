@@ -209,7 +209,10 @@ def test_a_pickled_one_continues():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"env_id": "Pendulum-v1"}, "env_id = 'Pendulum-v1': must be one of codrl_mj/Pendulum-v0"),
+        (
+            {"env_id": "Pendulum-v1"},
+            "Pendulum-v1: the environment has no MuJoCo model .* take 'pendulum', our task of it",
+        ),
         ({"env_id": "codrl_mj/Pendulum-v0", "num_envs": 0}, "num_envs = 0"),
         ({"env_id": "codrl_mj/Pendulum-v0", "num_envs": 0, "physics": "analytic"}, "num_envs = 0"),
         ({"env_id": "codrl_mj/Pendulum-v0", "physics": "newton"}, "unknown physics 'newton'"),
@@ -220,8 +223,9 @@ def test_bad_arguments_are_refused(arguments, message):
         codrl_mj.make_sb3_vec_env(**arguments)
 
 
-def test_it_is_a_vec_env_of_the_registered_limit():
-    env = batched("pendulum", 2)
+@pytest.mark.parametrize("name", ["codrl_mj/Pendulum-v0", "pendulum"])
+def test_it_is_a_vec_env_of_the_registered_limit(name):
+    env = codrl_mj.make_sb3_vec_env(name, 2)
     assert isinstance(env, ActuatedVecEnv)
     assert env.num_envs == 2
     env.reset()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.physics.registry import PHYSICS
+from codrl_mj.physics import PHYSICS
 from codrl_mj.tasks import TASKS
 from tests.engine.models import FULL, changed
 from tests.reference import MotorSimulation
@@ -51,7 +51,7 @@ def _episode(task, physics, actuator):
         desired = desired_force(task, action)
         for _ in range(env.task.motor_inner_steps):
             delivered = motor.step(dt, desired, state[SPEED[task]])
-            state = np.array(driver(state, delivered, dt, env.setup.integrator))
+            state = np.array(driver(state, delivered, dt, env.setup.plant.integrator))
         found.append([*env.state, info["actual_force"], info["current"], info["voltage"]])
         expected.append([*state, delivered, motor.current, motor.voltage])
     return np.array(found), np.array(expected)

@@ -1,14 +1,12 @@
 """A physics of one's own: MuJoCo's, with time running at half its pace."""
 
-from typing import Any
-
-from codrl_mj.physics import MujocoPhysics
+from codrl_mj.physics import MujocoPhysics, Plant
 
 
 class SlowMotion(MujocoPhysics):
     """As MuJoCo's, with integration steps of half the length."""
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
+    def __init__(self, plant: Plant) -> None:
         """Make the simulation, and halve its step."""
-        super().__init__(*arguments, **options)
+        super().__init__(plant)
         self.model.opt.timestep /= 2

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from codrl_mj.actuators import IDEAL, Actuator, Inputs
-from codrl_mj.physics import SimulationDivergedError
+from codrl_mj.physics import PHYSICS, Plant, SimulationDivergedError
 from codrl_mj.physics.base import check_finite
-from codrl_mj.physics.registry import PHYSICS
 from codrl_mj.tasks import TASKS
 
 
@@ -77,7 +76,7 @@ def test_divergence_names_every_broken_entry_and_the_time(task, bad):
 
 @pytest.mark.parametrize("name", PHYSICS)
 def test_every_physics_checks_its_present_state_and_lets_no_fields_be_set(name):
-    physics = PHYSICS[name](TASKS["pendulum"], [IDEAL], 1, "semi-implicit")
+    physics = PHYSICS[name](Plant(TASKS["pendulum"], [IDEAL], 1, "semi-implicit"))
     physics.reset(np.array([0.3, 0.1]))
     physics.check_finite()
     physics.set_model({})
@@ -87,7 +86,7 @@ def test_every_physics_checks_its_present_state_and_lets_no_fields_be_set(name):
 
 
 def test_the_analytic_physics_refuses_fields_of_a_model_and_names_them():
-    physics = PHYSICS["analytic"](TASKS["pendulum"], [IDEAL], 1, "semi-implicit")
+    physics = PHYSICS["analytic"](Plant(TASKS["pendulum"], [IDEAL], 1, "semi-implicit"))
     with pytest.raises(ValueError, match=r"fields = body_mass, .*: they are a MuJoCo model's, which .*use 'mujoco'"):
         physics.set_model({"body_mass": np.ones((1, 2)), "body_ipos": np.zeros((1, 2, 3))})
 

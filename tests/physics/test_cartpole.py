@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from codrl_mj.actuators import IDEAL, NAMED, Actuator, CurrentLoop, Motor
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError, motors, trace_names
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Plant, SimulationDivergedError, motors, trace_names
 from codrl_mj.tasks import TASKS, named_actuator
 from codrl_mj.tasks.assets import asset_path
 from tests.reference import MotorSimulation
@@ -33,7 +33,7 @@ def _gymnasium_step(env, state, force):
 def _step(physics, force):
     """Step, and say what the actuator did."""
     physics.step(force)
-    return SimpleNamespace(**dict(zip(trace_names(physics.family), physics.trace[-1, 0].tolist(), strict=True)))
+    return SimpleNamespace(**dict(zip(trace_names(physics.plant.family), physics.trace[-1, 0].tolist(), strict=True)))
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
@@ -42,7 +42,7 @@ def test_one_step_is_gymnasiums_from_ten_thousand_states_under_as_many_forces(in
     high = np.array([2.4, 5.0, np.pi, 10.0])
     states = generator.uniform(-high, high, (10_000, 4))
     forces = generator.uniform(-10.0, 10.0, 10_000)
-    physics, env = MujocoPhysics(TASK, [IDEAL], 1, integrator), _gymnasium(integrator)
+    physics, env = MujocoPhysics(Plant(TASK, [IDEAL], 1, integrator)), _gymnasium(integrator)
     found, expected = np.empty_like(states), np.empty_like(states)
     for index, (state, force) in enumerate(zip(states, forces, strict=True)):
         physics.reset(state)
@@ -56,7 +56,7 @@ def test_one_step_is_gymnasiums_from_ten_thousand_states_under_as_many_forces(in
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_the_two_integrators_are_not_the_same(integrator):
     other = INTEGRATORS[1 - INTEGRATORS.index(integrator)]
-    one, two = MujocoPhysics(TASK, [IDEAL], 1, integrator), MujocoPhysics(TASK, [IDEAL], 1, other)
+    one, two = MujocoPhysics(Plant(TASK, [IDEAL], 1, integrator)), MujocoPhysics(Plant(TASK, [IDEAL], 1, other))
     for physics in (one, two):
         physics.reset(np.array([0.0, 0.0, 0.1, 0.0]))
         physics.step(10.0)
@@ -66,7 +66,7 @@ def test_the_two_integrators_are_not_the_same(integrator):
 @pytest.mark.parametrize("physics", [MujocoPhysics, AnalyticPhysics])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_inner_steps_are_gymnasium_steps_of_a_fraction_of_the_time(physics, integrator):
-    simulation, env = physics(TASK, [IDEAL], 5, integrator), _gymnasium(integrator, 0.004)
+    simulation, env = physics(Plant(TASK, [IDEAL], 5, integrator)), _gymnasium(integrator, 0.004)
     state = np.array([0.1, -0.2, 0.05, 0.3])
     simulation.reset(state)
     for force in np.random.default_rng(1).uniform(-10, 10, 50):
@@ -83,7 +83,7 @@ def test_inner_steps_are_gymnasium_steps_of_a_fraction_of_the_time(physics, inte
 def test_the_motor_in_the_loop_is_the_reference_driving_gymnasium(physics, integrator, inner_steps, name):
     """The whole chain by hand: the reference motor turns desired into delivered force, Gymnasium moves."""
     actuator = named_actuator(name, "cartpole")
-    simulation = physics(TASK, [actuator], inner_steps, integrator)
+    simulation = physics(Plant(TASK, [actuator], inner_steps, integrator))
     env, motor = _gymnasium(integrator, 0.02 / inner_steps), MotorSimulation(actuator)
     state = np.array([0.01, -0.02, 0.03, 0.04])
     simulation.reset(state)
@@ -116,7 +116,7 @@ def _linear(state, generator):
 
 def episode_errors(actuator, policy, integrator="euler", inner_steps=1, steps=500, seed=0):
     """Largest distance between both physics over an episode that no end interrupts; each acts on its own state."""
-    both = [kind(TASK, [actuator], inner_steps, integrator) for kind in (MujocoPhysics, AnalyticPhysics)]
+    both = [kind(Plant(TASK, [actuator], inner_steps, integrator)) for kind in (MujocoPhysics, AnalyticPhysics)]
     start, worst = np.random.default_rng(seed).uniform(-0.05, 0.05, 4), 0.0
     generators = [np.random.default_rng(seed) for _ in both]
     for physics in both:
@@ -148,7 +148,7 @@ def test_both_physics_agree_with_inner_steps(integrator, inner_steps):
 def test_saturation_is_reported():
     actuator = Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=4.3, max_voltage=2.0))
     for kind in (MujocoPhysics, AnalyticPhysics):
-        physics = kind(TASK, [actuator], 1, "euler")
+        physics = kind(Plant(TASK, [actuator], 1, "euler"))
         physics.reset(np.zeros(4))
         first = _step(physics, 10.0)
         assert first.saturated
@@ -194,7 +194,7 @@ def test_a_diverging_simulation_is_reported_with_task_time_and_entry_and_works_a
     kind, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)  # the engine writes a log
-    physics = kind(TASK, [UNSTABLE], 1, "euler")
+    physics = kind(Plant(TASK, [UNSTABLE], 1, "euler"))
     physics.reset(np.zeros(4))
 
     def run():

@@ -13,7 +13,7 @@ from codrl_mj import engine
 from codrl_mj.actuators import IDEAL, Actuator, CurrentLoop, JointAdditions, Lag, Motor, parameters_type
 from codrl_mj.disturbances import Joint
 from codrl_mj.engine.families import HEAD, Slot, signals_at, slot_size, user_head
-from codrl_mj.physics import motors
+from codrl_mj.physics import Plant, motors
 from codrl_mj.physics.mjcf import drive, task_model
 from codrl_mj.tasks import TASKS
 from tests.actuators.strategies import actuators, every_actuator, of_every_family
@@ -194,7 +194,7 @@ def test_a_family_that_nobody_knows_is_refused_with_the_remedy():
 def test_what_actuator_and_environment_add_to_the_joint_is_summed_there_alone(task):
     definition = TASKS[task]
     plain, added = (
-        task_model(definition, (actuator,), 0.01, joint=joint)
+        task_model(Plant(definition, (actuator,), joint=joint))
         for actuator, joint in ((Lag(), Joint()), (_Heavy(), Joint(damping=0.5, friction=0.25, armature=0.125)))
     )
     dof = np.arange(plain.nv) == plain.jnt_dofadr[plain.actuator("motor").trnid[0]]

@@ -5,7 +5,7 @@ import pytest
 
 from codrl_mj.actuators import Actuator, CurrentLoop, Inputs, Motor, Supply, parameters_type
 from codrl_mj.disturbances import Disturbances
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, trace_names
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Plant, trace_names
 from codrl_mj.tasks import TASKS, named_actuator
 from tests.tasks.faces import every_rebuilt
 
@@ -17,13 +17,13 @@ STEPS = 20
 def _physics(kind, task, actuator="paper", **more):
     definition = TASKS[task]
     inner_steps = max(3, definition.motor_inner_steps)
-    physics = kind(definition, [named_actuator(actuator, task)], inner_steps, definition.integrators[0], **more)
+    physics = kind(Plant(definition, [named_actuator(actuator, task)], inner_steps, **more))
     physics.reset(np.full(len(definition.state_names), 0.05))
     return physics
 
 
 def _traces(physics, seed=0):
-    forces = np.random.default_rng(seed).uniform(-1, 1, STEPS) * physics.task.max_force
+    forces = np.random.default_rng(seed).uniform(-1, 1, STEPS) * physics.plant.task.max_force
     return forces, np.array([(physics.step(float(force)), physics.trace[:, 0].copy())[1] for force in forces])
 
 
@@ -33,15 +33,15 @@ def test_every_row_follows_from_the_row_before_by_the_loops_own_equations(kind, 
     physics = _physics(kind, task)
     speed_at_start = 0.05
     forces, traces = _traces(physics)
-    assert trace_names(physics.family) == (
+    assert trace_names(physics.plant.family) == (
         *("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated", "speed"),
     )
     actuator = named_actuator("paper", task)
     parameters = parameters_type(Actuator)(*actuator.numbers)
-    arm, timestep = actuator.motor.arm_radius, physics.task.step_duration / physics.inner_steps
+    arm, timestep = actuator.motor.arm_radius, physics.plant.task.step_duration / physics.plant.inner_steps
     loop, speed = Actuator.State(0.0, 0.0, 0.0), speed_at_start
     for force, trace in zip(forces, traces, strict=True):
-        assert trace.shape == (physics.inner_steps, 7)
+        assert trace.shape == (physics.plant.inner_steps, 7)
         for row in trace:
             inputs = Inputs(force * arm, 0.0, speed / arm, 0.0, 0.0)
             loop, _, signals = actuator.advance(parameters, timestep, loop, inputs)
@@ -57,9 +57,9 @@ def test_every_row_follows_from_the_row_before_by_the_loops_own_equations(kind, 
 def test_the_last_row_is_what_the_engine_says_of_the_steps_end(task, actuator):
     physics = _physics(MujocoPhysics, task, actuator)
     for _ in range(STEPS):
-        physics.step(0.5 * physics.task.max_force)
+        physics.step(0.5 * physics.plant.task.max_force)
         last, dof = physics.trace[-1, 0], physics.model.actuator("motor").trnid[0]
-        assert last[DESIRED] == 0.5 * physics.task.max_force
+        assert last[DESIRED] == 0.5 * physics.plant.task.max_force
         np.testing.assert_allclose(last[ACTUAL], physics.data.qfrc_actuator[dof], rtol=1e-14)
         assert last[SPEED] == physics.data.qvel[dof]
         if actuator == "ideal":
@@ -89,7 +89,7 @@ def test_the_integration_steps_are_marked_in_which_the_voltage_is_at_its_sagging
     task, limit, supply_resistance = TASKS["cartpole"], 2.0, 0.8
     loop = CurrentLoop(kp=2.0, max_voltage=limit)
     actuator = Actuator(Motor(arm_radius=0.15), loop, Supply(resistance=supply_resistance))
-    physics = kind(task, [actuator], 3, "euler")
+    physics = kind(Plant(task, [actuator], 3, "euler"))
     _, traces = _traces(physics)
     rows = traces.reshape(-1, traces.shape[-1])
     before = np.append(0.0, rows[:-1, CURRENT])  # the supply sags by the current at the step's start

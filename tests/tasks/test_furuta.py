@@ -17,7 +17,7 @@ from codrl_mj.actuators import IDEAL, NAMED, Drive
 from codrl_mj.catalogue import motor_entry
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes, summarize
-from codrl_mj.physics import MujocoPhysics
+from codrl_mj.physics import MujocoPhysics, Plant
 from codrl_mj.sizing.scripted import Scripted, StateObserved
 from codrl_mj.tasks import TASKS, resolve_actuators
 from codrl_mj.tasks.furuta import MAX_TORQUE, Twin
@@ -88,7 +88,7 @@ def off(found, expected):
 
 @every_actuator
 def test_the_engines_accelerations_are_lagranges(actuator):
-    physics = MujocoPhysics(TASK, resolve_actuators(actuator, TASK), 10, "rk4")
+    physics = MujocoPhysics(Plant(TASK, resolve_actuators(actuator, TASK), 10, "rk4"))
     model, data = physics.model, mujoco.MjData(physics.model)
     hub = NUMBERS["hub"] + (ROTOR if actuator == "default" else 0.0)
     generator = np.random.default_rng(1)
@@ -121,7 +121,7 @@ def test_a_number_that_is_set_is_lagranges(name, value):
 
 def test_energy_is_kept_over_an_episode_without_damping():
     """As `docs/environments/furuta.md` says: 1e-7 of what lifts the rod, 1 % with one integration step a step."""
-    physics = {count: MujocoPhysics(TASK, [IDEAL], count, "rk4") for count in (10, 1)}
+    physics = {count: MujocoPhysics(Plant(TASK, [IDEAL], count, "rk4")) for count in (10, 1)}
     lost = {}
     for count, each in physics.items():
         each.model.dof_damping[:] = 0.0
@@ -146,8 +146,8 @@ def test_its_own_actuator_is_the_motor_of_the_catalogue_at_every_door():
     assert motor.motor.torque_constant * motor.controller.max_current == pytest.approx(MAX_TORQUE)
     assert EnvConfig("furuta").actuator == motor
     assert gymnasium.make(TASK.env_id).unwrapped.actuator == motor
-    assert batched("furuta", 2).unwrapped.setup.actuator == motor
-    assert make_sb3_vec_env(TASK.env_id, 2).env.setup.actuator == motor
+    assert batched("furuta", 2).unwrapped.setup.config.actuator == motor
+    assert make_sb3_vec_env(TASK.env_id, 2).env.setup.config.actuator == motor
     weaker = EnvConfig("furuta", {"name": "default", "supply": {"voltage": 10.0}}).actuator
     assert (weaker.supply.voltage, weaker.motor) == (10.0, motor.motor)
     assert EnvConfig("pendulum").actuator == EnvConfig("pendulum", "paper").actuator

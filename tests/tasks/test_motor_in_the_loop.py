@@ -8,7 +8,7 @@ import mujoco.batch
 import numpy as np
 import pytest
 
-from codrl_mj.physics import MujocoPhysics, install_callbacks, motors
+from codrl_mj.physics import MujocoPhysics, Plant, install_callbacks, motors
 from codrl_mj.tasks import TASKS
 from codrl_mj.tasks.assets import asset_path
 from tests.tasks.faces import NEW, actions, every_rebuilt, ours
@@ -76,7 +76,9 @@ def test_the_stored_model_opens_without_us(task, bare_engine):
 def test_a_batch_is_bit_identical_to_a_loop(task):
     """Every simulation with its own start and control; RK4 (Acrobot) and the hill (mountain cars) included."""
     definition, simulations, steps = TASKS[task], 16, 200
-    model = MujocoPhysics(definition, definition.paper, definition.motor_inner_steps, definition.integrators[0]).model
+    model = MujocoPhysics(
+        Plant(definition, definition.paper, definition.motor_inner_steps, definition.integrators[0])
+    ).model
     install_callbacks(model)
     generator = np.random.default_rng(0)
     starts = np.array([definition.initial(generator, None) for _ in range(simulations)])

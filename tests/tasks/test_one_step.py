@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from codrl_mj.actuators import IDEAL
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics
-from codrl_mj.physics.constrain import compiled_constrain
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Plant
+from codrl_mj.physics.compiled_task import compiled_constrain
 from codrl_mj.tasks import TASKS
 from tests.tasks.faces import NEW, SPEED_LIMITED, actions, desired_force, gymnasiums, random_states
 
@@ -17,7 +17,7 @@ COUNT = 10_000
 def _largest_error(task, inner_steps, states, forces):
     definition = TASKS[task]
     arguments = definition, [IDEAL], inner_steps, definition.integrators[0]
-    simulated, analytic = MujocoPhysics(*arguments), AnalyticPhysics(*arguments)
+    simulated, analytic = MujocoPhysics(Plant(*arguments)), AnalyticPhysics(Plant(*arguments))
     largest = 0.0
     for state, force in zip(states, forces, strict=True):
         for physics in (simulated, analytic):
@@ -61,7 +61,7 @@ def test_actions_of_an_untouched_environment(task):
     if task == "acrobot":
         states *= [1, 1, 0.75, 0.75]
     definition, reference = TASKS[task], gymnasiums(task).unwrapped
-    physics = MujocoPhysics(definition, [IDEAL], 1, definition.integrators[0])
+    physics = MujocoPhysics(Plant(definition, [IDEAL], 1, definition.integrators[0]))
     reference.reset(seed=0)
     for state, action in zip(states, actions(task, 4, COUNT), strict=True):
         physics.reset(state)
@@ -74,7 +74,7 @@ def test_actions_of_an_untouched_environment(task):
 def test_the_continuous_mountain_car_to_the_precision_that_gymnasium_keeps():
     task = "mountain_car_continuous"
     definition, reference = TASKS[task], gymnasiums(task).unwrapped
-    physics = MujocoPhysics(definition, [IDEAL], 1, definition.integrators[0])
+    physics = MujocoPhysics(Plant(definition, [IDEAL], 1, definition.integrators[0]))
     reference.reset(seed=0)
     for state, action in zip(random_states(task, 5, COUNT), actions(task, 6, COUNT), strict=True):
         physics.reset(state)
@@ -91,8 +91,8 @@ def test_the_random_states_reach_every_bound(task):
     _, high = np.array(SPEED_LIMITED[task])
     assert (random_states(task, 0, 1000).max(axis=0) > 0.9 * high).all()
     unbounded = dataclasses.replace(definition, constrain=None)
-    physics = MujocoPhysics(unbounded, [IDEAL], 1, definition.integrators[0])
-    analytic = AnalyticPhysics(definition, [IDEAL], 1, definition.integrators[0])
+    physics = MujocoPhysics(Plant(unbounded, [IDEAL], 1, definition.integrators[0]))
+    analytic = AnalyticPhysics(Plant(definition, [IDEAL], 1, definition.integrators[0]))
     different = 0
     for state in random_states(task, 0, 1000):
         for one in (physics, analytic):
@@ -114,7 +114,7 @@ def test_the_random_states_reach_every_bound(task):
 def test_walls(task, inner_steps, state, expected):
     definition = TASKS[task]
     one = dataclasses.replace(definition, step_duration=definition.step_duration / inner_steps)
-    physics = MujocoPhysics(one, [IDEAL], 1, "semi-implicit")
+    physics = MujocoPhysics(Plant(one, [IDEAL], 1, "semi-implicit"))
     physics.reset(np.array(state))
     for _ in range(inner_steps):
         physics.step(np.sign(state[1]) * definition.max_force)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from codrl_mj.actuators import IDEAL
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Plant
 from codrl_mj.tasks import TASKS
 from codrl_mj.validation import convergence
 from codrl_mj.validation.continuous import gymnasium_equations, solve
@@ -131,7 +131,7 @@ def test_the_equations_are_the_textbooks():
 def test_acrobots_equations_are_the_limit_of_its_steps():
     task = TASKS["acrobot"]
     equations, state = gymnasium_equations(task), np.array([0.3, -0.7, 0.9, -1.1])
-    physics = AnalyticPhysics(dataclasses.replace(task, step_duration=1e-4), [IDEAL], 1, "rk4")
+    physics = AnalyticPhysics(Plant(dataclasses.replace(task, step_duration=1e-4), [IDEAL], 1, "rk4"))
     physics.reset(state)
     physics.step(1.0)
     np.testing.assert_allclose((physics.state - state) / 1e-4, equations(state, 1.0), rtol=0, atol=2e-3)
@@ -146,7 +146,7 @@ def test_the_runs_stay_away_from_every_bound(task, motor):
     actuators = convergence.analogues(definition) if motor else [IDEAL]
     states = [*solve(definition, gymnasium_equations(definition), start, forces, actuators)]
     unbounded = dataclasses.replace(definition, step_duration=definition.step_duration / 128, constrain=None)
-    physics = MujocoPhysics(unbounded, actuators, 1, definition.integrators[0])
+    physics = MujocoPhysics(Plant(unbounded, actuators, 1, definition.integrators[0]))
     physics.reset(start)
     for force in forces:
         for _ in range(128):

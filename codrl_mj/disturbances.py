@@ -1,10 +1,16 @@
-"""The description of an environment's disturbances: one frozen dataclass, every field off by default."""
+"""What lies between the agent's command and the joint besides the actuator: its description, and pure functions.
+
+These are plain Python on purpose: `codrl_mj.physics.disturber` compiles them.
+"""
 
 import dataclasses
-from collections.abc import Mapping
+import math
 from typing import Any
 
+import numpy as np
+
 from codrl_mj import fields
+from codrl_mj.actuators.noise import LOAD_STREAM, philox, unit
 from codrl_mj.fields import real
 
 
@@ -49,40 +55,13 @@ class Disturbances:
                 raise ValueError(f"Disturbances.{name} = {value:g}: there are no pulses: give pulse_force > 0")
 
     @property
-    def of_command(self) -> bool:
-        """Whether the command is changed on its way."""
-        return bool(self.command_delay or self.command_quantum or self.command_rate)
-
-    @property
     def random(self) -> bool:
         """Whether an episode needs a key for its random numbers."""
         return bool(self.pulse_force)
 
-    def as_mapping(self) -> dict[str, float]:
-        """The fields by name, JSON-serialisable."""
-        return dataclasses.asdict(self)
-
 
 OFF = Disturbances()
 """No disturbances."""
-
-
-def resolve_disturbances(disturbances: "Disturbances | Mapping[str, Any] | None") -> Disturbances:
-    """Turn whatever a user may write for disturbances into `Disturbances`.
-
-    Args:
-        disturbances: the description, a mapping of its fields, or None for none.
-
-    Raises:
-        ValueError: an unknown field (the nearest known one is suggested) or a value out of bounds.
-    """
-    if disturbances is None:
-        return OFF
-    if isinstance(disturbances, Disturbances):
-        return disturbances
-    if not isinstance(disturbances, Mapping):
-        raise ValueError(f"disturbances = {disturbances!r}: must be a Disturbances or a mapping of its fields")
-    return fields.build(Disturbances, disturbances, "field", "disturbances.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,12 +88,73 @@ PLAIN = Joint()
 """Nothing added."""
 
 
-def resolve_joint(joint: "Joint | Mapping[str, Any] | None") -> Joint:
-    """Turn whatever a user may write for a joint into a `Joint`.
+def resolve(given: Any, absent: Any) -> Any:
+    """What a user wrote for `Disturbances` or for a `Joint`: one, or a mapping of its fields; None is for `absent`.
+
+    Args:
+        given: what was written.
+        absent: `OFF` or `PLAIN`.
 
     Raises:
         ValueError: an unknown field (the nearest known one is suggested) or a value out of bounds.
     """
-    if joint is None or isinstance(joint, Joint):
-        return joint or PLAIN
-    return fields.build(Joint, joint, "field", "joint.")
+    if given is None or isinstance(given, type(absent)):
+        return absent if given is None else given
+    return fields.build(type(absent), given, "field", f"{type(absent).__name__.lower()}.")
+
+
+_NEAR = 1e-9  # of an integration step: nearer to a whole number of steps is that number
+
+
+def whole_and_fraction(delay: float, timestep: float) -> tuple[int, float]:
+    """A delay [s] in integration steps [s]: the whole number below it, and the rest in [0, 1)."""
+    steps = delay / timestep
+    nearest = round(steps)
+    if abs(steps - nearest) <= _NEAR * max(1.0, steps):
+        return nearest, 0.0
+    return math.floor(steps), steps - math.floor(steps)
+
+
+def delayed(newer: float, older: float, fraction: float) -> float:
+    """The command [N or N*m] between two that were given a step apart, `fraction` in [0, 1] of it towards the older."""
+    return newer + fraction * (older - newer)
+
+
+def quantised(command: float, quantum: float, limit: float) -> float:
+    """The nearest multiple of the quantum, half to even, within +-limit, all in [N or N*m]."""
+    return np.minimum(np.maximum(quantum * np.rint(command / quantum), -limit), limit)
+
+
+def rate_limited(command: float, before: float, change: float) -> float:
+    """The command, at most `change` away from that of the integration step before, all in [N or N*m]."""
+    return np.minimum(np.maximum(command, before - change), before + change)
+
+
+PULSE_NAMES = ("key", "step", "index", "start")
+"""What the memory of an environment's pulses holds: the key of the random numbers, integration steps since the start of
+the episode, number of the present or next pulse, and when that one starts [s]."""
+KEY, STEP, INDEX, START = range(len(PULSE_NAMES))
+
+
+def pulse_load(memory: np.ndarray, timestep: float, force: float, duration: float, interval: float) -> float:
+    """The mean load [N or N*m] over an environment's next integration step; moves the memory on by that step.
+
+    A pulse that covers part of a step counts in proportion, so that its impulse does not depend on the step.
+    """
+    key, step = int(memory[KEY]), memory[STEP]
+    begin, end = step * timestep, (step + 1.0) * timestep
+    w0, w1, sign, _ = philox(int(memory[INDEX]), 0, 0, LOAD_STREAM, key)
+    if step == 0.0:
+        memory[START] = -interval * math.log(unit(w0, w1))
+    load = 0.0
+    while memory[START] < end:
+        last = memory[START] + duration
+        covered = max(min(last, end) - max(memory[START], begin), 0.0) / timestep
+        load += min(covered, 1.0) * (force if sign & 1 else -force)
+        if last > end:
+            break
+        memory[INDEX] += 1.0
+        w0, w1, sign, _ = philox(int(memory[INDEX]), 0, 0, LOAD_STREAM, key)
+        memory[START] = last - interval * math.log(unit(w0, w1))
+    memory[STEP] = step + 1.0
+    return load
