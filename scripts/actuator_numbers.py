@@ -1,7 +1,7 @@
 """Writes docs/actuators_in_numbers.md and its two CSV files: what every actuator that has a name does on a bench.
 
 Torques and speeds are measured in the engine, on one hinge: blocked, turned slowly by a heavy load, or free. The loops
-of the catalogue's motors and their continuous torques are `codrl_mj.motor_design`'s. `make docs` runs it; a
+of the catalogue's motors and their continuous torques are `codrl_mj.drives`'s. `make docs` runs it; a
 test compares the files with what it would write.
 """
 
@@ -21,9 +21,9 @@ import numpy as np
 import codrl_mj
 from codrl_mj.actuators import NAMED, Drive
 from codrl_mj.catalogue import motor_entry, motor_names
-from codrl_mj.motor_design import design, find_drive, torque_limits
+from codrl_mj.drives import design, find_drive, torque_limits
 from codrl_mj.runs.files import writing
-from codrl_mj.sizing.bench import BLOCKED, Bench
+from codrl_mj.study.bench import BLOCKED, Bench
 from codrl_mj.tasks import OURS, named_actuator
 from codrl_mj.validation.drives import COLD
 
@@ -201,7 +201,7 @@ The joint is blocked, and the task's largest force is asked for, from rest.
 At the nominal voltage (24 V where none is printed), with a loop at 20 kHz of the default bandwidth. Torques are past
 friction, limits are those of the voltage and not of the drive's largest current; –: not printed, so not known. Stall,
 no load and τm are measured in the engine; the loop's two columns and the continuous torque are
-`codrl_mj.motor_design`'s.
+`codrl_mj.drives`'s.
 
 - **2 %**: when the current of a small step comes to within that for good. **Bandwidth**: where the closed loop's gain
   is -3 dB. Both are alike, because gains are designed for the winding.

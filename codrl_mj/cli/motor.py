@@ -41,7 +41,7 @@ class Changes:
 
     def drive(self, name: str) -> Any:
         """The named drive with these set over it."""
-        from codrl_mj.motor_design import find_drive
+        from codrl_mj.drives import find_drive
 
         given: dict[str, Any] = dict(vars(self))
         if given.pop("not_delayed") == given["delayed"]:
@@ -87,7 +87,7 @@ class List:
     def run(self) -> int:
         """Print the table."""
         from codrl_mj.cli.terminal import print_table
-        from codrl_mj.motor_design import catalogue_rows
+        from codrl_mj.drives import catalogue_rows
 
         rows = catalogue_rows(self.sort)
         if self.as_json:
@@ -121,7 +121,7 @@ class Show:
 
     def run(self) -> int:
         """Print the tables, draw the diagram."""
-        from codrl_mj.motor_design import explain, find_entry
+        from codrl_mj.drives import explain, find_entry
         from codrl_mj.pages.diagrams import torque_speed_diagram
 
         drive, entry = self.changes.drive(self.name), find_entry(self.name)
@@ -143,7 +143,7 @@ class Show:
 def _print_explained(title: str, volts: float, found: dict[str, Any]) -> None:
     """What it can do first, then its numbers, then what to know of them."""
     from codrl_mj.cli.terminal import print_table, say
-    from codrl_mj.motor_design import unknown_in_words
+    from codrl_mj.drives import unknown_in_words
 
     def show(title: str, part: str) -> None:
         rows = [(row["name"], _text(row["value"]), row["unit"]) for row in found[part]]
@@ -203,7 +203,7 @@ class Design:
     def run(self) -> int:
         """Print the table, draw Bode's diagram."""
         from codrl_mj.cli.terminal import print_table, say
-        from codrl_mj.motor_design import LoopDesign, design, designs, sampled_too_seldom
+        from codrl_mj.drives import LoopDesign, design, designs, sampled_too_seldom
         from codrl_mj.pages.diagrams import bode_diagram
 
         drive = self.changes.drive(self.name)
@@ -251,7 +251,7 @@ class Step:
     def run(self) -> int:
         """Print the table, draw the responses."""
         from codrl_mj.cli.terminal import print_table, say
-        from codrl_mj.motor_design import sampled_too_seldom, step
+        from codrl_mj.drives import sampled_too_seldom, step
         from codrl_mj.pages.diagrams import step_diagram
 
         drive = self.changes.drive(self.name)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import Drive
-from codrl_mj.motor_design import LoopDesign, Looped, Response, abilities, closed_loop, design, open_loop, small_step
-from codrl_mj.motor_design.drives import diagram_limits, torque_limits
-from codrl_mj.motor_design.windup import Steps
+from codrl_mj.drives import LoopDesign, Looped, Response, abilities, closed_loop, design, open_loop, small_step
+from codrl_mj.drives.abilities import diagram_limits, torque_limits
+from codrl_mj.drives.loop import Steps
 from codrl_mj.pages.plots import Curve, Plot
 
 TORQUE_SPEED = "speed of the output [rad/s]", "torque of the output [N·m]"
@@ -129,7 +129,7 @@ def _upright(label: str, x: float, low: float, high: float) -> Curve:
 
 
 def step_diagram(drive: Drive, steps: Steps) -> list[Plot]:
-    """Current and voltage of the steps that `codrl_mj.motor_design.step` took with a drive."""
+    """Current and voltage of the steps that `codrl_mj.drives.step` took with a drive."""
     return [*small_steps({"": (drive, None)}), *recoveries(drive, steps)]
 
 

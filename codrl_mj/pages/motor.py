@@ -8,7 +8,7 @@ from markupsafe import Markup
 
 from codrl_mj.actuators import Drive
 from codrl_mj.catalogue import MotorEntry
-from codrl_mj.motor_design import explain, step, unknown_in_words
+from codrl_mj.drives import explain, step, unknown_in_words
 from codrl_mj.pages import page
 from codrl_mj.pages.diagrams import recoveries, torque_speed_diagram
 from codrl_mj.pages.loop import loop_section, rates_table

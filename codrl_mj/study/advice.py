@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from codrl_mj.actuators import Actuator, Drive, GearMotor, SampledLoop, Supply
-from codrl_mj.sizing.bench import Delivery, delivery
+from codrl_mj.study.bench import Delivery, delivery
 from codrl_mj.study.doses import AXES, REAL, REFERENCE_SPEEDS, noise, posed, timestep
 from codrl_mj.study.evidence import Evidence, Loss, Outcome, total
 from codrl_mj.study.grid import check_chosen

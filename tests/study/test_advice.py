@@ -12,7 +12,7 @@ from scipy import stats
 from codrl_mj import cli
 from codrl_mj.actuators import IDEAL as IDEAL_ACTUATOR
 from codrl_mj.actuators import Actuator, CurrentLoop, Lag, Motor, Supply
-from codrl_mj.motor_design import find_drive, torque_limits
+from codrl_mj.drives import find_drive, torque_limits
 from codrl_mj.runs.files import write_json
 from codrl_mj.study.advice import (
     BUY,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from codrl_mj.actuators import Actuator, CurrentLoop, Drive, SampledLoop
-from codrl_mj.motor_design import (
+from codrl_mj.drives import (
     closed_loop,
     design,
     designs,
@@ -20,7 +20,7 @@ from codrl_mj.motor_design import (
     small_step,
     step,
 )
-from codrl_mj.motor_design.windup import ANTI_WINDUPS
+from codrl_mj.drives.loop import ANTI_WINDUPS
 from codrl_mj.validation import motor_loops
 
 MOTORS = ("quanser-qube-servo-2", "maxon-dcx22l", "heinzmann-pmg-132", "lego-ev3-large")
