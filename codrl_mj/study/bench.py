@@ -1,11 +1,16 @@
-"""One hinge that an actuator drives, in the engine: how fast its torque comes, how exact, and how much there is."""
+"""One hinge that an actuator drives, in the engine: how fast its torque comes, how exact, and how much; in doses."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
+from codrl_mj.actuators import Actuator, Drive, GearMotor, SampledLoop, Supply
 from codrl_mj.specs import motorise
+from codrl_mj.study.doses import REFERENCE_SPEEDS, noise, timestep
+from codrl_mj.study.grid import check_chosen
+from codrl_mj.tasks import find_task
 
 BLOCKED = 1e12
 """Inertia [kg*m^2] that nothing here turns."""
@@ -106,3 +111,87 @@ def delivery(actuator: Any, timestep: float, step: float, force: float, speed: f
 def _end(rows: np.ndarray) -> np.ndarray:
     """The last step of the policy."""
     return rows[-max(round(len(rows) / HORIZON), 1) :]
+
+
+# -- on a task of the study ---------------------------------------------------------------------------------------
+
+
+def delivered(actuator: Any, task: str, share: float = 1.0) -> Delivery:
+    """What an actuator makes of the commands of a task, on the bench, or of a `share` of its largest force."""
+    check_chosen("task", [task], REFERENCE_SPEEDS)
+    if actuator.MOTION:
+        raise ValueError(
+            f"actuator: a {actuator.family} is asked for motion, not for forces: name one of another family"
+        )
+    known = find_task(task)
+    return delivery(actuator, timestep(task), known.step_duration, share * known.max_force, REFERENCE_SPEEDS[task])
+
+
+def doses(found: Delivery, task: str) -> dict[str, float]:
+    """The dose of every axis that does to a command what the actuator does, as it was `found` on the task, by axis.
+
+    Weakness g and a supply that lacks a share d leave g*min(1, 2*(1 - d)) of the largest force at rest, and
+    g*(1 - 2*d) at the reference speed (`doses.supply`): solved for both, with g at most 1.
+    """
+    rest, speed = max(found.at_rest, 0.0), min(found.at_speed, found.at_rest)
+    strength = rest if speed >= 0.0 else rest - speed
+    if rest == 0.0:
+        lacks = 1.0
+    elif speed >= 0.0:
+        lacks = (1.0 - speed / rest) / 2.0
+    else:
+        lacks = 1.0 - rest / (2.0 * strength)
+    loud = found.noise and found.noise / delivered(noise(task, 1.0).actuator, task).noise
+    return {
+        "lag": found.lag,
+        "weakness": max(1.0 - strength, 0.0),
+        "supply": lacks,
+        "delay": found.dead_time,
+        "friction": found.friction,
+        "noise": loud,
+    }
+
+
+def commanded(actuator: Any, task: str, found: Delivery) -> Delivery | None:
+    """What comes of commands that are larger by what is lost at rest, where that is more than a fiftieth.
+
+    None for a loop that could be designed: what it has not delivered yet is no gear's loss.
+    """
+    if not 0.1 < found.at_rest < 0.98 or redesign(actuator, task) is not None:
+        return None
+    more = 1.0 / found.at_rest
+    there = delivered(actuator, task, more)
+    share = {name: min(getattr(there, name) * more, 1.0) for name in ("at_rest", "at_speed")}
+    scaled = {name: getattr(there, name) * more for name in ("friction", "noise", "unasked")}
+    return there._replace(**share, **scaled)
+
+
+def redesign(actuator: Any, task: str) -> Drive | None:
+    """The same motor and supply under a designed loop; None if it has one, or no loop that could be designed."""
+    if isinstance(actuator, Actuator):  # what a sensor gets wrong no loop makes right
+        wrong = actuator.controller.current_noise or actuator.controller.current_bias
+        return None if wrong else redesigned(actuator, task)
+    if isinstance(actuator, Drive):
+        loop = dataclasses.replace(actuator.controller, bandwidth=0.0, kp=0.0, ki=0.0, anti_windup="back_calculation")
+        return None if loop == actuator.controller else dataclasses.replace(actuator, controller=loop)
+    return None
+
+
+def redesigned(actuator: Actuator, task: str) -> Drive:
+    """The motor and supply of a current loop under a designed one: pole-zero cancellation, anti-windup, a limit."""
+    motor, voltage = actuator.motor, actuator.controller.max_voltage
+    if actuator.supply is not None:
+        voltage = min(voltage, actuator.supply.voltage)
+    limit = motor.arm_radius * find_task(task).max_force / motor.torque_constant
+    return Drive(
+        GearMotor(
+            motor.resistance,
+            motor.inductance,
+            motor.torque_constant,
+            motor.back_emf_constant,
+            rotor_inertia=0.0,
+            arm_radius=motor.arm_radius,
+        ),
+        SampledLoop(sample_rate=20.0 / timestep(task), max_current=limit),
+        Supply(voltage) if actuator.supply is None else dataclasses.replace(actuator.supply, voltage=voltage),
+    )

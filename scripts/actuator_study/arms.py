@@ -4,7 +4,7 @@ import dataclasses
 from typing import Any
 
 from codrl_mj.actuators import Drive
-from codrl_mj.study.advice import redesigned
+from codrl_mj.study.bench import redesigned
 from codrl_mj.study.doses import AXES, REAL, arm, at_home, dosed
 from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import named_actuator
