@@ -266,7 +266,7 @@ class ProposeColumns:
 
     def run(self) -> int:
         """Print the mapping, what could not be told, and the next line."""
-        from codrl_mj.identify.proposal import propose_columns
+        from codrl_mj.identify.reading import propose_columns
 
         found = propose_columns(self.log)
         if self.as_json:

@@ -167,7 +167,8 @@ def _reason(verdict: str, options: Mapping[str, Prospect], found: Delivery) -> s
     never = options[IDEAL]
     says = f"policies that never met it lose {in_words(never)}"
     if verdict in (IDEAL, BUY):
-        return says if verdict == IDEAL else f"{says}, and so do all others: {_others(options)}"
+        others = ", ".join(f"{name} {in_words(option)}" for name, option in options.items() if name != IDEAL)
+        return says if verdict == IDEAL else f"{says}, and so do all others: {others or 'none'}"
     if verdict == MEASURE:
         untried = [name for name, option in options.items() if option.most is None and name != IDEAL]
         return f"{says}; {' and '.join(untried) or 'what else there is'} was not tested with as much on this task"
@@ -175,10 +176,6 @@ def _reason(verdict: str, options: Mapping[str, Prospect], found: Delivery) -> s
     chosen = options[verdict]
     in_part = "" if chosen.most is not None and chosen.most.spared else ": buy another if that is too much"
     return f"{says}, with that{by} {in_words(chosen)}{in_part}"
-
-
-def _others(options: Mapping[str, Prospect]) -> str:
-    return ", ".join(f"{name} {in_words(option)}" for name, option in options.items() if name != IDEAL) or "none"
 
 
 def in_words(option: Prospect) -> str:

@@ -1,6 +1,7 @@
 """One hinge that an actuator drives, in the engine: how fast its torque comes, how exact, and how much; in doses."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import mujoco
@@ -18,35 +19,32 @@ HORIZON = 20.0
 """Steps of the policy after which a force counts as not there."""
 
 
-class Bench:
-    """One hinge with a load of some inertia [kg*m^2] that an actuator drives in steps of `timestep` [s]."""
+def on_bench(actuator: Any, timestep: float, inertia: float) -> Callable[..., np.ndarray]:
+    """One hinge with a load of some inertia [kg*m^2] that an actuator drives in steps of `timestep` [s], to be run."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep, spec.compiler.boundmass = timestep, 0.0
+    spec.option.tolerance = 0.0  # it is relative to the inertia, beside which friction would count as none
+    body = spec.worldbody.add_body(explicitinertial=True, mass=1.0, inertia=[inertia] * 3)
+    body.add_joint(name="hinge", axis=[0.0, 0.0, 1.0])
+    spec.add_actuator(target="hinge", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
+    model = motorise(spec, {"hinge": actuator}).compile()
+    data, moved = mujoco.MjData(model), inertia + actuator.additions.armature
 
-    def __init__(self, actuator: Any, timestep: float, inertia: float) -> None:
-        """Build it."""
-        spec = mujoco.MjSpec()
-        spec.option.timestep, spec.compiler.boundmass = timestep, 0.0
-        spec.option.tolerance = 0.0  # it is relative to the inertia, beside which friction would count as none
-        body = spec.worldbody.add_body(explicitinertial=True, mass=1.0, inertia=[inertia] * 3)
-        body.add_joint(name="hinge", axis=[0.0, 0.0, 1.0])
-        spec.add_actuator(target="hinge", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
-        self._model = motorise(spec, {"hinge": actuator}).compile()
-        self._data = mujoco.MjData(self._model)
-        self._inertia = inertia + actuator.additions.armature
-
-    def run(self, torque: float, duration: float, speed: float = 0.0) -> np.ndarray:
+    def run(torque: float, duration: float, speed: float = 0.0) -> np.ndarray:
         """Ask for a torque [N*m] at the joint for a `duration` [s], from a speed of the joint [rad/s].
 
         Shape (steps, 3): the actuator's torque [N*m] in each step, that which accelerates the hinge [N*m], and its
         speed [rad/s] after the step.
         """
-        model, data = self._model, self._data
         mujoco.mj_resetData(model, data)
         data.ctrl[:], data.qvel[:] = torque, speed
-        rows = np.empty((max(round(duration / model.opt.timestep), 1), 3))
+        rows = np.empty((max(round(duration / timestep), 1), 3))
         for row in rows:
             mujoco.mj_step(model, data)
-            row[:] = data.qfrc_actuator[0], data.qacc[0] * self._inertia, data.qvel[0]
+            row[:] = data.qfrc_actuator[0], data.qacc[0] * moved, data.qvel[0]
         return rows
+
+    return run
 
 
 class Delivery(NamedTuple):
@@ -80,14 +78,14 @@ def delivery(actuator: Any, timestep: float, step: float, force: float, speed: f
     `timestep` is that of the integration, `step` the policy's [s].
     """
     duration = HORIZON * step
-    blocked = Bench(actuator, timestep, BLOCKED)
-    unasked = blocked.run(0.0, duration)[:, 0]  # its noise is every run's, and thus taken from them
+    blocked = on_bench(actuator, timestep, BLOCKED)
+    unasked = blocked(0.0, duration)[:, 0]  # its noise is every run's, and thus taken from them
 
     def asked(at: float) -> np.ndarray:
-        return (blocked.run(force, duration, at)[:, 0] - unasked) / force
+        return (blocked(force, duration, at)[:, 0] - unasked) / force
 
     def braked(at: float) -> tuple[float, float]:
-        turned = _end(Bench(actuator, timestep, 1e4 * force * duration / at).run(0.0, duration, at))
+        turned = _end(on_bench(actuator, timestep, 1e4 * force * duration / at)(0.0, duration, at))
         driven, moved, _ = np.mean(turned, axis=0)
         return float(np.mean(_end(unasked)) - moved) / force, float(driven - moved) / force
 
