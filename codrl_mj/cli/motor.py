@@ -259,7 +259,8 @@ class Step:
         figure = self.out and step_diagram(drive, steps)
         small, constant = steps.small, drive.motor.torque_constant
         settled, amplitude = small.settling_time(), float(small.reference[-1])
-        recoveries = {kind: {"time": one.time, "undershoot": one.undershoot} for kind, one in steps.recoveries.items()}
+        responses = steps.recoveries.items()
+        recoveries = {k: {"time": one.settling_time(0.05), "undershoot": one.undershoot} for k, one in responses}
         if self.as_json:
             content = {"current": amplitude, "settling_time": settled, "overshoot": small.overshoot}
             asked = {name: getattr(steps, name) for name in ("speed", "unreachable", "reachable")}

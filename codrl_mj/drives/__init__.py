@@ -27,7 +27,6 @@ from codrl_mj.drives.feasibility import (
 from codrl_mj.drives.loop import (
     LoopDesign,
     Looped,
-    Recovery,
     Response,
     Steps,
     closed_loop,
@@ -65,7 +64,6 @@ __all__ = [
     "respond",
     "small_step",
     "Steps",
-    "Recovery",
     "step",
     "Demand",
     "demand_of",

@@ -126,12 +126,21 @@ class Response(NamedTuple):
         """How far the current goes beyond the last reference, as a share of it."""
         return max(float(self.current.max() / self.reference[-1]) - 1.0, 0.0)
 
+    @property
+    def _last(self) -> int:
+        """From where on the last reference is asked for."""
+        return int(np.flatnonzero(np.diff(self.reference, prepend=math.nan) != 0.0)[-1])
+
+    @property
+    def undershoot(self) -> float:
+        """How far the current falls below the last reference once that is asked for, as a share of it."""
+        return max(1.0 - float(self.current[self._last :].min()) / float(self.reference[-1]), 0.0)
+
     def settling_time(self, band: float = 0.02) -> float:
         """When the current stays within a share of the last reference [s after that came]; NaN: not within sight."""
-        start = int(np.flatnonzero(np.diff(self.reference, prepend=math.nan) != 0.0)[-1])
-        wrong = np.flatnonzero(np.abs(self.current[start:] / self.reference[-1] - 1.0) > band)
-        settled = start + (int(wrong[-1]) + 1 if len(wrong) else 0)
-        return float(self.time[settled] - self.time[start]) if settled < len(self.time) else math.nan
+        wrong = np.flatnonzero(np.abs(self.current[self._last :] / self.reference[-1] - 1.0) > band)
+        settled = self._last + (int(wrong[-1]) + 1 if len(wrong) else 0)
+        return float(self.time[settled] - self.time[self._last]) if settled < len(self.time) else math.nan
 
 
 def respond(one: Looped, references: Any, speed: float = 0.0, timestep: float | None = None) -> Response:
@@ -277,17 +286,6 @@ _AFTER = 0.1
 """How long the recovery is looked at [s]."""
 
 
-class Recovery(NamedTuple):
-    """What one kind of anti-windup makes of a current that could not be reached."""
-
-    response: Response
-    """The currents and voltages."""
-    time: float
-    """Until the current stays within 5 % of what can be reached again [s]; NaN where that takes over 0.1 s."""
-    undershoot: float
-    """How far the current falls below what is asked for, as a share of it."""
-
-
 class Steps(NamedTuple):
     """Step responses of a drive."""
 
@@ -299,8 +297,8 @@ class Steps(NamedTuple):
     """Current asked for in vain, for 20 ms [A]."""
     reachable: float
     """Current asked for then [A]."""
-    recoveries: dict[str, Recovery]
-    """By kind of anti-windup."""
+    recoveries: dict[str, Response]
+    """By kind of anti-windup: what it makes of a current that cannot be reached, and of one that can."""
 
 
 def step(drive: Drive) -> Steps:
@@ -323,12 +321,8 @@ def step(drive: Drive) -> Steps:
     reachable = 0.4 / 1.8 * unreachable
     spans = (_UNREACHABLE, unreachable), (_AFTER, reachable)
     references = np.concatenate([np.full(round(time * loop.sample_rate), current) for time, current in spans])
-    recoveries = {}
-    for kind in ANTI_WINDUPS:
-        one = dataclasses.replace(drive, controller=dataclasses.replace(loop, anti_windup=kind))
-        response = respond(one, references, speed)
-        after = response.current[response.time >= _UNREACHABLE - 0.5 / loop.sample_rate]
-        recoveries[kind] = Recovery(
-            response, response.settling_time(0.05), max(1.0 - float(after.min()) / reachable, 0.0)
-        )
+    kinds = {kind: dataclasses.replace(loop, anti_windup=kind) for kind in ANTI_WINDUPS}
+    recoveries = {
+        kind: respond(dataclasses.replace(drive, controller=one), references, speed) for kind, one in kinds.items()
+    }
     return Steps(small_step(drive), speed, unreachable, reachable, recoveries)

@@ -157,8 +157,9 @@ def recoveries(drive: Drive, steps: Steps) -> list[Plot]:
     """Current and voltage out of a demand that the voltage cannot meet, by kind of anti-windup; and the same close."""
     told = {}
     for kind, one in steps.recoveries.items():
-        took = f"{1e3 * one.time:.2g} ms" if math.isfinite(one.time) else "over 100 ms"
-        told[f"{kind.replace('_', ' ')}: back in {took}"] = one.response
+        back = one.settling_time(0.05)
+        took = f"{1e3 * back:.2g} ms" if math.isfinite(back) else "over 100 ms"
+        told[f"{kind.replace('_', ' ')}: back in {took}"] = one
     at = f"at {steps.speed:.4g} rad/s of the rotor"
     title = f"{steps.unreachable:.3g} A, out of reach, then {steps.reachable:.3g} A, {at}"
     return [*_responses(drive, title, told, _SHOWN), *_responses(drive, "The same, close", told, _CLOSE)]
