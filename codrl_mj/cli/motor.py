@@ -149,17 +149,14 @@ def _print_explained(title: str, volts: float, found: dict[str, Any]) -> None:
         rows = [(row["name"], _text(row["value"]), row["unit"]) for row in found[part]]
         print_table(title, ("number", "value", "unit"), rows, right=("value",))
 
-    sources: list[str] = []
     say(title)
     show(f"What it can do at its output, at {volts:g} V", "abilities")
     say(found["assumed"])
     if "numbers" in found:
         rows = []
         for row in found["numbers"]:
-            sources += [source for source in row["sources"] if source not in sources]
-            places = ", ".join(str(1 + sources.index(source)) for source in row["sources"])
             estimated = "" if row["name"] not in found["estimated"] else " (estimated)"
-            rows.append((row["name"], _text(row["value"]), row["unit"], row["how"] + estimated, places))
+            rows.append((row["name"], _text(row["value"]), row["unit"], row["how"] + estimated, row["places"]))
         columns = "number", "value", "unit", "how it came about", "source"
         print_table("The motor, at its rotor", columns, rows, right=("value",))
     show("As it is simulated", "drive")
@@ -168,7 +165,7 @@ def _print_explained(title: str, volts: float, found: dict[str, Any]) -> None:
             ("disagreement", found["disagreements"]),
             ("note", [" ".join(found["notes"].split())] if found["notes"] else []),
             ("estimated", [f"{field}: {why}" for field, why in found["estimated"].items()]),
-            ("source", [f"{number}: {source}" for number, source in enumerate(sources, 1)]),
+            ("source", [f"{number}: {source}" for number, source in enumerate(found["cited"], 1)]),
         ):
             say(*(f"{kind} {text}" if kind == "source" else f"{kind}: {text}" for text in texts))
         say(unknown_in_words(found["unknown"]))

@@ -231,7 +231,8 @@ def explain(drive: Drive, entry: MotorEntry | None = None) -> dict[str, Any]:
     Returns:
         `drive`, the fields of motor, controller and supply, and `abilities`, each a list of mappings with `name`,
         `value` and `unit`; `assumed`; and of a datasheet `manufacturer`, `product`, `kind`, `numbers`, such mappings
-        with `how` it came about and its `sources`, `unknown`, `disagreements`, `estimated` and `notes`.
+        with `how` it came about, its `sources` and their `places`, from 1, among all that are `cited`, `unknown`,
+        `disagreements`, `estimated` and `notes`.
     """
     parts: dict[str, Any] = {"motor": drive.motor, "controller": drive.controller, "supply": drive.supply}
     found: dict[str, Any] = {
@@ -250,14 +251,16 @@ def explain(drive: Drive, entry: MotorEntry | None = None) -> dict[str, Any]:
     found["abilities"].insert(2, _value("continuous_torque", torque, "N*m"))
     names = [field.name for field in dataclasses.fields(MotorNumbers) if field.name not in ("derived", "disagreements")]
     derived = entry.numbers.derived
+    sources = {name: _sources(derived[name], entry) for name in names if name in derived}
+    cited = list(dict.fromkeys(source for several in sources.values() for source in several))
     return found | {
         **{name: getattr(entry, name) for name in ("manufacturer", "product", "kind")},
         "numbers": [
             _value(name, getattr(entry.numbers, name), KINDS[OTHER_NAMES.get(name, name)].unit)
-            | {"how": derived[name], "sources": _sources(derived[name], entry)}
-            for name in names
-            if name in derived
+            | {"how": derived[name], "sources": own, "places": ", ".join(str(1 + cited.index(one)) for one in own)}
+            for name, own in sources.items()
         ],
+        "cited": cited,
         "unknown": [name for name in names if name not in derived],
         "disagreements": _disagreements(entry.numbers),
         "estimated": dict(entry.estimated),
