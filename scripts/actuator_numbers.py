@@ -1,7 +1,7 @@
 """Writes docs/actuators_in_numbers.md and its two CSV files: what every actuator that has a name does on a bench.
 
 Torques and speeds are measured in the engine, on one hinge: blocked, turned slowly by a heavy load, or free. The loops
-of the catalogue's motors and their continuous torques are `codrl_mj.motor_design`'s. `make docs` runs it; a
+of the catalogue's motors and their continuous torques are `codrl_mj.drives`'s. `make docs` runs it; a
 test compares the files with what it would write.
 """
 
@@ -21,9 +21,9 @@ import numpy as np
 import codrl_mj
 from codrl_mj.actuators import NAMED, Drive
 from codrl_mj.catalogue import motor_entry, motor_names
-from codrl_mj.motor_design import design, find_drive, torque_limits
+from codrl_mj.drives import design, find_drive, torque_limits
 from codrl_mj.runs.files import writing
-from codrl_mj.sizing.bench import BLOCKED, Bench
+from codrl_mj.study.bench import BLOCKED, on_bench
 from codrl_mj.tasks import OURS, named_actuator
 from codrl_mj.validation.drives import COLD
 
@@ -54,7 +54,7 @@ def free_run(actuator: Any, timestep: float, inertia: float, time_constant: floa
         inertia: of the load [kg*m^2].
         time_constant: about the one to be found [s], for how long to look.
     """
-    speeds = Bench(actuator, timestep, inertia).run(1e6, 20.0 * time_constant)[:, 2]
+    speeds = on_bench(actuator, timestep, inertia)(1e6, 20.0 * time_constant)[:, 2]
     return float(speeds[-1]), float(timestep * (1.0 + np.sum(1.0 - speeds / speeds[-1])))
 
 
@@ -62,8 +62,8 @@ def task_row(task: str, name: str) -> dict[str, Any]:
     """What a named actuator does on a task's bench: a torque step to the task's largest force, stall, free run."""
     spec, actuator = TASKS[task], named_actuator(name, task)
     timestep, motor = spec.step_duration / spec.motor_inner_steps, actuator.motor
-    asked, blocked = float(spec.max_forces[0]), Bench(actuator, timestep, BLOCKED)
-    torques = blocked.run(asked, LONG)[:, 0]
+    asked, blocked = float(spec.max_forces[0]), on_bench(actuator, timestep, BLOCKED)
+    torques = blocked(asked, LONG)[:, 0]
     row: dict[str, Any] = {"task": task, "actuator": name}
     for band in (5, 2):
         seconds = settled(torques, band / 100) * timestep
@@ -73,7 +73,7 @@ def task_row(task: str, name: str) -> dict[str, Any]:
     return row | {
         "first_step_percent": 100.0 * torques[spec.motor_inner_steps - 1] / asked,
         "steady_error_percent": round(100.0 * (torques[-1] / asked - 1.0), 6) + 0.0,
-        "stall_torque": blocked.run(1e6, 50.0 * motor.electrical_time_constant)[-1, 0],
+        "stall_torque": blocked(1e6, 50.0 * motor.electrical_time_constant)[-1, 0],
         "no_load_speed": free_run(actuator, timestep, 50.0 * timestep * product, 50.0 * timestep)[0],
         "slide": _on_a_slide(task),
     }
@@ -126,8 +126,8 @@ def _stall(drive: Drive, no_load_speed: float) -> float:
     """Torque [N*m] of the output that just turns, by its line through 1 and 2 % of the no-load speed."""
     duration = max(50.0 * drive.motor.electrical_time_constant, 2e-3)
     most = drive.motor.torque_constant * drive.voltage_limit / drive.motor.resistance / drive.arm_radius
-    bench = Bench(drive, 1.0 / drive.controller.sample_rate, 1e4 * most * duration / no_load_speed)
-    slow, less_slow = (bench.run(1e6, duration, share * no_load_speed)[-1, 1] for share in (0.01, 0.02))
+    bench = on_bench(drive, 1.0 / drive.controller.sample_rate, 1e4 * most * duration / no_load_speed)
+    slow, less_slow = (bench(1e6, duration, share * no_load_speed)[-1, 1] for share in (0.01, 0.02))
     return float(2.0 * slow - less_slow)
 
 
@@ -201,7 +201,7 @@ The joint is blocked, and the task's largest force is asked for, from rest.
 At the nominal voltage (24 V where none is printed), with a loop at 20 kHz of the default bandwidth. Torques are past
 friction, limits are those of the voltage and not of the drive's largest current; –: not printed, so not known. Stall,
 no load and τm are measured in the engine; the loop's two columns and the continuous torque are
-`codrl_mj.motor_design`'s.
+`codrl_mj.drives`'s.
 
 - **2 %**: when the current of a small step comes to within that for good. **Bandwidth**: where the closed loop's gain
   is -3 dB. Both are alike, because gains are designed for the winding.

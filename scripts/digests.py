@@ -30,10 +30,10 @@ from codrl_mj import Uniform
 from codrl_mj.actuators import Actuator, CurrentLoop, Ideal, Motor, Supply
 from codrl_mj.agents import AGENTS
 from codrl_mj.agents.presets import SETTINGS
+from codrl_mj.drives import find_drive
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.identify import identify, read_log
 from codrl_mj.identify.synthetic import Excitation, Load, Sampler, Sensor, simulate
-from codrl_mj.motor_design import find_drive
 from codrl_mj.runs.files import read_json, write_json
 from codrl_mj.tasks import OURS, find_task, named_actuator
 from codrl_mj.training import TrainConfig, train

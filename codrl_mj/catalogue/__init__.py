@@ -1,8 +1,7 @@
 """Motors that one can buy: datasheets as they are printed, the numbers that follow from them, and a catalogue."""
 
-from codrl_mj.catalogue.datasheet import Datasheet, from_datasheet
+from codrl_mj.catalogue.datasheet import Datasheet, MotorEntry, from_datasheet, motor_entry, motor_names, new_motor
 from codrl_mj.catalogue.derivation import Disagreement, MotorNumbers
-from codrl_mj.catalogue.entries import MotorEntry, motor_entry, motor_names, new_motor
 
 __all__ = [
     "Datasheet",

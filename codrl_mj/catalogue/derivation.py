@@ -1,12 +1,126 @@
-"""From what a datasheet prints to the numbers of a motor: applies the rules, and compares what is told twice."""
+"""From what a datasheet prints to the numbers of a motor: which follows from which, and which have to agree.
+
+The motor is V = R*I + kE*w with torque kT*I. The gear passes on `gear_efficiency` of it, and friction takes its part
+behind the gear, where the simulation has it: at no load it is gear_efficiency*kT*I0. Source of the relations: maxon's
+*Key information on maxon DC and EC motors*; they are those of any text on DC motors.
+"""
 
 import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from codrl_mj.catalogue.rules import CHECKS, NAME, RULES
 from codrl_mj.catalogue.units import Kind, Reading
+
+NAME = r"[a-z]\w+"
+"""A quantity in a formula."""
+
+
+class Rule(NamedTuple):
+    """How one quantity follows from others: the names in the formula, in their order, are the function's arguments."""
+
+    quantity: str
+    needs: tuple[str, ...]
+    formula: str
+    function: Callable[..., float]
+
+
+def _rule(quantity: str, formula: str) -> Rule:
+    needs = tuple(dict.fromkeys(re.findall(NAME, formula)))
+    return Rule(quantity, needs, formula, eval(f"lambda {', '.join(needs)}: {formula}"))
+
+
+# Torques at the output, past a gear's losses, have names of their own. The first rule whose needs are known is taken.
+RULES = (
+    _rule("resistance", "nominal_voltage / stall_current"),
+    _rule("resistance", "mechanical_time_constant * torque_constant * back_emf_constant / rotor_inertia"),
+    _rule(
+        "resistance",
+        "nominal_voltage * (no_load_speed - continuous_speed) "
+        "/ (continuous_current * no_load_speed - no_load_current * continuous_speed)",
+    ),
+    _rule("stall_current", "nominal_voltage / resistance"),
+    _rule("back_emf_constant", "1 / speed_constant"),
+    _rule("back_emf_constant", "(nominal_voltage - resistance * no_load_current) / no_load_speed"),
+    _rule("torque_constant", "stall_torque / (stall_current - no_load_current)"),
+    _rule("torque_constant", "continuous_torque / (continuous_current - no_load_current)"),
+    _rule(
+        "torque_constant", "stall_torque_at_output / (gear_ratio * gear_efficiency * (stall_current - no_load_current))"
+    ),
+    _rule("torque_constant", "back_emf_constant"),
+    _rule("back_emf_constant", "torque_constant"),
+    _rule("back_emf_constant", "(nominal_voltage - resistance * continuous_current) / continuous_speed"),
+    _rule(
+        "gear_efficiency", "stall_torque_at_output / (gear_ratio * torque_constant * (stall_current - no_load_current))"
+    ),
+    _rule(
+        "gear_efficiency",
+        "continuous_torque_at_output / (gear_ratio * torque_constant * (continuous_current - no_load_current))",
+    ),
+    _rule("rotor_inertia", "mechanical_time_constant * torque_constant * back_emf_constant / resistance"),
+    _rule("inductance", "electrical_time_constant * resistance"),
+    _rule("continuous_current", "continuous_torque / torque_constant + no_load_current"),
+    _rule(
+        "continuous_current",
+        "continuous_torque_at_output / (gear_ratio * gear_efficiency * torque_constant) + no_load_current",
+    ),
+    _rule("thermal_resistance", "thermal_resistance_winding + thermal_resistance_housing"),
+)
+_LOAD = "the shaft's torque is kT*(I - I0) here, many makers print kT*I; iron saturates at stall; warm motors give less"
+_SPEED = "iron losses and brushes are not in the model; many print a warm motor's speed, or a limit of the drive"
+CHECKS = (
+    # what a printed quantity should be, by the numbers that were found, and what to make of a difference
+    (
+        _rule("torque_constant", "back_emf_constant"),
+        "equal in SI for an ideal motor. A smaller torque constant is lost in iron, or saturates at stall; a larger "
+        "one would make energy: distrust the stall torque, or the conventions of current and voltage",
+    ),
+    (
+        _rule("speed_constant", "1 / back_emf_constant"),
+        "two ways to print one number; rounding, or the one includes losses",
+    ),
+    (
+        _rule("stall_current", "nominal_voltage / resistance"),
+        "rounding, or the resistance is without brushes and leads, or the stall current was measured on a warm motor",
+    ),
+    (_rule("stall_torque", "torque_constant * (stall_current - no_load_current)"), _LOAD),
+    (
+        _rule(
+            "stall_torque_at_output",
+            "gear_ratio * gear_efficiency * torque_constant * (stall_current - no_load_current)",
+        ),
+        _LOAD,
+    ),
+    (_rule("continuous_torque", "torque_constant * (continuous_current - no_load_current)"), _LOAD),
+    (
+        _rule(
+            "continuous_torque_at_output",
+            "gear_ratio * gear_efficiency * torque_constant * (continuous_current - no_load_current)",
+        ),
+        _LOAD,
+    ),
+    (_rule("no_load_speed", "(nominal_voltage - resistance * no_load_current) / back_emf_constant"), _SPEED),
+    (_rule("continuous_speed", "(nominal_voltage - resistance * continuous_current) / back_emf_constant"), _SPEED),
+    (
+        _rule("mechanical_time_constant", "resistance * rotor_inertia / (torque_constant * back_emf_constant)"),
+        "rounding; some print it with a gear's or an encoder's inertia",
+    ),
+    (
+        _rule("electrical_time_constant", "inductance / resistance"),
+        "rounding; inductance depends on the frequency it is measured at",
+    ),
+    (
+        _rule(
+            "no_load_current",
+            "(coulomb_friction + viscous_friction * no_load_speed) / (gear_efficiency * torque_constant)",
+        ),
+        "friction varies with temperature and from motor to motor",
+    ),
+    (
+        _rule("thermal_resistance", "thermal_resistance_winding + thermal_resistance_housing"),
+        "the housing's depends on what it is mounted on",
+    ),
+)
 
 
 class Disagreement(NamedTuple):
@@ -86,7 +200,8 @@ class MotorNumbers:
     """Values that are printed and also follow from others, the worst first; not those that agree to 1e-9."""
 
 
-_UNITS = {"stall_torque_at_output": "N*m", "continuous_torque_at_output": "N*m"}
+AT_OUTPUT = ("stall_torque_at_output", "continuous_torque_at_output")
+"""Torques past a gear's losses, which do not tell the motor's before its efficiency is known."""
 _LEAST_EFFICIENCY = 0.2
 """No gear that one can buy for a servo is worse: a derived efficiency below it is a slip of units."""
 OTHER_NAMES = {
@@ -108,22 +223,22 @@ def derive(readings: Mapping[str, Reading], kinds: Mapping[str, Kind], strict: b
     """The numbers that follow from what is printed; the arguments and errors of `from_datasheet`."""
     if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not tolerance > 0.0:
         raise ValueError(f"tolerance = {tolerance!r}: must be a number > 0, such as 0.2")
-    known, how = _at_motor(readings, kinds)
-    printed = {*known, "torque_constant"}
-    text = _Text(known, {name: kind.unit for name, kind in kinds.items()} | _UNITS)
+    found = _Derivation(readings, kinds)
+    known, how, printed = found.known, found.how, {*found.known, "torque_constant"}
     known.setdefault("no_load_current", 0.0)
-    _apply(known, how, text)
+    found.apply_rules()
     for name, remedy in _NEEDED.items():
         if name not in known:
             raise ValueError(f"datasheet.{name} is not printed and does not follow from what is: give {remedy}")
         if not known[name] > 0.0:
             raise ValueError(f"datasheet.{name} = {known[name]:.4g}: must be > 0, but {how[name]}; check these values")
-    _settle_gear(known, how, strict, tolerance)
-    _settle_friction(known, how, text, "no_load_current" in printed)
-    disagreements = _disagreements(known, printed, text)
+    found.settle_gear(strict, tolerance)
+    if "no_load_current" in printed:
+        found.settle_friction()
+    disagreements = found.disagreements(printed)
     if strict and disagreements and not abs(disagreements[0].difference) <= tolerance:
         worst = disagreements[0]
-        behind = ", ".join(text.behind([worst.quantity, *text.named(worst.formula)], how))
+        behind = ", ".join(found.behind([worst.quantity, *found.named(worst.formula)]))
         behind += ", and at which shaft they are (shaft, gear_ratio)" if known["gear_ratio"] != 1.0 else ""
         raise ValueError(
             f"datasheet.{worst.quantity} contradicts the rest by more than {tolerance:.0%}: {worst}. Check the values "
@@ -140,132 +255,120 @@ def derive(readings: Mapping[str, Reading], kinds: Mapping[str, Kind], strict: b
     )
 
 
-def _at_motor(readings: Mapping[str, Reading], kinds: Mapping[str, Kind]) -> tuple[dict[str, Any], dict[str, str]]:
-    """Printed values as seen at the motor's shaft, and sentences; torques at the output keep their place."""
-    known: dict[str, Any] = {}
-    how: dict[str, str] = {}
-    for name, reading in readings.items():
-        power = kinds[name].power
-        if reading.shaft == "motor" or power == 0:
-            known[name], how[name] = reading.value, f"{name} = {reading.printed}, printed"
-            continue
-        if "gear_ratio" not in readings:
-            raise ValueError(
-                f"datasheet.{name} = {reading.printed!r} at the output: needs the gear; write gear_ratio = 30, or "
-                "gear_ratio = 1 to describe the motor as it is seen at the output"
-            )
-        if name.endswith("torque"):
-            known[f"{name}_at_output"] = reading.value
-            how[f"{name}_at_output"] = f"{name} = {reading.printed} at the output, printed"
-            continue
-        ratio = readings["gear_ratio"].value
-        known[name] = reading.value * ratio**power
-        how[name] = f"{name} = {reading.printed} at the output * {ratio:g}^{power}, printed"
-    return known, how
+class _Derivation:
+    """What is known of a motor, seen at its shaft, and a sentence on how each number came about."""
 
+    def __init__(self, readings: Mapping[str, Reading], kinds: Mapping[str, Kind]) -> None:
+        """Begin with what is printed; torques at the output keep their place, under names of their own."""
+        self.known: dict[str, Any] = {}
+        self.how: dict[str, str] = {}
+        self._units = {name: kind.unit for name, kind in kinds.items()}
+        self._units |= dict.fromkeys(AT_OUTPUT, "N*m")
+        for name, (value, printed, shaft) in readings.items():
+            power, at, place = kinds[name].power, name, ""
+            if shaft != "motor" and power != 0:
+                if "gear_ratio" not in readings:
+                    raise ValueError(
+                        f"datasheet.{name} = {printed!r} at the output: needs the gear; write gear_ratio = 30, or "
+                        "gear_ratio = 1 to describe the motor as it is seen at the output"
+                    )
+                place = " at the output"
+                if name.endswith("torque"):
+                    at = f"{name}_at_output"
+                else:
+                    ratio = readings["gear_ratio"].value
+                    value, place = value * ratio**power, f"{place} * {ratio:g}^{power}"
+            self.known[at], self.how[at] = value, f"{name} = {printed}{place}, printed"
 
-class _Text:
-    """Writes formulas with numbers."""
-
-    def __init__(self, known: Mapping[str, Any], units: Mapping[str, str]) -> None:
-        self._known, self._units = known, units
-
-    def number(self, name: str) -> str:
+    def _number(self, name: str) -> str:
         """A known quantity with its unit."""
-        return f"{self._known[name]:.4g} {self._units[name]}".strip()
+        return f"{self.known[name]:.4g} {self._units[name]}".strip()
+
+    def _filled(self, formula: str) -> str:
+        """A formula with numbers for names."""
+        return re.sub(NAME, lambda match: self._number(match[0]), formula)
+
+    def _follow(self, name: str, formula: str, value: Any, more: str = "") -> None:
+        """What a quantity is by a formula, and in a sentence."""
+        self.known[name] = value
+        self.how[name] = f"{name} = {formula} = {self._filled(formula)} = {self._number(name)}{more}"
 
     def named(self, formula: str) -> list[str]:
         """The quantities in a formula."""
         return [name for name in dict.fromkeys(re.findall(NAME, formula)) if name in self._units]
 
-    def behind(self, names: list[str], how: Mapping[str, str]) -> list[str]:
+    def behind(self, names: list[str]) -> list[str]:
         """The printed quantities that some followed from."""
         found: list[str] = []
         while names:
             name = names.pop(0)
-            if "printed" in how.get(name, "") or name not in how:
+            if "printed" in self.how.get(name, "") or name not in self.how:
                 found.append(name)
             else:
-                names += [one for one in self.named(how[name]) if one not in (name, *found)]
+                names += [one for one in self.named(self.how[name]) if one not in (name, *found)]
         return list(dict.fromkeys(found))
 
-    def filled(self, formula: str) -> str:
-        """A formula with numbers for names."""
-        return re.sub(NAME, lambda match: self.number(match[0]), formula)
+    def apply_rules(self) -> None:
+        """Apply the first rule that tells something new, until none does."""
+        known = self.known
+        while new := next((r for r in RULES if r.quantity not in known and known.keys() >= {*r.needs}), None):
+            try:
+                value = new.function(*(known[name] for name in new.needs))
+            except ZeroDivisionError as error:
+                raise ValueError(
+                    f"datasheet.{new.quantity}: {new.formula} = {self._filled(new.formula)} divides by 0; "
+                    "check these values"
+                ) from error
+            self._follow(new.quantity, new.formula, value)
 
-    def sentence(self, name: str, formula: str) -> str:
-        """How a quantity followed."""
-        return f"{name} = {formula} = {self.filled(formula)} = {self.number(name)}"
-
-
-def _apply(known: dict[str, Any], how: dict[str, str], text: _Text) -> None:
-    """Apply the first rule that tells something new, until none does."""
-    while True:
-        for rule in RULES:
-            if rule.quantity not in known and all(name in known for name in rule.needs):
-                try:
-                    known[rule.quantity] = rule.function(*(known[name] for name in rule.needs))
-                except ZeroDivisionError as error:
-                    raise ValueError(
-                        f"datasheet.{rule.quantity}: {rule.formula} = {text.filled(rule.formula)} divides by 0; "
-                        "check these values"
-                    ) from error
-                how[rule.quantity] = text.sentence(rule.quantity, rule.formula)
-                break
-        else:
+    def settle_gear(self, strict: bool, tolerance: float) -> None:
+        """Without a gear its ratio and efficiency are 1; a derived efficiency must be one."""
+        known, how = self.known, self.how
+        for name in ("gear_ratio", "gear_efficiency"):
+            if name not in known and known.get("gear_ratio", 1.0) == 1.0:
+                known[name], how[name] = 1.0, f"{name} = 1: no gear is printed"
+        efficiency = known.get("gear_efficiency")
+        if efficiency is None:
             return
+        if strict and not _LEAST_EFFICIENCY <= efficiency <= 1.0 + tolerance:
+            raise ValueError(
+                f"datasheet.gear_efficiency = {efficiency:.4g}: must be in [{_LEAST_EFFICIENCY:g}, 1], but "
+                f"{how['gear_efficiency']}; check the units of these values, the gear_ratio, and at which shaft they "
+                "are"
+            )
+        if efficiency > 1.0:
+            known["gear_efficiency"] = 1.0
+            how["gear_efficiency"] += ", taken as 1"
 
+    def settle_friction(self) -> None:
+        """Friction from the no-load current: all of it Coulomb's, unless one of the two kinds is printed."""
+        known = self.known
+        coulomb, viscous = "coulomb_friction" in known, "viscous_friction" in known
+        total, free = known["torque_constant"] * known["no_load_current"], "torque_constant * no_load_current"
+        if known.get("gear_efficiency", 1.0) != 1.0:  # friction is behind the gear
+            total, free = known["gear_efficiency"] * total, f"gear_efficiency * {free}"
+        if not coulomb and not viscous:
+            self._follow("coulomb_friction", free, total)
+            known["viscous_friction"] = 0.0
+            self.how["viscous_friction"] = (
+                "viscous_friction = 0: the no-load current is taken as Coulomb friction alone"
+            )
+        elif coulomb != viscous and "no_load_speed" in known:
+            speed, more = known["no_load_speed"], ", not below 0"
+            if coulomb:
+                value = max(0.0, (total - known["coulomb_friction"]) / speed)
+                self._follow("viscous_friction", f"({free} - coulomb_friction) / no_load_speed", value, more)
+            else:
+                value = max(0.0, total - known["viscous_friction"] * speed)
+                self._follow("coulomb_friction", f"{free} - viscous_friction * no_load_speed", value, more)
 
-def _settle_gear(known: dict[str, Any], how: dict[str, str], strict: bool, tolerance: float) -> None:
-    """Without a gear its ratio and efficiency are 1; a derived efficiency must be one."""
-    if "gear_ratio" not in known:
-        known["gear_ratio"], how["gear_ratio"] = 1.0, "gear_ratio = 1: no gear is printed"
-    if "gear_efficiency" not in known and known["gear_ratio"] == 1.0:
-        known["gear_efficiency"], how["gear_efficiency"] = 1.0, "gear_efficiency = 1: no gear is printed"
-    efficiency = known.get("gear_efficiency")
-    if efficiency is None:
-        return
-    if strict and not _LEAST_EFFICIENCY <= efficiency <= 1.0 + tolerance:
-        raise ValueError(
-            f"datasheet.gear_efficiency = {efficiency:.4g}: must be in [{_LEAST_EFFICIENCY:g}, 1], but "
-            f"{how['gear_efficiency']}; check the units of these values, the gear_ratio, and at which shaft they are"
-        )
-    if efficiency > 1.0:
-        known["gear_efficiency"] = 1.0
-        how["gear_efficiency"] += ", taken as 1"
-
-
-def _settle_friction(known: dict[str, Any], how: dict[str, str], text: _Text, has_no_load: bool) -> None:
-    """Friction from the no-load current: all of it Coulomb's, unless one of the two kinds is printed."""
-    if not has_no_load:
-        return
-    coulomb, viscous = "coulomb_friction" in known, "viscous_friction" in known
-    total, free = known["torque_constant"] * known["no_load_current"], "torque_constant * no_load_current"
-    if known.get("gear_efficiency", 1.0) != 1.0:  # friction is behind the gear
-        total, free = known["gear_efficiency"] * total, f"gear_efficiency * {free}"
-    if not coulomb and not viscous:
-        known["coulomb_friction"], known["viscous_friction"] = total, 0.0
-        how["coulomb_friction"] = text.sentence("coulomb_friction", free)
-        how["viscous_friction"] = "viscous_friction = 0: the no-load current is taken as Coulomb friction alone"
-    elif coulomb != viscous and "no_load_speed" in known:
-        speed = known["no_load_speed"]
-        if coulomb:
-            name, formula = "viscous_friction", f"({free} - coulomb_friction) / no_load_speed"
-            known[name] = max(0.0, (total - known["coulomb_friction"]) / speed)
-        else:
-            name, formula = "coulomb_friction", f"{free} - viscous_friction * no_load_speed"
-            known[name] = max(0.0, total - known["viscous_friction"] * speed)
-        how[name] = text.sentence(name, formula) + ", not below 0"
-
-
-def _disagreements(known: dict[str, Any], printed: set[str], text: _Text) -> tuple[Disagreement, ...]:
-    found = []
-    for (quantity, needs, formula, function), reading in CHECKS:
-        if quantity in printed and all(name in known for name in needs):
-            value, computed = known[quantity], function(*(known[name] for name in needs))
-            if abs(computed - value) > 1e-9 * abs(value):
-                unit = text.number(quantity).partition(" ")[2]
-                found.append(
-                    Disagreement(quantity, value, computed, unit, f"{formula} = {text.filled(formula)}", reading)
-                )
-    return tuple(sorted(found, key=lambda one: -abs(one.difference)))
+    def disagreements(self, printed: set[str]) -> tuple[Disagreement, ...]:
+        """What is printed and also follows, otherwise; the worst first."""
+        found = []
+        for (quantity, needs, formula, function), reading in CHECKS:
+            if quantity in printed and self.known.keys() >= {*needs}:
+                value, computed = self.known[quantity], function(*(self.known[name] for name in needs))
+                if abs(computed - value) > 1e-9 * abs(value):
+                    text = f"{formula} = {self._filled(formula)}"
+                    found.append(Disagreement(quantity, value, computed, self._units[quantity], text, reading))
+        return tuple(sorted(found, key=lambda one: -abs(one.difference)))

@@ -65,52 +65,46 @@ def read(name: str, printed: Any, kind: Kind) -> Reading:
         raise ValueError(
             f"datasheet.{name} = {printed!r}: must be one number, without a space or a comma in it; {remedy}"
         )
-    value = _si(name, printed, math.prod(map(float, factors.split("*"))), unit, kind, remedy)
+    if re.search(r"(?i)\be-?rpm", unit):
+        raise ValueError(
+            f"datasheet.{name} = {printed!r}: electrical turns are not the rotor's; divide by the pole pairs, write rpm"
+        )
+    if not unit and kind.unit:
+        raise ValueError(f"datasheet.{name} = {printed!r}: has no unit; {remedy}")
+    try:
+        value = float(in_si(math.prod(map(float, factors.split("*"))), unit, kind.unit, weights=True))
+    except ValueError as error:
+        raise ValueError(f"datasheet.{name} = {printed!r}: {error}; {remedy}") from error
     bound = "a finite number >= 0" if kind.zero else "a finite number > 0"
     if not (math.isfinite(value) and (value > 0.0 or (value == 0.0 and kind.zero))):
         raise ValueError(f"datasheet.{name} = {printed!r}: must be {bound}; give its magnitude, or leave the field out")
     return Reading(value, f"{factors} {unit}".strip(), shaft)
 
 
-def _si(name: str, printed: str, number: float, unit: str, kind: Kind, remedy: str) -> float:
-    if re.search(r"(?i)\be-?rpm", unit):
-        raise ValueError(
-            f"datasheet.{name} = {printed!r}: electrical turns are not the rotor's; divide by the pole pairs, write rpm"
-        )
-    unit = respelled(unit)
-    if not unit and kind.unit:
-        raise ValueError(f"datasheet.{name} = {printed!r}: has no unit; {remedy}")
+def in_si(number: Any, unit: str, kind: str | None, of: str = "this quantity", weights: bool = False) -> Any:
+    """A number of a unit, as datasheets and loggers spell it, in the SI unit of its kind; of kind None in any.
+
+    With `weights` a mass stands for its weight where that alone makes sense: kg*cm, oz*in. The error says what is wrong
+    with it as a unit `of` something, and leaves the remedy to who asks.
+    """
     registry = unit_registry()
+    for spelling, plain in _SPELLINGS:
+        unit = re.sub(spelling, plain, unit)
     try:
         quantity = registry.Quantity(number, unit)
     except Exception as error:  # of any kind: what pint's parser stumbles over
-        raise ValueError(f"datasheet.{name} = {printed!r}: its unit {unit!r} is not known; {remedy}") from error
-    wanted = registry.Quantity(1.0, kind.unit).dimensionality
-    if quantity.dimensionality == wanted / registry.standard_gravity.dimensionality:
-        quantity = quantity * registry.standard_gravity  # kg*cm, oz*in: the weight of a kilogram, of an ounce
+        raise ValueError(f"the unit {unit!r} is not known") from error
+    if kind is None:
+        return quantity.to_base_units().magnitude
+    wanted = registry.Quantity(1.0, kind).dimensionality
+    if weights and quantity.dimensionality == wanted / registry.standard_gravity.dimensionality:
+        quantity = quantity * registry.standard_gravity
     if quantity.dimensionality != wanted:
-        raise ValueError(
-            f"datasheet.{name} = {printed!r}: {unit!r} is no unit of this quantity, which is in "
-            f"{kind.unit or 'no unit'}; {remedy}"
-        )
-    if leaves_angle_open(quantity, kind.unit):
-        raise ValueError(
-            f"datasheet.{name} = {printed!r}: turns or radians? Hz and 1/s leave it open; write rpm, turn/s or rad/s"
-        )
-    return float(quantity.to(kind.unit).magnitude)
-
-
-def respelled(unit: str) -> str:
-    """A unit as datasheets spell it, as pint does."""
-    for spelling, plain in _SPELLINGS:
-        unit = re.sub(spelling, plain, unit)
-    return unit
-
-
-def leaves_angle_open(quantity: Any, unit: str) -> bool:
-    """Whether a pint quantity leaves open if turns or radians are meant, where the SI unit is one of an angle."""
+        raise ValueError(f"{unit!r} is no unit of {of}, which is in {kind or 'no unit'}")
     units = {name for name, _ in quantity.unit_items()}
-    return any(name.endswith("hertz") for name in units) or (unit.startswith("rad") and not units & _ANGLES)
+    if any(name.endswith("hertz") for name in units) or (kind.startswith("rad") and not units & _ANGLES):
+        raise ValueError("turns or radians? Hz and 1/s leave it open")
+    return quantity.to(kind or "dimensionless").magnitude
 
 
 @functools.cache

@@ -107,7 +107,7 @@ class Advise:
 
     def _measured(self, seeds: int) -> Any:
         from codrl_mj.cli.terminal import say
-        from codrl_mj.study.measured import measurement
+        from codrl_mj.study.advice import decide, measurement
         from codrl_mj.study.parallel import Workers
         from codrl_mj.study.program import compute
 
@@ -116,11 +116,12 @@ class Advise:
             asked.grid.compute(Workers(self.jobs))
         else:
             compute(asked.grid, Workers(self.jobs))
-        found = asked.judged(asked.grid.collect())
+        options = asked.judged(asked.grid.collect())
+        verdict = decide(options)
         if not self.as_json:
-            _print_options(f"Measured: {seeds} policies of either kind, 50 episodes each", found.options)
-            say(f"measured: {found.verdict}" + " by more policies (--measure)" * (found.verdict == "measure it"))
-        return found
+            _print_options(f"Measured: {seeds} policies of either kind, 50 episodes each", options)
+            say(f"measured: {verdict}" + " by more policies (--measure)" * (verdict == "measure it"))
+        return {"options": options, "verdict": verdict}
 
 
 def _print(name: str, found: Any) -> None:

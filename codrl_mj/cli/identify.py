@@ -58,9 +58,9 @@ class Identify:
     def run(self) -> int:
         """Check the logs, fit, print a table, write the files."""
         from codrl_mj.cli.terminal import console, progress_bar
+        from codrl_mj.drives import find_drive
         from codrl_mj.identify.identify import checked, foreseen, identify
         from codrl_mj.identify.reading import read_log
-        from codrl_mj.motor_design import find_drive
 
         logs, held_out = ([read_log(path, self.columns) for path in paths] for paths in (self.logs, self.holdout))
         known = _numbers(self.known)

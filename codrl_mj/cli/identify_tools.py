@@ -48,9 +48,9 @@ class CheckLogs:
     def run(self) -> int:
         """Print a table for each log."""
         from codrl_mj.cli.terminal import console
+        from codrl_mj.drives import find_drive
         from codrl_mj.identify.checks import check
         from codrl_mj.identify.reading import read_log
-        from codrl_mj.motor_design import find_drive
 
         motor = None if self.motor is None else find_drive(self.motor).motor
         if not self.logs:
@@ -128,8 +128,8 @@ class PlanExperiment:
 
     def run(self) -> int:
         """Print the options, the best one last."""
+        from codrl_mj.drives import find_drive, find_entry
         from codrl_mj.identify.plan import GOALS, Sensing, plan, write_excitation
-        from codrl_mj.motor_design import find_drive, find_entry
 
         sensing, entry = Sensing(self.current_noise, self.encoder, self.voltage), find_entry(self.name)
         bears = None if entry is None else entry.numbers.continuous_current
@@ -219,8 +219,8 @@ class SimulateLog:
     def run(self) -> int:
         """Write the log."""
         from codrl_mj.actuators import Supply
+        from codrl_mj.drives import find_drive
         from codrl_mj.identify.synthetic import Excitation, Sampler, simulate, write_log
-        from codrl_mj.motor_design import find_drive
 
         if not self.out.name.endswith((".csv", ".csv.gz")):
             raise ValueError(f"out = {self.out}: must end in .csv or .csv.gz")
@@ -267,7 +267,7 @@ class ProposeColumns:
 
     def run(self) -> int:
         """Print the mapping, what could not be told, and the next line."""
-        from codrl_mj.identify.proposal import propose_columns
+        from codrl_mj.identify.reading import propose_columns
 
         found = propose_columns(self.log)
         if self.as_json:

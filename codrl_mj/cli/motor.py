@@ -41,7 +41,7 @@ class Changes:
 
     def drive(self, name: str) -> Any:
         """The named drive with these set over it."""
-        from codrl_mj.motor_design import find_drive
+        from codrl_mj.drives import find_drive
 
         given: dict[str, Any] = dict(vars(self))
         if given.pop("not_delayed") == given["delayed"]:
@@ -87,7 +87,7 @@ class List:
     def run(self) -> int:
         """Print the table."""
         from codrl_mj.cli.terminal import print_table
-        from codrl_mj.motor_design import catalogue_rows
+        from codrl_mj.drives import catalogue_rows
 
         rows = catalogue_rows(self.sort)
         if self.as_json:
@@ -121,7 +121,7 @@ class Show:
 
     def run(self) -> int:
         """Print the tables, draw the diagram."""
-        from codrl_mj.motor_design import explain, find_entry
+        from codrl_mj.drives import explain, find_entry
         from codrl_mj.pages.diagrams import torque_speed_diagram
 
         drive, entry = self.changes.drive(self.name), find_entry(self.name)
@@ -143,23 +143,20 @@ class Show:
 def _print_explained(title: str, volts: float, found: dict[str, Any]) -> None:
     """What it can do first, then its numbers, then what to know of them."""
     from codrl_mj.cli.terminal import print_table, say
-    from codrl_mj.motor_design import unknown_in_words
+    from codrl_mj.drives import unknown_in_words
 
     def show(title: str, part: str) -> None:
         rows = [(row["name"], _text(row["value"]), row["unit"]) for row in found[part]]
         print_table(title, ("number", "value", "unit"), rows, right=("value",))
 
-    sources: list[str] = []
     say(title)
     show(f"What it can do at its output, at {volts:g} V", "abilities")
     say(found["assumed"])
     if "numbers" in found:
         rows = []
         for row in found["numbers"]:
-            sources += [source for source in row["sources"] if source not in sources]
-            places = ", ".join(str(1 + sources.index(source)) for source in row["sources"])
             estimated = "" if row["name"] not in found["estimated"] else " (estimated)"
-            rows.append((row["name"], _text(row["value"]), row["unit"], row["how"] + estimated, places))
+            rows.append((row["name"], _text(row["value"]), row["unit"], row["how"] + estimated, row["places"]))
         columns = "number", "value", "unit", "how it came about", "source"
         print_table("The motor, at its rotor", columns, rows, right=("value",))
     show("As it is simulated", "drive")
@@ -168,7 +165,7 @@ def _print_explained(title: str, volts: float, found: dict[str, Any]) -> None:
             ("disagreement", found["disagreements"]),
             ("note", [" ".join(found["notes"].split())] if found["notes"] else []),
             ("estimated", [f"{field}: {why}" for field, why in found["estimated"].items()]),
-            ("source", [f"{number}: {source}" for number, source in enumerate(sources, 1)]),
+            ("source", [f"{number}: {source}" for number, source in enumerate(found["cited"], 1)]),
         ):
             say(*(f"{kind} {text}" if kind == "source" else f"{kind}: {text}" for text in texts))
         say(unknown_in_words(found["unknown"]))
@@ -203,7 +200,7 @@ class Design:
     def run(self) -> int:
         """Print the table, draw Bode's diagram."""
         from codrl_mj.cli.terminal import print_table, say
-        from codrl_mj.motor_design import LoopDesign, design, designs, sampled_too_seldom
+        from codrl_mj.drives import LoopDesign, design, designs, sampled_too_seldom
         from codrl_mj.pages.diagrams import bode_diagram
 
         drive = self.changes.drive(self.name)
@@ -251,7 +248,7 @@ class Step:
     def run(self) -> int:
         """Print the table, draw the responses."""
         from codrl_mj.cli.terminal import print_table, say
-        from codrl_mj.motor_design import sampled_too_seldom, step
+        from codrl_mj.drives import sampled_too_seldom, step
         from codrl_mj.pages.diagrams import step_diagram
 
         drive = self.changes.drive(self.name)
@@ -259,7 +256,8 @@ class Step:
         figure = self.out and step_diagram(drive, steps)
         small, constant = steps.small, drive.motor.torque_constant
         settled, amplitude = small.settling_time(), float(small.reference[-1])
-        recoveries = {kind: {"time": one.time, "undershoot": one.undershoot} for kind, one in steps.recoveries.items()}
+        responses = steps.recoveries.items()
+        recoveries = {k: {"time": one.settling_time(0.05), "undershoot": one.undershoot} for k, one in responses}
         if self.as_json:
             content = {"current": amplitude, "settling_time": settled, "overshoot": small.overshoot}
             asked = {name: getattr(steps, name) for name in ("speed", "unreachable", "reachable")}

@@ -51,9 +51,19 @@ class Feasible:
         from rich.text import Text
 
         from codrl_mj.cli.terminal import print_table, say
-        from codrl_mj.sizing import HOPELESS, SURELY_NOT, catalogued, demand_of, feasibility, geared
+        from codrl_mj.drives import (
+            HOPELESS,
+            SURELY_NOT,
+            demand_of,
+            feasibility,
+            find_drive,
+            find_entry,
+            geared,
+            uncounted,
+        )
 
-        drive, continuous, unknown = catalogued(self.name, self.gear_ratio, self.voltage)
+        drive, entry = find_drive(self.name, self.gear_ratio, voltage=self.voltage), find_entry(self.name)
+        continuous, unknown = entry.numbers.continuous_current if entry else None, uncounted(entry)
         demand = demand_of(self.asked, trust=self.trust, motor=self.motor)
         found = feasibility(drive, demand, continuous)
         title = f"{self.name}, {_gear(drive, demand)}, {drive.voltage_limit:g} V: {demand.source}"
@@ -115,7 +125,7 @@ class Choose:
     def run(self) -> int:
         """Print the ranking, or of several motors the best for each."""
         from codrl_mj.cli.terminal import console, say
-        from codrl_mj.sizing import choose, demand_of, demands_of
+        from codrl_mj.drives import choose, demand_of, demands_of
 
         if self.top < 1:
             raise ValueError(f"--top {self.top}: must be >= 1")
@@ -151,8 +161,8 @@ class Choose:
             return
         import yaml
 
+        from codrl_mj.drives import actuators_of
         from codrl_mj.runs.files import writing
-        from codrl_mj.sizing import actuators_of
 
         with writing(self.out / "actuators.yaml") as temporary:
             temporary.write_text(yaml.safe_dump(actuators_of(choices), sort_keys=False))
@@ -213,7 +223,7 @@ def _draw(drive: Any, demand: Any, name: str, path: Path) -> None:
     """The torque-speed diagram with what the demand asks at the gear's output, the rotor's inertia included."""
     import numpy as np
 
-    from codrl_mj.motor_design.drives import find_entry
+    from codrl_mj.drives.abilities import find_entry
     from codrl_mj.pages.diagrams import torque_speed_diagram
     from codrl_mj.pages.plots import save
 

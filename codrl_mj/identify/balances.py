@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codrl_mj.identify.log import Log, usable
-from codrl_mj.identify.segments import sensor_deviation
+from codrl_mj.identify.log import Log, sensor_deviation, usable
 
 _ROWS = 12  # rows of a window, at least
 _LONGEST = 20_000  # rows of a log beyond which a lag is not looked for

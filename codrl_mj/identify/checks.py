@@ -7,9 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from codrl_mj.identify.balances import Balance, effort_lag, torque_balance, velocity_lag, voltage_balance
-from codrl_mj.identify.log import LONGEST_STEP, SIGNALS, Finding, Log, find_resolution
+from codrl_mj.identify.log import LONGEST_STEP, SIGNALS, Finding, Log, find_resolution, moves, replaced
 from codrl_mj.identify.parameters import PARAMETERS
-from codrl_mj.identify.segments import moves, replaced
 
 _DROPPED = 1.5  # median steps, from which on rows are missing
 _MOST_LISTED = 10

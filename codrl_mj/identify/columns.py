@@ -123,20 +123,12 @@ class Column:
         kind, unit = KINDS[self.signal], self.unit
         if unit is None or (not kind and unit in ("", "1")):
             return value
-        from codrl_mj.catalogue.units import leaves_angle_open, respelled, unit_registry
+        from codrl_mj.catalogue.units import in_si
 
-        registry = unit_registry()
         try:
-            quantity = registry.Quantity(value, respelled(unit))
-        except Exception as error:  # pint raises what its parser stumbles over
-            raise self._wrong(f"the unit {unit!r} is not known; write {kind or '1'}") from error
-        if kind is None:
-            return quantity.to_base_units().magnitude
-        if not quantity.check(registry.Quantity(1.0, kind).dimensionality):
-            raise self._wrong(f"{unit!r} is no unit of {self.signal}, must be of {kind or '1'}")
-        if leaves_angle_open(registry.Quantity(1.0, respelled(unit)), kind):
-            raise self._wrong("turns or radians? Write rad, deg, turn, rad/s or rpm")
-        return quantity.to(kind or "dimensionless").magnitude
+            return in_si(value, unit, kind, self.signal)
+        except ValueError as error:
+            raise self._wrong(f"{error}; write {kind or '1'}, or another unit of that") from error
 
 
 def parse_columns(given: str | Mapping[str, str]) -> dict[str, Column]:

@@ -12,9 +12,8 @@ from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from codrl_mj.identify.log import Log
+from codrl_mj.identify.log import Log, Segment, shifted
 from codrl_mj.identify.parameters import DEFAULTS, PARAMETERS
-from codrl_mj.identify.segments import Segment, shifted
 
 DIFFERENCE = 1e-4  # step of finite differences, in the parameters' scales: dry friction makes smaller ones rough
 FAR = 1e30
@@ -73,7 +72,6 @@ class Fit:
     model: Any  # a `Model`
     segments: Sequence[Segment]
     values: np.ndarray  # shape (p,)
-    cost: float  # robust cost, in squares of the sensors' standard deviations
     scale: float  # residuals beyond this, in standard deviations of the sensor, count less
     residuals: tuple[np.ndarray, ...]  # of each segment, in standard deviations of the sensor, shape (m,)
     jacobians: tuple[np.ndarray, ...]  # of each segment, what its states cannot do taken out, shape (m, p)
@@ -81,6 +79,11 @@ class Fit:
     logs: tuple[Log, ...] = ()  # of the segments, with the input in time
     delay: float = 0  # rows by which it was late
     tried: tuple["Fit", ...] = ()  # what each start led to
+
+    @property
+    def cost(self) -> float:
+        """Robust cost, in squares of the sensors' standard deviations."""
+        return robust_cost(np.concatenate(self.residuals), self.scale)
 
     def costs(self, scale: float) -> np.ndarray:
         """Robust cost of each segment."""
@@ -249,8 +252,8 @@ def refit(
     jacobians = problem.jacobians(values)
     found = problem.solve(values)
     residuals = tuple(one.residuals for one in found)
-    cost, settled = robust_cost(np.concatenate(residuals), problem.scale), tuple(one.state for one in found)
-    return Fit(model, segments, values, cost, problem.scale, residuals, tuple(jacobians), settled)
+    states = tuple(one.state for one in found)
+    return Fit(model, segments, values, problem.scale, residuals, tuple(jacobians), states)
 
 
 def refitted(fit: Fit, model: Model) -> Fit:

@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.fields import check_names
-from codrl_mj.identify.estimate import Fit, fitted, refitted
-from codrl_mj.identify.log import Log
+from codrl_mj.identify.estimate import Fit, fitted, refit, refitted, search
+from codrl_mj.identify.log import SEGMENT, Log, moves, shifted
 from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import ESTIMABLE, OF_RIG, PARAMETERS
-from codrl_mj.identify.prediction import Prediction, fitted_traces, predict, with_friction
-from codrl_mj.identify.result import Identified, missing
-from codrl_mj.identify.segments import SEGMENT, moves, shifted
+from codrl_mj.identify.result import Identified, Prediction, fitted_traces, missing, predict
 from codrl_mj.identify.trust import correlations, judged
 
 INPUTS = "torque", "current", "voltage"  # what drives the shaft: the nearest to it that all logs that move have
@@ -198,3 +196,35 @@ def _foretold(shaft: Fit | None, logs: Sequence[Log]) -> tuple[Prediction, ...]:
     driven_by, output = shaft.model.driven_by, shaft.model.output
     told = [log for log in logs if moves(log) and log.has(driven_by, output)]
     return tuple(predict(shaft, shifted(log, driven_by, shaft.delay)) for log in told)
+
+
+def foretold(model: ShaftModel, logs: Sequence[Log], on_step: Callable[[], None]) -> np.ndarray:
+    """Mean absolute error on each log of the fit to all others, from that to all, shape (n,)."""
+    segments = model.segments(logs)
+    model, starts = model.begun(segments)
+    whole, errors = search(model, segments, starts[:2])[0].values, []
+    for place, log in enumerate(logs):
+        found = predict(refit(model, model.segments([*logs[:place], *logs[place + 1 :]]), whole, 12), log)
+        errors.append(found.open_loop if found.closed_loop is None else found.closed_loop)
+        on_step()
+    return np.array(errors)
+
+
+def with_friction(model: ShaftModel, logs: Sequence[Log], wanted: str, on_step: Callable[[], None]) -> ShaftModel:
+    """The model with the friction that is wanted or, for `auto`, with what leaving out one log at a time speaks for.
+
+    More than viscous and Coulomb friction is kept where the errors on the logs left out fall by more, in the mean, than
+    two standard deviations of that mean. With fewer than three logs none is.
+    """
+    if wanted != "auto":
+        return dataclasses.replace(model, friction=wanted)
+    if len(logs) < 3:
+        return model
+    best, least = model, foretold(model, logs, on_step)
+    for friction in ("load", "stribeck", "both"):
+        tried = dataclasses.replace(model, friction=friction)
+        errors = foretold(tried, logs, on_step)
+        gained = least - errors
+        if gained.mean() > 2.0 * gained.std(ddof=1) / np.sqrt(len(gained)):
+            best, least = tried, errors
+    return best

@@ -1,8 +1,10 @@
-"""A bench log in SI units: what the fit reads and the checks look at."""
+"""A bench log in SI units, what its sensors and its shaft do, and the segments that it is cut into."""
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -133,3 +135,138 @@ def find_resolution(values: np.ndarray) -> float:
         if count < _MOST_LEVELS and float(np.abs(grid - np.round(grid)).max()) < 0.1:
             return spread / count
     return 0.0
+
+
+# -- cut into segments, each simulated from an initial state of its own ----------------------------------------------
+
+SEGMENT = 0.5
+"""Time [s] that a shaft is simulated for at once: longer ones meet friction that no model has, and several minima."""
+BLOCK = 1.0  # shortest stretch [s] of a log that is resampled as a whole: residuals within it belong together
+SHAFT_STEP = 5e-4
+"""Rows that are nearer [s] are taken together for a shaft, which is slower: their mean input, their first position."""
+SPIKE = 50.0  # a row is a spike where it sticks out by more than so many times what nine of ten rows do at most
+WINDOW = 4e-3
+"""Time [s] that positions are smoothed over: short beside what a shaft does, long beside an encoder's steps."""
+STILL = 10.0  # a shaft that moves by no more than so many steps of its encoder is locked
+
+
+class Segment(NamedTuple):
+    """Rows that are simulated at once."""
+
+    log: int  # place of its log among those fitted
+    block: int  # number of the stretch that it is resampled with, unique over all logs
+    rows: slice  # of its log
+    times: np.ndarray  # [s], shape (m,)
+    inputs: np.ndarray  # what drives it, at the times, shape (m,)
+    slopes: np.ndarray  # how that changes till the next row [1/s], shape (m,)
+    speeds: np.ndarray  # mean speed [rad/s] till the next row, shape (m,): of a winding
+    measured: np.ndarray  # what a simulation is compared with, shape (m,)
+    deviation: float  # standard deviation of the sensor, in the unit of `measured`
+    state: np.ndarray  # a guess of the state at the first row
+
+    def first(self, count: int) -> "Segment":
+        """Its first rows."""
+        several = ("times", "inputs", "slopes", "speeds", "measured")
+        return self._replace(**{name: getattr(self, name)[:count] for name in several})
+
+
+def shifted(log: Log, name: str, rows: float) -> Log:
+    """A log whose signal is as it was some rows before (or, negative, after), the ends repeated; halves lie between."""
+    places, values = np.arange(len(log.time)), log.signals[name]
+    return log if rows == 0 else replaced(log, name, np.interp(places - rows, places, values))
+
+
+def replaced(log: Log, name: str, values: np.ndarray) -> Log:
+    """A log with another signal, shape (n,)."""
+    return dataclasses.replace(log, signals={**log.signals, name: values})
+
+
+def without_spikes(values: np.ndarray) -> np.ndarray:
+    """A sampled signal, rows that stick out of both their neighbours by far more than is usual in place of the nearer.
+
+    Residuals of an output bear outliers, by the robust loss; what drives a simulation has to be free of them.
+    """
+    middle = np.median(np.stack([values[:-2], values[1:-1], values[2:]]), axis=0)
+    off = np.abs(values[1:-1] - middle)
+    usual = max(float(np.percentile(off, 90.0)), 1e-3 * float(np.std(values)))
+    found = values.copy()
+    found[1:-1][off > SPIKE * usual] = middle[off > SPIKE * usual]
+    return found
+
+
+def sensor_deviation(log: Log, name: str) -> float:
+    """Standard deviation of a signal's sensor: of its quantisation, or of what no smooth motion does within 4 rows.
+
+    Where the latter is within a step of the quantisation it is that of the quantisation.
+    """
+    values = log.signals[name]
+    step = log.resolution.get(name, 0.0)
+    if len(values) < 8:
+        return max(step / math.sqrt(12.0), 1e-9)
+    ripple = np.diff(values, n=3) / math.sqrt(20.0)  # 1, 3, 3, 1
+    noise = 1.4826 * float(np.median(np.abs(ripple)))
+    return max(noise if noise > step else step / math.sqrt(12.0), 1e-6 * float(np.ptp(values)), 1e-12)
+
+
+def moves(log: Log) -> bool:
+    """Whether the shaft moves, by more than an encoder flickers or a velocity is noisy; no where neither is logged."""
+    if log.has("position"):
+        return float(np.ptp(log.signals["position"])) > max(STILL * log.resolution.get("position", 0.0), 1e-4)
+    if not log.has("velocity"):
+        return False
+    velocity, rows = log.signals["velocity"], max(min(round(0.05 / log.step), len(log.time) // 4), 1)
+    return float(np.std(np.convolve(velocity, np.full(rows, 1.0 / rows), "valid"))) > 0.3 * float(np.std(velocity))
+
+
+def speeds(times: np.ndarray, positions: np.ndarray, at: np.ndarray, window: float = WINDOW) -> np.ndarray:
+    """Slopes [rad/s] of straight lines through the positions within half a window of a time, at least three of them.
+
+    In the middle of a window that is also the slope of the parabola. Near the ends the window is what there is.
+    """
+    count = len(times)
+    first = np.searchsorted(times, at - 0.5 * window - 1e-9)
+    last = np.searchsorted(times, at + 0.5 * window + 1e-9)
+    near = np.clip(np.searchsorted(times, at), 1, count - 1)
+    first = np.clip(np.minimum(first, near - 1), 0, max(count - 2, 0))
+    last = np.clip(np.maximum(last, near + 1), first + 2, count)
+    shifted, moved = times - times[0], positions - positions[0]
+    sums = [np.concatenate([[0.0], np.cumsum(one)]) for one in (shifted, moved, shifted * moved, shifted**2)]
+    t, q, tq, tt = (one[last] - one[first] for one in sums)
+    number = last - first
+    return (number * tq - t * q) / (number * tt - t * t)
+
+
+def cut(log: Log, longest: float) -> list[slice]:
+    """Rows of segments of a length [s], where there are no gaps; the last of a stretch is up to half longer."""
+    found = []
+    for stretch in usable(log):
+        begin, end = log.time[stretch.start], log.time[stretch.stop - 1]
+        count = max(round((end - begin) / longest), 1)
+        edges = np.searchsorted(log.time[stretch], np.linspace(begin, end, count + 1)[:-1]) + stretch.start
+        edges = [*map(int, np.unique(edges)), stretch.stop]
+        found += [slice(a, b) for a, b in itertools.pairwise(edges) if b - a >= 4]
+    return found
+
+
+def initial_state(log: Log, rows: slice) -> np.ndarray:
+    """Position and speed at the first row, from the rows around it: a parabola within 15 ms, or five rows."""
+    time = log.time[rows.start]
+    stretch = next(one for one in usable(log) if one.start <= rows.start < one.stop)
+    first = max(min(int(np.searchsorted(log.time, time - 0.015)), rows.start - 2), stretch.start)
+    last = min(max(int(np.searchsorted(log.time, time + 0.015)), rows.start + 3), stretch.stop)
+    near = slice(first, last)
+    degree = min(2, last - first - 1)
+    fitted = np.polynomial.polynomial.polyfit(log.time[near] - time, log.signals["position"][near], degree)
+    return np.array([fitted[0], fitted[1]])
+
+
+def halved(log: Log) -> Log:
+    """Every second row of a log; a mean voltage becomes that of both."""
+    count = len(log.time) - (len(log.time) + 1) % 2  # to begin and end with a row that is kept
+    kept = log.part(slice(0, count, 2))
+    if not (log.mean_voltage and log.has("voltage")):
+        return kept
+    steps, volts = np.diff(log.time[:count]), log.signals["voltage"][:count]
+    energy = volts[:-1] * steps
+    mean = (energy[::2] + energy[1::2]) / (steps[::2] + steps[1::2])
+    return replaced(kept, "voltage", np.append(mean, volts[-1]))

@@ -9,12 +9,11 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from codrl_mj.identify.estimate import Model, Simulate, settled_state
-from codrl_mj.identify.log import Log, usable
-from codrl_mj.identify.parameters import DEFAULTS, ELECTRICAL, FRICTION, OF_FRICTION, OF_RIG, PARAMETERS
-from codrl_mj.identify.segments import (
+from codrl_mj.identify.log import (
     BLOCK,
     SEGMENT,
     SHAFT_STEP,
+    Log,
     Segment,
     cut,
     initial_state,
@@ -22,8 +21,10 @@ from codrl_mj.identify.segments import (
     sensor_deviation,
     shifted,
     speeds,
+    usable,
     without_spikes,
 )
+from codrl_mj.identify.parameters import DEFAULTS, ELECTRICAL, FRICTION, OF_FRICTION, OF_RIG, PARAMETERS
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)

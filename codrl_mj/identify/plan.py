@@ -17,10 +17,9 @@ import numpy as np
 from codrl_mj.actuators import Drive
 from codrl_mj.fields import check, check_names, real
 from codrl_mj.identify.estimate import Model, refit
-from codrl_mj.identify.log import Log
+from codrl_mj.identify.log import Log, Segment
 from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import ELECTRICAL, PARAMETERS
-from codrl_mj.identify.segments import Segment
 from codrl_mj.identify.synthetic import EXCITATIONS, FREE, Excitation, Load, Sampler, run, sample_times, simulate
 from codrl_mj.runs.files import writing
 

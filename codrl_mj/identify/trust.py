@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.identify.estimate import Fit, refit
-from codrl_mj.identify.log import Log
+from codrl_mj.identify.log import BLOCK, Log, halved, moves, replaced
 from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import DEFAULTS, FRICTION, PARAMETERS
 from codrl_mj.identify.result import Estimate, Status
-from codrl_mj.identify.segments import BLOCK, halved, moves, replaced
 
 LEAST_LOGS = 5  # from so many logs on whole logs are resampled; below, blocks of them
 DRAWS = 500

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import Drive
-from codrl_mj.motor_design import LoopDesign, Looped, Response, abilities, closed_loop, design, open_loop, small_step
-from codrl_mj.motor_design.drives import diagram_limits, torque_limits
-from codrl_mj.motor_design.windup import Steps
+from codrl_mj.drives import LoopDesign, Looped, Response, abilities, closed_loop, design, open_loop, small_step
+from codrl_mj.drives.abilities import diagram_limits, torque_limits
+from codrl_mj.drives.loop import Steps
 from codrl_mj.pages.plots import Curve, Plot
 
 TORQUE_SPEED = "speed of the output [rad/s]", "torque of the output [N·m]"
@@ -129,7 +129,7 @@ def _upright(label: str, x: float, low: float, high: float) -> Curve:
 
 
 def step_diagram(drive: Drive, steps: Steps) -> list[Plot]:
-    """Current and voltage of the steps that `codrl_mj.motor_design.step` took with a drive."""
+    """Current and voltage of the steps that `codrl_mj.drives.step` took with a drive."""
     return [*small_steps({"": (drive, None)}), *recoveries(drive, steps)]
 
 
@@ -157,8 +157,9 @@ def recoveries(drive: Drive, steps: Steps) -> list[Plot]:
     """Current and voltage out of a demand that the voltage cannot meet, by kind of anti-windup; and the same close."""
     told = {}
     for kind, one in steps.recoveries.items():
-        took = f"{1e3 * one.time:.2g} ms" if math.isfinite(one.time) else "over 100 ms"
-        told[f"{kind.replace('_', ' ')}: back in {took}"] = one.response
+        back = one.settling_time(0.05)
+        took = f"{1e3 * back:.2g} ms" if math.isfinite(back) else "over 100 ms"
+        told[f"{kind.replace('_', ' ')}: back in {took}"] = one
     at = f"at {steps.speed:.4g} rad/s of the rotor"
     title = f"{steps.unreachable:.3g} A, out of reach, then {steps.reachable:.3g} A, {at}"
     return [*_responses(drive, title, told, _SHOWN), *_responses(drive, "The same, close", told, _CLOSE)]

@@ -8,8 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from codrl_mj.identify.log import SIGNALS
-from codrl_mj.identify.prediction import Trace
-from codrl_mj.identify.result import USABLE, Identified
+from codrl_mj.identify.result import USABLE, Identified, Trace
 from codrl_mj.identify.trust import CAUSES
 from codrl_mj.pages import page
 from codrl_mj.pages.plots import Curve, Plot

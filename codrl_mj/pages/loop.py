@@ -8,7 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from codrl_mj.actuators import Actuator, ActuatorModel, Drive, Inputs, TorqueSpeed, parameters_type
-from codrl_mj.motor_design import LoopDesign, design, designs, torque_limits
+from codrl_mj.drives import LoopDesign, design, designs, torque_limits
 from codrl_mj.pages import page
 from codrl_mj.pages.diagrams import Loops, bode, small_steps
 from codrl_mj.pages.plots import Curve, Plot

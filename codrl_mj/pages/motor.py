@@ -8,7 +8,7 @@ from markupsafe import Markup
 
 from codrl_mj.actuators import Drive
 from codrl_mj.catalogue import MotorEntry
-from codrl_mj.motor_design import explain, step, unknown_in_words
+from codrl_mj.drives import explain, step, unknown_in_words
 from codrl_mj.pages import page
 from codrl_mj.pages.diagrams import recoveries, torque_speed_diagram
 from codrl_mj.pages.loop import loop_section, rates_table
@@ -63,17 +63,14 @@ def _numbers(known: Mapping[str, Any]) -> Markup:
     """Every number of a datasheet with its origin."""
     if "numbers" not in known:
         return Markup()
-    sources: list[str] = []
     rows = []
     for row in known["numbers"]:
-        sources += [source for source in row["sources"] if source not in sources]
-        places = ", ".join(str(1 + sources.index(source)) for source in row["sources"])
         how = row["how"] + (" (estimated)" if row["name"] in known["estimated"] else "")
-        cells = row["name"].replace("_", " "), page.number(row["value"]), page.unit(row["unit"]), how, places
+        cells = row["name"].replace("_", " "), page.number(row["value"]), page.unit(row["unit"]), how, row["places"]
         rows.append(cells)
     columns = ("number", "value", "unit", "how it came about", "source")
     parts = [page.table("Numbers and where they are from", columns, rows, numbers=(1,), cards=True)]
-    parts.append(page.definitions((str(place), source) for place, source in enumerate(sources, 1)))
+    parts.append(page.definitions((str(place), source) for place, source in enumerate(known["cited"], 1)))
     if known["estimated"]:
         parts += [page.heading("Estimated"), page.definitions(known["estimated"].items())]
     if known["unknown"]:

@@ -10,9 +10,9 @@ import numpy as np
 from markupsafe import Markup
 
 from codrl_mj.actuators import Actuator, ActuatorModel, Drive, Ideal
+from codrl_mj.drives import Looped, is_closed
 from codrl_mj.evaluation import Episode
 from codrl_mj.evaluation.evaluate import MEASURES
-from codrl_mj.motor_design import Looped, is_closed
 from codrl_mj.pages import certificate as certificates
 from codrl_mj.pages import page
 from codrl_mj.pages.episode import Shown, episode_section, show

@@ -3,22 +3,26 @@
 The bench gives one dose of everything that the study has an axis for. What ideal-trained policies lose at a dose is
 interpolated, policy by policy, between those that were tested, and losses are added up. What policies lose that were
 trained on random actuators, or through this one, is known where some were tested with no less of anything, or with no
-more. `measured.py` needs no such assumptions, and judges by the same rule.
+more. A `Measurement` needs no such assumptions: it trains and tests policies of its own, in whatever is an environment,
+and is judged by the same rule.
 """
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from codrl_mj.actuators import Actuator, Drive, GearMotor, SampledLoop, Supply
-from codrl_mj.sizing.bench import Delivery, delivery
-from codrl_mj.study.doses import AXES, REAL, REFERENCE_SPEEDS, noise, posed, timestep
+from codrl_mj.actuators import IDEAL as IDEAL_ACTUATOR
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.evaluation import RandomPolicy, evaluate
+from codrl_mj.study.bench import Delivery, commanded, delivered, doses, redesign
+from codrl_mj.study.doses import AXES, FLOORS, REAL, SECONDS, generic, ideal, posed
 from codrl_mj.study.evidence import Evidence, Loss, Outcome, total
-from codrl_mj.study.grid import check_chosen
 from codrl_mj.study.questions import MARGIN
-from codrl_mj.tasks import find_task
+from codrl_mj.study.trials import Arm, Collected, Grid, Trial
+from codrl_mj.training import TrainConfig, load_config
 
 IDEAL, COMMAND, LOOP = "train on ideal", "command more", "design the loop"
 RANDOMISE, THROUGH = "randomise", "train through it"
@@ -156,90 +160,6 @@ def tests_through(evidence: Evidence, task: str) -> Tests:
     }
 
 
-# -- the bench ------------------------------------------------------------------------------------------------
-
-
-def delivered(actuator: Any, task: str, share: float = 1.0) -> Delivery:
-    """What an actuator makes of the commands of a task, on the bench, or of a `share` of its largest force."""
-    check_chosen("task", [task], REFERENCE_SPEEDS)
-    if actuator.MOTION:
-        raise ValueError(
-            f"actuator: a {actuator.family} is asked for motion, not for forces: name one of another family"
-        )
-    known = find_task(task)
-    return delivery(actuator, timestep(task), known.step_duration, share * known.max_force, REFERENCE_SPEEDS[task])
-
-
-def doses(found: Delivery, task: str) -> dict[str, float]:
-    """The dose of every axis that does to a command what the actuator does, as it was `found` on the task, by axis.
-
-    Weakness g and a supply that lacks a share d leave g*min(1, 2*(1 - d)) of the largest force at rest, and
-    g*(1 - 2*d) at the reference speed (`doses.supply`): solved for both, with g at most 1.
-    """
-    rest, speed = max(found.at_rest, 0.0), min(found.at_speed, found.at_rest)
-    strength = rest if speed >= 0.0 else rest - speed
-    if rest == 0.0:
-        lacks = 1.0
-    elif speed >= 0.0:
-        lacks = (1.0 - speed / rest) / 2.0
-    else:
-        lacks = 1.0 - rest / (2.0 * strength)
-    loud = found.noise and found.noise / delivered(noise(task, 1.0).actuator, task).noise
-    return {
-        "lag": found.lag,
-        "weakness": max(1.0 - strength, 0.0),
-        "supply": lacks,
-        "delay": found.dead_time,
-        "friction": found.friction,
-        "noise": loud,
-    }
-
-
-def commanded(actuator: Any, task: str, found: Delivery) -> Delivery | None:
-    """What comes of commands that are larger by what is lost at rest, where that is more than a fiftieth.
-
-    None for a loop that could be designed: what it has not delivered yet is no gear's loss.
-    """
-    if not 0.1 < found.at_rest < 0.98 or redesign(actuator, task) is not None:
-        return None
-    more = 1.0 / found.at_rest
-    there = delivered(actuator, task, more)
-    share = {name: min(getattr(there, name) * more, 1.0) for name in ("at_rest", "at_speed")}
-    scaled = {name: getattr(there, name) * more for name in ("friction", "noise", "unasked")}
-    return there._replace(**share, **scaled)
-
-
-def redesign(actuator: Any, task: str) -> Drive | None:
-    """The same motor and supply under a designed loop; None if it has one, or no loop that could be designed."""
-    if isinstance(actuator, Actuator):  # what a sensor gets wrong no loop makes right
-        wrong = actuator.controller.current_noise or actuator.controller.current_bias
-        return None if wrong else redesigned(actuator, task)
-    if isinstance(actuator, Drive):
-        loop = dataclasses.replace(actuator.controller, bandwidth=0.0, kp=0.0, ki=0.0, anti_windup="back_calculation")
-        return None if loop == actuator.controller else dataclasses.replace(actuator, controller=loop)
-    return None
-
-
-def redesigned(actuator: Actuator, task: str) -> Drive:
-    """The motor and supply of a current loop under a designed one: pole-zero cancellation, anti-windup, a limit."""
-    motor, voltage = actuator.motor, actuator.controller.max_voltage
-    if actuator.supply is not None:
-        voltage = min(voltage, actuator.supply.voltage)
-    limit = motor.arm_radius * find_task(task).max_force / motor.torque_constant
-    return Drive(
-        GearMotor(
-            motor.resistance,
-            motor.inductance,
-            motor.torque_constant,
-            motor.back_emf_constant,
-            rotor_inertia=0.0,
-            arm_radius=motor.arm_radius,
-        ),
-        SampledLoop(sample_rate=20.0 / timestep(task), max_current=limit),
-        Supply(voltage) if actuator.supply is None else dataclasses.replace(actuator.supply, voltage=voltage),
-    )
-
-
 # -- in words -------------------------------------------------------------------------------------------------
 
 
@@ -247,7 +167,8 @@ def _reason(verdict: str, options: Mapping[str, Prospect], found: Delivery) -> s
     never = options[IDEAL]
     says = f"policies that never met it lose {in_words(never)}"
     if verdict in (IDEAL, BUY):
-        return says if verdict == IDEAL else f"{says}, and so do all others: {_others(options)}"
+        others = ", ".join(f"{name} {in_words(option)}" for name, option in options.items() if name != IDEAL)
+        return says if verdict == IDEAL else f"{says}, and so do all others: {others or 'none'}"
     if verdict == MEASURE:
         untried = [name for name, option in options.items() if option.most is None and name != IDEAL]
         return f"{says}; {' and '.join(untried) or 'what else there is'} was not tested with as much on this task"
@@ -255,10 +176,6 @@ def _reason(verdict: str, options: Mapping[str, Prospect], found: Delivery) -> s
     chosen = options[verdict]
     in_part = "" if chosen.most is not None and chosen.most.spared else ": buy another if that is too much"
     return f"{says}, with that{by} {in_words(chosen)}{in_part}"
-
-
-def _others(options: Mapping[str, Prospect]) -> str:
-    return ", ".join(f"{name} {in_words(option)}" for name, option in options.items() if name != IDEAL) or "none"
 
 
 def in_words(option: Prospect) -> str:
@@ -269,3 +186,88 @@ def in_words(option: Prospect) -> str:
     mean, low, high = outcome.loss
     failed = f"{round(outcome.failed * len(outcome.lost))} of {len(outcome.lost)} fail"
     return f"{option.bound}{mean:z.2f} of the span ({low:z.2f} to {high:z.2f}; {failed})"
+
+
+# -- measured ---------------------------------------------------------------------------------------------------
+
+RANDOM_EPISODES = 100
+"""Of random actions, whose mean return is the lower end of the span of a task that the study does not have."""
+
+
+class Measurement(NamedTuple):
+    """Trainings and tests that show what an actuator costs, and what can be done about it."""
+
+    grid: Grid
+    """Of all of them."""
+    home: Trial
+    """Policies that were trained on ideal forces, tested there."""
+    options: Mapping[str, Trial]
+    """What is done -> its policies, tested on the actuator, or on its motor under a designed loop."""
+
+    def judged(self, collected: Collected) -> dict[str, Prospect]:
+        """What policies lose by what is done, for `decide`, as if the span were exact; nothing may be missing of it."""
+        if collected.missing:
+            why = next((f": {name}: {error}" for name, error in collected.failures.items()), "")
+            raise ValueError(f"{len(collected.missing)} of its trainings and tests are missing{why}: run it again")
+        env = self.home.env
+        floor = FLOORS.get(env.task) if self.home.arm == _ideal_arm(env.task) else None
+        if floor is None:
+            floor = evaluate(RandomPolicy(env.action_space), env, RANDOM_EPISODES).returns.mean
+        level, succeeded = (_values(collected, self.home, name) for name in ("returns", "success"))
+        span = float(np.mean(level)) - floor
+        if span <= 0.0:
+            raise ValueError(f"{env.task}: ideal-trained policies are no better than random actions: train more seeds")
+        options = {}
+        for name, trial in self.options.items():
+            lost = (np.mean(level) - _values(collected, trial, "returns")) / span
+            missed = (
+                np.mean(succeeded) - _values(collected, trial, "success") if len(succeeded) else np.zeros_like(lost)
+            )
+            options[name] = Prospect(outcome := Outcome(lost, missed), outcome)
+        return options
+
+
+def measurement(actuator: Any, subject: str, seeds: int, root: Path, episodes: int = 50) -> Measurement:
+    """What there is to be trained and tested.
+
+    `subject` is a task, the Gymnasium id of an environment of others, or the folder of a run, whose environment, agent
+    and budget are taken; `actuator` whatever an `EnvConfig` takes; of every kind there are so many runs as `seeds`, in
+    folders below `root`.
+    """
+    if seeds < 2:
+        raise ValueError(f"seeds = {seeds}: an interval needs at least 2")
+    base = _ideal_arm(subject)
+    untouched = base.config.env  # and its reward: it is what policies were trained for
+    here = dataclasses.replace(untouched, actuator=actuator)
+    if all(one == IDEAL_ACTUATOR for one in here.actuators):
+        raise ValueError("actuator = 'ideal': training through it is training on ideal forces: name another")
+    env = dataclasses.replace(base.config.env, actuator=actuator)
+    through = Arm(f"{base.task}: through it", dataclasses.replace(base.config, env=env), base.seconds)
+    options = {IDEAL: Trial(base, "it", here)}
+    if "timestep" in here.world.fields and len(here.actuators) == 1:  # a loop is designed, and a lag drawn, for one
+        better = redesign(here.actuators[0], base.task)
+        if better is not None:
+            options[LOOP] = Trial(base, "designed", dataclasses.replace(untouched, actuator=better))
+        options[RANDOMISE] = Trial(generic(base), "it", here)
+    options[THROUGH] = Trial(through, "it", here)
+    home = Trial(base, "ideal", untouched)
+    return Measurement(Grid(root, (home, *options.values()), lambda _: range(seeds), episodes), home, options)
+
+
+def _ideal_arm(subject: str) -> Arm:
+    """The training on ideal forces: the study's, that of a run, or the default one of a world."""
+    if subject in SECONDS:
+        return ideal(subject)
+    if (Path(subject) / "config.json").is_file():
+        config = load_config(Path(subject))
+    else:
+        env = EnvConfig(subject)
+        config = TrainConfig.preset(subject, env.world.default_agent(env))
+    never = max(config.total_steps or 10**9, 10**9)
+    env = dataclasses.replace(config.env, actuator=IDEAL_ACTUATOR, randomize=None, allow_unstable=False)
+    config = dataclasses.replace(config, env=env, seed=0, evaluation_interval=never, checkpoint_interval=never)
+    return Arm(f"{config.task}: ideal", config, 60.0)
+
+
+def _values(collected: Collected, trial: Trial, measure: str) -> np.ndarray:
+    return np.array(list(collected.scores(trial, measure).values()))

@@ -244,11 +244,6 @@ def generic(base: Arm) -> Arm:
     return dataclasses.replace(base, name=f"{base.task}: generic", config=config)
 
 
-def dosed(arm: Arm, axis: str, dose: float) -> Trial:
-    """Policies tested on a dose."""
-    return Trial(arm, f"{axis} {dose:g}", AXES[axis].at(arm.task, dose))
-
-
 def at_home(arm: Arm) -> Trial:
     """Policies tested on ideal forces."""
     return Trial(arm, "ideal", posed(arm.task))

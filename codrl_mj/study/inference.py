@@ -4,6 +4,7 @@ A score is one trained policy's mean over its test episodes. Runs, not episodes,
 pools strata (the same question on several tasks or doses): its effect is the mean of their differences of means.
 """
 
+import bisect
 import functools
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -152,8 +153,4 @@ def runs_needed(difference: float, level: float = 0.05, chance: float = 0.8, mos
     """Runs of each kind that find a difference, in standard deviations of a run, with that chance; None: > `most`."""
     if difference == 0 or power(most, difference, level) < chance:
         return None
-    low, high = 2, most
-    while low < high:
-        middle = (low + high) // 2
-        low, high = (low, middle) if power(middle, difference, level) >= chance else (middle + 1, high)
-    return low
+    return bisect.bisect_left(range(most), chance, 2, key=lambda runs: power(runs, difference, level))

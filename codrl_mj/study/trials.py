@@ -65,11 +65,6 @@ class Arm:
         """The training with a seed."""
         return dataclasses.replace(self.config, seed=seed)
 
-    def shortened(self, steps: int) -> "Arm":
-        """The arm with another budget [environment steps], for trying things out."""
-        config = dataclasses.replace(self.config, total_steps=steps, total_episodes=None)
-        return dataclasses.replace(self, config=config)
-
 
 @dataclasses.dataclass(frozen=True)
 class Trial:

@@ -4,8 +4,9 @@ import dataclasses
 from typing import Any
 
 from codrl_mj.actuators import Drive
-from codrl_mj.study.advice import redesigned
-from codrl_mj.study.doses import AXES, REAL, arm, at_home, dosed
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.study.bench import redesigned
+from codrl_mj.study.doses import AXES, REAL, arm, at_home
 from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import named_actuator
 
@@ -27,6 +28,12 @@ GOOD: dict[str, dict[str, Any]] = {
 """Task -> the smallest motor of the catalogue that `codrl-mj motor choose` finds sufficient, with its gear."""
 MARGINAL: dict[str, dict[str, Any]] = {task: known["marginal motor"] for task, known in REAL.items()}
 """Task -> a motor that it calls `try it`."""
+
+
+def otherwise(env: EnvConfig, **fields: Any) -> EnvConfig:
+    """An environment whose actuator is otherwise in some fields of its parts, such as motor__resistance."""
+    changes = {name.replace("__", "."): value for name, value in fields.items()}
+    return dataclasses.replace(env, actuator=env.actuator.replaced(changes))
 
 
 def drawn(task: str, axis: str) -> Arm:
@@ -55,6 +62,11 @@ def designed(task: str) -> Drive:
 def matched(task: str, axis: str) -> Arm:
     """Trained through one dose of one thing."""
     return arm(task, axis, AXES[axis].at(task, AXES[axis].trained[task]))
+
+
+def dosed(arm: Arm, axis: str, dose: float) -> Trial:
+    """Policies tested on a dose."""
+    return Trial(arm, f"{axis} {dose:g}", AXES[axis].at(arm.task, dose))
 
 
 def undosed(arm: Arm, axis: str) -> Trial:

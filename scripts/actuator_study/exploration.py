@@ -1,21 +1,19 @@
 """What was looked at beyond the plan: more tests of the study's policies, tabulated and concluded from with care."""
 
 import dataclasses
-from typing import Any
 
 from actuator_study import arms
+from actuator_study.arms import dosed, otherwise
 from actuator_study.questions import on_loop, through_loop
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.study.doses import AXES, SECONDS, dosed, ideal, posed, supply, timestep
+from codrl_mj.study.doses import AXES, SECONDS, ideal, posed, supply, timestep
 from codrl_mj.study.trials import Trial
 from codrl_mj.tasks import find_task
 
 
 def wound_up(task: str, dose: float) -> EnvConfig:
     """A supply that comes short, under a loop whose integrator goes on while the voltage saturates."""
-    env = supply(task, dose)
-    loop = dataclasses.replace(env.actuator.controller, anti_windup="none")
-    return dataclasses.replace(env, actuator=dataclasses.replace(env.actuator, controller=loop))
+    return otherwise(supply(task, dose), controller__anti_windup="none")
 
 
 def windup() -> dict[str, list[tuple[Trial, Trial]]]:
@@ -39,16 +37,12 @@ def paper_loops(task: str) -> dict[str, EnvConfig]:
     paper's the whole of it.
     """
     nominal, step = posed(task, "paper"), find_task(task).step_duration
-    motor, loop = nominal.actuator.motor, nominal.actuator.controller
-
-    def driven(**parts: Any) -> EnvConfig:
-        return dataclasses.replace(nominal, actuator=dataclasses.replace(nominal.actuator, **parts))
-
+    motor = nominal.actuator.motor
     return {
-        "feed-forward 0": driven(controller=dataclasses.replace(loop, kff=0.0)),
-        "feed-forward R": driven(controller=dataclasses.replace(loop, kff=motor.resistance)),
-        "half the arm": driven(motor=dataclasses.replace(motor, arm_radius=0.5 * motor.arm_radius)),
-        "twice the arm": driven(motor=dataclasses.replace(motor, arm_radius=2.0 * motor.arm_radius)),
+        "feed-forward 0": otherwise(nominal, controller__kff=0.0),
+        "feed-forward R": otherwise(nominal, controller__kff=motor.resistance),
+        "half the arm": otherwise(nominal, motor__arm_radius=0.5 * motor.arm_radius),
+        "twice the arm": otherwise(nominal, motor__arm_radius=2.0 * motor.arm_radius),
         "step of the policy": dataclasses.replace(nominal, timestep=step),
         "step of a hundredth": dataclasses.replace(nominal, timestep=timestep(task) / 10.0),
     }

@@ -5,10 +5,10 @@ from collections.abc import Iterable
 from typing import Any
 
 from actuator_study import arms
-from actuator_study.arms import DRAWN, GOOD, LOOPED, MARGINAL, TRAINED, matched, undosed
+from actuator_study.arms import DRAWN, GOOD, LOOPED, MARGINAL, TRAINED, dosed, matched, otherwise, undosed
 from codrl_mj.disturbances import Disturbances, Joint
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.study.doses import AXES, SECONDS, arm, at_home, dosed, generic, ideal, posed
+from codrl_mj.study.doses import AXES, SECONDS, arm, at_home, generic, ideal, posed
 from codrl_mj.study.questions import Contrast, Question
 from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import find_task
@@ -61,10 +61,7 @@ an axis of its own, `weakness`."""
 def wrong_motors(task: str) -> dict[str, EnvConfig]:
     """The actuator `weaker`, otherwise than trained through, by name: `WRONG`, and shares of the largest force."""
     nominal, step, force = posed(task, "weaker"), find_task(task).step_duration, find_task(task).max_force
-    motor, loop = nominal.actuator.motor, nominal.actuator.controller
-
-    def driven(**parts: Any) -> EnvConfig:
-        return dataclasses.replace(nominal, actuator=dataclasses.replace(nominal.actuator, **parts))
+    motor = nominal.actuator.motor
 
     def pushed(share: float) -> EnvConfig:
         pulses = Disturbances(pulse_force=share * force, pulse_duration=step, pulse_interval=10 * step)
@@ -75,12 +72,12 @@ def wrong_motors(task: str) -> dict[str, EnvConfig]:
 
     noise = 0.2 * motor.arm_radius * force / motor.torque_constant  # A
     return {
-        name: driven(motor=dataclasses.replace(motor, **{field: getattr(motor, field) * factor}))
+        name: otherwise(nominal, **{f"motor__{field}": getattr(motor, field) * factor})
         for name, (field, factor) in WRONG.items()
     } | {
         "friction 5 %": rubbed(0.05),
         "friction 20 %": rubbed(0.2),
-        "current noise 20 %": driven(controller=dataclasses.replace(loop, current_noise=noise)),
+        "current noise 20 %": otherwise(nominal, controller__current_noise=noise),
         "pulses 25 %": pushed(0.25),
         "pulses 50 %": pushed(0.5),
     }

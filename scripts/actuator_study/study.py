@@ -44,7 +44,9 @@ class ActuatorStudy(Program):
         every = {trial.name: trial for trial in trials()} | explored()
         chosen = [trial for trial in every.values() if trial.arm.task in self.tasks]
         if self.total_steps is not None:
-            chosen = [dataclasses.replace(trial, arm=trial.arm.shortened(self.total_steps)) for trial in chosen]
+            for place, trial in enumerate(chosen):
+                short = dataclasses.replace(trial.arm.config, total_steps=self.total_steps, total_episodes=None)
+                chosen[place] = dataclasses.replace(trial, arm=dataclasses.replace(trial.arm, config=short))
         return Grid(self.root, tuple(chosen), lambda _: range(self.seeds), self.episodes, self.out / FOLDER)
 
     def write(self) -> tuple[Iterable[Path], Mapping[str, str]]:

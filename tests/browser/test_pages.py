@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from markupsafe import Markup
 
-from codrl_mj.motor_design import find_drive, find_entry
+from codrl_mj.drives import find_drive, find_entry
 from codrl_mj.pages import page as builder
 from codrl_mj.pages.motor import motor_page
 from codrl_mj.pages.plots import Curve, Plot

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from codrl_mj.catalogue import Datasheet, derivation, from_datasheet, rules
+from codrl_mj.catalogue import Datasheet, derivation, from_datasheet
 from codrl_mj.catalogue.datasheet import KINDS, named
 
 UNITS = {  # by definition: SI value of one unit
@@ -332,12 +332,12 @@ def test_without_strictness_a_contradiction_is_only_listed():
 
 
 def test_the_rules_speak_of_fields():
-    for rule in (*rules.RULES, *(check for check, _ in rules.CHECKS)):
-        assert {rule.quantity, *rule.needs} <= {*KINDS, *derivation._UNITS}, rule.formula
-    assert rules.RULES[0].needs == ("nominal_voltage", "stall_current")
-    assert rules.RULES[0].function(12.0, 133.0) == 12.0 / 133.0
+    for rule in (*derivation.RULES, *(check for check, _ in derivation.CHECKS)):
+        assert {rule.quantity, *rule.needs} <= {*KINDS, *derivation.AT_OUTPUT}, rule.formula
+    assert derivation.RULES[0].needs == ("nominal_voltage", "stall_current")
+    assert derivation.RULES[0].function(12.0, 133.0) == 12.0 / 133.0
 
 
 def test_pint_is_imported_only_when_a_datasheet_is_read():
-    script = "import sys, codrl_mj.catalogue.entries; assert 'pint' not in sys.modules"
+    script = "import sys, codrl_mj.catalogue.datasheet; assert 'pint' not in sys.modules"
     subprocess.run([sys.executable, "-c", script], check=True, timeout=120)

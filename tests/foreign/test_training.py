@@ -18,10 +18,10 @@ from codrl_mj.actuators import IDEAL, Drive, Lag
 from codrl_mj.agents import SACConfig
 from codrl_mj.catalogue import motor_entry
 from codrl_mj.cli import main
+from codrl_mj.drives import demand_of, demands_of
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy, evaluate, load_episode, run_episodes, save_episode
 from codrl_mj.runs.summaries import read_run
-from codrl_mj.sizing import demand_of, demands_of
 from codrl_mj.training import TrainConfig, load_config, train
 from codrl_mj.training.config import read_config
 from tests.foreign.models import BareEnv

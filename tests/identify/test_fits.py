@@ -8,7 +8,7 @@ import pytest
 
 from codrl_mj.identify import Log, identify, trust
 from codrl_mj.identify.estimate import Fit
-from codrl_mj.identify.segments import moves, replaced
+from codrl_mj.identify.log import moves, replaced
 from tests.identify import bench, draws
 
 
@@ -232,9 +232,7 @@ def test_what_is_known_worst_is_not_lost_beside_what_is_known_best():
     jacobian[:rows, 0], jacobian[rows:, 1] = 1e6 / np.sqrt(rows), 20.0 / np.sqrt(rows)
     residuals = random.standard_normal(2 * rows)
     segment = SimpleNamespace(block=0, log=0)
-    fit = Fit(
-        SimpleNamespace(names=("a", "b")), (segment,), np.ones(2), 0.0, 1e9, (residuals,), (jacobian,), (np.zeros(1),)
-    )
+    fit = Fit(SimpleNamespace(names=("a", "b")), (segment,), np.ones(2), 1e9, (residuals,), (jacobian,), (np.zeros(1),))
     found = trust.half_widths(fit, np.ones(2), np.eye(2), 0)["curvature"]
     np.testing.assert_allclose(found, [1.96e-6, 1.96 * 0.05], rtol=0.05)
 

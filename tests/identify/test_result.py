@@ -14,8 +14,8 @@ from codrl_mj.cli.environments import environment
 from codrl_mj.cli.train import train_verb
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.identify.identify import checked, foreseen, identify
+from codrl_mj.identify.log import replaced
 from codrl_mj.identify.result import Estimate, Identified
-from codrl_mj.identify.segments import replaced
 from tests.identify import bench
 
 GIVEN = {"inductance": 1e-3, "rotor_inertia": 2e-5}

@@ -14,9 +14,9 @@ import pytest
 
 from codrl_mj.actuators import Drive, Lag, SampledLoop
 from codrl_mj.cli import main
+from codrl_mj.drives import find_drive
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy, run_episodes
-from codrl_mj.motor_design import find_drive
 from codrl_mj.pages import episode as episodes
 from codrl_mj.pages import report as reports
 from codrl_mj.pages.episode import Shown, episode_section, show

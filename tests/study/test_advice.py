@@ -12,7 +12,7 @@ from scipy import stats
 from codrl_mj import cli
 from codrl_mj.actuators import IDEAL as IDEAL_ACTUATOR
 from codrl_mj.actuators import Actuator, CurrentLoop, Lag, Motor, Supply
-from codrl_mj.motor_design import find_drive, torque_limits
+from codrl_mj.drives import find_drive, torque_limits
 from codrl_mj.runs.files import write_json
 from codrl_mj.study.advice import (
     BUY,
@@ -25,13 +25,11 @@ from codrl_mj.study.advice import (
     Prospect,
     advise,
     decide,
-    delivered,
-    doses,
-    redesign,
+    measurement,
 )
+from codrl_mj.study.bench import delivered, doses, redesign
 from codrl_mj.study.doses import AXES, FLOORS, REAL, REFERENCE_SPEEDS, posed, supplied, timestep
 from codrl_mj.study.evidence import Evidence, Outcome
-from codrl_mj.study.measured import measurement
 from codrl_mj.tasks import find_task, named_actuator
 from codrl_mj.training import TrainConfig
 from tests.matrix import but
@@ -398,11 +396,11 @@ def test_the_verdict_of_a_measurement(tmp_path, ideal, designed, randomised, thr
 
     pretend(asked.grid, score)
     found = asked.judged(asked.grid.collect())
-    assert found.verdict == verdict
-    kept = [1.0 - found.options[name].most.loss.mean for name in (IDEAL, LOOP, RANDOMISE, THROUGH)]
+    assert decide(found) == verdict
+    kept = [1.0 - found[name].most.loss.mean for name in (IDEAL, LOOP, RANDOMISE, THROUGH)]
     assert kept == pytest.approx([ideal, designed, randomised, through])
     # of four policies +-0.001 around the mean: Student's t of three degrees of freedom
-    mean, low, _ = found.options[LOOP].most.loss
+    mean, low, _ = found[LOOP].most.loss
     assert mean - low == pytest.approx(3.18245 * 0.001 * math.sqrt(4 / 3) / 2, rel=1e-4)
 
 

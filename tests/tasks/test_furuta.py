@@ -15,10 +15,10 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 from codrl_mj import Uniform, make_sb3_vec_env, suite
 from codrl_mj.actuators import IDEAL, NAMED, Drive
 from codrl_mj.catalogue import motor_entry
+from codrl_mj.drives.scripted import Scripted, state_observed
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes, summarize
 from codrl_mj.physics import MujocoPhysics, Plant
-from codrl_mj.sizing.scripted import Scripted, StateObserved
 from codrl_mj.tasks import TASKS, resolve_actuators
 from codrl_mj.tasks.furuta import MAX_TORQUE, Twin
 from tests.envs.vectors import MODES, assert_equal_episodes, batched, looped
@@ -208,7 +208,7 @@ def test_it_starts_hanging_within_what_a_reset_asks_for():
 
 @every_actuator
 def test_the_scripted_controller_swings_up_and_balances(actuator):
-    episodes = run_episodes(Scripted(TASK), lambda: StateObserved(EnvConfig("furuta", actuator).make()), 10, seed=0)
+    episodes = run_episodes(Scripted(TASK), lambda: state_observed(EnvConfig("furuta", actuator).make()), 10, seed=0)
     assert summarize("furuta", episodes).success.mean == 1.0
 
 

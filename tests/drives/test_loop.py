@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from codrl_mj.actuators import Actuator, CurrentLoop, Drive, SampledLoop
-from codrl_mj.motor_design import (
+from codrl_mj.drives import (
     closed_loop,
     design,
     designs,
@@ -20,7 +20,7 @@ from codrl_mj.motor_design import (
     small_step,
     step,
 )
-from codrl_mj.motor_design.windup import ANTI_WINDUPS
+from codrl_mj.drives.loop import ANTI_WINDUPS
 from codrl_mj.validation import motor_loops
 
 MOTORS = ("quanser-qube-servo-2", "maxon-dcx22l", "heinzmann-pmg-132", "lego-ev3-large")
@@ -162,12 +162,12 @@ def test_anti_windup_is_what_makes_it_come_back(name):
     within = (drive.voltage_limit - drive.motor.back_emf_constant * steps.speed) / drive.motor.resistance
     assert steps.unreachable == pytest.approx(1.8 * within, rel=1e-9)
     assert steps.unreachable <= drive.controller.max_current
-    times = {kind: 1e3 * steps.recoveries[kind].time for kind in ANTI_WINDUPS}
+    times = {kind: 1e3 * steps.recoveries[kind].settling_time(0.05) for kind in ANTI_WINDUPS}
     assert times["back_calculation"] <= 1.0
     assert times["clamping"] <= 4.0
     assert 15.0 < times["none"] < 60.0
     assert steps.recoveries["back_calculation"].undershoot < 1e-3 < steps.recoveries["clamping"].undershoot < 1.0
-    reached = steps.recoveries["none"].response.current[round(0.0199 * drive.controller.sample_rate)]
+    reached = steps.recoveries["none"].current[round(0.0199 * drive.controller.sample_rate)]
     assert reached == pytest.approx(within, rel=0.01)
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from codrl_mj.catalogue import motor_names
 from codrl_mj.cli import main
-from codrl_mj.motor_design import Abilities, find_drive, find_entry
+from codrl_mj.drives import Abilities, find_drive, find_entry
 from codrl_mj.pages.diagrams import torque_speed_diagram
 
 OWN = """

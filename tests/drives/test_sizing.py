@@ -11,26 +11,26 @@ import pytest
 
 from codrl_mj.actuators import Drive, GearMotor, Ideal, Inputs, SampledLoop, Supply, parameters_type
 from codrl_mj.cli import main
-from codrl_mj.envs.config import EnvConfig
-from codrl_mj.evaluation import run_episodes
-from codrl_mj.sizing import (
+from codrl_mj.drives import (
     HOPELESS,
     SURELY,
     SURELY_NOT,
     TRY_IT,
     best_ratio,
-    catalogued,
     choose,
     demand_of,
     feasibility,
+    find_drive,
     least_gain,
     least_pumped,
     least_voltage,
     operation,
     recorded,
 )
-from codrl_mj.sizing.bounds import most_power
-from codrl_mj.sizing.scripted import Scripted, StateObserved
+from codrl_mj.drives.abilities import most_power
+from codrl_mj.drives.scripted import Scripted, state_observed
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.evaluation import run_episodes
 from codrl_mj.tasks import TASKS
 from tests.matrix import but
 
@@ -188,7 +188,7 @@ def test_the_supply_that_a_swing_up_takes_is_predicted_and_found(pendulum):
 
 
 def test_a_motor_that_one_can_buy_swings_up_a_little_above_the_supply_that_is_predicted(pendulum):
-    motor = catalogued("faulhaber-1331-006", 160.0).drive
+    motor = find_drive("faulhaber-1331-006", 160.0)
     least = least_voltage(pendulum.swing, motor, least_gain)
     assert not swings_up(dataclasses.replace(motor, supply=Supply(0.97 * least)))
     assert swings_up(dataclasses.replace(motor, supply=Supply(1.1 * least)))
@@ -281,7 +281,7 @@ def arrivals(task, actuator, episodes=5):
     """How many scripted episodes of a task end at the goal."""
     env = EnvConfig(task, actuator, inner_steps=TASKS[task].motor_inner_steps)
     policy = Scripted(TASKS[task])
-    ran = run_episodes(policy, lambda: StateObserved(env.make()), episodes, 0)
+    ran = run_episodes(policy, lambda: state_observed(env.make()), episodes, 0)
     return sum(not one.terminated if task == "cartpole" else bool(TASKS[task].goal(one.state[-1])) for one in ran)
 
 
@@ -312,10 +312,10 @@ def test_on_a_slide_a_geared_motor_gets_a_wheel():
     ("call", "match"),
     [
         (lambda: demand_of("pendulun"), "did you mean 'pendulum'"),
-        (lambda: catalogued("frc-kim"), "did you mean 'frc-cim'"),
-        (lambda: catalogued("frc-cim", gear_ratio=0.0), "gear_ratio = 0"),
-        (lambda: catalogued("frc-cim", voltage=-1.0), "voltage = -1"),
-        (lambda: catalogued("lag"), "no motor behind a drive"),
+        (lambda: find_drive("frc-kim"), "did you mean 'frc-cim'"),
+        (lambda: find_drive("frc-cim", gear_ratio=0.0), "gear_ratio = 0"),
+        (lambda: find_drive("frc-cim", voltage=-1.0), "voltage = -1"),
+        (lambda: find_drive("lag"), "no motor behind a drive"),
         (lambda: choose(steady(1.0, 1.0), ["frc-cim"], least_margin=1.0), r"least_margin = 1: must be >= 0 and < 1"),
         (lambda: recorded([0.0, 1.0], [1.0], [1.0, 1.0]), "torque: shape"),
         (lambda: recorded([0.0, 0.0], [1.0, 1.0], [1.0, 1.0]), r"time\[1\] = 0 s"),
@@ -362,7 +362,7 @@ def test_the_command_chooses_and_says_what_is_wrong_with_the_rest(tmp_path, caps
 
 def test_on_a_slide_gears_have_a_unit_and_hopeless_is_a_failure(monkeypatch, capsys):
     asked = dataclasses.replace(steady(10.0, 1.0), exact=False, linear=True)
-    monkeypatch.setattr("codrl_mj.sizing.demand_of", lambda *_, **__: asked)
+    monkeypatch.setattr("codrl_mj.drives.demand_of", lambda *_, **__: asked)
     assert main(["motor", "feasible", "rev-neo", "cartpole"]) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert "rev-neo, gear 1 rad/m, 12 V" in printed

@@ -1,4 +1,4 @@
-"""The current loop of a drive or an `Actuator`: gains, margins, bandwidth, and its step by their own equations.
+"""The current loop of a drive or an `Actuator`: gains, margins, bandwidth, and steps by their own equations.
 
 As the sampled current sees it: the winding under a zero-order hold is (1 - e)/R/(z - e) with e = exp(-R*T/L), the PI
 controller ((kp + ki*T)*z - kp)/(z - 1), the delay of a sample 1/z. Source: Franklin, Powell, Workman, *Digital Control
@@ -22,15 +22,6 @@ RATES = (10e3, 20e3, 40e3)
 """Sample rates [Hz] that drives commonly have."""
 
 
-def sample_rate(one: Looped, timestep: float | None = None) -> float:
-    """Samples a second [Hz] of a drive, or of an `Actuator` at a mechanical step [s]."""
-    if isinstance(one, Drive):
-        return one.controller.sample_rate
-    if timestep is None:
-        raise ValueError("timestep = None: must be the mechanical step [s] of an Actuator, whose loop is closed in it")
-    return one.controller.substeps / timestep
-
-
 def is_closed(one: Looped) -> bool:
     """Whether there is a loop: a gain on the error."""
     return isinstance(one, Drive) or any((one.controller.kp, one.controller.ki, one.controller.kd))
@@ -41,13 +32,9 @@ def gains(drive: Drive) -> tuple[float, float]:
     loop = drive.controller
     if loop.kp != 0.0 or loop.ki != 0.0:
         return loop.kp, loop.ki
-    kp, ki = designed_gains(*drive.winding, 1.0 / loop.sample_rate, 2.0 * math.pi * _bandwidth_asked(drive))
+    bandwidth = loop.bandwidth or DEFAULT_BANDWIDTH * loop.sample_rate
+    kp, ki = designed_gains(*drive.winding, 1.0 / loop.sample_rate, 2.0 * math.pi * bandwidth)
     return kp, ki * loop.sample_rate
-
-
-def _bandwidth_asked(drive: Drive) -> float:
-    """What the gains are designed for [Hz]."""
-    return drive.controller.bandwidth or DEFAULT_BANDWIDTH * drive.controller.sample_rate
 
 
 def sampled_too_seldom(drive: Drive) -> str:
@@ -58,51 +45,68 @@ def sampled_too_seldom(drive: Drive) -> str:
     return "" if 3.0 * rate * constant >= 1.0 else f"{text}{1.0 / 3.0 / constant:,.0f} Hz or more"
 
 
+class _Sampled(NamedTuple):
+    """A current loop in z, whosever it is."""
+
+    rate: float  # samples a second [Hz]
+    gains: tuple[float, float]  # proportional [V/A], integral [V/(A*s)]
+    over: np.ndarray  # numerator from error to sampled current
+    under: np.ndarray  # its denominator
+    forward: np.ndarray  # numerator from reference to sampled current
+    at_once: float  # voltage for one ampere of a step, in its first sample [V/A]
+    constant: float  # time constant of the designed loop, or of the winding under given gains [s]
+    most: float = math.inf  # largest current that is asked for [A]
+    delayed: bool = False  # whether the voltage comes a sample late
+
+
+def _sampled(one: Looped, timestep: float | None) -> _Sampled:
+    """The loop of a drive, or of an `Actuator` at a mechanical step [s]."""
+    resistance, inductance = one.winding
+    constant = inductance / resistance
+    if isinstance(one, Drive):
+        (kp, ki), rate = gains(one), one.controller.sample_rate
+        time = 1.0 / rate
+        if one.controller.kp == 0.0 and one.controller.ki == 0.0:
+            constant = 1.0 / (2.0 * math.pi * (one.controller.bandwidth or DEFAULT_BANDWIDTH * rate))
+        decay = math.exp(-resistance * time / inductance)
+        effect = -math.expm1(-resistance * time / inductance) / resistance  # [A/V], of a sample
+        over = np.array([effect * (kp + ki * time), -effect * kp])
+        late = [1.0, 0.0] if one.controller.delayed else [1.0]
+        under = np.polymul(np.polymul([1.0, -decay], [1.0, -1.0]), late)
+        most, delayed = one.controller.max_current, one.controller.delayed
+        return _Sampled(rate, (kp, ki), over, under, over, kp + ki / rate, constant, most, delayed)
+    if timestep is None:
+        raise ValueError("timestep = None: must be the mechanical step [s] of an Actuator, whose loop is closed in it")
+    rate, loop = one.controller.substeps / timestep, one.controller
+    time = 1.0 / rate
+    pid, below = np.array([loop.kp]), np.array([1.0])  # from error [A] to voltage [V]
+    for gain, up, down in (
+        (loop.ki, [time, 0.0], [1.0 + loop.integral_leak * time, -1.0]),
+        (loop.kd, [1.0, -1.0], [time + loop.derivative_time_constant, -loop.derivative_time_constant]),
+    ):
+        if gain:
+            pid, below = np.polyadd(np.polymul(pid, down), gain * np.polymul(up, below)), np.polymul(below, down)
+    over = pid * time / inductance
+    under = np.polymul(below, [1.0, resistance * time / inductance - 1.0])
+    forward = np.polyadd(over, loop.kff * time / inductance * below)  # feed-forward goes past the error
+    at_once = pid[0] / below[0] + loop.kff
+    return _Sampled(rate, (loop.kp, loop.ki), over, under, forward, at_once, constant)
+
+
 def open_loop(one: Looped, timestep: float | None = None) -> Any:
     """The loop from error to sampled current, a `control.TransferFunction` in z."""
     import control
 
-    (over, under), time = _open(one, timestep), 1.0 / sample_rate(one, timestep)
-    return control.TransferFunction(over, under, time)
+    loop = _sampled(one, timestep)
+    return control.TransferFunction(loop.over, loop.under, 1.0 / loop.rate)
 
 
 def closed_loop(one: Looped, timestep: float | None = None) -> Any:
     """The loop from reference to sampled current, a `control.TransferFunction` in z."""
     import control
 
-    (over, under), time = _open(one, timestep), 1.0 / sample_rate(one, timestep)
-    forward = over
-    if isinstance(one, Actuator):  # feed-forward: from the reference past the error
-        _, denominator = _pid(one, time)
-        forward = np.polyadd(over, one.controller.kff * time / one.motor.inductance * denominator)
-    return control.TransferFunction(forward, np.polyadd(under, over), time)
-
-
-def _open(one: Looped, timestep: float | None) -> tuple[np.ndarray, np.ndarray]:
-    """Numerator and denominator of the open loop."""
-    time, (resistance, inductance) = 1.0 / sample_rate(one, timestep), one.winding
-    if isinstance(one, Actuator):
-        over, under = _pid(one, time)
-        return over * time / inductance, np.polymul(under, [1.0, resistance * time / inductance - 1.0])
-    kp, ki = gains(one)
-    decay = math.exp(-resistance * time / inductance)
-    effect = -math.expm1(-resistance * time / inductance) / resistance  # [A/V], of a sample
-    late = [1.0, 0.0] if one.controller.delayed else [1.0]
-    poles = np.polymul(np.polymul([1.0, -decay], [1.0, -1.0]), late)
-    return np.array([effect * (kp + ki * time), -effect * kp]), poles
-
-
-def _pid(actuator: Actuator, time: float) -> tuple[np.ndarray, np.ndarray]:
-    """Numerator and denominator of an `Actuator`'s controller, from error [A] to voltage [V]."""
-    loop = actuator.controller
-    over, under = np.array([loop.kp]), np.array([1.0])
-    for gain, up, down in (
-        (loop.ki, [time, 0.0], [1.0 + loop.integral_leak * time, -1.0]),
-        (loop.kd, [1.0, -1.0], [time + loop.derivative_time_constant, -loop.derivative_time_constant]),
-    ):
-        if gain:
-            over, under = np.polyadd(np.polymul(over, down), gain * np.polymul(up, under)), np.polymul(under, down)
-    return over, under
+    loop = _sampled(one, timestep)
+    return control.TransferFunction(loop.forward, np.polyadd(loop.under, loop.over), 1.0 / loop.rate)
 
 
 class Response(NamedTuple):
@@ -122,12 +126,21 @@ class Response(NamedTuple):
         """How far the current goes beyond the last reference, as a share of it."""
         return max(float(self.current.max() / self.reference[-1]) - 1.0, 0.0)
 
+    @property
+    def _last(self) -> int:
+        """From where on the last reference is asked for."""
+        return int(np.flatnonzero(np.diff(self.reference, prepend=math.nan) != 0.0)[-1])
+
+    @property
+    def undershoot(self) -> float:
+        """How far the current falls below the last reference once that is asked for, as a share of it."""
+        return max(1.0 - float(self.current[self._last :].min()) / float(self.reference[-1]), 0.0)
+
     def settling_time(self, band: float = 0.02) -> float:
         """When the current stays within a share of the last reference [s after that came]; NaN: not within sight."""
-        start = int(np.flatnonzero(np.diff(self.reference, prepend=math.nan) != 0.0)[-1])
-        wrong = np.flatnonzero(np.abs(self.current[start:] / self.reference[-1] - 1.0) > band)
-        settled = start + (int(wrong[-1]) + 1 if len(wrong) else 0)
-        return float(self.time[settled] - self.time[start]) if settled < len(self.time) else math.nan
+        wrong = np.flatnonzero(np.abs(self.current[self._last :] / self.reference[-1] - 1.0) > band)
+        settled = self._last + (int(wrong[-1]) + 1 if len(wrong) else 0)
+        return float(self.time[settled] - self.time[self._last]) if settled < len(self.time) else math.nan
 
 
 def respond(one: Looped, references: Any, speed: float = 0.0, timestep: float | None = None) -> Response:
@@ -139,7 +152,7 @@ def respond(one: Looped, references: Any, speed: float = 0.0, timestep: float | 
         speed: of the rotor [rad/s], held.
         timestep: of an `Actuator`: see the module.
     """
-    time = 1.0 / sample_rate(one, timestep)
+    time = 1.0 / _sampled(one, timestep).rate
     kind: Any = one.State
     state = kind(*[0.0] * len(kind._fields))
     if isinstance(one, Drive):
@@ -166,19 +179,9 @@ def small_step(one: Looped, timestep: float | None = None) -> Response:
     voltage has no limit. It lasts 20 time constants of the designed loop, or of the winding under given gains, and 100
     to 20000 samples.
     """
-    (resistance, inductance), rate = one.winding, sample_rate(one, timestep)
-    constant, most = inductance / resistance, math.inf
-    if isinstance(one, Drive):
-        (kp, ki), most = gains(one), one.controller.max_current
-        at_once = kp + ki / rate
-        if one.controller.kp == 0.0 and one.controller.ki == 0.0:
-            constant = 1.0 / (2.0 * math.pi * _bandwidth_asked(one))
-    else:
-        over, under = _pid(one, 1.0 / rate)
-        at_once = over[0] / under[0] + one.controller.kff
-    limit = one.voltage_limit
-    amplitude = min(0.1 * limit / resistance, 0.5 * limit / at_once, most)
-    samples = min(max(math.ceil(20.0 * constant * rate), 100), 20_000)
+    loop, limit = _sampled(one, timestep), one.voltage_limit
+    amplitude = min(0.1 * limit / one.winding[0], 0.5 * limit / loop.at_once, loop.most)
+    samples = min(max(math.ceil(20.0 * loop.constant * loop.rate), 100), 20_000)
     return respond(one, np.full(samples, amplitude if math.isfinite(amplitude) else 1.0), timestep=timestep)
 
 
@@ -216,19 +219,11 @@ def design(one: Looped, timestep: float | None = None) -> LoopDesign:
     Raises:
         ValueError: the loop is unstable; the message has the spectral radius and a remedy.
     """
-    rate, own = sample_rate(one, timestep), (one.controller.kp, one.controller.ki)
-    one.check(1.0 / rate if timestep is None else timestep)
-    step, delayed = small_step(one, timestep), False
-    if isinstance(one, Drive):
-        own, delayed = gains(one), one.controller.delayed
-    return LoopDesign(
-        rate,
-        delayed,
-        *own,
-        *_margins(open_loop(one, timestep), closed_loop(one, timestep), rate),
-        step.settling_time(),
-        step.overshoot,
-    )
+    loop = _sampled(one, timestep)
+    one.check(1.0 / loop.rate if timestep is None else timestep)
+    margins = _margins(open_loop(one, timestep), closed_loop(one, timestep), loop.rate)
+    step = small_step(one, timestep)
+    return LoopDesign(loop.rate, loop.delayed, *loop.gains, *margins, step.settling_time(), step.overshoot)
 
 
 def designs(drive: Drive, rates: Any = None) -> dict[tuple[float, bool], LoopDesign | str]:
@@ -279,3 +274,55 @@ def _first_below(function: Any, rate: float) -> float:
         return math.nan
     around = frequencies[below[0] - 1], frequencies[below[0]]
     return float(brentq(lambda frequency: float(function(_point(frequency, rate))), *around))
+
+
+# -- out of saturation ---------------------------------------------------------------------------------------------
+
+ANTI_WINDUPS = ("back_calculation", "clamping", "none")
+"""The kinds, as `SampledLoop.anti_windup` names them."""
+_UNREACHABLE = 0.02
+"""For how long more is asked for than can be made [s]."""
+_AFTER = 0.1
+"""How long the recovery is looked at [s]."""
+
+
+class Steps(NamedTuple):
+    """Step responses of a drive."""
+
+    small: Response
+    """To a current that does not saturate, at standstill."""
+    speed: float
+    """Of the rotor in the saturated step [rad/s]: half V/kE, or what makes an unreachable current of `max_current`."""
+    unreachable: float
+    """Current asked for in vain, for 20 ms [A]."""
+    reachable: float
+    """Current asked for then [A]."""
+    recoveries: dict[str, Response]
+    """By kind of anti-windup: what it makes of a current that cannot be reached, and of one that can."""
+
+
+def step(drive: Drive) -> Steps:
+    """Step a drive's current: small, and out of saturation with each kind of anti-windup.
+
+    In saturation 1.8 times of what the voltage can make at `Steps.speed` is asked for, then 0.4 times of it.
+
+    Raises:
+        ValueError: the loop is unstable, the message has the spectral radius and a remedy; or its samples are too few.
+    """
+    loop = drive.controller
+    if loop.sample_rate < 1e3:
+        raise ValueError(f"SampledLoop.sample_rate = {loop.sample_rate:g}: must be >= 1000 Hz, to see a step; raise it")
+    drive.check(1.0 / loop.sample_rate)
+    motor, voltage = drive.motor, drive.voltage_limit
+    speed, unreachable = 0.0, min(1.8 * voltage / motor.resistance, loop.max_current)
+    if motor.back_emf_constant:
+        unreachable = min(0.9 * voltage / motor.resistance, loop.max_current)
+        speed = (voltage - motor.resistance * unreachable / 1.8) / motor.back_emf_constant
+    reachable = 0.4 / 1.8 * unreachable
+    spans = (_UNREACHABLE, unreachable), (_AFTER, reachable)
+    references = np.concatenate([np.full(round(time * loop.sample_rate), current) for time, current in spans])
+    kinds = {kind: dataclasses.replace(loop, anti_windup=kind) for kind in ANTI_WINDUPS}
+    recoveries = {
+        kind: respond(dataclasses.replace(drive, controller=one), references, speed) for kind, one in kinds.items()
+    }
+    return Steps(small_step(drive), speed, unreachable, reachable, recoveries)

@@ -47,18 +47,15 @@ def balance(states: np.ndarray) -> np.ndarray:
     return np.inf * (states @ np.array([0.1, 0.4, 5.0, 1.5]))
 
 
-class Pumping:
+def pumping(task: Task) -> Law:
     """Full force in the direction in which the actuated joint moves; at rest in one drawn at random."""
+    generator = np.random.default_rng(0)
 
-    def __init__(self, task: Task, seed: int = 0) -> None:
-        """Seed the draws."""
-        self._speed, self._generator = task.speeds[0], np.random.default_rng(seed)
-
-    def __call__(self, states: np.ndarray) -> np.ndarray:
-        """The forces."""
-        kick = self._generator.choice([-1.0, 1.0], len(states))
-        speed = states[:, self._speed]
+    def law(states: np.ndarray) -> np.ndarray:
+        kick, speed = generator.choice([-1.0, 1.0], len(states)), states[:, task.speeds[0]]
         return np.inf * np.where(np.abs(speed) > 1e-6, speed, kick)
+
+    return law
 
 
 class Scripted:
@@ -71,7 +68,7 @@ class Scripted:
             "cartpole": ("scripted balancing", balance),
             "furuta": ("scripted swing-up and balance", swing_up_and_balance),
         }
-        self.description, self._law = laws.get(task.name, ("scripted energy pumping", Pumping(task)))
+        self.description, self._law = laws.get(task.name, ("scripted energy pumping", pumping(task)))
         self._task = task
 
     def predict(
@@ -87,10 +84,6 @@ class Scripted:
         return np.abs(np.array(self._task.forces) - force[:, np.newaxis]).argmin(axis=1), None
 
 
-class StateObserved(gymnasium.ObservationWrapper[Any, Any, Any]):
-    """An environment that shows its mechanical state."""
-
-    def observation(self, observation: Any) -> np.ndarray:  # noqa: ARG002 - it is replaced
-        """The state, in the task's order."""
-        core: Any = self.env.unwrapped
-        return core.physics.state
+def state_observed(env: Any) -> Any:
+    """An environment that shows its mechanical state, in the task's order."""
+    return gymnasium.wrappers.TransformObservation(env, lambda _: env.unwrapped.physics.state, None)

@@ -10,7 +10,7 @@ import pytest
 import codrl_mj
 from codrl_mj.actuators import Drive, GearMotor, Ideal, SampledLoop, Supply
 from codrl_mj.catalogue import motor_entry, motor_names
-from codrl_mj.motor_design import abilities, catalogue_rows, explain, find_drive, find_entry, respond, torque_limits
+from codrl_mj.drives import abilities, catalogue_rows, explain, find_drive, find_entry, respond, torque_limits
 
 
 @pytest.mark.parametrize("name", motor_names())

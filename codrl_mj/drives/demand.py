@@ -3,18 +3,15 @@
 import contextlib
 import dataclasses
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from codrl_mj.actuators import IDEAL
-from codrl_mj.engine.reading import motors
-from codrl_mj.envs.config import EnvConfig
-from codrl_mj.evaluation import Episode, run_episodes
+from codrl_mj.drives.swing import Swing
 from codrl_mj.fields import did_you_mean
-from codrl_mj.sizing.scripted import Scripted, StateObserved
-from codrl_mj.sizing.swing import Swing
 
 EPISODES = 10
 """Episodes that a demand is taken from unless told otherwise."""
@@ -86,12 +83,33 @@ def demands_of(what: str | Path, episodes: int = EPISODES, seed: int = 0, trust:
     """
     path = Path(what)
     if path.suffix == ".npz":
-        return {"": _read(path)}
+        try:
+            with np.load(path, allow_pickle=False) as archive:
+                found = recorded(archive["time"], archive["torque"], archive["speed"], f"the recording {path.name}")
+        except (KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise ValueError(f"{path}: no recording of the arrays time, torque and speed: {error}") from None
+        return {"": found}
+    from codrl_mj.envs.config import EnvConfig
+    from codrl_mj.evaluation import run_episodes
+
     if path.is_dir():
-        return _of_run(path, episodes, seed, trust)
+        from codrl_mj.runs.policies import load_policy
+        from codrl_mj.training.folder import load_config
+
+        env = load_config(path, trust).env
+        if others := [one.family for one in env.actuators if one != IDEAL]:
+            raise ValueError(
+                f"{path}: was trained on {others[0]}: must be ideal, whose torques are the task's and not a motor's; "
+                "train it with --actuator ideal, or name the task instead"
+            )
+        env = env.world.as_with_motors(env)
+        ran = run_episodes(load_policy(path, trust), env.make, episodes, seed)
+        return _gathered(f"the policy {path.name} of {env.task}", env, ran)
+    from codrl_mj.drives.scripted import Scripted, state_observed
+
     env = EnvConfig(str(what), "ideal")
     policy, env = Scripted(env.world.scripted), env.world.as_with_motors(env)
-    ran = run_episodes(policy, lambda: StateObserved(env.make()), episodes, seed)
+    ran = run_episodes(policy, lambda: state_observed(env.make()), episodes, seed)
     return _gathered(f"{policy.description} of {env.world.name}", env, ran)
 
 
@@ -123,34 +141,11 @@ def recorded(time: Any, torque: Any, speed: Any, source: str = "a recording") ->
     return Demand(source, duration, arrays["torque"], arrays["speed"], acceleration, exact=True)
 
 
-def _read(path: Path) -> Demand:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return recorded(archive["time"], archive["torque"], archive["speed"], f"the recording {path.name}")
-    except (KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: no recording of the arrays time, torque and speed: {error}") from None
-
-
-def _of_run(path: Path, episodes: int, seed: int, trust: bool) -> dict[str, Demand]:
-    from codrl_mj.runs.policies import load_policy
-    from codrl_mj.training.folder import load_config
-
-    env = load_config(path, trust).env
-    others = [one.family for one in env.actuators if one != IDEAL]
-    if others:
-        raise ValueError(
-            f"{path}: was trained on {others[0]}: must be ideal, whose torques are the task's and not a motor's; train "
-            "it with --actuator ideal, or name the task instead"
-        )
-    env = env.world.as_with_motors(env)
-    ran = run_episodes(load_policy(path, trust), env.make, episodes, seed)
-    return _gathered(f"the policy {path.name} of {env.task}", env, ran)
-
-
-def _gathered(source: str, env: EnvConfig, ran: list[Episode]) -> dict[str, Demand]:
+def _gathered(source: str, env: Any, ran: Sequence[Any]) -> dict[str, Demand]:
     """The demands on all motors, from episodes of one environment."""
     import mujoco
 
+    from codrl_mj.engine.reading import motors
     from codrl_mj.specs import ON_JOINT
 
     swing, ends = None, [env.world.at_goal(one) for one in ran]

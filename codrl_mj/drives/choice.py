@@ -10,11 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from codrl_mj.actuators import Drive, labelled, named_mapping
-from codrl_mj.catalogue import motor_names
-from codrl_mj.motor_design.drives import find_drive, find_entry, most_power
-from codrl_mj.sizing.bounds import SURELY, VERDICTS, Feasibility, feasibility, margin
-from codrl_mj.sizing.demand import Demand
-from codrl_mj.sizing.operation import best_ratio, operation
+from codrl_mj.catalogue import MotorEntry, motor_names
+from codrl_mj.drives.abilities import find_drive, find_entry, most_power
+from codrl_mj.drives.demand import Demand
+from codrl_mj.drives.feasibility import SURELY, VERDICTS, Feasibility, best_ratio, feasibility, margin, operation
 
 MARGIN = 0.2
 """Share of voltage and currents that a motor is to leave: a rule of thumb, for the tolerances of motor and supply."""
@@ -27,17 +26,6 @@ _SPREAD = math.log(16.0)
 """Gears are tried up to this far, in logarithms, from that of the largest torque and the largest speed."""
 _WANTED = ("coulomb_friction", "viscous_friction", "gear_efficiency", "continuous_current")
 """What a datasheet may leave open, and is not counted then, besides what `Drive.assumed` says."""
-
-
-class Catalogued(NamedTuple):
-    """A motor with gear and supply."""
-
-    drive: Drive
-    """What drives the joint."""
-    continuous_current: float | None
-    """That the winding bears for good [A]; None if it is unknown."""
-    unknown: tuple[str, ...]
-    """What its datasheet leaves open, and is not counted."""
 
 
 class Candidate(NamedTuple):
@@ -84,22 +72,11 @@ def actuators_of(choices: Mapping[str, tuple[Candidate, Demand]]) -> dict[str, A
     return found
 
 
-def catalogued(name: str, gear_ratio: float | None = None, voltage: float | None = None) -> Catalogued:
-    """A motor by name.
-
-    Args:
-        name: as `codrl_mj.motor_design.find_drive` takes it; no more is known of a drive that is no datasheet's.
-        gear_ratio: turns of the rotor for one of the output; None: its own, or 1.
-        voltage: of the supply [V]; None: its nominal one, or 24.
-
-    Raises:
-        ValueError: there is no such motor, or a number is out of bounds.
-    """
-    drive, entry = find_drive(name, gear_ratio, voltage=voltage), find_entry(name)
+def uncounted(entry: MotorEntry | None) -> tuple[str, ...]:
+    """What a motor's datasheet leaves open, and is not counted; of a drive without one that is all of its heat."""
     if entry is None:
-        return Catalogued(drive, None, ("continuous current",))
-    unknown = tuple(name.replace("_", " ") for name in _WANTED if getattr(entry.numbers, name) is None)
-    return Catalogued(drive, entry.numbers.continuous_current, unknown)
+        return ("continuous current",)
+    return tuple(name.replace("_", " ") for name in _WANTED if getattr(entry.numbers, name) is None)
 
 
 def choose(
@@ -127,11 +104,14 @@ def choose(
         )
     choices = []
     for name in motor_names() if motors is None else motors:
-        drive, continuous, unknown = catalogued(name, None, voltage)
+        drive, entry = find_drive(name, voltage=voltage), find_entry(name)
+        continuous = entry.numbers.continuous_current if entry else None
         fixed = drive.motor.gear_ratio != 1.0 and not demand.linear
         best = drive if fixed else geared(drive, demand, continuous)
         found = feasibility(best, demand, continuous)
-        choices.append(Candidate(name, best, unknown, found, _lacks(best, found, demand, continuous, least_margin)))
+        choices.append(
+            Candidate(name, best, uncounted(entry), found, _lacks(best, found, demand, continuous, least_margin))
+        )
 
     def rank(choice: Candidate) -> tuple[bool, int, float]:
         found = choice.feasibility

@@ -1,0 +1,233 @@
+"""What a demand asks of a motor at its shaft, and what follows of it without a simulation: bounds, with remedies."""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from codrl_mj.actuators import Drive, GearMotor
+from codrl_mj.drives.abilities import most_power
+from codrl_mj.drives.demand import Demand
+from codrl_mj.drives.swing import Swing, least_gain, least_pumped, least_voltage
+
+
+class Operation(NamedTuple):
+    """A demand as the rotor sees it, over T steps."""
+
+    torque: np.ndarray
+    """The rotor's [N*m], shape (T,)."""
+    speed: np.ndarray
+    """The rotor's [rad/s], shape (T,)."""
+    current: np.ndarray
+    """[A], shape (T,)."""
+    voltage: np.ndarray
+    """That the supply has to have [V], shape (T,), >= 0."""
+    rms_current: float
+    """Over the whole demand [A]."""
+    copper_loss: float
+    """Heat in the winding in an episode [J]."""
+    energy_drawn: float
+    """Electrical energy drawn from the supply in an episode [J], what comes back not taken off."""
+    own_share: float
+    """Largest torque that rotor and friction take, over the largest that the joint is asked for; at least that, where
+    the rotor's inertia is unknown and thus 0."""
+
+
+def operation(demand: Demand, drive: Drive) -> Operation:
+    """What a demand asks of a motor.
+
+    With N turns of the rotor for one of the joint (1/arm on a slide),
+
+        tau_rotor = (tau + N^2 (J alpha + b omega) + N tau_c sign(omega)) / (N eta),   i = tau_rotor / kT,
+        V >= |R i + N kE omega| + R_supply |i|, and with L di/dt while i comes from its value in the step before.
+
+    with Stribeck friction in tau_c. A change of the torque is to be made within a step of the demand; so is that from
+    one episode to the next. Where the motor brakes or holds, eta is 1: the gear helps then. Energies
+    are of the mean speed in a step, all else of that at its start.
+    """
+    motor, added, arm = drive.motor, drive.additions, drive.arm_radius
+    sticking = motor.stribeck(demand.speed / arm) / arm
+    own = added.armature * demand.acceleration + added.damping * demand.speed
+    own = own + (added.friction + sticking) * np.sign(demand.speed)
+    joint = demand.torque + own
+    torque = arm * joint / np.where(joint * demand.speed > 0.0, motor.gear_efficiency, 1.0)
+    speed, current = demand.speed / arm, torque / motor.torque_constant
+    terminal = motor.resistance * current + motor.back_emf_constant * speed
+    changing = terminal + motor.inductance * np.diff(current, prepend=current[:1]) / demand.duration
+    supply = 0.0 if drive.supply is None else drive.supply.resistance
+    mean_speed = speed + demand.acceleration * demand.duration / (2.0 * arm)
+    power = (motor.resistance * current + motor.back_emf_constant * mean_speed) * current
+    square = float(current**2 @ demand.duration)
+    return Operation(
+        torque=torque,
+        speed=speed,
+        current=current,
+        voltage=np.maximum(np.abs(terminal), np.abs(changing)) + supply * np.abs(current),
+        rms_current=math.sqrt(square / float(demand.duration.sum())),
+        copper_loss=motor.resistance * square / demand.episodes,
+        energy_drawn=float(np.maximum(power, 0.0) @ demand.duration) / demand.episodes,
+        own_share=float(np.abs(own).max() / max(np.abs(demand.torque).max(), 1e-300)),
+    )
+
+
+def best_ratio(torque: Any, speed: Any, motor: GearMotor) -> Any:
+    """The gear N at which a torque [N*m] at a speed [rad/s] takes the least voltage, 2 N kE omega.
+
+    The minimum of R tau/(N kT) + N kE omega over N; rotor and friction are not in it.
+    """
+    return np.sqrt(motor.resistance * torque / (motor.torque_constant * motor.back_emf_constant * speed))
+
+
+# -- what follows ---------------------------------------------------------------------------------------------------
+
+SURELY, TRY_IT, HOPELESS, SURELY_NOT = "surely", "try it", "hopeless", "surely not"
+VERDICTS = (SURELY, TRY_IT, HOPELESS, SURELY_NOT)
+"""From the best."""
+SHORT = 10.0
+"""What is short by this factor is hopeless: in simulations none that was short by more than 7 got anywhere."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """A condition, and what follows from whether it holds."""
+
+    name: str
+    """Of the bound."""
+    formula: str
+    """What has to be at most what the motor has."""
+    needed: float
+    """The left side."""
+    available: float
+    """The right side."""
+    unit: str
+    """Of both."""
+    holds: bool
+    """Whether the motor has what is needed."""
+    verdict: str
+    """`surely`, `surely not`, or where nothing follows `try it`; `hopeless` where most of it is missing."""
+    remedy: str
+    """What to change; empty where it holds."""
+
+    def __str__(self) -> str:
+        """In a sentence."""
+        text = f"{self.name}: {self.formula}, needs {self.needed:.4g} {self.unit}, has {self.available:.4g} {self.unit}"
+        return text if self.holds else f"{text}: {self.remedy}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Feasibility:
+    """Whether a motor can do a task."""
+
+    bounds: tuple[Bound, ...]
+    """All that apply."""
+    operation: Operation
+    """What the demand asks of the motor."""
+    margin: float
+    """The smallest of the margins of voltage, current and heat; see `margin`."""
+
+    @property
+    def verdict(self) -> str:
+        """`surely not` or `hopeless` if one bound says so, `surely` if voltage, current and heat do, else `try it`."""
+        worst = max((bound.verdict for bound in self.bounds), key=VERDICTS.index)
+        if worst in (HOPELESS, SURELY_NOT):
+            return worst
+        return SURELY if self.margin >= 0.0 else TRY_IT
+
+    @property
+    def why(self) -> str:
+        """What is in the way, the decisive first; empty where nothing is."""
+        failed = sorted((b for b in self.bounds if not b.holds), key=lambda b: -VERDICTS.index(b.verdict))
+        return ". ".join(map(str, failed))
+
+
+def margin(drive: Drive, asked: Operation, continuous_current: float | None) -> float:
+    """The smallest share of voltage, largest current and continuous current that is left; below 0: what is missing."""
+    return 1.0 - max(
+        float(asked.voltage.max()) / drive.voltage_limit,
+        float(np.abs(asked.current).max()) / drive.controller.max_current,
+        asked.rms_current / continuous_current if continuous_current else 0.0,
+    )
+
+
+def feasibility(drive: Drive, demand: Demand, continuous_current: float | None = None) -> Feasibility:
+    """Whether a motor can deliver what a run asked of the ideal actuator.
+
+    `voltage`, `current` and `heat` together suffice. `stall` and `power` are necessary for the run, and so decide where
+    the demand is exact; another policy may do a task with less. `swing` is necessary for any policy.
+
+    Args:
+        drive: the motor with gear and supply.
+        demand: what is asked.
+        continuous_current: that the winding bears for good [A]; None: unknown, and heat is left out.
+
+    Raises:
+        ValueError: the actuator is no `Drive`.
+    """
+    if not isinstance(drive, Drive):
+        raise ValueError(
+            f"{drive!r}: must be a codrl_mj.actuators.Drive, a motor with gear and supply, or a catalogue's name"
+        )
+    asked, unmet = operation(demand, drive), SURELY_NOT if demand.exact else TRY_IT
+    bounds = []
+    rows = _conditions(drive, demand, asked, continuous_current, unmet)
+    for name, formula, needed, available, unit, verdicts, remedy in rows:
+        holds = needed <= available
+        verdict, most = verdicts[not holds], available * (math.sqrt(SHORT) if name == "heat" else SHORT)
+        if not holds and verdict == TRY_IT and needed >= most and name != "power":  # a policy may take its time over it
+            verdict = HOPELESS
+        bounds.append(Bound(name, formula, needed, available, unit, holds, verdict, "" if holds else remedy))
+    if demand.swing is not None:
+        bounds += _swinging(drive, demand.swing)
+    return Feasibility(tuple(bounds), asked, margin(drive, asked, continuous_current))
+
+
+def _conditions(
+    drive: Drive, demand: Demand, asked: Operation, continuous: float | None, unmet: str
+) -> Iterator[tuple[str, str, float, float, str, tuple[str, str], str]]:
+    """Name, formula, needed, available, unit, verdicts and remedy of each bound but a swing-up's.
+
+    Voltage and current at every operating point and the heat of all of them suffice; torque at standstill, and power
+    whatever the gear, are what any motor needs to deliver the run.
+    """
+    motor, limit, most = drive.motor, drive.voltage_limit, drive.controller.max_current
+    volts, largest = float(asked.voltage.max()), float(np.abs(asked.current).max())
+    remedy = f"raise the supply to {volts:.4g} V"
+    yield "voltage", "|R i + L di/dt + N kE omega|, largest", volts, limit, "V", (SURELY, unmet), remedy
+    remedy = f"raise controller.max_current to {largest:.4g} A, or the gear {largest / most:.3g} times"
+    yield "current", "|i|, largest", largest, most, "A", (SURELY, unmet), remedy
+    if continuous is not None:
+        remedy = f"let it rest, cool it, or raise the gear {asked.rms_current / continuous:.3g} times"
+        yield "heat", "i, rms", asked.rms_current, continuous, "A", (SURELY, TRY_IT), remedy
+    power = demand.torque * demand.speed
+    driving = float(np.abs(demand.torque[power >= 0.0]).max(initial=0.0))
+    current = min(limit / motor.resistance, most)
+    still = motor.torque_constant * motor.gear_efficiency * current / drive.arm_radius - drive.additions.friction
+    still -= motor.stribeck_friction / drive.arm_radius
+    verdicts = TRY_IT, unmet if still > 0.0 else SURELY_NOT
+    remedy, unit = "raise the supply, the largest current or the gear", "N" if demand.linear else "N*m"
+    yield "stall", "|tau| but of braking, largest", driving, still, unit, verdicts, remedy
+    at = int(np.argmax(power))
+    torque, speed, least = abs(float(demand.torque[at])) / motor.gear_efficiency, abs(float(demand.speed[at])), 0.0
+    if torque * speed * motor.back_emf_constant > 0.0:  # what the largest power takes at any gear [V]
+        least = 2.0 * float(best_ratio(torque, speed, motor)) * motor.back_emf_constant * speed
+    needed = float(power.max(initial=0.0)) / motor.gear_efficiency
+    remedy = f"no gear helps: raise the supply to {least:.4g} V and the largest current, or take a stronger motor"
+    yield "power", "tau omega / eta, largest", needed, most_power(drive), "W", (TRY_IT, unmet), remedy
+
+
+def _swinging(drive: Drive, swing: Swing) -> list[Bound]:
+    """What a swing-up needs: energy from every swing."""
+    bounds = []
+    for name, formula, energy, unmet in (
+        ("pumping", "energy from a swing, least", least_pumped, TRY_IT),
+        ("swing", "energy from rest to rest, least", least_gain, SURELY_NOT),
+    ):
+        gained, remedy = energy(swing, drive), ""
+        if gained <= 0.0:
+            volts = least_voltage(swing, drive, energy)
+            remedy = f"raise the supply to {volts:.3g} V" if math.isfinite(volts) else "raise the largest current"
+            remedy += ", or change the gear"
+        bounds.append(Bound(name, formula, 0.0, gained, "J", gained > 0.0, TRY_IT if gained > 0.0 else unmet, remedy))
+    return bounds

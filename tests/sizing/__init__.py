@@ -1,1 +1,0 @@
-"""Whether a motor can do a task."""
