@@ -11,7 +11,7 @@ from markupsafe import Markup
 from codrl_mj.pages import page
 from codrl_mj.runs.files import check_writable, writing
 from codrl_mj.validation.certificate import GROUPS, Certificate, verdict, versions
-from codrl_mj.validation.mutations import Caught, margin, unfailed
+from codrl_mj.validation.mutations import Caught, unfailed
 from codrl_mj.validation.table import Check
 
 JSON_NAME, HTML_NAME = "certificate.json", "certificate.html"
@@ -69,7 +69,7 @@ def _mutations(certificate: Certificate, caught: Sequence[Caught]) -> page.Secti
         clearest, cells = one.clearest, [one.mutation, one.task or "the motor", f"{len(one.failed)} of {one.made}"]
         found = ["none", "", "", ""]
         if clearest is not None:
-            values = (clearest.worst, clearest.tolerance, margin(clearest))
+            values = (clearest.worst, clearest.tolerance, clearest.beyond)
             found = [f"{clearest.group}: {clearest.name}", *(f"{value:.2g}" for value in values)]
         said = page.mark(clearest is not None, "MISSED" if clearest is None else "caught")
         rows.append(page.Row((*cells, *found, said), "failed" if clearest is None else ""))

@@ -15,7 +15,7 @@ from mujoco.batch import Batch
 from codrl_mj.physics import MujocoPhysics, install_callbacks, motors
 from codrl_mj.tasks import Task, find_task
 from codrl_mj.validation.compare import actuators_of, forces_of
-from codrl_mj.validation.table import Case, Check, Oracle, check
+from codrl_mj.validation.table import Case, Check, check
 
 UNIT = "64-bit floats that differ"
 SERIAL = "a loop over mj_step"
@@ -62,7 +62,7 @@ def bits(ours: np.ndarray, oracle: np.ndarray) -> Iterator[Case]:
     yield Case(float(unequal.sum()), lambda _: f"the first of them at step {first + 1} of {len(unequal)}", unequal.size)
 
 
-@check("execution", Oracle("batched, {threads}", SERIAL, 0.0, UNIT))
+@check("execution", Check("batched, {threads}", SERIAL, 0.0, UNIT))
 def batched(model: mujoco.MjModel, threads: str, simulations: int, steps: int) -> Iterator[Case]:
     """A batch, each simulation under commands of its own, against one simulation after the other."""
     inputs = np.stack([commands(model, steps, seed) for seed in range(simulations)], axis=1)
@@ -78,7 +78,7 @@ def batched(model: mujoco.MjModel, threads: str, simulations: int, steps: int) -
     yield from bits(np.array(ours), np.stack(serial, axis=1))
 
 
-@check("execution", Oracle("copied", "the original", 0.0, UNIT))
+@check("execution", Check("copied", "the original", 0.0, UNIT))
 def copied(model: mujoco.MjModel, steps: int) -> Iterator[Case]:
     """A copy of `MjData` made half-way, against the original."""
     inputs = commands(model, 2 * steps, seed=0)
@@ -89,7 +89,7 @@ def copied(model: mujoco.MjModel, steps: int) -> Iterator[Case]:
     yield from bits(ours, _advance(model, original, inputs[steps:]))
 
 
-@check("execution", Oracle("restored", "the run it was taken from", 0.0, UNIT))
+@check("execution", Check("restored", "the run it was taken from", 0.0, UNIT))
 def restored(model: mujoco.MjModel, steps: int, state: mujoco.mjtState = STATE) -> Iterator[Case]:
     """A state vector taken half-way and put into a new `MjData`, against the run it was taken from."""
     inputs = commands(model, 2 * steps, seed=1)
@@ -102,7 +102,7 @@ def restored(model: mujoco.MjModel, steps: int, state: mujoco.mjtState = STATE) 
     yield from bits(ours, _advance(model, original, inputs[steps:]))
 
 
-@check("execution", Oracle("forward passes", "one forward pass", 0.0, UNIT))
+@check("execution", Check("forward passes", "one forward pass", 0.0, UNIT))
 def forward_passes(model: mujoco.MjModel, steps: int) -> Iterator[Case]:
     """Between any two steps, three forward passes leave activations and plugins' states, the motors', as one does."""
     inputs, moving = commands(model, steps, seed=2), 1 + model.nq + model.nv
@@ -120,16 +120,14 @@ def forward_passes(model: mujoco.MjModel, steps: int) -> Iterator[Case]:
     yield from bits(np.array(often), np.array(once))
 
 
-def model_checks(
-    model: mujoco.MjModel, task: str = "", quick: bool = False, state: mujoco.mjtState = STATE
-) -> Iterator[Check]:
+def model_checks(model: mujoco.MjModel, quick: bool = False, state: mujoco.mjtState = STATE) -> Iterator[Check]:
     """The checks of any model whose callbacks are installed; a state vector holds `state`."""
     simulations, steps = (6, 40) if quick else (32, 200)
     for threads in THREADS:
-        yield from batched.of(task)(model, threads, simulations, steps)
-    yield from copied.of(task)(model, steps)
-    yield from restored.of(task)(model, steps, state)
-    yield from forward_passes.of(task)(model, steps)
+        yield from batched(model, threads, simulations, steps)
+    yield from copied(model, steps)
+    yield from restored(model, steps, state)
+    yield from forward_passes(model, steps)
 
 
 # -- with a task's bounds and integrator around it ----------------------------------------------------------
@@ -154,7 +152,7 @@ def _simulation(task: Task, integrator: str, seed: int, steps: int) -> tuple[Muj
     return physics, initial, forces_of(task, generator.uniform(-1.0, 1.0, steps * len(task.motors)))
 
 
-@check("execution", Oracle("pickled, {integrator}", "the original", 0.0, UNIT))
+@check("execution", Check("pickled, {integrator}", "the original", 0.0, UNIT))
 def pickled(task: Task, integrator: str, steps: int) -> Iterator[Case]:
     """A simulation pickled and unpickled half-way, against the original."""
     physics, _, forces = _simulation(task, integrator, 3, 2 * steps)
@@ -164,7 +162,7 @@ def pickled(task: Task, integrator: str, steps: int) -> Iterator[Case]:
     yield from bits(ours, oracle)
 
 
-@check("execution", Oracle("repeated, {integrator}", "the first episode", 0.0, UNIT))
+@check("execution", Check("repeated, {integrator}", "the first episode", 0.0, UNIT))
 def repeated(task: Task, integrator: str, steps: int) -> Iterator[Case]:
     """A second episode after a reset, against the first."""
     physics, initial, forces = _simulation(task, integrator, 4, steps)
@@ -173,7 +171,7 @@ def repeated(task: Task, integrator: str, steps: int) -> Iterator[Case]:
     yield from bits(_episode(physics, forces), oracle)
 
 
-@check("execution", Oracle("looked at, {integrator}", "an episode that nobody looks at", 0.0, UNIT))
+@check("execution", Check("looked at, {integrator}", "an episode that nobody looks at", 0.0, UNIT))
 def looked_at(task: Task, integrator: str, steps: int) -> Iterator[Case]:
     """An episode with a forward pass after every environment step, as a viewer makes them, against one without."""
     physics, initial, forces = _simulation(task, integrator, 5, steps)
@@ -188,7 +186,7 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check]:
     physics, _, _ = _simulation(task, task.integrators[0], 0, 1)
     assert motors(physics.model)
     install_callbacks(physics.model)
-    yield from model_checks(physics.model, task.name, quick)
+    yield from model_checks(physics.model, quick)
     for integrator in task.integrators:
         for compared in (pickled, repeated, looked_at):
             yield from compared(task, integrator, 30 if quick else 200)
