@@ -11,8 +11,7 @@ from markupsafe import Markup
 
 from codrl_mj.actuators import Drive, Ideal
 from codrl_mj.evaluation import Episode, run_episodes
-from codrl_mj.films.film import Clip, clip
-from codrl_mj.films.record import record
+from codrl_mj.films.film import Clip, clip, record
 from codrl_mj.films.strip import of_motor
 from codrl_mj.pages import page
 from codrl_mj.pages.diagrams import TORQUE_SPEED, envelope
@@ -50,8 +49,8 @@ def show(name: str, env: Any, policy: Any, seed: int, filmed: bool = True) -> Sh
     episode, film, problem = None, None, None if filmed else "none was asked for"
     if filmed:
         try:
-            episode, taken = record(policy, env, seed, *_SIZE)
-            film = clip(env.task, episode, taken, *_SIZE)
+            episode, seen = record(policy, env, seed, *_SIZE)
+            film = clip(env.task, episode, seen, *_SIZE)
         except Exception as error:  # each renderer raises its own kind, and so do libraries that are not installed
             problem = f"{type(error).__name__}: {error}"
     return Shown(name, env, episode or run_episodes(policy, env.make, 1, seed)[0], film, problem, seed)
