@@ -198,12 +198,6 @@ def unit(text: str) -> str:
     return text.replace("*", "·").replace("^2", "²").replace("ohm", "Ω").replace("degC", "°C")
 
 
-def replay(what: Any, label: str, first: bool) -> Markup:
-    """A `codrl_mj.replay.ReplayPart` on the page's clock; the first of a page brings the library along."""
-    library = Markup("<script>{}</script>").format(Markup(what.library)) if first else Markup()
-    return library + Markup("<figure>{}</figure>").format(clocked(label, what.fragment, what.script))
-
-
 def number(value: Any, digits: int = 4) -> str:
     """A number as text, or a mean or a median with its interval; a dash where there is none."""
     if isinstance(value, Mapping):

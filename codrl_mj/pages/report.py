@@ -278,11 +278,13 @@ def _episodes(
 
 def replays(shown: Sequence[Shown]) -> list[Markup]:
     """The episodes in three dimensions, to be turned and zoomed: what `joined` of a report may return."""
-    from codrl_mj.replay import motion_of_episode, replay
+    from codrl_mj.replay import SCRIPT, library, motion_of_episode, replay
 
-    made = [replay(motion_of_episode(one.episode, one.env), one.name) for one in shown]
-    named = zip(made, shown, strict=True)
-    return [page.replay(one, f"Replay: {of.name}", place == 0) for place, (one, of) in enumerate(named)]
+    parts = [Markup("<script>{}</script>").format(Markup(library()))]
+    for one in shown:
+        fragment = replay(motion_of_episode(one.episode, one.env), one.name)
+        parts.append(Markup("<figure>{}</figure>").format(page.clocked(f"Replay: {one.name}", fragment, SCRIPT)))
+    return parts
 
 
 def _loop(runs: Sequence[_Reported]) -> Markup:
