@@ -11,7 +11,6 @@ import tyro
 from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, with_environment
 from codrl_mj.cli.subject import Source, SubjectWord, policy_and_environment, title_of
 from codrl_mj.envs.worlds import is_world
-from codrl_mj.fields import field_docs
 from codrl_mj.runs.layout import told_apart
 
 
@@ -51,7 +50,7 @@ class LiveView:
         if self.native:
             run_native(session)
             return 0
-        shown = browser(session, self.port, title_of(self.subject, env), field_docs)
+        shown = browser(session, self.port, title_of(self.subject, env))
         print(f"{shown.url} (on this machine alone; Ctrl-C ends it)", flush=True)
         try:
             shown.run()

@@ -1,15 +1,17 @@
 """The live view in a browser: the scene, what can be done to it, what the motors do, and what they are made of."""
 
+import functools
 import itertools
 import queue
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 import trimesh
 from viser import uplot
 
+from codrl_mj.fields import field_docs
 from codrl_mj.replay.scene import TRIANGLES, Shape, first_view, mesh, read_poses, shapes, thinned
 from codrl_mj.view.local import LocalServer
 from codrl_mj.view.session import Control, Session, controls
@@ -23,18 +25,17 @@ _WANTED = ("desired", "reference")  # signals that are drawn first
 _HUGE = 1e30  # what is beyond it has diverged
 _DELAY_STEPS = 5  # environment steps, where the slider of the delay ends
 _FLAT = ("box", "cylinder", "mesh", "plane")
-Docs = Callable[[type], Mapping[str, str]]
 
 
 class Browser:
     """Serves a session until it is closed."""
 
-    def __init__(self, session: Session, port: int, title: str, docs: Docs, supply: float = 48.0) -> None:
+    def __init__(self, session: Session, port: int, title: str, supply: float = 48.0) -> None:
         """Begin to serve a session, which from now on this alone touches, at a port or the next free one.
 
-        `docs` describes each field of a class; the slider of an unlimited voltage ends at `supply` [V].
+        The slider of an unlimited voltage ends at `supply` [V].
         """
-        self.session, self._docs, self._supply = session, docs, supply
+        self.session, self._supply = session, supply
         self.playing, self._speed, self._budget, self._real = True, 1.0, 0.0, 1.0
         self._deeds: queue.SimpleQueue[tuple[Any, Callable[[], None]]] = queue.SimpleQueue()
         self._refusal = ""
@@ -211,9 +212,7 @@ class Browser:
         several = f" {pattern}" if len(self.session.config.driven) > 1 else ""
         own = actuator.family or type(actuator).__name__
 
-        def change(path: tuple[str, ...], value: Any) -> None:
-            self.session.set_actuator(pattern, path, value)
-
+        change = functools.partial(self.session.set_actuator, pattern)
         found = controls(actuator, self._supply)
         for part, fields in itertools.groupby(found, lambda one: one.path[0] if len(one.path) > 1 else own):
             self._settings(f"{part}{several}", fields, actuator, change)
@@ -290,7 +289,8 @@ class Browser:
         part: Any = settings
         for name in one.path[:-1]:
             part = getattr(part, name, None)
-        hint = self._docs(type(part)).get(one.path[-1]) if part is not None else None
+        kind: Any = type(part)
+        hint = field_docs(kind).get(one.path[-1]) if part is not None else None
         handle: Any
         if one.options:
             handle = gui.add_dropdown(label, one.options, initial_value=one.value, hint=hint)

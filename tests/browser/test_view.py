@@ -18,7 +18,7 @@ pytestmark = pytest.mark.browser
 def browser():
     """A pole on a motor, simulated in a thread of its own as in a terminal."""
     config = EnvConfig.from_mapping({"task": "InvertedPendulum-v5", "actuator": {".*": "maxon-re65"}})
-    made = Browser(Session(config, {}), 0, "pole", lambda _: {})
+    made = Browser(Session(config, {}), 0, "pole")
     ended = threading.Event()
     thread = threading.Thread(target=lambda: made.run(ended.is_set))
     thread.start()

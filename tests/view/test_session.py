@@ -177,7 +177,7 @@ def test_the_command_line_offers_the_runs_policy_and_those_of_others(monkeypatch
     class Fake:
         url = "http://127.0.0.1:0"
 
-        def __init__(self, session, _port, title, _docs):
+        def __init__(self, session, _port, title):
             seen.update(session=session, title=title)
 
         def run(self):
