@@ -142,11 +142,6 @@ def solve(
     return np.array(rows)
 
 
-def _finer(task: Task) -> int:
-    """How many times steps are halved in a run that nobody chose."""
-    return 2 if task.trials is None else 0
-
-
 def ideals(task: Task) -> tuple[ActuatorModel, ...]:
     """One for each motor."""
     return (IDEAL,) * len(task.motors)
@@ -175,7 +170,7 @@ def order_in_the_step(
 ) -> Iterator[Case]:
     """The solution's errors vanish as the integrator promises."""
     motors = [actuator.motor for actuator in actuators if isinstance(actuator, Actuator)]
-    finer = _finer(task)
+    finer = 2 if task.trials is None else 0  # halvings more in a run that nobody chose
     promised = 4.0 if integrator == "rk4" and not motors else 1.0
     if promised == 4.0:
         counts = 2 ** (np.arange(2, 6 if quick else 7) + finer)
@@ -195,7 +190,8 @@ def order_in_the_step(
 @check("convergence", order("rate in the loop's bandwidth", "{whose} with the desired force itself"))
 def rate_in_the_bandwidth(task: Task, quick: bool) -> Iterator[Case]:
     """The lag is resolved by two integration steps at every bandwidth; both runs take the same steps."""
-    lags = task.step_duration / 2 ** ((np.arange(3, 7) if quick else np.arange(4, 9)) + _finer(task))  # tau [s]
+    finer = 2 if task.trials is None else 0  # as above
+    lags = task.step_duration / 2 ** ((np.arange(3, 7) if quick else np.arange(4, 9)) + finer)  # tau [s]
     integrator, physics = task.integrators[0], physics_of(task)
     motors = [Motor(arm_radius=actuator.motor.arm_radius) for actuator in actuators_of(task)]
     errors: dict[str, list[float]] = {label: [] for label, _ in physics}

@@ -268,12 +268,6 @@ def balances(task: Task, integrator: str, quick: bool) -> Iterator[tuple[Case, .
     yield tuple(cases)
 
 
-@check("energy", order("order of the balances, {integrator}", "energy"))
-def diverged(error: str) -> Iterator[Case]:
-    """What is left of the balances of a run that broke down."""
-    yield Case(math.inf, error, 0)
-
-
 def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     """The checks of energy."""
     task = find_task(task_name)
@@ -288,7 +282,4 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
         yield Skipped("the balances of a whole run", reason)
         return
     for integrator in task.integrators:
-        try:
-            yield from balances(task, integrator, quick)
-        except SimulationDivergedError as error:
-            yield from diverged(str(error), integrator=integrator)
+        yield from balances(task, integrator, quick)
