@@ -34,7 +34,7 @@ def played(task="cartpole", actuator="weaker", steps=20, seed=1):
     resolved = named_actuator(actuator, task)
     make = EnvConfig(task, resolved, max_episode_steps=steps).make
     (episode,) = run_episodes(RandomPolicy(task, seed), make, 1, seed)
-    return Panel(f"{task} on {actuator}", task, episode)
+    return Panel(task, episode, title=f"{task} on {actuator}")
 
 
 def made_up(desired, actual, *, saturated=False, arm=1.0, steps=40, terminated=False, states=None):
@@ -45,7 +45,7 @@ def made_up(desired, actual, *, saturated=False, arm=1.0, steps=40, terminated=F
     actuator, trace, time = Actuator(Motor(arm_radius=arm)), {"speed": np.zeros(steps)}, 0.02 * np.arange(1, steps + 1)
     acted = np.zeros(steps), np.ones(steps), np.zeros(1)
     episode = Episode(time, states, states, *acted, trace, signals, terminated, actuator)
-    return Panel("made up", "cartpole", episode)
+    return Panel("cartpole", episode, title="made up")
 
 
 def filmed(monkeypatch, tmp_path, panels, **options):

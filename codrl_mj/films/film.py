@@ -71,55 +71,51 @@ class Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
         return np.frombuffer(zlib.decompress(packed), np.uint8).reshape(shape)
 
 
+@dataclasses.dataclass(frozen=True)
+class Panel:
+    """One episode to be shown, beside others."""
+
+    task: str
+    """Task name."""
+    episode: Episode
+    """The episode."""
+    seen: Filmed | None = None
+    """Of an environment of somebody else's: what was seen of it."""
+    title: str = ""
+    """Drawn above the scene."""
+    motor: int = 0
+    """Which of several motors the strip shows."""
+
+
 def record(
     policy: Any, env: Any, seed: int, width: int, height: int, camera: str = "fixed", pretty: bool = False
-) -> tuple[Episode, Filmed | None]:
+) -> Panel:
     """Run an episode, in an `EnvConfig`, to be filmed in images of a size [px].
 
-    In environments of others the camera `fixed` is their own, and what was seen of them is found beside the episode;
-    our tasks are drawn from its states.
+    In environments of others the camera `fixed` is their own, and what is seen is kept; our tasks are drawn from their
+    states.
     """
     view, made = env.world.view(env, width, height, None if camera == "fixed" else camera), []
     if view is None:
-        return run_episodes(policy, env.make, 1, seed)[0], None
+        return Panel(env.task, run_episodes(policy, env.make, 1, seed)[0])
 
     def make() -> Any:
         made.append(Filmed(env.make(**view), pretty))
         return made[-1]
 
     (episode,) = run_episodes(policy, make, 1, seed)
-    return episode, made[0]
-
-
-@dataclasses.dataclass(frozen=True)
-class Panel:
-    """One episode to be shown, beside others."""
-
-    title: str
-    """Drawn above the scene."""
-    task: str
-    """Task name."""
-    episode: Episode
-    """The episode."""
-    motor: int = 0
-    """Which of several motors the strip shows."""
-    seen: Filmed | None = None
-    """Of an environment of somebody else's: what `record` returned beside the episode."""
+    return Panel(env.task, episode, made[0])
 
 
 @contextlib.contextmanager
 def _scene(
-    task: str,
-    episode: Episode,
-    seen: Filmed | None,
-    size: tuple[int, int],
-    camera: str = "fixed",
-    pretty: bool = False,
+    panel: Panel, size: tuple[int, int], camera: str = "fixed", pretty: bool = False
 ) -> Iterator[tuple[float, Callable[[int], np.ndarray]]]:
     """Frames a second of an episode, and what draws its scene after so many steps: (height, width, 3), uint8, new.
 
     Of a task an OpenGL context is held meanwhile.
     """
+    episode, seen = panel.episode, panel.seen
     if seen is not None:
         from PIL import Image
 
@@ -129,7 +125,7 @@ def _scene(
 
         yield seen.metadata.get("render_fps") or 1.0 / float(episode.time[0]), sized
         return
-    env: Any = ActuatedEnv(task, "ideal")
+    env: Any = ActuatedEnv(panel.task, "ideal")
     with contextlib.closing(OffscreenRenderer(env.model, *size, camera, pretty)) as renderer:
 
         def drawn(instant: int) -> np.ndarray:
@@ -173,10 +169,7 @@ def film(
         raise ValueError("panels: there must be at least one episode to show")
     end = max(float(panel.episode.time[-1]) for panel in panels)
     with contextlib.ExitStack() as stack:
-        scenes = [
-            stack.enter_context(_scene(one.task, one.episode, one.seen, (width, height), camera, pretty))
-            for one in panels
-        ]
+        scenes = [stack.enter_context(_scene(one, (width, height), camera, pretty)) for one in panels]
         drawn = [_drawn(one, image, width, height, end) for one, (_, image) in zip(panels, scenes, strict=True)]
         rate, last = scenes[0][0], max(len(panel.episode.reward) for panel in panels)
         stride = max(1, round(rate / _MAX_FPS))
@@ -226,18 +219,18 @@ class Clip(NamedTuple):
     """An image of it, a JPEG file."""
 
 
-def clip(task: str, episode: Episode, seen: Filmed | None, width: int, height: int) -> Clip:
-    """The scene of an episode in memory, even sizes [px]; `seen` is what `record` returned beside the episode.
+def clip(panel: Panel, width: int, height: int) -> Clip:
+    """The scene of an episode in memory, even sizes [px].
 
     A `RenderingUnavailableError` has the remedy where no OpenGL context can be made.
     """
     from PIL import Image
 
-    steps, duration = len(episode.time), float(episode.time[0])
+    steps, duration = len(panel.episode.time), float(panel.episode.time[0])
     stride = max(1, round(1.0 / (duration * _MAX_FPS)), -(-steps // _MOST_FRAMES))
     instants = [*range(0, steps, stride), steps]
     rate, still = 1.0 / (stride * duration), io.BytesIO()
-    with _scene(task, episode, seen, (width, height)) as (_, draw), tempfile.TemporaryDirectory() as folder:
+    with _scene(panel, (width, height)) as (_, draw), tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
         with _encoding(path, rate, _SOUGHT) as add:
             for place, instant in enumerate(instants):

@@ -52,8 +52,9 @@ def show(name: str, env: Any, policy: Any, seed: int, filmed: bool = True) -> Sh
     episode, film, problem = None, None, None if filmed else "none was asked for"
     if filmed:
         try:
-            episode, seen = record(policy, env, seed, *_SIZE)
-            film = clip(env.task, episode, seen, *_SIZE)
+            panel = record(policy, env, seed, *_SIZE)
+            episode = panel.episode
+            film = clip(panel, *_SIZE)
         except Exception as error:  # each renderer raises its own kind, and so do libraries that are not installed
             problem = f"{type(error).__name__}: {error}"
     return Shown(name, env, episode or run_episodes(policy, env.make, 1, seed)[0], film, problem, seed)
