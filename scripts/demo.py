@@ -88,7 +88,7 @@ def main() -> int:
     returns = np.array([[episode.total for episode in episodes] for episodes in on_real.values()])
     typical = int(np.abs(returns - np.median(returns, axis=1, keepdims=True)).sum(axis=0).argmin())
     panels = [
-        Panel(f"{name}: {episodes[typical].total:.0f} of 500", TASK, motor, episodes[typical])
+        Panel(TASK, episodes[typical], title=f"{name}: {episodes[typical].total:.0f} of 500")
         for name, episodes in on_real.items()
     ]
     with progress_bar("{task.completed}/{task.total} frames") as bar:

@@ -27,7 +27,7 @@ def main() -> None:
     for name in options.actuators:
         env = dataclasses.replace(trained, actuator=name, max_episode_steps=None)
         (episode,) = run_episodes(policy, env.make, 1, options.seed)
-        panels.append(Panel(f"on {name}: return {episode.total:.0f}", env.task, env.actuator, episode))
+        panels.append(Panel(env.task, episode, title=f"on {name}: return {episode.total:.0f}"))
     print(f"wrote {film(panels, options.out)}")
 
 

@@ -34,7 +34,7 @@ def played(task="cartpole", actuator="weaker", steps=20, seed=1):
     resolved = named_actuator(actuator, task)
     make = EnvConfig(task, resolved, max_episode_steps=steps).make
     (episode,) = run_episodes(RandomPolicy(task, seed), make, 1, seed)
-    return Panel(f"{task} on {actuator}", task, resolved, episode)
+    return Panel(task, episode, title=f"{task} on {actuator}")
 
 
 def made_up(desired, actual, *, saturated=False, arm=1.0, steps=40, terminated=False, states=None):
@@ -45,7 +45,7 @@ def made_up(desired, actual, *, saturated=False, arm=1.0, steps=40, terminated=F
     actuator, trace, time = Actuator(Motor(arm_radius=arm)), {"speed": np.zeros(steps)}, 0.02 * np.arange(1, steps + 1)
     acted = np.zeros(steps), np.ones(steps), np.zeros(1)
     episode = Episode(time, states, states, *acted, trace, signals, terminated, actuator)
-    return Panel("made up", "cartpole", actuator, episode)
+    return Panel("cartpole", episode, title="made up")
 
 
 def filmed(monkeypatch, tmp_path, panels, **options):
@@ -200,9 +200,8 @@ def test_saturation_is_marked_in_the_colour_of_its_limit(monkeypatch, tmp_path, 
     panel = made_up(8.0, -4.0, saturated=limit != "")
     if limit is not None:
         signals = panel.episode.signals | {f"{one}_saturated": np.full(40, float(one == limit)) for one in LIMITS}
-        panel = dataclasses.replace(
-            panel, actuator=Drive(), episode=dataclasses.replace(panel.episode, signals=signals)
-        )
+        driven = dataclasses.replace(panel.episode, actuator=Drive(), signals=signals)
+        panel = dataclasses.replace(panel, episode=driven)
     frame = filmed(monkeypatch, tmp_path, [panel])[-1]
     for one, colour in LIMITS.items():
         pale = 0.3 * np.array(colour) + 0.7 * 255

@@ -86,14 +86,13 @@ class Test:
 
     def _film(self, out: Path, link: Any) -> None:
         from codrl_mj.deploy import Board
-        from codrl_mj.films.film import Panel, film
-        from codrl_mj.films.record import record
+        from codrl_mj.films.film import film, record
 
         with Board(self.folder, self.target, link, self.seed, self.loop, self.actuator) as board:
             env = board.env
-            episode, frames = record(board, env, self.seed, 640, 480, "fixed", False)
-        title = f"{env.task} by its C on {self.target}: return {episode.total:.0f}"
-        film([Panel(title, env.task, episode.actuator, episode, 0, frames)], out, 640, 480, "fixed", False)
+            panel = record(board, env, self.seed, 640, 480)
+        title = f"{env.task} by its C on {self.target}: return {panel.episode.total:.0f}"
+        film([dataclasses.replace(panel, title=title)], out, 640, 480)
         print(f"wrote {out}")
 
 

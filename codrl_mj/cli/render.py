@@ -44,18 +44,18 @@ class Render:
         """Run the episode and film it."""
         from codrl_mj.cli.terminal import progress_bar
         from codrl_mj.evaluation import save_episode
-        from codrl_mj.films.film import Panel, check_film, film
-        from codrl_mj.films.record import record
+        from codrl_mj.films.film import check_film, film, record
 
         check_film(self.out, self.width, self.height)
         if self.trajectory is not None and self.trajectory.suffix != ".npz":
             raise ValueError(f"--trajectory {self.trajectory}: the suffix is {self.trajectory.suffix!r}, must be .npz")
         policy, env = policy_and_environment(self)
-        episode, frames = record(policy, env, self.seed, self.width, self.height, self.camera, self.pretty)
+        panel = record(policy, env, self.seed, self.width, self.height, self.camera, self.pretty)
+        episode = panel.episode
         title = f"{title_of(self.subject, env)}: return {episode.total:.0f}"
         if episode.motors:
             title += f"; {episode.motors[self._motor(episode)]}"
-        panel = Panel(title, env.task, episode.actuator, episode, self._motor(episode), frames)
+        panel = dataclasses.replace(panel, title=title, motor=self._motor(episode))
         with progress_bar("{task.completed}/{task.total} frames") as bar:
             row = bar.add_task("filming", total=None)
             film(

@@ -109,15 +109,13 @@ def print_certificate(certificate: Certificate) -> None:
 
 def print_mutations(caught: Sequence[Caught], blind: Sequence[Check]) -> None:
     """Print one table, a row for each fault made on purpose, and the checks that none of them fails."""
-    from codrl_mj.validation.mutations import margin
-
     columns = "fault", "in", "failed", "clearest check", "worst", "allowed", "beyond"
     rows: list[Any] = []
     for outcome in caught:
         check = outcome.clearest
         shown: list[Any] = [Text("MISSED", "red"), "", "", ""]
         if check is not None:
-            numbers = f"{check.worst:.1e}", f"{check.tolerance:.0e}", f"{margin(check):.1e}"
+            numbers = f"{check.worst:.1e}", f"{check.tolerance:.0e}", f"{check.beyond:.1e}"
             shown = [f"{check.group}: {check.name}", *numbers]
         failed = f"{len(outcome.failed)} of {outcome.made}"
         rows.append((outcome.mutation, outcome.task or "the motor", failed, *shown))

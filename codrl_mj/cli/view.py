@@ -11,7 +11,6 @@ import tyro
 from codrl_mj.cli.fields import AS_TRAINED, ActuatorName, with_environment
 from codrl_mj.cli.subject import Source, SubjectWord, policy_and_environment, title_of
 from codrl_mj.envs.worlds import is_world
-from codrl_mj.fields import field_docs
 from codrl_mj.runs.layout import told_apart
 
 
@@ -38,22 +37,20 @@ class LiveView:
 
     def run(self: Any) -> int:
         """Serve until Ctrl-C."""
-        from codrl_mj.view.session import Session
+        from codrl_mj.view.session import Session, check_display, run_native
 
         if not 1 <= self.port <= 65535:
             raise ValueError(f"--port {self.port}: must be from 1 to 65535")
         if self.native:
-            from codrl_mj.view.native import check_display, run
-
             check_display()
         else:
             browser = _browser()
         policy, env = policy_and_environment(self)
         session = Session(env, self._policies(policy, env), self.seed)
         if self.native:
-            run(session)
+            run_native(session)
             return 0
-        shown = browser(session, self.port, title_of(self.subject, env), field_docs)
+        shown = browser(session, self.port, title_of(self.subject, env))
         print(f"{shown.url} (on this machine alone; Ctrl-C ends it)", flush=True)
         try:
             shown.run()

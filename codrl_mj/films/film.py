@@ -9,24 +9,19 @@ import dataclasses
 import io
 import itertools
 import tempfile
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import gymnasium
 import numpy as np
 
-from codrl_mj.evaluation.episodes import Episode
-from codrl_mj.films.record import Frames, scene
-from codrl_mj.films.strip import (
-    AXIS_WIDTH,
-    HEADER_HEIGHT,
-    MARGIN,
-    PLOT_HEIGHT,
-    draw_strip,
-    draw_text,
-    pixels_per_second,
-)
+from codrl_mj.envs.single import ActuatedEnv
+from codrl_mj.evaluation.episodes import Episode, run_episodes
+from codrl_mj.films.strip import AXIS_WIDTH, HEADER_HEIGHT, MARGIN, PLOT_HEIGHT, draw_strip, draw_text
+from codrl_mj.physics.offscreen import OffscreenRenderer
 from codrl_mj.runs.files import writing, writing_folder
 
 _FORMATS = (".mp4", ".gif", "")
@@ -42,22 +37,102 @@ _MAX_FPS, _MOST_FRAMES = 30, 600
 _FELL, _LASTED = "#B03A2E", "#1E8449"
 
 
+class Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Keeps an image of every instant of an episode, packed: they would fill a gigabyte."""
+
+    def __init__(self, env: "gymnasium.Env[Any, Any]", pretty: bool = False) -> None:
+        """Film an environment; pretty are shadows and multisampling, which on a CPU cost ten times the rest."""
+        if env.render_mode != "rgb_array":
+            raise ValueError(f"render_mode = {env.render_mode!r}: must be 'rgb_array' for a film")
+        super().__init__(env)
+        if not pretty and hasattr(env.unwrapped, "model"):
+            quality = env.unwrapped.model.vis.quality
+            quality.shadowsize = quality.offsamples = 0
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        """Start an episode, and its film."""
+        result = self.env.reset(**options)
+        self._packed: list[tuple[tuple[int, ...], bytes]] = []
+        self._keep(self.env.render())
+        return result
+
+    def step(self, action: Any) -> Any:
+        """Advance by one environment step."""
+        result = self.env.step(action)
+        self._keep(self.env.render())
+        return result
+
+    def _keep(self, image: Any) -> None:
+        self._packed.append((image.shape, zlib.compress(image.tobytes(), 1)))
+
+    def image(self, instant: int) -> np.ndarray:
+        """What was seen after so many steps: (height, width, 3), uint8."""
+        shape, packed = self._packed[instant]
+        return np.frombuffer(zlib.decompress(packed), np.uint8).reshape(shape)
+
+
 @dataclasses.dataclass(frozen=True)
 class Panel:
     """One episode to be shown, beside others."""
 
-    title: str
-    """Drawn above the scene."""
     task: str
     """Task name."""
-    actuator: Any
-    """What the episode ran on; with several motors a tuple."""
     episode: Episode
     """The episode."""
+    seen: Filmed | None = None
+    """Of an environment of somebody else's: what was seen of it."""
+    title: str = ""
+    """Drawn above the scene."""
     motor: int = 0
     """Which of several motors the strip shows."""
-    frames: Frames | None = None
-    """Of an environment of somebody else's: what `record` returned beside the episode."""
+
+
+def record(
+    policy: Any, env: Any, seed: int, width: int, height: int, camera: str = "fixed", pretty: bool = False
+) -> Panel:
+    """Run an episode, in an `EnvConfig`, to be filmed in images of a size [px].
+
+    In environments of others the camera `fixed` is their own, and what is seen is kept; our tasks are drawn from their
+    states.
+    """
+    view, made = env.world.view(env, width, height, None if camera == "fixed" else camera), []
+    if view is None:
+        return Panel(env.task, run_episodes(policy, env.make, 1, seed)[0])
+
+    def make() -> Any:
+        made.append(Filmed(env.make(**view), pretty))
+        return made[-1]
+
+    (episode,) = run_episodes(policy, make, 1, seed)
+    return Panel(env.task, episode, made[0])
+
+
+@contextlib.contextmanager
+def _scene(
+    panel: Panel, size: tuple[int, int], camera: str = "fixed", pretty: bool = False
+) -> Iterator[tuple[float, Callable[[int], np.ndarray]]]:
+    """Frames a second of an episode, and what draws its scene after so many steps: (height, width, 3), uint8, new.
+
+    Of a task an OpenGL context is held meanwhile.
+    """
+    episode, seen = panel.episode, panel.seen
+    if seen is not None:
+        from PIL import Image
+
+        def sized(instant: int) -> np.ndarray:
+            image = Image.fromarray(seen.image(instant))
+            return np.array(image if image.size == size else image.resize(size))
+
+        yield seen.metadata.get("render_fps") or 1.0 / float(episode.time[0]), sized
+        return
+    env: Any = ActuatedEnv(panel.task, "ideal")
+    with contextlib.closing(OffscreenRenderer(env.model, *size, camera, pretty)) as renderer:
+
+        def drawn(instant: int) -> np.ndarray:
+            env.physics.show(episode.state[instant])
+            return renderer.render(env.data)
+
+        yield env.metadata["render_fps"], drawn
 
 
 def film(
@@ -94,20 +169,17 @@ def film(
         raise ValueError("panels: there must be at least one episode to show")
     end = max(float(panel.episode.time[-1]) for panel in panels)
     with contextlib.ExitStack() as stack:
-        scenes = [
-            stack.enter_context(scene(one.task, one.episode, one.frames, (width, height), camera, pretty))
-            for one in panels
-        ]
-        drawn = [_DrawnPanel(one, image, width, height, end) for one, (_, image) in zip(panels, scenes, strict=True)]
+        scenes = [stack.enter_context(_scene(one, (width, height), camera, pretty)) for one in panels]
+        drawn = [_drawn(one, image, width, height, end) for one, (_, image) in zip(panels, scenes, strict=True)]
         rate, last = scenes[0][0], max(len(panel.episode.reward) for panel in panels)
         stride = max(1, round(rate / _MAX_FPS))
         instants = [*range(0, last, stride), last]
-        blank = np.hstack([drawing.blank for drawing in drawn])
+        blanks = np.hstack([blank for blank, _ in drawn])
         add = stack.enter_context(_encoding(out, rate / stride))
         for count, instant in enumerate(instants, 1):
-            frame = blank.copy()
-            for drawing, part in zip(drawn, np.hsplit(frame, len(drawn)), strict=True):
-                drawing.draw(instant, part)
+            frame = blanks.copy()
+            for (_, draw), part in zip(drawn, np.hsplit(frame, len(drawn)), strict=True):
+                draw(instant, part)
             add(frame)
             if on_frame is not None:
                 on_frame(count, len(instants))
@@ -147,19 +219,18 @@ class Clip(NamedTuple):
     """An image of it, a JPEG file."""
 
 
-def clip(task: str, episode: Episode, taken: Frames | None, width: int, height: int) -> Clip:
-    """The scene of a task's episode in memory, even sizes [px]; `taken` is what `record` returned beside the episode.
+def clip(panel: Panel, width: int, height: int) -> Clip:
+    """The scene of an episode in memory, even sizes [px].
 
-    Raises:
-        RenderingUnavailableError: no OpenGL context can be made here; the message has the remedy.
+    A `RenderingUnavailableError` has the remedy where no OpenGL context can be made.
     """
     from PIL import Image
 
-    steps, duration = len(episode.time), float(episode.time[0])
+    steps, duration = len(panel.episode.time), float(panel.episode.time[0])
     stride = max(1, round(1.0 / (duration * _MAX_FPS)), -(-steps // _MOST_FRAMES))
     instants = [*range(0, steps, stride), steps]
     rate, still = 1.0 / (stride * duration), io.BytesIO()
-    with scene(task, episode, taken, (width, height)) as (_, draw), tempfile.TemporaryDirectory() as folder:
+    with _scene(panel, (width, height)) as (_, draw), tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
         with _encoding(path, rate, _SOUGHT) as add:
             for place, instant in enumerate(instants):
@@ -201,39 +272,36 @@ def _encoding(out: Path, fps: float, h264: Sequence[str] = _FINE) -> Iterator[Ca
             one.result()
 
 
-class _DrawnPanel:
-    """A panel with its title and its strip drawn once; frames slide a window over the strip."""
+def _drawn(
+    panel: Panel, image: Callable[[int], np.ndarray], width: int, height: int, end: float
+) -> tuple[np.ndarray, Callable[[int, np.ndarray], None]]:
+    """A panel without its scene, and what draws it after so many steps over a copy of that: (height, width, 3), uint8.
 
-    def __init__(self, panel: Panel, image: Callable[[int], np.ndarray], width: int, height: int, end: float) -> None:
-        """Draw them; `image` draws the scene after so many steps, and `end` [s] is where the longest episode ends."""
-        episode = panel.episode
-        self._panel, self._top, self._bottom = panel, _TITLE_HEIGHT, _TITLE_HEIGHT + height
-        self._image = image
-        self._window = min(end, _WINDOW_STEPS * float(episode.time[0]))
-        self._scale = pixels_per_second(width, self._window)
-        self._axis, self._strip = draw_strip(panel.task, episode, panel.actuator, width, self._window, end, panel.motor)
-        empty = np.zeros((height, width, 3), np.uint8)
-        self.blank = np.vstack([draw_text(panel.title, width, _TITLE_HEIGHT), empty, self._axis])
-        self._last = len(episode.reward)
-        fell, over = episode.terminated, episode.time[-1]
-        ending = f"ended at {over:.2f} s" if fell else f"time limit, {over:.2f} s"
-        self._over = draw_text(ending, width, _TITLE_HEIGHT, _FELL if fell else _LASTED)
+    Title and strip are drawn once, a window slides over the strip. `image` draws the scene, and `end` [s] is where the
+    longest episode ends.
+    """
+    episode, top, bottom = panel.episode, _TITLE_HEIGHT, _TITLE_HEIGHT + height
+    window = min(end, _WINDOW_STEPS * float(episode.time[0]))
+    scale, axis, strip = draw_strip(panel.task, episode, panel.motor, width, window, end)
+    last, fell, over = len(episode.reward), episode.terminated, episode.time[-1]
+    words = f"ended at {over:.2f} s" if fell else f"time limit, {over:.2f} s"
+    ending = draw_text(words, width, _TITLE_HEIGHT, _FELL if fell else _LASTED)
 
-    def draw(self, instant: int, frame: np.ndarray) -> None:
-        """Draw the panel after `instant` steps over its `blank` one, shape (height, width, 3), uint8."""
-        episode, now = self._panel.episode, min(instant, self._last)
-        view = frame[self._top : self._bottom]
-        view[:] = self._image(now)
-        if now == self._last:
-            view[-_TITLE_HEIGHT:] = self._over
-            if episode.terminated:
+    def draw(instant: int, frame: np.ndarray) -> None:
+        now = min(instant, last)
+        view = frame[top:bottom]
+        view[:] = image(now)
+        if now == last:
+            view[-_TITLE_HEIGHT:] = ending
+            if fell:
                 view[:-_TITLE_HEIGHT] = view[:-_TITLE_HEIGHT] // 2 + 90  # faded
         time = float(episode.time[now - 1]) if now else 0.0
-        begin = round(self._scale * max(0.0, time - self._window))
-        size = round(self._scale * self._window)
-        cursor = min(round(self._scale * time) - begin, size - 1)
-        shown = self._strip[:, begin : begin + size + MARGIN]
-        strip = frame[self._bottom + HEADER_HEIGHT :, AXIS_WIDTH : AXIS_WIDTH + shown.shape[1]]
-        strip[PLOT_HEIGHT:] = shown[PLOT_HEIGHT:]
-        strip[:PLOT_HEIGHT, :cursor] = shown[:PLOT_HEIGHT, :cursor]  # and nothing of what has not happened yet
-        strip[:PLOT_HEIGHT, cursor] = 120
+        begin, size = round(scale * max(0.0, time - window)), round(scale * window)
+        cursor = min(round(scale * time) - begin, size - 1)
+        shown = strip[:, begin : begin + size + MARGIN]
+        below = frame[bottom + HEADER_HEIGHT :, AXIS_WIDTH : AXIS_WIDTH + shown.shape[1]]
+        below[PLOT_HEIGHT:] = shown[PLOT_HEIGHT:]
+        below[:PLOT_HEIGHT, :cursor] = shown[:PLOT_HEIGHT, :cursor]  # and nothing of what has not happened yet
+        below[:PLOT_HEIGHT, cursor] = 120
+
+    return np.vstack([draw_text(panel.title, width, top), np.zeros((height, width, 3), np.uint8), axis]), draw

@@ -35,27 +35,21 @@ def draw_text(text: str, width: int, height: int, colour: str = "#22313F") -> np
     return _pixels(figure)
 
 
-def pixels_per_second(width: int, window: float) -> float:
-    """Scale of the time axis where a frame `width` px wide shows `window` seconds."""
-    return (width - AXIS_WIDTH - MARGIN) / window
-
-
 def draw_strip(
-    task: str, episode: Episode, actuator: Any, width: int, window: float, end: float, motor: int = 0
-) -> tuple[np.ndarray, np.ndarray]:
-    """Draw an episode's signals once, so that frames `width` px wide that show `window` seconds can be cut from them.
+    task: str, episode: Episode, motor: int, width: int, window: float, end: float
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Draw the signals of a motor once, so that frames `width` px wide that show `window` seconds can be cut from them.
 
-    The whole strip ends at the time `end` [s]; of several motors, where the actuator is a tuple, it is of one. Found
-    are the strip's frame (legend and vertical axes), and its whole content below the legend, which is `MARGIN` px wider
-    than the time that it shows.
+    The whole strip ends at the time `end` [s]. Found are the scale of the time axis [px/s], the strip's frame (legend
+    and vertical axes), and its whole content below the legend, which is `MARGIN` px wider than the time that it shows.
     """
-    body = PLOT_HEIGHT + TIME_HEIGHT
+    body, scale = PLOT_HEIGHT + TIME_HEIGHT, (width - AXIS_WIDTH - MARGIN) / window
     frame = _figure(width, HEADER_HEIGHT + body)
-    length = round(pixels_per_second(width, window) * end)
+    length = round(scale * end)
     content = _figure(length + MARGIN, body)
-    if isinstance(actuator, tuple):
-        episode, actuator = of_motor(episode, motor), actuator[motor]
-    lines = []
+    if isinstance(episode.actuator, tuple):
+        episode = of_motor(episode, motor)
+    actuator, lines = episode.actuator, []
     for bottom, height, plot, label in (
         (TIME_HEIGHT + VOLTAGE_HEIGHT + GAP, TORQUE_HEIGHT, _plot_torque, torque_label(task, actuator, motor)),
         (TIME_HEIGHT, VOLTAGE_HEIGHT, _plot_signal, _signal(actuator)[1]),
@@ -63,14 +57,14 @@ def draw_strip(
         total = HEADER_HEIGHT + body
         axis = frame.add_axes((AXIS_WIDTH / width, bottom / total, 1e-6, height / total))
         axes = content.add_axes((0, bottom / body, length / (length + MARGIN), height / body))
-        lines += plot(episode, actuator, axes)
+        lines += plot(episode, axes)
         _share_axis(axis, axes, label, end, window)
     content.axes[0].set_xticks([])
     tight = {"columnspacing": 1.0, "handlelength": 1.4, "handletextpad": 0.4} if len(lines) > 4 else {}
     frame.legend(
         handles=lines, loc="upper right", ncols=len(lines), fontsize=8, frameon=False, borderaxespad=0.2, **tight
     )
-    return _pixels(frame), _pixels(content)
+    return scale, _pixels(frame), _pixels(content)
 
 
 def _figure(width: int, height: int) -> Any:
@@ -103,29 +97,24 @@ def _share_axis(axis: Any, axes: Any, label: str, end: float, window: float) -> 
     axes.xaxis.set_major_formatter(lambda time, _: f"{time:g} s" if time else "")  # the edge would cut a label at 0
 
 
-def _edges(episode: Episode) -> np.ndarray:
-    return np.concatenate([[0.0], episode.time])
-
-
-def _plot_torque(episode: Episode, actuator: ActuatorModel, axes: Any) -> list[Any]:
+def _plot_torque(episode: Episode, axes: Any) -> list[Any]:
     """Plot desired and actual torque (force, where there is no motor), and where the actuator was at its limit."""
-    arm = actuator.arm_radius
+    arm, edges = episode.actuator.arm_radius, np.append(0.0, episode.time)
     desired, actual = episode.signals["desired_force"] * arm, episode.signals["actual_force"] * arm
     limit = 1.15 * max(np.abs(desired).max(), np.abs(actual).max(), 1e-9)
     axes.set_ylim(-limit, limit)
     axes.axhline(0, color="0.85", linewidth=0.8)
     lines = [
-        axes.stairs(values, _edges(episode), baseline=None, color=colour, linewidth=line, label=label)
+        axes.stairs(values, edges, baseline=None, color=colour, linewidth=line, label=label)
         for values, colour, label, line in ((desired, DESIRED, "desired", 1.0), (actual, ACTUAL, "actual", 2.0))
     ]
-    own: Any = actuator.Signals
-    limits = [name for name in _LIMITS if name in own._fields] or ["saturated"]
+    limits = [name for name in _LIMITS if name in episode.actuator.Signals._fields] or ["saturated"]
     for name in limits:
         met = episode.signals[name] != 0.0
         if met.any():
             options = {"baseline": -limit, "fill": True, "color": _LIMITS.get(name, SATURATED), "alpha": 0.3}
             band, label = np.where(met, limit, -limit), name.replace("_saturated", " limit")
-            lines.append(axes.stairs(band, _edges(episode), label=label, **options))
+            lines.append(axes.stairs(band, edges, label=label, **options))
     return lines
 
 
@@ -148,8 +137,9 @@ def _signal(actuator: ActuatorModel) -> tuple[str | None, str]:
     return name, "u [V]" if name == "voltage" else f"{name} [{actuator.SIGNAL_UNITS[name]}]"
 
 
-def _plot_signal(episode: Episode, actuator: ActuatorModel, axes: Any) -> list[Any]:
+def _plot_signal(episode: Episode, axes: Any) -> list[Any]:
     """Plot the voltage, and its limit where it comes near; of a family without one its first signal."""
+    actuator = episode.actuator
     name, _ = _signal(actuator)
     if name is None:
         axes.set_ylim(-1, 1)
@@ -164,4 +154,4 @@ def _plot_signal(episode: Episode, actuator: ActuatorModel, axes: Any) -> list[A
         for side in (-limit, limit):
             axes.axhline(side, color=SATURATED, linewidth=1.0, linestyle="--")
     label = name.replace("_", " ")
-    return [axes.stairs(values, _edges(episode), baseline=None, color=VOLTAGE, linewidth=1.6, label=label)]
+    return [axes.stairs(values, np.append(0.0, episode.time), baseline=None, color=VOLTAGE, linewidth=1.6, label=label)]

@@ -11,7 +11,7 @@ from markupsafe import Markup
 from codrl_mj.pages import page
 from codrl_mj.runs.files import check_writable, writing
 from codrl_mj.validation.certificate import GROUPS, Certificate, verdict, versions
-from codrl_mj.validation.mutations import Caught, margin, unfailed
+from codrl_mj.validation.mutations import Caught, unfailed
 from codrl_mj.validation.table import Check
 
 JSON_NAME, HTML_NAME = "certificate.json", "certificate.html"
@@ -20,7 +20,7 @@ _CHECKS = ("check", "oracle", "samples", "worst", "allowed", "margin", "unit", "
 
 def html(certificate: Certificate, caught: Sequence[Caught] = ()) -> str:
     """The page of what was found, and of what mutations did, if they were tried."""
-    top = [page.verdict(certificate.passed, certificate.verdict)]
+    top = [page.judged(certificate.passed, certificate.verdict, "p", "verdict")]
     if certificate.quick:
         top.append(page.note("The quick form: fewer states, runs and step sizes than in the full one."))
     top.append(
@@ -32,7 +32,9 @@ def html(certificate: Certificate, caught: Sequence[Caught] = ()) -> str:
     software = page.definitions(versions().items())
     top.append(page.folded(f"Made in {certificate.seconds:.0f} s, with this software", software))
     sections = [_group(name, title, certificate) for name, title in GROUPS.items()]
-    sections += [_mutations(certificate, caught), _skipped(certificate)]
+    skipped = [(skip.name, skip.group, skip.reason) for skip in certificate.skipped]
+    left = page.table("What was not checked", ("what", "group", "why"), skipped, cards=True) if skipped else Markup()
+    sections += [_mutations(certificate, caught), page.Section("skipped", "Not checked", left)]
     return page.page(
         f"Is the port right? {certificate.subject}", "Certificate of validation", page.joined(top), sections
     )
@@ -45,20 +47,18 @@ def _group(name: str, title: str, certificate: Certificate) -> page.Section:
         own = [check for check in checks if check.task == task]
         body.append(page.heading(task) if task else Markup())
         caption = f"Checks of {name}{f', {task}' if task else ''}"
-        body.append(page.table(caption, _CHECKS, map(_row, own), numbers=range(2, 6), cards=True))
+        failed = (place for place, check in enumerate(own) if not check.passed)
+        body.append(page.table(caption, _CHECKS, map(_row, own), range(2, 6), True, failed))
         body.append(page.plots(plot for check in own for plot in check.plots))
     good = sum(check.passed for check in checks)
-    sign = ("good", "✓") if good == len(checks) else ("bad", "✗")
-    mark = Markup('<span class="{}">({} {} of {})</span>').format(*sign, good, len(checks))
+    mark = Markup("({})").format(page.judged(good == len(checks), f"{good} of {len(checks)}", "span"))
     return page.Section(name, name.capitalize(), page.joined(body), mark)
 
 
-def _row(check: Check) -> page.Row:
+def _row(check: Check) -> tuple[Any, ...]:
     worst, allowed = (f"{value:.2g}" for value in (check.worst, check.tolerance))
     cells = check.name, check.oracle, f"{check.samples:,}", worst, allowed, check.margin, check.unit, check.where
-    return page.Row(
-        (*cells, page.mark(check.passed, "passed" if check.passed else "FAILED")), "" if check.passed else "failed"
-    )
+    return (*cells, page.judged(check.passed, "passed" if check.passed else "FAILED"))
 
 
 def _mutations(certificate: Certificate, caught: Sequence[Caught]) -> page.Section:
@@ -69,10 +69,10 @@ def _mutations(certificate: Certificate, caught: Sequence[Caught]) -> page.Secti
         clearest, cells = one.clearest, [one.mutation, one.task or "the motor", f"{len(one.failed)} of {one.made}"]
         found = ["none", "", "", ""]
         if clearest is not None:
-            values = (clearest.worst, clearest.tolerance, margin(clearest))
+            values = (clearest.worst, clearest.tolerance, clearest.beyond)
             found = [f"{clearest.group}: {clearest.name}", *(f"{value:.2g}" for value in values)]
-        said = page.mark(clearest is not None, "MISSED" if clearest is None else "caught")
-        rows.append(page.Row((*cells, *found, said), "failed" if clearest is None else ""))
+        said = page.judged(clearest is not None, "MISSED" if clearest is None else "caught")
+        rows.append((*cells, *found, said))
     columns = "fault", "in", "failed", "clearest check", "worst", "allowed", "beyond", "verdict"
     blind = unfailed(certificate.checks, caught)
     told = "; ".join(f"{check.group}, {check.task}: {check.name}" for check in blind)
@@ -81,18 +81,19 @@ def _mutations(certificate: Certificate, caught: Sequence[Caught]) -> page.Secti
             "The certificate put to the test: each fault was made on purpose, and the quick checks were run with it. "
             "“Beyond” is how many times its tolerance the clearest of the failed checks was."
         ),
-        page.table("Faults made on purpose", columns, rows, numbers=(2, 4, 5, 6), cards=True),
+        page.table(
+            "Faults made on purpose",
+            columns,
+            rows,
+            numbers=(2, 4, 5, 6),
+            cards=True,
+            failed=(place for place, one in enumerate(caught) if not one.failed),
+        ),
         page.note(f"✗ No fault fails these checks: {told}", bad=True)
         if blind
         else page.paragraph("Every check of the certificate is failed by at least one of the faults."),
     )
     return page.Section("mutations", "Mutations", page.joined(body))
-
-
-def _skipped(certificate: Certificate) -> page.Section:
-    rows = [(skip.name, skip.group, skip.reason) for skip in certificate.skipped]
-    body = page.table("What was not checked", ("what", "group", "why"), rows, cards=True) if rows else Markup()
-    return page.Section("skipped", "Not checked", body)
 
 
 def summary(content: Mapping[str, Any]) -> Markup:
@@ -107,7 +108,7 @@ def summary(content: Mapping[str, Any]) -> Markup:
     whole = verdict([check["passed"] for check in checks])
     return page.joined(
         (
-            page.verdict(passed, whole),
+            page.judged(passed, whole, "p", "verdict"),
             page.paragraph(f"Of {content['subject']}, made {content['made']}{', the quick form' * content['quick']}."),
             page.table("Checks passed", ("group", "what", "passed"), rows, numbers=(2,)),
         )

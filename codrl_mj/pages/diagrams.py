@@ -1,13 +1,13 @@
-"""Diagrams of a drive, each drawn once for pages and pictures: torque over speed, Bode's of a current loop, steps."""
+"""Diagrams of actuators, each drawn once for pages and pictures: torque over speed, Bode's of a current loop, steps."""
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from codrl_mj.actuators import Drive
+from codrl_mj.actuators import Actuator, ActuatorModel, Drive, Ideal, Inputs, TorqueSpeed, parameters_type
 from codrl_mj.drives import LoopDesign, Looped, Response, abilities, closed_loop, design, open_loop, small_step
 from codrl_mj.drives.abilities import diagram_limits, torque_limits
 from codrl_mj.drives.loop import Steps
@@ -68,6 +68,66 @@ def envelope(
     """The lowest and the highest torque [N*m] over speeds [rad/s], and what lies between."""
     lowest, highest = labels
     return [Curve(lowest, speeds, ends[0], **style), Curve(highest, speeds, ends[1], filled=filled, **style)]
+
+
+def episode_diagram(lines: Sequence[Any]) -> Plot | None:
+    """The points of episodes in the plane of speed and torque, within what the motors (`episode.MotorLine`) can do."""
+    curves: list[Curve] = []
+    highest = 0.0
+    own = [line for line in lines if not isinstance(line.actuator, Ideal)]
+    if not own:
+        return None
+    for line in own:
+        ratio = line.actuator.motor.gear_ratio if isinstance(line.actuator, Drive) else 1.0
+        speed, torque = line.speed / ratio, line.actual * ratio
+        free = no_load_speed(line.actuator)
+        width = max(1.15 * free if np.isfinite(free) else 0.0, 1.1 * float(np.abs(speed).max()), 1e-6)
+        most = max(float(np.abs(torque).max()), float(np.abs(line.desired).max()) * ratio, 1e-9)
+        grid = np.linspace(-width, width, 401)
+        ends = limits(line.actuator, grid)
+        highest = max(highest, min(3.0 * most, 1.1 * float(np.abs(ends[1]).max()) if ends else most))
+        belongs: Any = {"shared": line.place, "tags": line.tags}
+        if ends is not None:
+            labels = f"{line.before}lowest possible", f"{line.before}highest possible"
+            curves += envelope(labels, grid, ends, colour=0, dashed=True, **belongs)
+        kept = slice(None, None, max(line.stride, len(speed) // 3000, 1))
+        times = line.episode.timestep * np.arange(len(speed))[kept]
+        label = f"{line.before}episode"
+        curves.append(Curve(label, speed[kept], torque[kept], style="trail", colour=1, times=times, **belongs))
+    title = "Torque and speed, within what the motor can do"
+    return Plot(title, *TORQUE_SPEED, tuple(curves), y_most=highest)
+
+
+def limits(actuator: Any, speeds: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Lowest and highest torque [N*m] that an actuator delivers at speeds [rad/s]; None where it has no such limits.
+
+    The joint's friction, which the model has, is not taken off.
+    """
+    if isinstance(actuator, Drive):
+        free = {f"motor.{name}": 0.0 for name in ("coulomb_friction", "viscous_friction", "stribeck_friction")}
+        return torque_limits(actuator.replaced(free), speeds, actuator.controller.max_current)
+    if isinstance(actuator, TorqueSpeed):
+        ends = (actuator.stall_torque * (side - speeds / actuator.no_load_speed) for side in (-1.0, 1.0))
+        low, high = (np.clip(end, -actuator.max_torque, actuator.max_torque) for end in ends)
+        return low, high
+    if isinstance(actuator, Actuator) and actuator.voltage_limit is not None:
+        motor, volts = actuator.motor, actuator.voltage_limit
+        low, high = (
+            motor.torque_constant * (side * volts - motor.back_emf_constant * speeds) / motor.resistance
+            for side in (-1, 1)
+        )
+        return low, high
+    return None
+
+
+def no_load_speed(actuator: Any) -> float:
+    """Where the voltage makes no more torque [rad/s], before friction; infinite where nothing is known of it."""
+    if isinstance(actuator, TorqueSpeed):
+        return float(actuator.no_load_speed)
+    if isinstance(actuator, Drive | Actuator) and actuator.voltage_limit is not None:
+        constant = actuator.motor.back_emf_constant * getattr(actuator.motor, "gear_ratio", 1.0)
+        return float(actuator.voltage_limit / constant) if constant > 0.0 else math.inf
+    return math.inf
 
 
 def bode_diagram(drive: Drive) -> list[Plot]:
@@ -194,3 +254,31 @@ def _voltages(loop: Looped, responses: Mapping[str, Response], span: tuple[float
 
 def _within(one: Response, span: tuple[float, float]) -> np.ndarray:
     return (1e3 * one.time >= span[0]) & (1e3 * one.time <= span[1])
+
+
+def held_step(steps: Mapping[str, tuple[ActuatorModel, float, float]]) -> Plot | None:
+    """The torque after a step of what is asked for, the shaft held; None where nothing is of interest.
+
+    By name: the actuator, the torque that is asked of it [N*m], the mechanical step [s].
+    """
+    curves = []
+    for name, (actuator, asked, timestep) in steps.items():
+        kind: Any = type(actuator)
+        if not actuator.tracks or actuator.MOTION or not kind.State._fields or asked == 0.0:
+            continue
+        parameters, state = parameters_type(kind)(*actuator.numbers), kind.State(*[0.0] * len(kind.State._fields))
+        share = [0.0]
+        for tick in range(100):
+            inputs = Inputs(asked, 0.0, 0.0, tick * timestep, 0.0)
+            state, torque, _ = kind.advance(parameters, timestep, state, inputs)
+            share.append(torque / asked)
+        time = timestep * np.arange(len(share))
+        within = np.flatnonzero(np.abs(np.array(share) - share[-1]) > 0.02)
+        shown = min(max(3 * (within[-1] + 1) if len(within) else 0, 20), len(share))
+        label = f"{name}, at steps of {1e3 * timestep:.3g} ms"
+        curves.append(Curve(label, time[:shown], np.array(share[:shown])))
+    if not curves:
+        return None
+    longest = max((curve.x for curve in curves), key=lambda time: time[-1])
+    curves.append(Curve("asked for", longest, np.ones(len(longest)), reference=True))
+    return Plot("A step of the torque, the shaft held", "time [s]", "share of what is asked for", tuple(curves))

@@ -9,14 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from codrl_mj.actuators import Drive, Ideal
+from codrl_mj.actuators import Ideal
 from codrl_mj.evaluation import Episode, run_episodes
-from codrl_mj.films.film import Clip, clip
-from codrl_mj.films.record import record
+from codrl_mj.films.film import Clip, clip, record
 from codrl_mj.films.strip import of_motor
 from codrl_mj.pages import page
-from codrl_mj.pages.diagrams import TORQUE_SPEED, envelope
-from codrl_mj.pages.loop import limits, no_load_speed
+from codrl_mj.pages.diagrams import episode_diagram
 from codrl_mj.pages.plots import POINTS, Curve, Plot, Shade, spans
 
 _SIZE = 480, 360
@@ -29,20 +27,24 @@ _MOST_STATES = 12
 
 
 class Shown(NamedTuple):
-    """An episode of a run."""
+    """A run, and an episode of it as far as there is one."""
 
     name: str
     """The run's."""
     env: Any
-    """What it ran in."""
-    episode: Episode
-    """What happened."""
+    """The `EnvConfig` that it runs in; None where that cannot be read."""
+    episode: Any
+    """What happened, an `Episode`; None: `problem`."""
     film: Clip | None
     """The scene; None: `problem`."""
     problem: str | None
-    """Why there is no film."""
+    """Why there is no episode, or no film of it."""
     seed: int
     """Of the episode."""
+    best: bool = False
+    """Whether the policy of its best evaluation acts."""
+    summary: Any = None
+    """What its folder says: a `RunSummary`."""
 
 
 def show(name: str, env: Any, policy: Any, seed: int, filmed: bool = True) -> Shown:
@@ -50,8 +52,9 @@ def show(name: str, env: Any, policy: Any, seed: int, filmed: bool = True) -> Sh
     episode, film, problem = None, None, None if filmed else "none was asked for"
     if filmed:
         try:
-            episode, taken = record(policy, env, seed, *_SIZE)
-            film = clip(env.task, episode, taken, *_SIZE)
+            panel = record(policy, env, seed, *_SIZE)
+            episode = panel.episode
+            film = clip(panel, *_SIZE)
         except Exception as error:  # each renderer raises its own kind, and so do libraries that are not installed
             problem = f"{type(error).__name__}: {error}"
     return Shown(name, env, episode or run_episodes(policy, env.make, 1, seed)[0], film, problem, seed)
@@ -123,12 +126,12 @@ def episode_section(shown: Sequence[Shown], joined: Iterable[Markup] = ()) -> Ma
         *notes,
         Markup('<div class="pinned">{}{}</div>').format(
             Markup('<div class="films">{}</div>').format(page.joined(films)) if films else "",
-            page.transport(end, min(float(one.episode.time[0]) for one in shown)),
+            page.part("transport", f"{end:.6g}", f"{min(float(one.episode.time[0]) for one in shown):.6g}"),
         ),
         _selectors(shown),
         *joined,
     ]
-    diagram = torque_speed(lines)
+    diagram = episode_diagram(lines)
     if diagram is not None:
         stage.append(page.plot(diagram))
     right = [page.plot(one, low=True) for one in (*_motor_plots(lines), *_run_plots(shown))]
@@ -309,31 +312,3 @@ def _run_plots(shown: Sequence[Shown]) -> list[Plot]:
         found.append(Plot(title, _TIME, f"state [{unit}]", tuple(curves), clock=True))
     found.append(Plot("Reward of each step", _TIME, "reward", tuple(rewards), clock=True))
     return found
-
-
-def torque_speed(lines: Sequence[_MotorLine]) -> Plot | None:
-    """The points of episodes in the plane of speed and torque, within what the motors can do."""
-    curves: list[Curve] = []
-    highest = 0.0
-    own = [line for line in lines if not isinstance(line.actuator, Ideal)]
-    if not own:
-        return None
-    for line in own:
-        ratio = line.actuator.motor.gear_ratio if isinstance(line.actuator, Drive) else 1.0
-        speed, torque = line.speed / ratio, line.actual * ratio
-        free = no_load_speed(line.actuator)
-        width = max(1.15 * free if np.isfinite(free) else 0.0, 1.1 * float(np.abs(speed).max()), 1e-6)
-        most = max(float(np.abs(torque).max()), float(np.abs(line.desired).max()) * ratio, 1e-9)
-        grid = np.linspace(-width, width, 401)
-        ends = limits(line.actuator, grid)
-        highest = max(highest, min(3.0 * most, 1.1 * float(np.abs(ends[1]).max()) if ends else most))
-        belongs: Any = {"shared": line.place, "tags": line.tags}
-        if ends is not None:
-            labels = f"{line.before}lowest possible", f"{line.before}highest possible"
-            curves += envelope(labels, grid, ends, colour=0, dashed=True, **belongs)
-        kept = slice(None, None, max(line.stride, len(speed) // 3000, 1))
-        times = line.episode.timestep * np.arange(len(speed))[kept]
-        label = f"{line.before}episode"
-        curves.append(Curve(label, speed[kept], torque[kept], style="trail", colour=1, times=times, **belongs))
-    title = "Torque and speed, within what the motor can do"
-    return Plot(title, *TORQUE_SPEED, tuple(curves), y_most=highest)

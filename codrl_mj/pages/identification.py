@@ -67,7 +67,10 @@ def _top(found: Identified) -> Markup:
         f"{f'; {found.supply_text}' if found.supply_text else ''}"
     )
     usable = "usable as an actuator" if problem is None else "not to be used as an actuator"
-    parts = [page.verdict(problem is None, usable), page.paragraph("; ".join([told, *late]) + ".", "lead")]
+    parts = [
+        page.judged(problem is None, usable, "p", "verdict"),
+        page.paragraph("; ".join([told, *late]) + ".", "lead"),
+    ]
     parts += [page.note(problem, bad=True)] if problem is not None else []
     return page.joined((*parts, *map(page.note, found.warnings)))
 
@@ -87,13 +90,14 @@ def _parameters(found: Identified) -> Markup:
             interval,
             share,
             unit,
-            page.mark(good, one.status),
+            page.judged(good, one.status),
             one.why,
             CAUSES.get(worst, ""),
         )
-        rows.append(page.Row(cells, "" if good else "failed"))
+        rows.append(cells)
     columns = ("parameter", "value", "95 % interval", "half of it", "unit", "status", "why", "mostly because")
-    return page.table("Parameters with 95 % intervals", columns, rows, numbers=(1, 2, 3), cards=True)
+    failed = (place for place, one in enumerate(found.estimates) if one.status not in USABLE)
+    return page.table("Parameters with 95 % intervals", columns, rows, (1, 2, 3), True, failed)
 
 
 def _advice(found: Identified) -> Markup:
@@ -113,7 +117,8 @@ def _advice(found: Identified) -> Markup:
         texts.append(Markup("A single log: a second one shows what differs from day to day."))
     if not texts:
         return page.paragraph("Nothing stands out: every number is identified or given, and a log was held out.")
-    return page.items([*texts, Markup("<code>codrl-mj identify plan</code> says which excitation tells what.")])
+    texts.append(Markup("<code>codrl-mj identify plan</code> says which excitation tells what."))
+    return Markup("<ul>{}</ul>").format(page.joined(Markup("<li>{}</li>").format(text) for text in texts))
 
 
 def _strong(found: Identified) -> Iterable[tuple[str, str, float]]:

@@ -1,5 +1,6 @@
 """A motor's page: its numbers and where they are from, what it can do, its current loop."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -8,10 +9,64 @@ from markupsafe import Markup
 
 from codrl_mj.actuators import Drive
 from codrl_mj.catalogue import MotorEntry
-from codrl_mj.drives import explain, step, unknown_in_words
+from codrl_mj.drives import LoopDesign, design, designs, explain, step, unknown_in_words
 from codrl_mj.pages import page
-from codrl_mj.pages.diagrams import recoveries, torque_speed_diagram
-from codrl_mj.pages.loop import loop_section, rates_table
+from codrl_mj.pages.diagrams import Loops, bode, recoveries, small_steps, torque_speed_diagram
+
+_RIGHTS = (
+    ("sample_rate", "sample rate", "Hz"),
+    ("kp", "proportional gain", "V/A"),
+    ("ki", "integral gain", "V/(A·s)"),
+    ("gain_margin", "gain margin", "dB"),
+    ("phase_margin", "phase margin", "°"),
+    ("crossover", "crossover", "Hz"),
+    ("bandwidth", "bandwidth, to 1/√2,", "Hz"),
+    ("settling_time", "settled to 2 % in", "ms"),
+    ("overshoot", "overshoot", "%"),
+)
+_SCALES = {"settling_time": 1e3, "overshoot": 100.0}
+
+
+def loop_section(loops: Loops) -> Markup:
+    """Margins, Bode's diagram and a small step of some current loops."""
+    found: dict[str, LoopDesign] = {}
+    notes = []
+    for name, (one, timestep) in loops.items():
+        try:
+            found[name] = design(one, timestep)
+        except ValueError as error:
+            notes.append(page.note(f"{name}: {error}", bad=True))
+    if not found:
+        return page.joined(notes)
+    rows = [
+        (label, *(page.number(_right(one, field)) for one in found.values()), unit) for field, label, unit in _RIGHTS
+    ]
+    late = {name: "a sample of delay" if one.delayed else "no delay" for name, one in found.items()}
+    rows.append(("the voltage comes with", *late.values(), ""))
+    table = page.table("Current loop", ("", *found, "unit"), rows, numbers=range(1, 1 + len(found)))
+    if any(math.isnan(_right(one, field)) for one in found.values() for field, _, _ in _RIGHTS):
+        notes.append(page.paragraph("–: not below half the sample rate, or not within sight.", "soft"))
+    known = {name: loops[name] for name in found}
+    return page.joined((table, *notes, page.plots((*bode(known, found), *small_steps(known)))))
+
+
+def _right(one: LoopDesign, field: str) -> float:
+    value = getattr(one, field)
+    return 20.0 * math.log10(value) if field == "gain_margin" else value * _SCALES.get(field, 1.0)
+
+
+def rates_table(drive: Drive) -> Markup:
+    """The loop at other sample rates, with and without delay."""
+    own = drive.controller.sample_rate, drive.controller.delayed
+    rows = []
+    for (rate, delayed), one in designs(drive).items():
+        name = f"{rate / 1e3:g} kHz, {'a sample' if delayed else 'no'} delay{' (as it is)' * ((rate, delayed) == own)}"
+        if isinstance(one, str):
+            rows.append((name, "not possible: " + one, *[""] * 5))
+        else:
+            rows.append((name, *(page.number(_right(one, field)) for field, _, _ in _RIGHTS[3:])))
+    columns = ("the loop at", *(f"{label} [{unit}]" for _, label, unit in _RIGHTS[3:]))
+    return page.table("Other sample rates", columns, rows, numbers=range(1, 7), cards=True)
 
 
 def motor_page(name: str, drive: Drive, entry: MotorEntry | None, out: Path) -> Path:
@@ -23,7 +78,6 @@ def motor_page(name: str, drive: Drive, entry: MotorEntry | None, out: Path) -> 
         page.Section("numbers", "The motor, at its rotor", _numbers(known)),
         page.Section("drive", "As it is simulated", _values("Fields of the drive", known["drive"])),
     ]
-    kicker = "A motor"
     top = Markup()
     if entry is not None:
         top = page.paragraph(f"{entry.title}.", "lead")
@@ -31,7 +85,7 @@ def motor_page(name: str, drive: Drive, entry: MotorEntry | None, out: Path) -> 
             top += page.paragraph(" ".join(entry.notes.split()))
         for text in known["disagreements"]:
             top += page.note(f"The datasheet disagrees with itself: {text}")
-    return page.write(out, page.page(name, kicker, top, sections))
+    return page.write(out, page.page(name, "A motor", top, sections))
 
 
 def _values(caption: str, rows: Any) -> Markup:

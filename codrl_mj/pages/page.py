@@ -36,22 +36,14 @@ class Section(NamedTuple):
     """Beside its entry in the contents."""
 
 
-class Row(NamedTuple):
-    """A row of a table."""
-
-    cells: Sequence[Any]
-    kind: str = ""
-    """Its CSS class, such as `failed`."""
-
-
 @functools.cache
 def _template(name: str) -> jinja2.Template:
     options: Any = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
     return jinja2.Environment(loader=jinja2.FileSystemLoader(_HERE), **options).get_template(name)
 
 
-def _part(name: str, *arguments: Any) -> Markup:
-    """A macro of `parts.html.jinja`, filled in."""
+def part(name: str, *arguments: Any) -> Markup:
+    """A macro of `parts.html.jinja`, filled in: `transport(end, step)` has the controls of the page's clock [s]."""
     return Markup(getattr(_template("parts.html.jinja").module, name)(*arguments))
 
 
@@ -112,42 +104,37 @@ def definitions(entries: Iterable[tuple[Any, Any]]) -> Markup:
     return Markup("<dl>{}</dl>").format(joined(Markup("<dt>{}</dt><dd>{}</dd>").format(*entry) for entry in entries))
 
 
-def items(texts: Iterable[Any]) -> Markup:
-    """A list."""
-    return Markup("<ul>{}</ul>").format(joined(Markup("<li>{}</li>").format(text) for text in texts))
-
-
 def folded(summary: Any, body: Markup) -> Markup:
     """Something to be unfolded."""
     return Markup("<details><summary>{}</summary>{}</details>").format(summary, body)
 
 
-def mark(good: bool, text: Any) -> Markup:
-    """A word in a table, said to be good or bad not by colour alone."""
-    return Markup('<strong class="{}">{} {}</strong>').format(*(("good", "✓") if good else ("bad", "✗")), text)
-
-
-def verdict(good: bool, text: Any) -> Markup:
-    """Whether something is as it should be, not by colour alone."""
-    return Markup('<p class="verdict {}">{} {}</p>').format(*(("good", "✓") if good else ("bad", "✗")), text)
+def judged(good: bool, text: Any, element: str = "strong", kind: str = "") -> Markup:
+    """A word in a table, or a paragraph, said to be good or bad not by colour alone."""
+    word, sign = ("good", "✓") if good else ("bad", "✗")
+    return Markup('<{0} class="{1}">{2} {3}</{0}>').format(element, f"{kind} {word}".strip(), sign, text)
 
 
 def table(
-    caption: str, columns: Sequence[Any], rows: Iterable[Any], numbers: Iterable[int] = (), cards: bool = False
+    caption: str,
+    columns: Sequence[Any],
+    rows: Iterable[Sequence[Any]],
+    numbers: Iterable[int] = (),
+    cards: bool = False,
+    failed: Iterable[int] = (),
 ) -> Markup:
-    """A table of rows (each a `Row` or a sequence of cells), which the first column names.
+    """A table of rows, which the first column names; some may have failed.
 
     Columns at the places `numbers` hold numbers. With `cards` a phone shows each row as a card; otherwise it scrolls.
     """
-    made = [row if isinstance(row, Row) else Row(row) for row in rows]
-    return _part("table", caption, columns, made, cards, set(numbers))
+    return part("table", caption, columns, list(rows), cards, set(numbers), set(failed))
 
 
 def plot(what: Plot, low: bool = False) -> Markup:
     """A plot; less high where it is `low`."""
     picture = _data("image/svg+xml", still(what, height=2.2 if low else 3.2).encode())
     axes = f"{what.y_label} over {what.x_label}" if what.clock else what.y_label
-    return _part("plot", what.title, axes, description(what), Markup(as_json(what)), picture, what.clock, low)
+    return part("plot", what.title, axes, description(what), Markup(as_json(what)), picture, what.clock, low)
 
 
 def plots(several: Iterable[Plot]) -> Markup:
@@ -167,18 +154,13 @@ def film(caption: str, video: bytes, rate: float, poster: bytes | None = None) -
     The poster, a JPEG file's content, is for as long as nothing is seen.
     """
     before = poster and _data("image/jpeg", poster)
-    return _part("film", caption, _data("video/mp4", video), before, f"{1.0 / rate:.6g}")
-
-
-def transport(end: float, step: float) -> Markup:
-    """The controls of the page's clock (its end [s], and by what it is moved [s]); there may be one in a page."""
-    return _part("transport", f"{end:.6g}", f"{step:.6g}")
+    return part("film", caption, _data("video/mp4", video), before, f"{1.0 / rate:.6g}")
 
 
 def selector(legend: str, kind: str, names: Sequence[str], shown: int | None = None) -> Markup:
     """Chooses by name what the curves with a tag `KIND:PLACE` show, at first the place `shown` alone, or all."""
     entries = [(f"{kind}:{place}", name, shown in (None, place)) for place, name in enumerate(names)]
-    return _part("selector", legend, kind, entries)
+    return part("selector", legend, kind, entries)
 
 
 def clocked(label: str, fragment: str, script: str) -> Markup:
@@ -190,18 +172,12 @@ def clocked(label: str, fragment: str, script: str) -> Markup:
         script: JavaScript that defines a function `setTime(seconds)`, which shows that instant. It sees `element`, the
             fragment's parent, and `seek(seconds)`, to be called when the fragment itself is scrubbed.
     """
-    return _part("clocked", label, Markup(fragment), Markup(script))
+    return part("clocked", label, Markup(fragment), Markup(script))
 
 
 def unit(text: str) -> str:
     """A unit as it is printed."""
     return text.replace("*", "·").replace("^2", "²").replace("ohm", "Ω").replace("degC", "°C")
-
-
-def replay(what: Any, label: str, first: bool) -> Markup:
-    """A `codrl_mj.replay.ReplayPart` on the page's clock; the first of a page brings the library along."""
-    library = Markup("<script>{}</script>").format(Markup(what.library)) if first else Markup()
-    return library + Markup("<figure>{}</figure>").format(clocked(label, what.fragment, what.script))
 
 
 def number(value: Any, digits: int = 4) -> str:

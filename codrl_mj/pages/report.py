@@ -15,8 +15,9 @@ from codrl_mj.evaluation import Episode
 from codrl_mj.evaluation.evaluate import MEASURES
 from codrl_mj.pages import certificate as certificates
 from codrl_mj.pages import page
+from codrl_mj.pages.diagrams import held_step
 from codrl_mj.pages.episode import Shown, episode_section, show
-from codrl_mj.pages.loop import held_step, loop_section
+from codrl_mj.pages.motor import loop_section
 from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.runs.files import check_page, read_json
 from codrl_mj.runs.layout import BEST, EPISODES, PROGRESS, finished, told_apart
@@ -26,20 +27,6 @@ from codrl_mj.training.folder import load_config
 from codrl_mj.training.history import learning_curves, read_episodes
 
 _MOST_LOOPS = 4
-
-
-@dataclasses.dataclass(frozen=True)
-class _Reported:
-    summary: RunSummary
-    name: str
-    shown: Shown | None
-    """Its episode."""
-    problem: str | None
-    """Why there is none."""
-    actuators: Mapping[str, ActuatorModel]
-    """What it was trained through, by the names of motors or patterns."""
-    best: bool = False
-    """Whether the policy of its best evaluation acts in the episode."""
 
 
 def report(
@@ -87,7 +74,7 @@ def report(
         for one, name in zip(summaries, told_apart([one.path for one in summaries]), strict=True)
     ]
     on_part("page")
-    shown = [run.shown for run in found if run.shown is not None]
+    shown = [run for run in found if run.episode is not None]
     sections = [
         page.Section("learning", "Learning", _learning(found)),
         page.Section("evaluation", "Evaluation", _evaluation(found)),
@@ -103,28 +90,26 @@ def report(
 
 def _run(
     summary: RunSummary, name: str, which: str, seed: int, trust: bool, filmed: bool, on_part: Callable[[str], None]
-) -> _Reported:
+) -> Shown:
     """A run with an episode, as far as there is one."""
     try:
         config = load_config(summary.path, trust)
     except (ValueError, OSError, ImportError) as error:
-        return _Reported(summary, name, None, str(error), {})
+        return Shown(name, None, None, None, str(error), seed, summary=summary)
     env = config.evaluation_env
-    actuators = env.driven
     best = which == "best" or not finished(summary.path)
     policy = summary.path / BEST if best else summary.path
     if not (policy / "policy.json").is_file():
         yet = "best policy" if finished(summary.path) else "policy yet"
-        return _Reported(summary, name, None, f"the run has no {yet}: none was evaluated so far", actuators)
+        return Shown(name, env, None, None, f"the run has no {yet}: none was evaluated so far", seed, summary=summary)
     try:
         on_part(f"{name}: episode")
-        shown = show(name, env, load_policy(policy, trust), seed, filmed)
+        return show(name, env, load_policy(policy, trust), seed, filmed)._replace(best=best, summary=summary)
     except Exception as error:  # environments and actuators of others raise what they like
-        return _Reported(summary, name, None, f"{type(error).__name__}: {error}", actuators)
-    return _Reported(summary, name, shown, None, actuators, best)
+        return Shown(name, env, None, None, f"{type(error).__name__}: {error}", seed, summary=summary)
 
 
-def _top(runs: Sequence[_Reported], shown: Sequence[Shown]) -> Markup:
+def _top(runs: Sequence[Shown], shown: Sequence[Shown]) -> Markup:
     """What it is, in sentences and a picture."""
     told: list[Markup] = []
     for run in runs:
@@ -175,7 +160,7 @@ def _about(task: str) -> str:
     return text.strip().partition("\n")[0]
 
 
-def _learning(runs: Sequence[_Reported]) -> Markup:
+def _learning(runs: Sequence[Shown]) -> Markup:
     """Curves from the runs' tables; beside others a run has one colour and no dots."""
     notes: list[Markup] = []
     returns: list[Curve] = []
@@ -224,7 +209,7 @@ def _reports(path: Path) -> dict[str, np.ndarray]:
         return {}
 
 
-def _evaluation(runs: Sequence[_Reported]) -> Markup:
+def _evaluation(runs: Sequence[Shown]) -> Markup:
     """Measures with their intervals."""
     known = [run for run in runs if run.summary.evaluation is not None]
     notes = [
@@ -269,45 +254,51 @@ def _measures(caption: str, columns: Mapping[str, Mapping[str, Any]]) -> Markup:
 
 
 def _episodes(
-    runs: Sequence[_Reported], shown: Sequence[Shown], joined: Callable[[Sequence[Shown]], Sequence[Markup]]
+    runs: Sequence[Shown], shown: Sequence[Shown], joined: Callable[[Sequence[Shown]], Sequence[Markup]]
 ) -> Markup:
-    notes = [page.note(f"No episode of {run.name}: {run.problem}", bad=True) for run in runs if run.shown is None]
+    notes = [page.note(f"No episode of {run.name}: {run.problem}", bad=True) for run in runs if run.episode is None]
     notes += [page.note(f"{run.name}: the policy of its best evaluation acts.") for run in runs if run.best]
     return page.joined((*notes, episode_section(shown, joined(shown)) if shown else ""))
 
 
 def replays(shown: Sequence[Shown]) -> list[Markup]:
     """The episodes in three dimensions, to be turned and zoomed: what `joined` of a report may return."""
-    from codrl_mj.replay import motion_of_episode, replay
+    from codrl_mj.replay import SCRIPT, library, motion_of_episode, replay
 
-    made = [replay(motion_of_episode(one.episode, one.env), one.name) for one in shown]
-    named = zip(made, shown, strict=True)
-    return [page.replay(one, f"Replay: {of.name}", place == 0) for place, (one, of) in enumerate(named)]
+    parts = [Markup("<script>{}</script>").format(Markup(library()))]
+    for one in shown:
+        fragment = replay(motion_of_episode(one.episode, one.env), one.name)
+        parts.append(Markup("<figure>{}</figure>").format(page.clocked(f"Replay: {one.name}", fragment, SCRIPT)))
+    return parts
 
 
-def _loop(runs: Sequence[_Reported]) -> Markup:
+def _loop(runs: Sequence[Shown]) -> Markup:
     """Current loops, and steps of actuators without one; each different one once."""
     loops: dict[str, tuple[Looped, float | None]] = {}
     others: dict[str, tuple[ActuatorModel, float, float]] = {}
     without: dict[str, None] = {}
+    seen: list[Any] = []
     for run in runs:
-        for motor, actuator in run.actuators.items():
-            name = motor if len(runs) == 1 else run.name if len(run.actuators) == 1 else f"{run.name}, {motor}"
+        driven = run.env.driven if run.env is not None else {}
+        for motor, actuator in driven.items():
+            name = motor if len(runs) == 1 else run.name if len(driven) == 1 else f"{run.name}, {motor}"
             name = "motor" if name == ".*" else name
-            timestep = run.shown.episode.timestep if run.shown is not None else None
+            timestep = run.episode.timestep if run.episode is not None else None
             if actuator.assumed:
                 without[f"{name}: {actuator.assumed}."] = None
             if isinstance(actuator, Drive | Actuator) and is_closed(actuator):
                 loop = actuator, None if isinstance(actuator, Drive) else timestep
                 known = isinstance(actuator, Drive) or timestep is not None
-                if known and all(_loop_of(*loop) != _loop_of(*one) for one in loops.values()):
+                same = (actuator.winding, actuator.controller, actuator.voltage_limit, loop[1])
+                if known and same not in seen:
+                    seen.append(same)
                     loops[name] = loop
                 continue
             without[_without_loop(name, actuator)] = None
-            if run.shown is None or timestep is None or isinstance(actuator, Ideal):
+            if timestep is None or isinstance(actuator, Ideal):
                 continue
             if all((actuator, timestep) != (one, step) for one, _, step in others.values()):
-                others[name] = actuator, _asked(actuator, run.shown.episode), timestep
+                others[name] = actuator, _asked(actuator, run.episode), timestep
     parts = [page.paragraph(text, "soft") for text in without]
     if len(loops) > _MOST_LOOPS:
         left = ", ".join(list(loops)[_MOST_LOOPS:])
@@ -336,10 +327,6 @@ def _asked(actuator: ActuatorModel, episode: Episode) -> float:
     return 0.5 * actuator.arm_radius * float(forces[own if any(own) else slice(None)].max())
 
 
-def _loop_of(one: Looped, timestep: float | None) -> Any:
-    return one.winding, one.controller, one.voltage_limit, timestep
-
-
 def _certificate(runs: Sequence[Path], given: Path | None) -> Markup:
     """What the certificate says, if there is one."""
     known = [place for path in runs if (place := path / certificates.JSON_NAME).is_file()]
@@ -356,7 +343,7 @@ def _certificate(runs: Sequence[Path], given: Path | None) -> Markup:
     return Markup()
 
 
-def _settings(runs: Sequence[_Reported]) -> Markup:
+def _settings(runs: Sequence[Shown]) -> Markup:
     """What differs between the runs, and all that they were made with."""
     parts = []
     if len(runs) > 1:

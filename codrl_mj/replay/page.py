@@ -1,18 +1,18 @@
-"""A replay as a part of a page, or as a page of its own; nothing in it asks anything of a server."""
+"""A motion of a model's bodies, and its replay: a part of a page or a page of its own, which asks no server."""
 
 import base64
 import dataclasses
 import html
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from codrl_mj.replay.camera import first_view
-from codrl_mj.replay.motion import Motion
-from codrl_mj.replay.shapes import TRIANGLES, mesh, thinned
+from codrl_mj.evaluation.episodes import Episode
+from codrl_mj.replay.scene import TRIANGLES, Shape, first_view, mesh, read_poses, shapes, thinned
 from codrl_mj.runs.files import check_page, writing
 
 _HERE = Path(__file__).parent
@@ -20,32 +20,97 @@ _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; connect-src blob:"
 )
 """What the browser itself holds the page to: nothing is fetched."""
+SCRIPT = "const setTime = codrlReplay(element);"
+"""JavaScript that defines `setTime(seconds)`, which shows that instant; it needs `library` before it in the page, and
+sees `element`, which a replay stands in. It follows a clock, and moves none."""
+_MOST_PER_SECOND = 30
+"""Instants; between them a viewer goes straight, and turns evenly."""
 
 
 @dataclasses.dataclass(frozen=True)
-class ReplayPart:
-    """A replay to be put into a page."""
+class Motion:
+    """What a replay shows."""
 
-    fragment: str
-    """HTML: where it is seen, and its data."""
-    script: str
-    """JavaScript that defines `setTime(seconds)`, which shows that instant; it needs `library` before it in the page.
-    It sees `element`, which the fragment stands in, and `seek(seconds)`, which it never calls: it follows a clock."""
-    library: str
-    """JavaScript that all replays of a page share."""
-    end: float
-    """The last instant [s]."""
+    model: mujoco.MjModel
+    """The model."""
+    shapes: list[Shape]
+    """What is seen of it."""
+    time: np.ndarray
+    """Instants [s], shape (T,)."""
+    bodies: np.ndarray
+    """Those that move and are seen, shape (n,)."""
+    poses: np.ndarray
+    """Of these: position [m] and orientation (quaternion w, x, y, z), shape (T, n, 7), float32."""
+    still: np.ndarray
+    """Of all bodies: the same at the first instant, shape (bodies, 7)."""
+    camera: str | None = None
+    """Of the model, from which it is first seen; None: MuJoCo's free camera."""
 
 
-def replay(what: Motion, label: str) -> ReplayPart:
-    """A replay.
+def motion(
+    model: mujoco.MjModel,
+    states: np.ndarray,
+    time: np.ndarray,
+    camera: str | None = None,
+    show: Callable[[np.ndarray], mujoco.MjData] | None = None,
+) -> Motion:
+    """The motion of any model.
 
     Args:
-        what: the motion.
-        label: what is seen, for those who do not see it.
+        model: the model.
+        states: one for each instant; what `show` takes, or else rows that begin with `qpos`.
+        time: instants [s], ascending, shape (T,).
+        camera: of the model, from which it is first seen.
+        show: brings a simulation of the model into a state.
+
+    Raises:
+        ValueError: `states` and `time` do not fit each other or the model, or the model has no such camera.
     """
+    if len(states) != len(time) or not len(time):
+        raise ValueError(f"states: there are {len(states)} for {len(time)} instants: must be one for each, and some")
+    cameras = [model.camera(index).name for index in range(model.ncam)]
+    if camera is not None and camera not in cameras:
+        raise ValueError(f"camera = {camera!r}: the model's cameras are {', '.join(cameras) or 'none'}")
+    if show is None and np.shape(states)[1] < model.nq:
+        have = f"a row has {np.shape(states)[1]} entries"
+        raise ValueError(f"states: {have}: must begin with the model's {model.nq} of qpos")
+    data = mujoco.MjData(model)
+
+    def by_positions(state: np.ndarray) -> mujoco.MjData:
+        data.qpos[:] = state[: model.nq]
+        mujoco.mj_kinematics(model, data)
+        return data
+
+    seen, show, time = shapes(model), show or by_positions, np.asarray(time)
+    step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+    stride = max(1, int(1.0 / (_MOST_PER_SECOND * step) + 1e-9))
+    chosen = np.unique([*range(0, len(time), stride), len(time) - 1])  # the last, and as many others as are needed
+    poses = np.empty((len(chosen), model.nbody, 7))
+    for row, index in zip(poses, chosen, strict=True):
+        read_poses(show(states[index]), seen, row)
+    spread = np.ptp(poses, axis=0).max(axis=1)
+    bodies = np.array([body for body in sorted({one.body for one in seen}) if spread[body] > 1e-9], dtype=int)
+    moved = poses[:, bodies]
+    for before, after in zip(moved[:-1, :, 3:], moved[1:, :, 3:], strict=True):
+        after[(before * after).sum(axis=1) < 0] *= -1  # a quaternion and its negative are one turn: no jumps
+    return Motion(model, seen, time[chosen], bodies, moved.astype(np.float32), poses[0], camera)
+
+
+def motion_of_episode(episode: Episode, env: Any) -> Motion:
+    """The motion of an episode that `codrl_mj.evaluation.run_episodes` recorded.
+
+    Args:
+        episode: the episode.
+        env: the `EnvConfig` that it was recorded in.
+    """
+    model, show, camera = env.world.scene(env)
+    return motion(model, episode.state, np.concatenate([[0.0], episode.time]), camera, show)
+
+
+def replay(what: Motion, label: str) -> str:
+    """HTML of a replay, where it is seen and its data, with a label for those who do not see it; `SCRIPT` runs it."""
     data = json.dumps(_content(what)).replace("<", "\\u003c")
-    fragment = (
+    return (
         f"<style>{_text('replay.css')}</style>\n"
         f'<div class="replay"><canvas tabindex="0" role="img" aria-label="{html.escape(label)}: three-dimensional, '
         'drag to turn, wheel to zoom, right button to move; keys R: view from the beginning, F: follow"></canvas>\n'
@@ -54,8 +119,11 @@ def replay(what: Motion, label: str) -> ReplayPart:
         '<button type="button" data-do="follow" title="F" aria-pressed="false">follow</button></div>\n'
         f'<script type="application/json">{data}</script></div>'
     )
-    library = f"/* three.js\n{_text('three/LICENSE').strip()}\n*/\n{_text('three/three.min.js')}\n{_text('replay.js')}"
-    return ReplayPart(fragment, "const setTime = codrlReplay(element);", library, float(what.time[-1]))
+
+
+def library() -> str:
+    """JavaScript that all replays of a page share."""
+    return f"/* three.js\n{_text('three/LICENSE').strip()}\n*/\n{_text('three/three.min.js')}\n{_text('replay.js')}"
 
 
 def write_replay(what: Motion, path: Path, title: str) -> Path:
@@ -70,14 +138,13 @@ def write_replay(what: Motion, path: Path, title: str) -> Path:
         ValueError: the suffix is none of a page.
     """
     check_page(path)
-    part = replay(what, title)
     entries = {
         "TITLE": html.escape(title),
         "POLICY": _POLICY,
-        "FRAGMENT": part.fragment,
-        "LIBRARY": part.library,
-        "SCRIPT": part.script,
-        "END": f"{part.end:.6g}",
+        "FRAGMENT": replay(what, title),
+        "LIBRARY": library(),
+        "SCRIPT": SCRIPT,
+        "END": f"{what.time[-1]:.6g}",
     }
     text = _text("page.html")
     before, *rest = text.split("{{")

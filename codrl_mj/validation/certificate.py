@@ -1,10 +1,9 @@
 """The certificate: all groups of checks over all tasks, or over a user's own model, and what they found."""
 
+import copy
 import dataclasses
-import functools
 import importlib
 import importlib.metadata
-import importlib.util
 import math
 import platform
 import time
@@ -13,7 +12,7 @@ from typing import Any
 
 import mujoco
 
-from codrl_mj.physics import SimulationDivergedError
+from codrl_mj.physics import SimulationDivergedError, install_callbacks, motors
 from codrl_mj.tasks import OURS, TASKS, find_task
 from codrl_mj.validation import execution, own_model
 from codrl_mj.validation.table import Check, Skipped
@@ -98,12 +97,9 @@ def versions() -> dict[str, str]:
     return found
 
 
-Part = tuple[str, str, Callable[[], Iterator[Check | Skipped]]]
-"""Group, task or model, and the checks that are made together."""
-
-
-Progress = Callable[[int, int, str], None]
-"""(parts done, parts in all, the part that begins) -> nothing."""
+Outcomes = Iterator[Check | Skipped]
+Progress = Callable[[int, int, str], object]
+"""(parts done, parts in all, the part that begins) -> what nobody looks at."""
 
 
 def unheard(*_: object) -> None:
@@ -112,36 +108,39 @@ def unheard(*_: object) -> None:
 
 def _certify(
     subject: str,
-    parts: Sequence[Part],
+    parts: Sequence[tuple[str, str, Outcomes]],
     skipped: Sequence[Skipped],
     quick: bool,
-    on_check: Callable[[Check], None],
+    on_check: Callable[[Check], object],
     on_part: Progress,
 ) -> Certificate:
-    """Make the parts; a simulation that breaks down is a failed check, a missing library a skipped one."""
+    """Make the parts: a group, a task or model, and its outcomes as they come, which are then said to be of these.
+
+    A simulation that breaks down is a failed check, a missing library a skipped one.
+    """
     started = time.perf_counter()
     found: list[Check] = []
     skips = list(skipped)
-
-    def take(outcome: Check | Skipped) -> None:
-        if isinstance(outcome, Skipped):
-            skips.append(outcome)
-            return
-        found.append(outcome)
-        on_check(outcome)
-
-    for index, (group, task, run) in enumerate(parts):
+    for index, (group, task, outcomes) in enumerate(parts):
         on_part(index, len(parts), f"{group}, {task}" if task else group)
-        try:
-            for outcome in run():
-                take(outcome)
-        except ModuleNotFoundError as error:
-            take(Skipped("the rest of the group", f"{error}: pip install 'codrl-mj[validate]'", group, task))
-        except (ArithmeticError, SimulationDivergedError) as error:
-            reason = f"{type(error).__name__}: {error}"
-            take(Check("runs to its end", "itself", 1, math.inf, 0.0, reason, group, task, ""))
+        for outcome in _to_the_end(outcomes):
+            if isinstance(outcome, Skipped):
+                skips.append(dataclasses.replace(outcome, group=group, task=task))
+            else:
+                found.append(dataclasses.replace(outcome, group=group, task=task))
+                on_check(found[-1])
     on_part(len(parts), len(parts), "done")
     return Certificate(subject, tuple(found), tuple(skips), quick, time.perf_counter() - started)
+
+
+def _to_the_end(outcomes: Outcomes) -> Outcomes:
+    try:
+        yield from outcomes
+    except ModuleNotFoundError as error:
+        yield Skipped("the rest of the group", f"{error}: pip install 'codrl-mj[validate]'")
+    except (ArithmeticError, SimulationDivergedError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        yield Check("runs to its end", "itself", 0.0, "", 1, math.inf, reason)
 
 
 def validate(
@@ -149,8 +148,8 @@ def validate(
     *,
     quick: bool = False,
     groups: Sequence[str] | None = None,
-    on_check: Callable[[Check], None] | None = None,
-    on_part: Progress | None = None,
+    on_check: Callable[[Check], object] = unheard,
+    on_part: Progress = unheard,
 ) -> Certificate:
     """Check that the port is right.
 
@@ -175,25 +174,19 @@ def validate(
         if group not in GROUPS:
             raise ValueError(f"unknown group of checks {group!r}: must be one of {', '.join(GROUPS)}")
 
-    def of_task(group: str, task: str | None) -> Iterator[Check | Skipped]:
+    def of_task(group: str, task: str | None) -> Outcomes:
         module = "own_model" if group in WITHOUT_TASK and task is not None else group
         # imported here: some need libraries that nothing else does
         yield from importlib.import_module(f"codrl_mj.validation.{module}").checks(task, quick)
 
     parts = [
-        (group, task or "", functools.partial(of_task, group, task))
+        (group, task or "", of_task(group, task))
         for group in GROUPS
         if group in chosen
         for task in ([None, *others] if group in WITHOUT_TASK else names)
     ]
     subject = "all tasks" if len(names) == len(TASKS) else ", ".join(names)
-    no_oracle = Skipped(
-        "the motor against gym-electric-motor's permanently excited DC motor",
-        "gym-electric-motor is not installed",
-        "motor",
-    )
-    missing = [] if importlib.util.find_spec("gym_electric_motor") or "motor" not in chosen else [no_oracle]
-    return _certify(subject, parts, missing, quick, on_check or unheard, on_part or unheard)
+    return _certify(subject, parts, (), quick, on_check, on_part)
 
 
 def validate_model(
@@ -201,8 +194,8 @@ def validate_model(
     name: str = "model",
     *,
     quick: bool = False,
-    on_check: Callable[[Check], None] | None = None,
-    on_part: Progress | None = None,
+    on_check: Callable[[Check], object] = unheard,
+    on_part: Progress = unheard,
 ) -> Certificate:
     """Put a model of your own, with any number of our motors, through the checks that apply to it.
 
@@ -217,10 +210,17 @@ def validate_model(
         ValueError: the model has no motor of ours, or one that is not as it should be.
         CallbackInUseError: another library's MuJoCo callback is installed where ours has to go.
     """
-    subject = own_model.prepare(model)
-    state = execution.FULL_STATE
-    parts: list[Part] = [
-        ("motor", name, functools.partial(own_model.motor_checks, subject, name, quick)),
-        ("execution", name, functools.partial(execution.model_checks, subject, name, quick, state)),
+    if not motors(model):
+        raise ValueError(
+            f"the model has no motor of codrl_mj among its {model.nactuator} actuators: put some in with "
+            "codrl_mj.motorise"
+        )
+    subject = copy.copy(model)
+    subject.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # it is left to diverge
+    install_callbacks(subject)
+    parts = [
+        ("motor", name, own_model.motor_checks(subject, quick)),
+        ("execution", name, execution.model_checks(subject, quick, execution.FULL_STATE)),
     ]
-    return _certify(name, parts, own_model.skipped(subject, name), quick, on_check or unheard, on_part or unheard)
+    unknown = [Skipped("all checks", reason, group, name) for group, reason in own_model.UNKNOWN.items()]
+    return _certify(name, parts, unknown, quick, on_check, on_part)

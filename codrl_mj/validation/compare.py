@@ -1,5 +1,11 @@
-"""What is compared, and how: relative to its size, angles on the circle, a NaN worse than anything."""
+"""What is compared, and how: relative to its size, angles on the circle, a NaN worse than anything.
 
+And with what: Gymnasium's equations of motion, read off its environments.
+"""
+
+import itertools
+import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -69,3 +75,37 @@ def forces_of(task: Task, shares: np.ndarray) -> np.ndarray:
     """Desired forces, row by row what `Physics.step` takes, from shares of the largest, shape (steps * motors,)."""
     forces = task.max_forces * shares.reshape(-1, len(task.motors))
     return forces[:, 0] if len(task.motors) == 1 else forces
+
+
+BOUNDS = {"max_speed": math.inf, "_max_speed": math.inf, "min_position": -math.inf, "max_position": math.inf}
+"""Attributes of environments and their twins that bound a state, and what bounds none."""
+
+Equations = Callable[[np.ndarray, Any], np.ndarray]
+"""(mechanical state, force [N or N*m], of several motors an array) -> its time derivative."""
+
+
+def gymnasium_equations(task: Task, dt: float | None = None) -> Equations:
+    """The right-hand side of the task's equations of motion, read off the environment, which nothing bounds here.
+
+    No equation is written down here. A twin may have its right-hand side as a method (Acrobot). The others take Euler
+    steps, whose new velocity is v + a*dt, linear in dt: one step of the environment gives a = (v_new - v)/dt, and the
+    derivative of a position is its velocity. dt [s] is a power of two, or None for one of at most a quarter of an
+    environment step.
+    """
+    assert task.twin is not None
+    driver: Any = task.twin()
+    if hasattr(driver, "derivative"):
+        return driver.derivative
+    for owner, name in itertools.product((driver, getattr(driver, "env", None)), BOUNDS):
+        if hasattr(owner, name):
+            setattr(owner, name, BOUNDS[name])
+    step = 2.0 ** math.floor(math.log2(task.step_duration / 4)) if dt is None else dt
+    qpos, qvel, integrator = list(task.qpos), list(task.qvel), task.integrators[0]
+
+    def derivative(state: np.ndarray, force: float) -> np.ndarray:
+        change = np.empty_like(state)
+        change[qpos] = state[qvel]
+        change[qvel] = (np.asarray(driver(state, force, step, integrator))[qvel] - state[qvel]) / step
+        return change
+
+    return derivative

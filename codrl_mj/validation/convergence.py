@@ -1,6 +1,6 @@
 """As the step shrinks, MuJoCo and Gymnasium's dynamics become one solution, at the order their integrators promise.
 
-The solution is scipy's, of equations taken from Gymnasium (`codrl_mj.validation.continuous`), or, of a task that has no
+The solution is scipy's, of equations taken from Gymnasium (`gymnasium_equations`), or, of a task that has no
 twin there, of the accelerations that MuJoCo finds: that checks its integrator and the motors. With the ideal actuator
 the Euler variants promise first order and RK4, under a force held over the step, fourth. With a motor all promise first
 order: its winding takes Euler steps, and its torque is held over the mechanical step.
@@ -18,13 +18,15 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import mujoco
 import numpy as np
+from scipy import integrate
 
 from codrl_mj.actuators import IDEAL, Actuator, ActuatorModel, CurrentLoop, Motor
-from codrl_mj.physics import MujocoPhysics, Plant, SimulationDivergedError
+from codrl_mj.physics import MujocoPhysics, Plant, SimulationDivergedError, install_callbacks
+from codrl_mj.physics.mjcf import task_model
 from codrl_mj.tasks import OURS, Task, find_task
-from codrl_mj.validation.compare import NO_TWIN, actuators_of, forces_of, physics_of
-from codrl_mj.validation.continuous import equations_of, solve
+from codrl_mj.validation.compare import NO_TWIN, Equations, actuators_of, forces_of, gymnasium_equations, physics_of
 from codrl_mj.validation.table import Case, Check, Family, Skipped, check, of_order, order
 
 
@@ -85,9 +87,59 @@ def _error(states: np.ndarray, solution: np.ndarray) -> float:
     return float((np.abs(states - solution).max(axis=0) / np.abs(solution).max(axis=0)).max())
 
 
-def _finer(task: Task) -> int:
-    """How many times steps are halved in a run that nobody chose."""
-    return 2 if task.trials is None else 0
+def engine_equations(task: Task) -> Equations:
+    """The accelerations that MuJoCo's `mj_forward` finds, whatever its integrator makes of them."""
+    model = task_model(Plant(task, (IDEAL,) * len(task.motors), max_forces=np.full(len(task.motors), 1e9)))
+    install_callbacks(model)
+    data, qpos, qvel = mujoco.MjData(model), list(task.qpos), list(task.qvel)
+    controls = [model.actuator_ctrladr[model.actuator(name).id] for name in task.motors]
+
+    def derivative(state: np.ndarray, force: Any) -> np.ndarray:
+        data.qpos[:], data.qvel[:], data.ctrl[controls] = state[qpos], state[qvel], force
+        mujoco.mj_forward(model, data)
+        change = np.empty_like(state)
+        change[qpos], change[qvel] = state[qvel], data.qacc
+        return change
+
+    return derivative
+
+
+def solve(
+    task: Task, equations: Equations, start: np.ndarray, forces: np.ndarray, actuators: Sequence[ActuatorModel]
+) -> np.ndarray:
+    """Mechanical states, shape (steps, n), at the ends of the environment steps, the forces held over each.
+
+    They are found by scipy's DOP853 at a relative tolerance of 1e-12.
+
+    With motors they are joined by those of each circuit and its analogue PI loop,
+    L di/dt = u - kE*omega - R*i, u = kP*e + kI*I + kFF*i_ref (+ kE*omega), dI/dt = e, torque = kT*i;
+    such a loop has no derivative gain and no filter, is never saturated, and starts at rest.
+    """
+    size, motors = len(start), [one for one in actuators if isinstance(one, Actuator)]
+
+    def derivative(_: float, state: np.ndarray, desired: np.ndarray) -> np.ndarray:
+        delivered, electrical = [*desired], []
+        for at, actuator in enumerate(motors):
+            motor, loop = actuator.motor, actuator.controller
+            current, integral = state[size + 2 * at : size + 2 * at + 2]
+            reference = desired[at] * motor.arm_radius / motor.torque_constant
+            back_emf = motor.back_emf_constant * state[task.speeds[at]] / motor.arm_radius
+            error = reference - current
+            voltage = loop.kp * error + loop.ki * integral + loop.kff * reference + loop.bemf_compensation * back_emf
+            electrical += [(voltage - back_emf - motor.resistance * current) / motor.inductance, error]
+            delivered[at] = motor.torque_constant * current / motor.arm_radius
+        force = delivered[0] if len(delivered) == 1 else np.array(delivered)
+        return np.concatenate([equations(state[:size], force), electrical])
+
+    state, rows = np.concatenate([start, np.zeros(2 * len(motors))]), []
+    span = (0.0, task.step_duration)
+    for force in forces:
+        found = integrate.solve_ivp(
+            derivative, span, state, "DOP853", rtol=1e-12, atol=1e-15, args=(np.atleast_1d(force),)
+        )
+        state = found.y[:, -1]
+        rows.append(state[:size])
+    return np.array(rows)
 
 
 def ideals(task: Task) -> tuple[ActuatorModel, ...]:
@@ -118,7 +170,7 @@ def order_in_the_step(
 ) -> Iterator[Case]:
     """The solution's errors vanish as the integrator promises."""
     motors = [actuator.motor for actuator in actuators if isinstance(actuator, Actuator)]
-    finer = _finer(task)
+    finer = 2 if task.trials is None else 0  # halvings more in a run that nobody chose
     promised = 4.0 if integrator == "rk4" and not motors else 1.0
     if promised == 4.0:
         counts = 2 ** (np.arange(2, 6 if quick else 7) + finer)
@@ -138,7 +190,8 @@ def order_in_the_step(
 @check("convergence", order("rate in the loop's bandwidth", "{whose} with the desired force itself"))
 def rate_in_the_bandwidth(task: Task, quick: bool) -> Iterator[Case]:
     """The lag is resolved by two integration steps at every bandwidth; both runs take the same steps."""
-    lags = task.step_duration / 2 ** ((np.arange(3, 7) if quick else np.arange(4, 9)) + _finer(task))  # tau [s]
+    finer = 2 if task.trials is None else 0  # as above
+    lags = task.step_duration / 2 ** ((np.arange(3, 7) if quick else np.arange(4, 9)) + finer)  # tau [s]
     integrator, physics = task.integrators[0], physics_of(task)
     motors = [Motor(arm_radius=actuator.motor.arm_radius) for actuator in actuators_of(task)]
     errors: dict[str, list[float]] = {label: [] for label, _ in physics}
@@ -162,16 +215,18 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     task = find_task(task_name)
     reason = obstacle(task)
     if reason:
-        yield Skipped("all checks", reason, "convergence", task.name)
+        yield Skipped("all checks", reason)
         return
     if task.twin is None:
-        yield Skipped("equations of motion that are not MuJoCo's", NO_TWIN, "convergence", task.name)
-    equations, whose = equations_of(task)
+        yield Skipped("equations of motion that are not MuJoCo's", NO_TWIN)
+    if task.twin is None:
+        equations, whose, ideal = engine_equations(task), "MuJoCo's own accelerations", "MuJoCo"
+    else:
+        equations, whose, ideal = gymnasium_equations(task), f"the equations of {task.oracle}", task.oracle
     start, forces, _ = free_run(task)
     for case, actuators in (("ideal actuator", ideals(task)), ("motor in the loop", analogues(task))):
         solution = solve(task, equations, start, forces, actuators)
         solved = whose if case == "ideal actuator" else f"{whose} and of the motor"
         for integrator in task.integrators:
-            compared = order_in_the_step.of(whose=solved)
-            yield from compared(task, case, integrator, actuators, solution, quick)
-    yield from rate_in_the_bandwidth.of(whose="MuJoCo" if task.twin is None else task.oracle)(task, quick)
+            yield from order_in_the_step(task, case, integrator, actuators, solution, quick, whose=solved)
+    yield from rate_in_the_bandwidth(task, quick, whose=ideal)

@@ -23,10 +23,9 @@ from codrl_mj.actuators import Drive, resolve
 from codrl_mj.catalogue import motor_names
 from codrl_mj.physics import MujocoPhysics, Plant, SimulationDivergedError
 from codrl_mj.tasks import Task
-from codrl_mj.validation.compare import differences
-from codrl_mj.validation.continuous import gymnasium_equations
+from codrl_mj.validation.compare import differences, gymnasium_equations
 from codrl_mj.validation.rotors import HELD, drive, motors_on
-from codrl_mj.validation.table import Case, Oracle, check
+from codrl_mj.validation.table import Case, Check, check
 
 FITTED = {
     "pendulum": ("maxon-ec45-flat-50w", {"gear_ratio": 30.0}, 20e3),
@@ -131,7 +130,7 @@ class Mechanics:
 _TWIN = "Gymnasium {task.gymnasium_id} with a rotor on its joint, the winding by scipy.linalg.expm"
 
 
-@check("trajectories", Oracle("run, {integrator}, {motor}", _TWIN, 1e-9))
+@check("trajectories", Check("run, {integrator}, {motor}", _TWIN, 1e-9))
 def fitted_run(task: Task, integrator: str, quick: bool) -> Iterator[Case]:
     """A run of a task with its drive of `FITTED`, which has that motor, in the engine, under bang-bang commands."""
     one, generator = fitted(task.name), np.random.default_rng(0)
@@ -160,8 +159,8 @@ def fitted_run(task: Task, integrator: str, quick: bool) -> Iterator[Case]:
 
 @check(
     "motor",
-    Oracle("drives, exact winding", "scipy.linalg.expm, sample by sample", 1e-10, "of the stall torque"),
-    Oracle(
+    Check("drives, exact winding", "scipy.linalg.expm, sample by sample", 1e-10, "of the stall torque"),
+    Check(
         "drives, closed form",
         "the same loops with their gains given, which are stepped in the engine",
         1e-10,

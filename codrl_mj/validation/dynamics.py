@@ -13,9 +13,8 @@ from codrl_mj.actuators import IDEAL
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError
 from codrl_mj.tasks import Task, find_task
 from codrl_mj.tasks.trials import Trials
-from codrl_mj.validation.compare import both, differences, without_oracle
-from codrl_mj.validation.continuous import gymnasium_equations
-from codrl_mj.validation.table import Case, Check, Oracle, Skipped, check
+from codrl_mj.validation.compare import both, differences, gymnasium_equations, without_oracle
+from codrl_mj.validation.table import Case, Check, Skipped, check
 
 TOLERANCE = 1e-12
 """One step rounds some tens of numbers to 1e-16; an RK4 step at the speed limits amplifies that a hundredfold."""
@@ -67,32 +66,35 @@ def _stepped(task: Task, integrator: str, states: np.ndarray, forces: np.ndarray
     return Case(differences(task, ours, oracle), where, len(states))
 
 
-@check("dynamics", Oracle("one step, {integrator}", "{task.oracle}", TOLERANCE))
-def one_step(task: Task, integrator: str, samples: int, seed: int = 0) -> Iterator[Case]:
-    """One integration step with an ideal actuator, from random states under random forces."""
-    generator = np.random.default_rng(seed)
-    bounds = np.array(trials_of(task).bounds)
+@check(
+    "dynamics",
+    *(
+        Check(f"one step{where}, {{integrator}}", "{task.oracle}", TOLERANCE)
+        for where in ("", " at the bounds", " beyond the force limit")
+    ),
+)
+def one_step(task: Task, integrator: str, quick: bool) -> Iterator[tuple[Case, ...]]:
+    """One integration step with an ideal actuator: from random states under random forces.
+
+    And from the task's edges under no, full and extreme forces, which MuJoCo is allowed there; and from a grid under
+    commands up to `EXTREME` times the limit, against Gymnasium under the limit.
+    """
+    generator, limit, flat = np.random.default_rng(0), task.max_force, len(task.state_names) == 2
+    bounds, samples = np.array(trials_of(task).bounds), 200 if quick else 10_000
     states = generator.uniform(-bounds, bounds, (samples, len(bounds)))
-    forces = generator.uniform(-task.max_force, task.max_force, samples)
-    yield _stepped(task, integrator, states, forces, task.max_force)
+    forces = generator.uniform(-limit, limit, samples)
+    edges = np.array(list(itertools.product(*trials_of(task).edges)))[:: 5 if quick and not flat else 1]
+    at_edges = _crossed(edges, limit * np.array([-EXTREME, -1.0, 0.0, 1.0, EXTREME]))
+    points = grid(task, 3 if quick else (21 if flat else 5))
+    beyond = _crossed(points, limit * np.array([-EXTREME, -1.001, 1.001, EXTREME]))
+    yield (
+        _stepped(task, integrator, states, forces, limit),
+        _stepped(task, integrator, *at_edges, EXTREME * limit),
+        _stepped(task, integrator, *beyond, limit),
+    )
 
 
-@check("dynamics", Oracle("one step at the bounds, {integrator}", "{task.oracle}", TOLERANCE))
-def one_step_at_the_bounds(task: Task, integrator: str, stride: int = 1) -> Iterator[Case]:
-    """One step from the task's edges under no, full and extreme forces, which MuJoCo is allowed here."""
-    states = np.array(list(itertools.product(*trials_of(task).edges)))[::stride]
-    crossed = _crossed(states, task.max_force * np.array([-EXTREME, -1.0, 0.0, 1.0, EXTREME]))
-    yield _stepped(task, integrator, *crossed, EXTREME * task.max_force)
-
-
-@check("dynamics", Oracle("one step beyond the force limit, {integrator}", "{task.oracle}", TOLERANCE))
-def one_step_beyond_the_force_limit(task: Task, integrator: str, points: int) -> Iterator[Case]:
-    """One step under commands up to `EXTREME` times the limit, against Gymnasium under the limit."""
-    crossed = _crossed(grid(task, points), task.max_force * np.array([-EXTREME, -1.001, 1.001, EXTREME]))
-    yield _stepped(task, integrator, *crossed, task.max_force)
-
-
-@check("dynamics", Oracle("accelerations", "{task.oracle}", TOLERANCE))
+@check("dynamics", Check("accelerations", "{task.oracle}", TOLERANCE))
 def accelerations(task: Task, points: int) -> Iterator[Case]:
     """MuJoCo's `qacc` over a dense grid of states, under no, half, full and extreme forces."""
     states, forces = _crossed(grid(task, points), task.max_force * np.array([-EXTREME, -1.0, 0.0, 0.5, EXTREME]))
@@ -119,12 +121,10 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     task = find_task(task_name)
     missing = without_oracle(task)
     if missing or task.trials is None:
-        yield Skipped("all checks", missing or "it names no states to try it in: Task.trials", "dynamics", task.name)
+        yield Skipped("all checks", missing or "it names no states to try it in: Task.trials")
         return
     flat = len(task.state_names) == 2
     points = (9 if flat else 3) if quick else (51 if flat else 7)
     yield from accelerations(task, points)
     for integrator in task.integrators:
-        yield from one_step(task, integrator, 200 if quick else 10_000)
-        yield from one_step_at_the_bounds(task, integrator, stride=5 if quick and not flat else 1)
-        yield from one_step_beyond_the_force_limit(task, integrator, 3 if quick else (21 if flat else 5))
+        yield from one_step(task, integrator, quick)

@@ -15,7 +15,7 @@ from mujoco.batch import Batch
 from codrl_mj.physics import MujocoPhysics, Plant, install_callbacks, motors
 from codrl_mj.tasks import Task, find_task
 from codrl_mj.validation.compare import actuators_of, forces_of
-from codrl_mj.validation.table import Case, Check, Oracle, check
+from codrl_mj.validation.table import Case, Check, check
 
 UNIT = "64-bit floats that differ"
 SERIAL = "a loop over mj_step"
@@ -55,14 +55,16 @@ def differing(ours: np.ndarray, oracle: np.ndarray) -> np.ndarray:
     return ours != oracle
 
 
-def bits(ours: np.ndarray, oracle: np.ndarray) -> Iterator[Case]:
+def bits(ours: np.ndarray, oracle: np.ndarray) -> Case:
     """States of shape (steps, n) or (steps, simulations, n): how many floats differ, and from which step on."""
     unequal = differing(ours, oracle)
     first = int(np.argmax(unequal.reshape(len(unequal), -1).any(axis=1)))
-    yield Case(float(unequal.sum()), lambda _: f"the first of them at step {first + 1} of {len(unequal)}", unequal.size)
+    return Case(
+        float(unequal.sum()), lambda _: f"the first of them at step {first + 1} of {len(unequal)}", unequal.size
+    )
 
 
-@check("execution", Oracle("batched, {threads}", SERIAL, 0.0, UNIT))
+@check("execution", Check("batched, {threads}", SERIAL, 0.0, UNIT))
 def batched(model: mujoco.MjModel, threads: str, simulations: int, steps: int) -> Iterator[Case]:
     """A batch, each simulation under commands of its own, against one simulation after the other."""
     inputs = np.stack([commands(model, steps, seed) for seed in range(simulations)], axis=1)
@@ -75,34 +77,33 @@ def batched(model: mujoco.MjModel, threads: str, simulations: int, steps: int) -
         batch.step()
         ours.append(np.concatenate(fields, axis=1))
     serial = [_advance(model, mujoco.MjData(model), inputs[:, each]) for each in range(simulations)]
-    yield from bits(np.array(ours), np.stack(serial, axis=1))
+    yield bits(np.array(ours), np.stack(serial, axis=1))
 
 
-@check("execution", Oracle("copied", "the original", 0.0, UNIT))
-def copied(model: mujoco.MjModel, steps: int) -> Iterator[Case]:
-    """A copy of `MjData` made half-way, against the original."""
-    inputs = commands(model, 2 * steps, seed=0)
-    original = mujoco.MjData(model)
-    _advance(model, original, inputs[:steps])
-    twin = copy.copy(original)
-    ours = _advance(model, twin, inputs[steps:])
-    yield from bits(ours, _advance(model, original, inputs[steps:]))
+@check(
+    "execution",
+    Check("copied", "the original", 0.0, UNIT),
+    Check("restored", "the run it was taken from", 0.0, UNIT),
+)
+def half_way(model: mujoco.MjModel, steps: int, state: mujoco.mjtState = STATE) -> Iterator[tuple[Case, ...]]:
+    """Half-way a copy of `MjData`, and a new one that a state vector is put into, against what they were made of."""
+
+    def restored(original: mujoco.MjData) -> mujoco.MjData:
+        fresh, vector = mujoco.MjData(model), np.empty(mujoco.mj_stateSize(model, state))
+        mujoco.mj_getState(model, original, vector, state)
+        mujoco.mj_setState(model, fresh, vector, state)
+        return fresh
+
+    cases = []
+    for seed, twin_of in enumerate((copy.copy, restored)):
+        inputs, original = commands(model, 2 * steps, seed), mujoco.MjData(model)
+        _advance(model, original, inputs[:steps])
+        pair = twin_of(original), original
+        cases.append(bits(*(_advance(model, one, inputs[steps:]) for one in pair)))
+    yield tuple(cases)
 
 
-@check("execution", Oracle("restored", "the run it was taken from", 0.0, UNIT))
-def restored(model: mujoco.MjModel, steps: int, state: mujoco.mjtState = STATE) -> Iterator[Case]:
-    """A state vector taken half-way and put into a new `MjData`, against the run it was taken from."""
-    inputs = commands(model, 2 * steps, seed=1)
-    original, fresh = mujoco.MjData(model), mujoco.MjData(model)
-    _advance(model, original, inputs[:steps])
-    vector = np.empty(mujoco.mj_stateSize(model, state))
-    mujoco.mj_getState(model, original, vector, state)
-    mujoco.mj_setState(model, fresh, vector, state)
-    ours = _advance(model, fresh, inputs[steps:])
-    yield from bits(ours, _advance(model, original, inputs[steps:]))
-
-
-@check("execution", Oracle("forward passes", "one forward pass", 0.0, UNIT))
+@check("execution", Check("forward passes", "one forward pass", 0.0, UNIT))
 def forward_passes(model: mujoco.MjModel, steps: int) -> Iterator[Case]:
     """Between any two steps, three forward passes leave activations and plugins' states, the motors', as one does."""
     inputs, moving = commands(model, steps, seed=2), 1 + model.nq + model.nv
@@ -117,19 +118,16 @@ def forward_passes(model: mujoco.MjModel, steps: int) -> Iterator[Case]:
             mujoco.mj_forward(model, looked_at)
         often.append(_state(looked_at)[moving:])
         mujoco.mj_step(model, data)
-    yield from bits(np.array(often), np.array(once))
+    yield bits(np.array(often), np.array(once))
 
 
-def model_checks(
-    model: mujoco.MjModel, task: str = "", quick: bool = False, state: mujoco.mjtState = STATE
-) -> Iterator[Check]:
+def model_checks(model: mujoco.MjModel, quick: bool = False, state: mujoco.mjtState = STATE) -> Iterator[Check]:
     """The checks of any model whose callbacks are installed; a state vector holds `state`."""
     simulations, steps = (6, 40) if quick else (32, 200)
     for threads in THREADS:
-        yield from batched.of(task)(model, threads, simulations, steps)
-    yield from copied.of(task)(model, steps)
-    yield from restored.of(task)(model, steps, state)
-    yield from forward_passes.of(task)(model, steps)
+        yield from batched(model, threads, simulations, steps)
+    yield from half_way(model, steps, state)
+    yield from forward_passes(model, steps)
 
 
 # -- with a task's bounds and integrator around it ----------------------------------------------------------
@@ -154,32 +152,27 @@ def _simulation(task: Task, integrator: str, seed: int, steps: int) -> tuple[Muj
     return physics, initial, forces_of(task, generator.uniform(-1.0, 1.0, steps * len(task.motors)))
 
 
-@check("execution", Oracle("pickled, {integrator}", "the original", 0.0, UNIT))
-def pickled(task: Task, integrator: str, steps: int) -> Iterator[Case]:
-    """A simulation pickled and unpickled half-way, against the original."""
+@check(
+    "execution",
+    Check("pickled, {integrator}", "the original", 0.0, UNIT),
+    Check("repeated, {integrator}", "the first episode", 0.0, UNIT),
+    Check("looked at, {integrator}", "an episode that nobody looks at", 0.0, UNIT),
+)
+def again(task: Task, integrator: str, steps: int) -> Iterator[tuple[Case, ...]]:
+    """A simulation that was pickled half-way, and episodes after a reset, against what they repeat.
+
+    The last is looked at after every step: by a forward pass, as viewers make them.
+    """
     physics, _, forces = _simulation(task, integrator, 3, 2 * steps)
     _episode(physics, forces[:steps])
-    twin = pickle.loads(pickle.dumps(physics))
-    ours, oracle = (_episode(each, forces[steps:]) for each in (twin, physics))
-    yield from bits(ours, oracle)
-
-
-@check("execution", Oracle("repeated, {integrator}", "the first episode", 0.0, UNIT))
-def repeated(task: Task, integrator: str, steps: int) -> Iterator[Case]:
-    """A second episode after a reset, against the first."""
-    physics, initial, forces = _simulation(task, integrator, 4, steps)
-    oracle = _episode(physics, forces)
-    physics.reset(initial)
-    yield from bits(_episode(physics, forces), oracle)
-
-
-@check("execution", Oracle("looked at, {integrator}", "an episode that nobody looks at", 0.0, UNIT))
-def looked_at(task: Task, integrator: str, steps: int) -> Iterator[Case]:
-    """An episode with a forward pass after every environment step, as a viewer makes them, against one without."""
-    physics, initial, forces = _simulation(task, integrator, 5, steps)
-    oracle = _episode(physics, forces)
-    physics.reset(initial)
-    yield from bits(_episode(physics, forces, look=True), oracle)
+    pair = pickle.loads(pickle.dumps(physics)), physics
+    cases = [bits(*(_episode(each, forces[steps:]) for each in pair))]
+    for seed, look in ((4, False), (5, True)):
+        physics, initial, forces = _simulation(task, integrator, seed, steps)
+        oracle = _episode(physics, forces)
+        physics.reset(initial)
+        cases.append(bits(_episode(physics, forces, look), oracle))
+    yield tuple(cases)
 
 
 def checks(task_name: str, quick: bool = False) -> Iterator[Check]:
@@ -188,7 +181,6 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check]:
     physics, _, _ = _simulation(task, task.integrators[0], 0, 1)
     assert motors(physics.model)
     install_callbacks(physics.model)
-    yield from model_checks(physics.model, task.name, quick)
+    yield from model_checks(physics.model, quick)
     for integrator in task.integrators:
-        for compared in (pickled, repeated, looked_at):
-            yield from compared(task, integrator, 30 if quick else 200)
+        yield from again(task, integrator, 30 if quick else 200)

@@ -15,7 +15,7 @@ from scipy import linalg, signal
 from codrl_mj.actuators import Actuator
 from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.validation.rotors import HELD, Loop, drive, motors_on, run, unlimited
-from codrl_mj.validation.table import Case, Check, Family, Oracle, check, of_order, order
+from codrl_mj.validation.table import Case, Check, Family, check, of_order, order
 
 # -- The analogue loop that it samples ------------------------------------------------------------------------
 
@@ -58,7 +58,7 @@ _ORACLE = "matrix exponential of the RL circuit under the analogue PID (scipy.li
 @check(
     "motor",
     order("closed form, order in the substeps", _ORACLE),
-    Oracle("closed form, limit of small substeps", _ORACLE, 1e-5, "N m"),
+    Check("closed form, limit of small substeps", _ORACLE, 1e-5, "N m"),
 )
 def analogue(loops: Mapping[str, Loop], quick: bool) -> Iterator[tuple[Case, ...]]:
     """Convergence to the closed form at first order in the substeps, and the limit itself.
@@ -104,7 +104,7 @@ def sampled_system(actuator: Actuator, timestep: float) -> Any:
 
 @check(
     "motor",
-    Oracle(
+    Check(
         "sampled loop, random torques and speeds",
         "the sampled loop as a state-space system (scipy.signal.dlsim)",
         1e-10,
@@ -157,7 +157,7 @@ def closed_loop(actuator: Actuator, timestep: float) -> Any:
     return control.feedback(pid * winding, 1) + loop.kff * control.feedback(winding, pid)
 
 
-@check("motor", Oracle("step response", "python-control, step_response of the discrete loop", 1e-10, "N m"))
+@check("motor", Check("step response", "python-control, step_response of the discrete loop", 1e-10, "N m"))
 def step_response(loops: Mapping[str, Loop]) -> Iterator[Case]:
     """Equal to rounding; tolerance 1e-10 of the 1 N m desired."""
     for name, loop in loops.items():
@@ -178,8 +178,8 @@ _FREQUENCY = "python-control, the discrete loop's frequency response"
 
 @check(
     "motor",
-    Oracle("frequency response, magnitude", _FREQUENCY, 1e-6, "dB"),
-    Oracle("frequency response, phase", _FREQUENCY, 1e-5, "deg"),
+    Check("frequency response, magnitude", _FREQUENCY, 1e-6, "dB"),
+    Check("frequency response, phase", _FREQUENCY, 1e-5, "deg"),
 )
 def frequency_response(loops: Mapping[str, Loop], frequencies: int) -> Iterator[tuple[Case, ...]]:
     """Magnitude and phase of desired -> actual torque, from sines driven through MuJoCo, one motor a frequency.

@@ -9,7 +9,6 @@ import dataclasses
 import functools
 import importlib
 import inspect
-import math
 import sys
 import types
 import warnings
@@ -27,7 +26,7 @@ from codrl_mj.engine.families import SLOT, replaced
 from codrl_mj.engine.hill import GRAVITY
 from codrl_mj.physics import MujocoPhysics, compiled_task, mjcf
 from codrl_mj.tasks import OURS, find_task
-from codrl_mj.validation.certificate import WITHOUT_TASK, unheard, validate
+from codrl_mj.validation.certificate import WITHOUT_TASK, Progress, unheard, validate
 from codrl_mj.validation.table import Check
 
 Fault = contextlib.AbstractContextManager[object]
@@ -136,21 +135,17 @@ def _wrong_families(module: types.ModuleType, edits: tuple[Edit, ...]) -> tuple[
 
 
 @contextlib.contextmanager
-def wrong_loop(*edits: Edit, module: types.ModuleType = current_loop) -> Iterator[None]:
-    """The callback runs a loop that was compiled from edited source; in Python it stays what it is."""
+def wrong_loop(*edits: Edit, module: types.ModuleType = current_loop, everywhere: bool = False) -> Iterator[None]:
+    """The callback runs a loop that was compiled from edited source; in Python it stays what it is.
+
+    With `everywhere` the plain-Python loop shares the fault: comparing the two cannot show it.
+    """
     with contextlib.ExitStack() as stack:
         for family in _wrong_families(module, edits):
-            stack.enter_context(replaced(getattr(module, family.__name__), family))
-        yield
-
-
-@contextlib.contextmanager
-def wrong_loop_everywhere(*edits: Edit) -> Iterator[None]:
-    """The callback and the plain-Python loop share the fault: comparing the two cannot show it."""
-    with wrong_loop(*edits), contextlib.ExitStack() as stack:
-        for family in _wrong_families(current_loop, edits):
-            right = getattr(current_loop, family.__name__)
-            stack.enter_context(mock.patch.object(right, "advance", vars(family)["advance"]))
+            right = getattr(module, family.__name__)
+            stack.enter_context(replaced(right, family))
+            if everywhere:
+                stack.enter_context(mock.patch.object(right, "advance", vars(family)["advance"]))
         yield
 
 
@@ -251,9 +246,14 @@ def _in_model(name: str, change: Callable[[mujoco.MjModel], None], *groups: str)
 
 
 def _in_loop(
-    name: str, edit: Edit, groups: tuple[str, ...] = _LOOP, tasks: tuple[str, ...] = Mutation.tasks
+    name: str,
+    edit: Edit,
+    groups: tuple[str, ...] = _LOOP,
+    tasks: tuple[str, ...] = Mutation.tasks,
+    everywhere: bool = False,
 ) -> Mutation:
-    return Mutation(f"{name}, in the callback", lambda: wrong_loop(edit), groups, tasks)
+    where = "everywhere" if everywhere else "in the callback"
+    return Mutation(f"{name}, {where}", lambda: wrong_loop(edit, everywhere=everywhere), groups, tasks)
 
 
 MUTATIONS: tuple[Mutation, ...] = (
@@ -265,9 +265,9 @@ MUTATIONS: tuple[Mutation, ...] = (
     _in_loop("a wrong clip: the voltage limit 1 % low", _VOLTAGE_LIMIT),
     _in_loop("a winding resistance off by 1 %", _RESISTANCE, (*_LOOP, "energy")),
     _in_loop("the sign of the back-EMF", _BACK_EMF, (*_LOOP, "energy")),
-    Mutation("the sign of the back-EMF, everywhere", lambda: wrong_loop_everywhere(_BACK_EMF), ("motor", "energy")),
+    _in_loop("the sign of the back-EMF", _BACK_EMF, ("motor", "energy"), everywhere=True),
     _in_loop("kp and ki swapped", _GAINS, _LOOP, _UNEQUAL_GAINS),
-    Mutation("kp and ki swapped, everywhere", lambda: wrong_loop_everywhere(_GAINS), ("motor", "convergence")),
+    _in_loop("kp and ki swapped", _GAINS, ("motor", "convergence"), everywhere=True),
     Mutation(
         "a drive's winding off by 1 %, its gains with it",
         lambda: wrong_loop(_WARM_WINDING, module=drive),
@@ -307,16 +307,7 @@ class Caught:
     @property
     def clearest(self) -> Check | None:
         """The failed check that is farthest beyond its tolerance, a NaN being infinitely far; None if none failed."""
-        return max(self.failed, key=margin, default=None)
-
-
-def margin(check: Check) -> float:
-    """How many times its tolerance a check's worst case is; above 1 it fails."""
-    if math.isnan(check.worst):
-        return math.inf
-    if check.tolerance == 0.0:
-        return 0.0 if check.worst == 0.0 else math.inf
-    return check.worst / check.tolerance
+        return max(self.failed, key=lambda check: check.beyond, default=None)
 
 
 @contextlib.contextmanager
@@ -344,7 +335,7 @@ def faulty(tasks: str | Sequence[str] | None = None) -> list[str]:
 def try_mutations(
     tasks: str | Sequence[str] | None = None,
     mutations: Sequence[Mutation] = MUTATIONS,
-    on_part: Callable[[int, int, str], None] | None = None,
+    on_part: Progress = unheard,
 ) -> list[Caught]:
     """Make each fault in turn and see which checks of the quick certificate fail.
 
@@ -356,10 +347,10 @@ def try_mutations(
     Raises:
         ValueError: see `faulty`.
     """
-    names, begun = faulty(tasks), on_part or unheard
+    names = faulty(tasks)
     results = []
     for index, mutation in enumerate(mutations):
-        begun(index, len(mutations), mutation.name)
+        on_part(index, len(mutations), mutation.name)
         affected = [name for name in names if name in mutation.tasks]
         if not affected:
             continue
@@ -369,7 +360,7 @@ def try_mutations(
             made = [check for check in certificate.checks if check.task == task]
             failed = tuple(check for check in made if not check.passed)
             results.append(Caught(mutation.name, task, failed, len(made)))
-    begun(len(mutations), len(mutations), "done")
+    on_part(len(mutations), len(mutations), "done")
     return results
 
 

@@ -1,21 +1,19 @@
 """The table of checks, and the one runner: the worst of what a check's cases found, where it was, and its picture.
 
 A check is a function of cases: it yields what it compared, case by case, and says nothing of verdicts. `check` enters
-it in `TABLE` with its rows (name, oracle, tolerance, unit) and makes it one that returns outcomes.
+its rows in `TABLE` and makes it one that returns them with what was found.
 """
 
 import dataclasses
+import functools
 import inspect
 import math
 from collections.abc import Callable, Iterable
-from typing import Any, Generic, NamedTuple, ParamSpec
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from codrl_mj.pages.plots import Curve, Plot
-
-Arguments = ParamSpec("Arguments")
-
 
 ORDER_TOLERANCE = 0.1
 """Farthest that any end of a slope's 95 % interval may lie from the promised order. A method one order worse misses by
@@ -24,26 +22,26 @@ ORDER_TOLERANCE = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """The outcome of one check."""
+    """A row of the table, whose name and oracle may hold words in braces; once it was made, what was found."""
 
     name: str
     """What was compared; stable, such as `one step, euler`, and unique within its group and task."""
     oracle: str
     """What it was compared with."""
-    samples: int
-    """How many comparisons were made."""
-    worst: float
-    """Largest difference found."""
     tolerance: float
     """Largest difference allowed."""
-    where: str
+    unit: str = "relative"
+    """Unit of `worst` and `tolerance`; `relative` measures each state entry against max(1, its size)."""
+    samples: int = 0
+    """How many comparisons were made."""
+    worst: float = math.nan
+    """Largest difference found."""
+    where: str = ""
     """Where the largest difference was found."""
-    group: str = "dynamics"
+    group: str = ""
     """Which part of the certificate: dynamics, trajectories, convergence, motor, energy or execution."""
     task: str = ""
     """The task or model it was run on; empty where it needs none."""
-    unit: str = "relative"
-    """Unit of `worst` and `tolerance`; `relative` measures each state entry against max(1, its size)."""
     plots: tuple[Plot, ...] = ()
     """What to look at."""
 
@@ -53,13 +51,18 @@ class Check:
         return bool(self.worst <= self.tolerance)
 
     @property
+    def beyond(self) -> float:
+        """How many times its tolerance the worst case is: above 1 it fails; a NaN is infinitely far."""
+        if self.tolerance == 0.0 or math.isnan(self.worst):
+            return 0.0 if self.worst == 0.0 else math.inf
+        return self.worst / self.tolerance
+
+    @property
     def margin(self) -> str:
         """Tolerance over worst case, as text."""
-        if self.worst == 0.0:
+        if self.beyond == 0.0:
             return "exact"
-        if not math.isfinite(self.worst) or self.tolerance == 0.0:
-            return "0"
-        ratio = self.tolerance / self.worst
+        ratio = 1.0 / self.beyond
         return f"{ratio:.2g}" if ratio >= 1.005 or ratio < 1.0 else f"{ratio:.4g}"
 
 
@@ -72,23 +75,14 @@ class Skipped:
     reason: str
     """Why it does not apply, or what it needs."""
     group: str = ""
-    """Which part of the certificate."""
+    """Which part of the certificate; the certificate fills it in."""
     task: str = ""
-    """The task or model."""
+    """The task or model; the certificate fills it in."""
 
 
-class Oracle(NamedTuple):
-    """A row of the table: name and oracle may hold words in braces, such as `{task.oracle}`, an argument's."""
-
-    name: str
-    oracle: str
-    tolerance: float
-    unit: str = "relative"
-
-
-def order(name: str, oracle: str) -> Oracle:
+def order(name: str, oracle: str) -> Check:
     """A row of slopes, which `of_order` finds: how far from the promised order errors vanish."""
-    return Oracle(name, oracle, ORDER_TOLERANCE, "slope")
+    return Check(name, oracle, ORDER_TOLERANCE, "slope")
 
 
 class Case(NamedTuple):
@@ -106,51 +100,36 @@ class Case(NamedTuple):
 
 EVERYWHERE = "everywhere: there is no difference"
 Cases = Iterable[Case | tuple[Case, ...]]
+TABLE: list[Check] = []
+"""The rows of every check of the modules that were imported."""
 
 
-class Compared(Generic[Arguments]):
-    """A check as it stands in the table; called, it makes its cases and returns an outcome for each row."""
-
-    def __init__(self, group: str, rows: tuple[Oracle, ...], cases: Callable[Arguments, Cases]) -> None:
-        """Of a group, with what is compared."""
-        self.group, self.rows, self.cases = group, rows, cases
-        self.__doc__ = cases.__doc__
-
-    def __call__(self, *arguments: Arguments.args, **named: Arguments.kwargs) -> list[Check]:
-        """The outcomes; without a case there is none."""
-        return self.of()(*arguments, **named)
-
-    def of(self, task: str = "", **words: str) -> Callable[Arguments, list[Check]]:
-        """The check with words for the braces of its rows that are none of its arguments; and the task or model."""
-
-        def run(*arguments: Arguments.args, **named: Arguments.kwargs) -> list[Check]:
-            bound = inspect.signature(self.cases).bind(*arguments, **named)
-            found = [(case,) if isinstance(case, Case) else case for case in self.cases(*arguments, **named)]
-            of_rows = zip(*found, strict=True)
-            said = {"task": task} | bound.arguments | words
-            return [outcome(row, self.group, said, cases) for row, cases in zip(self.rows, of_rows, strict=bool(found))]
-
-        return run
-
-
-TABLE: list[Compared[Any]] = []
-"""Every check of the modules that were imported."""
-
-
-def check(group: str, *rows: Oracle) -> Callable[[Callable[Arguments, Cases]], Compared[Arguments]]:
+def check(group: str, *rows: Check) -> Callable[[Callable[..., Cases]], Callable[..., list[Check]]]:
     """Enter a function of cases in the table, in a group of the certificate.
 
-    The function yields a `Case` each time, or of several rows a tuple of them, one for each.
+    The function yields a `Case` each time, or of several rows a tuple of them, one for each; without a case there is no
+    outcome. Words in the braces of rows are its arguments, or what it is called with besides, by name.
     """
+    of_group = [dataclasses.replace(row, group=group) for row in rows]
+    TABLE.extend(of_group)
 
-    def enter(cases: Callable[Arguments, Cases]) -> Compared[Arguments]:
-        TABLE.append(Compared(group, rows, cases))
-        return TABLE[-1]
+    def enter(cases: Callable[..., Cases]) -> Callable[..., list[Check]]:
+        signature = inspect.signature(cases)
+
+        @functools.wraps(cases)
+        def made(*arguments: Any, **named: Any) -> list[Check]:
+            words = {name: named.pop(name) for name in list(named) if name not in signature.parameters}
+            said = words | signature.bind(*arguments, **named).arguments
+            found = [(case,) if isinstance(case, Case) else case for case in cases(*arguments, **named)]
+            of_rows = zip(*found, strict=True)
+            return [outcome(row, said, several) for row, several in zip(of_group, of_rows, strict=bool(found))]
+
+        return made
 
     return enter
 
 
-def outcome(row: Oracle, group: str, said: dict[str, Any], cases: Iterable[Case]) -> Check:
+def outcome(row: Check, said: dict[str, Any], cases: Iterable[Case]) -> Check:
     """The worst of a row's cases: the largest gap, the first of equals; a NaN is larger than anything."""
     worst, where, samples = -math.inf, "", 0
     plots: list[Plot] = []
@@ -164,47 +143,28 @@ def outcome(row: Oracle, group: str, said: dict[str, Any], cases: Iterable[Case]
             where = words if isinstance(words, str) else words(at) if worst else EVERYWHERE
     if worst < 0.0:  # nothing was compared
         worst, where = 0.0, EVERYWHERE
-    task = said["task"]
     name, oracle = (text.format_map(said) for text in (row.name, row.oracle))
-    return Check(
-        name, oracle, samples, worst, row.tolerance, where, group, getattr(task, "name", task), row.unit, tuple(plots)
-    )
+    found: dict[str, Any] = {"samples": samples, "worst": worst, "where": where, "plots": tuple(plots)}
+    return dataclasses.replace(row, name=name, oracle=oracle, **found)
 
 
 # -- orders of convergence ----------------------------------------------------------------------------------
 
 
-class Slope(NamedTuple):
-    """A slope fitted to a cloud of points on logarithmic axes."""
+def fit_slope(steps: np.ndarray, errors: np.ndarray) -> tuple[float, float]:
+    """The exponent of a cloud of points on logarithmic axes, and half the width of its 95 % interval.
 
-    value: float
-    """The exponent p of error = c * step^p."""
-    half_width: float
-    """Half the width of its 95 % interval."""
-
-    def distance(self, promised: float) -> float:
-        """How far the farther end of the interval lies from the promised order; infinite if the fit is no number."""
-        distance = abs(self.value - promised) + self.half_width
-        return distance if np.isfinite(distance) else np.inf
-
-    def __str__(self) -> str:
-        """The slope with its interval."""
-        return f"{self.value:.3f} +- {self.half_width:.3f}"
-
-
-def fit_slope(steps: np.ndarray, errors: np.ndarray) -> Slope:
-    """Least squares on the logarithms, with the 95 % interval of Student's t at n - 2 degrees of freedom.
-
-    Of at least three steps > 0; an error that is zero or NaN makes the slope a NaN.
+    Least squares on the logarithms, and Student's t at n - 2 degrees of freedom, of at least three steps > 0; an error
+    that is zero or NaN makes both a NaN.
     """
     from scipy import stats  # the certificate's reader does without
 
     with np.errstate(divide="ignore", invalid="ignore"):
         logarithms = np.log(errors)
     if not np.isfinite(logarithms).all():
-        return Slope(np.nan, np.nan)
+        return math.nan, math.nan
     fit = stats.linregress(np.log(steps), logarithms)
-    return Slope(float(fit.slope), float(stats.t.ppf(0.975, len(steps) - 2) * fit.stderr))
+    return float(fit.slope), float(stats.t.ppf(0.975, len(steps) - 2) * fit.stderr)
 
 
 class Family(NamedTuple):
@@ -229,8 +189,10 @@ class Family(NamedTuple):
         clear = ~(self.errors <= self.rounding) | (self.rounding == 0.0)  # NaN is clear
         spread = f"errors {self.errors[0]:.2g} to {self.errors[-1]:.2g}"
         if clear.sum() >= 3 or not self.rounding:
-            slope = fit_slope(self.steps[clear], self.errors[clear])
-            return slope.distance(promised), f"{self.label}: slope {slope}, {spread}"
+            slope, half = fit_slope(self.steps[clear], self.errors[clear])
+            distance = abs(slope - promised) + half  # of the farther end of the interval
+            said = f"{self.label}: slope {slope:.3f} +- {half:.3f}, {spread}"
+            return distance if math.isfinite(distance) else math.inf, said
         share = float(self.errors.max() / (2.0 * self.rounding * (self.steps[0] / self.steps[2]) ** promised))
         share = math.inf if math.isnan(share) else share
         return ORDER_TOLERANCE * share, f"{self.label}: exact to rounding, {self.rounding:.2g}: {spread}"

@@ -13,13 +13,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from codrl_mj.actuators import Actuator, ActuatorModel, Ideal
+from codrl_mj.actuators import ActuatorModel
 from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.physics import AnalyticPhysics, SimulationDivergedError, trace_names
 from codrl_mj.tasks import Task, find_task, named_actuator
 from codrl_mj.validation.compare import both, differences, without_oracle
 from codrl_mj.validation.drives import FITTED, fitted_run
-from codrl_mj.validation.table import Case, Check, Oracle, Skipped, check
+from codrl_mj.validation.table import Case, Check, Skipped, check
 
 TOLERANCE = 1e-9
 """Of the difference: rounding (1e-16), a thousand steps, and the growth of tasks that are not chaotic."""
@@ -31,13 +31,6 @@ UNLIMITED_STEPS = 200
 """Environment steps of a run of a task without a time limit."""
 STARVED = "starved"
 ACTUATORS = ("ideal", "paper", "weaker", STARVED)
-
-
-def starved(task: Task) -> Actuator:
-    """The paper's motor with 0.5 V and nothing against its back-EMF, both of which its loop hides otherwise."""
-    (paper,) = task.paper
-    loop = dataclasses.replace(paper.controller, max_voltage=0.5, bemf_compensation=False)
-    return dataclasses.replace(paper, controller=loop)
 
 
 APART = 1e-7
@@ -157,13 +150,21 @@ _NAME, _ORACLE = "{integrator}, {actuator_name} actuator", "{task.oracle}{motor}
 
 @check(
     "trajectories",
-    Oracle(f"run, {_NAME}", _ORACLE, TOLERANCE),
-    Oracle(f"run against rounding, {_NAME}", _ORACLE, ROUNDINGS, "accumulated roundings"),
+    Check(f"run, {_NAME}", _ORACLE, TOLERANCE),
+    Check(f"run against rounding, {_NAME}", _ORACLE, ROUNDINGS, "accumulated roundings"),
 )
 def whole_runs(
-    task: Task, actuator_name: str, actuator: ActuatorModel, integrator: str, seeds: range, longest: int
+    task: Task, actuator_name: str, integrator: str, seeds: range, longest: int
 ) -> Iterator[tuple[Case, ...]]:
-    """Runs under the same random bang-bang commands: the difference itself up to the horizon, and all in roundings."""
+    """Runs under the same random bang-bang commands: the difference itself up to the horizon, and all in roundings.
+
+    The task's ends are ignored, and a divergence fails. `starved` is the paper's motor with 0.5 V and nothing against
+    its back-EMF, both of which its loop hides otherwise. There is a plot of the first run.
+    """
+    actuator = named_actuator("paper" if actuator_name == STARVED else actuator_name, task.name)
+    if actuator_name == STARVED:
+        loop = dataclasses.replace(actuator.controller, max_voltage=0.5, bemf_compensation=False)
+        actuator = dataclasses.replace(actuator, controller=loop)
     steps = min(longest, task.max_episode_steps or UNLIMITED_STEPS)
     horizon = min(steps, (task.trials and task.trials.horizon) or steps)
     for seed in seeds:
@@ -174,33 +175,24 @@ def whole_runs(
         yield Case(gaps[:horizon], where.__getitem__, horizon), Case(in_roundings, where.__getitem__, steps, plots)
 
 
-def episodes(task: Task, actuator_name: str, integrator: str, seeds: range, longest: int = 999) -> list[Check]:
-    """Whole runs of a named actuator, or `starved`; the task's ends are ignored, and a divergence fails.
-
-    There is a check of the difference itself, and one of the difference in roundings, with a plot of the first run.
-    """
-    actuator = starved(task) if actuator_name == STARVED else named_actuator(actuator_name, task.name)
-    motor = "" if isinstance(actuator, Ideal) else " and the motor in Python"
-    return whole_runs.of(motor=motor)(task, actuator_name, actuator, integrator, seeds, longest)
-
-
 def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     """The checks of this group."""
     task = find_task(task_name)
     if missing := without_oracle(task):
-        yield Skipped("all checks", missing, "trajectories", task.name)
+        yield Skipped("all checks", missing)
         return
     actuators = ACTUATORS if task.paper else ACTUATORS[:1]
     if not task.paper:
         reason = "they are variations of the paper's actuator, of which it has none"
-        yield Skipped(f"runs with the {', '.join(ACTUATORS[1:])} actuators", reason, "trajectories", task.name)
+        yield Skipped(f"runs with the {', '.join(ACTUATORS[1:])} actuators", reason)
     for actuator in actuators:
         for integrator in task.integrators:
             shorter = 100 if task.motor_inner_steps > 1 else 200
             seeds, longest = (range(1), shorter) if quick else (range(2), 999)
-            yield from episodes(task, actuator, integrator, seeds, longest)
+            motor = "" if actuator == "ideal" else " and the motor in Python"
+            yield from whole_runs(task, actuator, integrator, seeds, longest, motor=motor)
     if task.name in FITTED:
         for integrator in task.integrators:
-            yield from fitted_run.of(motor=FITTED[task.name][0])(task, integrator, quick)
+            yield from fitted_run(task, integrator, quick, motor=FITTED[task.name][0])
     else:
-        yield Skipped("a run with a motor that one can buy", "none was chosen for it", "trajectories", task.name)
+        yield Skipped("a run with a motor that one can buy", "none was chosen for it")

@@ -1,18 +1,20 @@
 """The live view in a browser: the scene, what can be done to it, what the motors do, and what they are made of."""
 
+import functools
 import itertools
 import queue
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
+import trimesh
 from viser import uplot
 
-from codrl_mj.view.controls import Control, controls
+from codrl_mj.fields import field_docs
+from codrl_mj.replay.scene import TRIANGLES, Shape, first_view, mesh, read_poses, shapes, thinned
 from codrl_mj.view.local import LocalServer
-from codrl_mj.view.scene import Scene
-from codrl_mj.view.session import Session
+from codrl_mj.view.session import Control, Session, controls
 
 _FRAME = 1 / 30  # s, of wall clock
 _PLOT_EVERY = 0.2  # s, of wall clock
@@ -22,27 +24,27 @@ _AXES = {"x": 0, "y": 1, "z": 2}
 _WANTED = ("desired", "reference")  # signals that are drawn first
 _HUGE = 1e30  # what is beyond it has diverged
 _DELAY_STEPS = 5  # environment steps, where the slider of the delay ends
-Docs = Callable[[type], Mapping[str, str]]
+_FLAT = ("box", "cylinder", "mesh", "plane")
 
 
 class Browser:
     """Serves a session until it is closed."""
 
-    def __init__(self, session: Session, port: int, title: str, docs: Docs, supply: float = 48.0) -> None:
+    def __init__(self, session: Session, port: int, title: str, supply: float = 48.0) -> None:
         """Begin to serve a session, which from now on this alone touches, at a port or the next free one.
 
-        `docs` describes each field of a class; the slider of an unlimited voltage ends at `supply` [V].
+        The slider of an unlimited voltage ends at `supply` [V].
         """
-        self.session, self._docs, self._supply = session, docs, supply
+        self.session, self._supply = session, supply
         self.playing, self._speed, self._budget, self._real = True, 1.0, 0.0, 1.0
         self._deeds: queue.SimpleQueue[tuple[Any, Callable[[], None]]] = queue.SimpleQueue()
         self._refusal = ""
         self.server = LocalServer(port)
         self.server.gui.set_panel_label(title)
-        self._scene = Scene(self.server, session)
+        self._send_scene()
         self._build()
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
-        self._scene.update(self.server, session)
+        self._move()
 
     @property
     def url(self) -> str:
@@ -58,7 +60,7 @@ class Browser:
             self.do()
             simulated += self._advance(now - last)
             last = now
-            self._scene.update(self.server, self.session)
+            self._move()
             if now - plotted > _PLOT_EVERY:
                 plotted = now
                 self._plot()
@@ -85,6 +87,53 @@ class Browser:
         """End the server."""
         self.server.stop()
 
+    # -- the scene ---------------------------------------------------------------------------------------------
+
+    def _send_scene(self) -> None:
+        """Send the model to whoever looks."""
+        model, scene = self.session.model, self.server.scene
+        self._shapes, self._poses = shapes(model), np.empty((model.nbody, 7))
+        moving = {body for body in range(model.nbody) if model.body_weldid[body]}
+        read_poses(self.session.data, self._shapes, self._poses)
+        cameras = [model.camera(index).name for index in range(model.ncam)]
+        own = hasattr(self.session.env.unwrapped, "physics") and "fixed" in cameras
+        view = first_view(model, self._shapes, self._poses, moving, "fixed" if own else None)
+        self._frames: dict[int, Any] = {}
+        few = {one.mesh: thinned(*mesh(model, *one.mesh), TRIANGLES // 4) for one in self._shapes if one.mesh}
+        with self.server.atomic():
+            scene.set_up_direction("+z")
+            scene.world_axes.visible = False
+            for body in sorted({one.body for one in self._shapes}):
+                position, quaternion = self._poses[body, :3], self._poses[body, 3:]
+                frame = scene.add_frame(f"/{body}", show_axes=False, position=position, wxyz=quaternion)
+                if body in moving:
+                    self._frames[body] = frame
+            for index, one in enumerate(self._shapes):
+                vertices, triangles = few[one.mesh] if one.mesh else _triangles(one, view.extent)
+                opacity = one.colour[3]
+                scene.add_mesh_simple(
+                    f"/{one.body}/{index}",
+                    vertices,
+                    triangles,
+                    color=tuple(round(255 * part) for part in one.colour[:3]),
+                    opacity=opacity if opacity < 1 else None,
+                    flat_shading=one.kind in _FLAT,
+                    side="double" if one.kind in ("mesh", "plane") else "front",
+                    cast_shadow=one.kind != "plane",
+                    position=one.position,
+                    wxyz=one.orientation,
+                )
+        first = self.server.initial_camera
+        first.position, first.look_at, first.up = view.eye, view.at, np.array([0.0, 0.0, 1.0])
+        first.fov = np.radians(view.fovy)
+
+    def _move(self) -> None:
+        """Move the bodies to where they are."""
+        read_poses(self.session.data, self._shapes, self._poses)
+        with self.server.atomic():
+            for body, frame in self._frames.items():
+                frame.position, frame.wxyz = self._poses[body, :3], self._poses[body, 3:]
+
     # -- a frame -----------------------------------------------------------------------------------------------
 
     def _advance(self, elapsed: float) -> float:
@@ -92,7 +141,7 @@ class Browser:
         if not self.playing:
             self._budget = 0.0
             return 0.0
-        step, done, began = self.session.step_duration, 0.0, time.perf_counter()
+        step, done, began = self.session.recorder.step_duration, 0.0, time.perf_counter()
         self._budget += elapsed * self._speed
         while self._budget >= step:
             if not self.session.step():
@@ -125,7 +174,7 @@ class Browser:
         if not kept:
             return
         kept = kept[:: max(1, len(kept) // _POINTS)]
-        motor = self.session.motors.index(self._motor.value) if self._motor is not None else 0
+        motor = self.session.recorder.motor_names.index(self._motor.value) if self._motor is not None else 0
         times = np.array([when for when, _ in kept])
         values = np.array([row[motor] for _, row in kept])
         for columns, handle in self._plots:
@@ -150,22 +199,20 @@ class Browser:
         again.on_update(lambda _: setattr(session, "again", again.value))
         self._pushes()
         self._signals()
-        for pattern, actuator in session.patterns.items():
+        for pattern, actuator in session.config.driven.items():
             self._actuator(pattern, actuator)
         disturbances = session.config.disturbances
-        ends = {"command_delay": _DELAY_STEPS * session.step_duration}
+        ends = {"command_delay": _DELAY_STEPS * session.recorder.step_duration}
         self._settings(
             "delay and disturbances", controls(disturbances, ends=ends), disturbances, session.set_disturbance
         )
 
     def _actuator(self, pattern: str, actuator: Any) -> None:
         """A folder for each part of what drives a motor, or the motors of a pattern."""
-        several = f" {pattern}" if len(self.session.patterns) > 1 else ""
+        several = f" {pattern}" if len(self.session.config.driven) > 1 else ""
         own = actuator.family or type(actuator).__name__
 
-        def change(path: tuple[str, ...], value: Any) -> None:
-            self.session.set_actuator(pattern, path, value)
-
+        change = functools.partial(self.session.set_actuator, pattern)
         found = controls(actuator, self._supply)
         for part, fields in itertools.groupby(found, lambda one: one.path[0] if len(one.path) > 1 else own):
             self._settings(f"{part}{several}", fields, actuator, change)
@@ -198,15 +245,15 @@ class Browser:
             "desired_force": "force, torque at the joint",
             "actual_force": "force, torque at the joint",
         }
-        for actuator in session.patterns.values():
+        for actuator in session.config.driven.values():
             units |= {name: f"{name.split('_')[-1]} [{unit}]" for name, unit in actuator.SIGNAL_UNITS.items()}
         groups: dict[str, list[str]] = {}
-        for name in sorted(session.trace_names, key=lambda name: not name.startswith(_WANTED)):
+        for name in sorted(session.recorder.trace_names, key=lambda name: not name.startswith(_WANTED)):
             if name in units:
                 groups.setdefault(units[name], []).append(name)
         with gui.add_folder("signals"):
-            if len(session.motors) > 1:
-                self._motor = gui.add_dropdown("motor", session.motors)
+            if len(session.recorder.motor_names) > 1:
+                self._motor = gui.add_dropdown("motor", tuple(session.recorder.motor_names))
             for title, names in groups.items():
                 series = [
                     uplot.Series(label=name.replace("_", " "), stroke=colour, width=2)
@@ -219,7 +266,7 @@ class Browser:
                     scales={"x": uplot.Scale(time=False, auto=True)},
                     height=170,
                 )
-                self._plots.append(([session.trace_names.index(name) for name in names], handle))
+                self._plots.append(([session.recorder.trace_names.index(name) for name in names], handle))
 
     def _settings(
         self, title: str, found: Iterable[Control], settings: Any, change: Callable[[tuple[str, ...], Any], None]
@@ -242,7 +289,8 @@ class Browser:
         part: Any = settings
         for name in one.path[:-1]:
             part = getattr(part, name, None)
-        hint = self._docs(type(part)).get(one.path[-1]) if part is not None else None
+        kind: Any = type(part)
+        hint = field_docs(kind).get(one.path[-1]) if part is not None else None
         handle: Any
         if one.options:
             handle = gui.add_dropdown(label, one.options, initial_value=one.value, hint=hint)
@@ -274,6 +322,23 @@ class Browser:
         if self.playing:
             self._toggle()
         self.session.step()
+
+
+def _triangles(one: Shape, extent: float) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles of a shape that is no mesh of the model's."""
+    size = one.size
+    if one.kind == "plane":
+        x, y = (half if half > 0 else 20 * extent for half in size[:2])
+        return np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    if one.kind == "box":
+        made = trimesh.creation.box(2 * np.array(size))
+    elif one.kind == "ellipsoid":
+        made = trimesh.creation.icosphere(subdivisions=3).apply_scale(size)
+    elif one.kind == "capsule":
+        made = trimesh.creation.capsule(height=2 * size[1], radius=size[0])
+    else:
+        made = trimesh.creation.cylinder(radius=size[0], height=2 * size[1], sections=48)
+    return np.asarray(made.vertices), np.asarray(made.faces)
 
 
 def drawable(values: np.ndarray) -> np.ndarray:

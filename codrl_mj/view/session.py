@@ -1,9 +1,16 @@
-"""A simulation under way: steps, pushes, other policies, other settings. No window, and no server."""
+"""A simulation under way: steps, pushes, other policies, and what can be set of actuators and disturbances meanwhile.
+
+There is no server in it; its one window is MuJoCo's own viewer, on a machine with a display.
+"""
 
 import dataclasses
 import math
+import os
+import sys
+import time
 from collections import deque
 from collections.abc import Callable, Mapping
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -12,7 +19,7 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import actuator_over
 from codrl_mj.evaluation import RandomPolicy
-from codrl_mj.view.controls import nested
+from codrl_mj.fields import parts
 
 _FOREVER = 10**9  # environment steps
 _DIVERGED = mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC
@@ -22,16 +29,78 @@ PUSH_DURATION = 0.1
 """How long a push lasts [s]."""
 
 
-class Zero:
-    """Does nothing."""
+@dataclasses.dataclass(frozen=True)
+class Control:
+    """A field that can be set."""
 
-    def __init__(self, action: Any) -> None:
-        """Take the action that does nothing."""
-        self._action = action
+    path: tuple[str, ...]
+    """Names from the outermost part to the field."""
+    unit: str
+    """Its unit; empty for none."""
+    value: Any
+    """What it is now; None where it is not set."""
+    low: float | None = None
+    """Of a number: where its slider begins; the bound, or a little above one that is excluded."""
+    high: float | None = None
+    """Of a number: where its slider ends; None where a scale for it is not known, so that it is typed."""
+    options: tuple[str, ...] = ()
+    """Of a word: what it may be."""
 
-    def predict(self, observation: np.ndarray, *, deterministic: bool = True) -> tuple[np.ndarray, Any]:  # noqa: ARG002
-        """The same action for each observation."""
-        return np.array([self._action] * len(observation)), None
+    @property
+    def endless(self) -> bool:
+        """Whether the end of the slider stands for infinity."""
+        return self.value == math.inf
+
+    def parsed(self, shown: Any) -> Any:
+        """The field's value for what a slider shows."""
+        if self.endless and self.high is not None and shown >= self.high:
+            return math.inf
+        return shown
+
+
+def controls(
+    settings: Any, scale: float | None = None, ends: Mapping[str, float] = MappingProxyType({})
+) -> list[Control]:
+    """Numbers, words and flags in an actuator or disturbances, and in its parts.
+
+    The slider of an infinite voltage ends at `scale` [V], without which infinite fields are left out; that of a field
+    that is 0 where `ends` says so by its name.
+    """
+    found = [
+        dataclasses.replace(one, high=ends[one.path[-1]]) if one.value == 0 and one.path[-1] in ends else one
+        for one in _within(settings, (), scale)
+    ]
+    return [one for one in found if not (one.endless and one.high is None)]
+
+
+def _within(settings: Any, path: tuple[str, ...], scale: float | None) -> list[Control]:
+    found, nested = [], parts(type(settings))
+    for field in dataclasses.fields(settings):
+        value, own = getattr(settings, field.name), (*path, field.name)
+        if field.name in nested:
+            found += _within(field.metadata.get("absent") if value is None else value, own, scale)
+        elif "options" in field.metadata:
+            found.append(Control(own, "", value, options=field.metadata["options"]))
+        elif isinstance(value, bool):
+            found.append(Control(own, "", value))
+        elif isinstance(value, int | float):
+            unit = field.metadata.get("unit", "")
+            low, high = field.metadata.get("between", (None, None))
+            ends = _slider(value, low, high, scale if unit == "V" else None)
+            found.append(Control(own, unit, value, *ends))
+    return found
+
+
+def _slider(
+    value: float, low: float | None, high: float | None, scale: float | None
+) -> tuple[float | None, float | None]:
+    """From a twentieth of the value to four times it, within the bounds; of what is 0 the bounds alone."""
+    if math.isinf(value):
+        return (scale / 100, scale) if scale else (None, None)
+    if value == 0:
+        return low, high
+    near, far = sorted((0.05 * value, 4 * value))
+    return (near if low is None else max(low, near)), (far if high is None else min(high, far))
 
 
 class Session:
@@ -59,12 +128,13 @@ class Session:
         self.again = True
         """Whether an episode that ended, or reached the time limit, begins anew by itself; otherwise it goes on."""
         self.signals: deque[tuple[float, np.ndarray]] = deque()
-        """Time [s], and a row of `trace_names` for each motor."""
+        """Time [s], and a row of the recorder's `trace_names` for each motor."""
         self._seed, self._diverged, self._pushes = seed, False, {}  # type: ignore[var-annotated]
         self.env = self._made()
-        self.policies = {**policies, "random": self._random}
+        self.policies = {**policies, "random": lambda: RandomPolicy(self.env.action_space, self._seed)}
         if (action := self._nothing()) is not None:
-            self.policies["zero"] = lambda: Zero(action)
+            still = SimpleNamespace(predict=lambda seen, **_: (np.array([action] * len(seen)), None))
+            self.policies["zero"] = lambda: still
         self.choose(next(iter(self.policies)))
         self.reset()
 
@@ -81,31 +151,11 @@ class Session:
         return self.env.unwrapped.data
 
     @property
-    def patterns(self) -> dict[str, Any]:
-        """The actuators by the motor, or by the pattern of motors, that they drive."""
-        return dict(self.config.driven)
-
-    @property
     def bodies(self) -> list[str]:
         """Names of the bodies that can be pushed, the last of a chain first."""
         model = self.model
         moves = [body for body in range(1, model.nbody) if model.body_weldid[body] and model.body_subtreemass[body] > 0]
         return [model.body(body).name for body in reversed(moves) if model.body(body).name]
-
-    @property
-    def motors(self) -> tuple[str, ...]:
-        """Names of the motors."""
-        return tuple(self._recorder.motor_names)
-
-    @property
-    def trace_names(self) -> tuple[str, ...]:
-        """What the columns of a row of `signals` are."""
-        return tuple(self._recorder.trace_names)
-
-    @property
-    def step_duration(self) -> float:
-        """Environment step [s]."""
-        return float(self._recorder.step_duration)
 
     @property
     def waits(self) -> bool:
@@ -159,22 +209,16 @@ class Session:
 
     def set_actuator(self, pattern: str, path: tuple[str, ...], value: Any) -> None:
         """Set a field of what drives a motor, or the motors of a pattern; the motion goes on, the motor is at rest."""
-        try:
-            changed = {**self.patterns, pattern: actuator_over(self.patterns[pattern], nested(path, value))}
-        except ValueError as error:
-            self.problem = str(error)
-            return
-        self._rebuild("actuator", changed)
+        for name in reversed(path):
+            value = {name: value}
+        self._rebuild(
+            lambda: {"actuator": {**self.config.driven, pattern: actuator_over(self.config.driven[pattern], value)}}
+        )
 
     def set_disturbance(self, path: tuple[str, ...], value: Any) -> None:
         """Set a field of the disturbances."""
         (name,) = path
-        try:
-            changed = dataclasses.replace(self.config.disturbances, **{name: value})
-        except ValueError as error:
-            self.problem = str(error)
-            return
-        self._rebuild("disturbances", changed)
+        self._rebuild(lambda: {"disturbances": dataclasses.replace(self.config.disturbances, **{name: value})})
 
     def step(self) -> bool:
         """Advance by one environment step, if it can be simulated.
@@ -195,7 +239,10 @@ class Session:
         action, _ = self.policy.predict(np.asarray(self.observation)[np.newaxis], deterministic=True)
         try:
             self.observation, reward, terminated, truncated, _ = self.env.step(action[0])
-            if self._bad() or not np.isfinite(np.asarray(self.observation)).all():
+            began_anew = any(
+                self.data.warning[kind].number for kind in _DIVERGED
+            )  # by itself, from numbers that are none
+            if began_anew or not np.isfinite(np.asarray(self.observation)).all():
                 raise ArithmeticError("the simulation left the finite numbers")
         except ArithmeticError as error:
             self.problem, self._diverged = f"{error}; reset, and set what drives it otherwise", True
@@ -213,19 +260,19 @@ class Session:
         env: Any = self.config.make()
         if getattr(env.unwrapped, "model", None) is None:
             raise ValueError(f"{self.config.task} has no MuJoCo model to be shown; physics must be mujoco, its default")
-        self._recorder: Any = env.get_wrapper_attr("recorder")
+        self.recorder: Any = env.get_wrapper_attr("recorder")
         return env
 
-    def _rebuild(self, field: str, value: Any) -> None:
-        """Go on in an environment with another setting, or say why that cannot be."""
+    def _rebuild(self, changed: Callable[[], dict[str, Any]]) -> None:
+        """Go on in an environment with other settings, or say why that cannot be."""
         positions, speeds = self.data.qpos.copy(), self.data.qvel.copy()
-        self.config = dataclasses.replace(self.config, **{field: value})
-        old = self.env, self._recorder
+        old = self.env, self.recorder
         try:
+            self.config = dataclasses.replace(self.config, **changed())
             self.env = self._made()
             self.env.reset(seed=self._seed)
         except ValueError as error:
-            self.env, self._recorder = old
+            self.env, self.recorder = old
             self.problem = str(error)
             return
         old[0].close()
@@ -244,20 +291,13 @@ class Session:
         else:
             physics.show(physics.state)
 
-    def _bad(self) -> bool:
-        """Whether MuJoCo found numbers that are none, and began anew by itself."""
-        return any(self.data.warning[kind].number for kind in _DIVERGED)
-
     def _remember(self) -> None:
-        rows = self._recorder.trace
+        rows = self.recorder.trace
         for row in rows:
-            self.time += self.step_duration / len(rows)
+            self.time += self.recorder.step_duration / len(rows)
             self.signals.append((self.time, row.copy()))
         while self.signals and self.signals[0][0] < self.time - HISTORY:
             self.signals.popleft()
-
-    def _random(self) -> Any:
-        return RandomPolicy(self.env.action_space, self._seed)
 
     def _nothing(self) -> Any:
         """The action that does nothing; None if there is none."""
@@ -269,3 +309,25 @@ class Session:
             least = min(forces, key=lambda action: forces[action])
             return least if math.isclose(forces[least], 0.0, abs_tol=1e-12) else None
         return None
+
+
+def check_display() -> None:
+    """Refuse where there is no display."""
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise RuntimeError(
+            "--native needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set: leave it out to see the "
+            "simulation in a browser, also through ssh -L 8080:localhost:8080"
+        )
+
+
+def run_native(session: Session) -> None:
+    """Simulate in real time until the window is closed; there its mouse pushes bodies."""
+    from mujoco import viewer
+
+    with viewer.launch_passive(session.model, session.data) as window:
+        while window.is_running():
+            began = time.perf_counter()
+            with window.lock():
+                session.step()
+            window.sync()
+            time.sleep(max(0.0, session.recorder.step_duration - (time.perf_counter() - began)))

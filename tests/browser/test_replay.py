@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from codrl_mj.replay import motion, replay, write_replay
+from codrl_mj.replay import SCRIPT, library, motion, replay, write_replay
 from tests.browser.waiting import until
 from tests.replay.test_motion import ARM, positions
 
@@ -26,12 +26,12 @@ def page_file(what, tmp_path_factory):
 
 
 CLOCKED = """<!DOCTYPE html><title>report</title><link rel="icon" href="data:,">
-<div id="one">{part.fragment}</div><div id="other">{part.fragment}</div>
-<script>{part.library}</script>
+<div id="one">{part}</div><div id="other">{part}</div>
+<script>{library}</script>
 <script>
 const clocks = ["one", "other"].map((id) => {{
   const element = document.getElementById(id), seek = () => {{}};
-  {part.script}
+  {script}
   return setTime;
 }});
 const setAll = (time) => clocks.forEach((clock) => clock(time));
@@ -130,7 +130,7 @@ def test_it_fits_laptop_and_phone_light_and_dark(page_file, opened, width, schem
 def test_a_part_of_another_page_follows_its_clock(what, tmp_path, opened):
     part = replay(what, "arm")
     path = tmp_path / "report.html"
-    path.write_text(CLOCKED.format(part=part))
+    path.write_text(CLOCKED.format(part=part, library=library(), script=SCRIPT))
     page = opened(path.as_uri())
     for index in (30, 5):
         page.evaluate(f"setAll({float(what.time[index])!r})")

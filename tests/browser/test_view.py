@@ -18,7 +18,7 @@ pytestmark = pytest.mark.browser
 def browser():
     """A pole on a motor, simulated in a thread of its own as in a terminal."""
     config = EnvConfig.from_mapping({"task": "InvertedPendulum-v5", "actuator": {".*": "maxon-re65"}})
-    made = Browser(Session(config, {}), 0, "pole", lambda _: {})
+    made = Browser(Session(config, {}), 0, "pole")
     ended = threading.Event()
     thread = threading.Thread(target=lambda: made.run(ended.is_set))
     thread.start()
@@ -47,7 +47,7 @@ def test_it_simulates_in_real_time_and_is_paused_stepped_and_reset(browser, open
     browser.session.again = False  # an episode that has just ended would begin anew with the next step
     time = browser.session.time
     page.get_by_role("button", name="Step").click()
-    until(page, lambda: browser.session.time == pytest.approx(time + browser.session.step_duration))
+    until(page, lambda: browser.session.time == pytest.approx(time + browser.session.recorder.step_duration))
     browser.session.again = True
     page.get_by_role("button", name="Reset").click()
     page.wait_for_selector("text=0.00 s")
@@ -88,14 +88,14 @@ def test_settings_change_the_simulation_and_unstable_ones_are_said(browser, open
     voltage = field(page, "voltage [V]")
     voltage.fill("7")
     voltage.press("Enter")
-    until(page, lambda: browser.session.patterns[".*"].supply.voltage == pytest.approx(7.0))
+    until(page, lambda: browser.session.config.driven[".*"].supply.voltage == pytest.approx(7.0))
 
 
 def test_signals_that_differ_by_rounding_alone_are_drawn(browser, opened):
     page = opened(browser.url)
     shown(browser, page)
     kept, browser.playing = browser.session.signals, False
-    count = len(browser.session.trace_names)
+    count = len(browser.session.recorder.trace_names)
     browser.session.signals = collections.deque(
         (0.01 * index, np.full((1, count), -24.0) * (1 + 1e-10 * (index % 2))) for index in range(50)
     )

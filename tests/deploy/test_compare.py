@@ -8,10 +8,10 @@ import pytest
 
 from codrl_mj.cli import main
 from codrl_mj.deploy import Contract, OnnxPolicy, compare, export, write_log
+from codrl_mj.drives import find_drive
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes
 from codrl_mj.identify import identify, read_log
-from codrl_mj.drives import find_drive
 from tests.deploy.test_export import trained
 
 TASKS = {"furuta": "ppo", "acrobot": "dqn", "mountain_car_continuous": "td3"}

@@ -6,8 +6,7 @@ import numpy as np
 
 from codrl_mj.cli import main
 from codrl_mj.drives import abilities, explain, find_drive
-from codrl_mj.pages.diagrams import torque_speed_diagram
-from codrl_mj.pages.loop import limits, no_load_speed
+from codrl_mj.pages.diagrams import limits, no_load_speed, torque_speed_diagram
 from codrl_mj.pages.motor import _abilities
 from tests.pages.parsed import check_alone
 

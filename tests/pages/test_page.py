@@ -20,10 +20,16 @@ def small(*parts, title="t"):
 def test_names_with_markup_show_as_text_everywhere():
     plot = Plot(EVIL, EVIL, EVIL, (Curve(EVIL, np.arange(3.0), np.arange(3.0)),), clock=True)
     parts = (
-        *(page.paragraph(EVIL), page.note(EVIL), page.heading(EVIL), page.verdict(True, EVIL), page.plot(plot)),
-        *(page.items([EVIL]), page.definitions([(EVIL, EVIL)]), page.folded(EVIL, page.paragraph("p"))),
+        *(
+            page.paragraph(EVIL),
+            page.note(EVIL),
+            page.heading(EVIL),
+            page.judged(True, EVIL, "p", "verdict"),
+            page.plot(plot),
+        ),
+        *(page.definitions([(EVIL, EVIL)]), page.folded(EVIL, page.paragraph("p"))),
         *(page.table(EVIL, (EVIL, "b"), [(EVIL, EVIL)], cards=True), page.selector(EVIL, "run", [EVIL])),
-        *(page.film(EVIL, b"film", 20.0), page.image(b"image", EVIL), page.transport(1.0, 0.1), EVIL),
+        *(page.film(EVIL, b"film", 20.0), page.image(b"image", EVIL), page.part("transport", "1", "0.1"), EVIL),
     )
     text = page.page(EVIL, EVIL, page.paragraph(EVIL), [page.Section("s", EVIL, page.joined(parts), EVIL)])
     parsed = check_alone(text)
@@ -56,7 +62,7 @@ def test_a_plot_is_a_picture_where_no_script_may_run():
 
 
 def test_tables_have_captions_and_headings():
-    text = page.table("what", ("a", "b"), [("x", 1), page.Row(("y", 2), "failed")], numbers=(1,))
+    text = page.table("what", ("a", "b"), [("x", 1), ("y", 2)], numbers=(1,), failed=(1,))
     assert "<caption>what</caption>" in text
     assert text.count('scope="col"') == 2
     assert text.count('scope="row"') == 2

@@ -19,8 +19,8 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy, run_episodes
 from codrl_mj.pages import episode as episodes
 from codrl_mj.pages import report as reports
+from codrl_mj.pages.diagrams import held_step
 from codrl_mj.pages.episode import Shown, episode_section, show
-from codrl_mj.pages.loop import held_step
 from codrl_mj.pages.report import report
 from codrl_mj.physics.offscreen import RenderingUnavailableError
 from codrl_mj.runs.policies import load_policy
@@ -89,7 +89,7 @@ def test_the_papers_current_loop_has_its_margins_and_its_step(text):
 
 def test_it_says_which_loops_it_leaves_out_and_why_there_is_none():
     def run(actuators):
-        return reports._Reported(None, "run", None, None, actuators)
+        return Shown("run", SimpleNamespace(driven=actuators), None, None, None, 0)
 
     drives = {f"m{place}": find_drive("maxon-dcx22l", bandwidth=300.0 + place) for place in range(6)}
     assert "The first 4 of 6 different loops are shown; not those of m4, m5" in str(reports._loop([run(drives)]))

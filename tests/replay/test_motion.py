@@ -6,7 +6,7 @@ import pytest
 
 from codrl_mj.envs.single import ActuatedEnv
 from codrl_mj.replay import motion
-from codrl_mj.replay.shapes import mesh, shapes, thinned
+from codrl_mj.replay.scene import mesh, shapes, thinned
 
 ARM = """
 <mujoco>

@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import math
+import sys
 from pathlib import Path
 
 import control
@@ -12,15 +13,16 @@ import pytest
 from scipy import integrate, signal
 
 from codrl_mj.actuators import FAMILIES, Actuator, CurrentLoop, Motor
-from codrl_mj.validation import drives, in_python, motor, motor_windings, rotors
+from codrl_mj.validation import drives, motor, own_model, rotors
 from codrl_mj.validation.motor_loops import closed_form, closed_loop, sampled_system
 from codrl_mj.validation.rotors import EVERY_FEATURE, Loop, standard_loops
+from codrl_mj.validation.table import Skipped
 from tests.reference import of_actuator
 from tests.validation.mutations import entry
 
 pytestmark = pytest.mark.usefixtures("bare_engine")
 
-SMALL = {"small": motor_windings.MOTORS["small"]}
+SMALL = {"small": motor.MOTORS["small"]}
 ORDER, LIMIT = "closed form, order in the substeps", "closed form, limit of small substeps"
 SAMPLED, STEP = "sampled loop, random torques and speeds", "step response"
 MAGNITUDE, PHASE = "frequency response, magnitude", "frequency response, phase"
@@ -42,8 +44,10 @@ EVERY = LOOP | {VOLTAGE, LINE, NO_LOAD, RK4, GEM} | NATIVE | COMPILED | DRIVES
 def outcomes():
     """All checks with a few loops and motors only, by name."""
     checks = [*motor.checks_of({"every feature": EVERY_FEATURE}, quick=True)]
-    checks += [*in_python.compiled_checks(quick=True), *motor_windings.native_checks(SMALL, quick=True)]
-    checks += [*motor_windings.gem_check(Motor(), quick=True), *drives.drive_checks(quick=True)]
+    for native in (motor.same_map, motor.substeps, motor.implicitfast):
+        checks += native(SMALL, quick=True)
+    checks += [*own_model.compiled_checks(quick=True), *motor.rk4_check(quick=True)]
+    checks += [*motor.gem_check(Motor(), quick=True), *drives.drive_checks(quick=True)]
     return {check.name: check for check in checks}
 
 
@@ -215,7 +219,7 @@ def test_the_oracles_use_none_of_our_mathematics():
 
 
 def test_the_native_motor_is_wrong_under_rk4_and_ours_is_not():
-    (check,) = motor_windings.rk4_check(quick=True)
+    (check,) = motor.rk4_check(quick=True)
     ours, native = check.plots[0].curves
     assert ours.y.max() < 1e-12
     assert native.y[0] > 0.02
@@ -224,5 +228,7 @@ def test_the_native_motor_is_wrong_under_rk4_and_ours_is_not():
 
 def test_without_gym_electric_motor_its_check_is_left_out(monkeypatch):
     monkeypatch.setattr(motor, "checks_of", lambda *_: iter(()))
-    monkeypatch.setattr(motor, "available", lambda: False)
-    assert {check.name for check in motor.checks(quick=True)} == NATIVE | {RK4} | COMPILED | DRIVES
+    monkeypatch.setitem(sys.modules, "gym_electric_motor", None)
+    *made, skipped = motor.checks(quick=True)
+    assert {check.name for check in made} == NATIVE | {RK4} | COMPILED | DRIVES
+    assert skipped == Skipped(skipped.name, "gym-electric-motor is not installed")

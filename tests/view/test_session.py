@@ -10,8 +10,7 @@ import pytest
 
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.view.controls import controls, nested
-from codrl_mj.view.session import PUSH_DURATION, Session
+from codrl_mj.view.session import PUSH_DURATION, Session, controls
 
 POLE, MOTOR = "InvertedPendulum-v5", "maxon-re65"
 
@@ -34,7 +33,7 @@ def test_at_the_time_limit_it_says_so_and_begins_anew_or_goes_on(again):
     made.again = again
     said = [made.step() and made.ended for _ in range(4)]
     assert said[:3] == ["", "", "past the time limit"]
-    assert made.time == pytest.approx((1 if again else 4) * made.step_duration)
+    assert made.time == pytest.approx((1 if again else 4) * made.recorder.step_duration)
     assert said[3] == ("" if again else "past the time limit")
 
 
@@ -59,7 +58,7 @@ def test_signals_are_those_of_every_integration_step(motorised):
         motorised.step()
     times = [when for when, _ in motorised.signals]
     np.testing.assert_allclose(times, 0.02 * np.arange(1, 11), atol=1e-12)
-    assert motorised.signals[-1][1].shape == (1, len(motorised.trace_names))
+    assert motorised.signals[-1][1].shape == (1, len(motorised.recorder.trace_names))
     assert motorised.time == pytest.approx(0.2)
 
 
@@ -74,7 +73,7 @@ def test_a_setting_goes_into_the_simulation_and_the_motion_goes_on(motorised):
     voltages = []
     for _ in range(20):
         motorised.step()
-    voltages = [row[0, motorised.trace_names.index("voltage")] for _, row in motorised.signals]
+    voltages = [row[0, motorised.recorder.trace_names.index("voltage")] for _, row in motorised.signals]
     assert np.abs(voltages).max() == pytest.approx(7.0)
     motorised.choose("zero")
     motorised.set_disturbance(("command_delay",), 0.04)
@@ -144,7 +143,7 @@ def test_a_policy_for_another_environment_is_refused(motorised):
 
 
 def test_controls_are_the_fields_with_their_bounds_and_units(motorised):
-    actuator = motorised.patterns[".*"]
+    actuator = motorised.config.driven[".*"]
     found = {one.path: one for one in controls(actuator, 48.0)}
     resistance = found["motor", "resistance"]
     assert resistance.unit == "ohm"
@@ -170,7 +169,6 @@ def test_an_endless_voltage_ends_at_the_end_of_its_slider():
     assert voltage.parsed(48.0) == np.inf
     assert voltage.parsed(12.0) == 12.0
     assert ("supply", "voltage") not in [one.path for one in controls(Actuator())]
-    assert nested(("supply", "voltage"), 12.0) == {"supply": {"voltage": 12.0}}
 
 
 def test_the_command_line_offers_the_runs_policy_and_those_of_others(monkeypatch, capsys, tmp_path):
@@ -179,7 +177,7 @@ def test_the_command_line_offers_the_runs_policy_and_those_of_others(monkeypatch
     class Fake:
         url = "http://127.0.0.1:0"
 
-        def __init__(self, session, _port, title, _docs):
+        def __init__(self, session, _port, title):
             seen.update(session=session, title=title)
 
         def run(self):

@@ -1,11 +1,14 @@
-"""What is seen of a model: its geoms and sites as shapes, and its meshes, thinned out to a size that fits a page."""
+"""The scene of a model: geoms and sites as shapes, meshes, where its bodies are, and whence it is first seen."""
 
 import dataclasses
-from typing import Any
+from collections.abc import Collection
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
+_MUJOCO_ELEVATION, _ELEVATION = -45.0, -20.0
+"""Of a free camera [degrees]: MuJoCo's, of models that say nothing, which looks down on a robot; ours for these."""
 _GEOM = mujoco.mjtGeom
 _NAMES = {
     int(_GEOM.mjGEOM_PLANE): "plane",
@@ -91,27 +94,23 @@ def _colour(model: mujoco.MjModel, rgba: Any, material: int) -> tuple[tuple[floa
 def mesh(model: mujoco.MjModel, kind: str, index: int) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [m], shape (n, 3), and triangles, shape (m, 3), of a mesh or of a height field."""
     if kind == "hfield":
-        return _height_field(model, index)
+        rows, columns = int(model.hfield_nrow[index]), int(model.hfield_ncol[index])
+        begin, (x, y, top, _) = int(model.hfield_adr[index]), model.hfield_size[index]
+        heights = model.hfield_data[begin : begin + rows * columns] * top
+        across, along = np.meshgrid(np.linspace(-x, x, columns), np.linspace(-y, y, rows))
+        corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+        faces = np.concatenate(
+            [
+                np.stack([corner, corner + 1, corner + columns], 1),
+                np.stack([corner + 1, corner + columns + 1, corner + columns], 1),
+            ]
+        )
+        return np.stack([across.ravel(), along.ravel(), heights], 1), faces
     vertex, face = int(model.mesh_vertadr[index]), int(model.mesh_faceadr[index])
     return (
         model.mesh_vert[vertex : vertex + model.mesh_vertnum[index]].copy(),
         model.mesh_face[face : face + model.mesh_facenum[index]].copy(),
     )
-
-
-def _height_field(model: mujoco.MjModel, index: int) -> tuple[np.ndarray, np.ndarray]:
-    rows, columns = int(model.hfield_nrow[index]), int(model.hfield_ncol[index])
-    begin, (x, y, top, _) = int(model.hfield_adr[index]), model.hfield_size[index]
-    heights = model.hfield_data[begin : begin + rows * columns] * top
-    across, along = np.meshgrid(np.linspace(-x, x, columns), np.linspace(-y, y, rows))
-    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
-    faces = np.concatenate(
-        [
-            np.stack([corner, corner + 1, corner + columns], 1),
-            np.stack([corner + 1, corner + columns + 1, corner + columns], 1),
-        ]
-    )
-    return np.stack([across.ravel(), along.ravel(), heights], 1), faces
 
 
 def thinned(vertices: np.ndarray, triangles: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
@@ -131,3 +130,63 @@ def thinned(vertices: np.ndarray, triangles: np.ndarray, most: int) -> tuple[np.
             return middles, np.unique(merged[whole], axis=0)
         cells = int(cells / 1.25)
     return vertices, triangles
+
+
+def read_poses(data: mujoco.MjData, seen: list[Shape], poses: np.ndarray) -> None:
+    """Fill `poses` (positions and quaternions, shape (bodies, 7)) with where the bodies that are seen are.
+
+    The kinematics are up to date. A body is where its first geom is, which may have been moved along a hill.
+    """
+    poses[:, :3], poses[:, 3:] = data.xpos, data.xquat
+    first = {one.body: one for one in reversed(seen) if one.geom is not None and one.body != 0}
+    for body, one in first.items():
+        turned, back, back_turned = np.empty(4), np.empty(3), np.empty(4)
+        mujoco.mju_mat2Quat(turned, data.geom_xmat[one.geom])
+        mujoco.mju_negPose(back, back_turned, one.position, one.orientation)
+        mujoco.mju_mulPose(poses[body, :3], poses[body, 3:], data.geom_xpos[one.geom], turned, back, back_turned)
+
+
+class Viewpoint(NamedTuple):
+    """A camera that looks at something."""
+
+    eye: np.ndarray
+    """Where it is [m]."""
+    at: np.ndarray
+    """What it looks at [m]."""
+    fovy: float
+    """Vertical field of view [degrees]."""
+    extent: float
+    """How far what moves reaches from its middle [m]."""
+
+
+def first_view(
+    model: mujoco.MjModel, shapes: list[Shape], poses: np.ndarray, moving: Collection[int], camera: str | None
+) -> Viewpoint:
+    """A named camera of the model; else MuJoCo's free one, near enough to the bodies that move.
+
+    Poses are of all bodies, position and quaternion, shape (bodies, 7).
+    """
+    reaches = []
+    for one in shapes:
+        if one.geom is not None and one.body in moving:
+            offset = np.empty(3)
+            mujoco.mju_rotVecQuat(offset, one.position, poses[one.body, 3:])
+            middle, radius = poses[one.body, :3] + offset, model.geom_rbound[one.geom]
+            reaches += [middle - radius, middle + radius]
+    centre, extent = np.array(model.stat.center), float(model.stat.extent)
+    if reaches:  # the middle of what moves, and how far it reaches from there
+        low, high = np.min(reaches, axis=0), np.max(reaches, axis=0)
+        centre, extent = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    if camera is not None:
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_camlight(model, data)
+        index = model.camera(camera).id
+        eye, forward = data.cam_xpos[index].copy(), -data.cam_xmat[index].reshape(3, 3)[:, 2]
+        ahead = max(float((centre - eye) @ forward), 0.5 * extent)
+        return Viewpoint(eye, eye + ahead * forward, float(model.cam_fovy[index]), extent)
+    free = model.vis.global_
+    down = _ELEVATION if free.elevation == _MUJOCO_ELEVATION else free.elevation
+    azimuth, elevation = np.radians([free.azimuth, down])
+    forward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    return Viewpoint(centre - 2.6 * extent * forward, centre, 45.0, extent)
