@@ -18,8 +18,8 @@ from codrl_mj.pages import page
 from codrl_mj.pages.episode import Shown, episode_section, show
 from codrl_mj.pages.loop import held_step, loop_section
 from codrl_mj.pages.plots import Curve, Plot
+from codrl_mj.runs import BEST, EPISODES, PROGRESS, finished, told_apart
 from codrl_mj.runs.files import check_page, read_json
-from codrl_mj.runs.layout import BEST, EPISODES, PROGRESS, finished, told_apart
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.runs.summaries import RunSummary, compare, read_run
 from codrl_mj.training.folder import load_config
