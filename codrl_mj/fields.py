@@ -52,12 +52,12 @@ def real(
     return _bounded(default, holds, text, optional, unit, float, (low, high))
 
 
-def integer(default: int | None, least: int, optional: bool = False, unit: str = "") -> Any:
+def integer(default: int | None, least: int, optional: bool = False, unit: str = "", most: float = math.inf) -> Any:
     """A field for an integer of at least `least`; `optional`, or a default of None, lets it be None."""
     return _bounded(
         default,
-        lambda value: _is_integer(value) and value >= least,
-        f"an integer >= {least}",
+        lambda value: _is_integer(value) and least <= value <= most,
+        f"an integer >= {least}" if most == math.inf else f"an integer from {least} to {most}",
         optional,
         unit,
         int,

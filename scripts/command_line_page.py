@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 
 from codrl_mj import cli
-from codrl_mj.cli.identify import TOOLS
 from codrl_mj.runs.files import writing
 
 PAGE = Path(__file__).parent.parent / "docs" / "reference" / "command_line.md"
@@ -28,10 +27,11 @@ def help_of(*words: str) -> str:
 def page() -> str:
     """The Markdown page: a section for each verb, and for each that it has below it."""
     parts = ["# Command line\n\n`codrl-mj VERB --help` says the same."]
-    for verb in cli.VERBS:
+    for verb in cli.SAYS:
         text = help_of(verb)
         named = re.match(rf"usage: codrl-mj {verb} \[-h\] \{{(.*?)\}}", text)
-        below = named[1].split(",") if named else TOOLS if verb == "identify" else []
+        below = [name.split()[1] for name in cli.VERBS if name.startswith(f"{verb} ")]
+        below = below or (named[1].split(",") if named else [])
         parts.append(f"## {verb}\n\n```text\n{text.strip()}\n```")
         parts += [f"### {verb} {name}\n\n```text\n{help_of(verb, name).strip()}\n```" for name in below]
     return "\n\n".join(parts) + "\n"

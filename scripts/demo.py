@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from codrl_mj.cli.tables import print_evaluations
+from codrl_mj.cli.evaluate import print_evaluations
 from codrl_mj.cli.terminal import progress_bar
 from codrl_mj.cli.train import training_bars
 from codrl_mj.cli.validate import print_checks
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes, summarize
 from codrl_mj.films.film import Panel, film
-from codrl_mj.runs.layout import CONFIG
+from codrl_mj.runs import CONFIG
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.study.grid import failure_record, train_runs
 from codrl_mj.tasks import named_actuator

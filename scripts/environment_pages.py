@@ -15,9 +15,9 @@ import gymnasium
 from PIL import Image
 
 from codrl_mj.actuators import Drive
-from codrl_mj.cli.fields import field_docs
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.fields import field_docs
 from codrl_mj.runs.files import writing
 from codrl_mj.tasks import TASKS, named_actuator
 

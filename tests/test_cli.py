@@ -20,7 +20,7 @@ import codrl_mj
 from codrl_mj import register
 from codrl_mj.actuators import NAMED, CurrentLoop, Ideal, Lag, Motor, Supply
 from codrl_mj.agents.presets import ELSEWHERE, PRESETS
-from codrl_mj.cli import main
+from codrl_mj.cli import VERBS, find_verb, main
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import evaluate, run_episodes
 from codrl_mj.runs.policies import load_policy
@@ -286,6 +286,53 @@ def test_a_task_can_be_filmed_with_random_actions_through_the_papers_motor(tmp_p
     assert (tmp_path / "film.gif").read_bytes().startswith(b"GIF89a")
 
 
+# -- for other programs -------------------------------------------------------------------------------------
+
+WITH_NUMBERS = [
+    # a line, and a number in its JSON by the keys on the way there
+    (f"train cartpole {' '.join(TINY)} --out mine", "best return"),
+    ("evaluate RUN --episodes 2", "returns mean"),
+    ("runs RUN", "0 evaluation_return"),
+    ("runs --compare RUN RUN", "results seconds 1"),
+    ("motor list", "motors 0 stall_torque"),
+    ("motor show rev-neo --out pictures", "abilities 0 value"),
+    ("motor design rev-neo", "phase_margin"),
+    ("motor step rev-neo", "small settling_time"),
+    ("motor feasible maxon-ec45-flat-50w pendulum --gear-ratio 20", "bounds 0 needed"),
+    ("motor choose maxon-ec45-flat-50w pendulum --out chosen", "ranking 0 margin"),
+    ("advise weak pendulum", "advice found lag"),
+    ("identify plan maxon-ec45-flat-50w --duration 1", "best rate"),
+]
+
+
+@pytest.mark.parametrize(("line", "place"), WITH_NUMBERS)
+def test_with_json_nothing_else_is_printed(capsys, trained, line, place):
+    words = [str(trained) if word == "RUN" else word for word in line.split()]
+    assert main([*words, "--json"]) in (0, 1)
+    printed = capsys.readouterr().out
+    found = json.loads(printed)
+    assert printed == json.dumps(found, indent=2) + "\n"
+    for key in place.split():
+        found = found[int(key) if key.isdigit() else key]
+    assert isinstance(found, float)
+
+
+@pytest.mark.parametrize("verb", [verb for verb in VERBS if hasattr(find_verb(verb), "as_json")])
+def test_the_help_of_a_verb_with_numbers_has_json(capsys, verb):
+    assert "--json Print JSON and nothing else" in helped(capsys, *verb.split())
+
+
+def test_a_file_gets_neither_colours_nor_bars(trained):
+    done = command(f"evaluate {trained} --episodes 2", env=os.environ | {"TERM": "xterm-256color"})
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "\x1b" not in done.stdout
+    assert "━" not in done.stdout
+    assert max(map(len, done.stdout.splitlines())) <= 110
+    done = command(f"evaluate {trained} --episodes 2 --json")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert json.loads(done.stdout)["units"]["tracking_rms"] == "N*m"
+
+
 # -- actuators of any family --------------------------------------------------------------------------------
 
 SHORT_FILM = ["--out", "film.gif", "--width", "160", "--height", "120", "--env.max-episode-steps", "2"]
@@ -421,6 +468,7 @@ def test_a_certificate_that_is_stopped_exits_with_130_and_leaves_nothing(monkeyp
     ("line", "expected"),
     [
         ("", "codrl-mj needs a verb, one of train, evaluate, runs,"),
+        ("", "try codrl-mj motor list, or codrl-mj train cartpole; codrl-mj --help says more"),
         ("trian cartpole", "unknown verb 'trian': did you mean 'train'? verbs are train, evaluate,"),
         ("motor", "codrl-mj motor needs a verb, one of list, new, show,"),
         ("motor lst", "unknown verb 'lst': did you mean 'list'? verbs are list, new, show,"),

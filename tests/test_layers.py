@@ -39,11 +39,10 @@ ALLOWED = {
     "making": {"envs", "envs.config", "envs.worlds", "foreign"},
     "suite": {"actuators", "envs", "envs.config", "physics", "tasks"},
     "agents": {"actuators", "envs", "envs.config", "fields", "kept", "own_code", "physics"},
-    "runs.files": set(),
-    "runs.layout": set(),
-    "runs.summaries": {"actuators", "envs.worlds", "fields", "runs.files", "runs.layout", "tasks"},
-    "runs.policies": {"actuators", "agents", "runs.files", "runs.layout"},
     "runs": set(),
+    "runs.files": set(),
+    "runs.summaries": {"actuators", "envs.worlds", "fields", "runs.files", "runs", "tasks"},
+    "runs.policies": {"actuators", "agents", "runs.files", "runs"},
     "evaluation.measures": set(),
     "evaluation": {
         *("actuators", "envs", "envs.config", "envs.worlds", "evaluation.measures", "physics", "runs.files"),
@@ -57,7 +56,7 @@ ALLOWED = {
     "replay": {"envs", "envs.config", "evaluation", "runs.files"},
     "view": {"actuators", "envs.config", "evaluation", "fields", "replay"},
     "training": {
-        *("actuators", "agents", "disturbances", "envs", "envs.config", "evaluation", "runs.files", "runs.layout"),
+        *("actuators", "agents", "disturbances", "envs", "envs.config", "evaluation", "runs.files", "runs"),
         *("runs.policies", "tasks", "tasks.assets", "fields", "foreign", "pages.plots"),
     },
     "drives": {
@@ -74,7 +73,7 @@ ALLOWED = {
     "identify": {"actuators", "catalogue", "fields", "kept", "runs.files", "tasks.assets"},
     "pages": {
         *("__init__", "actuators", "catalogue", "drives", "evaluation", "films", "foreign", "identify"),
-        *("pages.plots", "replay", "runs.files", "runs.layout", "runs.policies", "runs.summaries", "tasks", "training"),
+        *("pages.plots", "replay", "runs.files", "runs", "runs.policies", "runs.summaries", "tasks", "training"),
         "validation",
     },
     "cli": {
@@ -87,7 +86,7 @@ ALLOWED = {
             "pages.plots",
             "replay",
             "runs.files",
-            "runs.layout",
+            "runs",
             "runs.policies",
             "runs.summaries",
             "drives",

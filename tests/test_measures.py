@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -55,6 +56,17 @@ def test_values_without_spread_have_an_interval_without_width(values):
 def test_the_interval_is_the_same_every_time():
     values = np.random.default_rng(2).normal(size=20)
     assert bootstrap_mean(values) == bootstrap_mean(values)
+
+
+@pytest.mark.parametrize("count", [2, 3, 10, 57])
+def test_intervals_and_means_are_scipys_to_the_bit(count):
+    for values in (np.random.default_rng(count).normal(size=count), np.arange(float(count)) ** 2):
+        theirs = scipy.stats.bootstrap((values,), np.mean, method="percentile", rng=0).confidence_interval
+        assert bootstrap_mean(values)[1:] == (theirs.low, theirs.high)
+        assert interquartile_mean(values) == scipy.stats.trim_mean(values, 0.25)
+    for successes in range(count + 1):
+        theirs = scipy.stats.binomtest(successes, count).proportion_ci(0.95, "wilson")
+        assert wilson_rate(successes, count)[1:] == (theirs.low, theirs.high)
 
 
 @given(st.integers(1, 500).flatmap(lambda trials: st.tuples(st.integers(0, trials), st.just(trials))))

@@ -6,10 +6,9 @@ import json
 import os
 
 import pytest
-import tyro
 
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor, actuator_over, mapping_of, resolve
-from codrl_mj.cli.runs import Runs
+from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.pages import report
 from codrl_mj.runs.summaries import SORT_KEYS, compare, find_runs, read_run, sort_runs
@@ -231,7 +230,8 @@ def test_a_comparison_has_the_settings_that_differ_and_every_result(tmp_path):
     assert comparison.results["evaluation.tracking_rms"] == (0.1, 0.1, None)
     assert [one and one["mean"] for one in comparison.results["evaluation.returns"]] == [401.0, 402.0, None]
     assert "evaluation.peak_voltage" not in comparison.results  # none of them has it
-    json.dumps(comparison.as_mapping())
+    json.dumps(vars(comparison))
+    assert comparison.units == {"seconds": "s", "evaluation.returns": "reward", "evaluation.tracking_rms": "N*m"}
     with pytest.raises(ValueError, match="two or more"):
         compare(runs[:1])
 
@@ -245,7 +245,7 @@ def test_beside_an_ideal_actuator_no_field_of_another_is_listed(tmp_path):
 
 
 def verb(*arguments):
-    return tyro.cli(Runs, args=list(map(str, arguments))).run()
+    return main(["runs", *map(str, arguments)])
 
 
 def test_the_verb_lists_runs_in_the_order_asked_for(tmp_path, capsys):
@@ -276,7 +276,7 @@ def test_the_verb_compares_runs(tmp_path, capsys, monkeypatch):
     comparison = json.loads((tmp_path / "both.json").read_text())
     assert comparison["names"] == ["a", "b"]
     assert comparison["configuration"]["seed"] == [1, 50]
-    with pytest.raises(FileNotFoundError, match="no run at nothing"):
-        verb("--compare", "a", "nothing")
-    with pytest.raises(ValueError, match="two or more"):
-        verb("--compare", "a")
+    assert comparison["units"]["evaluation.tracking_rms"] == "N*m"
+    for names, refusal in ((("a", "nothing"), "no run at nothing"), (("a",), "two or more")):
+        assert verb("--compare", *names) == 2
+        assert refusal in capsys.readouterr().err

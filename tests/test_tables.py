@@ -1,11 +1,11 @@
 """Tables: they fit the terminal, and hold the numbers that they are of."""
 
+import contextlib
 import io
 
 import pytest
-from rich.console import Console
 
-from codrl_mj.cli.tables import evaluation_tables
+from codrl_mj.cli.evaluate import print_evaluations
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import MEASURES, RandomPolicy, evaluate
 
@@ -26,10 +26,9 @@ def results():
 
 def printed(evaluations, **options):
     """The tables as lines of a terminal, without the space at their ends."""
-    console = Console(width=110, file=io.StringIO())
-    for table in evaluation_tables(evaluations, **options):
-        console.print(table)
-    return [line.rstrip() for line in console.file.getvalue().splitlines()]
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        print_evaluations(evaluations, **options)
+    return [line.rstrip() for line in out.getvalue().splitlines()]
 
 
 def test_a_row_has_the_most_telling_measures(results):

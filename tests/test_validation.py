@@ -662,6 +662,10 @@ def test_a_fault_that_is_missed_fails_the_command(capsys, monkeypatch, missed, s
     monkeypatch.setattr("codrl_mj.validation.try_mutations", lambda *_, **__: outcomes)
     assert main(["validate", "cartpole", "--mutations"]) == status
     assert ("MISSED" in capsys.readouterr().out) is missed
+    assert main(["validate", "cartpole", "--mutations", "--json"]) == status
+    found = json.loads(capsys.readouterr().out)
+    assert found["checks"][0]["unit"] == good.unit
+    assert [fault["failed"] == [] for fault in found["mutations"]] == [False] + [True] * missed
 
 
 def test_importing_the_certificate_needs_none_of_the_oracles_libraries():

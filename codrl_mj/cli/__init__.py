@@ -1,7 +1,11 @@
 """The command line: parses, calls the package, prints. Nothing imports it."""
 
 import contextlib
+import dataclasses
 import importlib
+import io
+import json
+import math
 import os
 import re
 import signal
@@ -9,9 +13,9 @@ import sys
 import textwrap
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import gymnasium
 import mujoco
@@ -20,25 +24,55 @@ import codrl_mj
 from codrl_mj.cli.parsing import parse, understood
 from codrl_mj.runs.files import check_file, check_page, check_writable
 
-VERBS: dict[str, tuple[str, str, str]] = {
-    # verb: its class, what it does in a sentence, and an example
-    "train": ("train:Train", "Train an agent through an actuator.", "cartpole --actuator weaker"),
-    "evaluate": ("evaluate:Evaluate", "Measure a policy on any actuator.", "runs/mine --actuator lag"),
-    "runs": ("runs:Runs", "List the runs of a folder, or compare some.", "runs --sort return"),
-    "render": ("render:Render", "Film one episode.", "runs/mine --out balance.mp4"),
-    "replay": ("replay:Replay", "Write one episode as a page in three dimensions.", "runs/mine --out balance.html"),
-    "view": ("view:LiveView", "Watch a simulation live in a browser, and set its motor.", "cartpole"),
-    "report": ("report:Report", "Write a report of a run as one HTML file.", "runs/mine --out mine.html"),
-    "motor": ("motor:MotorTools", "List motors that one can buy, look at one, design its loop, choose one.", "list"),
-    "advise": ("advise:Advise", "Say whether to train through an actuator or do something else.", "weak pendulum"),
-    "identify": ("identify:Identify", "Identify a motor from its bench logs.", "check swing.csv --columns time=t:s"),
-    "data": ("data:Data", "List or fetch measurements of real motors that others have published.", "dfki_pendulum"),
-    "cache": ("cache:Cache", "Show or clear the compiled code that is kept on disk.", "--clear"),
-    "export": ("export:Export", "Take a policy out: ONNX, and all that it assumes.", "runs/mine --out mine"),
-    "board": ("board:BoardTools", "Run the exported C as a controller, or check its log.", "test mine"),
-    "validate": ("validate:Validate", "Certify that the port is right.", "cartpole --out certificate"),
+SAYS: dict[str, tuple[str, str]] = {
+    # verb, or the word before several: what it does in a sentence, and an example
+    "train": ("Train an agent through an actuator.", "cartpole --actuator weaker"),
+    "evaluate": ("Measure a policy on any actuator.", "runs/mine --actuator lag"),
+    "runs": ("List the runs of a folder, or compare some.", "runs --sort return"),
+    "render": ("Film one episode.", "runs/mine --out balance.mp4"),
+    "replay": ("Write one episode as a page in three dimensions.", "runs/mine --out balance.html"),
+    "view": ("Watch a simulation live in a browser, and set its motor.", "cartpole"),
+    "report": ("Write a report of a run as one HTML file.", "runs/mine --out mine.html"),
+    "motor": ("List motors that one can buy, look at one, design its loop, choose one.", "list"),
+    "advise": ("Say whether to train through an actuator or do something else.", "weak pendulum"),
+    "identify": ("Identify a motor from its bench logs.", "check swing.csv --columns time=t:s"),
+    "data": ("List or fetch measurements of real motors that others have published.", "dfki_pendulum"),
+    "cache": ("Show or clear the compiled code that is kept on disk.", "--clear"),
+    "export": ("Take a policy out: ONNX, and all that it assumes.", "runs/mine --out mine"),
+    "board": ("Run the exported C as a controller, or check its log.", "test mine"),
+    "validate": ("Certify that the port is right.", "cartpole --out certificate"),
 }
-"""The verbs by name; the module of one is imported when it is called."""
+VERBS = {
+    "train": "train:Train",
+    "evaluate": "evaluate:Evaluate",
+    "runs": "runs:Runs",
+    "render": "see:Render",
+    "replay": "see:Replay",
+    "view": "see:LiveView",
+    "report": "see:Report",
+    "motor list": "motor:List",
+    "motor new": "motor:New",
+    "motor show": "motor:Show",
+    "motor design": "motor:Design",
+    "motor step": "motor:Step",
+    "motor feasible": "motor_choice:Feasible",
+    "motor choose": "motor_choice:Choose",
+    "advise": "advise:Advise",
+    "identify": "identify:Identify",
+    "identify check": "identify:CheckLogs",
+    "identify columns": "identify:ProposeColumns",
+    "identify plan": "identify:PlanExperiment",
+    "identify simulate": "identify:SimulateLog",
+    "identify compare": "compare:CompareLog",
+    "data": "runs:Data",
+    "cache": "runs:Cache",
+    "export": "export:Export",
+    "board test": "board:Test",
+    "board check": "board:CheckLog",
+    "board run": "board:RunBoard",
+    "validate": "validate:Validate",
+}
+"""The words of every verb -> its module, which is imported when it is called, and its class."""
 _ABOUT = (
     "Reinforcement learning through a real actuator: classic control in MuJoCo, driven by a motor. Each verb has "
     "its own --help; -h leaves descriptions out; --version; --traceback shows where an error arose."
@@ -55,7 +89,7 @@ _FILES: dict[str, Callable[[Path], None]] = {
 
 def find_verb(name: str) -> Any:
     """The class of a verb."""
-    module, _, kind = VERBS[name][0].partition(":")
+    module, _, kind = VERBS[name].partition(":")
     return getattr(importlib.import_module(f"codrl_mj.cli.{module}"), kind)
 
 
@@ -81,18 +115,16 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _run(arguments: list[str], traced: bool) -> int:
-    verb: Any = None
     try:
         words = understood(arguments)
-        if words[:1] and words[0] in VERBS:
-            kind = find_verb(words[0])  # or the one that it makes for a line on which its flags depend
-            kind = kind.for_line(words[1:]) if hasattr(kind, "for_line") else kind
-            verb = parse(kind, f"codrl-mj {words[0]}", words[1:])
-        else:
-            helped = {name: f"{says}\n\nExample: codrl-mj {name} {line}" for name, (_, says, line) in VERBS.items()}
-            verb = parse(helped, "codrl-mj", words, _ABOUT)
+        name = next((one for one in (" ".join(words[:2]), *words[:1]) if one in VERBS), None)
+        if name is None:
+            _help(words)
+        rest = words[1 + name.count(" ") :]
+        kind = find_verb(name)  # or the one that it makes for a line on which its flags depend
+        verb = parse(kind.for_line(rest) if hasattr(kind, "for_line") else kind, f"codrl-mj {name}", rest)
         _check_outputs(getattr(verb, "verb", verb))
-        return verb.run()
+        return _answer(verb)
     except BrokenPipeError:  # whoever read the output has enough of it, such as head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left is flushed at exit
         return 141
@@ -109,6 +141,43 @@ def _run(arguments: list[str], traced: bool) -> int:
             return 130
         print(f"codrl-mj: error: {_sentence(error)}", file=sys.stderr)
         return 2
+
+
+def _help(words: Sequence[str]) -> NoReturn:
+    """Say what verbs there are, all or those that begin with the first word; SystemExit."""
+    about, group = _ABOUT, words[0] if words[:1] and words[0] in SAYS else ""
+    helped = {name: f"{says}\n\nExample: codrl-mj {name} {line}" for name, (says, line) in SAYS.items()}
+    if group:
+        about = helped[group]
+        helped = {name.split()[1]: find_verb(name).__doc__ for name in VERBS if name.startswith(f"{group} ")}
+    parse(helped, f"codrl-mj {group}".strip(), words[1:] if group else words, about)
+    raise SystemExit
+
+
+def _answer(verb: Any) -> int:
+    """Run a verb. With --json nothing is printed but what it returns beside its exit status."""
+    if not getattr(verb, "as_json", False):
+        done = verb.run()
+        return int(done[0] if isinstance(done, tuple) else done)
+    with contextlib.redirect_stdout(io.StringIO()):
+        status, content = verb.run()
+    print(json.dumps(_plain(content), indent=2, allow_nan=False))
+    return int(status)
+
+
+def _plain(content: Any) -> Any:
+    """As JSON has it: what has names as a mapping; null for numbers that are not finite, which it has no word for."""
+    for how in ("as_mapping", "summary", "_asdict"):
+        if hasattr(content, how):
+            return _plain(getattr(content, how)())
+    if isinstance(content, Mapping) or dataclasses.is_dataclass(content):
+        named = content if isinstance(content, Mapping) else vars(content)
+        return {str(name): _plain(value) for name, value in named.items()}
+    if isinstance(content, list | tuple):
+        return [_plain(value) for value in content]
+    if isinstance(content, float):
+        return float(content) if math.isfinite(content) else None
+    return str(content) if isinstance(content, Path) else content
 
 
 def _check_outputs(verb: Any) -> None:

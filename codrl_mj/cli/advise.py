@@ -1,13 +1,13 @@
 """`codrl-mj advise`."""
 
 import dataclasses
-import json
-import math
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
+from codrl_mj.cli.parsing import AsJson
+from codrl_mj.cli.terminal import print_table, say
 from codrl_mj.fields import did_you_mean
 
 _DELIVERED = {
@@ -61,13 +61,10 @@ class Advise:
     """Trainings at once; -1 for one on each CPU."""
     evidence: Path | None = None
     """The study's runs.csv, unless that of the installation is meant."""
-    as_json: Annotated[
-        bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(name="json", help="Print JSON instead of tables.")
-    ] = False
+    as_json: AsJson = False
 
-    def run(self) -> int:
+    def run(self) -> tuple[int, Any]:
         """Print the doses, what is known of what can be done, and the verdict last."""
-        from codrl_mj.cli.terminal import say
         from codrl_mj.study.advice import advise
         from codrl_mj.study.doses import REFERENCE_SPEEDS, posed
         from codrl_mj.study.evidence import Evidence
@@ -89,13 +86,23 @@ class Advise:
                 about = ", ".join(flag for flag, value in given.items() if value is not None)
                 raise ValueError(f"{about}: {error}" if about else str(error)) from error
             found = advise(actuator, self.task, Evidence.read(self.evidence))
-            if not self.as_json:
-                _print(self.actuator, found)
-                say(actuator.assumed)
-        measured = None if self.measure is None else self._measured(self.measure)
-        if self.as_json:
-            print(json.dumps({"advice": _plain(found), "measured": _plain(measured)}, indent=2))
-        return 0
+            _print(self.actuator, found)
+            say(actuator.assumed)
+        measured = None
+        if self.measure is not None:
+            from codrl_mj.study.advice import decide, measurement
+            from codrl_mj.study.parallel import Workers
+            from codrl_mj.study.program import compute
+
+            asked = measurement(self._named(), self.task, self.measure, self.root)
+            compute(asked.grid, Workers(self.jobs))
+            options = asked.judged(asked.grid.collect())
+            measured = {"options": options, "verdict": decide(options)}
+            _print_options(f"Measured: {self.measure} policies of either kind, 50 episodes each", options)
+            more = " by more policies (--measure)" * (measured["verdict"] == "measure it")
+            say(f"measured: {measured['verdict']}{more}")
+        units = {name: unit or "1" for name, (_, unit, _) in _DELIVERED.items()} | {"loss": "share of the task's span"}
+        return 0, {"units": units, "advice": found, "measured": measured}
 
     def _named(self) -> Any:
         changed: dict[str, Any] = {}
@@ -105,27 +112,8 @@ class Advise:
             changed["supply"] = {"voltage": self.voltage}
         return {"name": self.actuator, **changed} if changed else self.actuator
 
-    def _measured(self, seeds: int) -> Any:
-        from codrl_mj.cli.terminal import say
-        from codrl_mj.study.advice import decide, measurement
-        from codrl_mj.study.parallel import Workers
-        from codrl_mj.study.program import compute
-
-        asked = measurement(self._named(), self.task, seeds, self.root)
-        if self.as_json:
-            asked.grid.compute(Workers(self.jobs))
-        else:
-            compute(asked.grid, Workers(self.jobs))
-        options = asked.judged(asked.grid.collect())
-        verdict = decide(options)
-        if not self.as_json:
-            _print_options(f"Measured: {seeds} policies of either kind, 50 episodes each", options)
-            say(f"measured: {verdict}" + " by more policies (--measure)" * (verdict == "measure it"))
-        return {"options": options, "verdict": verdict}
-
 
 def _print(name: str, found: Any) -> None:
-    from codrl_mj.cli.terminal import print_table, say
     from codrl_mj.study.doses import AXES
 
     columns = "what it does to the largest force", "value", "unit"
@@ -149,7 +137,6 @@ _LOST = "loss", "95 %", "fail", "success lost"
 
 
 def _print_options(title: str, options: Any) -> None:
-    from codrl_mj.cli.terminal import print_table
     from codrl_mj.study.advice import OPTIONS
 
     rows = []
@@ -170,16 +157,3 @@ def _lost(outcome: Any, bound: str) -> tuple[str, ...]:
         failed,
         f"{100 * outcome.success_lost.mean:z.0f} %",
     )
-
-
-def _plain(value: Any) -> Any:
-    """Named tuples as mappings, outcomes by their summaries, recursively."""
-    if hasattr(value, "summary"):
-        return _plain(value.summary())
-    if hasattr(value, "_asdict"):
-        return _plain(value._asdict())
-    if isinstance(value, dict):
-        return {name: _plain(part) for name, part in value.items()}
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return [_plain(part) for part in value] if isinstance(value, tuple) else value

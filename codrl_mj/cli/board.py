@@ -164,22 +164,3 @@ class RunBoard:
         print_table(f"{self.folder} on {self.port}", ("", ""), rows)
         say(f"wrote {self.out}; try: codrl-mj board check {self.folder} {self.out}")
         return int(done.why != "told to")
-
-
-@dataclasses.dataclass(frozen=True)
-class BoardTools:
-    """An exported policy as a controller: its C in the loop with the simulation, on a board, and what a rig recorded.
-
-    Example: codrl-mj board test furuta
-    """
-
-    verb: tyro.conf.OmitSubcommandPrefixes[
-        Annotated[Test, tyro.conf.subcommand("test")]
-        | Annotated[CheckLog, tyro.conf.subcommand("check")]
-        | Annotated[RunBoard, tyro.conf.subcommand("run")]
-    ]
-    """What to do; each has its own --help."""
-
-    def run(self) -> int:
-        """Do it."""
-        return self.verb.run()

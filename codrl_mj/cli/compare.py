@@ -1,13 +1,12 @@
 """`codrl-mj identify compare`: a rig's log beside the simulation under its commands."""
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.cli.motor import AsJson
+from codrl_mj.cli.parsing import AsJson
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +37,7 @@ class CompareLog:
     """Import the modules of a run's own task or actuator, which executes them."""
     as_json: AsJson = False
 
-    def run(self) -> int:
+    def run(self) -> tuple[int, Any]:
         """Compare, print a table, draw."""
         from codrl_mj.cli.terminal import print_table, say
         from codrl_mj.deploy import Contract, compare
@@ -61,18 +60,14 @@ class CompareLog:
             env = dataclasses.replace(env, actuator=dict.fromkeys(env.driven, self.actuator), randomize=None)
         found = compare(env, self.log, self.window)
         columns = list(zip(found.names, found.units, found.errors.tolist(), found.moved.tolist(), strict=True))
-        if self.as_json:
-            keys = ("name", "unit", "error", "if_nothing_changed")
-            print(json.dumps([dict(zip(keys, row, strict=True)) for row in columns], indent=2))
-        else:
-            title = f"{self.log.name} through {env.through}: {len(found.starts)} windows"
-            rows = [(name, unit or "?", f"{error:.3g}", f"{moved:.3g}") for name, unit, error, moved in columns]
-            print_table(title, ("", "unit", "error (RMS)", "if nothing changed"), rows)
+        title = f"{self.log.name} through {env.through}: {len(found.starts)} windows"
+        rows = [(name, unit or "?", f"{error:.3g}", f"{moved:.3g}") for name, unit, error, moved in columns]
+        print_table(title, ("", "unit", "error (RMS)", "if nothing changed"), rows)
         if self.out is not None:
             _draw(found, self.out)
-            if not self.as_json:
-                say(f"wrote {self.out}")
-        return 0
+            say(f"wrote {self.out}")
+        keys = ("name", "unit", "error", "if_nothing_changed")
+        return 0, [dict(zip(keys, row, strict=True)) for row in columns]
 
 
 def _draw(found: Any, out: Path) -> None:

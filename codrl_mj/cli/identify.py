@@ -1,14 +1,33 @@
-"""`codrl-mj identify`: a motor from its bench logs, and what is done before."""
+"""`codrl-mj identify`: a motor from its bench logs; and `check`, `columns`, `plan` and `simulate`, done before."""
 
 import dataclasses
+import math
+import re
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
-from codrl_mj.cli.identify_tools import TOOLS, Columns, IdentifyTools, Logs
-from codrl_mj.cli.motor import AsJson
+from codrl_mj.cli.motor import MotorName
+from codrl_mj.cli.parsing import AsJson
+from codrl_mj.cli.terminal import number, print_table, progress_bar, say
+
+Columns = Annotated[
+    str,
+    tyro.conf.arg(
+        metavar="SIGNAL=COLUMN:UNIT,...",
+        help="What the columns are, as time=t:s,voltage=duty*vbus:V,current=i:mA,position=q:deg. Signals are voltage, "
+        "current, position, velocity, torque, bus, duty, temperature and command; formulas have + - * /, "
+        "twos_complement(column,16), unwrap(column,360), atan2(y,x), abs, sign, sqrt: docs/identify_logs.md.",
+    ),
+]
+"""Type of a verb's flag `--columns`."""
+_FILE = tyro.conf.arg(metavar="LOG", help="CSV, JSON (or .gz), Parquet.")
+Logs = Annotated[tyro.conf.Positional[tuple[Path, ...]], _FILE]
+"""Type of a verb's files."""
+_STYLES = {"error": "red", "warning": "yellow", "info": ""}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,14 +69,8 @@ class Identify:
     """Fit logs that the checks find errors in."""
     as_json: AsJson = False
 
-    @classmethod
-    def for_line(cls, words: Sequence[str]) -> Any:
-        """The fit, or what is done before."""
-        return IdentifyTools if words[:1] and words[0] in TOOLS else cls
-
-    def run(self) -> int:
+    def run(self) -> tuple[int, Any]:
         """Check the logs, fit, print a table, write the files."""
-        from codrl_mj.cli.terminal import console, progress_bar
         from codrl_mj.drives import find_drive
         from codrl_mj.identify.identify import checked, foreseen, identify
         from codrl_mj.identify.reading import read_log
@@ -70,8 +83,8 @@ class Identify:
         mapping = base and base.as_mapping()
         wanted = logs, self.rig, known, self.friction
         known_too = checked(*wanted, self.estimate, self.segment, mapping)
-        if (lacking := foreseen(logs, known_too, mapping)) and not self.as_json:
-            console().print(f"there will be no actuator. {lacking}", markup=False, highlight=False, style="yellow")
+        if lacking := foreseen(logs, known_too, mapping):
+            say(f"there will be no actuator. {lacking}", style="yellow")
         held_out = self._check(logs, held_out, base)
         with progress_bar("{task.completed}/{task.total}") as bar:
             row = bar.add_task("identifying", total=1)
@@ -83,41 +96,30 @@ class Identify:
                 mapping,
                 lambda what, done, total: bar.update(row, description=f"fitting: {what}", completed=done, total=total),
             )
-        if self.as_json:
-            console().print_json(data=found.as_mapping())
-        else:
-            print_identified(found)
+        print_identified(found)
         if self.out is not None:
             for path in found.write(self.out):
-                if not self.as_json:
-                    print(f"wrote {path}")
-            self._write_page(found, self.out / "report.html")
-        return 0
+                print(f"wrote {path}")
+            page = self.out / "report.html"
+            try:  # where what draws it is installed: the numbers are written already
+                from codrl_mj.pages.identification import identification_page
 
-    def _write_page(self, found: Any, path: Path) -> None:
-        """Write the page, where what draws it is installed: the numbers are written already."""
-        try:
-            from codrl_mj.pages.identification import identification_page
-
-            identification_page(found, path)
-            told = f"wrote {path}"
-        except ModuleNotFoundError as error:
-            told = f"no {path}: {error}; pages need the extra 'validate': pip install 'codrl-mj[validate]'"
-        if not self.as_json:
-            print(told)
+                identification_page(found, page)
+                print(f"wrote {page}")
+            except ModuleNotFoundError as error:
+                print(f"no {page}: {error}; pages need the extra 'validate': pip install 'codrl-mj[validate]'")
+        return 0, found.as_mapping() | {"units": {one.name: one.unit for one in found.estimates}}
 
     def _check(self, logs: list[Any], held_out: list[Any], base: Any) -> list[Any]:
         """Print what is wrong with the logs; returns those held out that have no errors."""
-        from codrl_mj.cli.identify_tools import findings_table
-        from codrl_mj.cli.terminal import console
         from codrl_mj.identify.checks import check
 
         found = [(log, check(log, base and base.motor, self.rig)) for log in (*logs, *held_out)]
         wrong = [log for log, findings in found if any(one.severity == "error" for one in findings)]
         for log, findings in found:
             worth = [one for one in findings if one.severity != "info"]
-            if worth and not self.as_json:
-                console().print(findings_table(log.name, worth))
+            if worth:
+                print_findings(log.name, worth)
         if self.ignore_errors:
             return held_out
         if fitted := [log.name for log in logs if any(log is one for one in wrong)]:
@@ -126,8 +128,7 @@ class Identify:
                 "correct the columns, leave the logs out, or pass --ignore-errors"
             )
         for log in wrong:
-            text = f"warning: {log.name}, which is held out, has errors, and is left out"
-            console().print(text, markup=False, highlight=False, style="yellow")
+            say(f"warning: {log.name}, which is held out, has errors, and is left out", style="yellow")
         return [log for log in held_out if not any(log is one for one in wrong)]
 
 
@@ -147,19 +148,16 @@ def _numbers(texts: tuple[str, ...]) -> dict[str, float]:
 
 def print_identified(found: Any) -> None:
     """Print parameters and errors of the simulation, and what is to be known of them."""
-    from rich.markup import escape
-
-    from codrl_mj.cli.terminal import console, titled_table
     from codrl_mj.identify.log import SIGNALS
     from codrl_mj.identify.result import USABLE
 
-    columns = "parameter", "value", "95 % interval", "unit", "status", "why"
-    table = titled_table(f"Identified from {', '.join(found.logs)}", columns, right=columns[1:3])
+    rows: list[Any] = []
     for one in found.estimates:
         interval = "" if one.status == "given" else f"{one.low:.4g} to {one.high:.4g}"
-        texts = one.name, f"{one.value:.4g}", interval, one.unit, one.status, one.why
-        table.add_row(*map(escape, texts), style="" if one.status in USABLE else "yellow")
-    console().print(table)
+        rows.append((one.name, f"{one.value:.4g}", interval, one.unit, one.status, one.why))
+    styles = ["" if one.status in USABLE else "yellow" for one in found.estimates]
+    columns = "parameter", "value", "95 % interval", "unit", "status", "why"
+    print_table(f"Identified from {', '.join(found.logs)}", columns, rows, right=columns[1:3], styles=styles)
     rows = [
         (one.log, kind, f"{one.output} {SIGNALS[one.output]}", f"{one.open_loop:.3g}",
          "" if one.closed_loop is None else f"{one.closed_loop:.3g}")
@@ -167,14 +165,237 @@ def print_identified(found: Any) -> None:
     ]  # fmt: skip
     if rows:
         heads = "log", "", "of", "open loop, 0.5 s", "closed loop"
-        console().print(titled_table("Errors of the simulation, mean absolute", heads, rows, right=heads[3:]))
+        print_table("Errors of the simulation, mean absolute", heads, rows, right=heads[3:])
     for part, late in found.delays.items():
         if late:
             print(f"{part}: the input is late by {late} row{'s' if abs(late) > 1 else ''}, which is allowed for")
-    for text in found.warnings:
-        console().print(f"warning: {text}", markup=False, highlight=False, style="yellow")
+    say(*(f"warning: {text}" for text in found.warnings), style="yellow")
     if found.supply_text:
         print(found.supply_text)
-    problem = found.problem()
-    if problem:
-        console().print(f"not to be used as an actuator: {problem}", markup=False, highlight=False, style="yellow")
+    if problem := found.problem():
+        say(f"not to be used as an actuator: {problem}", style="yellow")
+
+
+@dataclasses.dataclass(frozen=True)
+class CheckLogs:
+    """Check bench logs before anything is fitted to them: rows, sensors, lags, signs, units, what does not show.
+
+    Exit status 1 if a log has errors, with which a fit would be wrong. Example: codrl-mj identify check log.csv
+    --columns time=t:s,voltage=u:V,current=i:A,position=q:rad
+    """
+
+    logs: Logs
+    columns: Columns
+    motor: str | None = None
+    """Motor of the catalogue, or a file with a datasheet, that resistance and back-EMF are compared with."""
+    rig: Literal["pendulum", "free", "load"] | None = None
+    """What the output moves, as for the fit; where it is not said, it may be a pendulum."""
+    as_json: AsJson = False
+
+    def run(self) -> tuple[int, Any]:
+        """Print a table for each log."""
+        from codrl_mj.drives import find_drive
+        from codrl_mj.identify.checks import check
+        from codrl_mj.identify.reading import read_log
+
+        motor = None if self.motor is None else find_drive(self.motor).motor
+        if not self.logs:
+            raise ValueError("no log is given: name one or more files")
+        logs = [read_log(path, self.columns) for path in self.logs]
+        found = {path: check(log, motor, self.rig) for path, log in zip(self.logs, logs, strict=True)}
+        for log, findings in zip(logs, found.values(), strict=True):
+            title = f"{log.name}: {len(log.time)} rows, {log.time[-1]:.4g} s, a row every {1e3 * log.step:.4g} ms"
+            print_findings(title, findings)
+        failed = any(one.severity == "error" for findings in found.values() for one in findings)
+        return int(failed), [{"log": path, **vars(one)} for path, findings in found.items() for one in findings]
+
+
+def print_findings(title: str, findings: Sequence[Any]) -> None:
+    """Print findings of `codrl_mj.identify.checks.check` as a table, or a line where there are none."""
+    if not findings:
+        say(f"{title}: nothing is wrong with it")
+        return
+    rows = [
+        (one.severity, one.check, "" if one.row is None else str(one.row), one.message, one.remedy) for one in findings
+    ]
+    styles = [_STYLES[one.severity] for one in findings]
+    print_table(title, ("", "check", "row", "what", "remedy"), rows, right=["row"], styles=styles)
+
+
+@dataclasses.dataclass(frozen=True)
+class Turned:
+    """What the motor turns on the bench."""
+
+    inertia: float = 0.0
+    """Inertia of the load [kg*m^2], at the output, besides the rotor's."""
+    gravity: float = 0.0
+    """m*g*l [N*m] of a pendulum that hangs at position 0."""
+    torque: Annotated[float, tyro.conf.arg(name="against")] = 0.0
+    """Constant torque [N*m] against the motor."""
+    locked: tyro.conf.FlagCreatePairsOff[bool] = False
+    """The shaft is held."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PlanExperiment:
+    """Plan an experiment: which excitation, sample rate and amplitude a motor needs, and what each would tell.
+
+    The errors are those to be expected at best, of a motor that is about as its datasheet says; of a drive at the bench
+    they are some times larger. Example: codrl-mj identify plan maxon-ec45-flat-50w --inertia 1e-4 --out plan
+    """
+
+    name: MotorName
+    load: tyro.conf.OmitArgPrefixes[Turned] = Turned()
+    current_noise: float = 0.01
+    """Noise of the current (standard deviation) as a share of the largest current."""
+    encoder: float = 4096.0
+    """Steps of the position for a turn of the output."""
+    voltage: Literal["together", "instantaneous", "mean"] = "together"
+    """The voltage changes together with the rows; else a row has what it is at the time, or its mean to the next."""
+    duration: float = 4.0
+    """Of a log [s]."""
+    max_current: float = math.inf
+    """Largest current [A] that the bench allows; that of the drive and the continuous one of a datasheet count too."""
+    out: Path | None = None
+    """Folder for excitation.csv: the voltage to play."""
+    as_json: AsJson = False
+
+    def run(self) -> tuple[int, Any]:
+        """Print the options, the best one last."""
+        from codrl_mj.drives import find_drive, find_entry
+        from codrl_mj.identify.plan import GOALS, Sensing, plan, write_excitation
+        from codrl_mj.identify.synthetic import Load
+
+        sensing, entry = Sensing(self.current_noise, self.encoder, self.voltage), find_entry(self.name)
+        bears = None if entry is None else entry.numbers.continuous_current
+        limits = self.max_current, math.inf if bears is None else bears
+        found = plan(find_drive(self.name), Load(**vars(self.load)), sensing, self.duration, *limits)
+        heads = "kHz", "V", "peak A", "rms A", *(f"{_SHORT[name]}\n≤ {GOALS[name]:.0%}" for name in GOALS)
+        rows = []
+        for option in found.options:
+            mark = "*" if option is found.best else ""
+            values = option.rate / 1e3, option.excitation.amplitude, option.peak_current, option.rms_current
+            errors = (option.errors.get(name) for name in GOALS)
+            texts = (number(error and 100.0 * error, 2) for error in errors)
+            rows.append((f"{mark}{option.excitation.kind}", *(f"{one:.3g}" for one in values), *texts))
+        print_table(f"{self.name}: errors to be expected [%]", ("excitation", *heads), rows, right=heads)
+        best = found.best.excitation
+        clock = f", a clock of {1e3 * best.clock:.3g} ms" if "prbs" in best.kind else ""
+        print(f"* play {best.kind}, {best.amplitude:.4g} V, {best.duration:g} s{clock}, rows at {found.best.rate:g} Hz")
+        if found.missed:
+            print(f"it misses the goals of {', '.join(found.missed)}: a larger current, a longer log, or other sensors")
+        if found.unknown:
+            print(f"nothing is said of {', '.join(found.unknown)}: 0 on the datasheet")
+        if self.out is not None:
+            write_excitation(self.out / "excitation.csv", found.best)
+            print(f"wrote {self.out / 'excitation.csv'}: play each voltage [V] until the time [s] of the next")
+        return 0, found
+
+
+_SHORT = {
+    "resistance": "R",
+    "inductance": "L",
+    "back_emf_constant": "kE",
+    "inertia": "J",
+    "coulomb_friction": "Coulomb",
+    "viscous_friction": "viscous",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulateLog:
+    """Simulate a bench log of a motor, through sensors and a sampler, with faults to order.
+
+    Prints the --columns that read the file. Example: codrl-mj identify simulate maxon-ec45-flat-50w --out log.csv.gz
+    --kind prbs --amplitude 12 --inertia 1e-4 --rate 5000 --sensor current:noise=0.05 position:resolution=0.0015
+    """
+
+    name: MotorName
+    out: Path
+    """File to write, .csv or .csv.gz."""
+    load: tyro.conf.OmitArgPrefixes[Turned] = Turned()
+    kind: Literal["slow_sine", "square", "chirp", "prbs", "locked_prbs"] = "prbs"
+    """Excitation."""
+    amplitude: float | None = None
+    """Largest voltage [V]; half of the supply's unless given."""
+    duration: float = 4.0
+    """[s]"""
+    frequency: float | None = None
+    """Of sine and square, where the chirp begins [Hz]; 2 of a square, 0.5 of others."""
+    clock: float | None = None
+    """Of a PRBS [s]; 4 L/R unless given."""
+    rate: float = 5000.0
+    """Rows a second [Hz]."""
+    jitter: float = 0.0
+    """Standard deviation of the stamps, as a share of the period."""
+    dropped: float = 0.0
+    """Share of rows that are lost."""
+    mean_voltage: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Rows have the mean voltage to the next row."""
+    sag: float = 0.0
+    """Resistance of the supply [ohm], of which the logged voltage knows nothing."""
+    sensor: tuple[str, ...] = ()
+    """SIGNAL:FIELD=VALUE,..., with the fields noise, resolution, bias (in SI), delay [s], gain and outliers (share)."""
+    seed: int = 0
+    """Of noise, jitter and losses."""
+
+    def run(self) -> int:
+        """Write the log."""
+        from codrl_mj.actuators import Supply
+        from codrl_mj.drives import find_drive
+        from codrl_mj.identify.synthetic import Excitation, Load, Sampler, simulate, write_log
+
+        if not self.out.name.endswith((".csv", ".csv.gz")):
+            raise ValueError(f"out = {self.out}: must end in .csv or .csv.gz")
+        drive = find_drive(self.name)
+        if self.sag != 0.0:
+            drive = drive.replaced({"supply": Supply(drive.voltage_limit, self.sag)})
+        clock = 4.0 * drive.motor.electrical_time_constant if self.clock is None else self.clock
+        frequency = (2.0 if self.kind == "square" else 0.5) if self.frequency is None else self.frequency
+        amplitude = 0.5 * drive.voltage_limit if self.amplitude is None else self.amplitude
+        excitation = Excitation(self.kind, amplitude, self.duration, frequency, clock=clock)
+        sampler = Sampler(self.rate, self.jitter, self.dropped, self.mean_voltage)
+        log = simulate(drive, excitation, Load(**vars(self.load)), _sensors(self.sensor), sampler, self.seed)
+        columns = write_log(self.out, log)
+        print(f"wrote {self.out}: {len(log.time)} rows; read it by --columns '{columns}'")
+        return 0
+
+
+def _sensors(texts: Sequence[str]) -> dict[str, Any]:
+    from codrl_mj.fields import check_names
+    from codrl_mj.identify.synthetic import Sensor
+
+    known, found = [field.name for field in dataclasses.fields(Sensor)], {}
+    for text in texts:
+        signal, _, rest = text.partition(":")
+        pairs = [pair.partition("=") for pair in rest.split(",")]
+        check_names([name for name, *_ in pairs], known, "field of a sensor")
+        try:
+            found[signal] = Sensor(**{name: float(value) for name, _, value in pairs})
+        except ValueError as error:
+            remedy = "write SIGNAL:FIELD=NUMBER,..., such as current:noise=0.02"
+            raise ValueError(f"sensor = {text!r}: {error}; {remedy}") from None
+    return found
+
+
+@dataclasses.dataclass(frozen=True)
+class ProposeColumns:
+    """Propose the --columns of a log, by its names, units and values, and print what to type next.
+
+    Example: codrl-mj identify columns log.csv
+    """
+
+    log: Annotated[tyro.conf.Positional[Path], _FILE]
+    as_json: AsJson = False
+
+    def run(self) -> tuple[int, Any]:
+        """Print the mapping, what could not be told, and the next line."""
+        from codrl_mj.identify.reading import propose_columns
+
+        found = propose_columns(self.log)
+        for doubt in found.doubts:
+            print(f"to be checked: {doubt}")
+        rig = " --rig free --known load_inertia=0" if re.search("(position|velocity)=", found.columns) else ""
+        print("next (--rig pendulum if one hangs at position 0, load if it lifts one):" if rig else "next:")
+        print(f"codrl-mj identify {shlex.quote(str(self.log))} --columns {shlex.quote(found.columns)}{rig} --out motor")
+        return 0, found

@@ -1,14 +1,14 @@
-"""`codrl-mj motor`: one dataclass for each verb."""
+"""`codrl-mj motor list`, `new`, `show`, `design` and `step`: motors that one can buy, and one's own."""
 
 import dataclasses
-import json
 import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from codrl_mj.cli.motor_choice import Choose, Feasible
+from codrl_mj.cli.parsing import AsJson
+from codrl_mj.cli.terminal import number, print_table, say
 
 MotorName = Annotated[
     tyro.conf.Positional[str],
@@ -53,9 +53,6 @@ class Changes:
 
 Settings = tyro.conf.OmitArgPrefixes[Changes]
 """Type of a verb's field for `Changes`: `--gear-ratio` and not `--changes.gear-ratio`."""
-AsJson = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(name="json", help="Print JSON, in SI units.")]
-"""Type of a verb's field that chooses JSON instead of tables."""
-
 _LISTED = {
     # column: header, its unit, SI values to it
     "name": ("name", "", 0.0),
@@ -84,20 +81,22 @@ class List:
     """Order: names from A, numbers from the highest."""
     as_json: AsJson = False
 
-    def run(self) -> int:
+    def run(self) -> tuple[int, Any]:
         """Print the table."""
-        from codrl_mj.cli.terminal import print_table
+        from codrl_mj.catalogue.datasheet import KINDS
+        from codrl_mj.catalogue.derivation import OTHER_NAMES
         from codrl_mj.drives import catalogue_rows
+        from codrl_mj.drives.abilities import ABILITY_UNITS
 
         rows = catalogue_rows(self.sort)
-        if self.as_json:
-            return _print_json(rows)
         columns = [f"{head}\n{unit}" for head, unit, _ in _LISTED.values()]
         scales = [(name, scale) for name, (*_, scale) in _LISTED.items() if name != "name"]
-        cells = [(row["name"], *(_text(row[name] and row[name] * scale, 3) for name, scale in scales)) for row in rows]
+        cells = [(row["name"], *(number(row[name] and row[name] * scale) for name, scale in scales)) for row in rows]
         print_table("Motors of the catalogue", columns, cells, right=columns[1:], whole=columns[:1], padding=(0, 0))
         print("V: nominal, –: not printed, and taken as 24 V. codrl-mj motor show NAME says where each number is from.")
-        return 0
+        kinds = {name: KINDS.get(OTHER_NAMES.get(name, name)) for name in rows[0]}
+        units = ABILITY_UNITS | {name: kind.unit for name, kind in kinds.items() if kind is not None}
+        return 0, {"units": units, "motors": rows}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,34 +118,33 @@ class Show:
     """Page with all of this, the current loop and its steps: one .html file."""
     as_json: AsJson = False
 
-    def run(self) -> int:
+    def run(self) -> tuple[int, Any]:
         """Print the tables, draw the diagram."""
         from codrl_mj.drives import explain, find_entry
-        from codrl_mj.pages.diagrams import torque_speed_diagram
 
         drive, entry = self.changes.drive(self.name), find_entry(self.name)
         found = explain(drive, entry)
-        figure = self.out and torque_speed_diagram(drive, entry and entry.numbers)
-        if self.as_json:
-            _print_json(found)
-        else:
-            _print_explained(f"{self.name}: {entry.title}" if entry else "", drive.voltage_limit, found)
+        if self.out is not None:
+            from codrl_mj.pages.diagrams import torque_speed_diagram
+
+            figure = torque_speed_diagram(drive, entry and entry.numbers)
+        _print_explained(f"{self.name}: {entry.title}" if entry else "", drive.voltage_limit, found)
         if self.html is not None:
             from codrl_mj.pages.motor import motor_page
 
             motor_page(self.name, drive, entry, self.html)
-            if not self.as_json:
-                print(f"wrote {self.html}")
-        return _save(figure, self.out, "torque_speed.png", self.as_json)
+            print(f"wrote {self.html}")
+        if self.out is not None:
+            save_plot(figure, self.out / "torque_speed.png")
+        return 0, found
 
 
 def _print_explained(title: str, volts: float, found: dict[str, Any]) -> None:
     """What it can do first, then its numbers, then what to know of them."""
-    from codrl_mj.cli.terminal import print_table, say
     from codrl_mj.drives import unknown_in_words
 
     def show(title: str, part: str) -> None:
-        rows = [(row["name"], _text(row["value"]), row["unit"]) for row in found[part]]
+        rows = [(row["name"], number(row["value"], 4), row["unit"]) for row in found[part]]
         print_table(title, ("number", "value", "unit"), rows, right=("value",))
 
     say(title)
@@ -156,7 +154,7 @@ def _print_explained(title: str, volts: float, found: dict[str, Any]) -> None:
         rows = []
         for row in found["numbers"]:
             estimated = "" if row["name"] not in found["estimated"] else " (estimated)"
-            rows.append((row["name"], _text(row["value"]), row["unit"], row["how"] + estimated, row["places"]))
+            rows.append((row["name"], number(row["value"], 4), row["unit"], row["how"] + estimated, row["places"]))
         columns = "number", "value", "unit", "how it came about", "source"
         print_table("The motor, at its rotor", columns, rows, right=("value",))
     show("As it is simulated", "drive")
@@ -173,7 +171,7 @@ def _print_explained(title: str, volts: float, found: dict[str, Any]) -> None:
 
 _DESIGNED = (
     *("rate\nkHz", "delay\nsamples", "kp\nV/A", "ki\nV/(A·s)", "gain\nmargin dB", "phase\nmargin °"),
-    *("crossover\nHz", "bandwidth\nHz", "settled to\n2 % in ms", "overshoot\n%"),
+    *("cross-\nover Hz", "band-\nwidth Hz", "2 % in\nms", "over-\nshoot %"),
 )
 
 
@@ -197,19 +195,12 @@ class Design:
     """Folder for bode.png: the loop, open and closed, with its margins."""
     as_json: AsJson = False
 
-    def run(self) -> int:
+    def run(self) -> tuple[int, Any]:
         """Print the table, draw Bode's diagram."""
-        from codrl_mj.cli.terminal import print_table, say
         from codrl_mj.drives import LoopDesign, design, designs, sampled_too_seldom
-        from codrl_mj.pages.diagrams import bode_diagram
 
         drive = self.changes.drive(self.name)
         own, every = design(drive), designs(drive)
-        figure = self.out and bode_diagram(drive)
-        if self.as_json:
-            others = [vars(one) for one in every.values() if isinstance(one, LoopDesign)]
-            _print_json({**vars(own), "others": others})
-            return _save(figure, self.out, "bode.png", True)
         late = "a sample of delay" if own.delayed else "no delay"
         print(f"{self.name} at {own.sample_rate:g} Hz, {late}: kp = {own.kp:.6g} V/A, ki = {own.ki:.6g} V/(A*s)")
         rows = []
@@ -219,13 +210,23 @@ class Design:
             if isinstance(one, LoopDesign):
                 margin = 20.0 * math.log10(one.gain_margin)
                 rest = one.kp, one.ki, margin, one.phase_margin, one.crossover, one.bandwidth
-                row += [_text(value) for value in (*rest, 1e3 * one.settling_time, 100.0 * one.overshoot)]
+                row += [number(value, 4) for value in (*rest, 1e3 * one.settling_time, 100.0 * one.overshoot)]
             rows.append(row)
-        print_table("The loop at other rates, with and without delay (*: as asked for)", _DESIGNED, rows, _DESIGNED)
+        print_table(
+            "The loop at other rates, with and without delay (*: as asked for)",
+            _DESIGNED,
+            rows,
+            _DESIGNED,
+            padding=(0, 0),
+        )
         for why in dict.fromkeys(one for one in every.values() if isinstance(one, str)):
             print(f"not possible: {why}")
         say(sampled_too_seldom(drive), drive.assumed)
-        return _save(figure, self.out, "bode.png", False)
+        if self.out is not None:
+            from codrl_mj.pages.diagrams import bode_diagram
+
+            save_plot(bode_diagram(drive), self.out / "bode.png")
+        return 0, {**vars(own), "others": [vars(one) for one in every.values() if isinstance(one, LoopDesign)]}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -245,37 +246,35 @@ class Step:
     """Folder for step.png: current, torque and voltage."""
     as_json: AsJson = False
 
-    def run(self) -> int:
+    def run(self) -> tuple[int, Any]:
         """Print the table, draw the responses."""
-        from codrl_mj.cli.terminal import print_table, say
         from codrl_mj.drives import sampled_too_seldom, step
-        from codrl_mj.pages.diagrams import step_diagram
 
         drive = self.changes.drive(self.name)
         steps = step(drive)
-        figure = self.out and step_diagram(drive, steps)
         small, constant = steps.small, drive.motor.torque_constant
         settled, amplitude = small.settling_time(), float(small.reference[-1])
         responses = steps.recoveries.items()
         recoveries = {k: {"time": one.settling_time(0.05), "undershoot": one.undershoot} for k, one in responses}
-        if self.as_json:
-            content = {"current": amplitude, "settling_time": settled, "overshoot": small.overshoot}
-            asked = {name: getattr(steps, name) for name in ("speed", "unreachable", "reachable")}
-            _print_json({"small": content, "saturated": {**asked, "recoveries": recoveries}})
-            return _save(figure, self.out, "step.png", True)
         print(
             f"{self.name}: a step to {amplitude:.4g} A, {constant * amplitude:.4g} N*m at the rotor, stays within "
-            f"2 % after {_text(1e3 * settled)} ms and overshoots by {100.0 * small.overshoot:.2g} %"
+            f"2 % after {number(1e3 * settled, 4)} ms and overshoots by {100.0 * small.overshoot:.2g} %"
         )
         asked_text = f"{steps.unreachable:.4g} A, out of reach, for 20 ms, then {steps.reachable:.4g} A"
         print(f"at {steps.speed:.4g} rad/s of the rotor it is asked for {asked_text}, which it reaches:")
         columns = "anti-windup", "within 5 %\nafter ms", "undershoot\n%"
         rows = [
-            (kind, _text(1e3 * one["time"], 3), _text(100.0 * one["undershoot"], 2)) for kind, one in recoveries.items()
+            (kind, number(1e3 * one["time"]), number(100.0 * one["undershoot"], 2)) for kind, one in recoveries.items()
         ]
         print_table("", columns, rows, right=columns[1:])
         say(sampled_too_seldom(drive), drive.assumed)
-        return _save(figure, self.out, "step.png", False)
+        if self.out is not None:
+            from codrl_mj.pages.diagrams import step_diagram
+
+            save_plot(step_diagram(drive, steps), self.out / "step.png")
+        content = {"current": amplitude, "settling_time": settled, "overshoot": small.overshoot}
+        asked = {name: getattr(steps, name) for name in ("speed", "unreachable", "reachable")}
+        return 0, {"small": content, "saturated": {**asked, "recoveries": recoveries}}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -297,61 +296,9 @@ class New:
         return 0
 
 
-@dataclasses.dataclass(frozen=True)
-class MotorTools:
-    """Motors that one can buy: list them, look at one, design its current loop, and see it step; or write one down.
+def save_plot(figure: Any, path: Path) -> None:
+    """Write a figure, and say so."""
+    from codrl_mj.pages.plots import save
 
-    New writes a file to fill in with a datasheet, show says what the motor is and can do, design what its drive makes
-    of it, step how that looks; feasible and choose say whether it can do a task. docs/own_motor.md has more.
-    Example: codrl-mj motor show maxon-ec45-flat-50w
-    """
-
-    verb: tyro.conf.OmitSubcommandPrefixes[
-        Annotated[List, tyro.conf.subcommand("list")]
-        | Annotated[New, tyro.conf.subcommand("new")]
-        | Annotated[Show, tyro.conf.subcommand("show")]
-        | Annotated[Design, tyro.conf.subcommand("design")]
-        | Annotated[Step, tyro.conf.subcommand("step")]
-        | Annotated[Feasible, tyro.conf.subcommand("feasible")]
-        | Annotated[Choose, tyro.conf.subcommand("choose")]
-    ]
-    """What to do; each has its own --help."""
-
-    def run(self) -> int:
-        """Do it."""
-        return self.verb.run()
-
-
-def _text(value: Any, digits: int = 4) -> str:
-    """A number, or what stands for one, as text."""
-    if value is None or (isinstance(value, float) and math.isnan(value)):
-        return "–"
-    if not isinstance(value, float):
-        return str(value)
-    rounded = float(f"{value:.{digits}g}")
-    return f"{rounded:,.0f}" if 1e3 <= abs(rounded) < 1e6 else f"{rounded:.{digits}g}"
-
-
-def _print_json(content: Any) -> int:
-    """Print JSON; numbers that are not finite, which it has no word for, are null."""
-    print(json.dumps(_finite(content), indent=2, allow_nan=False))
-    return 0
-
-
-def _finite(content: Any) -> Any:
-    if isinstance(content, dict):
-        return {name: _finite(value) for name, value in content.items()}
-    if isinstance(content, list | tuple):
-        return [_finite(value) for value in content]
-    return None if isinstance(content, float) and not math.isfinite(content) else content
-
-
-def _save(figure: Any, folder: Path | None, name: str, quiet: bool) -> int:
-    """Write a figure into a folder, if there is one, and say so."""
-    if folder is not None:
-        from codrl_mj.pages.plots import save
-
-        save(figure, folder / name)
-        if not quiet:
-            print(f"wrote {folder / name}")
-    return 0
+    save(figure, path)
+    print(f"wrote {path}")

@@ -6,6 +6,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
+from rich.text import Text
+
+from codrl_mj.cli.motor import save_plot
+from codrl_mj.cli.parsing import AsJson
+from codrl_mj.cli.terminal import print_table, say
 
 Asked = Annotated[
     tyro.conf.Positional[str],
@@ -45,12 +50,10 @@ class Feasible:
     out: Path | None = None
     """Folder for torque_speed.png: what was asked for over what the motor can do."""
     trust: Trust = False
+    as_json: AsJson = False
 
-    def run(self) -> int:
+    def run(self) -> tuple[int, Any]:
         """Print the bounds, and the verdict last."""
-        from rich.text import Text
-
-        from codrl_mj.cli.terminal import print_table, say
         from codrl_mj.drives import (
             HOPELESS,
             SURELY_NOT,
@@ -86,7 +89,20 @@ class Feasible:
         if self.out is not None:
             _draw(drive, demand, self.name, self.out / "torque_speed.png")
         say(found.verdict)
-        return 1 if found.verdict in (HOPELESS, SURELY_NOT) else 0
+        content = {
+            "units": _UNITS,
+            "motor": self.name,
+            "gear_ratio": 1.0 / drive.arm_radius,
+            "voltage": drive.voltage_limit,
+            "demand": demand.source,
+            "verdict": found.verdict,
+            "margin": found.margin,
+            "bounds": found.bounds,
+            **_asked(asked),
+            "best": {"gear_ratio": 1.0 / best.arm_radius, "verdict": at_best.verdict, "margin": at_best.margin},
+            "unknown": unknown,
+        }
+        return int(found.verdict in (HOPELESS, SURELY_NOT)), content
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,11 +137,14 @@ class Choose:
     out: Path | None = None
     """Folder for NAME.png of those shown: what was asked for over what the motor can do."""
     trust: Trust = False
+    as_json: AsJson = False
 
-    def run(self) -> int:
+    def run(self) -> tuple[int, Any]:
         """Print the ranking, or of several motors the best for each."""
-        from codrl_mj.cli.terminal import console, say
-        from codrl_mj.drives import choose, demand_of, demands_of
+        import yaml
+
+        from codrl_mj.drives import actuators_of, choose, demand_of, demands_of
+        from codrl_mj.runs.files import writing
 
         if self.top < 1:
             raise ValueError(f"--top {self.top}: must be >= 1")
@@ -139,8 +158,8 @@ class Choose:
             say(f"{text}arm_radius {alone.model_gear:g} undoes")
         told = [(name, choice) for name, found in ranked.items() for choice in (found if alone else found[:1])]
         shown = told[: self.top] if alone else told
-        title = f"smallest that does it with {self.margin:.0%} left first: {alone.source if alone else asked}"
-        console().print(_ranking(shown, demands, title))
+        source = alone.source if alone else asked
+        _print_ranking(shown, demands, f"smallest that does it with {self.margin:.0%} left first: {source}")
         for place, (name, choice) in enumerate(told):
             at = f"{choice.name} at {_gear(choice.drive, demands[name])}"
             rest = ", ".join(one for one in choice.unknown if one not in choice.lacks)
@@ -148,25 +167,49 @@ class Choose:
             about = "; ".join(filter(None, (choice.lacks, unknown, choice.drive.assumed)))
             if about and (choice.lacks or place < len(shown)):
                 say(f"{at}: {about}" if alone else f"{name}: {at}: {about}")
-        for name, choice in shown if self.out is not None else ():
-            assert self.out is not None
-            picture = Path(choice.name).stem if alone else name
-            _draw(choice.drive, demands[name], choice.name, self.out / f"{picture}.png")
-        self._write({name: (found[0], demands[name]) for name, found in ranked.items()})
-        return 0
+        if self.out is not None:
+            for name, choice in shown:
+                picture = Path(choice.name).stem if alone else name
+                _draw(choice.drive, demands[name], choice.name, self.out / f"{picture}.png")
+            with writing(self.out / "actuators.yaml") as temporary:
+                chosen = actuators_of({name: (found[0], demands[name]) for name, found in ranked.items()})
+                temporary.write_text(yaml.safe_dump(chosen, sort_keys=False))
+            print(f"wrote {self.out / 'actuators.yaml'}")
+        content = [
+            {
+                "drives": name or None,
+                "motor": choice.name,
+                "gear_ratio": choice.ratio,
+                "voltage": choice.drive.voltage_limit,
+                "power": choice.power,
+                "does_it": not choice.lacks,
+                "lacks": choice.lacks,
+                "margin": choice.feasibility.margin,
+                **_asked(choice.feasibility.operation),
+                "unknown": choice.unknown,
+            }
+            for name, choice in told
+        ]
+        return 0, {"units": _UNITS, "demand": source, "ranking": content}
 
-    def _write(self, choices: Mapping[str, Any]) -> None:
-        """Leave what --actuators takes."""
-        if self.out is None:
-            return
-        import yaml
 
-        from codrl_mj.drives import actuators_of
-        from codrl_mj.runs.files import writing
+_UNITS = {
+    "gear_ratio": "1, or rad/m on a slide",
+    "voltage": "V",
+    "power": "W",
+    "margin": "1",
+    "own_share": "1",
+    "peak_current": "A",
+    "rms_current": "A",
+    "energy_drawn": "J",
+    "copper_loss": "J",
+}
 
-        with writing(self.out / "actuators.yaml") as temporary:
-            temporary.write_text(yaml.safe_dump(actuators_of(choices), sort_keys=False))
-        print(f"wrote {self.out / 'actuators.yaml'}")
+
+def _asked(found: Any) -> dict[str, Any]:
+    """What an episode asks of a motor, by names in `_UNITS`."""
+    named = {name: getattr(found, name) for name in ("own_share", "rms_current", "energy_drawn", "copper_loss")}
+    return {"peak_current": float(abs(found.current).max()), **named}
 
 
 def _told_apart(words: Sequence[str]) -> tuple[str, list[str]]:
@@ -195,12 +238,8 @@ def _share(drive: Any, asked: Any) -> str:
     return f"{asked.own_share:.0%}" if drive.motor.rotor_inertia > 0.0 else "unknown"
 
 
-def _ranking(choices: Sequence[tuple[str, Any]], demands: Mapping[str, Any], title: str) -> Any:
+def _print_ranking(choices: Sequence[tuple[str, Any]], demands: Mapping[str, Any], title: str) -> None:
     """A row for each choice; of several motors, each with what it drives."""
-    from rich.text import Text
-
-    from codrl_mj.cli.terminal import titled_table
-
     columns: tuple[str, ...]
     columns = ("motor", "gear", "supply\n[V]", "power\n[W]", "does\nit", "margin", "rotor's\nshare", "peak\n[A]")
     columns += ("rms\n[A]", "drawn\n[J]", "heat\n[J]")
@@ -216,7 +255,7 @@ def _ranking(choices: Sequence[tuple[str, Any]], demands: Mapping[str, Any], tit
             *(f"{choice.feasibility.margin:.0%}", _share(choice.drive, asked), *(f"{one:.3g}" for one in numbers)),
         )
         rows.append(row)
-    return titled_table(title, (*(("drives",) if several else ()), *columns), rows, right, whole=columns)
+    print_table(title, (*(("drives",) if several else ()), *columns), rows, right, columns[1:], padding=(0, 0))
 
 
 def _draw(drive: Any, demand: Any, name: str, path: Path) -> None:
@@ -225,11 +264,8 @@ def _draw(drive: Any, demand: Any, name: str, path: Path) -> None:
 
     from codrl_mj.drives.abilities import find_entry
     from codrl_mj.pages.diagrams import torque_speed_diagram
-    from codrl_mj.pages.plots import save
 
     radius, entry = drive.motor.arm_radius, find_entry(name)
     torque = radius * (demand.torque + drive.additions.armature * demand.acceleration)
     points = np.column_stack([demand.speed / radius, torque])
-    path.parent.mkdir(parents=True, exist_ok=True)
-    save(torque_speed_diagram(drive, None if entry is None else entry.numbers, points), path)
-    print(f"wrote {path}")
+    save_plot(torque_speed_diagram(drive, None if entry is None else entry.numbers, points), path)

@@ -18,6 +18,13 @@ from codrl_mj.fields import did_you_mean
 _PATHS = ("--out", "--root", "--html", "--trajectory", "--config", "--resume", "--compare", "--policies")
 _SHORT = {"--gear-ratio": "gear ratio", "--voltage": "supply voltage"}
 
+AsJson = Annotated[
+    bool,
+    tyro.conf.FlagCreatePairsOff,
+    tyro.conf.arg(name="json", help="Print JSON and nothing else: in SI units, or with the unit beside the number."),
+]
+"""Type of a verb's field for which its `run` returns not only the exit status, but what to print as JSON."""
+
 
 def parse(kind: Any, called: str, words: Sequence[str], about: str | None = None) -> Any:
     """A dataclass with its settings; of a mapping of verbs to what they do nothing but help; SystemExit after help."""
@@ -26,7 +33,7 @@ def parse(kind: Any, called: str, words: Sequence[str], about: str | None = None
         verbs = [dataclasses.make_dataclass(name, [], namespace={"__doc__": says}) for name, says in kind.items()]
         kind = Union[tuple(Annotated[verb, tyro.conf.subcommand(verb.__name__)] for verb in verbs)]  # noqa: UP007
     errors: Any = getattr(tyro, "_errors", None)  # of no public name; without it errors come in boxes
-    hook = errors and errors.on_parse_error(lambda event: _refuse(event, kind, called, words))
+    hook = errors and errors.on_parse_error(lambda event: _refuse(event, kind, called))
     with hook or contextlib.nullcontext():
         return cli(
             kind,
@@ -37,18 +44,16 @@ def parse(kind: Any, called: str, words: Sequence[str], about: str | None = None
         )
 
 
-def _refuse(event: Any, kind: Any, called: str, words: Sequence[str]) -> None:
+def _refuse(event: Any, kind: Any, called: str) -> None:
     """Say in a sentence what the parser would in a box; of kinds of errors that are not known here its box remains."""
-    several = called in ("codrl-mj motor", "codrl-mj identify")
-    inner = [word for word in words[:1] if several and re.fullmatch(r"[a-z]+", word)]
-    shown = " ".join([called, *inner])
     match type(event).__name__:
         case "MissingSubcommand":
             known = ", ".join(event.subcommand_spec.parser_from_name)
-            raise ValueError(f"{shown} needs a verb, one of {known}; {shown} --help says more")
+            first = f"try {called} motor list, or {called} train cartpole; " if called == "codrl-mj" else ""
+            raise ValueError(f"{called} needs a verb, one of {known}; {first}{called} --help says more")
         case "MissingArgs":
             missing = [_called(one.arg) for one in event.missing_arguments]
-            raise ValueError(f"{shown} needs {', '.join(missing)}; {shown} --help says more")
+            raise ValueError(f"{called} needs {', '.join(missing)}; {called} --help says more")
         case "BadValue" if event.reason == "too_few_values":
             raise ValueError(f"{_called(event.argument)} needs a value: {_kind(event.argument)}")
         case "InvalidChoice":
@@ -61,8 +66,8 @@ def _refuse(event: Any, kind: Any, called: str, words: Sequence[str]) -> None:
             raise ValueError(f"{_called(event.argument)}{given}: must be {_kind(event.argument)}")
         case "UnrecognizedArgs":
             with contextlib.redirect_stdout(io.StringIO()) as printed, contextlib.suppress(SystemExit):
-                parse(kind, called, [*inner, "--help"])
-            _refuse_words(event.tokens, printed.getvalue(), shown)
+                parse(kind, called, ["--help"])
+            _refuse_words(event.tokens, printed.getvalue(), called)
 
 
 def _refuse_words(tokens: Sequence[str], text: str, shown: str) -> None:

@@ -11,7 +11,7 @@ from codrl_mj.cli.environments import environment
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.worlds import is_world
 from codrl_mj.fields import did_you_mean
-from codrl_mj.runs.layout import CONFIG, finished
+from codrl_mj.runs import CONFIG, finished
 from codrl_mj.tasks import TASKS
 
 SubjectWord = Annotated[
@@ -100,26 +100,22 @@ class Source:
         return Subject(policy, EnvConfig(self.task))
 
 
-def policy_and_environment(verb: Any) -> tuple[Any, EnvConfig]:
-    """What acts, and in what, by a verb's `subject` and its flags: of a task or an id random actions."""
+def policy_and_environment(verb: Any) -> tuple[Any, EnvConfig, str]:
+    """What acts, in what, and a title for both, by a verb's `subject` and its flags: random actions of a task or id."""
     if is_world(verb.subject):
         from codrl_mj.evaluation import RandomPolicy
 
         known = EnvConfig(verb.subject)
         env = environment(verb, known.task, verb.actuator_name, known)
-        if env.action == "force":
-            return RandomPolicy(env.action_space, verb.seed), env
-        with contextlib.closing(env.make()) as made:
-            return RandomPolicy(made.action_space, verb.seed), env
+        actions = env.action_space
+        if env.action != "force":
+            with contextlib.closing(env.make()) as made:
+                actions = made.action_space
+        return RandomPolicy(actions, verb.seed), env, f"{Path(verb.subject).name} on {env.through}"
     if not Path(verb.subject).exists():
         hint = did_you_mean(verb.subject, TASKS)
         raise FileNotFoundError(f"no run configuration at {verb.subject}/{CONFIG}: {hint}It is no run and no task")
     loaded = verb.source.load(Path(verb.subject))
     env = environment(verb, loaded.env.task, verb.actuator_name, loaded.env)
     loaded.check_interface(env)
-    return loaded.policy, env
-
-
-def title_of(policy: Path | str, env: EnvConfig) -> str:
-    """What acts, and what its episode runs on."""
-    return f"{Path(policy).name} on {env.through}"
+    return loaded.policy, env, f"{Path(verb.subject).name} on {env.through}"

@@ -1,16 +1,19 @@
 """What a person sees in a terminal: lines, tables and progress bars."""
 
 import contextlib
+import math
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from rich import box
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, Task, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Column, Table
 from rich.text import Text
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 
 def console() -> Console:
@@ -24,17 +27,18 @@ def say(*texts: str, style: str | None = None) -> None:
         console().print(text, markup=False, highlight=False, style=style)
 
 
-def titled_table(
+def print_table(
     title: str,
-    columns: Sequence[str] = (),
-    rows: Iterable[Iterable[Any]] = (),
+    columns: Sequence[str],
+    rows: Iterable[Iterable[Any]],
     right: Collection[str] = (),
     whole: Collection[str] = (),
+    styles: Sequence[str] = (),
     **look: Any,
-) -> Table:
-    """A table of texts, not markup, and rich's; some columns to the right, some never wrapped; titles may be empty."""
-    usual = {"title_justify": "left", "box": box.SIMPLE_HEAD, "pad_edge": False, "padding": (0, 1, 0, 0)}
-    table = Table(title=escape(title) or None, **usual | look)  # type: ignore[arg-type]
+) -> None:
+    """Print a table of texts, not markup, and rich's: some columns to the right, some never wrapped, rows in styles."""
+    usual: dict[str, Any] = {"title_justify": "left", "box": box.SIMPLE_HEAD, "pad_edge": False}
+    table = Table(title=escape(title) or None, row_styles=styles, **{**usual, "padding": (0, 1, 0, 0), **look})
     for name in columns:
         justify: Any = "right" if name in right else "left"
         table.add_column(
@@ -42,38 +46,47 @@ def titled_table(
         )
     for row in rows:
         table.add_row(*(escape(cell) if isinstance(cell, str) else cell for cell in row))
-    return table
+    console().print(table)
 
 
-def print_table(*content: Any, **look: Any) -> None:
-    """Print a `titled_table`."""
-    console().print(titled_table(*content, **look))
+def number(value: Any, digits: int = 3) -> str:
+    """A number with so many digits, thousands whole; – where there is none; a mean or a median with its interval."""
+    if isinstance(value, Mapping | tuple):
+        middle, *ends = (number(one, digits) for one in (value.values() if isinstance(value, Mapping) else value))
+        return f"{middle} [{', '.join(ends)}]"
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return "–"
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:,.0f}" if 1e3 <= abs(float(f"{value:.{digits}g}")) < 1e6 else f"{value:.{digits}g}"
 
 
-class _Line(TextColumn):
-    """Text in one line; nothing while numbers in it are not known, such as of how many a count is."""
-
-    def render(self, task: Task) -> Text:
-        """The text of a task."""
-        text = super().render(task)
-        text = Text() if "/None" in text.plain or " nan" in f" {text.plain}" else text
-        text.no_wrap, text.overflow = True, "ellipsis"
-        return text
-
-
-def progress_bar(*columns: str) -> Progress:
+def progress_bar(*columns: str) -> "Progress":
     """A progress display with the given text columns, the time elapsed and the time left.
 
-    Where all is too long for a line, the bar and the description give way.
+    Text is in one line; nothing while numbers in it are not known, such as of how many a count is. Where all is too
+    long for a line, the bar and the description give way. It goes to standard error, and nowhere where that is no
+    terminal.
     """
+    from rich.progress import BarColumn, Progress, Task, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    class Line(TextColumn):
+        def render(self, task: Task) -> Text:
+            text = super().render(task)
+            text = Text() if "/None" in text.plain or " nan" in f" {text.plain}" else text
+            text.no_wrap, text.overflow = True, "ellipsis"
+            return text
+
+    errors = Console(stderr=True)
     return Progress(
-        _Line("{task.description}", table_column=Column()),
+        Line("{task.description}", table_column=Column()),
         BarColumn(),
-        *(_Line(column) for column in columns if column),
+        *(Line(column) for column in columns if column),
         TimeElapsedColumn(table_column=Column(no_wrap=True)),
         TextColumn("left"),
         TimeRemainingColumn(table_column=Column(no_wrap=True)),
-        console=console(),
+        console=errors,
+        disable=not errors.is_terminal,
     )
 
 

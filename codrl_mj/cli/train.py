@@ -11,21 +11,25 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
+from rich.console import Console
 
 from codrl_mj.actuators.model import family_name
 from codrl_mj.agents import AGENTS
 from codrl_mj.agents.presets import SETTINGS
-from codrl_mj.cli.environments import environment, through
-from codrl_mj.cli.fields import (
+from codrl_mj.cli.environments import (
     AS_CONFIGURED,
     ActuatorName,
+    environment,
     environment_fields,
     flags,
     scan,
+    through,
 )
-from codrl_mj.cli.terminal import console, progress_bar, say
+from codrl_mj.cli.parsing import AsJson
+from codrl_mj.cli.terminal import progress_bar, say
 from codrl_mj.envs.worlds import find_world
-from codrl_mj.runs.layout import PROGRESS, finished
+from codrl_mj.runs import PROGRESS, RESULT, finished
+from codrl_mj.runs.files import read_json
 from codrl_mj.runs.summaries import last_report
 from codrl_mj.tasks import TASKS
 from codrl_mj.training.config import TrainConfig, default_agent, read_config
@@ -118,13 +122,14 @@ class Train:
     """Write events for TensorBoard, if it is installed."""
     wandb: str | None = None
     """Weights & Biases project to report to as well."""
+    as_json: AsJson = False
     for_line = staticmethod(train_verb)
 
-    def run(self: Any) -> int:
+    def run(self: Any) -> tuple[int, Any]:
         """Train, with a progress bar."""
         from codrl_mj.training import train
 
-        if _task(self.task) != _task(self.base.task) and self.resume is None:
+        if find_world(self.task).reference != find_world(self.base.task).reference and self.resume is None:
             raise ValueError(f"name the task before the flags, as in codrl-mj train {self.task} --seed 1")
         if self.resume is not None and self.out not in (None, self.resume):
             raise ValueError(f"--out {self.out}: a run continues in its own folder, {self.resume}: leave --out out")
@@ -144,7 +149,7 @@ class Train:
         following = "next: codrl-mj evaluate" + (" --trust" if own else "")
         if self.resume is not None and finished(self.resume) and config == load_config(self.resume, self.trust):
             print(f"{self.resume} is finished already; {following} {self.resume}")
-            return 0
+            return 0, _came_to(self.resume) if self.as_json else None
         name = "-".join(re.sub(r"[^\w.]+", "_", part) for part in parts)
         out = self.resume or self.out or Path("runs") / name
         admit(out, config, self.resume is not None, self.accept_changes)
@@ -160,7 +165,13 @@ class Train:
                 wandb=self.wandb,
             )
         print(f"wrote {out}: see {out / 'learning_curve.png'}; {following} {out}")
-        return 0
+        return 0, _came_to(out) if self.as_json else None
+
+
+def _came_to(run: Path) -> dict[str, Any]:
+    """What there is to say of a finished run."""
+    units = {"mean_return": "reward", "evaluation_return": "reward", "best.return": "reward", "seconds": "s"}
+    return {"run": run, **read_json(run / RESULT, "result of a run"), "units": units}
 
 
 @contextlib.contextmanager
@@ -172,7 +183,7 @@ def training_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> Iterator[None
         "end torque err {task.fields[torque_error]:.2g} N·m",
         "{task.fields[steps_per_second]:.0f}/s",
     )
-    with progress_bar(*(one for one in columns if "torque" not in one or console().width >= 100)) as bar:
+    with progress_bar(*(one for one in columns if "torque" not in one or Console(stderr=True).width >= 100)) as bar:
         rows = {}
         for name, (config, folder) in runs.items():
             unit, total = (
@@ -220,8 +231,3 @@ def _base(chosen: argparse.Namespace) -> TrainConfig:
     agent = chosen.agent if chosen.agent in AGENTS or ":" in str(chosen.agent) else default_agent(task)
     settings = chosen.settings if chosen.settings in SETTINGS else "default"
     return TrainConfig.preset(task, agent, settings, find_world(task).default_actuator)
-
-
-def _task(name: str) -> str:
-    """A task's one name, whichever of its names is given."""
-    return find_world(name).reference

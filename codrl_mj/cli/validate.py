@@ -9,6 +9,7 @@ import tyro
 from rich import box
 from rich.text import Text
 
+from codrl_mj.cli.parsing import AsJson
 from codrl_mj.cli.terminal import console, print_table, progress_bar, say
 from codrl_mj.tasks import TASKS, find_task
 from codrl_mj.validation import GROUPS, Caught, Certificate, Check
@@ -38,8 +39,9 @@ class Validate:
     """Put the certificate to the test as well: make faults on purpose and see which checks fail."""
     out: Path | None = None
     """Folder for the certificate: certificate.json, and certificate.html with plots."""
+    as_json: AsJson = False
 
-    def run(self) -> int:
+    def run(self) -> tuple[int, Any]:
         """Validate and print a table for each group."""
         from codrl_mj.validation import own_model, try_mutations, validate, validate_model
         from codrl_mj.validation.mutations import faulty, unfailed
@@ -70,7 +72,18 @@ class Validate:
 
             for file in write(certificate, self.out, caught):
                 print(f"wrote {file}")
-        return 0 if certificate.passed and not blind and all(outcome.failed for outcome in caught) else 1
+        failed = not certificate.passed or blind or not all(outcome.failed for outcome in caught)
+        faults = [
+            {
+                "fault": one.mutation,
+                "task": one.task,
+                "checks": one.made,
+                "failed": [check.name for check in one.failed],
+            }
+            for one in caught
+        ]
+        told = {"mutations": faults, "failed_by_no_fault": [check.name for check in blind]} if self.mutations else {}
+        return int(bool(failed)), certificate.as_mapping() | told
 
 
 _FRAMED: dict[str, Any] = {"box": box.HEAVY_HEAD, "pad_edge": True, "padding": (0, 1)}

@@ -5,7 +5,7 @@ import copy
 import dataclasses
 import json
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -219,16 +219,6 @@ class _Recording:
         )
 
 
-@contextlib.contextmanager
-def _sampling_from(seed: int) -> Iterator[None]:
-    """Seed the generator that torch's policies sample actions from, and leave it as it was found."""
-    import torch
-
-    with torch.random.fork_rng(devices=[]):
-        torch.default_generator.manual_seed(seed)
-        yield
-
-
 def run_episodes(
     policy: Policy,
     make: MakeEnv,
@@ -260,7 +250,12 @@ def run_episodes(
         raise ValueError(f"seed = {seed}: must be >= 0")
     recordings = [_Recording(make(), seed + index) for index in range(episodes)]
     running = recordings
-    with contextlib.nullcontext() if deterministic else _sampling_from(seed):
+    with contextlib.ExitStack() as stack:
+        if not deterministic:  # the generator that torch's policies sample from is left as it was found
+            import torch
+
+            stack.enter_context(torch.random.fork_rng(devices=[]))
+            torch.default_generator.manual_seed(seed)
         while running:
             observations = np.stack([recording.observations[-1] for recording in running])
             actions, _ = policy.predict(observations, deterministic=deterministic)

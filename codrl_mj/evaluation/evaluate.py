@@ -118,15 +118,15 @@ class Evaluation:
         Intervals are mappings of `mean`, `low` and `high`, quartiles of `median`, `low` and `high`; `units` has the
         unit of every measure.
         """
-        named = {name: _plain(value) for name, value in vars(self).items()}
+        named = {
+            name: value._asdict()
+            if isinstance(value, Interval | Quartiles)
+            else [*value]
+            if type(value) is tuple
+            else value
+            for name, value in vars(self).items()
+        }
         return named | {"units": {name: field.metadata["unit"] for name, field in MEASURES.items()}}
-
-
-def _plain(value: Any) -> Any:
-    """The value as JSON has it."""
-    if isinstance(value, Interval | Quartiles):
-        return value._asdict()
-    return list(value) if isinstance(value, tuple) else value
 
 
 MEASURES: dict[str, dataclasses.Field[Any]] = {

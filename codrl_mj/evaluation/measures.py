@@ -1,5 +1,6 @@
 """What episodes are reduced to, as pure functions: means with intervals, rates, delays, energies."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -28,26 +29,33 @@ class Quartiles(NamedTuple):
 
 
 def bootstrap_mean(values: np.ndarray) -> Interval:
-    """Mean and 95 % percentile-bootstrap interval (scipy, 9999 resamples, fixed seed).
+    """Mean and 95 % percentile-bootstrap interval: 9999 resamples, fixed seed; to the bit `scipy.stats.bootstrap`'s.
 
     Args:
         values: shape (n,), n >= 1.
     """
-    mean = float(np.mean(values))
-    if np.ptp(values) == 0:  # scipy's bootstrap warns about a sample without spread
+    mean, count = float(np.mean(values)), len(values)
+    if np.ptp(values) == 0:
         return Interval(mean, mean, mean)
-    from scipy.stats import bootstrap
+    means = np.sort(values[np.random.default_rng(0).integers(0, count, (_RESAMPLES, count))].mean(axis=-1))
+    tail = (1 - 0.95) / 2
+    below, share = np.divmod(np.array([tail, 1 - tail]) * (_RESAMPLES - 1), 1.0)  # linear between two of them
+    low, high = (1 - share) * means[below.astype(int)] + share * means[below.astype(int) + 1]
+    return Interval(mean, float(low), float(high))
 
-    interval = bootstrap((values,), np.mean, method="percentile", rng=0).confidence_interval
-    return Interval(mean, float(interval.low), float(interval.high))
+
+_RESAMPLES = 9999
+_NORMAL = 1.959963984540054
+"""Quantile of the normal distribution at 97.5 %."""
 
 
 def wilson_rate(successes: int, trials: int) -> Interval:
-    """Share of successes, and its 95 % interval by Wilson's score (scipy): good for few trials and shares of 0 or 1."""
-    from scipy.stats import binomtest
-
-    interval = binomtest(successes, trials).proportion_ci(confidence_level=0.95, method="wilson")
-    return Interval(successes / trials, float(interval.low), float(interval.high))
+    """Share of successes, and its 95 % interval by Wilson's score: good for few trials and shares of 0 or 1."""
+    share, square = successes / trials, _NORMAL**2
+    scale = 2 * (trials + square)
+    centre = (2 * trials * share + square) / scale
+    half = _NORMAL / scale * math.sqrt(4 * trials * share * (1 - share) + square)
+    return Interval(share, 0.0 if successes == 0 else centre - half, 1.0 if successes == trials else centre + half)
 
 
 def interquartile_mean(values: np.ndarray) -> float:
@@ -56,9 +64,8 @@ def interquartile_mean(values: np.ndarray) -> float:
     Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice" (2021), recommend it for
     returns: outliers move it less than the mean, and it uses more of the values than the median.
     """
-    from scipy.stats import trim_mean
-
-    return float(trim_mean(values, 0.25))
+    quarter = len(values) // 4
+    return float(np.mean(np.partition(values, (quarter, len(values) - quarter - 1))[quarter : len(values) - quarter]))
 
 
 def quartiles(values: np.ndarray) -> Quartiles:
@@ -87,7 +94,7 @@ def delay(
     None where either signal is constant, where even the highest peak is below `LEAST_CORRELATION`, or where there is
     none.
     """
-    from scipy.signal import correlate
+    from scipy import fft  # scipy.signal takes most of a second to import
 
     reach = int(np.mean([len(signal) for signal in desired]) / 2)
     every_desired, every_actual = np.concatenate(desired), np.concatenate(actual)
@@ -100,7 +107,9 @@ def delay(
         x, y = signal - means[place % motors][0], following - means[place % motors][1]
         here = lags < len(x)
         shifts = lags[here]
-        products[here] += correlate(y, x, method="fft")[shifts + len(x) - 1]
+        size = fft.next_fast_len(2 * len(x) - 1, real=True)
+        correlated = fft.irfft(fft.rfft(y, size) * fft.rfft(x[::-1], size), size)
+        products[here] += correlated[shifts + len(x) - 1]
         desired_squares[here] += _sums_between(x * x, np.maximum(-shifts, 0), len(x) - np.maximum(shifts, 0))
         actual_squares[here] += _sums_between(y * y, np.maximum(shifts, 0), len(y) - np.maximum(-shifts, 0))
     scale = np.sqrt(desired_squares * actual_squares)

@@ -19,8 +19,8 @@ from codrl_mj.pages.diagrams import held_step
 from codrl_mj.pages.episode import Shown, episode_section, show
 from codrl_mj.pages.motor import loop_section
 from codrl_mj.pages.plots import Curve, Plot
+from codrl_mj.runs import BEST, EPISODES, PROGRESS, finished, told_apart
 from codrl_mj.runs.files import check_page, read_json
-from codrl_mj.runs.layout import BEST, EPISODES, PROGRESS, finished, told_apart
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.runs.summaries import RunSummary, compare, read_run
 from codrl_mj.training.folder import load_config

@@ -13,8 +13,8 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import trusting
 from codrl_mj.agents import AgentConfig, agent_from_mapping
+from codrl_mj.runs import DESCRIPTION, DIGEST, WEIGHTS
 from codrl_mj.runs.files import check_digest, read_json, sealed, write_json, writing
-from codrl_mj.runs.layout import DESCRIPTION, DIGEST, WEIGHTS
 
 FORMAT = "codrl_mj policy 2"
 _ENTRIES = {"format", DIGEST, "agent", "observation_space", "action_space"}

@@ -14,8 +14,7 @@ from typing import Any, Literal
 from codrl_mj.actuators import actuator_from_mapping, name_of, trusting
 from codrl_mj.envs.worlds import patterns_of
 from codrl_mj.fields import leaves
-from codrl_mj.runs.files import check_digest, read_json
-from codrl_mj.runs.layout import (
+from codrl_mj.runs import (
     BEST,
     CONFIG,
     DESCRIPTION,
@@ -27,6 +26,7 @@ from codrl_mj.runs.layout import (
     WEIGHTS,
     finished,
 )
+from codrl_mj.runs.files import check_digest, read_json
 from codrl_mj.tasks import TASKS
 
 
@@ -114,7 +114,12 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
     if done and missing:
         problems.append(f"it is finished, but {' and '.join(missing)} is missing: copy the folder anew")
     for folder in (path, path / BEST):
-        _check_policy(folder, problems)
+        described = _mapping(folder / DESCRIPTION, "policy description", problems)
+        try:
+            if described is not None and (folder / WEIGHTS).is_file():
+                check_digest(folder / WEIGHTS, (folder / WEIGHTS).read_bytes(), described.get(DIGEST), DESCRIPTION)
+        except (ValueError, OSError) as error:
+            problems.append(str(error))
     reported, learned = _first("steps", progress), _first("steps", result)
     if None not in (reported, learned) and reported != learned:
         problems.append(f"{path / PROGRESS} ends at step {reported:.0f} of {learned:.0f}: copy it anew")
@@ -142,16 +147,6 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
             {**config, **{key: one for key, one in (content or {}).items() if key not in ("train", "labels")}}
         ),
     )
-
-
-def _check_policy(folder: Path, problems: list[str]) -> None:
-    """Note if a folder's policy, where there is one, is damaged or not the one that it says."""
-    described = _mapping(folder / DESCRIPTION, "policy description", problems)
-    try:
-        if described is not None and (folder / WEIGHTS).is_file():
-            check_digest(folder / WEIGHTS, (folder / WEIGHTS).read_bytes(), described.get(DIGEST), DESCRIPTION)
-    except (ValueError, OSError) as error:
-        problems.append(str(error))
 
 
 def _mapping(path: Path, what: str, problems: list[str]) -> Mapping[str, Any] | None:
@@ -277,10 +272,8 @@ class Comparison:
     """Dotted name of a setting that differs -> its values."""
     results: Mapping[str, tuple[Any, ...]]
     """Name of a result -> its values; measures of the evaluation are numbers, or mappings of a mean and an interval."""
-
-    def as_mapping(self) -> dict[str, Any]:
-        """The comparison as JSON-serialisable values."""
-        return vars(self)
+    units: Mapping[str, str]
+    """Name of a result -> its unit."""
 
 
 def compare(runs: Sequence[RunSummary]) -> Comparison:
@@ -297,10 +290,14 @@ def compare(runs: Sequence[RunSummary]) -> Comparison:
     }
     evaluations = [run.evaluation or {} for run in runs]
     units = [one.get("units") for one in evaluations]
-    for measure in dict.fromkeys(name for one in units if isinstance(one, Mapping) for name in one):
+    measures = {name: str(unit) for one in units if isinstance(one, Mapping) for name, unit in one.items()}
+    for measure in measures:
         results[f"evaluation.{measure}"] = tuple(one.get(measure) for one in evaluations)
+    results = {name: values for name, values in results.items() if any(value is not None for value in values)}
+    known_units = {"seconds": "s"} | {f"evaluation.{measure}": unit for measure, unit in measures.items()}
     return Comparison(
         names=tuple(run.name for run in runs),
         configuration={key: values for key, values in settings.items() if any(value != values[0] for value in values)},
-        results={name: values for name, values in results.items() if any(value is not None for value in values)},
+        results=results,
+        units={name: unit for name, unit in known_units.items() if name in results},
     )

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
-from codrl_mj.training.run import Stop, TrainingStoppedError, stopping
+from codrl_mj.training.run import TrainingStoppedError, stopping
 
 BACKENDS = ("local", "ray")
 """Where calls are computed: in processes of this machine, or on a Ray cluster."""
@@ -57,7 +57,8 @@ def compute(function: Callable[..., Any], work: Iterable[tuple[Any, ...]], worke
     import joblib
 
     local = workers.backend == "local"
-    with _backend(workers) as backend, stopping(signal.SIGINT) if local else contextlib.nullcontext(Stop()) as stop:
+    none: list[int] = []
+    with _backend(workers) as backend, stopping(signal.SIGINT) if local else contextlib.nullcontext(none) as asked:
         parallel = joblib.Parallel(
             n_jobs=workers.jobs,
             backend=backend,
@@ -67,13 +68,14 @@ def compute(function: Callable[..., Any], work: Iterable[tuple[Any, ...]], worke
         )
         call = joblib.delayed(_call)
         parent = os.getpid() if local else None
-        begun = itertools.takewhile(lambda _: stop.signal is None, calls)
+        begun = itertools.takewhile(lambda _: not asked, calls)
         for result, stopped_by in parallel(call(function, arguments, parent) for arguments in begun):
-            stop.signal = stop.signal or stopped_by
             if stopped_by is None:
                 yield result
-        if stop.signal is not None:
-            raise TrainingStoppedError("stopped: the same command goes on from the last checkpoints", stop.signal)
+            else:
+                asked.append(stopped_by)
+        if asked:
+            raise TrainingStoppedError("stopped: the same command goes on from the last checkpoints", asked[0])
 
 
 def _call(function: Callable[..., Any], arguments: tuple[Any, ...], parent: int | None) -> tuple[Any, int | None]:

@@ -11,7 +11,7 @@ from codrl_mj.agents import AgentConfig, agent_from_mapping, check_fits
 from codrl_mj.agents.ppo import PPOConfig
 from codrl_mj.agents.presets import ELSEWHERE, find_preset
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.fields import check_names, leaves
+from codrl_mj.fields import check, check_names, integer, leaves
 
 EVALUATION_SEED = 1_000_000
 """Seed of the first episode in which a trained policy is evaluated, away from those that trainings start from."""
@@ -29,19 +29,19 @@ class TrainConfig:
     """What to train in: task, actuator and all else."""
     agent: AgentConfig = PPOConfig()
     """The agent's settings."""
-    seed: int = 0
+    seed: int = integer(0, least=0, most=2**32 - 1)
     """Seed of weights, actions and environments, from 0 to 2**32 - 1."""
-    total_steps: int | None = 200_000
+    total_steps: int | None = integer(200_000, least=1, optional=True)
     """Environment steps in all, >= 1; rounded up to whole rollouts. None: until `total_episodes`."""
-    num_envs: int = 8
+    num_envs: int = integer(8, least=1)
     """Environments side by side, >= 1."""
-    total_episodes: int | None = None
+    total_episodes: int | None = integer(None, least=1)
     """Training episodes in all, >= 1, where they and not the steps are counted; None: until `total_steps`."""
-    checkpoint_interval: int = 20_000
+    checkpoint_interval: int = integer(20_000, least=1)
     """Environment steps between two checkpoints, >= 1; the next end of a rollout counts."""
-    evaluation_interval: int = 20_000
+    evaluation_interval: int = integer(20_000, least=1)
     """Environment steps between two evaluations of the greedy policy, >= 1, of which the best policy is kept."""
-    evaluation_episodes: int = 20
+    evaluation_episodes: int = integer(20, least=1)
     """Episodes of each evaluation, >= 1: of the task as Gymnasium poses it, on the actuator trained through."""
 
     def __post_init__(self) -> None:
@@ -50,23 +50,11 @@ class TrainConfig:
             if not isinstance(getattr(self, name), kind):
                 raise ValueError(f"TrainConfig.{name} = {getattr(self, name)!r}: must be a {kind.__name__}")
         check_fits(self.agent.known_as(), self.env)
-        for name in ("num_envs", "checkpoint_interval", "evaluation_interval", "evaluation_episodes"):
-            self._check_integer(name, 1)
-        self._check_integer("seed", 0, 2**32 - 1)
-        budgets = [name for name in ("total_steps", "total_episodes") if getattr(self, name) is not None]
-        if not budgets:
+        check(self)
+        if self.total_steps is None and self.total_episodes is None:
             raise ValueError("TrainConfig.total_steps = None: must be an integer >= 1, or total_episodes must be one")
-        for name in budgets:
-            self._check_integer(name, 1)
         if self.total_steps is None and self.env.time_limit is None:
             raise ValueError(f"TrainConfig.total_steps = None: {self.task} has no time limit: give max_episode_steps")
-
-    def _check_integer(self, name: str, least: int, most: int | None = None) -> None:
-        value = getattr(self, name)
-        whole = isinstance(value, int) and not isinstance(value, bool)
-        if not whole or value < least or (most is not None and value > most):
-            bound = f">= {least}" if most is None else f"from {least} to {most}"
-            raise ValueError(f"TrainConfig.{name} = {value!r}: must be an integer {bound}")
 
     @property
     def task(self) -> str:

@@ -14,8 +14,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from codrl_mj.actuators import label_of, labelled, trusting
-from codrl_mj.runs.files import check_writable, leftovers, read_json, sealed, write_json
-from codrl_mj.runs.layout import (
+from codrl_mj.runs import (
     BEST,
     CHECKPOINT,
     CHECKPOINTS,
@@ -30,6 +29,7 @@ from codrl_mj.runs.layout import (
     TENSORBOARD,
     finished,
 )
+from codrl_mj.runs.files import check_writable, leftovers, read_json, sealed, write_json
 from codrl_mj.training.config import TrainConfig
 
 _FILES = {CONFIG, RESULT, EVALUATION, PROGRESS, EPISODES, CURVE, *POLICY_FILES}
@@ -38,6 +38,15 @@ _PACKAGES = ("codrl-mj", "gymnasium", "mujoco", "numba", "numpy", "stable-baseli
 
 class RunInUseError(RuntimeError):
     """Another process trains in a run folder."""
+
+
+class TrainingStoppedError(Exception):
+    """A training was asked to stop by a signal; it can be continued."""
+
+    def __init__(self, message: str, signal_number: int) -> None:
+        """Keep the signal, for the exit status."""
+        super().__init__(message)
+        self.signal_number = signal_number
 
 
 def load_config(run: Path, trust: bool = False) -> TrainConfig:
@@ -85,25 +94,6 @@ def unused(run: Path) -> bool:
     return {path.name for path in run.iterdir()} <= {LOCK, *(path.name for path in _leftovers(run))}
 
 
-def remove_leftovers(run: Path) -> None:
-    """Delete what a killed process left half-written. Only for who owns the folder: others' are in use."""
-    for path in [*_leftovers(run), *_leftovers(run / BEST), *_leftovers(run / CHECKPOINTS)]:
-        path.unlink(missing_ok=True)
-
-
-def clear(run: Path) -> None:
-    """Delete what a training has written that failed before it kept anything; nothing once there is a policy of it."""
-    remove_leftovers(run)
-    if [*run.glob(f"{CHECKPOINTS}/*"), *run.glob(f"{BEST}/*")]:
-        return
-    for name in (CONFIG, PROGRESS, EPISODES, LOCK):
-        (run / name).unlink(missing_ok=True)
-    shutil.rmtree(run / TENSORBOARD, ignore_errors=True)
-    for name in (CHECKPOINTS, BEST):
-        with contextlib.suppress(OSError):
-            (run / name).rmdir()
-
-
 def standing(run: Path) -> str:
     """What there is to go on from in the folder of a training that was broken off, and how."""
     names = (CHECKPOINT.fullmatch(path.name) for path in run.glob(f"{CHECKPOINTS}/*"))
@@ -118,6 +108,12 @@ def standing(run: Path) -> str:
 def _leftovers(place: Path) -> list[Path]:
     """Half-written files of a training."""
     return [path for path, name in leftovers(place) if name in _FILES or CHECKPOINT.fullmatch(name)]
+
+
+def _sweep(run: Path) -> None:
+    """Delete what a killed process left half-written. Only for who owns the folder: others' are in use."""
+    for path in [*_leftovers(run), *_leftovers(run / BEST), *_leftovers(run / CHECKPOINTS)]:
+        path.unlink(missing_ok=True)
 
 
 def start_folder(run: Path, config: TrainConfig) -> None:
@@ -180,6 +176,30 @@ def _code_digest(*others: str | Path) -> str:
         if file is not None and not any(Path(file).is_relative_to(ours) for ours in (package, asset_folder())):
             digest.update(Path(file).read_bytes())
     return digest.hexdigest()
+
+
+@contextlib.contextmanager
+def taken(run: Path, exists: bool) -> Iterator[None]:
+    """Own a run folder while the block runs, and leave no new one in which nothing was learned when it raises."""
+    made = [path for path in (run, *run.parents) if not path.exists()]
+    with owned(run):
+        if finished(run) or not ((run / CONFIG).exists() if exists else unused(run)):
+            raise RunInUseError(f"{run}: another process trained in it in the meantime; start again")
+        _sweep(run)
+        try:
+            yield
+        except BaseException as error:
+            if exists or isinstance(error, TrainingStoppedError):  # else all of it is this training's
+                raise
+            _sweep(run)
+            if not [*run.glob(f"{CHECKPOINTS}/*"), *run.glob(f"{BEST}/*")]:
+                for name in (CONFIG, PROGRESS, EPISODES, LOCK):
+                    (run / name).unlink(missing_ok=True)
+                shutil.rmtree(run / TENSORBOARD, ignore_errors=True)
+                for path in (run / CHECKPOINTS, run / BEST, *made):
+                    with contextlib.suppress(OSError):  # a folder that others use by now stays
+                        path.rmdir()
+            raise
 
 
 @contextlib.contextmanager

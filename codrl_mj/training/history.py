@@ -5,7 +5,6 @@ import dataclasses
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -84,47 +83,34 @@ def save_learning_curve(path: Path, title: str, episodes: np.ndarray, reports: n
 
 
 class GrowingTable:
-    """A CSV file of numbers that grows row by row, and the rows in memory."""
+    """A CSV file of numbers that grows, and its rows in memory."""
 
     def __init__(self, path: Path, columns: Sequence[str], rows: np.ndarray | None = None) -> None:
         """Write the file anew, with the rows (n, columns) that a checkpoint has."""
-        self._columns = columns
-        self._rows: list[tuple[float, ...]] = [] if rows is None else [tuple(row) for row in rows.tolist()]
-        with writing(path) as temporary, temporary.open("w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(columns)
-            writer.writerows(map(_plain, self._rows))
-        self._file = path.open("a", newline="")
-        self._writer = csv.writer(self._file)
+        self.rows: list[tuple[float, ...]] = [] if rows is None else [tuple(row) for row in rows.tolist()]
+        self._path, self._columns, self._kept = path, columns, 0
+        with writing(path) as temporary:
+            temporary.write_text(f"{','.join(columns)}\r\n", newline="")
+            self.flush(temporary)
 
     def add(self, row: Iterable[float]) -> None:
-        """Append a row."""
-        self._rows.append(tuple(float(value) for value in row))
-        self._writer.writerow(_plain(self._rows[-1]))
+        """A row more, in memory."""
+        self.rows.append(tuple(float(value) for value in row))
 
-    def flush(self) -> None:
-        """Bring what was added to the file."""
-        self._file.flush()
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-    def __len__(self) -> int:
-        """The number of rows."""
-        return len(self._rows)
+    def flush(self, path: Path | None = None) -> None:
+        """Bring what was added to the file; whole numbers as integers, so that a step is not `1000.0`."""
+        with (path or self._path).open("a", newline="") as file:
+            csv.writer(file).writerows(
+                [int(one) if math.isfinite(one) and one == int(one) else one for one in row]
+                for row in self.rows[self._kept :]
+            )
+        self._kept = len(self.rows)
 
     def array(self) -> np.ndarray:
         """The rows, shape (n, columns)."""
-        return np.array(self._rows, dtype=np.float64).reshape(-1, len(self._columns))
+        return np.array(self.rows, dtype=np.float64).reshape(-1, len(self._columns))
 
     def last_mean(self, column: str, count: int = WINDOW) -> float:
         """Mean over the last rows; NaN if there are none."""
-        index = self._columns.index(column)
-        values = [row[index] for row in self._rows[-count:]]
+        values = [row[self._columns.index(column)] for row in self.rows[-count:]]
         return sum(values) / len(values) if values else math.nan
-
-
-def _plain(row: Sequence[float]) -> list[Any]:
-    """Whole numbers as integers, so that a step is not `1000.0`."""
-    return [int(value) if math.isfinite(value) and value == int(value) else value for value in row]

@@ -9,28 +9,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from codrl_mj.runs import CURVE, EVALUATION, RESULT, finished
 from codrl_mj.runs.files import sealed, write_json
-from codrl_mj.runs.layout import CONFIG, CURVE, EVALUATION, RESULT, finished
 from codrl_mj.training import folder
 from codrl_mj.training.config import TrainConfig
-from codrl_mj.training.folder import RunInUseError
+from codrl_mj.training.folder import TrainingStoppedError
 from codrl_mj.training.history import Progress
-
-
-class TrainingStoppedError(Exception):
-    """A training was asked to stop by a signal; it can be continued."""
-
-    def __init__(self, message: str, signal_number: int) -> None:
-        """Keep the signal, for the exit status."""
-        super().__init__(message)
-        self.signal_number = signal_number
-
-
-class Stop:
-    """A wish to stop."""
-
-    signal: int | None = None
-    """The signal that it came with; None before."""
 
 
 def train(
@@ -80,57 +64,29 @@ def train(
     import torch
 
     importlib.import_module("matplotlib.figure")  # what is missing is missed now and not in the end
-    from codrl_mj.envs.sb3 import ActuatedVecEnv
     from codrl_mj.training.watcher import LearningEnded, Watcher
 
     torch.set_num_threads(1)  # networks this small run several times slower on two
-    with _taking(out, exists), stopping(signal.SIGINT, signal.SIGTERM) as stop:
+    with folder.taken(out, exists), stopping(signal.SIGINT, signal.SIGTERM) as asked:
         envs = ActuatedVecEnv(config.env.world.vector(config.env, config.num_envs))
         with contextlib.closing(envs), _reporting_to(wandb, out, config):
             model = config.agent.make_model(envs, config.seed)
-            watcher = Watcher(config, out, stop, on_progress, tensorboard)
+            watcher = Watcher(config, out, asked, on_progress, tensorboard)
             with contextlib.closing(watcher), watcher.explaining():
                 if not exists:
                     folder.start_folder(out, config)
+                steps = config.total_steps
+                if steps is None:  # those of the longest possible episodes where these are counted
+                    steps = (config.total_episodes or 0) * (config.env.time_limit or 0) * config.num_envs
                 with contextlib.suppress(LearningEnded):
-                    model.learn(_step_limit(config), callback=watcher, log_interval=None)
-                if stop.signal is not None and not watcher.complete:
+                    model.learn(steps, callback=watcher, log_interval=None)
+                if asked and not watcher.complete:
                     raise TrainingStoppedError(
                         f"stopped after {watcher.saved_steps:,} steps: continue with codrl-mj train --resume {out}",
-                        stop.signal,
+                        asked[-1],
                     )
                 _finish(config, out, model, watcher)
     return out
-
-
-@contextlib.contextmanager
-def _taking(out: Path, exists: bool) -> Iterator[None]:
-    """Own a run folder while the block runs, and leave no new one in which nothing was learned when it raises."""
-    made = [path for path in (out, *out.parents) if not path.exists()]
-    with folder.owned(out):
-        if finished(out) or not ((out / CONFIG).exists() if exists else folder.unused(out)):
-            raise RunInUseError(f"{out}: another process trained in it in the meantime; start again")
-        folder.remove_leftovers(out)
-        try:
-            yield
-        except TrainingStoppedError:
-            raise
-        except BaseException:
-            if not exists:  # so that all of it is this training's
-                with contextlib.suppress(OSError):  # a folder that others use by now stays
-                    folder.clear(out)
-                    for path in made:
-                        path.rmdir()
-            raise
-
-
-def _step_limit(config: TrainConfig) -> int:
-    """Steps after which training ends at the latest: those of the longest possible episodes where these are counted."""
-    if config.total_steps is not None:
-        return config.total_steps
-    assert config.total_episodes is not None
-    assert config.env.time_limit is not None
-    return config.total_episodes * config.env.time_limit * config.num_envs
 
 
 def _finish(config: TrainConfig, out: Path, model: Any, watcher: Any) -> None:
@@ -146,21 +102,21 @@ def _finish(config: TrainConfig, out: Path, model: Any, watcher: Any) -> None:
 
 
 @contextlib.contextmanager
-def stopping(*signals: int) -> Iterator[Stop]:
-    """Turn the first of some signals within the block into a wish; a second SIGINT raises KeyboardInterrupt."""
-    stop = Stop()
+def stopping(*signals: int) -> Iterator[list[int]]:
+    """Turn the first of some signals within the block into a wish, the list's entry; a second SIGINT raises."""
+    asked: list[int] = []
     if threading.current_thread() is not threading.main_thread():
-        yield stop  # only the main thread may handle signals
+        yield asked  # only the main thread may handle signals
         return
 
     def wish(number: int, _: Any) -> None:
-        if stop.signal is not None and number == signal.SIGINT:
+        if asked and number == signal.SIGINT:
             raise KeyboardInterrupt
-        stop.signal = number
+        asked.append(number)
 
     before = {number: signal.signal(number, wish) for number in signals}
     try:
-        yield stop
+        yield asked
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

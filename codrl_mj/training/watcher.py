@@ -4,7 +4,7 @@ import contextlib
 import json
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +13,13 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 
 from codrl_mj.evaluation import Evaluation, evaluate
+from codrl_mj.runs import BEST, CHECKPOINTS, EPISODES, EVALUATION, PROGRESS, TENSORBOARD
 from codrl_mj.runs.files import sealed, write_json
-from codrl_mj.runs.layout import BEST, CHECKPOINTS, EPISODES, EVALUATION, PROGRESS, TENSORBOARD
 from codrl_mj.runs.policies import save_policy
 from codrl_mj.training import folder
-from codrl_mj.training.checkpoint import load_checkpoint, save_checkpoint
+from codrl_mj.training.checkpoint import State, capture, load_checkpoint, restore, save_checkpoint
 from codrl_mj.training.config import EVALUATION_SEED, TrainConfig
 from codrl_mj.training.history import EPISODE_COLUMNS, REPORT_COLUMNS, GrowingTable, Progress
-from codrl_mj.training.state import State, capture, restore
 
 REPORT_INTERVAL = 1000
 """Environment steps between two reports; the next end of a rollout counts."""
@@ -39,13 +38,13 @@ class Watcher(BaseCallback):
         self,
         config: TrainConfig,
         out: Path,
-        stop: Any,
+        asked: Sequence[int],
         on_progress: Callable[[Progress], None] | None,
         tensorboard: bool,
     ) -> None:
-        """Prepare; the arguments are those of `train`, and a `Stop`."""
+        """Prepare; the arguments are those of `train`, and the signals that ask to stop."""
         super().__init__()
-        self._config, self._out, self._stop, self._on_progress = config, out, stop, on_progress
+        self._config, self._out, self._asked, self._on_progress = config, out, asked, on_progress
         self._tensorboard = tensorboard
         self._marks = {"report": 0, "evaluation": 0, "checkpoint": 0}
         self._squares, self._samples = 0.0, 0  # of the torque error since the last report
@@ -87,7 +86,7 @@ class Watcher(BaseCallback):
         if self._resumed is not None:  # Stable-Baselines3 has drawn state-dependent noise since it was restored
             restore(self.model, self.training_env, self._resumed)
             self._resumed = None
-        stopping = self._stop.signal is not None
+        stopping = bool(self._asked)
         self.boundary(stopping)
         if stopping:
             raise LearningEnded
@@ -103,12 +102,12 @@ class Watcher(BaseCallback):
         for info in self.locals["infos"]:
             if "episode" in info:
                 episode = info["episode"]
-                self.episodes.add((len(self.episodes) + 1, self.num_timesteps, episode["r"], episode["l"]))
+                self.episodes.add((len(self.episodes.rows) + 1, self.num_timesteps, episode["r"], episode["l"]))
         return not self._episodes_done
 
     @property
     def _episodes_done(self) -> bool:
-        return self._config.total_episodes is not None and len(self.episodes) >= self._config.total_episodes
+        return self._config.total_episodes is not None and len(self.episodes.rows) >= self._config.total_episodes
 
     @property
     def complete(self) -> bool:
@@ -181,7 +180,7 @@ class Watcher(BaseCallback):
         elapsed = time.perf_counter() - self._start
         progress = Progress(
             steps=self.model.num_timesteps,
-            episodes=len(self.episodes),
+            episodes=len(self.episodes.rows),
             mean_return=self.episodes.last_mean("return"),
             mean_length=self.episodes.last_mean("length"),
             torque_error=math.sqrt(self._squares / self._samples) if self._samples else math.nan,
@@ -207,13 +206,14 @@ class Watcher(BaseCallback):
         tables = {"watch.episodes": self.episodes.array(), "watch.reports": self.reports.array()}
         state = State(arrays | tables, facts | {"watch": watch})
         save_checkpoint(self._out / CHECKPOINTS, state, self._identity)
+        self.episodes.flush()
         self.saved_steps = self.model.num_timesteps
 
     def result(self) -> dict[str, Any]:
         """What a finished run came to."""
         return {
             "steps": self.model.num_timesteps,
-            "episodes": len(self.episodes),
+            "episodes": len(self.episodes.rows),
             "mean_return": self.episodes.last_mean("return"),
             "evaluation_return": self.evaluation.returns.mean if self.evaluation else math.nan,
             "best": self._best,
@@ -221,9 +221,6 @@ class Watcher(BaseCallback):
         }
 
     def close(self) -> None:
-        """Close the files."""
-        for name in ("episodes", "reports"):
-            if hasattr(self, name):
-                getattr(self, name).close()
+        """Close the logger's files."""
         if hasattr(getattr(self, "model", None), "_logger"):  # learning may not have begun
             self.logger.close()

@@ -16,8 +16,7 @@ from safetensors.numpy import save
 from codrl_mj.cli import main
 from codrl_mj.runs.files import writing
 from codrl_mj.training import TrainConfig, history, watcher
-from codrl_mj.training.checkpoint import load_checkpoint, save_checkpoint
-from codrl_mj.training.state import State
+from codrl_mj.training.checkpoint import State, load_checkpoint, save_checkpoint
 from tests.damage import damage
 from tests.training.interruptions import CASES, TERMINATE, differing, interrupt, outcome, resume
 

@@ -129,7 +129,7 @@ def die_at_call(owner, name, which):
 KILLED_WHILE = {
     "taking the folder": lambda: die_at_call(folder, "start_folder", 1),
     "writing the configuration": lambda: die_at_call(files.json, "dumps", 3),
-    "beginning the tables": lambda: die_at_call(history.csv, "writer", 3),
+    "beginning the tables": lambda: die_at_call(history.csv, "writer", 2),
     "writing a checkpoint": lambda: die_at_call(checkpoint.os, "fsync", 3),
     "deleting an old checkpoint": lambda: die_at_call(Path, "unlink", 2),
     "exchanging the best policy's files": lambda: die_at_call(policies, "write_json", 2),

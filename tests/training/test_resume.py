@@ -9,8 +9,7 @@ from codrl_mj.envs.sb3 import ActuatedVecEnv
 from codrl_mj.runs.files import write_json
 from codrl_mj.runs.summaries import read_run
 from codrl_mj.training import TrainConfig, TrainingStoppedError, finished, history, watcher
-from codrl_mj.training.checkpoint import load_checkpoint, save_checkpoint
-from codrl_mj.training.state import State
+from codrl_mj.training.checkpoint import State, load_checkpoint, save_checkpoint
 from tests.matrix import but
 from tests.training.interruptions import (
     CASES,

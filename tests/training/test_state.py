@@ -10,7 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
 from codrl_mj.envs.sb3 import make_sb3_vec_env
-from codrl_mj.training.state import State, capture, restore
+from codrl_mj.training.checkpoint import State, capture, restore
 from codrl_mj.training.watcher import LearningEnded
 from tests.matrix import but
 from tests.training.interruptions import CASES
