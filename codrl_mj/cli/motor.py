@@ -304,7 +304,7 @@ class MotorTools:
     """Motors that one can buy: list them, look at one, design its current loop, and see it step; or write one down.
 
     New writes a file to fill in with a datasheet, show says what the motor is and can do, design what its drive makes
-    of it, step how that looks; feasible and choose say whether it can do a task. docs/own_motor.md has more.
+    of it, step how that looks; feasible and choose say whether it can do a task. docs/motors.md has more.
     Example: codrl-mj motor show maxon-ec45-flat-50w
     """
 

@@ -1,4 +1,4 @@
-"""Can this motor, with this gear and supply, do that task? Answered before anything is trained; docs/motors.md."""
+"""Can this motor, with this gear and supply, do that task? Answered before training; docs/motor_methods.md."""
 
 from codrl_mj.sizing.bounds import HOPELESS, SURELY, SURELY_NOT, TRY_IT, Bound, Feasibility, feasibility
 from codrl_mj.sizing.choice import Candidate, Catalogued, actuators_of, catalogued, choose, geared
