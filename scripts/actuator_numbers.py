@@ -169,6 +169,14 @@ def _of_tasks(rows: list[dict[str, str]], column: str) -> str:
     return _table(["task", *(f"`{name}`" for name in names)], body)
 
 
+def _first_steps(rows: list[dict[str, str]]) -> str:
+    """What of the largest force is there after the policy's first step, from task to task, of each actuator."""
+    found: dict[str, list[float]] = {}
+    for row in rows:
+        found.setdefault(row["actuator"], []).append(float(row["first_step_percent"]))
+    return ", ".join(f"{min(some):.0f} to {max(some):.0f} % with `{name}`" for name, some in found.items())
+
+
 def _limits(rows: list[dict[str, str]]) -> str:
     """Stall and no-load speed of each task, which all actuators share: they are the motor's."""
     units = {"False": ("N·m", "rad/s"), "True": ("N", "m/s")}
@@ -196,7 +204,6 @@ def _motor_line(row: dict[str, str]) -> list[str]:
     measured = ("stall_torque", "no_load_speed", "continuous_torque", "mechanical_time_constant_ms")
     return [
         f"`{row['motor']}`" + (" t" if entry.numbers.thermal_resistance else ""),
-        entry.kind.replace("brushed, coreless", "coreless").replace("brushless, flat", "brushless"),
         *(_number(row[name]) for name in ("voltage", "gear_ratio", *measured)),
     ]
 
@@ -204,7 +211,7 @@ def _motor_line(row: dict[str, str]) -> list[str]:
 def page(tables: Mapping[str, list[dict[str, str]]]) -> str:
     """The Markdown page, from the rows of the CSV files and the catalogue."""
     tasks, motors = tables["tasks"], tables["motors"]
-    heads = ("motor", "kind", "V", "gear", "stall [N·m]", "no load [rad/s]", "continuous [N·m]", "τm [ms]")
+    heads = ("motor", "V", "gear", "stall [N·m]", "no load [rad/s]", "continuous [N·m]", "τm [ms]")
     loop = motors[0]
     return f"""# Actuators in numbers
 
@@ -219,13 +226,9 @@ Seconds until a step to the task's largest force is within 2 % for good (0: with
 
 {_of_tasks(tasks, "settled_2_s")}
 
-What is there at the end of the policy's first step, in percent:
-
-{_of_tasks(tasks, "first_step_percent")}
-
-After {LONG:g} s nothing is missing. Stall and no-load speed are the motor's, whatever its loop:
+After the policy's first step there is, of the force that was asked for, {_first_steps(tasks)}; after {LONG:g} s, all.
+Stall and no-load speed are the motor's, whatever its loop:
 {_limits(tasks)}.
-`ideal` delivers all at once, without a limit.
 
 ## The catalogue
 
@@ -241,8 +244,6 @@ no load and τm are measured; they are as printed, to 5 %.
 
 Datasheets contradict themselves: {_contradictions()}. `codrl-mj motor show NAME` lists all, with the source of
 every value.
-
-`make docs` writes this page.
 """
 
 

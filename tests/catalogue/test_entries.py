@@ -177,5 +177,5 @@ def test_the_pages_have_every_motor_and_their_examples_run(tmp_path, capsys):
 
 def test_the_page_names_every_value_of_a_datasheet():
     page = (Path(__file__).parents[2] / "docs" / "own_motor.md").read_text()
-    named = set(re.findall(r"`(\w+)`", page.partition("## What you can write")[2].partition("Mind the following")[0]))
+    named = set(re.findall(r"`(\w+)`", page.partition("## What you can write")[2].partition("Mind three")[0]))
     assert {field.name for field in dataclasses.fields(Datasheet)} <= named
