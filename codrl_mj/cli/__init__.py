@@ -29,7 +29,7 @@ VERBS: dict[str, tuple[str, str, str]] = {
     "replay": ("replay:Replay", "Write one episode as a page in three dimensions.", "runs/mine --out balance.html"),
     "view": ("view:LiveView", "Watch a simulation live in a browser, and set its motor.", "cartpole"),
     "report": ("report:Report", "Write a report of a run as one HTML file.", "runs/mine --out mine.html"),
-    "motor": ("motor:MotorTools", "List motors that one can buy, look at one, design its loop, choose one.", "list"),
+    "motor": ("motor:MotorTools", "List off-the-shelf motors, look at one, design its loop, choose one.", "list"),
     "advise": ("advise:Advise", "Say whether to train through an actuator or do something else.", "weak pendulum"),
     "identify": ("identify:Identify", "Identify a motor from its bench logs.", "check swing.csv --columns time=t:s"),
     "data": ("data:Data", "List or fetch measurements of real motors that others have published.", "dfki_pendulum"),

@@ -301,7 +301,7 @@ class New:
 
 @dataclasses.dataclass(frozen=True)
 class MotorTools:
-    """Motors that one can buy: list them, look at one, design its current loop, and see it step; or write one down.
+    """Off-the-shelf motors: list them, look at one, design its current loop, and see it step; or write one down.
 
     New writes a file to fill in with a datasheet, show says what the motor is and can do, design what its drive makes
     of it, step how that looks; feasible and choose say whether it can do a task. docs/motors.md has more.
