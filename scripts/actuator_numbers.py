@@ -101,6 +101,12 @@ def motor_row(name: str) -> dict[str, Any]:
     return {
         "motor": name,
         "gear_ratio": numbers.gear_ratio,
+        "resistance": numbers.resistance,
+        "inductance": numbers.inductance,
+        "torque_constant": numbers.torque_constant,
+        "back_emf_constant": numbers.back_emf_constant,
+        "rotor_inertia": math.nan if numbers.rotor_inertia is None else numbers.rotor_inertia,
+        "estimated": " ".join(motor_entry(name).estimated),
         "voltage": drive.voltage_limit,
         "settled_2_ms": 1e3 * loop.settling_time,
         "bandwidth_hz": loop.bandwidth,
@@ -153,64 +159,91 @@ def _table(heads: Iterable[str], body: Iterable[Iterable[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def page(tables: Mapping[str, list[dict[str, str]]]) -> str:
-    """The Markdown page, from the rows of the CSV files."""
+def _of_tasks(rows: list[dict[str, str]], column: str) -> str:
+    """A table of one number: tasks in rows, named actuators in columns."""
+    names = list(dict.fromkeys(row["actuator"] for row in rows))
+    body = [
+        [task, *(_number(row[column]) for row in rows if row["task"] == task)]
+        for task in dict.fromkeys(row["task"] for row in rows)
+    ]
+    return _table(["task", *(f"`{name}`" for name in names)], body)
+
+
+def _first_steps(rows: list[dict[str, str]]) -> str:
+    """What of the largest force is there after the policy's first step, from task to task, of each actuator."""
+    found: dict[str, list[float]] = {}
+    for row in rows:
+        found.setdefault(row["actuator"], []).append(float(row["first_step_percent"]))
+    return ", ".join(f"{min(some):.0f} to {max(some):.0f} % with `{name}`" for name, some in found.items())
+
+
+def _limits(rows: list[dict[str, str]]) -> str:
+    """Stall and no-load speed of each task, which all actuators share: they are the motor's."""
     units = {"False": ("N·m", "rad/s"), "True": ("N", "m/s")}
-    tasks = []
-    for row in tables["tasks"]:
+    found: dict[str, list[str]] = {}
+    for row in rows:
         force, speed = units[row["slide"]]
-        numbers = [_number(row[f"settled_{band}_{unit}"]) for band in (5, 2) for unit in ("steps", "s")]
-        numbers += [_number(row[name]) for name in ("first_step_percent", "steady_error_percent")]
-        limits = f"{_number(row['stall_torque'])} {force}", f"{_number(row['no_load_speed'])} {speed}"
-        tasks.append([f"{row['task']}", f"`{row['actuator']}`", *numbers, *limits])
-    motors = [[f"`{row['motor']}`", *(_number(row[name]) for name in list(row)[1:])] for row in tables["motors"]]
-    heads = (
-        "task",
-        "actuator",
-        "5 % [steps]",
-        "[s]",
-        "2 % [steps]",
-        "[s]",
-        "first step [%]",
-        "steady error [%]",
-        "stall",
-        "no load",
+        limits = f"{_number(row['stall_torque'])} {force} and {_number(row['no_load_speed'])} {speed}"
+        found.setdefault(limits, []).append(row["task"])
+    return "; ".join(f"{limits} ({', '.join(dict.fromkeys(tasks))})" for limits, tasks in found.items())
+
+
+def _contradictions() -> str:
+    """The motors whose printed values differ from what follows from others by a tenth or more, and by how much."""
+    worst = {name: next(iter(motor_entry(name).numbers.disagreements), None) for name in motor_names()}
+    return ", ".join(
+        f"`{name}` by {100 * abs(one.difference):.0f} % ({one.quantity.replace('_', ' ')})"
+        for name, one in worst.items()
+        if one is not None and abs(one.difference) >= 0.1
     )
-    motor_heads = ("motor", "gear", "V", "2 % [ms]", "bandwidth [Hz]", "stall [N·m]", "no load [rad/s]")
+
+
+def _motor_line(row: dict[str, str]) -> list[str]:
+    """A motor: what is printed, and what is measured."""
+    entry = motor_entry(row["motor"])
+    measured = ("stall_torque", "no_load_speed", "continuous_torque", "mechanical_time_constant_ms")
+    return [
+        f"`{row['motor']}`" + (" t" if entry.numbers.thermal_resistance else ""),
+        *(_number(row[name]) for name in ("voltage", "gear_ratio", *measured)),
+    ]
+
+
+def page(tables: Mapping[str, list[dict[str, str]]]) -> str:
+    """The Markdown page, from the rows of the CSV files and the catalogue."""
+    tasks, motors = tables["tasks"], tables["motors"]
+    heads = ("motor", "V", "gear", "stall [N·m]", "no load [rad/s]", "continuous [N·m]", "τm [ms]")
+    loop = motors[0]
     return f"""# Actuators in numbers
 
-Written by `make docs` from runs in the engine on a bench, one hinge. Raw numbers:
-[tasks]({TABLES["tasks"]}), [motors]({TABLES["motors"]}).
+What every actuator that has a name does on a bench: one hinge in the engine, blocked or free. Raw numbers, and the
+motors' constants: [tasks]({TABLES["tasks"]}), [motors]({TABLES["motors"]}).
 
-## Named actuators, on each task
+![Share of the largest force that each of the paper's actuators delivers](pictures/actuators_in_numbers.png)
 
-The joint is blocked, and the task's largest force is asked for, from rest.
+## The paper's actuators
 
-- **5 %, 2 %**: when the force comes to within that of its last value for good, in steps of the policy and in seconds
-  after the first of them began; 0 is within the first integration step.
-- **First step**: what is there at the end of the policy's first step, of what was asked for.
-- **Steady error**: of the last value, after {LONG:g} s, against what was asked for.
-- **Stall**: the blocked joint's force when more is asked for than there is. **No load**: the free joint's speed then.
+Seconds until a step to the task's largest force is within 2 % for good (0: within the first integration step):
 
-`ideal` delivers all at once, without a limit.
+{_of_tasks(tasks, "settled_2_s")}
 
-{_table(heads, tasks)}
+After the policy's first step there is, of the force that was asked for, {_first_steps(tasks)}; after {LONG:g} s, all.
+Stall and no-load speed are the motor's, whatever its loop:
+{_limits(tasks)}.
 
-## Motors of the catalogue, each at its own gear
+## The catalogue
 
-At the nominal voltage (24 V where none is printed), with a loop at 20 kHz of the default bandwidth. Torques are past
-friction, limits are those of the voltage and not of the drive's largest current; –: not printed, so not known. Stall,
-no load and τm are measured in the engine; the loop's two columns and the continuous torque are
-`codrl_mj.drives`'s.
+Each at its own gear and nominal voltage (24 V where none is printed), cold, without a limit of the current. Under a
+loop at 20 kHz all settle within 2 % in {_number(loop["settled_2_ms"])} ms, with a bandwidth of
+{_number(loop["bandwidth_hz"], 4)} Hz: gains are designed for the winding.
 
-- **2 %**: when the current of a small step comes to within that for good. **Bandwidth**: where the closed loop's gain
-  is -3 dB. Both are alike, because gains are designed for the winding.
-- **Stall**: torque of the output that just turns. **No load**: speed of the free output.
-- **Continuous**: torque of the output that just turns, at the current that the winding bears for good.
-- **τm**: time constant with which the free output comes up to speed, the area that is missing over the speed: of a
-  motor alone R·J/(kT·kE), behind a gear with losses longer.
+{_table(heads, map(_motor_line, motors))}
 
-{_table((*motor_heads, "continuous [N·m]", "τm [ms]"), motors)}
+Torques are those of the output that just turns, past friction; *continuous*, at the current that the winding bears for
+good. *τm*: time constant of the free output, R·J/(kT·kE) without a gear. t: has thermal values. –: not printed. Stall,
+no load and τm are measured; they are as printed, to 5 %.
+
+Datasheets contradict themselves: {_contradictions()}. `codrl-mj motor show NAME` lists all, with the source of
+every value.
 """
 
 

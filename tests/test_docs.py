@@ -69,7 +69,7 @@ def folder_of_a_reader(trained, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     Path("examples").symlink_to(ROOT / "examples")
     Path("half_cheetah.xml").symlink_to(Path(gymnasium.__file__).parent / "envs/mujoco/assets/half_cheetah.xml")
-    written = re.search(r"```toml\n(.*?)```", PAGES["docs/own_motor.md"], re.DOTALL)
+    written = re.search(r"```toml\n(.*?)```", PAGES["docs/motors.md"], re.DOTALL)
     Path("my_motor.toml").write_text(written[1])
     Path("car.yaml").write_text(re.search(r"```yaml\n(.*?)```", PAGES["docs/training.md"], re.DOTALL)[1])
     family = re.search(r"```python\n(import dataclasses\n.*?)```", PAGES["docs/actuators.md"], re.DOTALL)

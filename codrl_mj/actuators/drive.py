@@ -1,4 +1,4 @@
-"""A motor that one can buy behind a drive that one can buy, family `drive`: gear, rotor, friction, a sampled PI loop.
+"""An off-the-shelf motor behind an off-the-shelf drive, family `drive`: gear, rotor, friction, a sampled PI loop.
 
 Where the paper's `current_loop` takes one or a few Euler steps of a slow winding, a bench motor's winding has a time
 constant of 0.1 to 5 ms under a loop that samples at 10 to 40 kHz. The winding is exact here, the loop has a sample rate

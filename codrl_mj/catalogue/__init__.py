@@ -1,4 +1,4 @@
-"""Motors that one can buy: datasheets as they are printed, the numbers that follow from them, and a catalogue."""
+"""Off-the-shelf motors: datasheets as they are printed, the numbers that follow from them, and a catalogue."""
 
 from codrl_mj.catalogue.datasheet import Datasheet, MotorEntry, from_datasheet, motor_entry, motor_names, new_motor
 from codrl_mj.catalogue.derivation import Disagreement, MotorNumbers

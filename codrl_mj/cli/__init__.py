@@ -33,7 +33,7 @@ SAYS: dict[str, tuple[str, str]] = {
     "replay": ("Write one episode as a page in three dimensions.", "runs/mine --out balance.html"),
     "view": ("Watch a simulation live in a browser, and set its motor.", "cartpole"),
     "report": ("Write a report of a run as one HTML file.", "runs/mine --out mine.html"),
-    "motor": ("List motors that one can buy, look at one, design its loop, choose one.", "list"),
+    "motor": ("List off-the-shelf motors, look at one, design its loop, choose one.", "list"),
     "advise": ("Say whether to train through an actuator or do something else.", "weak pendulum"),
     "identify": ("Identify a motor from its bench logs.", "check swing.csv --columns time=t:s"),
     "data": ("List or fetch measurements of real motors that others have published.", "dfki_pendulum"),

@@ -48,7 +48,7 @@ ActuatorName = Annotated[
         help="What the force goes through. "
         + "; ".join(f"{name}: {description}" for name, (description, _) in NAMED.items())
         + f"; a family with its defaults: {', '.join(name for name in FAMILIES if name not in NAMED)}; "
-        "a motor that one can buy (codrl-mj motor list), or a TOML file with its datasheet; "
+        "an off-the-shelf motor (codrl-mj motor list), or a TOML file with its datasheet; "
         "a YAML file with the fields of an actuator; or module:NAME of your own.",
     ),
 ]

@@ -279,7 +279,7 @@ class Step:
 
 @dataclasses.dataclass(frozen=True)
 class New:
-    """Write a file for a motor of your own, to be filled in with what its datasheet prints; docs/own_motor.md.
+    """Write a file for a motor of your own, to be filled in with what its datasheet prints; docs/motors.md.
 
     Example: codrl-mj motor new my_motor.toml
     """

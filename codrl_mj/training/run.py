@@ -64,6 +64,7 @@ def train(
     import torch
 
     importlib.import_module("matplotlib.figure")  # what is missing is missed now and not in the end
+    from codrl_mj.envs.sb3 import ActuatedVecEnv
     from codrl_mj.training.watcher import LearningEnded, Watcher
 
     torch.set_num_threads(1)  # networks this small run several times slower on two

@@ -1,5 +1,6 @@
 """The catalogue: every motor loads, has a source for every value, and agrees with itself or says why not."""
 
+import dataclasses
 import re
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pytest
 from gym_electric_motor.physical_systems.electric_motors import DcPermanentlyExcitedMotor
 
 from codrl_mj.catalogue import motor_entry, motor_names
-from codrl_mj.catalogue.datasheet import KINDS
+from codrl_mj.catalogue.datasheet import KINDS, Datasheet
 
 NAMES = motor_names()
 EXPLAINED = {  # disagreements above 5 % -> what the notes say of them
@@ -158,13 +159,23 @@ def test_an_unknown_motor_is_refused_with_the_nearest():
         motor_entry("maxon-re-65")
 
 
-def test_the_page_has_every_motor_and_its_examples_run(tmp_path, capsys):
-    page = (Path(__file__).parents[2] / "docs" / "motors.md").read_text()
-    assert re.findall(r"^\| `([\w-]+)`", page, re.M) == NAMES
-    names = {}
+def test_the_pages_have_every_motor_and_their_examples_run(tmp_path, capsys):
+    docs = Path(__file__).parents[2] / "docs"
+    catalogue = (docs / "actuators_in_numbers.md").read_text().partition("## The catalogue")[2]
+    assert re.findall(r"^\| `([\w-]+)`", catalogue, re.M) == NAMES
+    page, names = (docs / "own_motor.md").read_text(), {}
     for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
         exec(block, names)
     assert "gear_efficiency = stall_torque_at_output" in capsys.readouterr().out
-    path = tmp_path / "my_motor.toml"
-    path.write_text(re.search(r"```toml\n(.*?)```", page, re.DOTALL)[1])
-    assert motor_entry(str(path)).numbers.rotor_inertia == pytest.approx(5.4e-7)
+    path, written = tmp_path / "my_motor.toml", re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    for upto in range(1, len(written) + 1):
+        path.write_text("".join(written[:upto]))
+        assert motor_entry(str(path)).numbers.rotor_inertia == pytest.approx(1.05e-6)
+    assert motor_entry(str(path)).sources["stall_torque"] == "a page"
+    assert set(motor_entry(str(path)).estimated) == {"inductance"}
+
+
+def test_the_page_names_every_value_of_a_datasheet():
+    page = (Path(__file__).parents[2] / "docs" / "own_motor.md").read_text()
+    named = set(re.findall(r"`(\w+)`", page.partition("## What you can write")[2].partition("Mind three")[0]))
+    assert {field.name for field in dataclasses.fields(Datasheet)} <= named
