@@ -2,8 +2,8 @@
 
 An agent learns each environment on ideal actuators; the motors are chosen for what the first seed's policy asks of
 them; the others are the strongest of the catalogue that lack something. Agents then learn through both, and every
-policy is tested on all three. Trainings that were interrupted go on. Writes docs/worked_examples.csv and the page's
-tables; `--steps 0.01` tries it.
+policy is tested on all three. Trainings that were interrupted go on. Writes docs/worked_examples.csv and prints its
+means; `--steps 0.01` tries it.
 """
 
 import argparse

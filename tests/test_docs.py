@@ -15,8 +15,10 @@ import pytest
 
 from codrl_mj import cli
 from codrl_mj.agents import PPOConfig
+from codrl_mj.cli.identify_tools import TOOLS
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.study.trials import Grid
+from codrl_mj.tasks import pendulum
 from codrl_mj.training import TrainConfig, train
 from tests.published import folder_of
 
@@ -107,8 +109,8 @@ def test_the_python_of_a_page_runs(page, monkeypatch):
 @pytest.mark.parametrize(("page", "command"), COMMANDS)
 def test_a_command_of_a_page_is_understood(page, command, monkeypatch):
     parsed = []
-    for verb in cli.VERBS:
-        monkeypatch.setattr(cli.find_verb(verb), "run", lambda self: parsed.append(self) or 0)
+    for verb in (*map(cli.find_verb, cli.VERBS), *TOOLS.values()):
+        monkeypatch.setattr(verb, "run", lambda self: parsed.append(self) or 0)
     with contextlib.suppress(SystemExit):
         assert cli.main(shlex.split(command, comments=True)) == 0
     assert len(parsed) == 1
@@ -226,8 +228,14 @@ def test_a_page_links_to_what_exists(page):
             assert ((ROOT / page).parent / link).exists(), link
 
 
-def test_the_table_of_upright_tolerances_is_the_file():
+def test_the_file_of_upright_tolerances_has_the_pendulum_s_own():
     with (ROOT / "docs/upright_tolerances.csv").open(newline="") as file:
-        rows = list(csv.reader(file))
-    page = (ROOT / "docs/evaluation.md").read_text()
-    assert all(f"| {' | '.join(row)} |" in page for row in rows)
+        rows = list(csv.DictReader(file))
+    assert "(upright_tolerances.csv)" in PAGES["docs/evaluation.md"]
+    own = f"{pendulum.GOAL_ANGLE:g} rad, {pendulum.GOAL_SPEED:g} rad/s"
+    assert (
+        f"within {pendulum.GOAL_ANGLE:g} rad of upright and slower than {pendulum.GOAL_SPEED:g} rad/s"
+        in (PAGES["docs/evaluation.md"])
+    )
+    assert all(0.0 <= float(row[own]) <= 1.0 for row in rows)
+    assert len(rows) == 13

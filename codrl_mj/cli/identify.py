@@ -55,14 +55,14 @@ class Identify:
     estimate: tuple[str, ...] = ()
     """What to fit that is otherwise taken as known, such as torque_gain."""
     friction: Literal["auto", "coulomb", "stribeck", "load", "both"] = "coulomb"
-    """Viscous and Coulomb friction, or more; auto keeps more where it foretells logs that it was not fitted to."""
+    """Viscous and Coulomb friction, or more; auto keeps more where it predicts left-out logs better."""
     segment: float = 0.5
     """Time [s] that the shaft is simulated for at once: short where it tips over by itself, a second or two where it
     only sticks and slides."""
     motor: str | None = None
     """Motor of the catalogue, or a file, that gives what the logs do not tell."""
     holdout: tuple[Path, ...] = ()
-    """Logs that are only foretold."""
+    """Logs that are only predicted."""
     out: Path | None = None
     """Folder for actuator.yaml, result.json, and report.html with what the fit looks like."""
     ignore_errors: tyro.conf.FlagCreatePairsOff[bool] = False

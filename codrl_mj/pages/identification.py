@@ -38,7 +38,7 @@ def identification_page(found: Identified, out: Path) -> Path:
     """Write the page of what identification found."""
     winding = [one for one in found.traces if one.part == "winding"]
     shaft = [one for one in found.traces if one.part == "shaft"]
-    foretold = [one.trace for one in found.held_out if one.trace is not None]
+    predicted = [one.trace for one in found.held_out if one.trace is not None]
     fits = [page.heading("Winding: the current under the logged voltage"), *map(_looked_at, winding)] if winding else []
     fits += [page.heading("Shaft, piece by piece"), *map(_looked_at, shaft)] if shaft else []
     sections = [
@@ -46,7 +46,7 @@ def identification_page(found: Identified, out: Path) -> Path:
         page.Section("better", "What to do better on the bench", _advice(found)),
         page.Section("errors", "Errors of the simulation", _errors(found)),
         page.Section("fits", "Logs that were fitted", page.joined(fits)),
-        page.Section("held-out", "Logs that were only foretold", page.joined(map(_looked_at, foretold))),
+        page.Section("held-out", "Logs that were only predicted", page.joined(map(_looked_at, predicted))),
         page.Section("correlations", "Which parameters can stand for each other", _correlations(found)),
     ]
     title = f"Identified from {', '.join(found.logs)}"
@@ -112,7 +112,7 @@ def _advice(found: Identified) -> Markup:
     )
     texts += [told.format(*pair) for pair in _strong(found)]
     if not found.held_out and found.driven_by:
-        texts.append(Markup("No log was held out: keep one back with --holdout, to see what the numbers foretell."))
+        texts.append(Markup("No log was held out: keep one back with --holdout, to see what the numbers predict."))
     if len(found.logs) < 2:
         texts.append(Markup("A single log: a second one shows what differs from day to day."))
     if not texts:
