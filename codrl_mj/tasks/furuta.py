@@ -55,7 +55,7 @@ On 10 V PPO's `default` settings balance from all of five seeds, whether they co
 return 230.8 to 232.7 of 250:
 
 ```console
-$ codrl-mj train furuta --env.action voltage --actuator.supply.voltage 10 --seed 0
+$ codrl-mj train furuta --env.action voltage --actuator.supply.voltage 10 --seed 0 --out runs/volts
 ```
 
 Beware of a local optimum: whirling the rod, letting it creep through upright, returns 190 and more. Trainings with 16
