@@ -1,4 +1,4 @@
-"""Trainings side by side: how soon CartPole and Pendulum are learnt, by ours and by other libraries.
+"""Trainings side by side: how soon CartPole and Pendulum are learned, by ours and by other libraries.
 
     python scripts/benchmark_training.py --seeds 10
     python scripts/benchmark_training.py --only 'ours, fast' --task pendulum
@@ -30,6 +30,7 @@ ROWS = Path(__file__).parents[1] / "docs" / "results" / "training_speed.csv"
 PAGE, WRITTEN = ROWS.parents[1] / "training_speed.md", "<!-- written by scripts/benchmark_training.py -->"
 COLUMNS = ("task", "contender", "seed", "steps", "seconds", "greedy_steps", "greedy_seconds", "first")
 ENOUGH = {"cartpole": 475.0, "pendulum": -200.0}
+TITLES = {"cartpole": "CartPole", "pendulum": "Pendulum"}
 WORTH = {"cartpole": 200.0, "pendulum": -500.0}
 """Mean of the last 20 training episodes from which on greedy ones are looked at."""
 THEIRS = {"cartpole": "CartPole-v1", "pendulum": "Pendulum-v1"}
@@ -333,28 +334,52 @@ def rows() -> list[dict[str, str]]:
     return list(csv.DictReader(ROWS.open(newline=""))) if ROWS.is_file() else []
 
 
+def medians(task: str, name: str) -> dict[str, float]:
+    """Medians over a contender's seeds, of what there is; `seeds` and `learned` count them."""
+    own = [row for row in rows() if (row["task"], row["contender"]) == (task, name)]
+    found = {"seeds": len(own), "learned": sum(bool(row["greedy_steps"]) for row in own)}
+    known = {column: [float(row[column]) for row in own if row[column]] for column in COLUMNS[3:]}
+    return found | {column: statistics.median(values) for column, values in known.items() if values}
+
+
+FORMS = {"greedy_seconds": ".1f", "greedy_steps": ",.0f", "first": ".1f"}
+"""Columns of the table, and how they are written."""
+
+
 def table() -> str:
-    """All of it in Markdown: medians over seeds, and how many reached it."""
-    lines = []
-    for task, enough in ENOUGH.items():
-        lines += [
-            f"| {task.capitalize()} to {enough:g} | seeds that learnt | steps | seconds | steps, exploring | "
-            "seconds, exploring | first of a process |",
-            "| --- | ---: | ---: | ---: | ---: | ---: | ---: |",
-        ]
-        for name in CONTENDERS:
-            own = [row for row in rows() if (row["task"], row["contender"]) == (task, name)]
-            if not own:
-                lines.append(f"| {name} | – | | | | | |")
-                continue
-            cells = [name, f"{sum(bool(row['greedy_steps']) for row in own)} of {len(own)}"]
-            forms = {"greedy_steps": ",.0f", "greedy_seconds": ".1f", "steps": ",.0f", "seconds": ".1f", "first": ".1f"}
-            for column, form in forms.items():
-                values = [float(row[column]) for row in own if row[column]]
-                cells.append(format(statistics.median(values), form) if values else "–")
-            lines.append(f"| {' | '.join(cells)} |")
-        lines.append("")
-    return "\n".join(lines)
+    """All of it in Markdown: seconds, steps, and the first training of a process."""
+    titles = [TITLES[task] for task in ENOUGH]
+    lines = [
+        f"| | {' | '.join(f'{title}: seconds | steps | first' for title in titles)} |",
+        f"| --- |{' ---: |' * len(FORMS) * len(titles)}",
+    ]
+    for name in CONTENDERS:
+        cells = [name]
+        for task in ENOUGH:
+            of = medians(task, name)
+            seconds, *others = (format(of[key], form) if key in of else "–" for key, form in FORMS.items())
+            few = f" ({of['learned']:.0f} of {of['seeds']:.0f})" if of["learned"] < of["seeds"] else ""
+            cells += [seconds + few, *others]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def draw() -> None:
+    """Seconds until each has learned each task, as bars."""
+    from matplotlib.figure import Figure
+
+    from codrl_mj.study.pages import save
+
+    figure = Figure(figsize=(8.0, 4.2), layout="constrained")
+    for axes, (task, enough) in zip(figure.subplots(1, len(ENOUGH), sharey=True), ENOUGH.items(), strict=True):
+        seconds = {name: medians(task, name).get("greedy_seconds", 0.0) for name in reversed(CONTENDERS)}
+        colours = ["#0072B2" if name.startswith("ours") else "#999999" for name in seconds]
+        bars = axes.barh([*seconds], [*seconds.values()], color=colours)
+        axes.bar_label(bars, [f"{value:.1f}" if value else "–" for value in seconds.values()], padding=3)
+        axes.set(title=f"{TITLES[task]} to {enough:g}", xlabel="seconds of one core")
+        axes.margins(x=0.15)
+        axes.spines[["top", "right"]].set_visible(False)
+    save(figure, ROWS.with_suffix(".svg"))
 
 
 def main() -> None:
@@ -386,6 +411,7 @@ def main() -> None:
     if not options.here:
         print(table())
         PAGE.write_text(f"{PAGE.read_text().partition(WRITTEN)[0]}{WRITTEN}\n\n{table()}")
+        draw()
 
 
 if __name__ == "__main__":

@@ -11,15 +11,13 @@ import re
 import sys
 from pathlib import Path
 
-import gymnasium
-from PIL import Image
-
 from codrl_mj.actuators import Drive
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import field_docs
 from codrl_mj.runs.files import writing
 from codrl_mj.tasks import TASKS, named_actuator
+from page_pictures_tasks import SCENES
 
 FOLDER = Path(__file__).parent.parent / "docs" / "environments"
 
@@ -72,14 +70,10 @@ def page(task_name: str) -> str:
     """The Markdown page of one environment."""
     task = TASKS[task_name]
     summary, body = _documentation(task_name)
-    own = task.options()._asdict().items()
+    says = summary.partition(": ")[2]
+    title, own = _title(task_name), task.options()._asdict().items()
     facts = {
-        "make it": f'`gymnasium.make("{task.env_id}")`, on the command line `{task_name}`',
-        "rebuilds": f"Gymnasium's `{task.gymnasium_id}`" if task.gymnasium_id else "nothing of Gymnasium's",
-        "model": f"`assets/{task.asset}`",
         "action space": f"`{_space(task.action_space)}`",
-        "observation space": f"`{_space(task.observation_space)}`",
-        "observation names": ", ".join(f"`{name}`" for name in task.observation_names),
         "state": ", ".join(task.state_names),
         "environment step": f"{task.step_duration:g} s",
         "integration steps in it": f"{task.motor_inner_steps} with a motor, {task.ideal_inner_steps} without",
@@ -91,9 +85,11 @@ def page(task_name: str) -> str:
     }
     rows = "\n".join(f"| {name} | {value} |" for name, value in facts.items())
     return (
-        f"# {_title(task_name)}\n\n{summary}\n\n![{_title(task_name)}]({task_name}.png)\n\n"
-        f"| | |\n| --- | --- |\n{rows}\n\n{body}\n\n"
-        f"## Arguments of every environment\n\n{common_arguments()}\n"
+        f"# {title}\n\n{says[0].upper()}{says[1:]}\n\n"
+        f"![A policy on {title}; below it torque and voltage of the motor]({task_name}.webp)\n\n"
+        f"```console\n$ codrl-mj train {task_name} {SCENES[task_name].flags}\n```\n\n"
+        f'In Python it is `gymnasium.make("{task.env_id}")`, after `import codrl_mj`.\n\n'
+        f"| | |\n| --- | --- |\n{rows}\n\n{body}\n"
     )
 
 
@@ -122,30 +118,28 @@ def index() -> str:
         f"| [{_title(name)}]({name}.md) | {_documentation(name)[0].partition(': ')[2]} |" for name in TASKS
     )
     return (
-        f"# Environments\n\nWritten by `make docs` from the code; edit the docstrings in `codrl_mj/tasks/`.\n\n"
-        f"| environment | task |\n| --- | --- |\n{rows}\n"
+        "# Environments\n\nChoose a task; all take [the same arguments](arguments.md). `make docs` writes these pages "
+        f"from the docstrings in `codrl_mj/tasks/`.\n\n| environment | task |\n| --- | --- |\n{rows}\n"
     )
 
 
-def picture(task_name: str) -> Image.Image:
-    """The task after a few random actions."""
-    env = gymnasium.make(TASKS[task_name].env_id, render_mode="rgb_array", width=480, height=360, pretty=True)
-    env.action_space.seed(1)
-    env.reset(seed=1)
-    for _ in range(8):
-        env.step(env.action_space.sample())
-    image = Image.fromarray(env.render())  # type: ignore[arg-type]
-    env.close()
-    return image
+def arguments() -> str:
+    """The Markdown page of what every environment takes."""
+    return (
+        "# Arguments of every environment\n\nSay what the force goes through, and how it is simulated.\n\n"
+        '```python\nimport codrl_mj\n\nenv = codrl_mj.make("cartpole", actuator="weak", observe_actuator=True)\n```\n\n'
+        "`gymnasium.make` takes the same, and so do command lines: `--env.observe-actuator`. A task's own options are "
+        f"on [its page](README.md).\n\n{common_arguments()}\n"
+    )
 
 
 def pages() -> dict[str, str]:
     """Every page by its file name."""
-    return {"README.md": index()} | {f"{name}.md": page(name) for name in TASKS}
+    return {"README.md": index(), "arguments.md": arguments()} | {f"{name}.md": page(name) for name in TASKS}
 
 
 def main() -> int:
-    """Write every page."""
+    """Write every page; scripts/page_pictures_tasks.py makes the films on them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=FOLDER, help="folder for the pages")
     options = parser.parse_args()
@@ -153,10 +147,6 @@ def main() -> int:
         with writing(options.out / name) as temporary:
             temporary.write_text(text)
         print(f"wrote {options.out / name}")
-    for name in TASKS:
-        with writing(options.out / f"{name}.png") as temporary:
-            picture(name).save(temporary, format="png", optimize=True)
-        print(f"wrote {options.out / name}.png")
     return 0
 
 

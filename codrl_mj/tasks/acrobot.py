@@ -8,20 +8,17 @@ torque noise.
 
 ## Observation space
 
-`Box` of shape (6,), float32
-
 | index | observation | min | max | unit |
 | --- | --- | --- | --- | --- |
-| 0 | cos(theta1) | -1 | 1 | |
-| 1 | sin(theta1) | -1 | 1 | |
-| 2 | cos(theta2) | -1 | 1 | |
-| 3 | sin(theta2) | -1 | 1 | |
-| 4 | angular velocity of theta1 | -4 pi | 4 pi | rad/s |
-| 5 | angular velocity of theta2 | -9 pi | 9 pi | rad/s |
+| 0 | `cos_angle_1` | -1 | 1 | |
+| 1 | `sin_angle_1` | -1 | 1 | |
+| 2 | `cos_angle_2` | -1 | 1 | |
+| 3 | `sin_angle_2` | -1 | 1 | |
+| 4 | `velocity_1` | -4 pi | 4 pi | rad/s |
+| 5 | `velocity_2` | -9 pi | 9 pi | rad/s |
 
-theta1 is the first link's angle, 0 hanging down; theta2 is the second link's relative to the first. Both grow
-counter-clockwise and are wrapped to [-pi, pi] after every integration step. The state is (theta1, theta2, their
-velocities).
+Angle 1 is the first link's, 0 hanging down; angle 2 the second's relative to the first. Both grow counter-clockwise and
+are wrapped to [-pi, pi] after every integration step.
 
 ## Action space
 
@@ -33,20 +30,18 @@ velocities).
 
 ## Start
 
-All four state entries uniform in [-0.1, 0.1] (rad, rad/s), rounded to float32 as Gymnasium does.
-`reset(options={"low": ..., "high": ...})` sets the bounds.
+All four state entries uniform in [-0.1, 0.1], rounded to float32 as Gymnasium does. `reset(options={"low": ..., "high":
+...})` sets the bounds.
 
 ## End
 
-The tip is more than 1 m above the shoulder: -cos(theta1) - cos(theta1 + theta2) > 1. Truncated after 500 steps (100 s).
-
-An episode succeeds if it ends there before the time limit.
+The tip is more than 1 m above the shoulder, which is success: -cos(angle 1) - cos(angle 1 + angle 2) > 1. Truncated
+after 500 steps (100 s).
 
 ## Arguments
 
-Those of `codrl_mj.envs.ActuatedEnv`. The task has no options of its own. An environment step of 0.2 s is one
-integration step (RK4, Gymnasium's) when the actuator is ideal, and ten of 0.02 s with a motor, the paper's choice; the
-torque is held over each of them.
+[Those of every environment](arguments.md). An environment step is one integration step (RK4, Gymnasium's) when the
+actuator is ideal, and ten with a motor, the paper's choice; the torque is held over each.
 """
 
 import math

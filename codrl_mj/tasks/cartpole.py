@@ -2,49 +2,44 @@
 
 ## Description
 
-A cart (1 kg) slides on a track without friction under a gravity of 9.8 m/s^2; a uniform pole (0.1 kg, 1 m long) stands
-on it, on a hinge without friction. The actuator pushes the cart.
+A cart (1 kg) slides on a track under a gravity of 9.8 m/s^2; a uniform pole (0.1 kg, 1 m) stands on it on a hinge.
+There is no friction. The actuator pushes the cart.
 
 ## Observation space
 
-`Box` of shape (4,), float32
-
 | index | observation | min | max | unit |
 | --- | --- | --- | --- | --- |
-| 0 | position x of the cart, positive to the right | -4.8 | 4.8 | m |
-| 1 | velocity of the cart | -inf | inf | m/s |
-| 2 | angle theta of the pole, 0 upright, positive leaning right | -0.4189 (24 deg) | 0.4189 (24 deg) | rad |
-| 3 | angular velocity of the pole | -inf | inf | rad/s |
+| 0 | `cart_position`, positive to the right | -4.8 | 4.8 | m |
+| 1 | `cart_velocity` | -inf | inf | m/s |
+| 2 | `pole_angle`, 0 upright, positive to the right | -0.4189 (24 deg) | 0.4189 (24 deg) | rad |
+| 3 | `pole_velocity` | -inf | inf | rad/s |
 
-The bounds are twice those at which an episode ends. The observation is the state, rounded to float32.
+Positions' bounds are twice those at which an episode ends.
 
 ## Action space
 
-`Discrete(2)`: the desired force on the cart is -10 N (to the left) or 10 N (to the right).
+`Discrete(2)`: the desired force on the cart is -10 N (left) or 10 N (right).
 
 ## Reward
 
-1 a step, the last one included. With `center_radius` a step that ends farther than that from the centre of the track
-earns 0, and the episode goes on. With `sutton_barto_reward` the step that ends the episode earns -1, and with
-`center_radius` so does one that ends farther out; all others earn 0.
+1 a step, the last one included. With `center_radius` a step that ends farther than that from the centre earns 0, and
+the episode goes on. With `sutton_barto_reward` the step that ends the episode earns -1, and with `center_radius` so
+does one that ends farther out; all others earn 0.
 
 ## Start
 
-All four state entries uniform in [-0.05, 0.05] (m, m/s, rad, rad/s). `reset(options={"low": ..., "high": ...})` sets
-the bounds.
+All four state entries uniform in [-0.05, 0.05]. `reset(options={"low": ..., "high": ...})` sets the bounds.
 
 ## End
 
-The cart is more than 2.4 m from the centre, or the pole leans by more than 12 degrees. Truncated after 500 steps
-(10 s).
-
-An episode succeeds if it lasts until the time limit.
+The cart is more than 2.4 m from the centre, or the pole leans by more than 12 degrees. Truncated after 500 steps (10
+s), which is success.
 
 ## Arguments
 
-Those of `codrl_mj.envs.ActuatedEnv`, and two of its own: `center_radius` [m], > 0, no limit by default; the paper
-trains with 0.1; and Gymnasium's `sutton_barto_reward`, False by default. One integration step an environment step, with
-and without a motor (the paper's choice). Two integrators: `euler` (explicit, Gymnasium's default) and `semi-implicit`.
+[Those of every environment](arguments.md), and two of its own: `center_radius` [m], > 0, no limit by default, 0.1 in
+the paper's training; and Gymnasium's `sutton_barto_reward`. One integration step an environment step, the paper's
+choice. Integrators: `euler` (explicit, Gymnasium's default) and `semi-implicit`.
 """
 
 import math

@@ -2,110 +2,86 @@
 
 ## Description
 
-An arm (0.095 kg, 85 mm) turns about a vertical shaft; a rod (0.024 kg, 129 mm) hangs from a hinge at its end and swings
-across it, under a gravity of 9.81 m/s^2. The actuator turns the arm: the rod has none. It is the task that one can buy,
-so its own actuator is a motor of the catalogue, `quanser-qube-servo-2`, behind a drive; there are no actuators of the
-paper's, and `paper`, `weak` and so on are refused. `ideal` is the bare arm, without the rotor.
-
-Masses and lengths are the manual's (Quanser, *QUBE-Servo 2 User Manual*). Arm and rod are uniform: the arm's moment of
-inertia about the shaft is m l^2/3 (some simulators have m l^2/12 there, which is that about its centre), its hub adds
-0.6e-6 kg m^2 and its rotor 4e-6. Joint damping is 5e-6 and 1e-6 N m s/rad, as quanser_robots and its successor Pyrado
-identified it. Other sources have up to five hundred times that: BlueRiverTech's simulator 2.7e-4 and 5e-5, Quanser's
-course 1.5e-3 and 5e-4. `joint=` adds to the arm's, `randomize=` of `model.damping.hinge` to the rod's. There is no
-stiction, and the cable of the rod's encoder does not pull.
+An arm (0.095 kg, 85 mm) turns about a vertical shaft. A rod (0.024 kg, 129 mm) hangs from a hinge at its end and swings
+across it, under a gravity of 9.81 m/s^2. The actuator turns the arm: the rod has none. You can buy it, so its own
+actuator is a motor of the catalogue, `quanser-qube-servo-2`, behind a drive. The paper's actuators (`paper`, `weak` and
+so on) are refused; `ideal` is the bare arm, without the rotor.
 
 ## Observation space
 
-`Box` of shape (6,), float32
-
 | index | observation | min | max | unit |
 | --- | --- | --- | --- | --- |
-| 0 | cos(arm angle) | -1 | 1 | |
-| 1 | sin(arm angle) | -1 | 1 | |
-| 2 | cos(rod angle): height of the rod's tip over its hinge | -1 | 1 | |
-| 3 | sin(rod angle) | -1 | 1 | |
-| 4 | angular velocity of the arm | -inf | inf | rad/s |
-| 5 | angular velocity of the rod | -inf | inf | rad/s |
+| 0 | `cos_arm` | -1 | 1 | |
+| 1 | `sin_arm` | -1 | 1 | |
+| 2 | `cos_rod`, height of the tip | -1 | 1 | |
+| 3 | `sin_rod` | -1 | 1 | |
+| 4 | `arm_velocity` | -inf | inf | rad/s |
+| 5 | `rod_velocity` | -inf | inf | rad/s |
 
-The arm's angle is positive counter-clockwise from above. The rod's is 0 upright and positive counter-clockwise as seen
-from outside; it is not wrapped. The state is (arm angle, rod angle, their velocities).
+The arm's angle grows counter-clockwise as seen from above. The rod's is 0 upright and grows counter-clockwise as seen
+from outside; it is not wrapped.
 
 ## Action space
 
 `Box(-0.084, 0.084, (1,), float32)`: the desired torque on the arm [N*m]; it saturates at +-0.084, which the motor makes
-of the drive's largest current, 2 A.
+of the drive's largest current, 2 A. Command current or voltage with `action="current"` or `action="voltage"`.
 
 ## Reward
 
-h (1 - (arm angle / 2)^2 / 2 - (torque / 0.084)^2 / 10), with h = (1 + cos(rod angle))/2: the rod's height, 0 hanging
-and 1 upright, less what the arm is off and the torque delivered. Angles are those after the step. It is never negative,
-so ending early earns nothing.
+h (1 - (arm angle / 2)^2 / 2 - (torque / 0.084)^2 / 10), with the height h = (1 + cos(rod angle))/2, angles after the
+step and the torque delivered. It is never negative, so ending early earns nothing.
 
 ## Start
 
-Hanging: arm angle, rod angle less pi, and both velocities uniform in [-0.05, 0.05] (rad, rad/s).
-`reset(options={"low": ..., "high": ...})` sets the bounds.
+Hanging: arm angle, rod angle less pi, and both velocities uniform in [-0.05, 0.05] (rad, rad/s). `reset(options={"low":
+..., "high": ...})` sets the bounds.
 
 ## End
 
-The arm is more than 2 rad (115 degrees) off the middle, as in quanser_robots. There are no stops in the dynamics: a
-bench has none either, but a cable. Truncated after 250 steps (5 s).
-
-An episode succeeds if the rod is within 0.1 rad (5.7 degrees) of upright over its last second.
-
-### By torque, current and voltage
-
-What PPO's `default` settings return at the 10 V of the bench's amplifier, of 250, greedy in 20 episodes each after
-200,704 steps: `codrl-mj train furuta --env.action voltage --actuator.supply.voltage 10 --seed 0`. "Balanced" are the
-seeds that succeed in every episode.
-
-| command | seed 0 | 1 | 2 | 3 | 4 | balanced | CPU s each |
-| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |
-| torque | 232.2 | 231.6 | 232.1 | 232.7 | 232.6 | 5 of 5 | 35 to 39 |
-| current | 232.1 | 232.1 | 231.1 | 231.2 | 232.6 | 5 of 5 | 36 to 39 |
-| voltage | 231.1 | 231.1 | 230.8 | 231.7 | 231.9 | 5 of 5 | 34 to 56 |
-
-CPU time is one core's; 15 to 20 s of the 56 went into compilation, which the others had from the run before in their
-process. A policy with 10 V can also whirl the rod, letting it creep through upright, fall and swing up again in 1.3 s:
-that returns 190 and more, and is a local optimum. Trainings with 16 environments, a discount of 0.99 and speeds times
-0.05 did not balance, both that were tried by voltage and one of four by current. 32 environments alone mended both, but
-then rollouts of 2048 steps returned 183, and 1.6 times the noise at the start 215, without balance either.
-
-### Weaker supplies and late commands
-
-What policies of PPO return that were trained on the ideal arm and through motors, of 250: the mean over three seeds,
-and the worst and the best of them (`scripts/furuta_table.py`, 200,000 steps and 30 episodes each). V is the motor's
-supply, ms how late commands arrive.
-
-| run on | trained on ideal | trained at 18 V | trained at 6 V | trained at 18 V, 6 ms |
-| --- | ---: | ---: | ---: | ---: |
-| 18 V | 235 (232 to 240) | 233 (232 to 233) | 221 (210 to 230) | 231 (228 to 233) |
-| 12 V | 230 (226 to 233) | 232 (231 to 233) | 220 (212 to 230) | 230 (227 to 232) |
-| 10 V | 155 (3 to 232) | 232 (231 to 232) | 227 (221 to 231) | 230 (228 to 232) |
-| 8 V | 154 (2 to 232) | 231 (230 to 232) | 229 (227 to 230) | 230 (229 to 231) |
-| 7 V | 114 (2 to 229) | 230 (230 to 231) | 229 (227 to 231) | 198 (182 to 230) |
-| 6 V | 106 (1 to 213) | 213 (204 to 220) | 221 (218 to 225) | 74 (2 to 219) |
-| 5 V | 34 (1 to 99) | 200 (181 to 219) | 218 (218 to 219) | 56 (1 to 165) |
-| 18 V, 2 ms | 234 (232 to 236) | 232 (232 to 233) | 224 (219 to 230) | 232 (231 to 233) |
-| 18 V, 4 ms | 200 (135 to 233) | 232 (232 to 233) | 224 (221 to 230) | 232 (232 to 233) |
-| 18 V, 6 ms | 190 (111 to 232) | 232 (231 to 232) | 227 (221 to 230) | 227 (216 to 233) |
-| 18 V, 8 ms | 221 (208 to 230) | 231 (230 to 232) | 227 (222 to 230) | 234 (232 to 237) |
-| 18 V, 10 ms | 230 (224 to 234) | 226 (224 to 229) | 224 (217 to 230) | 232 (228 to 237) |
-
-Trained at 18 V, policies lose nothing down to 7 V and behind 8 ms of delay, and swing up at 5 V still. Trained at 6 V
-they are the best at 5 V, and pay with 3 to 22 of 232 where there is more. Trained on the ideal arm they are a matter of
-their seed: one learns to swing up with all the torque there is, gets the most of all, 240, at 18 V, and fails from 10 V
-down and in half of the episodes behind 4 or 6 ms; the second fails from 7 V down, the third at 5 V.
-Trained with 6 ms of delay, two seeds of three no longer swing up from 6 V down.
+The arm is more than 2 rad (115 degrees) off the middle, as in quanser_robots; a bench has no stops there, but a cable.
+Truncated after 250 steps (5 s). An episode succeeds if the rod is within 0.1 rad of upright over its last second.
 
 ## Arguments
 
-Those of `codrl_mj.envs.ActuatedEnv`. The task has no options of its own. An environment step of 20 ms is ten
-integration steps (RK4), with and without a motor: over 5 s without damping they change the energy by 1e-7 of what lifts
-the rod, a single one by 1 %. `action="current"` and `action="voltage"` command the motor's current and voltage, and
-`disturbances={"command_delay": 0.004}` is a delay such as a bench has. The supply is the motor's nominal 18 V; the
-bench's amplifier is made for 10 V and gives 15: `{"name": "default", "supply": {"voltage": 10.0}}`.
-`physics="analytic"` has the equations of motion in closed form, for actuators without a rotor, such as `ideal`.
+[Those of every environment](arguments.md). The supply is the motor's nominal 18 V. The bench's amplifier is made for 10
+V and gives 15: set `{"name": "default", "supply": {"voltage": 10.0}}`. Model its delay by
+`disturbances={"command_delay": 0.004}`. `physics="analytic"` has the equations in closed form, for actuators without a
+rotor. An environment step is ten RK4 steps: over 5 s without damping they change the energy by 1e-7 of what lifts the
+rod, a single one by 1 %.
+
+## What to expect
+
+On 10 V PPO's `default` settings balance from all of five seeds, whether they command torque, current or voltage, and
+return 230.8 to 232.7 of 250:
+
+```console
+$ codrl-mj train furuta --env.action voltage --actuator.supply.voltage 10 --seed 0 --out runs/volts
+```
+
+Beware of a local optimum: whirling the rod, letting it creep through upright, returns 190 and more. Trainings with 16
+environments, a discount of 0.99 and speeds times 0.05 ended so by voltage.
+
+On weaker supplies (V) and behind delays (ms) policies lose that were trained on the ideal arm. The mean return over
+three seeds, with the worst in brackets, and [all rows](furuta_supplies.csv) of `scripts/furuta_table.py`:
+
+| run on | trained on ideal | at 18 V | at 6 V | at 18 V, 6 ms |
+| --- | ---: | ---: | ---: | ---: |
+| 18 V | 235 (232) | 233 (232) | 221 (210) | 231 (228) |
+| 10 V | 155 (3) | 232 (231) | 227 (221) | 230 (228) |
+| 7 V | 114 (2) | 230 (230) | 229 (227) | 198 (182) |
+| 5 V | 34 (1) | 200 (181) | 218 (218) | 56 (1) |
+| 4 ms | 200 (135) | 232 (232) | 224 (221) | 232 (232) |
+
+Train at 18 V: you lose nothing down to 7 V and behind 8 ms, and still swing up at 5 V. Training at 6 V is best at 5 V,
+and costs 3 to 22 where there is more.
+
+## Where the numbers come from
+
+Masses and lengths are the manual's (Quanser, *QUBE-Servo 2 User Manual*). Arm and rod are uniform, so the arm's inertia
+about the shaft is m l^2/3 (some simulators have m l^2/12); hub and rotor add 0.6e-6 and 4e-6 kg m^2. Joint damping,
+5e-6 and 1e-6 N m s/rad, is what quanser_robots and Pyrado identified. Others have up to five hundred times that
+(BlueRiverTech 2.7e-4 and 5e-5, Quanser's course 1.5e-3 and 5e-4): add it by `joint=` to the arm, by `randomize=` of
+`model.damping.hinge` to the rod. There is no stiction, and the encoder's cable does not pull.
 """
 
 import math

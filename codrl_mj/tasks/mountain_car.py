@@ -2,21 +2,19 @@
 
 ## Description
 
-A car drives on a hill of the shape sin(3 x). Its acceleration along x is 0.001 F - 0.0025 cos(3 x), in m/s^2 with F in
-N: a car of 1/0.001 = 1000 kg. The force does not suffice to drive up from the valley; the car has to rock. Renders show
-the hill that Gymnasium draws, to scale: its height is 0.55 + 0.45 sin(3 x), in m.
+A car drives on a hill of the shape sin(3 x), and has to rock: its force does not suffice to drive up. Its acceleration
+along x is 0.001 F - 0.0025 cos(3 x), in m/s^2 with F in N: a car of 1000 kg. Renders show Gymnasium's hill to scale, of
+height 0.55 + 0.45 sin(3 x), in m.
 
 ## Observation space
 
-`Box([-1.2, -0.07], [0.6, 0.07], (2,), float32)`
-
 | index | observation | min | max | unit |
 | --- | --- | --- | --- | --- |
-| 0 | position x along the horizontal | -1.2 | 0.6 | m |
-| 1 | velocity v | -0.07 | 0.07 | m/s |
+| 0 | `position` | -1.2 | 0.6 | m |
+| 1 | `velocity` | -0.07 | 0.07 | m/s |
 
-The bounds are kept after every integration step: the speed is limited before it moves the car, the position afterwards,
-and the left wall stops the car.
+Every integration step keeps these bounds: the speed is limited before it moves the car, the position afterwards, and
+the left wall stops the car.
 
 ## Action space
 
@@ -32,15 +30,12 @@ x uniform in [-0.6, -0.4] m, v = 0. `reset(options={"low": ..., "high": ...})` s
 
 ## End
 
-At the end of a step x >= 0.5 m with v >= 0. Truncated after 200 steps (200 s).
-
-An episode succeeds if it ends there before the time limit.
+At the end of a step x >= 0.5 m with v >= 0, which is success. Truncated after 200 steps (200 s).
 
 ## Arguments
 
-Those of `codrl_mj.envs.ActuatedEnv`. The task has no options of its own (Gymnasium's `goal_velocity` is 0 here). An
-environment step of 1 s is one semi-implicit Euler step (Gymnasium's) when the actuator is ideal, and twenty of 0.05 s
-with a motor, the paper's choice.
+[Those of every environment](arguments.md); Gymnasium's `goal_velocity` is 0. An environment step is one semi-implicit
+Euler step (Gymnasium's) when the actuator is ideal, and twenty with a motor, the paper's choice.
 """
 
 from typing import Any

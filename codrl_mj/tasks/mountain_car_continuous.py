@@ -2,20 +2,18 @@
 
 ## Description
 
-The car and the hill of `codrl_mj.tasks.mountain_car`, with a stronger motor: its acceleration along x is
-0.0015 F - 0.0025 cos(3 x), in m/s^2 with F in N: a car of 1/0.0015 = 666.7 kg.
+The car and the hill of [MountainCar](mountain_car.md), with a stronger motor. Its acceleration along x is 0.0015 F -
+0.0025 cos(3 x), in m/s^2 with F in N: a car of 666.7 kg.
 
 ## Observation space
 
-`Box([-1.2, -0.07], [0.6, 0.07], (2,), float32)`
-
 | index | observation | min | max | unit |
 | --- | --- | --- | --- | --- |
-| 0 | position x along the horizontal | -1.2 | 0.6 | m |
-| 1 | velocity v | -0.07 | 0.07 | m/s |
+| 0 | `position` | -1.2 | 0.6 | m |
+| 1 | `velocity` | -0.07 | 0.07 | m/s |
 
-The bounds are kept as in `mountain_car`. Gymnasium rounds its state to float32 in every step; here the state is float64
-and only the observation is rounded.
+The bounds are kept as in MountainCar. Only the observation is rounded to float32; Gymnasium rounds its state in every
+step.
 
 ## Action space
 
@@ -23,9 +21,8 @@ and only the observation is rounded.
 
 ## Reward
 
-100 for the step that ends at the goal, minus 0.1 F^2 for the force F [N] delivered in the step: the motor's at the end
-of it, which need not be the desired one. (Gymnasium charges for the action. With an ideal actuator that is the same,
-unless an action lies outside the action space: Gymnasium then charges for more than it delivers.)
+100 for the step that ends at the goal, minus 0.1 F^2 for the force F [N] that the motor delivered at the end of the
+step. Gymnasium charges for the action, which is the same with an ideal actuator unless it lies outside its space.
 
 ## Start
 
@@ -33,15 +30,11 @@ x uniform in [-0.6, -0.4] m, v = 0. `reset(options={"low": ..., "high": ...})` s
 
 ## End
 
-At the end of a step x >= 0.45 m with v >= 0. Truncated after 999 steps (999 s).
-
-An episode succeeds if it ends there before the time limit.
+At the end of a step x >= 0.45 m with v >= 0, which is success. Truncated after 999 steps (999 s).
 
 ## Arguments
 
-Those of `codrl_mj.envs.ActuatedEnv`. The task has no options of its own (Gymnasium's `goal_velocity` is 0 here). An
-environment step of 1 s is one semi-implicit Euler step (Gymnasium's) when the actuator is ideal, and twenty of 0.05 s
-with a motor, the paper's choice.
+[Those of every environment](arguments.md); Gymnasium's `goal_velocity` is 0. Integrated as MountainCar.
 """
 
 import dataclasses

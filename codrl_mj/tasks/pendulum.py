@@ -2,48 +2,43 @@
 
 ## Description
 
-A uniform rod (mass 1 kg, length 1 m) hangs from a pivot under a gravity of 10 m/s^2. The actuator turns the pivot. Two
-newton metres do not lift the rod in one go: it has to be swung.
+A uniform rod (1 kg, 1 m) hangs from a pivot under a gravity of 10 m/s^2. The actuator turns the pivot. Two newton
+metres do not lift the rod in one go: it has to be swung.
 
 ## Observation space
 
-`Box([-1, -1, -8], [1, 1, 8], (3,), float32)`
-
 | index | observation | min | max | unit |
 | --- | --- | --- | --- | --- |
-| 0 | cos(theta): height of the tip over the pivot | -1 | 1 | m |
-| 1 | sin(theta): distance of the tip to the left of the pivot | -1 | 1 | m |
-| 2 | angular velocity of the rod | -8 | 8 | rad/s |
+| 0 | `cos_angle`, height of the tip | -1 | 1 | m |
+| 1 | `sin_angle`, how far left the tip is | -1 | 1 | m |
+| 2 | `angular_velocity` | -8 | 8 | rad/s |
 
-theta is 0 upright and grows counter-clockwise. The state is (theta, theta_dot); theta is not wrapped.
+The angle theta is 0 upright and grows counter-clockwise; the state's is not wrapped.
 
 ## Action space
 
-`Box(-2, 2, (1,), float32)`: the desired torque [N*m]; it saturates at +-2. Gymnasium computes with float32 actions in
-float32; here they become float64 first, so the two differ by some 1e-8 a step unless the actions are float64.
+`Box(-2, 2, (1,), float32)`: the desired torque [N*m]; it saturates at +-2. Actions become float64 first, where
+Gymnasium computes in float32: give float64 actions, or the two differ by some 1e-8 a step.
 
 ## Reward
 
--(angle^2 + 0.1 theta_dot^2 + 0.001 torque^2): angle (wrapped to [-pi, pi)) and theta_dot are those *before* the step,
-the torque is the one delivered *in* it: the motor's, which need not be the desired one.
+-(theta^2 + 0.1 theta_dot^2 + 0.001 torque^2), with theta wrapped to [-pi, pi) and theta_dot from *before* the step, and
+the torque that the motor delivered *in* it.
 
 ## Start
 
-theta uniform in [-pi, pi] rad, theta_dot uniform in [-1, 1] rad/s. `reset(options={"x_init": ..., "y_init": ...})` sets
-the two bounds, as in Gymnasium.
+theta uniform in [-pi, pi] rad, theta_dot in [-1, 1] rad/s. `reset(options={"x_init": ..., "y_init": ...})` sets the two
+bounds, as in Gymnasium.
 
 ## End
 
-Never; truncated after 200 steps (10 s).
-
-An episode succeeds if the rod is upright and still over its last second: within 0.1 rad (5.7 degrees) of upright, where
-gravity takes a quarter of the torque, and slower than 0.1 rad/s, which in a second would carry it no farther than that.
+Never; truncated after 200 steps (10 s). An episode succeeds if over its last second the rod is within 0.1 rad of
+upright and slower than 0.1 rad/s.
 
 ## Arguments
 
-Those of `codrl_mj.envs.ActuatedEnv`. The task has no options of its own (Gymnasium's `g` is the model's gravity here).
-One integration step an environment step, with and without a motor (the paper's choice); semi-implicit Euler, as in
-the installed Gymnasium (the paper says explicit).
+[Those of every environment](arguments.md); Gymnasium's `g` is the model's gravity. One integration step an environment
+step, the paper's choice; semi-implicit Euler, as in the installed Gymnasium (the paper says explicit).
 """
 
 import math

@@ -66,12 +66,11 @@ def write(collected: Collected, out: Path) -> list[Path]:
         _insured(drawn),
         _motors(evidence, drawn),
         _advised(evidence, said, drawn),
-        _head(collected),
         _verdicts(first, others),
-        *(_question(name, title, others, drawn) for name, title in QUESTIONS.items()),
+        _secondary(others, drawn),
         _explored(scores),
-        _missing(collected),
         _method(collected, scores),
+        _missing(collected),
     ]
     write_page(out / PAGE, parts)
     return [out / PAGE, *drawn.values(), *(folder / name for name in (*rows, ADVISED, TOTALS))]
@@ -128,16 +127,18 @@ def _borne(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
             scale, of = {"lag": (1000 * step, "ms"), "delay": (1000 * step, "ms"), "supply": (100.0, "%")}.get(
                 name, (force, unit)
             )
-            text = f"≤ {_short(scale * borne[-1] if borne else 0.0)} {of}"
+            text = f"≤{_short(scale * borne[-1] if borne else 0.0)}"
             if hurt is not None:
-                text += f"; ≥ {_short(scale * hurt[0])} {of} ({round(hurt[1].failed * len(hurt[1].lost))})"
+                text += f", ≥{_short(scale * hurt[0])} {of} ({round(hurt[1].failed * len(hurt[1].lost))})"
+            else:
+                text += f" {of}"
             rows[-1].append(text if known else "–")
     header = ["task: policy step, largest force", "lag", "missing force", "missing voltage", "delay", "friction"]
-    return f"""## What is borne
+    return f"""## What policies bear
 
-Left: harmless. Policies that were trained on ideal forces lose at most {MARGIN:g} of the span on the mean, surely at
-most {FAILED:g}, and a tenth of their success. Right: it hurts. They surely lose more than {FAILED:g}, or a tenth of
-their success; in brackets how many of the 20 policies fail there, by losing more than {FAILED:g}. Between the two,
+Up to the first number it is harmless: ideal-trained policies lose at most {MARGIN:g} of the score on the mean, surely
+at most {FAILED:g}, and a tenth of their success. From the second on it hurts: they surely lose more than {FAILED:g},
+or a tenth of their success. In brackets: how many of 20 fail there, by losing more than {FAILED:g}. Between the two,
 measure.
 
 {markdown_table([*header, "noise"], rows)}
@@ -153,9 +154,9 @@ def _insured(drawn: Mapping[str, Path]) -> str:
         return ""
     return f"""## Train through it, or randomise?
 
-Twenty policies a column, tested at one dose of each thing, that was chosen to hurt. *Random actuators* means random
-strength, lag and delay, and pushes: no model of the motor, though three of the six things are of its kind. Its ranges
-reach 1 times the tested lag and delay on Pendulum, and 4 times on Furuta, so that the two tasks differ in that, too.
+Twenty policies a column, tested at one dose of each thing that was chosen to hurt. *Random actuators*
+draws strength, lag, delay and pushes, which three of the six things are of. Its ranges fit Pendulum better: they reach
+the lag and delay that are tested there, and four times those of Furuta.
 
 {_figure(drawn, "insured", "Scores by what policies were trained on")}"""
 
@@ -172,9 +173,9 @@ def _motors(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
     header = ["task", "motor, gear", "", "trained on ideal forces", "trained through it"]
     return f"""## Off-the-shelf motors
 
-*Good* is the smallest that `codrl-mj motor choose` found sufficient, *marginal* one that it called `try it`. On the
-cars the good one rubs away an eighth of the largest force; since then `motor choose` allows a twentieth, by another
-gear. What policies lose on them, how many fail, and what of their success is lost:
+What policies lose, how many of 20 fail, and how much of their success goes. *Good* is the smallest motor that
+`codrl-mj motor choose` found sufficient, *marginal* one that it called `try it`. On the cars the good one rubs away an
+eighth of the largest force; since then `motor choose` allows a twentieth.
 
 {markdown_table(header, rows)}
 {_figure(drawn, "motors", "Scores on motors of the catalogue")}"""
@@ -185,8 +186,8 @@ def _lost(outcome: Outcome | None) -> str:
         return "–"
     mean, low, high = outcome.loss
     count = len(outcome.lost)
-    failed = f"{round(outcome.failed * count)} of {count} fail"
-    return f"{mean:z.2f} [{low:z.2f}, {high:z.2f}], {failed}, {100 * outcome.success_lost.mean:z.0f} %"
+    failed = f"{round(outcome.failed * count)}" if count == 20 else f"{round(outcome.failed * count)} of {count}"
+    return f"{mean:z.2f} [{low:z.2f}, {high:z.2f}]; {failed}; {100 * outcome.success_lost.mean:z.0f} %"
 
 
 def _advised(evidence: Evidence, said: Sequence[Mapping[str, Any]], drawn: Mapping[str, Path]) -> str:
@@ -195,25 +196,25 @@ def _advised(evidence: Evidence, said: Sequence[Mapping[str, Any]], drawn: Mappi
         return ""
     rows = []
     for one in said:
-        numbers = f"{'≥ ' * one['beyond']}{one['predicted_mean']:z.2f}", f"{one['measured_mean']:z.2f}"
-        rows.append([TITLES[one["task"]], one["actuator"], *numbers, one["said"], one["measured"], one["judged"]])
+        if one["judged"] != "right":
+            numbers = f"{'≥ ' * one['beyond']}{one['predicted_mean']:z.2f}", f"{one['measured_mean']:z.2f}"
+            rows.append([TITLES[one["task"]], one["actuator"], *numbers, one["said"], one["measured"]])
     errors = [abs(one["predicted_mean"] - one["measured_mean"]) for one in said]
     large = [error for error, one in zip(errors, said, strict=True) if one["measured_mean"] > MARGIN] or [0.0]
     told = [one["judged"] for one in said]
     left = advised.left_out(evidence)
-    header = ["task", "actuator", "predicted", "measured", "advise says", "measurement says", ""]
+    header = ["task", "actuator", "predicted", "measured", "advise says", "measurement says"]
     return f"""## What `advise` says, and how right it is
 
-`codrl-mj advise ACTUATOR TASK` ([how](../advise.md)) predicts what ideal-trained policies lose, here on actuators that
-none of the doses was taken from, and without what was measured on the one that is asked about:
+Of {len(told)} actuators that none of the doses was taken from, `codrl-mj advise` ([how](../advise.md)) is right about
+{told.count("right")} and wrong about {told.count("wrong")}, without what was measured on the one it is asked about. For
+{told.count("says nothing")} it says to measure, and for {told.count("not tested")} what was not tested. These are
+all that are not right:
 
 {markdown_table(header, rows)}
-Of {len(told)} answers {told.count("right")} are right, {told.count("wrong")} wrong; {told.count("not tested")} name
-something that was not tested there, and {told.count("says nothing")} say to measure. The mean error of the prediction
-is {np.mean(errors):.2f}, and {np.mean(large):.2f} over those that lose more than {MARGIN:g}. Of
-{left["doses"]} doses, each predicted from its neighbours, {left["off"]} are off by more than {MARGIN:g} (mean
-{left["mean_error"]:.3f}), and {left["flips"]} change sides between harmless and not. The numbers are in
-[advised]({FOLDER}/{ADVISED}).
+The predicted loss is {np.mean(errors):.2f} off on the mean, and {np.mean(large):.2f} where more than {MARGIN:g} is
+lost. Of {left["doses"]} doses, each predicted from its neighbours, {left["off"]} are off by more than {MARGIN:g} (mean
+{left["mean_error"]:.3f}), and {left["flips"]} change sides between harmless and not.
 
 {_figure(drawn, "chart", "What to do about an actuator that is late or short of voltage")}"""
 
@@ -222,31 +223,27 @@ def _explored(scores: Scores) -> str:
     """Tables of what was not planned: mean scores."""
     doses = AXES["supply"].doses[1:]
     wound = [
-        [TITLES[task], *(" / ".join(_mean(scores, one) for one in pair) for pair in pairs)]
+        [TITLES[task], *("/".join(_mean(scores, one) for one in pair) for pair in pairs)]
         for task, pairs in windup().items()
     ]
-    columns = around_the_paper()
-    names = ["the paper's", *paper_loops(arms.LOOPED[0])]
+    names = [*paper_loops(arms.LOOPED[0])]
+    columns = {title: [_mean(scores, one) for one in trials] for title, trials in around_the_paper().items()}
     around = [
-        [
-            name,
-            *(
-                "the same" if row and column[row].env == column[0].env else _mean(scores, column[row])
-                for column in columns.values()
-            ),
-        ]
-        for row, name in enumerate(names)
+        "; ".join(
+            [f"- {title}: {own}", *(f"{name} {one}" for name, one in zip(names, others, strict=True) if one != own)]
+        )
+        for title, (own, *others) in columns.items()
     ]
     return f"""## Exploration
 
-Not planned, and without p: mean scores of the same policies, rows of [trials]({FOLDER}/{TRIALS}). A supply that
-lacks a share of what is needed, under ideal-trained policies, with anti-windup / with an integrator that goes on while
-the voltage saturates:
+Not planned, and without p: mean scores. A supply lacks a share of what is needed, under ideal-trained policies, with
+anti-windup/with an integrator that goes on while the voltage saturates:
 
 {markdown_table(["supply lacks", *(f"{dose:g}" for dose in doses)], wound)}
-The paper's motor and loop, and otherwise, under policies that were trained on ideal forces and on it:
+{textwrap.fill(f"The paper's loop around its motor, and what of {', '.join(names)} scores otherwise:", 120)}
 
-{markdown_table(["loop", *columns], around)}"""
+{chr(10).join(around)}
+"""
 
 
 def _mean(scores: Scores, trial: Trial) -> str:
@@ -254,48 +251,33 @@ def _mean(scores: Scores, trial: Trial) -> str:
     return f"{np.mean(found):.2f}" if found else "–"
 
 
-def _head(collected: Collected) -> str:
-    grid, totals = collected.grid, collected.totals
-    done, wanted = totals.trainings, len(grid.cells())
-    tested, tests = sum(map(len, collected.evaluations.values())), len(grid.deployments())
-    codes = ", ".join(f"`{code}` ({count})" for code, count in sorted(totals.codes.items())) or "none"
-    return f"""## How it was measured
-
-{done} of {wanted} trainings are finished ({totals.seconds / 3600:.1f} hours of one core), and {tested} of {tests}
-tests. [The plan](plan.md) was written before the first of them: questions, hypotheses, tests.
-Versions of the code that trained, with the number of runs: {codes}.
-
-`python scripts/study_actuators.py` writes this page, its figures and its tables; do not edit it
-([how to run it](../studies.md)). The numbers are files: [hypotheses]({FOLDER}/{HYPOTHESES}),
-[trials]({FOLDER}/{TRIALS}), [runs]({FOLDER}/{RUNS}); `examples/recompute.py` recomputes the conclusions from the last
-without this package.
-"""
-
-
 def _verdicts(verdicts: Sequence[Verdict], others: Sequence[Verdict]) -> str:
     """The primary hypotheses, one row each, and what those are worth that hold."""
     rows = []
     for verdict in verdicts:
-        says = verdict.question.statement
+        says = verdict.question.statement.replace(_EACH, " *")
         if verdict.outcome == "open" and (seeds := verdict.seeds_to_close(len(verdicts))) is not None:
             says += f" (about {seeds} seeds would tell)"
         tested, wanted = verdict.strata
         if tested < wanted:
             says += f" ({tested} of {wanted} comparisons have runs)"
-        policies = str(min(verdict.runs))
-        name = verdict.question.name
-        rows.append([name, verdict.outcome, _effect(verdict), _p(verdict.corrected), policies, says])
-    header = ["", "holds", "effect [95 %]", "corrected p", "policies", "says"]
+        rows.append([verdict.question.name, verdict.outcome, _effect(verdict), _p(verdict.corrected), says])
+    header = ["", "holds", "effect [95 %]", "corrected p", "says"]
     wrong = [one for one in others if " 25 % over nominal" in one.question.statement.replace("-", "").replace("+", "")]
     sizes = [abs(one.effect.mean) for one in wrong if not np.isnan(one.effect.mean)] or [0.0]
     return f"""## The twelve hypotheses
 
 {markdown_table(header, rows)}
-Seven of those that hold could hardly fail. P1 to P5: their doses were chosen in a pilot, so that ideal-trained policies
-lose. P9: the loop was badly detuned. P10: errors of both signs cancel in its mean; their mean *size* is
-{np.mean(sizes):.3f} over {len(wrong)} cases, the largest {np.max(sizes):.3f}. P6, P7, P8, P11 and P12 could have gone
-either way.
+\\* P{_EACH[3:]}.
+
+Seven of those that hold could hardly fail. P1 to P5: doses were chosen in a pilot so that ideal-trained policies lose.
+P9: the loop was badly detuned. P10: errors of both signs cancel in its mean; their mean *size* is {np.mean(sizes):.3f}
+over {len(wrong)} cases, the largest {np.max(sizes):.3f}. P6, P7, P8, P11 and P12 could have gone either way.
 """
+
+
+_EACH = ": policies trained through it score higher on it than policies trained on ideal forces"
+"""What six of the hypotheses say."""
 
 
 def _effect(verdict: Verdict) -> str:
@@ -304,22 +286,24 @@ def _effect(verdict: Verdict) -> str:
 
 
 def _p(value: float) -> str:
-    return "< 0.001" if value < 0.001 else f"{value:.3f}"
+    return "<0.001" if value < 0.001 else f"{value:.3f}"
 
 
-def _question(name: str, title: str, verdicts: Sequence[Verdict], drawn: Mapping[str, Path]) -> str:
-    """A question: its figure, and how many of its secondary comparisons were decided."""
-    mine = [verdict for verdict in verdicts if verdict.question.section == name and verdict.runs != (0, 0)]
-    decided = [verdict for verdict in mine if verdict.outcome != "open"]
-    lines = [f"## {title}", ""]
-    if name == "tune":
-        lines += [f"![{title}]({FOLDER}/{drawn[name].name})", ""]
-    beyond = sum(one.effect.low > MARGIN or one.effect.high < -MARGIN for one in decided)
-    lines.append(
-        f"Of {len(mine)} secondary comparisons {len(decided) or 'none'} differ with a false discovery rate of 5 %, "
-        f"{beyond or 'none'} by more than {MARGIN:g} of the span (its 95 % interval, Student's t)."
-    )
-    return "\n".join(lines) + "\n"
+def _secondary(verdicts: Sequence[Verdict], drawn: Mapping[str, Path]) -> str:
+    """How many of each question's secondary comparisons were decided, and the figure of loops."""
+    rows = []
+    for name, title in QUESTIONS.items():
+        mine = [verdict for verdict in verdicts if verdict.question.section == name and verdict.runs != (0, 0)]
+        decided = [verdict for verdict in mine if verdict.outcome != "open"]
+        beyond = sum(one.effect.low > MARGIN or one.effect.high < -MARGIN for one in decided)
+        rows.append([title, *map(str, (len(mine), len(decided), beyond))])
+    header = ["secondary comparisons", "of", "differ", f"by more than {MARGIN:g}"]
+    return f"""## The other comparisons
+
+With a false discovery rate of 5 %, and by how much by the 95 % interval:
+
+{markdown_table(header, rows, numbers=3)}
+{_figure(drawn, "tune", QUESTIONS["tune"])}"""
 
 
 def _missing(collected: Collected) -> str:
@@ -341,16 +325,24 @@ def _missing(collected: Collected) -> str:
 
 
 def _method(collected: Collected, scores: Scores) -> str:
+    grid, totals = collected.grid, collected.totals
+    done, wanted = totals.trainings, len(grid.cells())
+    tested, tests = sum(map(len, collected.evaluations.values())), len(grid.deployments())
+    codes = ", ".join(f"`{code}` ({count})" for code, count in sorted(totals.codes.items())) or "none"
     known = [f"{task} {FLOORS[task]:g} to {ceiling:.1f}" for task, ceiling in scores.ceilings.items()]
-    grid = collected.grid
     runs = max(len(grid.seeds_of(grid.arms[0])), 2)
+    about = f"""{done} of {wanted} trainings are finished ({totals.seconds / 3600:.1f} hours of one core), and {tested}
+of {tests} tests, by [the plan](plan.md). Code that trained, with its runs: {codes}. `scripts/study_actuators.py`
+([how](../studies.md)) writes this page, its figures and its tables: [hypotheses]({FOLDER}/{HYPOTHESES}),
+[trials]({FOLDER}/{TRIALS}), [runs]({FOLDER}/{RUNS}), [advised]({FOLDER}/{ADVISED}). `examples/recompute.py` recomputes
+the conclusions without this package."""
     text = f"""A policy's score is its mean return over {grid.episodes} test episodes, in shares of the span: 0 is
 what random actions get on ideal forces, 1 what policies get there on the mean that were trained there
 ({"; ".join(known) or "none is known yet"}). CartPole's return is the paper's: steps within 0.1 m of the centre.
-Effects are differences of mean scores, pooled over tasks or doses where a hypothesis has several: policies count once
-on every task, by their mean over its comparisons. Intervals are by Student's t. p are of permutation tests, of
-equivalence by two one-sided ones with a margin of
-{MARGIN:g}; primary ones are corrected by Holm, the others by Benjamini and Hochberg. With {runs} seeds a difference of
+Effects are differences of mean scores, pooled over tasks or doses; policies count once on every task. Intervals are by
+Student's t, p of permutation tests, of equivalence by two one-sided ones with a margin of {MARGIN:g}; primary ones are
+corrected by Holm, the others by Benjamini and Hochberg. With {runs} seeds a difference of
 {detectable(runs, LEVEL / 12):.2f} standard deviations of a run is found with a chance of 80 % at the strictest of
 Holm's levels."""
-    return f"## How the numbers are made\n\n{textwrap.fill(' '.join(text.split()), 120, break_long_words=False)}\n"
+    wrapped = (textwrap.fill(" ".join(each.split()), 120, break_long_words=False) for each in (about, text))
+    return "## How it was measured\n\n" + "\n\n".join(wrapped) + "\n"

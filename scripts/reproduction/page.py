@@ -37,18 +37,17 @@ def write(findings: Findings, out: Path) -> list[Path]:
     parts = [
         _head(findings),
         f"## Conclusions\n\n{conclusions(out / PAGE)}",
-        _missing(rows),
         verdicts_section(rows["claims"]),
         *_tasks(rows, drawn),
+        _how(findings),
+        _missing(rows),
     ]
     write_page(out / PAGE, parts)
     return [out / PAGE, *written, *(path for paths in drawn.values() for path in paths)]
 
 
 def _head(findings: Findings) -> str:
-    plan, runs = findings.rows["plan"], findings.rows["runs"]
-    done, wanted = len(runs), len(findings.found.grid.cells())
-    hours, trial = sum(row["seconds"] for row in runs) / 3600, ""
+    plan, trial = findings.rows["plan"], ""
     if plan["episodes"] is not None:
         trial = (
             f"\n**A trial: every training was cut off after {plan['episodes']} episodes. "
@@ -56,13 +55,21 @@ def _head(findings: Findings) -> str:
         )
     return f"""# The paper's experiments, done again
 {trial}
-*Control-Optimized Deep Reinforcement Learning* (arXiv 2507.00268) reports one run of each experiment. Here every one of
-them is trained with many seeds, and each reported number is judged by a check that was written down before.
-{done} of {wanted} trainings are finished; they took {hours:.1f} hours of one core in all. Every trained policy was
-tested, without exploration, in {plan["test_episodes"]} episodes on the actuator that it was trained on.
+*Control-Optimized Deep Reinforcement Learning* (arXiv 2507.00268) reports one run of each experiment. Here each is
+trained with many seeds, and judged by a check that was written down before.
+"""
 
-`python scripts/reproduce.py` writes this page, its figures and its tables from run folders; do not edit it.
-[How it is done](../reproduction.md). As files: [every claim with its check]({FOLDER}/{FILES["claims"]}),
+
+def _how(findings: Findings) -> str:
+    """How it was measured, and where the numbers are."""
+    plan, runs = findings.rows["plan"], findings.rows["runs"]
+    hours = sum(row["seconds"] for row in runs) / 3600
+    return f"""## How it was measured
+
+{len(runs)} of {len(findings.found.grid.cells())} trainings are finished, {plan["seeds"]} of a kind,
+{plan["sarsa_seeds"]} of SARSA; they took {hours:.1f} hours of one core. Every policy was tested greedily in
+{plan["test_episodes"]} episodes on the actuator of its training. `scripts/reproduce.py` ([how](../reproduction.md))
+writes this page, its figures and its tables: [every claim with its check]({FOLDER}/{FILES["claims"]}),
 [every run]({FOLDER}/{FILES["runs"]}), [every number]({FOLDER}/{EVERYTHING}).
 """
 
@@ -99,23 +106,21 @@ def verdicts_section(claims: Sequence[Mapping[str, Any]]) -> str:
 
 
 _WORDS = """\
-*Confirmed* is what holds over seeds; *compatible* is what is said of one run or one episode, and could be one of ours.
-A statement that is judged on MuJoCo and on Gymnasium's equations has two verdicts and counts once, as passed if it is
-on both.
+*Confirmed* holds over seeds; *compatible* is said of one run or one episode, and could be one of ours
+([all checks](../reproduction.md#how-it-is-judged)). A statement judged on MuJoCo and on Gymnasium's equations has two
+verdicts and counts once, as passed if it is on both.
 """
 
 
 def _tasks(rows: Mapping[str, Any], drawn: Mapping[str, Mapping[Path, str]]) -> Iterable[str]:
     for task in rows["plan"]["tasks"]:
         section = next(claim.section for claim in CLAIMS if claim.task == task)
-        yield f"## {TITLES[task]}: the paper's *{section}*\n"
+        yield f"## {TITLES[task]}\n\nThe paper's *{section}*.\n"
         yield _claims([claim for claim in rows["claims"] if claim["task"] == task])
-        if task == VALUE_TASK:
-            yield _value_iteration(rows["value_iteration"])
         if drawn[task]:
             first, *others = (f"[{caption}]({FOLDER}/{path.name})" for path, caption in drawn[task].items())
             yield f"!{first}\n"
-            yield ", ".join(others) + "\n"
+            yield f"A test episode: {', '.join(others)}\n"
 
 
 def _claims(claims: Iterable[Mapping[str, Any]]) -> str:
@@ -125,28 +130,34 @@ def _claims(claims: Iterable[Mapping[str, Any]]) -> str:
         if claim["source"] == PAPER_SAYS and claim["physics"] != "analytic":
             outcome = claim["verdict"] if claim["verdict"] == NOT_TESTABLE else f"**{claim['verdict']}**"
             ours = "–" if claim["mean"] is None else _interval(claim)
-            rows.append([outcome, claim["statement"], claim["measure"], ours, str(claim["seeds"] or "–")])
-    return markdown_table(["verdict", "the paper reports", "measure", "ours [95 %]", "seeds"], rows)
+            rows.append([shorter(claim["statement"]), f"{shorter(claim['measure'])}: {ours}", outcome])
+    return markdown_table(["the paper reports", "ours [95 %]", "verdict"], rows)
 
 
-def _value_iteration(optima: Iterable[Mapping[str, Any]]) -> str:
-    """What the best policy does at each discount factor."""
-    rows = [
-        [
-            number(one["discount"]),
-            "yes" if one["stands_still"] else "no",
-            _interval(one["returns"]),
-            f"{100 * one['success']:.0f} %",
-            "–" if one["steps"] is None else number(one["steps"]["median"]),
-        ]
-        for one in optima
-    ]
-    header = ["discount factor", "standing still is best", "return of the best policy", "success", "steps to the goal"]
-    return (
-        "Why the printed settings fail: value iteration of Gymnasium's own dynamics, on a grid with interpolation,\n"
-        "and its policy at work in Gymnasium's environment, without a motor. Returns are not discounted.\n\n"
-        + markdown_table(header, rows)
-    )
+_SHORTER = {
+    "rms torque error / rms desired torque [%]": "rms error [%]",
+    "mean return of the last 50 training episodes": "last 50",
+    "mean return in test": "test",
+    "time to the goal in test [s]": "[s]",
+    "share of test episodes that succeed": "success",
+    ": the first minus the second": ", difference",
+    ": with the motor minus ideal": ", difference",
+    "share of the 500 steps with |x| <= 0.1 m": "share of steps",
+    "largest torque error in test [N·m]": "largest [N·m]",
+    "first epoch of length 4000": "epoch",
+    "first epoch with a return of 3800": "epoch",
+    "imperfect tracking (gains 1, 1, 1e-2)": "imperfect tracking",
+    "perfect tracking (gains 2, 10, 1e-6)": "perfect tracking",
+    "the desired torque is tracked almost perfectly": "tracked almost perfectly",
+    "the desired torque is well tracked": "well tracked",
+}
+
+
+def shorter(text: str) -> str:
+    """What is reported or measured, in as few words as what stands beside it allows."""
+    for long, short in _SHORTER.items():
+        text = text.replace(long, short)
+    return text
 
 
 def _draw(findings: Findings, task: str, folder: Path) -> None:
@@ -169,13 +180,12 @@ def _draw(findings: Findings, task: str, folder: Path) -> None:
 def _figures(task: str, folder: Path) -> dict[Path, str]:
     """The figures of a task that there are, and what they show."""
     title = TITLES[task]
-    shown = {f"learning_{task}": f"Learning, mean over seeds with its 95 % interval: {title}"}
+    shown = {f"learning_{task}": f"Learning on {title}: mean over seeds with its 95 % interval"}
     for settings in dict.fromkeys(arm.settings for arm in ARMS if arm.task == task):
-        torque = f"Desired and actual torque, and error, {settings} settings: {title}"
-        states = f"States over a test episode, {settings} settings: {title}"
+        torque, states = f"torque, {settings} settings", f"states, {settings} settings"
         shown |= {f"torque_{task}_{settings}": torque, f"states_{task}_{settings}": states}
     if task == VALUE_TASK:
-        shown["discount"] = "Value of the start, and the best policies, over discount factors"
+        shown["discount"] = "the best policy by discount factor"
     files = {folder / f"{name}.svg": caption for name, caption in shown.items()}
     return {path: caption for path, caption in files.items() if path.is_file()}
 
