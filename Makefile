@@ -62,7 +62,7 @@ results: $(STAMP)  ## docs/results/ anew: hours; what is finished in runs/ is no
 docs: $(DOCS)  ## the site in build/site, and the pages that are written from the code
 	@$(BIN)/python scripts/environment_pages.py
 	@$(BIN)/python scripts/actuator_numbers.py
-	@$(BIN)/python scripts/command_line_page.py
+	@$(BIN)/python scripts/reference_pages.py
 	@$(BIN)/zensical build --strict --config-file zensical.toml
 
 pictures: $(STAMP)  ## the README's pictures of what comes out; it takes Chromium
