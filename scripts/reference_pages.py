@@ -14,6 +14,7 @@ import itertools
 import os
 import re
 import sys
+import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from codrl_mj.tasks import TASKS, Task
 from codrl_mj.training import TrainConfig
 
 FOLDER = Path(__file__).parent.parent / "docs" / "reference"
-WIDTH = "100"
+WIDTH = "80"
 """Of the help [characters]."""
 ROOMS = (
     *("actuators", "agents", "catalogue", "deploy", "disturbances", "engine", "envs", "evaluation", "identify"),
@@ -57,7 +58,11 @@ def help_of(*words: str) -> str:
     with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
         cli.main([*words, "--help"])
     lines = [re.sub(r"^╭─ (.*?) ─*╮$", r"\n\1:", line) for line in printed.getvalue().splitlines()]
-    return "\n".join(line.strip("│").rstrip() for line in lines if not re.fullmatch(r"[│ ]*[╰─]+[╯│ ]*", line)).strip()
+    kept = [line.strip("│").rstrip() for line in lines if not re.fullmatch(r"[│ ]*[╰─]+[╯│ ]*", line)]
+    long = int(WIDTH) + 5
+    return "\n".join(
+        textwrap.fill(one, int(WIDTH)) if len(one) > long and one[0] != " " else one for one in kept
+    ).strip()
 
 
 def verb_page(verb: str) -> str:
@@ -127,7 +132,9 @@ def settings() -> dict[str, list[type]]:
         room: [
             one
             for name in module.__all__
-            if dataclasses.is_dataclass(one := getattr(module, name)) and isinstance(one, type) and rows_of(one)
+            if dataclasses.is_dataclass(one := getattr(module, name))
+            and isinstance(one, type)
+            and dataclasses.fields(one)
         ]
         for room, module in rooms.items()
     }
@@ -171,9 +178,10 @@ def shown(default: Any) -> str:
 
 
 def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """In Markdown."""
-    head = list(header)
-    lines = [head, ["---"] * len(head), *rows]
+    """In Markdown, without the columns that are empty."""
+    columns = [column for column in zip(header, *rows, strict=True) if any(column[1:])]  # those that say something
+    head, *rest = zip(*columns, strict=True)
+    lines = [head, ["---"] * len(head), *rest]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
 
 
