@@ -24,8 +24,9 @@ ROOT = Path(__file__).parent.parent
 PAGES = {
     str(path.relative_to(ROOT)): path.read_text()
     for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-    if "results" not in path.parts
+    if "results" not in path.parts and ("reference" not in path.parts or path.name == "python.md")
 }
+"""What is written by hand; `make docs` writes the other pages of the reference, from the code."""
 TUTORIAL = "docs/tutorial_log_to_policy.md"
 ELSEWHERE = {
     "README.md",
