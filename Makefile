@@ -65,7 +65,7 @@ docs: $(DOCS)  ## the site in build/site, and the pages that are written from th
 	@$(BIN)/python scripts/reference_pages.py
 	@$(BIN)/zensical build --strict --config-file zensical.toml
 
-pictures: $(STAMP)  ## the README's pictures of what comes out; it takes Chromium
+pictures: $(STAMP)  ## of what comes out, for README, gallery and pages: half an hour, and Chromium
 	@$(BIN)/python scripts/pictures.py
 
 clean:  ## everything but what was trained
