@@ -6,7 +6,7 @@ ideal forces and drops it on a motor, and another of five numbers that learned t
     python examples/the_whole_idea.py
 
 Everything else in codrl_mj is this with MuJoCo in the place of `cartpole`, real motors in the place of `Motor`, and
-better agents in the place of `learn`. Up to rounding, the first two steps below are the package's own.
+better agents in the place of `learn`. Up to rounding, `motor_step` and `cartpole_step` are the package's own steps.
 """
 
 from typing import NamedTuple
