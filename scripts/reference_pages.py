@@ -21,7 +21,7 @@ from typing import Any
 
 from codrl_mj import cli
 from codrl_mj.actuators import Inputs
-from codrl_mj.cli.identify import TOOLS
+from codrl_mj.cli import identify
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import field_docs
 from codrl_mj.runs.files import writing
@@ -65,11 +65,17 @@ def help_of(*words: str) -> str:
     ).strip()
 
 
+def verbs() -> list[str]:
+    """The first words of command lines."""
+    return list(dict.fromkeys(name.split()[0] for name in cli.VERBS))
+
+
 def verb_page(verb: str) -> str:
     """A verb, and each that it has below it."""
     text = help_of(verb)
     named = re.match(rf"usage: codrl-mj {verb} \[-h\] \{{(.*?)\}}", text)
-    below = named[1].split(",") if named else TOOLS if verb == "identify" else []
+    below = [name.split()[1] for name in cli.VERBS if name.startswith(f"{verb} ")]
+    below = below or (named[1].split(",") if named else list(getattr(identify, "TOOLS", ())) * (verb == "identify"))
     parts = [f"# codrl-mj {verb}", fenced(text)]
     parts += [f"## {verb} {name}\n\n{fenced(help_of(verb, name))}" for name in below]
     return "\n\n".join(parts)
@@ -83,8 +89,8 @@ def fenced(text: str) -> str:
 def verbs_page() -> str:
     """The first sentence of every verb."""
     rows = []
-    for verb in cli.VERBS:
-        sentence = (inspect.getdoc(cli.find_verb(verb)) or "").partition("\n\n")[0]
+    for verb in verbs():
+        sentence = help_of(verb).split("\n\n")[1]
         rows.append((f"[`{verb}`](command_line/{verb}.md)", " ".join(sentence.split())))
     return f"# Command line\n\n`codrl-mj VERB --help` says the same.\n\n{table(('verb', 'does'), rows)}"
 
@@ -206,7 +212,7 @@ def pages() -> dict[str, str]:
     """Path below docs/reference -> text."""
     os.environ["COLUMNS"] = WIDTH
     made = {"command_line.md": verbs_page(), "settings.md": settings_page()}
-    made |= {f"command_line/{verb}.md": verb_page(verb) for verb in cli.VERBS}
+    made |= {f"command_line/{verb}.md": verb_page(verb) for verb in verbs()}
     return made | {f"rooms/{room}.md": room_page(room) for room in sorted((*ROOMS, *ALONE))}
 
 
