@@ -62,10 +62,10 @@ results: $(STAMP)  ## docs/results/ anew: hours; what is finished in runs/ is no
 docs: $(DOCS)  ## the site in build/site, and the pages that are written from the code
 	@$(BIN)/python scripts/environment_pages.py
 	@$(BIN)/python scripts/actuator_numbers.py
-	@$(BIN)/python scripts/command_line_page.py
+	@$(BIN)/python scripts/reference_pages.py
 	@$(BIN)/zensical build --strict --config-file zensical.toml
 
-pictures: $(STAMP)  ## the README's pictures of what comes out; it takes Chromium
+pictures: $(STAMP)  ## of what comes out, for README, gallery and pages: half an hour, and Chromium
 	@$(BIN)/python scripts/pictures.py
 
 clean:  ## everything but what was trained

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from codrl_mj.sizing.bench import BLOCKED, Bench
 from PIL import Image
 
 from codrl_mj.actuators import Drive, GearMotor, Lag, SampledLoop, Supply, TorqueSpeed
 from codrl_mj.cli import main
 from codrl_mj.pages.plots import Curve, Plot, save
-from codrl_mj.sizing.bench import BLOCKED, Bench
 from codrl_mj.tasks import OURS, named_actuator
 
 DOCS = Path(__file__).parents[1] / "docs"

@@ -65,7 +65,7 @@ def make(task: str, path: Path) -> None:
         episodes = run_episodes(load_policy(run), env.make, 21, EVALUATION_SEED)
         typical = episodes[int(np.argsort([episode.total for episode in episodes])[len(episodes) // 2])]
         title = f"{scene.agent.upper()}, {len(typical.reward) * float(typical.time[0]):g} s"
-        panel = Panel(title, task, typical.actuator, typical)
+        panel = Panel(task, typical, title=title)
         frames = film([panel], Path(made) / "film", WIDTH, HEIGHT, scene.camera)
         images = sorted(frames.iterdir())[:-1]  # the last one is faded, and says how it ended
         chosen = sorted({round(at) for at in np.linspace(0, len(images) - 1, FRAMES)})

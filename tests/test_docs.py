@@ -15,7 +15,6 @@ import pytest
 
 from codrl_mj import cli
 from codrl_mj.agents import PPOConfig
-from codrl_mj.cli.identify_tools import TOOLS
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.study.trials import Grid
 from codrl_mj.tasks import pendulum
@@ -26,8 +25,9 @@ ROOT = Path(__file__).parent.parent
 PAGES = {
     str(path.relative_to(ROOT)): path.read_text()
     for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-    if "results" not in path.parts
+    if "results" not in path.parts and ("reference" not in path.parts or path.name == "python.md")
 }
+"""What is written by hand; `make docs` writes the other pages of the reference, from the code."""
 TUTORIAL = "docs/tutorial_log_to_policy.md"
 ELSEWHERE = {
     "README.md",
@@ -109,7 +109,7 @@ def test_the_python_of_a_page_runs(page, monkeypatch):
 @pytest.mark.parametrize(("page", "command"), COMMANDS)
 def test_a_command_of_a_page_is_understood(page, command, monkeypatch):
     parsed = []
-    for verb in (*map(cli.find_verb, cli.VERBS), *TOOLS.values()):
+    for verb in map(cli.find_verb, cli.VERBS):
         monkeypatch.setattr(verb, "run", lambda self: parsed.append(self) or 0)
     with contextlib.suppress(SystemExit):
         assert cli.main(shlex.split(command, comments=True)) == 0

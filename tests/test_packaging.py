@@ -1,12 +1,18 @@
-"""The wheel has all that a user needs, and works without the checkout."""
+"""The wheel has all that a user needs, and works without the checkout; what is published is as an index wants it."""
 
 import os
+import re
+import site
 import subprocess
 import sys
+import tarfile
+import venv
 import zipfile
 from pathlib import Path
 
 import pytest
+
+from tests.test_docs import RUN, shortened
 
 REPOSITORY = Path(__file__).parents[1]
 
@@ -31,14 +37,39 @@ pytestmark = pytest.mark.matrix
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory):
-    """The wheel, built from the checkout."""
-    out = tmp_path_factory.mktemp("wheel")
-    build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out), str(REPOSITORY)]
-    done = subprocess.run(build, capture_output=True, text=True, timeout=120, check=False)
+def built(tmp_path_factory):
+    """A folder with the source distribution, and the wheel that is built from it, as `python -m build` does."""
+    out = tmp_path_factory.mktemp("built")
+    build = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), str(REPOSITORY)]
+    done = subprocess.run(build, capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    (path,) = out.glob("*.whl")
+    return out
+
+
+@pytest.fixture(scope="module")
+def wheel(built):
+    """The wheel."""
+    (path,) = built.glob("*.whl")
     return path
+
+
+@pytest.fixture(scope="module")
+def environment(wheel, tmp_path_factory):
+    """The folder of programs of an environment that has the wheel, and of this one only what the wheel depends on."""
+    folder = tmp_path_factory.mktemp("environment")
+    venv.create(folder, symlinks=True)
+    programs = folder / ("Scripts" if os.name == "nt" else "bin")
+    python = programs / "python"
+    install = [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet", "--no-deps", str(wheel)]
+    subprocess.run(install, check=True, timeout=240)
+    where = "import sysconfig; print(sysconfig.get_path('purelib'))"
+    own = Path(subprocess.run([python, "-c", where], capture_output=True, text=True, check=True).stdout.strip())
+    (own / "dependencies.pth").write_text("\n".join([*site.getsitepackages(), *filter(_is_site, sys.path)]))
+    return programs
+
+
+def _is_site(path):
+    return Path(path).name == "site-packages"
 
 
 def test_the_wheel_has_every_module_model_and_the_type_marker(wheel):
@@ -92,3 +123,36 @@ def test_the_unpacked_wheel_steps_and_draws_every_task_from_another_folder(wheel
     assert has_evidence == "True"
     assert len(tasks) == 6
     assert all(line.endswith("(48, 64, 3) True True") for line in tasks), tasks
+
+
+def test_the_source_distribution_has_what_the_checkout_has(built):
+    (path,) = built.glob("*.tar.gz")
+    with tarfile.open(path) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    needed = {"README.md", "CHANGELOG.md", "LICENSE", "pyproject.toml", "examples/the_whole_idea.py", "docs/index.md"}
+    assert names >= needed | {"tests/conftest.py", "scripts/demo.py", "assets/cartpole.xml", "docs/pictures/demo.gif"}
+    assert not [name for name in names if name.startswith((".venv", "runs", "build"))]
+
+
+def test_an_index_would_take_both(built):
+    pytest.importorskip("twine")
+    files = sorted(map(str, built.iterdir()))
+    done = subprocess.run([sys.executable, "-m", "twine", "check", "--strict", *files], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("PASSED") == 2
+
+
+def test_the_readme_works_with_the_wheel_alone(environment, tmp_path):
+    """Its Python, and its commands with fewer steps, by the program that the wheel installed."""
+    clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    options = {"cwd": tmp_path, "env": clean, "capture_output": True, "text": True, "timeout": 300}
+    where = subprocess.run([environment / "python", "-c", "import codrl_mj; print(codrl_mj.__file__)"], **options)
+    assert Path(where.stdout.strip()).is_relative_to(environment.parent), where.stderr
+    (block,) = re.findall(r"```python\n(.*?)```", (REPOSITORY / "README.md").read_text(), re.DOTALL)
+    done = subprocess.run([environment / "python", "-c", block], **options)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split()[0] == "10.0"
+    for command in RUN["README.md"]:
+        done = subprocess.run([environment / "codrl-mj", *shortened(command)], **options)
+        assert done.returncode == 0, f"{command}: {done.stdout[-1000:]}{done.stderr[-1000:]}"
+    assert {"mine.html", "points", "runs"} <= {path.name for path in tmp_path.iterdir()}

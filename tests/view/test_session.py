@@ -186,7 +186,7 @@ def test_the_command_line_offers_the_runs_policy_and_those_of_others(monkeypatch
         def close(self):
             seen["closed"] = True
 
-    monkeypatch.setattr("codrl_mj.cli.view._browser", lambda: Fake)
+    monkeypatch.setattr("codrl_mj.view.browser.Browser", Fake)
     run = Path(__file__).parents[1] / "fixtures" / "runs" / "cartpole"
     other = shutil.copytree(run, tmp_path / "other" / "cartpole")
     assert main(["view", str(run), "--policies", str(run), str(other), "--actuator", "weaker"]) == 0
