@@ -13,6 +13,8 @@ from codrl_mj import fields
 from codrl_mj.actuators.noise import LOAD_STREAM, philox, unit
 from codrl_mj.fields import real
 
+__all__ = ["OFF", "PLAIN", "Disturbances", "Joint", "resolve"]
+
 
 @dataclasses.dataclass(frozen=True)
 class Disturbances:

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from codrl_mj.sizing.bench import BLOCKED, Bench
 from PIL import Image
 
 from codrl_mj.actuators import Drive, GearMotor, Lag, SampledLoop, Supply, TorqueSpeed
 from codrl_mj.cli import main
 from codrl_mj.pages.plots import Curve, Plot, save
+from codrl_mj.study.bench import BLOCKED, on_bench
 from codrl_mj.tasks import OURS, named_actuator
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -97,7 +97,7 @@ def actuators(out: Path) -> None:
     timestep, asked, inertia = 1e-3, 4.0, 0.2
     times = timestep * np.arange(1, 1501)
     curves = [
-        Curve(name, times, Bench(one, timestep, inertia).run(asked, times[-1])[:, 0]) for name, one in families.items()
+        Curve(name, times, on_bench(one, timestep, inertia)(asked, times[-1])[:, 0]) for name, one in families.items()
     ]
     ideal = Curve("ideal", times, np.full_like(times, asked), reference=True, dashed=True)
     title = "4 N·m asked for, on a joint that is free to turn"
@@ -112,9 +112,7 @@ def actuators_in_numbers(out: Path) -> None:
         timestep = task.step_duration / task.motor_inner_steps
         curves = []
         for name in ("paper", "weak", "weaker", "open_loop"):
-            torques = Bench(named_actuator(name, task.name), timestep, BLOCKED).run(float(task.max_forces[0]), 8.0)[
-                :, 0
-            ]
+            torques = on_bench(named_actuator(name, task.name), timestep, BLOCKED)(float(task.max_forces[0]), 8.0)[:, 0]
             times = timestep * np.arange(len(torques) + 1)
             curves.append(Curve(name, times, np.concatenate([[0.0], torques]) / float(task.max_forces[0])))
         plots.append(Plot(task.name, "time [s]", "share of the largest force", tuple(curves)))

@@ -31,12 +31,23 @@ FOLDER = Path(__file__).parent.parent / "docs" / "reference"
 WIDTH = "80"
 """Of the help [characters]."""
 ROOMS = (
-    *("actuators", "agents", "catalogue", "deploy", "disturbances", "engine", "envs", "evaluation", "identify"),
-    *("motor_design", "physics", "replay", "sizing", "study", "tasks", "training", "validation"),
+    *(
+        "actuators",
+        "agents",
+        "catalogue",
+        "deploy",
+        "disturbances",
+        "drives",
+        "engine",
+        "envs",
+        "evaluation",
+        "identify",
+    ),
+    *("physics", "replay", "study", "tasks", "training", "validation"),
 )
 """Rooms with an `__all__`."""
 ALONE = {
-    "films": ("film.film", "film.Panel", "record.record"),
+    "films": ("film.film", "film.Panel", "film.record"),
     "foreign": ("building.motorised", "dm_control.make_dm_control", "world.GymnasiumWorld"),
     "pages": (
         *("report.report", "report.replays", "motor.motor_page", "identification.identification_page"),

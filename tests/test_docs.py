@@ -28,14 +28,15 @@ PAGES = {
     if "results" not in path.parts and ("reference" not in path.parts or path.name == "python.md")
 }
 """What is written by hand; `make docs` writes the other pages of the reference, from the code."""
-TUTORIAL = "docs/tutorial_log_to_policy.md"
+TUTORIALS = {"docs/tutorial_log_to_policy.md", "docs/tutorial_datasheet_to_board.md"}
+"""Pages whose commands have tests of their own, which follow them."""
 ELSEWHERE = {
     "README.md",
     "docs/own_robot.md",
     "docs/training.md",
     "docs/other_agents.md",
     "docs/randomization.md",
-    TUTORIAL,
+    *TUTORIALS,
 }
 """Pages whose Python has tests of its own, which look at what comes out."""
 SHORT = {
@@ -49,7 +50,7 @@ LONG = {f"docs/{name}.md" for name in ("actuators", "foreign", "identify", "moto
 COMMANDS = [
     pytest.param(name, command.replace("\\\n", ""), marks=pytest.mark.matrix if name != "README.md" else [])
     for name, text in PAGES.items()
-    if name != TUTORIAL
+    if name not in TUTORIALS
     for command in re.findall(r"^(?:\$ )?codrl-mj ((?:.*\\\n)*.*)$", text, re.MULTILINE)
     if not re.search(r"\b(?:NAME|LOG|RUN)\b", command)  # a form, not an example
 ]
@@ -71,7 +72,7 @@ def folder_of_a_reader(trained, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     Path("examples").symlink_to(ROOT / "examples")
     Path("half_cheetah.xml").symlink_to(Path(gymnasium.__file__).parent / "envs/mujoco/assets/half_cheetah.xml")
-    written = re.search(r"```toml\n(.*?)```", PAGES["docs/motors.md"], re.DOTALL)
+    written = re.search(r"```toml\n(.*?)```", PAGES["docs/own_motor.md"], re.DOTALL)
     Path("my_motor.toml").write_text(written[1])
     Path("car.yaml").write_text(re.search(r"```yaml\n(.*?)```", PAGES["docs/training.md"], re.DOTALL)[1])
     family = re.search(r"```python\n(import dataclasses\n.*?)```", PAGES["docs/actuators.md"], re.DOTALL)

@@ -49,8 +49,8 @@ ALLOWED = {
         *("runs.policies", "tasks"),
     },
     "deploy": {
-        *("actuators", "engine", "envs.config", "evaluation", "fields", "kept", "runs.files", "runs.policies", "tasks"),
-        "tasks.assets",
+        *("actuators", "agents", "engine", "envs.config", "evaluation", "fields", "kept"),
+        *("runs.files", "runs.policies", "tasks", "tasks.assets"),
     },
     "films": {"actuators", "envs", "envs.config", "evaluation", "physics", "runs.files", "tasks"},
     "replay": {"envs", "envs.config", "evaluation", "runs.files"},

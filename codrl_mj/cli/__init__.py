@@ -80,7 +80,7 @@ _ABOUT = (
 
 
 _FILES: dict[str, Callable[[Path], None]] = {
-    **dict.fromkeys(("Evaluate", "Runs", "SimulateLog"), check_file),
+    **dict.fromkeys(("Evaluate", "Runs", "SimulateLog", "CompareLog", "RunBoard"), check_file),
     **dict.fromkeys(("Replay", "Report"), check_page),
     "Render": lambda path: check_writable(path.parent),  # a film or a folder, which it checks itself
 }

@@ -56,11 +56,9 @@ class CompareLog:
             if exported
             else load_config(self.run_folder, self.trust).env
         )
-        if self.actuator is not None:
-            env = dataclasses.replace(env, actuator=dict.fromkeys(env.driven, self.actuator), randomize=None)
-        found = compare(env, self.log, self.window)
+        found = compare(env, self.log, self.window, self.actuator)
         columns = list(zip(found.names, found.units, found.errors.tolist(), found.moved.tolist(), strict=True))
-        title = f"{self.log.name} through {env.through}: {len(found.starts)} windows"
+        title = f"{self.log.name} through {self.actuator or env.through}: {len(found.starts)} windows"
         rows = [(name, unit or "?", f"{error:.3g}", f"{moved:.3g}") for name, unit, error, moved in columns]
         print_table(title, ("", "unit", "error (RMS)", "if nothing changed"), rows)
         if self.out is not None:

@@ -4,16 +4,13 @@ import contextlib
 import math
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Column, Table
 from rich.text import Text
-
-if TYPE_CHECKING:
-    from rich.progress import Progress
 
 
 def console() -> Console:
@@ -61,7 +58,7 @@ def number(value: Any, digits: int = 3) -> str:
     return f"{value:,.0f}" if 1e3 <= abs(float(f"{value:.{digits}g}")) < 1e6 else f"{value:.{digits}g}"
 
 
-def progress_bar(*columns: str) -> "Progress":
+def progress_bar(*columns: str) -> Any:
     """A progress display with the given text columns, the time elapsed and the time left.
 
     Text is in one line; nothing while numbers in it are not known, such as of how many a count is. Where all is too

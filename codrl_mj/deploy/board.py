@@ -160,6 +160,10 @@ class Board:
                 f"actuator: a {type(motor).__name__}, must be a {trained.__name__}, for which the C closes the loop; "
                 "or let the simulation close it (--no-loop)"
             )
+        self.rig = self.env  # where the drive's limit of the current is the C's, which knows its own motor alone
+        if self.loop is not None and actuator is not None and self.loop["kind"] == "sampled":
+            unlimited = motor.replaced({"controller.max_current": np.inf})
+            self.rig = dataclasses.replace(self.env, actuator=dict.fromkeys(self.env.driven, unlimited))
         steps = self._converters()
         with contextlib.ExitStack() as held:
             process = held.enter_context(_running(folder, target))
@@ -300,7 +304,7 @@ def board_test(
     with Board(folder, target, link, seed, loop, actuator) as board:
         env = board.env
         began = time.perf_counter()
-        on_board = run_episodes(board, env.make, episodes, seed, on_step=on_step)
+        on_board = run_episodes(board, board.rig.make, episodes, seed, on_step=on_step)
         rate = (board.frames + board.samples) / (time.perf_counter() - began)
         counts = board.frames, board.samples, board.refused, board.stopped, board.unanswered
     in_python = run_episodes(OnnxPolicy(folder), env.make, episodes, seed)

@@ -45,16 +45,18 @@ class Comparison:
         return np.sqrt(((held - self.logged) ** 2).mean(axis=0))
 
 
-def compare(env: EnvConfig, path: Path, window: float | None = None) -> Comparison:
+def compare(env: EnvConfig, path: Path, window: float | None = None, actuator: Any = None) -> Comparison:
     """Simulate the commands of a log, and hold what is observed then against what was observed on the rig.
 
     The simulation begins at the first row's observation and again after each window; its motors go on as they are, as
-    the commands before have left them. What is drawn in the environment is not drawn here.
+    the commands before have left them. What is drawn in the environment is not drawn here. Another motor gets the
+    current that a command stood for in the training, as on the rig: a controller knows no other torque constant.
 
     Args:
-        env: the environment that the policy was trained in, with the actuator that is to be tried.
+        env: the environment that the policy was trained in.
         path: the log, as `codrl_mj.deploy.log.read_rows` reads it.
         window: time [s] from one beginning to the next; None: half a second, and at least ten rows of the log.
+        actuator: what the simulation has for motors, by name, file or object; None: those of the training.
 
     Raises:
         FileNotFoundError: there is no such log.
@@ -68,10 +70,22 @@ def compare(env: EnvConfig, path: Path, window: float | None = None) -> Comparis
     if window is not None and length < 2:
         raise ValueError(f"window = {window:g} s: must be at least {2 / interface.rate:g} s, two rows of the log")
     starts = np.arange(0, len(rows.time), length)
-    with contextlib.closing(env.make()) as made:
+    tried = env if actuator is None else dataclasses.replace(env, actuator=dict.fromkeys(env.driven, actuator))
+    if env.action == "force" and interface.levels is None:
+        forces = np.array(
+            [_per_ampere(new) / _per_ampere(old) for new, old in zip(tried.actuators, env.actuators, strict=True)]
+        )
+        rows = rows._replace(commands=rows.commands * forces)
+    with contextlib.closing(tried.make()) as made:
         simulated = _simulated(made.unwrapped, interface, rows, starts)
     names, units = ([one[key] for one in interface.observations] for key in ("name", "unit"))
     return Comparison(names, units, rows.time, rows.observed, simulated, starts)
+
+
+def _per_ampere(actuator: Any) -> float:
+    """Force [N] or torque [N*m] at the joint for an ampere; 1 of what has no motor."""
+    motor = getattr(actuator, "motor", None)
+    return 1.0 if motor is None else float(motor.torque_constant / actuator.arm_radius)
 
 
 def _simulated(env: Any, interface: Interface, rows: Rows, starts: np.ndarray) -> np.ndarray:

@@ -3,8 +3,8 @@
 import contextlib
 import hashlib
 import json
+import os
 import re
-import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -22,10 +22,12 @@ def writing(path: Path) -> Iterator[Path]:
     The folder is made if it is missing. The temporary name keeps the suffix, which some encoders go by.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.parent / f".{path.stem}-{secrets.token_hex(4)}{path.suffix}"
-    temporary.touch(exist_ok=False)
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    temporary = Path(name)
     try:
         yield temporary
+        temporary.chmod(0o666 & ~_umask())  # mkstemp's files are private
         temporary.replace(path)
     except BaseException:
         temporary.unlink(missing_ok=True)
@@ -45,14 +47,20 @@ def writing_folder(path: Path) -> Iterator[Path]:
     It raises where `path` exists and is not an empty folder.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.parent / f".{path.name}.{secrets.token_hex(4)}"
-    temporary.mkdir()
+    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     try:
         yield temporary
+        temporary.chmod(0o777 & ~_umask())
         temporary.replace(path)
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
 
 
 def check_writable(folder: Path) -> None:

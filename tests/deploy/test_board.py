@@ -149,10 +149,12 @@ def test_the_simulation_may_have_another_motor_than_the_one_the_loop_is_for(tmp_
     export(trained("furuta", "ppo")[0], FURUTA, "ppo", tmp_path / "arm", 1)
     real = DRIVE.replaced({"motor.torque_constant": 0.03, "motor.back_emf_constant": 0.03, "motor.resistance": 9.0})
     done = board_test(tmp_path / "arm", episodes=1, actuator=real)
-    assert done.on_board[0].actuator == real
-    # the C asks for what its own motor would need, and gets 0.03/0.042 of the torque; Python knows the real one
+    assert done.on_board[0].actuator.motor == real.motor
+    # the C asks for what its own motor would need; Python, which knows the real one, for more, up to the drive's 2 A
     board, python = (side[0].signals["current"][0] for side in (done.on_board, done.in_python))
-    assert board == pytest.approx(python * 0.03 / 0.042, rel=0.05)
+    asked = abs(float(done.on_board[0].action[0, 0]))
+    assert abs(board) == pytest.approx(asked / 0.042, rel=0.02)
+    assert abs(python) == pytest.approx(min(asked / 0.03, 2.0), rel=0.02)
     with pytest.raises(ValueError, match="actuator: a Lag, must be a Drive"):
         board_test(tmp_path / "arm", episodes=1, actuator={"family": "lag"})
 
