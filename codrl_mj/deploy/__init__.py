@@ -2,7 +2,7 @@
 
 from codrl_mj.deploy.board import Board, BoardTest, Link, OnnxPolicy, board_test, instructions
 from codrl_mj.deploy.c_code import c_files
-from codrl_mj.deploy.compare import Comparison, compare
+from codrl_mj.deploy.compare import RigComparison, compare
 from codrl_mj.deploy.contract import Contract, Interface
 from codrl_mj.deploy.export import export, onnx_model
 from codrl_mj.deploy.log import LogCheck, check_log, read_rows, write_log
@@ -16,7 +16,7 @@ __all__ = [
     "Board",
     "BoardRun",
     "BoardTest",
-    "Comparison",
+    "RigComparison",
     "Contract",
     "Interface",
     "Link",

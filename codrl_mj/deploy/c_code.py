@@ -49,8 +49,6 @@ def c_files(network: Network | Tiles, contract: Contract) -> dict[str, str]:
     levels = contract.levels
     if network.low is None and levels is None:  # an environment of others: what they stand for is their index
         levels = np.arange(network.choices, dtype=np.float64)[:, None]
-    acted = np.array(golden["actions"])
-    size = 8 if double else 4
     known = {
         "version": codrl_mj.__version__,
         "real": contract.controller["real"],
@@ -78,26 +76,22 @@ def c_files(network: Network | Tiles, contract: Contract) -> dict[str, str]:
         "late_after": f"{round(1e6 * contract.late['after'])}u",
         "safe": contract.late["command"],
         "golden_seen": golden["observations"],
-        "golden_commands": contract.commands(acted),
-        "constants": size
-        * (network.size + len(network.factors) + (3 * len(acted[0]) if levels is None else levels.size)),
-        "stack": size * network.working,
-        "state": 2 * size,
-        **_operations(network),
+        "golden_commands": contract.commands(np.array(golden["actions"])),
+        **_sizes(network, 8 if double else 4, 3 * len(contract.actions) if levels is None else levels.size),
     }
     made = jinja2.Environment(undefined=jinja2.StrictUndefined, keep_trailing_newline=True, autoescape=False)
     return {name: made.from_string(asset_path(f"deploy/{name}.jinja").read_text()).render(known) for name in FILES}
 
 
-def _operations(network: Network | Tiles) -> dict[str, int]:
-    """How many operations a step takes."""
+def _sizes(network: Network | Tiles, size: int, further: int) -> dict[str, int]:
+    """Bytes of constants, stack and state by those of a number, and how many operations a step takes."""
+    constants = size * (network.size + len(network.factors) + further)
+    told = {"constants": constants, "stack": size * network.working, "state": 2 * size}
     if isinstance(network, Tiles):
         tilings, axes = network.coder.displacements.shape
-        return {"products": tilings * (axes + network.choices), "tanhs": 0}
-    return {
-        "products": sum(layer.weight.size for layer in network.layers),
-        "tanhs": sum(len(layer.bias) for layer in network.layers if layer.activation == "Tanh"),
-    }
+        return told | {"products": tilings * (axes + network.choices), "tanhs": 0}
+    tanhs = sum(len(layer.bias) for layer in network.layers if layer.activation == "Tanh")
+    return told | {"products": sum(layer.weight.size for layer in network.layers), "tanhs": tanhs}
 
 
 def check_board(board: str, network: Network | Tiles, double: bool = False) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.deploy.contract import Interface
-from codrl_mj.deploy.log import Rows, read_rows
+from codrl_mj.deploy.log import RigLog, read_rows
 from codrl_mj.envs.config import EnvConfig
 
 WINDOW, ROWS = 0.5, 10
@@ -17,7 +17,7 @@ _STARTS = 8  # further states from which the one is searched that an observation
 
 
 @dataclasses.dataclass(frozen=True)
-class Comparison:
+class RigComparison:
     """Observations of a log of n rows and of the simulation under its commands, which begins anew at some of them."""
 
     names: list[str]
@@ -45,7 +45,7 @@ class Comparison:
         return np.sqrt(((held - self.logged) ** 2).mean(axis=0))
 
 
-def compare(env: EnvConfig, path: Path, window: float | None = None, actuator: Any = None) -> Comparison:
+def compare(env: EnvConfig, path: Path, window: float | None = None, actuator: Any = None) -> RigComparison:
     """Simulate the commands of a log, and hold what is observed then against what was observed on the rig.
 
     The simulation begins at the first row's observation and again after each window; its motors go on as they are, as
@@ -79,7 +79,7 @@ def compare(env: EnvConfig, path: Path, window: float | None = None, actuator: A
     with contextlib.closing(tried.make()) as made:
         simulated = _simulated(made.unwrapped, interface, rows, starts)
     names, units = ([one[key] for one in interface.observations] for key in ("name", "unit"))
-    return Comparison(names, units, rows.time, rows.observed, simulated, starts)
+    return RigComparison(names, units, rows.time, rows.observed, simulated, starts)
 
 
 def _per_ampere(actuator: Any) -> float:
@@ -88,7 +88,7 @@ def _per_ampere(actuator: Any) -> float:
     return 1.0 if motor is None else float(motor.torque_constant / actuator.arm_radius)
 
 
-def _simulated(env: Any, interface: Interface, rows: Rows, starts: np.ndarray) -> np.ndarray:
+def _simulated(env: Any, interface: Interface, rows: RigLog, starts: np.ndarray) -> np.ndarray:
     """What an environment observes under the commands of a log, shape (n, k)."""
     task = getattr(env, "task", None)
     if task is None:

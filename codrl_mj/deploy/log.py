@@ -75,7 +75,7 @@ def _measured(contract: Contract, episode: Episode) -> np.ndarray:
     return before.reshape(steps, -1)
 
 
-class Rows(NamedTuple):
+class RigLog(NamedTuple):
     """A log, as it was recorded."""
 
     time: np.ndarray
@@ -86,7 +86,7 @@ class Rows(NamedTuple):
     """Shape (n, m), in the units of the interface's actions."""
 
 
-def read_rows(interface: Interface, path: Path) -> Rows:
+def read_rows(interface: Interface, path: Path) -> RigLog:
     """Read a log that a controller recorded.
 
     Args:
@@ -129,7 +129,7 @@ def read_rows(interface: Interface, path: Path) -> Rows:
             raise ValueError(
                 f"{path}: action {one['name']!r}: its unit is {told[place][1]}, must be {one['unit']}: convert it"
             )
-    return Rows(table[:, where["time"]], table[:, seen], table[:, sent])
+    return RigLog(table[:, where["time"]], table[:, seen], table[:, sent])
 
 
 def check_log(folder: Path, path: Path) -> LogCheck:

@@ -5,7 +5,7 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -60,16 +60,10 @@ def run_board(
         FileNotFoundError: the folder has no contract.
         RuntimeError: the board has no sensors, or there is none at the port.
     """
-    import serial
-
     contract = Contract.read(folder)
     kind, late_after = DRIVE if drive else WATCH, float(contract.late["after"])
     nothing, rows, missed, in_a_row, late, why = np.zeros(len(contract.observations)), 0, 0, 0, 0, ""
-    try:
-        line = serial.Serial(port, baud, timeout=0, exclusive=True)
-    except serial.SerialException as error:
-        raise RuntimeError(f"--port {port}: {error}; is the board plugged in, and may you open it?") from None
-    with line, writing(log) as part, part.open("w", newline="") as file:
+    with _opened(port, baud) as line, writing(log) as part, part.open("w", newline="") as file:
         table, wire = csv.writer(file), Wire(contract, line.fileno(), line.fileno())
         table.writerow(columns(contract) + motor_columns(contract))
         began = time.monotonic()
@@ -97,6 +91,16 @@ def run_board(
             stamp = int(1e6 * (time.monotonic() - began)) + 2
             wire.asked(wire.frame(sequence + 1, stamp, nothing, WATCH), sequence + 1, late_after)
     return BoardRun(rows, missed, late, why)
+
+
+def _opened(port: str, baud: int) -> Any:
+    """The serial port."""
+    import serial
+
+    try:
+        return serial.Serial(port, baud, timeout=0, exclusive=True)
+    except serial.SerialException as error:
+        raise RuntimeError(f"--port {port}: {error}; is the board plugged in, and may you open it?") from None
 
 
 def _wrong(contract: Contract, answer: Answer | None, in_a_row: int) -> str:
