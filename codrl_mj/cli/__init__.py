@@ -213,9 +213,9 @@ def _sentence(error: BaseException) -> str:
 def _engine_warnings() -> Iterator[None]:
     """Show MuJoCo's warnings as ours, each kind once, for it would write MUJOCO_LOG.TXT; not if somebody else has them.
 
-    That a simulation diverged is left out, which ends in an error.
+    That a simulation diverged is left out, which ends in an error, and what Gymnasium's model of a cheetah is old in.
     """
-    shown = {"Nan, Inf or huge value in "}
+    shown = {"Nan, Inf or huge value in ", "compiler attribute 'settotalmass' is deprecated"}
 
     def show(text: str) -> None:
         if not any(text.startswith(kind) for kind in shown):
