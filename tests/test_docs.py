@@ -128,8 +128,8 @@ SHORTER = {
 }
 """Verb -> flags with which a command takes seconds."""
 NEEDING_MORE = (
-    r"identify|data |view|board run|validate (--model|--mutations|--out)|validate *(#.*)?$|.*policies/theirs|.*model.zip"
-    "|.*--backend ray|.*motor/actuator.yaml" + ("" if shutil.which("cc") else "|board")
+    r"identify|data |view|validate (--model|--mutations|--out)|validate *(#.*)?$|.*policies/theirs|.*model.zip"
+    "|board run|.*--backend ray|.*motor/actuator.yaml" + ("" if shutil.which("cc") else "|board")
 )
 """Commands that need logs, a browser, a cluster, a compiler, others' files or minutes: they are only parsed."""
 RUNNER = """
