@@ -36,9 +36,12 @@ def otherwise(env: EnvConfig, **fields: Any) -> EnvConfig:
     return dataclasses.replace(env, actuator=env.actuator.replaced(changes))
 
 
-def drawn(task: str, axis: str) -> Arm:
-    """Trained on doses that are drawn anew for every episode, evenly from none to `drawn_up_to`."""
-    most = AXES[axis].at(task, drawn_up_to(task, axis))
+def drawn(task: str, axis: str, trained: float | None = None) -> Arm:
+    """Trained on doses that are drawn anew for every episode, evenly from none to `drawn_up_to`.
+
+    `trained` is the dose that others are trained through, where it is not the axis' own.
+    """
+    most = AXES[axis].at(task, drawn_up_to(axis, AXES[axis].trained[task] if trained is None else trained))
     none, actuator = AXES[axis].at(task, 0.0).actuator, most.actuator
     text = {
         "lag": lambda: f"time_constant=uniform(0, {actuator.time_constant:g})",
@@ -49,9 +52,9 @@ def drawn(task: str, axis: str) -> Arm:
     return arm(task, f"{axis}, drawn", dataclasses.replace(most, randomize=(text,)))
 
 
-def drawn_up_to(task: str, axis: str) -> float:
+def drawn_up_to(axis: str, trained: float) -> float:
     """The largest dose that is drawn: twice the one that others are trained through, or the largest that is tested."""
-    return min(2.0 * AXES[axis].trained[task], AXES[axis].doses[-1])
+    return min(2.0 * trained, AXES[axis].doses[-1])
 
 
 def designed(task: str) -> Drive:

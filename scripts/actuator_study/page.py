@@ -261,7 +261,7 @@ def _verdicts(verdicts: Sequence[Verdict], others: Sequence[Verdict]) -> str:
         tested, wanted = verdict.strata
         if tested < wanted:
             says += f" ({tested} of {wanted} comparisons have runs)"
-        rows.append([verdict.question.name, verdict.outcome, _effect(verdict), _p(verdict.corrected), says])
+        rows.append([verdict.question.name, verdict.outcome, effect_text(verdict), p_text(verdict.corrected), says])
     header = ["", "holds", "effect [95 %]", "corrected p", "says"]
     wrong = [one for one in others if " 25 % over nominal" in one.question.statement.replace("-", "").replace("+", "")]
     sizes = [abs(one.effect.mean) for one in wrong if not np.isnan(one.effect.mean)] or [0.0]
@@ -280,12 +280,14 @@ _EACH = ": policies trained through it score higher on it than policies trained 
 """What six of the hypotheses say."""
 
 
-def _effect(verdict: Verdict) -> str:
+def effect_text(verdict: Verdict) -> str:
+    """A difference of scores with its interval."""
     mean, low, high = verdict.effect
     return "–" if np.isnan(mean) else f"{mean:+.3f} [{low:+.3f}, {high:+.3f}]"
 
 
-def _p(value: float) -> str:
+def p_text(value: float) -> str:
+    """A probability, to three digits."""
     return "<0.001" if value < 0.001 else f"{value:.3f}"
 
 

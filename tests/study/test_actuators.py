@@ -145,9 +145,9 @@ def test_drawn_doses_end_at_the_dose_that_they_are_said_to(task, axis):
     (name, distribution), *rest = arms.drawn(task, axis).config.env.distributions.items()
     assert not rest
     of = operator.attrgetter(name)
-    ends = [of(AXES[axis].at(task, dose).actuator) for dose in (0.0, arms.drawn_up_to(task, axis))]
+    ends = [of(AXES[axis].at(task, dose).actuator) for dose in (0.0, arms.drawn_up_to(axis, AXES[axis].trained[task]))]
     assert [distribution.low, distribution.high] == pytest.approx(sorted(ends), rel=1e-5)
-    assert AXES[axis].trained[task] < arms.drawn_up_to(task, axis) <= AXES[axis].doses[-1]
+    assert AXES[axis].trained[task] < arms.drawn_up_to(axis, AXES[axis].trained[task]) <= AXES[axis].doses[-1]
 
 
 def test_what_is_explored_is_one_thing_otherwise():

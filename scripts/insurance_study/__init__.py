@@ -1,0 +1,1 @@
+"""The study of what insures a policy against actuators that nobody has measured: docs/results/insurance_plan.md."""

@@ -1,0 +1,180 @@
+"""The page of what insures a policy: a table and a figure of all kinds of training, and the verdicts."""
+
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from actuator_study.arms import DRAWN
+from actuator_study.page import HYPOTHESES, TRIALS, effect_text, p_text
+from codrl_mj.runs.files import write_json
+from codrl_mj.study.doses import AXES, FLOORS, at_home, ideal
+from codrl_mj.study.pages import COLOURS, TITLES, conclusions, legend, markdown_table, save, write_csv, write_page
+from codrl_mj.study.questions import MARGIN, Scores, Verdict, judge
+from codrl_mj.study.trials import FAILED, RUNS, TOTALS, Collected, Trial, run_rows, trial_rows
+from insurance_study.questions import DOSES, KINDS, REMEMBERED, TASKS, home, primary, reach, secondary, under
+
+PAGE, FOLDER, FIGURE = "insurance.md", "insurance", "insured.svg"
+"""The page, the folder beside it with its figure and tables, and the figure."""
+SAYS: Mapping[str, str] = {
+    "ideal": "ideal forces",
+    "matched": "the very dose",
+    "drawn": "doses of the very thing, drawn",
+    "remembering": "the very dose, seeing its last commands",
+    "random": "random actuators",
+    "half": "random actuators, half the reach",
+    "double": "random actuators, twice the reach",
+    "pushes": "random pushes alone",
+    "strength": "random strength alone",
+}
+"""What policies of each kind were trained on."""
+_AXES: Mapping[str, Sequence[str]] = {"drawn": DRAWN, "remembering": REMEMBERED}
+
+
+class Found(NamedTuple):
+    """What policies of a kind came to in some tests, a number for each policy and test."""
+
+    scores: np.ndarray
+    success: np.ndarray
+
+    @property
+    def text(self) -> str:
+        """Mean, median, how many fail, success."""
+        if not self.scores.size:
+            return "–"
+        failed, success = np.sum(self.scores < 1.0 - FAILED), np.mean(self.success)
+        mean, median = np.mean(self.scores), np.median(self.scores)
+        return f"{mean:z.2f}, {median:z.2f}; {failed} of {self.scores.size}; {100 * success:.0f} %"
+
+
+def found(collected: Collected, scores: Scores, trials: Iterable[Trial]) -> Found:
+    """Of every policy in every trial."""
+    both: list[tuple[float, float]] = []
+    for trial in trials:
+        success = collected.scores(trial, "success")
+        both += [(score, success.get(seed, np.nan)) for seed, score in scores.of(trial).items()]
+    values = np.reshape(both, (-1, 2))
+    return Found(values[:, 0], values[:, 1])
+
+
+def write(collected: Collected, out: Path) -> list[Path]:
+    """Write page, figure and tables; whatever is missing is named on the page.
+
+    Returns:
+        The files that were written.
+    """
+    folder, scores = out / FOLDER, Scores(collected, FLOORS, [at_home(ideal(task)) for task in TASKS])
+    first, others = judge(scores, primary(), primary=True), judge(scores, secondary())
+    rows = {
+        RUNS: run_rows(collected, scores.of),
+        TRIALS: trial_rows(collected, scores.of),
+        HYPOTHESES: (verdict.row(len(first)) for verdict in (*first, *others)),
+    }
+    for name, table in rows.items():
+        write_csv(folder / name, list(table))
+    write_json(folder / TOTALS, collected.totals._asdict())
+    draw(folder / FIGURE, scores)
+    parts = [
+        "# What insures a policy?\n",
+        conclusions(out / PAGE),
+        _kinds(collected, scores),
+        f"![Scores by what policies were trained on]({FOLDER}/{FIGURE})\n",
+        _verdicts(first),
+        _secondary(others),
+        _method(collected),
+    ]
+    write_page(out / PAGE, parts)
+    return [out / PAGE, folder / FIGURE, *(folder / name for name in (*rows, TOTALS))]
+
+
+def _kinds(collected: Collected, scores: Scores) -> str:
+    rows = []
+    for kind, says in SAYS.items():
+        cells = [says]
+        for task in TASKS:
+            axes = list(_AXES.get(kind, AXES))
+            there = [under(KINDS[kind](task, axis), axis) for axis in axes]
+            at = {trial.name: trial for axis in axes for trial in [home(KINDS[kind](task, axis))]}
+            lost = found(collected, scores, at.values()).scores
+            cells.append(f"{np.mean(lost):z.2f}" if lost.size else "–")
+            cells.append(found(collected, scores, there).text)
+        rows.append(cells)
+    header = ["trained on", *(text for task in TASKS for text in (f"{TITLES[task]}: ideal", "six doses"))]
+    return f"""## What each kind of training comes to
+
+Mean score on ideal forces. Then on the six doses: mean, median; how many policies fail (lose more than {FAILED:g});
+success.
+Drawn doses were tested on four of them, remembering on lag and delay.
+
+{markdown_table(header, rows)}"""
+
+
+def draw(path: Path, scores: Scores) -> None:
+    """Draw what policies score at the trained doses, a panel a task, by what they were trained on; every one a dot."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11.0, 8.4), layout="constrained")
+    panels: Any = figure.subplots(len(TASKS), 1, sharey=True)
+    shown = [kind for kind in SAYS if kind not in ("half", "double", "strength")]
+    for panel, task in zip(panels, TASKS, strict=True):
+        for place, axis in enumerate(AXES):
+            for number, kind in enumerate(shown):
+                if axis in _AXES.get(kind, AXES):
+                    values = list(scores.of(under(KINDS[kind](task, axis), axis)).values())
+                    clipped = np.sort(np.maximum(values, -0.1))
+                    at, colour = place + 0.14 * (number - 2.5), COLOURS[number]
+                    spread = np.linspace(-0.045, 0.045, len(values))
+                    panel.plot(at + spread, clipped, ".", color=colour, ms=3.5, alpha=0.7, label=SAYS[kind])
+                    if values:
+                        panel.plot([at - 0.06, at + 0.06], [np.mean(clipped)] * 2, color=colour, lw=1.5)
+        panel.set_xticks(range(len(AXES)), [f"{one.title} {DOSES[task][name]:g}" for name, one in AXES.items()])
+        panel.set(title=TITLES[task], ylabel="score [share of the span]")
+        panel.grid(axis="y", color="0.9")
+        panel.set_axisbelow(True)
+    legend(figure, 3)
+    save(figure, path)
+
+
+def _verdicts(verdicts: Sequence[Verdict]) -> str:
+    rows = []
+    for verdict in verdicts:
+        says = verdict.question.statement
+        tested, wanted = verdict.strata
+        if tested < wanted:
+            says += f" ({tested} of {wanted} comparisons have runs)"
+        fewest = str(min(verdict.runs))
+        rows.append(
+            [verdict.question.name, verdict.outcome, effect_text(verdict), p_text(verdict.corrected), fewest, says]
+        )
+    header = ["", "holds", "effect [95 %]", "corrected p", "policies", "says"]
+    return f"## The ten hypotheses\n\n{markdown_table(header, rows)}"
+
+
+def _secondary(verdicts: Sequence[Verdict]) -> str:
+    rows = []
+    for name in dict.fromkeys(verdict.question.section for verdict in verdicts):
+        mine = [verdict for verdict in verdicts if verdict.question.section == name and verdict.runs != (0, 0)]
+        decided = [verdict for verdict in mine if verdict.outcome != "open"]
+        beyond = sum(one.effect.low > MARGIN or one.effect.high < -MARGIN for one in decided)
+        rows.append([name, *map(str, (len(mine), len(decided), beyond))])
+    header = ["secondary comparisons", "of", "decided", f"by more than {MARGIN:g}"]
+    return f"""Others, each of one task, with a false discovery rate of 5 %:
+
+{markdown_table(header, rows, numbers=3)}"""
+
+
+def _method(collected: Collected) -> str:
+    totals, wanted = collected.totals, len(collected.grid.cells())
+    done, tests = sum(map(len, collected.evaluations.values())), len(collected.grid.deployments())
+    reaches = "; ".join(
+        f"{TITLES[task]} {', '.join(f'{axis} {reach(task, axis):g}' for axis in ('lag', 'weakness', 'delay'))}"
+        for task in TASKS
+    )
+    text = f"""By [the plan](insurance_plan.md), scores and tests as in [what an actuator costs](actuators.md). {done}
+of {tests} tests of {wanted} policies are there ({totals.seconds / 3600:.1f} hours of one core at hand). Random
+actuators reach up to (policy steps, share, policy steps): {reaches}. `scripts/study_insurance.py`
+([how](../studies.md)) writes this page, [every policy]({FOLDER}/{RUNS}), [trials]({FOLDER}/{TRIALS}) with medians and
+failures, and [every comparison]({FOLDER}/{HYPOTHESES})."""
+    return "## How it was measured\n\n" + textwrap.fill(" ".join(text.split()), 120, break_long_words=False) + "\n"

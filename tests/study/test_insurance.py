@@ -1,0 +1,177 @@
+"""The study of what insures a policy: its actuator against the package's own, its arms, and its page."""
+
+import itertools
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from actuator_study.arms import DRAWN
+from codrl_mj.actuators import Lag
+from codrl_mj.disturbances import Disturbances
+from codrl_mj.study.doses import AXES, FLOORS, posed, timestep
+from codrl_mj.study.evidence import Evidence
+from codrl_mj.study.pages import read_csv
+from codrl_mj.tasks import find_task
+from insurance_study.questions import (
+    DOSES,
+    HARMLESS,
+    REMEMBERED,
+    TASKS,
+    double,
+    generic,
+    half,
+    late,
+    new,
+    primary,
+    reach,
+    secondary,
+    trials,
+)
+from insurance_study.study import InsuranceStudy
+from tests.study.pretended import pretend
+
+RESULTS = Path(__file__).parents[2] / "docs/results"
+
+
+def played(config, actions):
+    """Observations without what is seen of the actuator, and everything that is seen, of given actions."""
+    env = config.make()
+    seen = [env.reset(seed=3)[0]]
+    seen += [env.step(action)[0] for action in actions]
+    env.close()
+    return np.array(seen)
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("steps", [0.0, 0.25, 0.8])
+@pytest.mark.parametrize("lag", [0.0, 0.7])
+def test_late_is_lag_where_lag_remembers_enough(task, steps, lag):
+    step, gain = find_task(task).step_duration, 0.8
+    actions = [posed(task).make().action_space.sample() for _ in range(40)]
+    ours = posed(task, late(task, time_constant=lag * step, delay=steps * step, gain=gain))
+    theirs = posed(task, Lag(lag * step, steps * step, gain))
+    np.testing.assert_allclose(played(ours, actions), played(theirs, actions), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("steps", [0.5, 1.0, 1.25, 2.0, 3.3, 4.0])
+def test_a_longer_delay_is_that_of_the_environment(task, steps):
+    step = find_task(task).step_duration
+    actions = [posed(task).make().action_space.sample() for _ in range(40)]
+    ours = posed(task, late(task, delay=steps * step))
+    theirs = posed(task, disturbances=Disturbances(command_delay=steps * step))
+    np.testing.assert_allclose(played(ours, actions), played(theirs, actions), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_what_is_shown_is_the_last_four_commands(task):
+    config = posed(task, late(task, delay=1.3 * find_task(task).step_duration), observe_actuator=True)
+    space = posed(task).make().action_space
+    actions = [space.sample() for _ in range(12)]
+    shown = played(config, actions)[:, -4:]
+    given = [0.0, 0.0, 0.0, 0.0, *(float(np.ravel(action)[0]) for action in actions)]
+    if task == "acrobot":  # 0, 1, 2 are -1, 0 and 1 times the largest torque
+        given[4:] = [value - 1.0 for value in given[4:]]
+    largest = find_task(task).max_force if task != "acrobot" else 1.0
+    wanted = [[given[at + 3 - back] / largest for back in range(4)] for at in range(13)]
+    np.testing.assert_allclose(shown, wanted, rtol=0, atol=1e-6)
+
+
+def test_a_delay_that_is_not_remembered_is_refused():
+    step = find_task("pendulum").step_duration
+    with pytest.raises(ValueError, match=r"Late\.delay"):
+        posed("pendulum", late("pendulum", delay=4.1 * step)).make()
+    assert timestep("pendulum") == pytest.approx(step / 10)
+
+
+def test_doses_and_reaches_follow_from_the_first_study_by_the_rules_of_the_plan():
+    evidence = Evidence.read()
+    for task in TASKS:
+        for axis, harmless in HARMLESS[task].items():
+            known = [(dose, evidence.loss(task, axis, dose).outcome) for dose in AXES[axis].doses[1:]]
+            spared = [dose for dose, _ in itertools.takewhile(lambda pair: pair[1].spared, known)]
+            assert harmless == (spared[-1] if spared else 0.0)
+            assert reach(task, axis) == (2 * harmless or AXES[axis].doses[1])
+    for axis, dose in DOSES["acrobot"].items():
+        hurt = [d for d in AXES[axis].doses[1:] if evidence.loss("acrobot", axis, d).outcome.hurt]
+        assert dose == (hurt[0] if hurt else AXES[axis].doses[-1])
+
+
+def test_the_plan_is_what_is_computed():
+    plan = (RESULTS / "insurance_plan.md").read_text()
+    arms = {trial.arm.name for trial in trials() if new(trial)}
+    assert f"{len(arms)} new arms" in plan
+    assert f"All others ({len(secondary())}, each of one task)" in " ".join(plan.split())
+    for number, question in enumerate(primary(), start=1):
+        line = next(line for line in plan.splitlines() if line.startswith(f"| I{number} |"))
+        assert question.name == f"I{number}"
+        assert ("equivalence" in line) == (question.kind == "equivalent")
+        for words, axes in (
+            ("six axes", AXES),
+            ("four axes", DRAWN),
+            ("six arms", AXES),
+            ("lag and delay", REMEMBERED),
+        ):
+            if words in line:
+                assert len(question.contrasts) == len(axes) * len(TASKS)
+    for task, title in (("pendulum", "Pendulum"), ("furuta", "Furuta"), ("acrobot", "Acrobot")):
+        told = " | ".join(f"{reach(task, axis):g}" for axis in ("lag", "weakness", "delay"))
+        assert f"| {title} | {told} |" in plan
+
+
+def test_random_actuators_reach_as_far_as_they_are_said_to():
+    for task in TASKS:
+        step = find_task(task).step_duration
+        for share, made in ((1.0, generic(task)), (0.5, half(task)), (2.0, double(task))):
+            env = made.config.env
+            ends = {name: (one.low, one.high) for name, one in env.distributions.items()}
+            assert ends["time_constant"] == (0.0, pytest.approx(share * reach(task, "lag") * step))
+            assert ends["delay"] == (0.0, pytest.approx(share * reach(task, "delay") * step))
+            short = share * reach(task, "weakness")
+            assert ends["gain"] == pytest.approx((1 - short, 1 + short))
+            assert env.disturbances.pulse_force == pytest.approx(0.25 * share * find_task(task).max_force)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """Matched training keeps 0.9 at its doses, random actuators 0.7, all else half; at home nothing is lost.
+
+    Commands that are seen change nothing.
+    """
+    out = tmp_path_factory.mktemp("insurance")
+
+    def level(trial):
+        kind = trial.arm.name.partition(": ")[2].removesuffix(", remembering")
+        if trial.test.startswith("ideal"):
+            return 1.0
+        return 0.9 if kind in AXES else 0.7 if kind == "random" else 0.5
+
+    grid = InsuranceStudy(root=out / "runs", out=out, seeds=4).grid
+    spread = [-0.02, 0.02, 0.01, -0.01]  # sums to 0
+    pretend(grid, lambda trial, seed: FLOORS[trial.arm.task] + 100.0 * (level(trial) + spread[seed]))
+    files = InsuranceStudy(root=out / "runs", out=out, seeds=4).write()[0]
+    return out, list(files)
+
+
+def test_what_is_so_stands_on_the_page(written):
+    out, files = written
+    assert all(file.is_file() for file in files)
+    rows = {row["name"]: row for row in read_csv(out / "insurance" / "hypotheses.csv")}
+    effects = {name: float(rows[name]["effect"]) for name in ("I1", "I2", "I3", "I4", "I6", "I8", "I9", "I10")}
+    wanted = {"I1": 0.2, "I2": 0.2, "I3": 0.0, "I4": 0.0, "I6": 0.2, "I8": 0.0, "I9": 0.2, "I10": -0.2}
+    assert effects == pytest.approx(wanted, abs=1e-9)
+    assert rows["I10"]["outcome"] == "the other way"
+    assert rows["I3"]["outcome"] == "yes"
+    page = (out / "insurance.md").read_text()
+    assert "| random actuators | 1.00 | 0.70, 0.70; 24 of 24;" in page  # 4 policies on 6 doses
+    assert "| the very dose | 1.00 | 0.90, 0.90;" in page
+
+
+def test_rows_stand_for_run_folders_that_are_gone(written, tmp_path):
+    out, _ = written
+    shutil.copytree(out / "insurance", tmp_path / "insurance")
+    InsuranceStudy(root=tmp_path / "runs", out=tmp_path, seeds=4).write()
+    for name in ("runs.csv", "hypotheses.csv"):
+        assert (tmp_path / "insurance" / name).read_text() == (out / "insurance" / name).read_text()
