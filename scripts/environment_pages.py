@@ -62,7 +62,11 @@ def common_arguments() -> str:
         for name, parameter in parameters.items()
         if name not in defaults and parameter.kind is not parameter.VAR_KEYWORD  # the tasks' own, which each page has
     }
-    rows = [f"| `{name}` | `{default!r}` | {meanings[name]} |" for name, default in defaults.items()]
+    for name, text in meanings.items():  # the reference has them whole
+        first, stop, _ = text.partition(". ")
+        meanings[name] = first + stop.strip()
+    shown = {name: re.sub(r"\(.*\)$", "()", repr(default)) for name, default in defaults.items()}
+    rows = [f"| `{name}` | `{default}` | {meanings[name]} |" for name, default in shown.items()]
     return "| argument | default | meaning |\n| --- | --- | --- |\n" + "\n".join(rows)
 
 

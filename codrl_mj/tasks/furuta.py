@@ -3,8 +3,8 @@
 ## Description
 
 An arm (0.095 kg, 85 mm) turns about a vertical shaft. A rod (0.024 kg, 129 mm) hangs from a hinge at its end and swings
-across it, under a gravity of 9.81 m/s^2. The actuator turns the arm: the rod has none. You can buy it, so its own
-actuator is a motor of the catalogue, `quanser-qube-servo-2`, behind a drive. The paper's actuators (`paper`, `weak` and
+across it, under a gravity of 9.81 m/s^2. The actuator turns the arm: the rod has none. Its own
+actuator is an off-the-shelf motor, `quanser-qube-servo-2`, behind a drive. The paper's actuators (`paper`, `weak` and
 so on) are refused; `ideal` is the bare arm, without the rotor.
 
 ## Observation space
@@ -43,11 +43,10 @@ Truncated after 250 steps (5 s). An episode succeeds if the rod is within 0.1 ra
 
 ## Arguments
 
-[Those of every environment](arguments.md). The supply is the motor's nominal 18 V. The bench's amplifier is made for 10
-V and gives 15: set `{"name": "default", "supply": {"voltage": 10.0}}`. Model its delay by
-`disturbances={"command_delay": 0.004}`. `physics="analytic"` has the equations in closed form, for actuators without a
-rotor. An environment step is ten RK4 steps: over 5 s without damping they change the energy by 1e-7 of what lifts the
-rod, a single one by 1 %.
+[Those of every environment](arguments.md). The supply is the motor's nominal 18 V; the bench's amplifier is made for 10
+V: set `{"name": "default", "supply": {"voltage": 10.0}}`, and its delay by `disturbances={"command_delay": 0.004}`.
+`physics="analytic"` has the equations in closed form, for actuators without a rotor. An environment step is ten RK4
+steps: a single one loses energy.
 
 ## What to expect
 
@@ -58,8 +57,7 @@ return 230.8 to 232.7 of 250:
 $ codrl-mj train furuta --env.action voltage --actuator.supply.voltage 10 --seed 0 --out runs/volts
 ```
 
-Beware of a local optimum: whirling the rod, letting it creep through upright, returns 190 and more. Trainings with 16
-environments, a discount of 0.99 and speeds times 0.05 ended so by voltage.
+Beware of a local optimum: whirling the rod, letting it creep through upright, returns 190 and more.
 
 On weaker supplies (V) and behind delays (ms) policies lose that were trained on the ideal arm. The mean return over
 three seeds, with the worst in brackets, and [all rows](furuta_supplies.csv) of `scripts/furuta_table.py`:
@@ -77,11 +75,10 @@ and costs 3 to 22 where there is more.
 
 ## Where the numbers come from
 
-Masses and lengths are the manual's (Quanser, *QUBE-Servo 2 User Manual*). Arm and rod are uniform, so the arm's inertia
-about the shaft is m l^2/3 (some simulators have m l^2/12); hub and rotor add 0.6e-6 and 4e-6 kg m^2. Joint damping,
-5e-6 and 1e-6 N m s/rad, is what quanser_robots and Pyrado identified. Others have up to five hundred times that
-(BlueRiverTech 2.7e-4 and 5e-5, Quanser's course 1.5e-3 and 5e-4): add it by `joint=` to the arm, by `randomize=` of
-`model.damping.hinge` to the rod. There is no stiction, and the encoder's cable does not pull.
+Masses and lengths are the manual's (Quanser, *QUBE-Servo 2 User Manual*). Arm and rod are uniform: the arm's inertia
+about the shaft is m l^2/3 (some simulators have m l^2/12). Joint damping, 5e-6 and 1e-6 N m s/rad, is what
+quanser_robots and Pyrado identified; others have up to five hundred times that: add it by `joint=` to the arm, by
+`randomize=` of `model.damping.hinge` to the rod. There is no stiction, and the encoder's cable does not pull.
 """
 
 import math

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from actuator_study import advised, arms, figures
-from actuator_study.exploration import around_the_paper, paper_loops, windup
 from actuator_study.questions import on_loop, on_motor, primary, secondary, through_loop, through_motor
 from codrl_mj.runs.files import write_json
 from codrl_mj.study.advice import IDEAL, THROUGH
@@ -68,7 +67,6 @@ def write(collected: Collected, out: Path) -> list[Path]:
         _advised(evidence, said, drawn),
         _verdicts(first, others),
         _secondary(others, drawn),
-        _explored(scores),
         _method(collected, scores),
         _missing(collected),
     ]
@@ -219,38 +217,6 @@ lost. Of {left["doses"]} doses, each predicted from its neighbours, {left["off"]
 {_figure(drawn, "chart", "What to do about an actuator that is late or short of voltage")}"""
 
 
-def _explored(scores: Scores) -> str:
-    """Tables of what was not planned: mean scores."""
-    doses = AXES["supply"].doses[1:]
-    wound = [
-        [TITLES[task], *("/".join(_mean(scores, one) for one in pair) for pair in pairs)]
-        for task, pairs in windup().items()
-    ]
-    names = [*paper_loops(arms.LOOPED[0])]
-    columns = {title: [_mean(scores, one) for one in trials] for title, trials in around_the_paper().items()}
-    around = [
-        "; ".join(
-            [f"- {title}: {own}", *(f"{name} {one}" for name, one in zip(names, others, strict=True) if one != own)]
-        )
-        for title, (own, *others) in columns.items()
-    ]
-    return f"""## Exploration
-
-Not planned, and without p: mean scores. A supply lacks a share of what is needed, under ideal-trained policies, with
-anti-windup/with an integrator that goes on while the voltage saturates:
-
-{markdown_table(["supply lacks", *(f"{dose:g}" for dose in doses)], wound)}
-{textwrap.fill(f"The paper's loop around its motor, and what of {', '.join(names)} scores otherwise:", 120)}
-
-{chr(10).join(around)}
-"""
-
-
-def _mean(scores: Scores, trial: Trial) -> str:
-    found = list(scores.of(trial).values())
-    return f"{np.mean(found):.2f}" if found else "–"
-
-
 def _verdicts(verdicts: Sequence[Verdict], others: Sequence[Verdict]) -> str:
     """The primary hypotheses, one row each, and what those are worth that hold."""
     rows = []
@@ -292,7 +258,7 @@ def p_text(value: float) -> str:
 
 
 def _secondary(verdicts: Sequence[Verdict], drawn: Mapping[str, Path]) -> str:
-    """How many of each question's secondary comparisons were decided, and the figure of loops."""
+    """How many of each question's secondary comparisons were decided, what was explored, and the figure of loops."""
     rows = []
     for name, title in QUESTIONS.items():
         mine = [verdict for verdict in verdicts if verdict.question.section == name and verdict.runs != (0, 0)]
@@ -305,6 +271,9 @@ def _secondary(verdicts: Sequence[Verdict], drawn: Mapping[str, Path]) -> str:
 With a false discovery rate of 5 %, and by how much by the 95 % interval:
 
 {markdown_table(header, rows, numbers=3)}
+What was explored beyond the plan, without p, stands in [trials]({FOLDER}/{TRIALS}): loops without anti-windup, and the
+paper's loop otherwise.
+
 {_figure(drawn, "tune", QUESTIONS["tune"])}"""
 
 
@@ -333,18 +302,16 @@ def _method(collected: Collected, scores: Scores) -> str:
     codes = ", ".join(f"`{code}` ({count})" for code, count in sorted(totals.codes.items())) or "none"
     known = [f"{task} {FLOORS[task]:g} to {ceiling:.1f}" for task, ceiling in scores.ceilings.items()]
     runs = max(len(grid.seeds_of(grid.arms[0])), 2)
-    about = f"""{done} of {wanted} trainings are finished ({totals.seconds / 3600:.1f} hours of one core), and {tested}
-of {tests} tests, by [the plan](plan.md). Code that trained, with its runs: {codes}. `scripts/study_actuators.py`
-([how](../studies.md)) writes this page, its figures and its tables: [hypotheses]({FOLDER}/{HYPOTHESES}),
-[trials]({FOLDER}/{TRIALS}), [runs]({FOLDER}/{RUNS}), [advised]({FOLDER}/{ADVISED}). `examples/recompute.py` recomputes
-the conclusions without this package."""
-    text = f"""A policy's score is its mean return over {grid.episodes} test episodes, in shares of the span: 0 is
-what random actions get on ideal forces, 1 what policies get there on the mean that were trained there
-({"; ".join(known) or "none is known yet"}). CartPole's return is the paper's: steps within 0.1 m of the centre.
-Effects are differences of mean scores, pooled over tasks or doses; policies count once on every task. Intervals are by
-Student's t, p of permutation tests, of equivalence by two one-sided ones with a margin of {MARGIN:g}; primary ones are
-corrected by Holm, the others by Benjamini and Hochberg. With {runs} seeds a difference of
-{detectable(runs, LEVEL / 12):.2f} standard deviations of a run is found with a chance of 80 % at the strictest of
-Holm's levels."""
+    about = f"""By [the plan](plan.md): {done} of {wanted} trainings ({totals.seconds / 3600:.1f} hours of one core) and
+{tested} of {tests} tests; code with its runs: {codes}. `scripts/study_actuators.py` ([how](../studies.md)) writes this
+page, [hypotheses]({FOLDER}/{HYPOTHESES}), [trials]({FOLDER}/{TRIALS}), [runs]({FOLDER}/{RUNS}) and
+[advised]({FOLDER}/{ADVISED}). `examples/recompute.py` recomputes the conclusions without this package."""
+    text = f"""A score is the mean return over {grid.episodes} test episodes in shares of the span: 0 is what random
+actions get on ideal forces, 1 what ideal-trained policies get there on the mean ({"; ".join(known) or "none yet"}).
+CartPole's return is the paper's: steps within 0.1 m of the centre. Effects are differences of mean scores; policies
+count once on every task. Intervals are by Student's t, p of permutation tests, of equivalence by two one-sided ones
+with a margin of {MARGIN:g}; primary ones are corrected by Holm, the others by Benjamini and Hochberg. With {runs} seeds
+a difference of {detectable(runs, LEVEL / 12):.2f} standard deviations is found with a chance of 80 % at the strictest
+level."""
     wrapped = (textwrap.fill(" ".join(each.split()), 120, break_long_words=False) for each in (about, text))
     return "## How it was measured\n\n" + "\n\n".join(wrapped) + "\n"
