@@ -133,7 +133,7 @@ class RunBoard:
     It watches unless told to --drive: the board says its observations and which commands it would give. A motor moves
     only with --drive, which ends by itself when something is wrong, and always ends with the command for safety.
 
-    Example: codrl-mj board run furuta --port /dev/ttyACM0 --log swing.csv
+    Example: codrl-mj board run furuta --port /dev/ttyACM0 --out swing.csv
     """
 
     folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FOLDER", help="What export wrote.")]

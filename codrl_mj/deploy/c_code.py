@@ -99,7 +99,11 @@ def check_board(board: str, network: Network | Tiles, double: bool = False) -> N
     check_names([board], BOARDS, "board")
     size = 8 if double else 4
     flash, ram = BOARDS[board]
-    for what, needed, there in (("flash", size * network.size + CODE, flash), ("RAM", size * network.working, ram)):
+    if board == "arduino-uno" and double:
+        raise ValueError("board arduino-uno: its double has 4 bytes: leave out --float64, or name a larger board")
+    copied = size * network.size if board == "arduino-uno" else 0  # AVR's compiler copies constants to RAM
+    needs = ("flash", size * network.size + CODE, flash), ("RAM", size * network.working + copied, ram)
+    for what, needed, there in needs:
         if needed > there:
             raise ValueError(
                 f"board {board}: the policy needs about {needed} bytes of {what}, must be at most {there}: train a "

@@ -1,5 +1,6 @@
 """A real board behind a serial port: watched, or told to drive, over the exported wire. What it says becomes a log."""
 
+import contextlib
 import csv
 import math
 import time
@@ -11,7 +12,7 @@ import numpy as np
 
 from codrl_mj.deploy.contract import Contract
 from codrl_mj.deploy.log import columns, motor_columns
-from codrl_mj.deploy.wire import BEYOND, DAMAGED, DRIVE, LATE, NO_SENSORS, NOT_FINITE, WATCH, Answer, Wire
+from codrl_mj.deploy.wire import BEYOND, DAMAGED, DRIVE, LATE, NO_SENSORS, NOT_FINITE, OLD, WATCH, Answer, Wire
 from codrl_mj.runs.files import writing
 
 MOST_MISSED = 3
@@ -66,7 +67,7 @@ def run_board(
     with _opened(port, baud) as line, writing(log) as part, part.open("w", newline="") as file:
         table, wire = csv.writer(file), Wire(contract, line.fileno(), line.fileno())
         table.writerow(columns(contract) + motor_columns(contract))
-        began = time.monotonic()
+        began = due = time.monotonic()
         try:
             for sequence in range(1, 10**9):
                 now = time.monotonic() - began
@@ -81,13 +82,20 @@ def run_board(
                     if answer.status & NO_SENSORS:
                         raise RuntimeError(f"{port}: the board has no sensors: give it wire_sense (docs/deploy.md)")
                     rows, late = rows + 1, late + bool(answer.status & LATE)
-                    table.writerow([stamp / 1e6, *answer.observation, *answer.command, *answer.motors.ravel()])
+                    if not answer.status & DAMAGED:  # whose bytes are no observation
+                        table.writerow([stamp / 1e6, *answer.observation, *answer.command, *answer.motors.ravel()])
                     if on_answer is not None:
                         on_answer(answer)
                 if drive and (why := _wrong(contract, answer, in_a_row)):
                     break
-                time.sleep(max(0.0, began + sequence / contract.rate - time.monotonic()))
-        finally:
+                due += 1.0 / contract.rate
+                wait = due - time.monotonic()
+                if wait < -1.0 / contract.rate:  # after a pause no burst of frames
+                    due -= wait
+                time.sleep(max(0.0, wait))
+        except (KeyboardInterrupt, OSError) as error:  # what was logged is kept
+            why = f"interrupted: {error or type(error).__name__}"
+        with contextlib.suppress(OSError):
             stamp = int(1e6 * (time.monotonic() - began)) + 2
             wire.asked(wire.frame(sequence + 1, stamp, nothing, WATCH), sequence + 1, late_after)
     return BoardRun(rows, missed, late, why)
@@ -107,6 +115,8 @@ def _wrong(contract: Contract, answer: Answer | None, in_a_row: int) -> str:
     """Why a board must not go on to drive; empty where it may."""
     if answer is None:
         return f"{in_a_row} frames in a row had no answer" if in_a_row >= MOST_MISSED else ""
+    if answer.status & OLD:
+        return "the board took a frame for old: it heard of a later time, before this run: reset it"
     if answer.status & (DAMAGED | NOT_FINITE):
         return "the board took a frame for damaged" if answer.status & DAMAGED else "a sensor says no finite number"
     if answer.status & BEYOND or not contract.within(answer.observation[np.newaxis])[0]:

@@ -326,24 +326,70 @@ def test_a_frame_of_which_bytes_are_lost_is_refused_and_those_after_it_come_thro
     assert fine == {n: want[n] for n in (0, 2, 3, 4, 5, 6, 7)}
 
 
-def test_the_watchdog_sets_the_command_to_zero(folder, tmp_path):
-    library = tmp_path / "wire.so"
+WATCHING, DRIVING = 1, 2
+SENSORS = """
+#include "wire.h"
+real given[CONTROLLER_COMMANDS];
+int wire_sense(real observation[CONTROLLER_OBSERVATIONS]) {
+  for (int k = 0; k < CONTROLLER_OBSERVATIONS; k++) observation[k] = 0.3f;
+  return 1;
+}
+void wire_measure(real motors[3 * CONTROLLER_COMMANDS]) {
+  for (int k = 0; k < 3 * CONTROLLER_COMMANDS; k++) motors[k] = 0;
+}
+void wire_apply(const real command[CONTROLLER_COMMANDS]) {
+  for (int k = 0; k < CONTROLLER_COMMANDS; k++) given[k] = command[k];
+}
+"""
+
+
+@pytest.fixture
+def wired(folder, tmp_path):
+    """Functions of the exported wire: to send a frame of a kind at a stamp [us], to ask the watchdog; what is given."""
+    (tmp_path / "sensors.c").write_text(SENSORS)
     sources = [str(folder / name) for name in ("controller.c", "wire.c", "board.c")]
-    subprocess.run(["cc", "-std=c99", "-shared", "-fPIC", *sources, "-lm", "-o", str(library)], check=True)
-    wire, contract = ctypes.CDLL(str(library)), Contract.read(folder)
+    line = ["cc", "-std=c99", "-shared", "-fPIC", "-DBOARD_SENSORS", f"-I{folder}", *sources]
+    library = str(tmp_path / "wire.so")
+    subprocess.run([*line, str(tmp_path / "sensors.c"), "-lm", "-o", library], check=True)
+    wire, contract = ctypes.CDLL(library), Contract.read(folder)
+    real = {"f": ctypes.c_float, "d": ctypes.c_double}[kind_of(folder)]
+    given = (real * len(contract.actions)).in_dll(wire, "given")
     state, answer = (ctypes.c_ubyte * 1024)(), (ctypes.c_ubyte * 256)()
     wire.wire_reset(state)
-    assert wire.wire_late(state, 0)  # nothing came yet
-    row = contract.golden["observations"][0]
-    for byte in frame(folder, 1, 1_000, row):
-        wire.wire_byte(state, byte, answer)
-    late = round(1e6 * contract.late["after"])
-    assert not wire.wire_late(state, 1_000 + late)
-    before = bytes(state)
-    assert wire.wire_late(state, 1_001 + late)
-    changed = [after for after, one in zip(bytes(state), before, strict=True) if after != one]
-    assert changed  # the command, and nothing else
-    assert not any(changed)
+
+    def send(stamp, kind, spoilt=False):
+        row = contract.golden["observations"][0]
+        content = struct.pack(f"<BBI{len(row)}{kind_of(folder)}", 1, kind, stamp % 2**32, *row)
+        crc = binascii.crc_hqx(content, 0xFFFF) ^ spoilt
+        for byte in b"\xa5\x5a" + content + struct.pack("<H", crc):
+            wire.wire_byte(state, byte, answer)
+        return answer[3], any(given)
+
+    return send, lambda now: (bool(wire.wire_late(state, now % 2**32)), any(given)), contract
+
+
+def test_the_watchdog_goes_by_the_board_s_own_clock_and_stops_the_drive(wired):
+    send, late, contract = wired
+    after = round(1e6 * contract.late["after"])
+    assert late(5_000_000) == (True, False)  # nothing came yet
+    assert send(1_000, DRIVING) == (OK, True)
+    assert late(5_000_100) == (False, True)  # when it came, by this clock, which began before the host's
+    assert late(5_000_100 + after) == (False, True)
+    assert late(5_000_101 + after) == (True, False)
+    assert send(1, DRIVING) == (OK, True)  # another run of the host, whose stamps begin anew, or hours later
+    assert late(2**32 - 10) == (False, True)
+    assert late(after - 10) == (False, True)  # the clock comes around
+    assert late(after - 9) == (True, False)
+
+
+def test_an_old_frame_moves_nothing_that_did_not_move(wired):
+    send, _, _ = wired
+    assert send(9_000, WATCHING) == (OK, False)
+    assert send(9_000, DRIVING) == (OLD, False)  # what was only watched is no command
+    assert send(10_000, DRIVING) == (OK, True)
+    assert send(10_000, DRIVING) == (OLD, True)  # a doubled frame keeps what the drive has
+    assert send(11_000, DRIVING, spoilt=True) == (DAMAGED, False)
+    assert send(10_000, DRIVING) == (OLD, False)
 
 
 def test_a_log_of_the_board_keeps_its_contract_and_one_that_is_changed_does_not(folder, tmp_path, capsys):

@@ -236,5 +236,12 @@ def test_a_policy_that_does_not_fit_is_refused_with_both_sizes():
         ValueError, match=r"arduino-uno: the policy needs about \d+ bytes of flash, must be at most 32256"
     ):
         check_board("arduino-uno", network)
+    small = network_of(trained("pendulum", "ppo", hidden=(48, 48))[0])
+    with pytest.raises(
+        ValueError, match=r"arduino-uno: the policy needs about 1\d+ bytes of RAM, must be at most 2048"
+    ):
+        check_board("arduino-uno", small)  # whose constants are copied there
+    with pytest.raises(ValueError, match="double has 4 bytes"):
+        check_board("arduino-uno", small, double=True)
     with pytest.raises(ValueError, match="did you mean arduino-uno"):
         check_board("arduino-un", network)

@@ -265,7 +265,7 @@ def test_from_the_command_line(tmp_path, capsys):
     seen = np.array(contract.golden["observations"], np.float32)
     np.testing.assert_array_equal(again.predict(seen, deterministic=True)[0], contract.golden["actions"])
     assert "typedef float real" in (out / "controller.h").read_text()
-    assert main([*line, "--out", str(tmp_path / "small"), "--board", "arduino-uno", "--float64"]) == 0
+    assert main([*line, "--out", str(tmp_path / "small"), "--board", "arduino-due", "--float64"]) == 0
     assert "typedef double real" in (tmp_path / "small" / "controller.h").read_text()
     assert main([*line, "--out", str(out)]) == 2
     assert "is no empty folder" in capsys.readouterr().err
