@@ -414,7 +414,7 @@ def test_a_test_that_failed_is_said(done, tmp_path):
     findings = shorter.findings()
     assert "policy.json" in findings.failures[f"{HILL[0].name} on test, seed 0"]
     assert 0 in findings.missing[HILL[0].name]
-    assert [row["seed"] for row in findings.runs[HILL[1].name]] == ["0"]
+    assert "0" in {row["seed"] for row in findings.runs[HILL[1].name]}
 
 
 def test_an_unknown_task_is_named(capsys):
