@@ -1,7 +1,8 @@
 """Whether what was reported is what is found: checks as pure functions of values over seeds.
 
-What was reported is one number, as a rule from one run or one episode. What is found is a sample over seeds. What holds
-over them is *confirmed*; what was said of one run or one episode, and could be one of ours, is only *compatible*.
+What was reported is one number, as a rule from one run or one episode. What is found is a sample over seeds. One rule
+judges bounds and comparisons: the 95 % interval lies inside (*confirmed*), outside (*not confirmed*), or across
+(*open*). What was said of one run or one episode, and could be one of ours, is only *compatible*.
 """
 
 import dataclasses
@@ -11,12 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from codrl_mj.evaluation.measures import Interval, bootstrap_mean
+from codrl_mj.evaluation.measures import Interval
 from codrl_mj.study.inference import Stratum, effect
 
-OUTCOMES = ("confirmed", "compatible", "not confirmed", "not testable")
+OUTCOMES = ("confirmed", "compatible", "open", "not confirmed", "not testable")
 """What a check may come to."""
-CONFIRMED, COMPATIBLE, NOT_CONFIRMED, NOT_TESTABLE = OUTCOMES
+CONFIRMED, COMPATIBLE, OPEN, NOT_CONFIRMED, NOT_TESTABLE = OUTCOMES
 
 
 class Verdict(NamedTuple):
@@ -30,66 +31,116 @@ class Verdict(NamedTuple):
     """What was found, and its 95 % interval over seeds; None if nothing."""
     samples: int = 0
     """Number of seeds, of the arm that has the fewest."""
+    p: float | None = None
+    """Of no difference, where two arms are compared: Welch's t test, two-sided, of this comparison alone."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """How values over seeds are judged."""
+    """How values over seeds are judged: one value for each seed of every arm; of a time in an episode, an array."""
 
+    rule: str
+    """`mean`, `difference`, `paired`, `one run`, `one episode` or `every seed`."""
+    low: float
+    """Lower bound, or the number that was reported of one run or episode."""
+    high: float
+    """Upper bound, or the same number."""
     criterion: str
     """When it is passed, in words."""
-    judge: Callable[..., tuple[bool, str, Interval | None]]
-    """Of each arm's values, one for each seed: whether it is passed, why, and what was found."""
-    passed: str = CONFIRMED
-    """What it then comes to."""
-    least: int = 1
+    judge: Callable[..., Verdict]
+    """Of each arm's values."""
+    least: int = 2
     """Seeds that it takes."""
-    paired: bool = False
-    """Whether the n-th values of all arms are to be of one seed."""
 
     def __call__(self, *values: Any) -> Verdict:
         """Judge one value for each seed of every arm, shape (n,)."""
         samples = min(map(len, values))
-        if samples == 0:
-            return Verdict(NOT_TESTABLE, "no finished run")
         if samples < self.least:
-            measured = bootstrap_mean(values[0]) if len(values) == 1 else None
-            return Verdict(NOT_TESTABLE, "one seed: it takes two to say how runs differ", measured, samples)
-        holds, reason, measured = self.judge(*values)
-        return Verdict(self.passed if holds else NOT_CONFIRMED, reason, measured, samples)
+            reason = "one seed: it takes two to say how runs differ" if samples else "no published value"
+            return Verdict(NOT_TESTABLE, reason, samples=samples)
+        return self.judge(*values)._replace(samples=samples)
+
+
+def mean_interval(values: np.ndarray) -> Interval:
+    """Mean over seeds and its 95 % interval by Student's t; of one value, or of equal ones, a point.
+
+    Args:
+        values: shape (n,), n >= 1.
+    """
+    mean = float(np.mean(values))
+    if np.ptp(values) == 0:
+        return Interval(mean, mean, mean)
+    from scipy.special import stdtrit
+
+    half = float(stdtrit(len(values) - 1, 0.975) * np.std(values, ddof=1) / math.sqrt(len(values)))
+    return Interval(mean, mean - half, mean + half)
+
+
+def place(measured: Interval, low: float, high: float) -> tuple[str, str]:
+    """The one rule: what a 95 % interval comes to, against bounds that are included, and why."""
+    if low <= measured.low and measured.high <= high:
+        return CONFIRMED, "the whole interval is"
+    if measured.high < low or measured.low > high:
+        return NOT_CONFIRMED, "the whole interval is beyond"
+    return OPEN, "the interval lies across: more seeds would tell"
 
 
 def within(low: float = -math.inf, high: float = math.inf) -> Check:
-    """The mean over seeds lies in a band, bounds included."""
+    """The mean over seeds lies between bounds."""
 
-    def judge(values: np.ndarray) -> tuple[bool, str, Interval]:
-        measured = bootstrap_mean(values)
-        inside = low <= measured.mean <= high
-        if measured.low == measured.high:
-            reason = f"every seed has {number(measured.mean)}" if len(values) > 1 else "one seed: no interval"
-        elif inside:
-            whole = low <= measured.low and measured.high <= high
-            reason = "the whole interval is" if whole else f"the mean is; the interval reaches beyond: {_MORE}"
-        else:
-            beyond = measured.high < low or measured.low > high
-            reason = "the whole interval is beyond" if beyond else f"the mean is not; the interval reaches in: {_MORE}"
-        return inside, reason, measured
+    def judge(values: np.ndarray) -> Verdict:
+        measured = mean_interval(values)
+        return Verdict(*place(measured, low, high), measured)
 
     bounds = f"from {number(low)} to {number(high)}"
     if math.isinf(low) or math.isinf(high):
         bounds = f"at most {number(high)}" if math.isinf(low) else f"at least {number(low)}"
-    return Check(f"mean over seeds {bounds}", judge)
+    return Check("mean", low, high, f"the 95 % interval of the mean is {bounds}", judge)
+
+
+def same(margin: float, paired: bool = False) -> Check:
+    """Both arms have the same mean, up to a margin.
+
+    Args:
+        margin: difference that does not matter.
+        paired: whether the n-th values of both belong together, as those of one seed on two kinds of physics do.
+    """
+    kind = "paired t" if paired else "Welch"
+    criterion = f"the 95 % interval of the difference ({kind}) is within ±{number(margin)}"
+    return _difference(-margin, margin, criterion, paired)
+
+
+def higher(margin: float) -> Check:
+    """The mean of the one arm is higher than the other's by more than what does not matter."""
+    criterion = f"the 95 % interval of the difference (Welch) is above {number(margin)}"
+    return _difference(margin, math.inf, criterion, paired=False)
+
+
+def _difference(low: float, high: float, criterion: str, paired: bool) -> Check:
+    def judge(values: np.ndarray, others: np.ndarray) -> Verdict:
+        from scipy.stats import ttest_ind, ttest_rel
+
+        measured = effect([Stratum(values, others, paired)])
+        outcome, reason = place(measured, low, high)
+        if measured.low == measured.high:  # without any spread there is no statistic
+            reason = "no two values differ" if measured.mean == 0 else reason
+            return Verdict(outcome, reason, measured, p=float(measured.mean == 0))
+        test = ttest_rel(values, others) if paired else ttest_ind(values, others, equal_var=False)
+        return Verdict(outcome, reason, measured, p=float(test.pvalue))
+
+    return Check("paired" if paired else "difference", low, high, criterion, judge)
 
 
 def one_run(figure: float) -> Check:
     """A number that was read off one run could be one of our runs': by the prediction interval of one more."""
 
-    def judge(values: np.ndarray) -> tuple[bool, str, Interval]:
+    def judge(values: np.ndarray) -> Verdict:
         low, high = prediction_interval(values)
         reason = f"95 % of single runs lie from {number(low)} to {number(high)} (Student's prediction interval)"
-        return low <= figure <= high, reason, bootstrap_mean(values)
+        return Verdict(COMPATIBLE if low <= figure <= high else NOT_CONFIRMED, reason, mean_interval(values))
 
-    return Check(f"{number(figure)} is within the range of 95 % of single runs", judge, COMPATIBLE, least=2)
+    criterion = f"{number(figure)} is within the range of 95 % of single runs"
+    return Check("one run", figure, figure, criterion, judge)
 
 
 def one_episode(figure: float) -> Check:
@@ -99,73 +150,37 @@ def one_episode(figure: float) -> Check:
     measured is the mean over seeds of the median over episodes that arrive.
     """
 
-    def judge(times: list[np.ndarray]) -> tuple[bool, str, Interval | None]:
-        arriving = [of_seed[np.isfinite(of_seed)] for of_seed in times]
-        arrived, count = np.concatenate(arriving), sum(map(len, times))
+    def judge(times: list[np.ndarray]) -> Verdict:
+        every = np.concatenate(times)
+        arrived = every[np.isfinite(every)]
         if not len(arrived):
-            return False, f"none of {count} episodes arrives", None
+            return Verdict(NOT_CONFIRMED, f"none of {len(every)} episodes arrives")
         low, high = central_range(arrived)
         reason = f"95 % of those that arrive take {number(low)} to {number(high)} s"
-        if len(arrived) < count:
-            reason += f"; {100 * (1 - len(arrived) / count):.0f} % never arrive"
-        medians = np.array([np.median(of_seed) for of_seed in arriving if len(of_seed)])
-        return low <= figure <= high, reason, bootstrap_mean(medians)
+        if len(arrived) < len(every):
+            reason += f"; {len(every) - len(arrived)} of {len(every)} never arrive"
+        outcome = COMPATIBLE if low <= figure <= high else NOT_CONFIRMED
+        return Verdict(outcome, reason, mean_interval(medians(times)))
 
     criterion = f"{number(figure)} s is within the range of 95 % of the test episodes that arrive"
-    return Check(criterion, judge, COMPATIBLE)
+    return Check("one episode", figure, figure, criterion, judge, least=1)
 
 
 def every_seed(limit: float) -> Check:
     """The value of every seed is at most a limit."""
 
-    def judge(values: np.ndarray) -> tuple[bool, str, Interval]:
+    def judge(values: np.ndarray) -> Verdict:
         beyond = int(np.sum(values > limit))
         reason = f"{beyond} of {len(values)} seeds are beyond; the largest has {number(float(np.max(values)))}"
-        return not beyond, reason, bootstrap_mean(values)
+        return Verdict(NOT_CONFIRMED if beyond else CONFIRMED, reason, mean_interval(values))
 
-    return Check(f"at most {number(limit)} in every seed", judge)
-
-
-def higher() -> Check:
-    """The mean of the one arm is higher than the other's: Welch's t test over seeds."""
-
-    def judge(values: np.ndarray, others: np.ndarray) -> tuple[bool, str, Interval]:
-        from scipy.stats import ttest_ind
-
-        measured = effect([Stratum(values, others)])
-        alike = measured.low == measured.high  # without any spread there is no statistic
-        p = float(measured.mean == 0) if alike else ttest_ind(values, others, equal_var=False).pvalue
-        found = "higher" if measured.low > 0 else "lower" if measured.high < 0 else "no difference can be told"
-        means = number(float(np.mean(values))), number(float(np.mean(others)))
-        return measured.low > 0, f"means {means[0]} and {means[1]}, p = {p:.2g}: {found}", measured
-
-    return Check("the 95 % interval of the difference (Welch) is above 0", judge, least=2)
+    return Check("every seed", -math.inf, limit, f"at most {number(limit)} in every seed", judge, least=1)
 
 
-def same(margin: float, paired: bool = False) -> Check:
-    """Both arms have the same mean, up to a margin, included.
-
-    Args:
-        margin: difference that does not matter.
-        paired: whether the n-th values of both belong together, as those of one seed on two kinds of physics do.
-    """
-
-    def judge(values: np.ndarray, others: np.ndarray) -> tuple[bool, str, Interval]:
-        measured = effect([Stratum(values, others, paired)])
-        inside = -margin <= measured.low and measured.high <= margin
-        if inside:
-            reason = "no two values differ" if measured == (0.0, 0.0, 0.0) else "the whole interval is"
-        else:
-            beyond = measured.low > margin or measured.high < -margin
-            reason = "they differ by more" if beyond else f"the interval is too wide: {_MORE}"
-        return inside, reason, measured
-
-    kind = "paired t" if paired else "Welch"
-    criterion = f"the 95 % interval of the difference ({kind}) is within ±{number(margin)}"
-    return Check(criterion, judge, least=2, paired=paired)
-
-
-_MORE = "more seeds would tell"
+def medians(times: list[np.ndarray]) -> np.ndarray:
+    """The median time of each seed's episodes that arrive; seeds of which none does are left out."""
+    arriving = [of_seed[np.isfinite(of_seed)] for of_seed in times]
+    return np.array([np.median(of_seed) for of_seed in arriving if len(of_seed)])
 
 
 def prediction_interval(values: np.ndarray) -> tuple[float, float]:
@@ -176,10 +191,10 @@ def prediction_interval(values: np.ndarray) -> tuple[float, float]:
     Args:
         values: shape (n,), n >= 2.
     """
-    from scipy.stats import t
+    from scipy.special import stdtrit
 
     count = len(values)
-    reach = t.ppf(0.975, count - 1) * np.std(values, ddof=1) * math.sqrt(1 + 1 / count)
+    reach = stdtrit(count - 1, 0.975) * np.std(values, ddof=1) * math.sqrt(1 + 1 / count)
     return float(np.mean(values) - reach), float(np.mean(values) + reach)
 
 
@@ -194,5 +209,5 @@ def central_range(values: np.ndarray) -> tuple[float, float]:
 
 
 def number(value: float) -> str:
-    """A number as text: four digits, or all before the point."""
-    return f"{value:.4g}" if abs(value) < 1000 else f"{value:.0f}"
+    """A number as text: three digits, four from 100 on, or all before the point."""
+    return f"{value:.3g}" if abs(value) < 100 else f"{value:.4g}" if abs(value) < 1000 else f"{value:.0f}"

@@ -1,6 +1,7 @@
 """What is reported about the paper's experiments: each number with its source, and the check that judges it.
 
-The paper (arXiv 2507.00268) shows one run of each experiment; its numbers are read off figures.
+The paper (arXiv 2507.00268) shows one run of each experiment; its numbers are read off figures. A statement is judged
+by published rows alone (`reproduction.rows`), so whoever has them can judge it again.
 """
 
 import dataclasses
@@ -9,10 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from codrl_mj.tasks import TASKS
-from reproduction.arms import CENTRE
-from reproduction.checks import Check, Verdict, every_seed, higher, one_episode, one_run, same, within
-from reproduction.series import Epochs, Series
+from reproduction.checks import Check, Verdict, every_seed, higher, number, one_episode, one_run, same, within
+from reproduction.rows import Row, times_of
 from reproduction.value_iteration import TASK as VALUE_TASK
 
 PAPER_SAYS, PORT = "paper", "this port"
@@ -21,11 +20,9 @@ PAPER_SAYS, PORT = "paper", "this port"
 # what the paper's words are taken to mean, which have no number
 ALMOST_PERFECT = 5.0  # % of the desired torque's rms
 WELL = 20.0  # % of the desired torque's rms
-SIMILAR_RETURN = 10.0  # Pendulum: 7 % of its return
+SIMILAR_RETURN = {"pendulum": 10.0, "mountain_car": 3.0, "cartpole": 200.0}  # does not matter
 ALWAYS = 0.95  # share of the test episodes, in which the paper's one episode is no accident
 NEAR_CENTRE = 0.9  # share of the steps of a test
-FULL_LENGTH = 4000.0  # steps of an epoch
-FULL_RETURN = 3800.0  # of an epoch, that "approaches 4000"
 
 
 class Measure(NamedTuple):
@@ -33,8 +30,17 @@ class Measure(NamedTuple):
 
     text: str
     """What it is, with the unit."""
-    values: Callable[[Series], Any]
-    """One value for each seed of a series; of `TIMES` an array for each."""
+    column: str
+    """Of the published rows."""
+    unit: str = ""
+    """What is written behind it; `share` for a share, which is written in %."""
+    parse: Callable[[str], Any] = float
+    """The value of a row by its text."""
+
+    def values(self, rows: Sequence[Row]) -> Any:
+        """One for each row that has it, shape (n,); of `TIMES` an array for each."""
+        found = [self.parse(row[self.column]) for row in rows if row.get(self.column)]
+        return found if self.parse is times_of else np.array(found)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,150 +51,150 @@ class Claim:
     """Task name."""
     source: str
     """Who says it: `PAPER_SAYS` or `PORT`."""
+    figure: str
+    """Where the paper shows it; empty if only its text says so."""
     statement: str
-    """What is said, with the number that is reported."""
+    """What is said to be so."""
+    says: str
+    """How, with the number that is reported."""
     measure: Measure
     """What is judged."""
-    arms: tuple[str, ...]
-    """Names of the arm that it is about, or of the two that it compares."""
+    settings: str
+    """Of the agent."""
+    motors: tuple[str, ...]
+    """What the arm that it is about is called for its motor, or the two that it compares."""
     check: Check
     """How it is judged."""
+    counted: bool = True
+    """Whether it is the statement's verdict, not that of settings as printed beside repaired ones, or a second look."""
+    physics: tuple[str, ...] = ("mujoco",)
+    """What it was trained in; of both kinds the first is compared with the second."""
 
     @property
-    def physics(self) -> str:
-        """`mujoco` or `analytic`; both where both are compared."""
-        return " and ".join(dict.fromkeys(name.rpartition(", ")[2] for name in self.arms))
+    def arms(self) -> tuple[str, ...]:
+        """Names of the arm that it is about, or of the two that it compares."""
+        kinds = [(motor, physics) for physics in self.physics for motor in self.motors]
+        return tuple(f"{self.task}, {self.settings}, {motor}, {physics}" for motor, physics in kinds)
 
-    @property
-    def section(self) -> str:
-        """Where in the paper the experiment is described."""
-        name = {VALUE_TASK: "Mountain Car"}.get(self.task, self.task.replace("_", " ").title())
-        return f"Solving the {name} Environment"
+    def judge(self, rows: Mapping[str, Sequence[Row]]) -> Verdict:
+        """The verdict by the published rows of every arm, by its name; of pairs by the first row of each seed."""
+        mine = [rows.get(name, ()) for name in self.arms]
+        if self.check.rule == "paired":
+            by_seed = [{row["seed"]: row for row in reversed(one)} for one in mine]
+            shared = [row["seed"] for row in by_seed[0].values() if row["seed"] in by_seed[1]]
+            mine = [[one[seed] for seed in shared] for one in by_seed]
+        return self.check(*map(self.measure.values, mine))
 
-    def judge(self, series: Mapping[str, Series]) -> Verdict:
-        """The verdict by the runs of every arm, by its name."""
-        mine = [series[name] for name in self.arms]
-        if self.check.paired:
-            shared = set.intersection(*(set(one.runs) for one in mine))
-            mine = [one.only(shared) for one in mine]
-        return self.check(*(self.measure.values(one) for one in mine))
-
-
-def _near_centre(series: Series) -> np.ndarray:
-    return series.tested("returns", CENTRE) / TASKS[series.arm.task].max_episode_steps
-
-
-def _first_epoch(reached: Callable[[Epochs], np.ndarray]) -> Callable[[Series], np.ndarray]:
-    """The first epoch in which something holds; one more than there are if it never does."""
-    return lambda series: np.array([1.0 + np.argmax(np.append(reached(one), True)) for one in series.epochs()])
+    def without_motor(self, rows: Mapping[str, Sequence[Row]]) -> float | None:
+        """The mean of what is judged where there is no motor; None if it is not known, compared, or of the motor."""
+        column = {TIMES: "time_to_goal"}.get(self.measure, self.measure.column)  # medians are known of more trainings
+        ideal = rows.get(f"{self.task}, {self.settings}, ideal, mujoco", ())
+        values = [float(row[column]) for row in ideal if row[column]]
+        if not values or len(self.arms) > 1 or self.measure in (TRACKING, LARGEST_ERROR):
+            return None
+        return float(np.mean(values))
 
 
-LAST = Measure("mean return of the last 50 training episodes", Series.last_returns)
-RETURN = Measure("mean return in test", lambda series: series.tested("returns"))
-SUCCESS = Measure("share of test episodes that succeed", lambda series: series.tested("success"))
-TIMES = Measure("time to the goal in test [s]", Series.times_to_goal)
-TRACKING = Measure("rms torque error / rms desired torque [%]", lambda series: series.tested("tracking_percent"))
-LARGEST_ERROR = Measure("largest torque error in test [N·m]", lambda series: series.tested("tracking_max"))
-CENTRED = Measure("share of the 500 steps with |x| <= 0.1 m", _near_centre)
-LONG_EPOCH = Measure("first epoch of length 4000", _first_epoch(lambda epochs: epochs.lengths >= FULL_LENGTH))
-PAID_EPOCH = Measure("first epoch with a return of 3800", _first_epoch(lambda epochs: epochs.returns >= FULL_RETURN))
+LAST = Measure("mean return of the last 50 training episodes", "last_50")
+RETURN = Measure("mean return in test", "returns")
+UPRIGHT = Measure("share of test episodes that end upright", "upright", "share")
+SUCCESS = Measure("share of test episodes that succeed", "success", "share")
+TIMES = Measure("time to the goal in test [s]", "times", "s", times_of)
+TRACKING = Measure("rms torque error / rms desired torque [%]", "tracking_percent", "%")
+LARGEST_ERROR = Measure("largest torque error in test [N·m]", "tracking_max", "N·m")
+CENTRED = Measure("share of the 500 steps with |x| <= 0.1 m", "centred", "share")
+LONG_EPOCH = Measure("first epoch of length 4000", "long_epoch")
+PAID_EPOCH = Measure("first epoch with a return of 3800", "paid_epoch")
+
+_Row = tuple[str, str, str, Measure, Sequence[str], Check]
+"""A claim's figure, statement and number, what is judged, its motors, and how."""
 
 
-def _compared(measure: Measure, how: str) -> Measure:
-    """A measure of two arms."""
-    return measure._replace(text=f"{measure.text}: {how}")
-
-
-_Row = tuple[str, Measure, Sequence[str], Check]
-"""A claim's statement, what is judged, its arms without task and physics, and how."""
-
-
-def _paper(task: str, *rows: _Row, physics: Sequence[str] = ("mujoco",)) -> list[Claim]:
-    """What the paper says of a task, to be judged on each kind of physics."""
+def _paper(task: str, *rows: _Row, settings: Sequence[str] = ("paper",), counted: bool = True) -> list[Claim]:
+    """What the paper says of a task; where its settings do not learn, the repaired ones count."""
     return [
-        Claim(task, PAPER_SAYS, statement, measure, tuple(f"{task}, {arm}, {kind}" for arm in arms), check)
-        for kind in physics
-        for statement, measure, arms, check in rows
+        Claim(task, PAPER_SAYS, *row[:4], of, tuple(row[4]), row[5], counted and of == settings[-1])
+        for row in rows
+        for of in settings
     ]
 
 
-def _same_physics(task: str, motors: Sequence[str], margin: float) -> list[Claim]:
+def _same_physics(task: str, motors: Sequence[str]) -> list[Claim]:
     """MuJoCo and Gymnasium's own equations give the same results, seed by seed."""
+    check, both = same(SIMILAR_RETURN[task], paired=True), ("mujoco", "analytic")
     return [
-        Claim(
-            task,
-            PORT,
-            f"{motor}: training in MuJoCo comes to what it comes to on Gymnasium's equations",
-            _compared(LAST, "MuJoCo minus Gymnasium"),
-            (f"{task}, paper, {motor}, mujoco", f"{task}, paper, {motor}, analytic"),
-            same(margin, paired=True),
-        )
+        Claim(task, PORT, "", f"{motor}: MuJoCo less Gymnasium", "0", LAST, "paper", (motor,), check, physics=both)
         for motor in motors
     ]
 
 
-_PRINTED, _REPAIRED = "paper, paper gains", "repaired, paper gains"
-_IDEAL, _FAST = "paper, ideal", "paper, fast gains"
-_BOTH = (("as printed", _PRINTED), ("repaired", _REPAIRED))
-_RIVALS = (("the ideal environment", _IDEAL), ("perfect tracking (gains 2, 10, 1e-6)", _FAST))
+_BOTH = ("paper", "repaired")
+_MOTOR, _FAST, _IDEAL = ("paper gains",), ("fast gains",), ("ideal",)
+_RIVALS = (("no motor", "75 s sooner", "ideal"), ("gains 2, 10, 1e-6", "15 s sooner", "fast gains"))
 
+
+def _beats(measure: Measure) -> list[_Row]:
+    """The paper's gains against both rivals; a step is a second and costs 1."""
+    check = higher(SIMILAR_RETURN["mountain_car"])
+    return [("", f"beats {rival}", by, measure, (*_MOTOR, other), check) for rival, by, other in _RIVALS]
+
+
+_PERFECT, _TRACKED = within(high=ALMOST_PERFECT), "torque error"
 CLAIMS: tuple[Claim, ...] = (
     *_paper(
         "pendulum",
-        *(
-            (f"{name}: the desired torque is tracked almost perfectly", TRACKING, [arm], within(high=ALMOST_PERFECT))
-            for name, arm in _BOTH
-        ),
-        *((f"{name}: upright and still within 10 s", SUCCESS, [arm], within(low=ALWAYS)) for name, arm in _BOTH),
-        (
-            "repaired: the return is the ideal environment's",
-            _compared(RETURN, "with the motor minus ideal"),
-            [_REPAIRED, "repaired, ideal"],
-            same(SIMILAR_RETURN),
-        ),
+        ("5b", _TRACKED, "almost none", TRACKING, _MOTOR, _PERFECT),
+        ("5c–f", "upright within 10 s", "yes", UPRIGHT, _MOTOR, within(low=ALWAYS)),
+        settings=_BOTH,
+    ),
+    *_paper(
+        "pendulum",
+        ("5a", "return, less ideal's", "similar", RETURN, ("paper gains", "ideal"), same(SIMILAR_RETURN["pendulum"])),
+        settings=("repaired",),
     ),
     *_paper(
         "mountain_car",
-        ("gains 1, 1, 1e-2: about -114", LAST, [_PRINTED], one_run(-114.0)),
-        ("gains 1, 1, 1e-2: tracking is imperfect", TRACKING, [_PRINTED], within(low=ALMOST_PERFECT)),
-        ("gains 2, 10, 1e-6: tracking is perfect", TRACKING, [_FAST], within(high=ALMOST_PERFECT)),
-        ("gains 1, 1, 1e-2: goal in 85 s", TIMES, [_PRINTED], one_episode(85.0)),
-        ("gains 2, 10, 1e-6: goal in 100 s", TIMES, [_FAST], one_episode(100.0)),
-        ("ideal: goal in 160 s", TIMES, [_IDEAL], one_episode(160.0)),
-        *(
-            (
-                f"imperfect tracking (gains 1, 1, 1e-2) beats {rival}",
-                _compared(measure, "the first minus the second"),
-                [_PRINTED, arm],
-                higher(),
-            )
-            for rival, arm in _RIVALS
-            for measure in (LAST, RETURN)
-        ),
-        physics=("mujoco", "analytic"),
+        ("6a", "return, last 50", "-114", LAST, _MOTOR, one_run(-114.0)),
+        ("6b", _TRACKED, "imperfect", TRACKING, _MOTOR, within(low=ALMOST_PERFECT)),
+        ("", f"{_TRACKED}, gains 2, 10, 1e-6", "perfect", TRACKING, _FAST, _PERFECT),
+        ("6c", "goal", "85 s", TIMES, _MOTOR, one_episode(85.0)),
+        ("", "goal, gains 2, 10, 1e-6", "100 s", TIMES, _FAST, one_episode(100.0)),
+        ("", "goal, no motor", "160 s", TIMES, _IDEAL, one_episode(160.0)),
+        *_beats(RETURN),
     ),
-    *_same_physics("mountain_car", ("paper gains", "fast gains", "ideal"), margin=3.0),
+    *_paper("mountain_car", *_beats(LAST), counted=False),
+    *_same_physics("mountain_car", ("paper gains", "fast gains", "ideal")),
     *_paper(
         VALUE_TASK,
-        *((f"{name}: the return is about 95", LAST, [arm], within(90.0, 100.0)) for name, arm in _BOTH),
-        *((f"{name}: goal in 75 s", TIMES, [arm], one_episode(75.0)) for name, arm in _BOTH),
-        *((f"{name}: tracking is nearly perfect", TRACKING, [arm], within(high=ALMOST_PERFECT)) for name, arm in _BOTH),
+        ("7a", "return, last 50", "95", LAST, _MOTOR, within(90.0, 100.0)),
+        ("7c", "goal", "75 s", TIMES, _MOTOR, one_episode(75.0)),
+        ("7b", _TRACKED, "almost none", TRACKING, _MOTOR, _PERFECT),
+        settings=_BOTH,
     ),
     *_paper(
         "acrobot",
-        ("the desired torque is well tracked", TRACKING, [_PRINTED], within(high=WELL)),
-        ("the return converges to about -200", LAST, [_PRINTED], one_run(-200.0)),
-        ("goal in about 25 s", TIMES, [_PRINTED], one_episode(25.0)),
+        ("8b", _TRACKED, "small", TRACKING, _MOTOR, within(high=WELL)),
+        ("8a", "return, last 50", "-200", LAST, _MOTOR, one_run(-200.0)),
+        ("8c", "goal", "25 s", TIMES, _MOTOR, one_episode(25.0)),
     ),
     *_paper(
         "cartpole",
-        ("episodes last the whole epoch from 32 on", LONG_EPOCH, [_PRINTED], one_run(32)),
-        ("the return approaches 4000 after epoch 35", PAID_EPOCH, [_PRINTED], one_run(35)),
-        ("the torque error is within ±0.1 N·m", LARGEST_ERROR, [_PRINTED], every_seed(0.1)),
-        ("pole and cart stay in bounds in test", SUCCESS, [_PRINTED], within(low=ALWAYS)),
-        ("the cart stays near the origin in test", CENTRED, [_PRINTED], within(low=NEAR_CENTRE)),
-        physics=("mujoco", "analytic"),
+        ("9a", "whole epochs from", "epoch 32", LONG_EPOCH, _MOTOR, one_run(32)),
+        ("9a", "return near 4000 from", "epoch 35", PAID_EPOCH, _MOTOR, one_run(35)),
+        ("9b", "largest torque error", "0.1 N·m", LARGEST_ERROR, _MOTOR, every_seed(0.1)),
+        ("9c–d", "in bounds", "yes", SUCCESS, _MOTOR, within(low=ALWAYS)),
+        ("9d", "near the origin", "yes", CENTRED, _MOTOR, within(low=NEAR_CENTRE)),
     ),
-    *_same_physics("cartpole", ("paper gains", "ideal"), margin=200.0),
+    *_same_physics("cartpole", ("paper gains", "ideal")),
 )
 """Everything that is reported, in the paper's order."""
+
+
+def needed(arm: str) -> set[str]:
+    """The columns by which an arm's claims are judged."""
+    return {claim.measure.column for claim in CLAIMS if arm in claim.arms}
+
+
+def as_text(measure: Measure, value: float) -> str:
+    """A measured value with its unit."""
+    return f"{number(100 * value)} %" if measure.unit == "share" else f"{number(value)} {measure.unit}".strip()

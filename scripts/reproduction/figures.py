@@ -1,4 +1,4 @@
-"""The paper's figures, redrawn from run folders: learning, torque, states; and what value iteration finds."""
+"""The paper's figures, redrawn from published tables: learning, torque, states; and what value iteration finds."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -7,23 +7,21 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.actuators import IDEAL
-from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.films.strip import ACTUAL, DESIRED
-from codrl_mj.runs.policies import load_policy
 from codrl_mj.study.doses import CENTRE_RADIUS
 from codrl_mj.study.pages import COLOURS, legend, save
 from codrl_mj.tasks import acrobot, cartpole, find_task, mountain_car, mountain_car_continuous, pendulum
-from codrl_mj.training import EVALUATION_SEED
-from reproduction.arms import TEST, PaperArm
-from reproduction.series import LAST, Series
+from reproduction.drawn import ENTRIES, Table, arms_of, column
+from reproduction.rows import LAST
 from reproduction.value_iteration import Optimum
 
 STYLES = {"ideal": (COLOURS[0], "--"), "paper gains": (COLOURS[2], "-"), "fast gains": (COLOURS[1], "-.")}
 """Of an arm, by its motor: colour and dashes."""
-PHYSICS = {"mujoco": "MuJoCo", "analytic": "Gymnasium's equations"}
+SETTINGS = {"paper": "as printed", "repaired": "repaired"}
+"""What settings are called."""
+LEARNED = {"returns": "mean return", "lengths": "mean length\n[steps]", "counts": "number of\nepisodes"}
+"""What learning curves are called."""
 _ERROR = COLOURS[3]
-_MANY = 4000  # points of a line; more are drawn as an image within the SVG
 _WIDTH = 8.0  # in
 
 
@@ -81,97 +79,104 @@ def _unbroken(angle: np.ndarray) -> np.ndarray:
     return np.where(jumps, np.nan, angle)
 
 
-def example(series: Series) -> Episode:
-    """The first test episode of the first seed that is finished, of which there must be one."""
-    run = next(iter(series.runs.values()))
-    (episode,) = run_episodes(load_policy(run.folder), series.arm.trials[TEST].env.make, 1, EVALUATION_SEED)
-    return episode
-
-
-def draw_learning(path: Path, arms: Sequence[Series]) -> None:
-    """Draw trainings, a column for each settings and physics: means and 95 % bands over seeds.
-
-    It is the running mean of returns over episodes; of PPO, whose rollouts are the paper's epochs, mean return, mean
-    length and number of episodes over epochs.
+def draw_learning(path: Path, task: str, curves: Table) -> bool:
+    """Draw how a task is learned, all on one scale: means and 95 % bands over seeds, faint with settings as printed.
 
     Args:
         path: SVG file.
-        arms: of one task, at least one, each with a run.
+        task: task name.
+        curves: rows of `drawn.CURVES`.
+
+    Returns:
+        Whether there is anything to draw.
     """
-
-    def over_epochs(what: str) -> Callable[[Series], np.ndarray]:
-        return lambda series: np.array([_filled(getattr(one, what).astype(float)) for one in series.epochs()])
-
-    rows = {f"return, mean of last {LAST}": lambda series: running_mean(series.returns_by_episode())}
-    along, title, size = "training episode", "{} settings, {}", "medium"
-    if arms[0].arm.config.agent.name == "ppo":
-        labels = {"mean return": "returns", "mean length [steps]": "lengths", "number of episodes": "counts"}
-        rows = {label: over_epochs(what) for label, what in labels.items()}
-        along, title, size = "epoch of 4000 steps", "{1}", "large"
-    columns: dict[tuple[str, str], list[Series]] = {}
-    for series in arms:
-        columns.setdefault((series.arm.settings, PHYSICS[series.arm.physics]), []).append(series)
-    figure, all_axes = _panels(len(rows), len(columns))
-    for (about, members), column in zip(columns.items(), all_axes.T, strict=True):
-        for axes, (label, values_of) in zip(column, rows.items(), strict=True):
-            for series in members:
-                values = values_of(series)
-                colour, dashes = STYLES[series.arm.motor]
-                places, (mean, low, high) = np.arange(1, values.shape[1] + 1), band(values)
-                name = f"{_name(series.arm)} ({len(values)} seeds)"
-                axes.plot(places, mean, color=colour, linestyle=dashes, linewidth=1.4, label=name)
-                axes.fill_between(places, low, high, color=colour, alpha=0.2, linewidth=0)
-            axes.set(ylabel=label, yscale="log" if label == "number of episodes" else "linear")
-        column[0].set_title(title.format(*about), fontsize=size)
-        column[-1].set_xlabel(along)
-    legend(figure, 2)
+    arms = arms_of(curves, task)
+    names = list(dict.fromkeys(row["curve"] for rows in arms.values() for row in rows))
+    if not names:
+        return False
+    figure, all_axes = _panels(len(names), 1, row_height=1.3 if len(names) > 1 else 2.6)
+    repaired = any(settings == "repaired" for settings, _ in arms)
+    for axes, name in zip(all_axes[:, 0], names, strict=True):
+        for (settings, motor), rows in arms.items():
+            shown = [row for row in rows if row["curve"] == name]
+            places, mean, low, high = (column(shown, part) for part in ("at", "mean", "low", "high"))
+            colour, dashes = STYLES[motor]
+            label = f"{motor}{f', {SETTINGS[settings]}' if repaired else ''} ({shown[0]['seeds']} seeds)"
+            faint = repaired and settings == "paper"
+            axes.plot(places, mean, color=colour, linestyle=dashes, linewidth=0.8 if faint else 1.6, label=label)
+            axes.fill_between(places, low, high, color=colour, alpha=0.2, linewidth=0)
+        axes.set(ylabel=LEARNED[name], yscale="log" if name == "counts" else "linear")
+        axes.yaxis.label.set_fontsize("small" if len(names) > 1 else "medium")
+    all_axes[-1, 0].set_xlabel("training episode" if len(names) == 1 else "epoch of 4000 steps")
+    if len(names) == 1:
+        all_axes[0, 0].set_ylabel(f"return, mean of last {LAST}")
+    legend(figure, 2 if repaired else 3)
     save(figure, path)
+    return True
 
 
-def draw_torque(path: Path, episodes: Sequence[tuple[PaperArm, Episode]]) -> None:
-    """Draw desired and actual torque at the shaft, and their difference, over an episode: a column for each arm.
+def draw_torque(path: Path, task: str, torques: Table) -> bool:
+    """Draw the beginning of an episode: desired and actual torque at the shaft, and their difference, on one scale.
 
     Args:
         path: SVG file.
-        episodes: arms with a motor, and an episode of each.
+        task: task name.
+        torques: rows of `drawn.TORQUES`.
+
+    Returns:
+        Whether there is anything to draw.
     """
-    figure, all_axes = _panels(2, len(episodes), heights=(2, 1))
-    for (above, below), (arm, episode) in zip(all_axes.T, episodes, strict=True):
-        radius = arm.actuator.motor.arm_radius
-        edges = np.arange(len(episode.trace["speed"]) + 1) * episode.timestep
-        desired = radius * np.repeat(episode.signals["desired_force"], episode.inner_steps)
-        actual = radius * episode.trace["actual_force"]
-        options: dict[str, Any] = {"baseline": None, "rasterized": len(edges) > _MANY}
-        above.stairs(actual, edges, color=ACTUAL, linewidth=1.8, label="actual", **options)
-        above.stairs(desired, edges, color=DESIRED, linewidth=0.9, linestyle="--", label="desired", **options)
-        below.stairs(desired - actual, edges, color=_ERROR, label="error: desired - actual", **options)
-        above.set(ylabel="torque [N·m]", title=arm.gains)
-        below.set(ylabel="error [N·m]", xlabel="time [s]")
-    legend(figure, 2)
+    arms = _learned(arms_of(torques, task))
+    if not arms:
+        return False
+    figure, all_axes = _panels(len(arms), 1, row_height=2.0, sharey=True)
+    for axes, (motor, rows) in zip(all_axes[:, 0], arms.items(), strict=True):
+        times, desired, actual = (column(rows, name) for name in ("time", "desired", "actual"))
+        edges = np.append(times, times[-1] + times[1])
+        axes.stairs(actual, edges, color=ACTUAL, linewidth=1.8, label="actual", baseline=None)
+        axes.stairs(desired, edges, color=DESIRED, linewidth=0.9, linestyle="--", label="desired", baseline=None)
+        axes.stairs(desired - actual, edges, color=_ERROR, label="error: desired - actual", baseline=None)
+        axes.set(ylabel=f"torque [N·m],\n{motor}")
+    all_axes[-1, 0].set_xlabel("time [s]")
+    legend(figure, 3)
     save(figure, path)
+    return True
 
 
-def draw_states(path: Path, task: str, episodes: Sequence[tuple[PaperArm, Episode]]) -> None:
-    """Draw what there is to see of the states over an episode, a row for each curve, a line for each arm.
+def draw_states(path: Path, task: str, states: Table) -> bool:
+    """Draw what there is to see of the states over an episode, a row for each curve, a line for each motor.
 
     Args:
         path: SVG file.
-        task: the task's name.
-        episodes: arms, and an episode of each.
+        task: task name.
+        states: rows of `drawn.STATES`.
+
+    Returns:
+        Whether there is anything to draw.
     """
-    curves = CURVES[task]
+    arms, curves = _learned(arms_of(states, task)), CURVES[task]
+    if not arms:
+        return False
     figure, all_axes = _panels(len(curves), 1, row_height=1.35)
+    entries = ENTRIES[: len(find_task(task).state_names)]
     for axes, curve in zip(all_axes[:, 0], curves, strict=True):
         for mark in curve.marks:
             axes.axhline(mark, color="0.6", linewidth=0.8)
-        for arm, episode in episodes:
-            times = np.concatenate([[0.0], episode.time])
-            colour, dashes = STYLES[arm.motor]
-            axes.plot(times, curve.values(episode.state.T), color=colour, linestyle=dashes, label=_name(arm))
+        for motor, rows in arms.items():
+            colour, dashes = STYLES[motor]
+            state = np.array([column(rows, entry) for entry in entries])
+            axes.plot(column(rows, "time"), curve.values(state), color=colour, linestyle=dashes, label=motor)
         axes.set_ylabel(curve.label.replace("_dot", "'"), fontsize="small")
     all_axes[-1, 0].set_xlabel("time [s]")
-    legend(figure, 2)
+    legend(figure, 3)
     save(figure, path)
+    return True
+
+
+def _learned(arms: Mapping[tuple[str, str], Table]) -> dict[str, Table]:
+    """An episode's rows by motor: with repaired settings where there are any, for others learn nothing there."""
+    shown = "repaired" if any(settings == "repaired" for settings, _ in arms) else "paper"
+    return {motor: rows for (settings, motor), rows in arms.items() if settings == shown}
 
 
 def draw_discounts(path: Path, values: Mapping[float, float], optima: Sequence[Optimum]) -> None:
@@ -200,64 +205,19 @@ def draw_discounts(path: Path, values: Mapping[float, float], optima: Sequence[O
         drive.plot(times, one.episode.state[:, 0], color=COLOURS[index], linestyle=style, label=f"{one.discount:g}")
     drive.axhline(mountain_car_continuous.GOAL, color="0.6", linewidth=0.8)
     drive.set(xlabel="time [s]", ylabel="x [m]", xlim=(0, 120), title="best policy at discount factor")
-    drive.legend(fontsize="small", ncols=3)
+    legend(figure, 5)
     save(figure, path)
 
 
-def _panels(rows: int, columns: int, row_height: float = 0.0, heights: Sequence[float] | None = None) -> Any:
+def _panels(rows: int, columns: int, row_height: float = 2.6, sharey: bool = False) -> Any:
     """A figure and its axes, shape (rows, columns); rows share their time or episode axis."""
     from matplotlib.figure import Figure
 
-    height = rows * row_height if row_height else 1.6 + 1.6 * rows
-    figure = Figure(figsize=(_WIDTH if columns < 3 else 2.7 * columns, 0.6 + height), layout="constrained", dpi=110)
-    axes = figure.subplots(rows, columns, squeeze=False, sharex="col", height_ratios=heights)
+    figure = Figure(figsize=(_WIDTH, 0.6 + rows * row_height), layout="constrained", dpi=110)
+    axes = figure.subplots(rows, columns, squeeze=False, sharex="col", sharey=sharey)
     for each in axes.flat:
         each.grid(color="0.9")
         each.set_axisbelow(True)
         each.spines[["top", "right"]].set_visible(False)
     figure.align_ylabels()
     return figure, axes
-
-
-def running_mean(values: np.ndarray, count: int = LAST) -> np.ndarray:
-    """Mean of each value and those before it, at most `count` in all.
-
-    Args:
-        values: shape (..., n).
-        count: >= 1.
-
-    Returns:
-        Shape (..., n).
-    """
-    sums = np.cumsum(values, axis=-1)
-    sums[..., count:] = sums[..., count:] - sums[..., :-count]
-    return sums / np.minimum(np.arange(1, values.shape[-1] + 1), count)
-
-
-def band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean over seeds with its 95 % percentile-bootstrap interval, at every place (scipy, 999 resamples, fixed seed).
-
-    Args:
-        values: shape (seeds, n), seeds >= 1.
-
-    Returns:
-        Mean, lower and upper bound, shape (n,) each; with one seed the bounds are the mean.
-    """
-    mean = values.mean(axis=0)
-    if len(values) < 2 or not values.size:
-        return mean, mean, mean
-    from scipy.stats import bootstrap
-
-    options: dict[str, Any] = {"n_resamples": 999, "batch": 50, "method": "percentile", "rng": 0}
-    interval = bootstrap((values,), np.mean, axis=0, **options).confidence_interval
-    return mean, interval.low, interval.high
-
-
-def _filled(values: np.ndarray) -> np.ndarray:
-    """NaN replaced by the value before it; 0 where there is none."""
-    last = np.maximum.accumulate(np.where(np.isnan(values), -1, np.arange(len(values))))
-    return np.where(last >= 0, values[last], 0.0)
-
-
-def _name(arm: PaperArm) -> str:
-    return "ideal" if arm.actuator == IDEAL else arm.gains

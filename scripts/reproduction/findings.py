@@ -1,142 +1,158 @@
-"""What the reproduction found, as rows: from run folders, and from what is published of those that are not at hand."""
+"""What the reproduction found, as rows: of run folders that are at hand, and of trainings that are published."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from codrl_mj.runs.files import read_json, write_json
+from codrl_mj.study.inference import holm
 from codrl_mj.study.pages import write_csv
-from codrl_mj.study.trials import Collected, Grid
-from reproduction.arms import ARMS
-from reproduction.claims import CLAIMS, Claim
-from reproduction.series import LAST, Series, read_series
+from codrl_mj.study.trials import Grid
+from reproduction.arms import ARMS, PaperArm
+from reproduction.checks import Verdict
+from reproduction.claims import CLAIMS, PAPER_SAYS, Claim, needed
+from reproduction.drawn import Table, gather_tables
+from reproduction.rows import RUNS, Row, Trained, complete, identity, joined, read_rows, read_trained, run_row
 from reproduction.value_iteration import DISCOUNTS, TASK, Mesh, Model, Optimum, optimum, values_over
 
 VALUE_DISCOUNTS = tuple(1 - 0.2 * 0.8**step for step in range(24))
 """Discount factors of the curve of values, from 0.8 to 0.999."""
-FILES = {"claims": "claims.csv", "runs": "runs.csv"}
-"""Parts of the findings that are tables -> their files."""
-EVERYTHING = "findings.json"
-"""All of them."""
-TESTED = (
-    *("returns", "success", "time_to_goal", "tracking_rms", "tracking_percent", "tracking_max"),
-    *("saturated_percent", "peak_voltage"),
-)
-"""Measures of the test in a run's row, as docs/evaluation.md has them: means, and the median time to the goal."""
+CLAIM_ROWS, EVERYTHING = "claims.csv", "findings.json"
+"""Verdicts; the plan, what is missing, and what value iteration finds."""
+Runs = Mapping[str, Sequence[Row]]
+"""Published rows by arm."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Findings:
     """What there is, and what it says."""
 
-    found: Collected
-    """What is at hand."""
-    series: Mapping[str, Series]
-    """The runs of every arm that are at hand, by its name."""
+    plan: Mapping[str, Any]
+    """Numbers of episodes of trainings and tests."""
+    runs: Runs
+    """Published rows by arm."""
+    verdicts: Sequence[tuple[Claim, Verdict]]
+    """Every claim with what it came to, p not corrected."""
+    tables: Mapping[str, Table]
+    """What figures are drawn of, by file."""
     optima: Sequence[Optimum]
     """The continuous mountain car's best policies at `DISCOUNTS`; none without that task."""
-    rows: Mapping[str, Any]
-    """Everything as JSON-serialisable values: the plan, claims, runs, and what is missing."""
+    values: Mapping[float, float]
+    """What its start is worth, by discount factor."""
+    missing: Mapping[str, Sequence[int]]
+    """Arm -> seeds that are planned, and whose rows lack what is judged by."""
+    failures: Mapping[str, str]
+    """What went wrong."""
+
+
+def published_rows(folder: Path, plan: Mapping[str, Any]) -> dict[tuple[str, ...], list[Row]]:
+    """Published rows by what they are of, unless they are of other trainings and tests."""
+    file = folder / EVERYTHING
+    before = read_json(file, "findings")["plan"] if file.is_file() else {}
+    alike = file.is_file() and all(before.get(name) == of for name, of in plan.items())
+    return read_rows(folder) if alike else {}
 
 
 def gather(grid: Grid, plan: Mapping[str, Any], published: Path, mesh: Mesh) -> Findings:
-    """Read what is finished, and judge every claim by it; runs nothing but value iteration.
+    """Read what is finished, and judge every claim by it; runs nothing but value iteration and single episodes.
 
     Args:
-        grid: trainings and tests.
-        plan: numbers of seeds and episodes, and the tasks.
-        published: folder of the published files. A run that is not at hand has its row there; what such runs were
-            judged by was not published, so that a claim about them keeps its verdict.
+        grid: trainings and tests, of which those at hand have their rows made.
+        plan: numbers of episodes of trainings and tests.
+        published: folder of the published files: a training that is not at hand has its row there.
         mesh: of value iteration.
 
     Raises:
         ValueError: a file of a finished run is damaged.
     """
-    found, arms = grid.collect(), [arm for arm in ARMS if arm.task in plan["tasks"]]
-    series = {arm.name: read_series(arm, found) for arm in arms}
-    before = read_json(published / EVERYTHING, "findings") if (published / EVERYTHING).is_file() else {}
-    if any(before.get("plan", {}).get(name) != plan[name] for name in ("episodes", "test_episodes")):
-        before = {}  # of other trainings and tests
-    identity = ("task", "settings", "motor", "physics", "seed")
-    runs_before = {tuple(row[name] for name in identity): row for row in before.get("runs", ())}
-    claims_before = {_identity(row): row for row in before.get("claims", ())}
-    runs, missing, gone = [], dict[str, list[int]](), set()
+    found, before = grid.collect(), published_rows(published, plan)
+    chosen = {arm.name for arm in grid.arms}
+    arms = [arm for arm in ARMS if arm.name in chosen or any(of[0] == arm.task for of in before)]
+    at_hand = {arm.name: read_trained(arm, found) for arm in arms if arm.name in chosen}
+    runs, missing = dict[str, list[Row]](), dict[str, list[int]]()
     for arm in arms:
-        absent = []
-        for seed in grid.seeds_of(arm):
-            row = runs_before.get((arm.task, arm.settings, arm.motor, arm.physics, seed))
-            if seed in series[arm.name].runs:
-                runs.append(run_row(series[arm.name], seed))
-            elif row is not None:
-                runs.append(row)
-                gone.add(arm.name)
-            else:
-                absent.append(seed)
+        rows = arm_rows(arm, at_hand.get(arm.name, {}), before)
+        runs[arm.name] = [row for seed in sorted(rows) for row in rows[seed]]
+        planned = grid.seeds_of(arm) if arm.name in chosen else ()
+        absent = [seed for seed in planned if not complete(rows.get(seed, ()), needed(arm.name))]
         missing |= {arm.name: absent} if absent else {}
-    claims = []
-    for claim in CLAIMS:
-        if claim.task in plan["tasks"]:
-            row = claim_row(claim, series)
-            claims.append(claims_before.get(_identity(row), row) if gone & set(claim.arms) else row)
-    driven = TASK in plan["tasks"]
+    driven = any(arm.task == TASK for arm in arms)
     model = Model(mesh) if driven else None
-    optima = [optimum(model, discount) for discount in DISCOUNTS] if model else []
-    values = values_over(model, VALUE_DISCOUNTS) if model else {}
+    tasks = {arm.task for arm in arms}
     return Findings(
-        found,
-        series,
-        optima,
-        {
-            "plan": dict(plan),
-            "claims": claims,
-            "missing": missing,
-            "failures": dict(found.failures),
-            "runs": runs,
-            "value_iteration": [one.as_mapping() for one in optima],
-            "values_of_start": [{"discount": discount, "value": value} for discount, value in values.items()],
-        },
+        plan=plan,
+        runs=runs,
+        verdicts=[(claim, claim.judge(runs)) for claim in CLAIMS if claim.task in tasks],
+        tables=gather_tables(arms, at_hand, published if before else Path("nowhere")),
+        optima=[optimum(model, discount) for discount in DISCOUNTS] if model else [],
+        values=values_over(model, VALUE_DISCOUNTS) if model else {},
+        missing=missing,
+        failures=found.failures,
     )
 
 
-def _identity(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    """What a claim's row is about."""
-    return tuple(row[name] for name in ("task", "physics", "source", "statement", "measure", "criterion"))
+def arm_rows(
+    arm: PaperArm, at_hand: Mapping[int, Trained], before: Mapping[tuple[str, ...], Sequence[Row]]
+) -> dict[int, list[Row]]:
+    """An arm's rows by seed: those that are published, and of runs at hand that are not."""
+    rows = {int(of[-1]): list(found) for of, found in before.items() if of == identity(arm, int(of[-1]))}
+    for seed, run in at_hand.items():
+        mine = rows.get(seed, [])
+        if not complete([row for row in mine if row["run"] == run.folder.name], needed(arm.name)):
+            rows[seed] = joined(mine, run_row(arm, seed, run))
+    return rows
 
 
-def claim_row(claim: Claim, series: Mapping[str, Series]) -> dict[str, Any]:
-    """A claim and its verdict: ours over seeds, and the mean wall-clock time of a training that it is about [s]."""
-    verdict = claim.judge(series)
+def claim_rows(verdicts: Sequence[tuple[Claim, Verdict]]) -> list[dict[str, Any]]:
+    """Claims and their verdicts; p corrected for all comparisons of the same source (Holm)."""
+    corrected: dict[int, float] = {}
+    for ours in (False, True):
+        compared = [n for n, (claim, verdict) in enumerate(verdicts) if _compared(claim, verdict, ours)]
+        corrected |= dict(zip(compared, holm([verdicts[n][1].p or 0.0 for n in compared]).tolist(), strict=True))
+    return [_claim_row(claim, verdict, corrected.get(n)) for n, (claim, verdict) in enumerate(verdicts)]
+
+
+def _compared(claim: Claim, verdict: Verdict, ours: bool) -> bool:
+    return verdict.p is not None and (claim.source != PAPER_SAYS) == ours
+
+
+def _claim_row(claim: Claim, verdict: Verdict, corrected: float | None) -> dict[str, Any]:
     mean, low, high = verdict.measured or (None, None, None)
-    took = [run.seconds for name in claim.arms for run in series[name].runs.values()]
-    names = ("task", "physics", "source", "section", "statement")
+    names = ("task", "source", "figure", "statement", "says", "settings")
     return {name: getattr(claim, name) for name in names} | {
+        "counted": "yes" if claim.counted else "no",
+        "arm": claim.arms[0],
+        "against": claim.arms[1] if len(claim.arms) > 1 else "",
         "measure": claim.measure.text,
+        "column": claim.measure.column,
+        "rule": claim.check.rule,
+        "least": claim.check.low,
+        "most": claim.check.high,
         "criterion": claim.check.criterion,
         "mean": mean,
         "low": low,
         "high": high,
         "seeds": verdict.samples,
-        "seconds": float(np.mean(took)) if took else None,
+        "p": verdict.p,
+        "p_corrected": corrected,
         "verdict": verdict.outcome,
         "why": verdict.reason,
     }
 
 
-def run_row(series: Series, seed: int) -> dict[str, Any]:
-    """A finished run of an arm."""
-    run, alone = series.runs[seed], series.only({seed})
-    measured = {f"last_{LAST}": alone.last_returns()} | {name: alone.tested(name) for name in TESTED}
-    row = {name: getattr(series.arm, name) for name in ("task", "settings", "motor", "gains", "physics")}
-    row |= {"seed": seed, "run": run.folder.name, "seconds": run.seconds}
-    return row | {name: float(one[0]) if len(one) else None for name, one in measured.items()}
-
-
-def write_files(rows: Mapping[str, Any], folder: Path) -> list[Path]:
-    """Write the rows as CSV and JSON into a folder."""
-    for part, name in FILES.items():
-        write_csv(folder / name, rows[part])
-    write_json(folder / EVERYTHING, rows)
-    return [folder / name for name in (*FILES.values(), EVERYTHING)]
+def write_files(findings: Findings, folder: Path) -> list[Path]:
+    """Write everything as tables, and what is none as JSON, into a folder."""
+    tables: dict[str, Iterable[Mapping[str, Any]]] = {
+        CLAIM_ROWS: claim_rows(findings.verdicts),
+        RUNS: [row for rows in findings.runs.values() for row in rows],
+        **findings.tables,
+    }
+    for name, rows in tables.items():
+        write_csv(folder / name, list(rows))
+    rest = {name: getattr(findings, name) for name in ("plan", "missing", "failures")} | {
+        "value_iteration": [one.as_mapping() for one in findings.optima],
+        "values_of_start": [{"discount": discount, "value": value} for discount, value in findings.values.items()],
+    }
+    write_json(folder / EVERYTHING, rest)
+    return [folder / name for name in (*tables, EVERYTHING)]

@@ -1,7 +1,7 @@
 """The paper's experiments done again, as a program: their grid, and what it writes."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,29 +11,58 @@ from rich.table import Table
 
 from codrl_mj.fields import integer
 from codrl_mj.study.grid import check_chosen
+from codrl_mj.study.pages import write_csv
+from codrl_mj.study.parallel import Workers
 from codrl_mj.study.program import Program
-from codrl_mj.study.trials import Grid
-from reproduction.arms import ARMS, TASKS
+from codrl_mj.study.trials import Arm, Grid
+from reproduction.arms import ARMS, TASKS, PaperArm
 from reproduction.checks import COMPATIBLE, CONFIRMED, NOT_CONFIRMED, number
-from reproduction.findings import gather
+from reproduction.claims import needed
+from reproduction.findings import Findings, arm_rows, gather, published_rows
 from reproduction.page import FOLDER, write
+from reproduction.rows import RUNS, complete, identity, read_trained
 from reproduction.value_iteration import Mesh
 
 _COLOURS = {CONFIRMED: "green", COMPATIBLE: "cyan", NOT_CONFIRMED: "red"}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class Publishing(Grid):
+    """A grid that is computed seed by seed, and publishes rows after each."""
+
+    publish: Callable[[], None]
+    """Writes the rows of what is finished."""
+
+    def compute(
+        self,
+        workers: Workers = Workers(),  # noqa: B008 - frozen
+        accept_changes: bool = False,
+        on_cell: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        """Train and test what is missing."""
+
+        def only(seed: int) -> Callable[[Arm], range]:
+            return lambda arm: range(seed, seed + (seed in self.seeds_of(arm)))
+
+        for seed in sorted({seed for _, seed in self.cells()}):
+            Grid(self.root, self.trials, only(seed), self.episodes).compute(workers, accept_changes, on_cell)
+            self.publish()
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Reproduction(Program):
     """Do the paper's experiments again, judge what it reports, and write a page: docs/reproduction.md.
 
-    What is finished is not computed again: the same command resumes, adds seeds, and writes the page anew. Example:
-    python scripts/reproduce.py --dry-run, or with mountain_car --jobs 2
+    What is published is not computed again: the same command resumes and adds seeds, whose rows are published as they
+    finish. Example: python scripts/reproduce.py --dry-run, or with pendulum --settings repaired --seeds 20 --jobs 2
     """
 
     tasks: Annotated[
         tyro.conf.Positional[tuple[str, ...]],
         tyro.conf.arg(metavar="{" + ",".join(TASKS) + "}", help="Whose experiments; all if none is named."),
     ] = TASKS
+    settings: tuple[str, ...] = ("paper", "repaired")
+    """Of the agents: those that the paper prints, and those that learn where these do not."""
     root: Path = Path("runs/paper")
     """Folder of the run folders."""
     sarsa_seeds: int = integer(30, least=1)
@@ -49,37 +78,66 @@ class Reproduction(Program):
         """Validate."""
         super().__post_init__()
         check_chosen("tasks", self.tasks, TASKS)
+        check_chosen("settings", self.settings, ("paper", "repaired"))
+
+    @property
+    def plan(self) -> dict[str, Any]:
+        """Numbers of episodes of trainings and tests."""
+        return {"episodes": self.episodes, "test_episodes": self.test_episodes}
+
+    @property
+    def every(self) -> Grid:
+        """All chosen trainings and their tests, whether they are published or not."""
+        arms = [arm for arm in ARMS if arm.task in self.tasks and arm.settings in self.settings]
+        if self.episodes is not None:
+            arms = [arm.cut_off(self.episodes) for arm in arms]
+        trials = tuple(trial for arm in arms for trial in arm.trials.values())
+        return Grid(self.root, trials, lambda arm: range(self._seeds(arm)), self.test_episodes)
 
     @property
     def grid(self) -> Grid:
-        """The trainings and their tests."""
-        arms = [arm for arm in ARMS if arm.task in self.tasks]
-        if self.episodes is not None:
-            arms = [arm.cut_off(self.episodes) for arm in arms]
-        return Grid(
-            self.root,
-            tuple(trial for arm in arms for trial in arm.trials.values()),
-            lambda arm: range(self.sarsa_seeds if arm.config.agent.name == "sarsa" else self.seeds),
-            self.test_episodes,
+        """Those that are not published: of each arm from the first seed on whose row lacks something."""
+        every, rows = self.every, published_rows(self.out / FOLDER, self.plan)
+
+        def left(arm: Any) -> range:
+            columns, planned = needed(arm.name), self._seeds(arm)
+            lacking = (seed for seed in range(planned) if not complete(rows.get(identity(arm, seed), ()), columns))
+            return range(next(lacking, planned), planned)
+
+        seeds = {arm.name: left(arm) for arm in every.arms}
+        return Publishing(
+            every.root, every.trials, lambda arm: seeds[arm.name], self.test_episodes, publish=self.publish
         )
 
-    def findings(self) -> Any:
+    def _seeds(self, arm: Arm) -> int:
+        return self.sarsa_seeds if arm.config.agent.name == "sarsa" else self.seeds
+
+    def publish(self) -> None:
+        """Write the rows of what is finished beside those that are published, and nothing else."""
+        folder = self.out / FOLDER
+        before, found = published_rows(folder, self.plan), self.every.collect()
+        chosen = [arm for arm in found.grid.arms if isinstance(arm, PaperArm)]
+        new = {
+            identity(arm, seed): rows
+            for arm in chosen
+            for seed, rows in arm_rows(arm, read_trained(arm, found), before).items()
+        }
+        if new:
+            write_csv(folder / RUNS, [row for rows in (before | new).values() for row in rows])
+
+    def findings(self) -> Findings:
         """What there is, and what it says."""
-        plan = {name: getattr(self, name) for name in ("seeds", "sarsa_seeds", "episodes", "test_episodes")}
-        return gather(self.grid, plan | {"tasks": list(self.tasks)}, self.out / FOLDER, self.mesh)
+        return gather(self.every, self.plan, self.out / FOLDER, self.mesh)
 
     def write(self) -> tuple[Iterable[Path], Mapping[str, str]]:
         """The page of what there is; the verdicts are printed too."""
         findings = self.findings()
         files = write(findings, self.out)
-        for task in self.tasks:
-            table = Table("said by", "what is reported", "ours [95 %]", "seeds", "verdict", title=task, box=None)
-            for row in findings.rows["claims"]:
-                if row["task"] == task:
-                    known = [row[name] for name in ("mean", "low", "high")]
-                    ours = "–" if None in known else "{} [{}, {}]".format(*map(number, known))
-                    verdict = f"[{_COLOURS.get(row['verdict'], 'yellow')}]{row['verdict']}[/]"
-                    says = f"{row['statement']} ({row['physics']})"
-                    table.add_row(row["source"], says, ours, str(row["seeds"]), verdict)
-            Console().print(table)
-        return files, findings.found.failures
+        table = Table("task", "said by", "what is reported", "ours [95 %]", "seeds", "verdict", box=None)
+        for claim, verdict in findings.verdicts:
+            ours = "–" if verdict.measured is None else "{} [{}, {}]".format(*map(number, verdict.measured))
+            says = f"{claim.statement}: {claim.says} ({claim.settings})"
+            outcome = f"[{_COLOURS.get(verdict.outcome, 'yellow')}]{verdict.outcome}[/]"
+            table.add_row(claim.task, claim.source, says, ours, str(verdict.samples), outcome)
+        Console().print(table)
+        return files, findings.failures

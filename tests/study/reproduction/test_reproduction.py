@@ -6,6 +6,9 @@ import dataclasses
 import json
 import re
 import shutil
+import subprocess
+import sys
+import types
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -24,14 +27,15 @@ from codrl_mj.tasks import find_task
 from codrl_mj.training import EVALUATION_SEED
 from reproduction import figures
 from reproduction.arms import ARMS, TASKS
-from reproduction.checks import COMPATIBLE, CONFIRMED, NOT_CONFIRMED, NOT_TESTABLE
-from reproduction.claims import CLAIMS
-from reproduction.findings import claim_row
-from reproduction.page import FOLDER, PAGE, shorter, verdicts_section, write
-from reproduction.series import Series
+from reproduction.checks import CONFIRMED, OPEN, Verdict
+from reproduction.claims import CLAIMS, PAPER_SAYS
+from reproduction.drawn import CURVES, STATES, TORQUES, curve_rows, state_rows, torque_rows
+from reproduction.findings import claim_rows
+from reproduction.page import FOLDER, PAGE, statements_table, verdicts_line, write
+from reproduction.rows import read_rows
 from reproduction.study import Reproduction
 from reproduction.value_iteration import Mesh
-from tests.study.reproduction.worlds import trained
+from tests.study.reproduction.worlds import PAPERS, trained, world
 
 RESULTS = Path(__file__).parents[3] / "docs/results"
 HILL = [arm for arm in ARMS if arm.task == "mountain_car"]
@@ -54,7 +58,7 @@ def done(tmp_path_factory):
         mesh=Mesh(31, 31, 5),
     )
     hill = dataclasses.replace(plan, tasks=("mountain_car",), sarsa_seeds=1)
-    hill.grid.folders()[BLOCKED.name, 0].write_text("a file in the way")
+    hill.every.folders()[BLOCKED.name, 0].write_text("a file in the way")
     reported = []
     hill.grid.compute(Workers(jobs=1), on_cell=reported.append)
     findings = plan.findings()
@@ -66,80 +70,76 @@ def test_every_arm_is_trained_tested_and_read(done):
     plan, findings, _, _, reported = done
     assert (reported.count("training"), reported.count("test")) == (6, 5)
     for arm in HILL[:-1]:
-        series = findings.series[arm.name]
-        assert (*series.runs, *findings.rows["missing"][arm.name]) == (0, 1)
-        run = series.runs[0]
-        assert run.folder == plan.grid.folders()[arm.name, 0]
-        assert len(run.episodes) == 2
-        env = arm.config.evaluation_env
-        expected = evaluate(load_policy(run.folder), env, 3, EVALUATION_SEED)
-        assert run.tests["test"]["episode_returns"] == list(expected.episode_returns)
-        assert series.tested("returns") == [expected.returns.mean]
+        (row,) = findings.runs[arm.name]
+        folder = plan.every.folders()[arm.name, 0]
+        assert (row["seed"], row["run"]) == ("0", folder.name)
+        expected = evaluate(load_policy(folder), arm.config.evaluation_env, 3, EVALUATION_SEED)
+        assert float(row["returns"]) == expected.returns.mean
+        assert row["time_to_goal"] == ""  # nobody arrives after two episodes
+        assert row["times"] == "- - -"
 
 
 @pytest.mark.matrix
 def test_what_failed_or_was_not_tried_is_said(done):
     _, findings, out, _, _ = done
-    assert findings.rows["missing"][BLOCKED.name] == [0, 1]
-    assert "is not a folder" in findings.found.failures[f"{BLOCKED.name}, seed 0"]
+    assert findings.missing[BLOCKED.name] == [0, 1]
+    assert "is not a folder" in findings.failures[f"{BLOCKED.name}, seed 0"]
     page = (out / PAGE).read_text()
     assert f"- {BLOCKED.name}: seeds 0 to 1\n" in page
     assert f"- {BLOCKED.name}, seed 0 failed: " in page
     assert "- mountain_car_continuous, repaired, ideal, mujoco: seeds 0\n" in page
-    assert "5 of 16 trainings are finished" in page
+    assert "\n5 trainings, " in page
     assert "A trial: every training was cut off after 2 episodes" in page
 
 
 @pytest.mark.matrix
-def test_the_page_has_what_the_paper_reports_and_the_table_every_claim_with_its_check(done):
-    plan, findings, out, _, _ = done
+def test_the_page_has_every_statement_once_and_the_table_every_claim_with_its_check(done):
+    _, findings, out, _, _ = done
     page = (out / PAGE).read_text()
-    with (out / FOLDER / "claims.csv").open(newline="", encoding="utf-8") as file:
-        rows = {(row["source"], row["physics"], row["statement"], row["measure"]): row for row in csv.DictReader(file)}
-    assert len(rows) == len(findings.rows["claims"])
-    for claim in CLAIMS:
-        if claim.task not in plan.tasks:
-            continue
-        verdict = claim.judge(findings.series)
-        row = rows[claim.source, claim.physics, claim.statement, claim.measure.text]
-        assert (row["verdict"], row["why"], row["criterion"]) == (
-            verdict.outcome,
-            verdict.reason,
-            claim.check.criterion,
-        )
-        of_the_paper = claim.source == "paper" and claim.physics != "analytic"
-        found = [
-            line
-            for line in page.splitlines()
-            if f"| {shorter(claim.statement)} | {shorter(claim.measure.text)}: " in line
-        ]
-        assert len(found) == of_the_paper or claim.source == "paper"
-        if of_the_paper:
-            assert verdict.outcome in found[0]
-    untested = [row for row in findings.rows["claims"] if row["verdict"] == NOT_TESTABLE]
-    assert {row["task"] for row in untested} == {"mountain_car_continuous", "mountain_car"}  # one seed: no comparison
-    assert page.count("| the paper reports | ours [95 %] |") == 2
+    rows = list(csv.DictReader((out / FOLDER / "claims.csv").open(newline="", encoding="utf-8")))
+    judged = [claim for claim in CLAIMS if claim.task in ("mountain_car", "mountain_car_continuous")]
+    assert len(rows) == len(judged)
+    for claim, row in zip(judged, rows, strict=True):
+        verdict = claim.judge(findings.runs)
+        assert (row["verdict"], row["why"], row["criterion"]) == (*verdict[:2], claim.check.criterion)
+        shown = [line for line in page.splitlines() if f"{claim.statement} | {claim.figure} | " in line]
+        if claim.source == PAPER_SAYS and claim.counted:
+            assert any(verdict.outcome in line for line in shown)
+    lines = [line for line in page.splitlines() if line.startswith("| ")]
+    assert len(lines) == 2 + sum(claim.source == PAPER_SAYS and claim.counted for claim in judged)
 
 
-@pytest.mark.parametrize(
-    ("mujoco", "analytic", "counted"),
-    [
-        (CONFIRMED, CONFIRMED, "1 | 0 | 0 | 0"),
-        (COMPATIBLE, COMPATIBLE, "0 | 1 | 0 | 0"),
-        (COMPATIBLE, NOT_CONFIRMED, "0 | 0 | 1 | 0"),
-        (CONFIRMED, NOT_TESTABLE, "1 | 0 | 0 | 0"),
-        (NOT_TESTABLE, NOT_TESTABLE, "0 | 0 | 0 | 1"),
-    ],
-)
-def test_a_statement_about_both_kinds_of_physics_has_two_verdicts_and_counts_once(mujoco, analytic, counted):
-    both = [claim for claim in CLAIMS if claim.statement == "ideal: goal in 160 s"]
-    assert [claim.physics for claim in both] == ["mujoco", "analytic"]
-    nothing = {arm.name: Series(arm, {}) for arm in ARMS}
-    judged = [
-        claim_row(claim, nothing) | {"verdict": verdict}
-        for claim, verdict in zip(both, (mujoco, analytic), strict=True)
-    ]
-    assert f"| the paper | 2 | 1 | {counted} |" in verdicts_section(judged)
+def pretended(outcome=None, rows=None):
+    """What is found where every claim comes to the same, or to what rows say."""
+    runs = rows or {arm.name: [] for arm in ARMS}
+    verdicts = [(claim, Verdict(outcome, "") if outcome else claim.judge(runs)) for claim in CLAIMS]
+    return types.SimpleNamespace(runs=runs, verdicts=verdicts)
+
+
+def test_22_statements_are_counted_whatever_they_come_to():
+    assert "**Of 22 statements: 22 open.**" in verdicts_line(pretended(OPEN).verdicts)
+    table = statements_table(pretended(CONFIRMED)).splitlines()
+    assert len(table) == 2 + 22
+    assert all(line.endswith("**confirmed** |") for line in table[2:])
+
+
+def test_what_settings_as_printed_come_to_stands_beside_what_counts():
+    table = statements_table(pretended(rows=world(PAPERS)))
+    assert "| goal, no motor |  | 160 s |  |  | 160.0 s" in table.replace("160 s [", "160.0 s [")
+    line = next(line for line in table.splitlines() if "*Continuous Mountain Car*" in line)
+    assert line.count("95 [94") == 2
+    upright = next(line for line in table.splitlines() if "upright" in line)
+    assert "| 100 %, after 50 s | 100 %, after 50 s | 100 %, after 50 s | **confirmed** |" in upright
+
+
+def test_p_is_corrected_for_all_comparisons_of_a_source():
+    """Holm: the smallest of n by n."""
+    rows = claim_rows(pretended(rows=world(PAPERS)).verdicts)
+    compared = [row for row in rows if row["p"] is not None and row["source"] == PAPER_SAYS]
+    assert len(compared) == 5
+    least = min(compared, key=lambda row: row["p"])
+    assert least["p_corrected"] == pytest.approx(5 * least["p"])
+    assert all(row["p_corrected"] is None for row in rows if row["p"] is None)
 
 
 @pytest.mark.matrix
@@ -147,12 +147,12 @@ def test_every_file_that_the_page_names_is_there_and_whole(done):
     _, _, out, files, _ = done
     page = (out / PAGE).read_text()
     named = {out / name for name in re.findall(rf"\(({FOLDER}/[^)]+)\)", page)}
-    assert named | {out / PAGE} == set(files)
+    assert named | {out / PAGE, out / FOLDER / STATES, out / FOLDER / TORQUES} == set(files)
     drawn = [path for path in files if path.suffix == ".svg"]
     assert {path.stem for path in drawn} == {
         "learning_mountain_car",
-        "torque_mountain_car_paper",
-        "states_mountain_car_paper",
+        "torque_mountain_car",
+        "states_mountain_car",
         "discount",
     }
     for path in drawn:
@@ -163,22 +163,37 @@ def test_every_file_that_the_page_names_is_there_and_whole(done):
 @pytest.mark.matrix
 def test_the_tables_are_the_findings(done):
     _, findings, out, _, _ = done
-    with (out / FOLDER / "runs.csv").open() as file:
-        runs = list(csv.DictReader(file))
-    assert len(runs) == 5
-    for row in runs:
-        name = f"{row['task']}, {row['settings']}, {row['motor']}, {row['physics']}"
-        run = findings.series[name].runs[int(row["seed"])]
-        assert float(row["returns"]) == run.tests["test"]["returns"]["mean"]
-        assert float(row["last_50"]) == run.column("return").mean()
-        assert row["time_to_goal"] == ""  # nobody arrives after two episodes
-    with (out / FOLDER / "claims.csv").open() as file:
-        claims = list(csv.DictReader(file))
+    runs = list(csv.DictReader((out / FOLDER / "runs.csv").open()))
+    assert runs == [row for rows in findings.runs.values() for row in rows]
+    claims = list(csv.DictReader((out / FOLDER / "claims.csv").open()))
+    assert [row["verdict"] for row in claims] == [verdict.outcome for _, verdict in findings.verdicts]
     content = json.loads((out / FOLDER / "findings.json").read_text())
-    assert [row["verdict"] for row in claims] == [row["verdict"] for row in findings.rows["claims"]]
-    assert [row["verdict"] for row in content["claims"]] == [row["verdict"] for row in claims]
     assert content["missing"][BLOCKED.name] == [0, 1]
     assert [one["discount"] for one in content["value_iteration"]] == [0.85, 0.9, 0.95, 0.99, 0.999]
+    curves = list(csv.DictReader((out / FOLDER / CURVES).open()))
+    assert {(row["motor"], row["seeds"]) for row in curves} == {
+        ("paper gains", "1"),
+        ("fast gains", "1"),
+        ("ideal", "1"),
+    }
+
+
+@pytest.mark.matrix
+def test_rows_are_published_as_they_finish_and_stand_for_run_folders_that_are_gone(done, tmp_path):
+    """Once without folders, and once with none of its rows: both are the same page."""
+    plan, _, out, _, _ = done
+    elsewhere = dataclasses.replace(plan, out=tmp_path)
+    elsewhere.publish()
+    assert (tmp_path / FOLDER / "runs.csv").read_bytes() == (out / FOLDER / "runs.csv").read_bytes()
+    shutil.copytree(out / FOLDER, tmp_path / "gone" / FOLDER)
+    gone = dataclasses.replace(plan, root=tmp_path / "none", out=tmp_path / "gone")
+    for path in write(gone.findings(), gone.out):
+        other = out / path.relative_to(gone.out)
+        if path.suffix in (".csv", ".svg"):
+            assert path.read_bytes() == other.read_bytes(), path
+    left = {cost.arm.name: cost.missing for cost in gone.grid.costs()}
+    assert left[HILL[0].name] == (1,)
+    assert left[BLOCKED.name] == (0, 1)
 
 
 @pytest.mark.matrix
@@ -202,11 +217,10 @@ def test_the_page_includes_what_a_person_wrote(done, tmp_path):
 
 @pytest.mark.matrix
 def test_the_published_page_is_what_the_published_rows_say(tmp_path):
-    """Byte for byte, with its tables; curves and times of episodes were not published: their figures stay."""
+    """Byte for byte, with its tables and figures, from rows, curves and episodes."""
     shutil.copytree(RESULTS / FOLDER, tmp_path / FOLDER)
     shutil.copy(RESULTS / "reproduction_conclusions.md", tmp_path)
-    for name in ("claims.csv", "runs.csv"):
-        (tmp_path / FOLDER / name).unlink()
+    (tmp_path / FOLDER / "claims.csv").unlink()
     files, failures = Reproduction(root=tmp_path / "none", out=tmp_path).write()
     assert not failures
     assert {file.name for file in files} == {PAGE, *(file.name for file in (RESULTS / FOLDER).iterdir())}
@@ -215,11 +229,31 @@ def test_the_published_page_is_what_the_published_rows_say(tmp_path):
             assert file.read_bytes() == (RESULTS / file.relative_to(tmp_path)).read_bytes(), file.name
 
 
+def test_a_stranger_recomputes_every_verdict_without_the_package():
+    """In an interpreter that has nothing of ours."""
+    example = RESULTS.parents[1] / "examples" / "recompute_reproduction.py"
+    run = [sys.executable, "-I", "-S", str(example), str(RESULTS / FOLDER)]
+    lines = subprocess.run(run, capture_output=True, text=True, check=True).stdout.splitlines()
+    claims = list(csv.DictReader((RESULTS / FOLDER / "claims.csv").open(newline="", encoding="utf-8")))
+    assert [line.rsplit(": ", 1)[1] for line in lines] == [row["verdict"] for row in claims]
+    assert len(claims) == len(CLAIMS)
+
+
+def test_published_verdicts_are_of_the_claims_as_they_are():
+    rows = read_rows(RESULTS / FOLDER)
+    runs = {arm.name: [] for arm in ARMS}
+    for of, found in rows.items():
+        runs[", ".join(of[:-1])] += found
+    claims = list(csv.DictReader((RESULTS / FOLDER / "claims.csv").open(newline="", encoding="utf-8")))
+    for claim, row in zip(CLAIMS, claims, strict=True):
+        assert (row["statement"], row["verdict"]) == (claim.statement, claim.judge(runs).outcome)
+
+
 @pytest.mark.matrix
 def test_finished_runs_are_not_trained_again(done):
     plan, _, _, _, _ = done
     hill = dataclasses.replace(plan, tasks=("mountain_car",), sarsa_seeds=1)
-    results = [folder / "result.json" for folder in hill.grid.folders().values() if (folder / "result.json").is_file()]
+    results = [folder / "result.json" for folder in hill.every.folders().values() if (folder / "result.json").is_file()]
     assert len(results) == 5
     before = [path.stat().st_mtime_ns for path in results]
     hill.grid.compute(Workers(jobs=1))
@@ -230,22 +264,23 @@ def test_finished_runs_are_not_trained_again(done):
 def test_costs_are_those_of_finished_runs_or_estimates(done):
     plan, findings, _, _, _ = done
     by_arm = {cost.arm.name: cost for cost in plan.grid.costs()}
-    half = by_arm[HILL[0].name]
-    assert (half.finished, half.missing) == ((0,), (1,))
-    assert half.seconds == findings.series[HILL[0].name].runs[0].seconds
-    assert (half.tests, half.left) == (1, half.seconds + TEST_SECONDS)
+    half = by_arm[HILL[0].name]  # the first seed's row is published
+    assert (half.finished, half.missing) == ((), (1,))
+    assert (half.tests, half.left) == (1, HILL[0].seconds + TEST_SECONDS)
     none = by_arm[BLOCKED.name]
     assert (none.finished, none.missing, none.left) == ((), (0, 1), 2 * (BLOCKED.seconds + TEST_SECONDS))
+    took = {cost.arm.name: cost.seconds for cost in plan.every.costs()}
+    assert took[HILL[0].name] == float(findings.runs[HILL[0].name][0]["seconds"])
 
 
 def test_the_whole_is_estimated_at_less_than_four_hours_of_two_cores(tmp_path):
-    grid = Reproduction(root=tmp_path).grid
+    grid = Reproduction(root=tmp_path, out=tmp_path).grid
     assert sum(cost.left for cost in grid.costs()) < 2 * 4 * 3600
     assert len(grid.cells()) == sum(30 if arm.task == "mountain_car" else 5 for arm in ARMS)
 
 
 def test_all_arms_first_seeds_are_trained_first_and_the_longest_before_the_others(tmp_path):
-    order = list(Reproduction(root=tmp_path).grid.cells())
+    order = list(Reproduction(root=tmp_path, out=tmp_path).grid.cells())
     seeds = [seed for _, seed in order]
     assert seeds == sorted(seeds)
     seconds = {arm.name: arm.seconds for arm in ARMS}
@@ -258,6 +293,7 @@ def test_all_arms_first_seeds_are_trained_first_and_the_longest_before_the_other
     [
         ({"tasks": ("cartpol",)}, "unknown 'cartpol': did you mean 'cartpole'"),
         ({"tasks": ()}, "none is named"),
+        ({"settings": ("repared",)}, "did you mean 'repaired'"),
         ({"seeds": 0}, "seeds = 0: must be an integer >= 1"),
         ({"sarsa_seeds": 1.5}, "sarsa_seeds = 1.5"),
         ({"episodes": 0}, "episodes = 0"),
@@ -292,11 +328,25 @@ def made_up(arm, steps=30, inner_steps=3):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_states_and_torques_are_drawn_of_every_task(task, tmp_path):
-    episodes = [(arm, made_up(arm)) for arm in ARMS if arm.task == task and arm.physics == "mujoco"]
-    figures.draw_states(tmp_path / "states.svg", task, episodes)
-    figures.draw_torque(tmp_path / "torque.svg", [one for one in episodes if one[0].actuator != IDEAL])
+    arms = [arm for arm in ARMS if arm.task == task and arm.physics == "mujoco"]
+    states = [row for arm in arms for row in state_rows(arm, made_up(arm))]
+    torques = [row for arm in arms if arm.actuator != IDEAL for row in torque_rows(arm, made_up(arm))]
+    assert figures.draw_states(tmp_path / "states.svg", task, states)
+    assert figures.draw_torque(tmp_path / "torque.svg", task, torques)
     for name in ("states", "torque"):
         assert ElementTree.parse(tmp_path / f"{name}.svg").getroot().tag.endswith("svg")
+    assert not figures.draw_states(tmp_path / "none.svg", task, [])
+    assert not (tmp_path / "none.svg").exists()
+
+
+def test_of_a_torque_a_second_or_twenty_steps_are_shown():
+    ends = {}
+    for arm in ARMS:
+        if arm.actuator != IDEAL:
+            rows = torque_rows(arm, made_up(arm, steps=80, inner_steps=2))
+            ends[arm.task] = float(rows[-1]["time"]) + find_task(arm.task).step_duration / 2
+    expected = {"pendulum": 1.0, "mountain_car": 20.0, "mountain_car_continuous": 20.0, "acrobot": 4.0, "cartpole": 1.0}
+    assert ends == pytest.approx(expected)
 
 
 def test_the_curves_are_what_the_paper_plots():
@@ -312,10 +362,11 @@ def test_the_curves_are_what_the_paper_plots():
     assert speed.tolist() == [3.0, 0.0]
 
 
-def test_epochs_are_drawn(tmp_path):
-    arms = [arm for arm in ARMS if arm.task == "cartpole"]
-    series = [Series(arm, {seed: trained(seed, epoch=35) for seed in range(3)}) for arm in arms]
-    figures.draw_learning(tmp_path / "epochs.svg", series)
+def test_epochs_are_drawn_below_one_another(tmp_path):
+    arms = [arm for arm in ARMS if arm.task == "cartpole" and arm.physics == "mujoco"]
+    rows = [row for arm in arms for row in curve_rows(arm, {seed: trained(seed) for seed in range(3)})]
+    assert {(row["curve"], row["seeds"]) for row in rows} == {(name, "3") for name in ("lengths", "returns", "counts")}
+    assert figures.draw_learning(tmp_path / "epochs.svg", "cartpole", rows)
     assert ElementTree.parse(tmp_path / "epochs.svg").getroot().tag.endswith("svg")
 
 
@@ -324,6 +375,7 @@ def test_epochs_are_drawn(tmp_path):
 
 def test_a_dry_run_lists_and_makes_nothing(tmp_path, capsys):
     given = ["acrobot", "--dry-run", "--seeds", "3", "--jobs", "2", "--root", str(tmp_path / "no")]
+    given += ["--out", str(tmp_path / "out")]
     assert main(Reproduction, given) == 0
     shown = capsys.readouterr().out
     assert "acrobot, paper, paper gains, mujoco" in shown
@@ -335,7 +387,7 @@ def test_a_dry_run_lists_and_makes_nothing(tmp_path, capsys):
 def test_a_page_can_be_written_of_nothing(tmp_path, capsys):
     given = ["acrobot", "--only-page", "--root", str(tmp_path / "no"), "--out", str(tmp_path / "out")]
     assert main(Reproduction, given) == 0
-    assert "0 of 10 trainings are finished" in (tmp_path / "out" / PAGE).read_text()
+    assert "\n0 trainings, " in (tmp_path / "out" / PAGE).read_text()
     assert "not testable" in capsys.readouterr().out
     assert not (tmp_path / "no").exists()
 
@@ -351,7 +403,7 @@ def test_failures_show_in_the_exit_status(done, tmp_path, capsys):
 @pytest.mark.matrix
 def test_a_test_that_failed_is_said(done, tmp_path):
     plan, _, _, _, _ = done
-    folder = plan.grid.folders()[HILL[0].name, 0]
+    folder = plan.every.folders()[HILL[0].name, 0]
     broken, content = folder / "policy.json", (folder / "policy.json").read_text()
     shorter = dataclasses.replace(plan, tasks=("mountain_car",), test_episodes=2)
     broken.write_text("{")
@@ -360,9 +412,9 @@ def test_a_test_that_failed_is_said(done, tmp_path):
     finally:
         broken.write_text(content)
     findings = shorter.findings()
-    assert "policy.json" in findings.found.failures[f"{HILL[0].name} on test, seed 0"]
-    assert findings.rows["missing"][HILL[0].name] == [0]
-    assert 0 in findings.series[HILL[1].name].runs
+    assert "policy.json" in findings.failures[f"{HILL[0].name} on test, seed 0"]
+    assert 0 in findings.missing[HILL[0].name]
+    assert "0" in {row["seed"] for row in findings.runs[HILL[1].name]}
 
 
 def test_an_unknown_task_is_named(capsys):

@@ -1,63 +1,62 @@
-"""Made-up runs of every arm, in which what somebody reports is so."""
+"""Made-up rows of every arm, in which what somebody reports is so."""
 
 from pathlib import Path
 
 import numpy as np
 
-from reproduction.arms import ARMS, CENTRE, TEST
-from reproduction.series import Series, Trained
+from reproduction.arms import ARMS
+from reproduction.rows import COLUMNS, Trained
 
 SPREAD = np.array([-1.0, 0.0, 1.0, 0.5, -0.5])
 """Of five seeds around what they are said to be."""
 
 
-def trained(seed=0, last=0.0, test=0.0, success=1.0, tracking=1.0, largest=0.05, time=50.0, centre=480.0, epoch=None):
-    """A run.
+def made_up(arm, seed=0, last=0.0, test=0.0, success=1.0, tracking=1.0, largest=0.05, time=50.0, centre=0.96, epoch=33):
+    """A row.
 
     Args:
+        arm: of which.
         seed: makes returns, times and epochs differ a little from what is given.
-        last: return of every training episode.
-        test: return of every test episode.
+        last: return of the last training episodes.
+        test: return of the test.
         success: share of the test episodes that succeed.
         tracking: rms torque error [%].
         largest: largest torque error [N*m].
         time: median time to the goal [s]; the episodes' are up to 20 % away from it.
-        centre: return of the test near the centre.
-        epoch: the epoch from which on episodes last 4000 steps and earn as much; None: no epochs.
+        centre: share of steps near the centre.
+        epoch: the epoch from which on episodes last 4000 steps and earn as much.
     """
     shift = SPREAD[seed]
-    if epoch is None:
-        episodes = np.array([[n + 1, 100 * (n + 1), last + shift, 100] for n in range(60)])
-    else:
-        first = int(epoch + 2 * shift)
-        short = [[0, 4000 * (n + k / 10), 390.0, 400] for n in range(first - 1) for k in range(1, 11)]
-        long = [[0, 4000 * n, 3990.0, 4000] for n in range(first, 61)]
-        episodes = np.array(short + long)
     times = time * np.linspace(0.8, 1.2, 41) + shift
     arrived = round(success * len(times))
-    evaluation = {
-        "returns": {"mean": test + 0.5 * shift if test != 500 else 500.0, "low": 0.0, "high": 0.0},
-        "success": {"mean": success, "low": 0.0, "high": 1.0},
-        "tracking_percent": tracking,
-        "tracking_max": largest,
-        "episode_times_to_goal": [*times[:arrived].tolist(), *[None] * (len(times) - arrived)],
+    row = {name: getattr(arm, name) for name in ("task", "settings", "motor", "gains", "physics")}
+    row |= {"seed": seed, "run": "nowhere", "seconds": 60.0, "last_50": last + shift}
+    row |= {"returns": test + 0.5 * shift if test != 500 else 500.0, "success": success, "upright": success}
+    row |= {"tracking_percent": tracking, "tracking_max": largest, "centred": centre}
+    row |= {
+        "time_to_goal": float(np.median(times)),
+        "times": " ".join([*map(str, times[:arrived]), *"-" * (41 - arrived)]),
     }
-    tests = {TEST: evaluation, CENTRE: {"returns": {"mean": centre, "low": 0.0, "high": 500.0}}}
-    return Trained(Path("nowhere"), episodes, tests, 60.0)
+    row |= dict.fromkeys(("long_epoch", "paid_epoch"), int(epoch + 2 * shift))
+    return {name: str(row.get(name, "")) for name in COLUMNS}
+
+
+def trained(seed=0, epoch=35):
+    """A run whose episodes last 4000 steps, and earn as much, from an epoch on."""
+    first = int(epoch + 2 * SPREAD[seed])
+    short = [[0, 4000 * (n + k / 10), 390.0, 400] for n in range(first - 1) for k in range(1, 11)]
+    long = [[0, 4000 * n, 3990.0, 4000] for n in range(first, 61)]
+    return Trained(Path("nowhere"), np.array(short + long), {}, 60.0)
 
 
 def world(values, seeds=range(5)):
-    """The series of every arm, by its name.
+    """The rows of every arm, by its name.
 
     Args:
-        values: (task, settings, motor) -> arguments of `trained`; each arm takes those of its task, settings and motor.
+        values: (task, settings, motor) -> arguments of `made_up`; each arm takes those of its task, settings and motor.
         seeds: of every arm.
     """
-    series = {}
-    for arm in ARMS:
-        given = values[arm.task, arm.settings, arm.motor]
-        series[arm.name] = Series(arm, {seed: trained(seed, **given) for seed in seeds})
-    return series
+    return {arm.name: [made_up(arm, n, **values[arm.task, arm.settings, arm.motor]) for n in seeds] for arm in ARMS}
 
 
 PAPERS = {
