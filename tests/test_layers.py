@@ -30,7 +30,7 @@ ALLOWED = {
     "envs.config": {"actuators", "disturbances", "envs.distributions", "envs.worlds", "fields"},
     "envs": {
         *("actuators", "disturbances", "engine", "envs.config", "envs.distributions", "envs.worlds", "fields"),
-        *("kept", "physics", "specs", "tasks", "tasks.assets"),
+        *("kept", "own_code", "physics", "specs", "tasks", "tasks.assets"),
     },
     "foreign": {
         *("actuators", "disturbances", "engine", "envs", "envs.config", "envs.distributions", "fields", "physics"),

@@ -17,8 +17,8 @@ from codrl_mj.actuators import (
     reference,
 )
 from codrl_mj.actuators.noise import LARGEST_KEY
+from codrl_mj.engine.doors import shaft_inertia
 from codrl_mj.engine.families import HEAD, SIGNATURE, loaded_families, signals_at, slot_size
-from codrl_mj.engine.inertia import shaft_inertia
 from codrl_mj.engine.plugin import EXTRA_STATES, PLUGIN_HEAD, REASONS
 from codrl_mj.plugin import FAMILY, NAME, registered
 

@@ -245,10 +245,11 @@ class ControlCommands:
             return action
         arrived = np.array(action, dtype=np.float64)
         wanted = arrived[self._controls] * self._gains
-        arrived[self._controls] = self._disturber.commands(wanted[np.newaxis])[0] / self._gains
+        commands, loads = (each[0] for each in self._disturber.disturbed(wanted[np.newaxis]))
+        arrived[self._controls] = commands / self._gains
         if self._pulses:
             self._data.qfrc_applied[self._dofs] = 0.0
-            np.add.at(self._data.qfrc_applied, self._dofs, self._disturber.loads()[0])
+            np.add.at(self._data.qfrc_applied, self._dofs, loads)
         return arrived
 
 

@@ -37,7 +37,7 @@ from codrl_mj.engine.memory import floats, internal, on_stack
 from codrl_mj.envs.setup import Setup
 from codrl_mj.kept import njit
 from codrl_mj.physics.compiled_task import Compiled, Outcomes, compiled_outcomes
-from codrl_mj.physics.rows import Lane, Rows, claim, complain, finish, load, store
+from codrl_mj.physics.rows import BROKEN, CLAIMED, DONE, Lane, Rows, load, store, tallied
 from codrl_mj.physics.stepping import Stepping
 
 RANDOM, OPTIONS = 0, 1
@@ -226,7 +226,7 @@ def _kernels(
         stepping, observations, signals, elapsed = steps.stepping, steps.observations, steps.signals, steps.elapsed
         model, data, settings, trace = lane.model, lane.data, lane.settings, lane.trace
         last, count = trace[len(trace) - 1], len(stepping)
-        first = claim(tally, at_once)
+        first = tallied(tally, CLAIMED, at_once)
         while first < count:
             end = min(first + at_once, count)
             for row in range(first, end):
@@ -240,12 +240,12 @@ def _kernels(
                 steps.terminated[row] = over and stepping[row]
                 steps.truncated[row] = elapsed[row] >= steps.limit and stepping[row]
                 if not fine:
-                    complain(tally)
+                    tallied(tally, BROKEN, 1)
                 for motor in range(len(last)):
                     for column in range(len(signals)):
                         signals[column, row, motor] = last[motor, 1 + column]
-            finish(tally, end - first)
-            first = claim(tally, at_once)
+            tallied(tally, DONE, end - first)
+            first = tallied(tally, CLAIMED, at_once)
 
     @compiled
     def observe_rows(which: np.ndarray, lane: Any, rows: Any, observations: np.ndarray) -> None:

@@ -113,7 +113,9 @@ def task_model(plant: Plant) -> mujoco.MjModel:
                 joint_driven.frictionloss += added.friction
                 spec.option.disableflags = flags_with_friction(spec.option.disableflags)
     if all(texture.type != mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
-        _add_sky(spec)
+        kind, gradient = mujoco.mjtTexture.mjTEXTURE_SKYBOX, mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
+        sky = spec.add_texture(type=kind, builtin=gradient, width=64, height=64)  # ours: it would be drawn on black
+        sky.rgb1, sky.rgb2 = [0.93, 0.95, 0.97], [0.76, 0.82, 0.88]
     model = spec.compile()
     if (model.nq, model.nv) != (len(task.qpos), len(task.qvel)):
         raise ValueError(
@@ -124,13 +126,6 @@ def task_model(plant: Plant) -> mujoco.MjModel:
 
 
 _ALONG = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-
-
-def _add_sky(spec: mujoco.MjSpec) -> None:
-    """Give a model without a sky that of our own models: it would be drawn on black."""
-    kind, gradient = mujoco.mjtTexture.mjTEXTURE_SKYBOX, mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
-    sky = spec.add_texture(type=kind, builtin=gradient, width=64, height=64)
-    sky.rgb1, sky.rgb2 = [0.93, 0.95, 0.97], [0.76, 0.82, 0.88]
 
 
 def flags_with_friction(flags: int) -> int:

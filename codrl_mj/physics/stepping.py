@@ -18,13 +18,12 @@ from codrl_mj.actuators import Family
 from codrl_mj.disturbances import OFF
 from codrl_mj.engine.doors import user_of
 from codrl_mj.engine.families import HEAD, Slot, compiled_observe, load_family, signals_at
-from codrl_mj.engine.layout import DATA, MODEL
-from codrl_mj.engine.library import engine
-from codrl_mj.engine.memory import internal, on_stack, read
+from codrl_mj.engine.layout import DATA, MODEL, engine_function
+from codrl_mj.engine.memory import internal, on_stack, row_as
 from codrl_mj.kept import njit
 from codrl_mj.physics.base import Plant
 from codrl_mj.physics.compiled_task import Compiled, compiled_constrain, compiled_reader, is_fine
-from codrl_mj.physics.disturber import KEY_COLUMN, compiled_disturbance, numbers_of
+from codrl_mj.physics.disturber import KEY_COLUMN, Numbers, compiled_disturbance
 
 TORQUE, NOISE_KEY = Slot._fields.index("torque"), Slot._fields.index("noise_key")
 
@@ -66,7 +65,8 @@ def compiled_stepping(plant: Plant) -> Stepping:
     task, disturbed = plant.task, plant.disturbances != OFF
     if plant.motorised:
         load_family(plant.family)
-    kept, reader = compiled_constrain(task), compiled_reader(task)
+    kept = compiled_constrain(task.constrain, task.state_names, task.qpos, task.qvel)
+    reader = compiled_reader(task.qpos, task.qvel)
     return _stepping(kept, reader, task.qpos, task.qvel, plant.explicit, disturbed, plant.family, plant.motorised)
 
 
@@ -93,7 +93,7 @@ def _stepping(
     family: Family,
     motorised: bool,
 ) -> Stepping:
-    engine_step, engine_reset, _ = engine()
+    engine_step, engine_reset = engine_function("mj_step"), engine_function("mj_resetData")
     size, moving = len(positions) + len(velocities), len(positions)
     bounded, constrain = keep is not None, keep or _nothing
     disturbance = compiled_disturbance()
@@ -109,10 +109,10 @@ def _stepping(
         state = numba.carray(on_stack(size), size)
         for inner in range(len(trace)):
             for actuator in range(len(settings)):
-                wiring = wiring_of(settings[actuator])
+                wiring = row_as(settings[actuator], Wiring)
                 command = force_of(force, actuator)
                 if disturbed:
-                    numbers = numbers_of(settings[actuator, WIRING:])
+                    numbers = row_as(settings[actuator, WIRING:], Numbers)
                     command = disturb(numbers, memory[actuator], command)
                     DATA.qfrc_applied(data)[int(wiring.dof)] = disturbing_load(numbers, memory[actuator])
                 ctrl[int(wiring.ctrl)] = command * wiring.arm
@@ -127,7 +127,7 @@ def _stepping(
             if bounded:
                 constrain(qpos, qvel, state, timestep)
             for actuator in range(len(settings)):
-                wiring = wiring_of(settings[actuator])
+                wiring = row_as(settings[actuator], Wiring)
                 row = trace[inner, actuator]
                 if motorised:
                     own = int(wiring.act)
@@ -158,7 +158,7 @@ def _stepping(
             qvel[entry] = state[velocities[entry]]
         for actuator in range(len(settings)):
             if motorised:
-                DATA.act(data)[int(wiring_of(settings[actuator]).act) + NOISE_KEY] = key + actuator
+                DATA.act(data)[int(row_as(settings[actuator], Wiring).act) + NOISE_KEY] = key + actuator
             if disturbed:
                 memory[actuator] = 0.0
                 memory[actuator, memory.shape[1] + KEY_COLUMN] = key + actuator
@@ -186,7 +186,7 @@ def _stepping(
     ) -> None:
         if seeing:
             for actuator in range(len(settings)):
-                wiring = wiring_of(settings[actuator])
+                wiring = row_as(settings[actuator], Wiring)
                 observe(
                     user_of(model, int(wiring.actuator)) + 8 * HEAD,
                     row[actuator, 2:].ctypes.data,
@@ -197,12 +197,6 @@ def _stepping(
                 )
 
     return Stepping(step, start, read, observed)
-
-
-@internal
-def wiring_of(vector: np.ndarray) -> Wiring:
-    """A row of `settings` as the wiring that it begins with."""
-    return read(vector.ctypes.data, Wiring)
 
 
 @internal
