@@ -28,15 +28,6 @@ SIGNATURE = (250700.0, 268401.0)
 because a number keeps six digits in an XML file."""
 
 
-class Head(NamedTuple):
-    """What the `user` data of an actuator of ours begin with, at either door; the family's parameters follow."""
-
-    signature_1: float
-    signature_2: float
-    family: float
-    """The family's number."""
-
-
 class Slot(NamedTuple):
     """What the state of an actuator of ours begins with, in `data.act` or `data.plugin_state`.
 
@@ -52,7 +43,8 @@ class Slot(NamedTuple):
     """Torque delivered at the shaft [N*m]."""
 
 
-HEAD, SLOT = len(Head._fields), len(Slot._fields)
+HEAD, SLOT = 3, len(Slot._fields)
+"""Numbers of what an actuator's `user` data, and its state, begin with."""
 
 _ADDRESSES = np.zeros(10**6, dtype=np.uintp)
 """Address of a family's compiled function by its number; 0 where it has not been compiled. 8 MB that the system hands
@@ -90,9 +82,9 @@ def signals_at(family: Family) -> int:
     return SLOT + 2 * len(family.State._fields)
 
 
-def user_head(family: Family) -> Head:
-    """What the `user` data of a family's actuators begin with."""
-    return Head(*SIGNATURE, float(family_number(family)))
+def user_head(family: Family) -> tuple[float, float, float]:
+    """What the `user` data of a family's actuators begin with, at either door; its parameters follow."""
+    return *SIGNATURE, float(family_number(family))
 
 
 def load_family(family: Family) -> None:

@@ -221,6 +221,11 @@ MODEL, DATA = Fields("mjModel"), Fields("mjData")
 """The structures that a simulation is known by."""
 
 
+def addresses(data: mujoco.MjData) -> tuple[int, int]:
+    """The addresses of an `MjData`'s model and of itself, by which compiled code knows them."""
+    return data.model._address, data._address
+
+
 def address_of(owner: Any, name: str) -> int:
     """Of a field of an `MjModel` or `MjData`, which may be dotted (`opt.timestep`): of an array that of its entries."""
     live = functools.reduce(getattr, name.split("."), owner)

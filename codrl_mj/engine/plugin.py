@@ -37,7 +37,7 @@ from codrl_mj.kept import cfunc, external, njit
 from codrl_mj.plugin import FAMILY, NAME, complain, library, registered
 
 PLUGIN_HEAD = HEAD + 1
-"""The `user` data begin with `Head` and the actuator's arm [m]."""
+"""The `user` data begin with `user_head` and the actuator's arm [m]."""
 EXTRA_STATES = 2
 """After the actuator's slot: the desired force [N], at the joint's side of the arm; and 1 between a step's first call
 and its end, where further calls within it are stages of RK4."""

@@ -158,20 +158,13 @@ def _kernels(
 
     @internal
     def look(
-        row: np.ndarray,
-        observation: np.ndarray,
-        state: np.ndarray,
-        model: int,
-        data: int,
-        settings: np.ndarray,
-        memory: np.ndarray,
-        trace: np.ndarray,
+        row: np.ndarray, observation: np.ndarray, state: np.ndarray, model: int, data: int, settings: np.ndarray
     ) -> None:
-        read(state, model, data, settings, memory, trace)
+        read(state, data)
         observe(state, observation)
         if sensors > 0:
             seen = numba.carray(on_stack(len(row) * sensors), (len(row), sensors))
-            observed(row, seen, model, data, settings, memory, trace)
+            observed(row, seen, model, data, settings)
             first = len(observation) - seen.size
             for motor in range(len(row)):
                 for entry in range(sensors):
@@ -189,10 +182,10 @@ def _kernels(
         trace: np.ndarray,
     ) -> tuple[float, bool, bool]:
         before, after = numba.carray(on_stack(size), size), numba.carray(on_stack(size), size)
-        read(before, model, data, settings, memory, trace)
+        read(before, data)
         fine = advance(force, model, data, settings, memory, trace)
         last = trace[len(trace) - 1]
-        look(last, observation, after, model, data, settings, memory, trace)
+        look(last, observation, after, model, data, settings)
         reward = rewarded(before, delivered(last[:, 1]), after, interface[OPTIONS:])
         return reward, ended(after), fine
 
@@ -216,9 +209,9 @@ def _kernels(
         for entry in range(size):
             state[entry] = entries[entry]
         key = generator.random() * LARGEST_KEY if interface[RANDOM] != 0.0 else 0.0
-        start(state, key, model, data, settings, memory, trace)
+        start(state, key, model, data, settings, memory)
         nothing = np.zeros((trace.shape[1], trace.shape[2]))
-        look(nothing, observation, state, model, data, settings, memory, trace)
+        look(nothing, observation, state, model, data, settings)
 
     @compiled
     def step_rows(tally: np.ndarray, at_once: int, lane: Any, rows: Any, interface: np.ndarray, steps: Any) -> None:
@@ -254,6 +247,6 @@ def _kernels(
         nothing, state = np.zeros((trace.shape[1], trace.shape[2])), np.empty(size)
         for row in which:
             load(rows, row, lane)
-            look(nothing, observations[row], state, model, data, settings, rows.memory[row], trace)
+            look(nothing, observations[row], state, model, data, settings)
 
     return Kernels(step, reset, step_rows, observe_rows)

@@ -92,11 +92,6 @@ class Plant:
         return not issubclass(self.family, Ideal)
 
     @property
-    def explicit(self) -> bool:
-        """Whether positions are moved by the old velocity."""
-        return self.integrator == "euler"
-
-    @property
     def timestep(self) -> float:
         """Integration step [s]."""
         return self.task.step_duration / self.inner_steps

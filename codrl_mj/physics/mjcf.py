@@ -7,8 +7,8 @@ from codrl_mj.actuators import ActuatorModel, Ideal, JointAdditions
 from codrl_mj.engine import HILL_NAMES
 from codrl_mj.engine.families import SIGNATURE, slot_size, user_head
 from codrl_mj.engine.reading import motors
+from codrl_mj.own_code import asset_path
 from codrl_mj.physics.base import Plant
-from codrl_mj.tasks.assets import asset_path
 from codrl_mj.tasks.base import INTEGRATORS
 
 
@@ -94,7 +94,7 @@ def task_model(plant: Plant) -> mujoco.MjModel:
         )
     spec.option.timestep = plant.timestep
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    if plant.explicit:
+    if plant.integrator == "euler":
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     joint = JointAdditions(plant.joint.armature, plant.joint.damping, plant.joint.friction)
     for name, actuator, limit in zip(task.motors, plant.actuators, plant.max_forces.tolist(), strict=True):

@@ -126,10 +126,7 @@ class MujocoBatchPhysics:
 
     @state.setter
     def state(self, states: np.ndarray) -> None:
-        self._place(slice(None), states)
-
-    def _place(self, rows: np.ndarray | slice, states: np.ndarray) -> None:
-        self._qpos[rows], self._qvel[rows] = states[:, self._positions], states[:, self._velocities]
+        self._qpos[:], self._qvel[:] = states[:, self._positions], states[:, self._velocities]
 
     def models(self) -> Iterator[mujoco.MjModel]:
         """One model, which has each simulation's fields in turn; what is only drawn is the first one's."""
@@ -142,7 +139,7 @@ class MujocoBatchPhysics:
         """Start episodes of m simulations, from states (m, n) with keys (m,) of random numbers, motors at rest."""
         self._nominal.install()  # raises if somebody replaced ours since the last episodes
         self._states[rows] = self._rest
-        self._place(rows, states)
+        self._qpos[rows], self._qvel[rows] = states[:, self._positions], states[:, self._velocities]
         if self.plant.motorised:
             for at, one in enumerate(self._wiring):
                 self._act[rows, int(one.act) + NOISE_KEY] = keys + at

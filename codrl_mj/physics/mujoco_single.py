@@ -9,6 +9,7 @@ import numpy as np
 from codrl_mj import engine
 from codrl_mj.actuators import ActuatorModel
 from codrl_mj.engine.families import HEAD
+from codrl_mj.engine.layout import addresses
 from codrl_mj.physics.base import Physics, Plant
 from codrl_mj.physics.mjcf import flags_with_friction, needed_callbacks, task_model
 from codrl_mj.physics.stepping import Wiring, compiled_stepping
@@ -48,8 +49,7 @@ class MujocoPhysics(Physics):
         """Take the views that a step uses, and make sure that the callbacks are there."""
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
         self.stepping = compiled_stepping(self.plant)
-        live = self._settings, self._disturber.memory, self.trace
-        self.arguments = self.model._address, self.data._address, *live
+        self.arguments = *addresses(self.data), self._settings, self._disturber.memory, self.trace
         self.scene: tuple[Any, Any] | None = (self.model, self.data)
         self._callbacks = needed_callbacks(self.model)
         self.install()
@@ -89,7 +89,7 @@ class MujocoPhysics(Physics):
     def reset(self, state: np.ndarray, key: float = 0.0) -> None:
         """See `Physics.reset`."""
         self.install()  # raises if somebody replaced ours since the last episode
-        self.stepping.start(np.asarray(state, dtype=np.float64), float(key), *self.arguments)
+        self.stepping.start(np.asarray(state, dtype=np.float64), float(key), *self.arguments[:-1])
 
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
         """Exchange the actuators for others of their family; to be followed by a reset.
@@ -129,7 +129,7 @@ class MujocoPhysics(Physics):
     def observed(self, row: np.ndarray) -> np.ndarray:
         """See `Physics.observed`."""
         seen = np.empty((len(row), len(self.plant.family.OBSERVED)))
-        self.stepping.observed(row, seen, *self.arguments)
+        self.stepping.observed(row, seen, *self.arguments[:3])
         return seen
 
     def snapshot(self) -> np.ndarray:

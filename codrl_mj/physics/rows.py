@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from codrl_mj.engine.layout import address_of, engine_function
+from codrl_mj.engine.layout import address_of, addresses, engine_function
 from codrl_mj.engine.memory import copy_bytes, count_on, f64, internal
 from codrl_mj.kept import njit
 from codrl_mj.physics.mujoco_single import ARM, MujocoPhysics
@@ -80,8 +80,8 @@ def lane(physics: MujocoPhysics, data: mujoco.MjData, fields: Mapping[str, np.nd
     ]
     parts = [(name, part(data.model, name)) for name in _MOVING]
     live = [(address_of(data, name), one.start, one.stop - one.start) for name, one in parts]
-    own = data.model._address, data._address, settings.copy(), memory, trace.copy()
-    return Lane(np.array(rows, np.int64).reshape(-1, 4), np.array(live, np.int64), *own)
+    own = settings.copy(), memory, trace.copy()
+    return Lane(np.array(rows, np.int64).reshape(-1, 4), np.array(live, np.int64), *addresses(data), *own)
 
 
 @internal

@@ -53,11 +53,12 @@ class Stepping(NamedTuple):
     """(force, *arguments) -> whether the state is still one of numbers within `LARGEST`: takes one environment step
     under a desired force [N or N*m], or under several, an array (n,). What the actuators did is in `trace`."""
     start: Compiled
-    """(state (n,), key, *arguments) -> nothing: starts an episode, as `Physics.reset` does."""
+    """(state (n,), key, *arguments but the last) -> nothing: starts an episode, as `Physics.reset` does."""
     read: Compiled
-    """(state (n,), *arguments) -> nothing: fills `state` with the present one."""
+    """(state (n,), address of the data) -> nothing: fills `state` with the present one."""
     observed: Compiled
-    """(row of trace (n, c), seen (n, k), *arguments) -> nothing: fills `seen` with what the sensors say at present."""
+    """(row of trace (n, c), seen (n, k), *the first three arguments) -> nothing: fills `seen` with what the sensors say
+    at present."""
 
 
 def compiled_stepping(plant: Plant) -> Stepping:
@@ -65,9 +66,9 @@ def compiled_stepping(plant: Plant) -> Stepping:
     task, disturbed = plant.task, plant.disturbances != OFF
     if plant.motorised:
         load_family(plant.family)
-    kept = compiled_constrain(task.constrain, task.state_names, task.qpos, task.qvel)
-    reader = compiled_reader(task.qpos, task.qvel)
-    return _stepping(kept, reader, task.qpos, task.qvel, plant.explicit, disturbed, plant.family, plant.motorised)
+    order, explicit = (task.qpos, task.qvel), plant.integrator == "euler"
+    kept = compiled_constrain(task.constrain, task.state_names, *order)
+    return _stepping(kept, compiled_reader(*order), *order, explicit, disturbed, plant.family, plant.motorised)
 
 
 def force_of(forces: Any, actuator: int) -> float:
@@ -148,7 +149,6 @@ def _stepping(
         data: int,
         settings: np.ndarray,
         memory: np.ndarray,
-        trace: np.ndarray,  # noqa: ARG001 - it is one of the simulation's arguments
     ) -> None:
         engine_reset(model, data)
         qpos, qvel = DATA.qpos(data), DATA.qvel(data)
@@ -164,26 +164,11 @@ def _stepping(
                 memory[actuator, memory.shape[1] + KEY_COLUMN] = key + actuator
 
     @njit(nogil=True, error_model="numpy")
-    def read(
-        state: np.ndarray,
-        model: int,  # noqa: ARG001 - the arguments of a simulation go together
-        data: int,
-        settings: np.ndarray,  # noqa: ARG001
-        memory: np.ndarray,  # noqa: ARG001
-        trace: np.ndarray,  # noqa: ARG001
-    ) -> None:
+    def read(state: np.ndarray, data: int) -> None:
         read_state(DATA.qpos(data), DATA.qvel(data), state)
 
     @njit(nogil=True, error_model="numpy")
-    def observed(
-        row: np.ndarray,
-        seen: np.ndarray,
-        model: int,
-        data: int,
-        settings: np.ndarray,
-        memory: np.ndarray,  # noqa: ARG001
-        trace: np.ndarray,  # noqa: ARG001
-    ) -> None:
+    def observed(row: np.ndarray, seen: np.ndarray, model: int, data: int, settings: np.ndarray) -> None:
         if seeing:
             for actuator in range(len(settings)):
                 wiring = row_as(settings[actuator], Wiring)
