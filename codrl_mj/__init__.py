@@ -27,7 +27,7 @@ _PUBLIC = {
     "Joint": "codrl_mj.disturbances",
     "make_sb3_vec_env": "codrl_mj.envs.sb3",
     "make_dm_control": "codrl_mj.foreign.dm_control",
-    "motorise": "codrl_mj.specs",
+    "motorise": "codrl_mj.engine.specs",
     "motorised": "codrl_mj.foreign.building",
     "signals": "codrl_mj.engine.reading",
     "Task": "codrl_mj.tasks",

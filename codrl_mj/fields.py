@@ -104,11 +104,7 @@ def reals(default: tuple[float, ...] | None = None) -> Any:
 
 
 def check(settings: Any) -> None:
-    """Check every field of a dataclass made with the functions above, and store numbers as Python's own.
-
-    Raises:
-        ValueError: a field is out of bounds; the message names it, its value and the bound.
-    """
+    """Refuse a field out of bounds, of a dataclass made with the functions above, and store numbers as Python's own."""
     for field in dataclasses.fields(settings):
         if "bound" not in field.metadata:
             continue

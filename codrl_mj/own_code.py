@@ -1,4 +1,4 @@
-"""What users write: modules that names stand for, and functions, called once before they are compiled.
+"""What users write: modules and model files that names stand for, and functions, called once before they are compiled.
 
 Errors in them are one sentence.
 """
@@ -80,6 +80,25 @@ def not_compiled(function: Callable[..., Any], error: Exception) -> str:
     said = causes[-1] if causes else " ".join(lines[:2] if lines[0].endswith(":") else lines[:1])
     line = re.search(r'(?m)^\s*File ".+", line (\d+):', text)
     return f"{place(function, int(line[1]) if line else None)}: numba does not compile it: {said.strip()}"
+
+
+def asset_folder() -> Path:
+    """The folder of our MJCF files and of `motors/`: in a checkout `assets/`, in a wheel inside the package."""
+    package = Path(__file__).parent
+    for folder in (package / "_assets", package.parent / "assets"):
+        if folder.is_dir():
+            return folder
+    raise FileNotFoundError(f"no models beside codrl_mj in {package}: the installation is incomplete")
+
+
+def asset_path(name: str) -> Path:
+    """Path of an MJCF file: somebody's own, or of ours the one of that name."""
+    for path in (Path(name), asset_folder() / name):
+        if path.is_file():
+            return path
+    if Path(name).parent == Path():
+        raise FileNotFoundError(f"no model {name!r} in {Path.cwd()}, nor among codrl_mj's: give the whole path")
+    raise FileNotFoundError(f"no model file {name}")
 
 
 _TRUSTED = contextvars.ContextVar("trusted", default=True)

@@ -16,7 +16,7 @@ from gymnasium import spaces
 import codrl_mj
 import tests
 from codrl_mj.fields import real
-from codrl_mj.tasks.trials import Trials
+from codrl_mj.tasks.twin import Trials
 
 ROOT, _NUMBERS = Path(__file__).parent, itertools.count()
 STATE = "state[0], state[1], state[2], state[3]"

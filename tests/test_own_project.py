@@ -20,7 +20,7 @@ from codrl_mj.physics import PHYSICS
 from codrl_mj.runs.summaries import read_run
 from codrl_mj.tasks import OURS, TASKS, find_task, reference_of
 from codrl_mj.tasks.attributes import Fixed
-from codrl_mj.tasks.trials import Trials
+from codrl_mj.tasks.twin import Trials
 from codrl_mj.validation import try_mutations, validate
 from tests.own_project import arm, series_elastic, slow_motion
 from tests.training.interruptions import TERMINATE, after, differing, outcome

@@ -15,11 +15,11 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import Episode, RandomPolicy, run_episodes
 from codrl_mj.films.film import Panel, film
 from codrl_mj.films.strip import torque_label
+from codrl_mj.own_code import asset_path
 from codrl_mj.physics import Plant, signal_names
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.offscreen import OffscreenRenderer
 from codrl_mj.tasks import TASKS, named_actuator
-from codrl_mj.tasks.assets import asset_path
 
 WIDTH, HEIGHT = 200, 120
 FRAME_HEIGHT = 40 + HEIGHT + 24 + 120 + 8 + 60 + 26  # title, scene, and the strip's legend, plots and time axis

@@ -10,7 +10,7 @@ from typing import Any
 from codrl_mj.catalogue.derivation import MotorNumbers, derive
 from codrl_mj.catalogue.units import Kind, read
 from codrl_mj.fields import check_names
-from codrl_mj.tasks.assets import asset_folder
+from codrl_mj.own_code import asset_folder
 
 
 def _printed(unit: str, example: str, power: int = 0, zero: bool = False, also: str = "") -> Any:

@@ -165,7 +165,7 @@ def environment(verb: Any, task: str, name: str, known: EnvConfig) -> EnvConfig:
 
 def _patterns(items: Sequence[str]) -> dict[str, Any]:
     """Pattern -> what is behind these actuators, of PATTERN=NAME and of files."""
-    from codrl_mj.specs import resolve_patterns
+    from codrl_mj.engine.specs import resolve_patterns
 
     found: dict[str, Any] = {}
     for item in items:

@@ -146,7 +146,7 @@ def _gathered(source: str, env: Any, ran: Sequence[Any]) -> dict[str, Demand]:
     import mujoco
 
     from codrl_mj.engine.reading import motors
-    from codrl_mj.specs import ON_JOINT
+    from codrl_mj.engine.specs import ON_JOINT
 
     swing, ends = None, [env.world.at_goal(one) for one in ran]
     if all(end is not None for end in ends):

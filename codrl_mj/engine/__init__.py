@@ -4,14 +4,13 @@ from codrl_mj.engine.families import load_family
 from codrl_mj.engine.hill import HILL_NAMES
 from codrl_mj.engine.install import CallbackInUseError, install, installed, uninstall
 from codrl_mj.engine.layout import LayoutError
-from codrl_mj.engine.reading import Readout, check, clear_motors, motors, signals
+from codrl_mj.engine.reading import Readout, clear_motors, motors, signals
 
 __all__ = [
     "motors",
     "signals",
     "Readout",
     "clear_motors",
-    "check",
     "load_family",
     "HILL_NAMES",
     "CallbackInUseError",

@@ -7,40 +7,29 @@ all state is in `data.act`. Nothing is cached on disk: the structure offsets are
 import ctypes
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 from numba import types
 
-from codrl_mj.engine.doors import command, is_disabled, user_of
+from codrl_mj.engine.doors import command, is_disabled, seen_from, user_of
 from codrl_mj.engine.families import (
     HEAD,
+    INERTIA,
+    PARAMETERS,
     SIGNATURE,
+    WHOLE,
     advance_slot,
-    asks_inertia,
     commit_slot,
     is_compiled,
-    parameter_count,
     size_of,
 )
-from codrl_mj.engine.inertia import seen_from
 from codrl_mj.engine.layout import DATA, MODEL
 from codrl_mj.engine.memory import at, f64, internal
 from codrl_mj.kept import cfunc
 
 _USER_DYNAMICS, _USER_BIAS = int(mujoco.mjtDyn.mjDYN_USER), int(mujoco.mjtBias.mjBIAS_USER)
 _FIRST, _SECOND = SIGNATURE
-
-
-class Callbacks(NamedTuple):
-    """The compiled callbacks."""
-
-    control: Any
-    """ctypes pointer for `mjcb_control`: advances the actuators."""
-    act_bias: Any
-    """ctypes pointer for `mjcb_act_bias`: the torque that they deliver."""
-    owners: tuple[Any, ...]
-    """The numba objects that own the machine code: they must live as long as the pointers."""
 
 
 @internal(inline="always")
@@ -57,15 +46,18 @@ def _is_ours(model: int, actuator: int) -> bool:
         user[0] == _FIRST
         and user[1] == _SECOND
         and is_compiled(user[2])
-        and MODEL.nuser_actuator(model) >= HEAD + parameter_count(int(user[2]))
+        and MODEL.nuser_actuator(model) >= HEAD + size_of(int(user[2]), PARAMETERS)
         and MODEL.actuator_biastype(model)[actuator] == _USER_BIAS
-        and MODEL.actuator_actnum(model)[actuator] == size_of(int(user[2]))
+        and MODEL.actuator_actnum(model)[actuator] == size_of(int(user[2]), WHOLE)
     )
 
 
 @functools.cache
-def compiled() -> Callbacks:
-    """Compile the callbacks on first use and keep them for the life of the process."""
+def compiled() -> dict[str, Any]:
+    """MuJoCo's names of the callbacks -> what its setters take; compiled on first use, kept for the process's life.
+
+    `control` advances the actuators, `act_bias` is the torque that they deliver.
+    """
 
     @cfunc(types.void(types.uintp, types.uintp), nogil=True, error_model="numpy")
     def control(model: int, data: int) -> None:
@@ -91,7 +83,7 @@ def compiled() -> Callbacks:
                 DATA.actuator_length(data)[out],
                 DATA.actuator_velocity(data)[out],
                 time,
-                seen_from(model, data, out, 1.0) if asks_inertia(number) else math.inf,
+                seen_from(model, data, out, 1.0) if size_of(number, INERTIA) else math.inf,
             )
 
     @cfunc(types.float64(types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")
@@ -100,6 +92,11 @@ def compiled() -> Callbacks:
             return 0.0  # as the engine does when there is no callback
         return f64(_slot_of(model, data, actuator))[2]
 
-    generic = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
-    bias = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int)
-    return Callbacks(generic(control.address), bias(act_bias.address), (control, act_bias))
+    return {"control": callback(control), "act_bias": callback(act_bias, ctypes.c_double, ctypes.c_int)}
+
+
+def callback(function: Any, returned: Any = None, *more: Any) -> Any:
+    """What MuJoCo's setters take for a compiled function of (mjModel, mjData) and `more`; it keeps that alive."""
+    made: Any = ctypes.CFUNCTYPE(returned, ctypes.c_void_p, ctypes.c_void_p, *more)(function.address)
+    made.owner = function
+    return made

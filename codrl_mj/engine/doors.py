@@ -1,11 +1,25 @@
-"""What both doors read of a model, compiled: an actuator's numbers, and what the engine makes of its control."""
+"""What both doors read of a model, compiled: an actuator's numbers, its control, and what it moves.
+
+The inertia at an actuator's shaft comes from the engine's own factorisation of the inertia matrix.
+"""
+
+import functools
+import math
+from typing import Any
 
 import mujoco
+import numpy as np
+from numba import types
 
 from codrl_mj.engine.layout import DATA, MODEL
-from codrl_mj.engine.memory import at, internal
+from codrl_mj.engine.memory import at, call, internal, on_stack, symbol, u64
+from codrl_mj.kept import cfunc
 
 _NO_CLAMP, _GROUPS, _LARGEST = int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL), mujoco.mjNGROUP, mujoco.mjMAXVAL
+MOST_ON_STACK = 1024
+"""Degrees of freedom up to which the work is done on the stack, which is quicker."""
+_ADDRESS = np.zeros(1, dtype=np.uintp)
+_address_at = symbol("codrl_mj_inertia", _ADDRESS.ctypes.data)
 
 
 @internal(inline="always")
@@ -43,3 +57,59 @@ def is_disabled(model: int, actuator: int) -> bool:
     """Whether an actuator's group is switched off."""
     group = MODEL.actuator_group(model)[actuator]
     return 0 <= group < _GROUPS and (MODEL.opt.disableactuator(model) >> group) & 1 == 1
+
+
+@internal
+def seen_from(model: int, data: int, output: int, gear: float) -> float:
+    """The inertia [kg*m^2] at an actuator's output, through a gear; `load_inertia` must have been called.
+
+    To be compiled takes a second, which only families that ask for it are to pay.
+    """
+    return call(u64(_address_at())[0], model, data, output, gear)
+
+
+@internal(inline="always")
+def _eliminated(model: int, data: int, output: int, gear: float, turned: Any) -> float:
+    """The inertia; `turned` becomes L^-T*m; there it has room for a number for each degree of freedom."""
+    start, last = DATA.moment_rowadr(data)[output], 0
+    entries = range(start, start + DATA.moment_rownnz(data)[output])
+    for entry in entries:
+        last = max(last, DATA.moment_colind(data)[entry])
+    for row in range(last + 1):
+        turned[row] = 0.0
+    for entry in entries:
+        turned[DATA.moment_colind(data)[entry]] = gear * DATA.actuator_moment(data)[entry]
+    total = 0.0
+    for row in range(last, -1, -1):
+        if turned[row] == 0.0:
+            continue
+        total += turned[row] * turned[row] * DATA.qLDiagInv(data)[row]
+        start = MODEL.M_rowadr(model)[row]
+        for entry in range(start, start + MODEL.M_rownnz(model)[row] - 1):  # its ancestors; then itself
+            turned[MODEL.M_colind(model)[entry]] -= DATA.qLD(data)[entry] * turned[row]
+    return 1.0 / total if total > 0.0 else math.inf
+
+
+@functools.cache
+def load_inertia() -> Any:
+    """Compile what `seen_from` calls, once a process; returns what owns the machine code.
+
+    With its moment m, the gear times a row of `actuator_moment`, and the inertia matrix M = L^T*D*L that
+    `mj_fwdPosition` has factorised, it is 1/(m*M^-1*m): how hard it is to turn with all other joints free. Infinite
+    where nothing moves.
+    """
+
+    @cfunc(types.float64(types.uintp, types.uintp, types.int32, types.float64), nogil=True, error_model="numpy")
+    def through_gear(model: int, data: int, output: int, gear: float) -> float:
+        count = MODEL.nv(model)
+        if count > MOST_ON_STACK:
+            return _eliminated(model, data, output, gear, np.empty(count))
+        return _eliminated(model, data, output, gear, on_stack(count))
+
+    _ADDRESS[0] = through_gear.address
+    return through_gear
+
+
+def shaft_inertia(model: mujoco.MjModel, data: mujoco.MjData, output: int, gear: float) -> float:
+    """What `inertia` finds of a simulation whose `mj_fwdPosition` has run."""
+    return float(load_inertia().ctypes(model._address, data._address, output, gear))

@@ -18,23 +18,14 @@ from numba.extending import register_jitable
 
 from codrl_mj.actuators import Family, Inputs, family_number, parameters_type, reference
 from codrl_mj.actuators.model import advance_form, check_family
-from codrl_mj.engine.inertia import load_inertia
-from codrl_mj.engine.memory import call_family, f64, i32, internal, read, symbol, tuple_of, u8, u64, write
+from codrl_mj.engine.doors import load_inertia
+from codrl_mj.engine.memory import call, f64, i32, internal, read, symbol, tuple_of, u8, u64, write
 from codrl_mj.kept import Note, cfunc
 from codrl_mj.own_code import Form, check_form, not_compiled
 
 SIGNATURE = (250700.0, 268401.0)
 """First two numbers of the `user` data of every actuator and joint that is ours: the paper's arXiv identifier, in two,
 because a number keeps six digits in an XML file."""
-
-
-class Head(NamedTuple):
-    """What the `user` data of an actuator of ours begin with, at either door; the family's parameters follow."""
-
-    signature_1: float
-    signature_2: float
-    family: float
-    """The family's number."""
 
 
 class Slot(NamedTuple):
@@ -52,13 +43,17 @@ class Slot(NamedTuple):
     """Torque delivered at the shaft [N*m]."""
 
 
-HEAD, SLOT = len(Head._fields), len(Slot._fields)
+HEAD, SLOT = 3, len(Slot._fields)
+"""Numbers of what an actuator's `user` data, and its state, begin with."""
 
 _ADDRESSES = np.zeros(10**6, dtype=np.uintp)
 """Address of a family's compiled function by its number; 0 where it has not been compiled. 8 MB that the system hands
 out page by page."""
-_SIZES = np.zeros((10**6, 5), dtype=np.int32)
-"""Numbers of states, signals and parameters, and whether it asks for the inertia and is asked for motions, likewise."""
+STATES, SIGNALS, PARAMETERS, INERTIA, MOTION, WHOLE = range(6)
+"""Columns of the table of sizes: a family's numbers of states, signals and parameters, whether it asks for the inertia
+and is asked for motions, and its `slot_size`."""
+_SIZES = np.zeros((10**6, 6), dtype=np.int32)
+"""They, likewise."""
 _REFERENCES = np.zeros(10**6, dtype=np.uintp)
 """Address of its `reference`, as C has strings, likewise."""
 _COMPILED: dict[int, tuple[Family, Any]] = {}
@@ -87,9 +82,9 @@ def signals_at(family: Family) -> int:
     return SLOT + 2 * len(family.State._fields)
 
 
-def user_head(family: Family) -> Head:
-    """What the `user` data of a family's actuators begin with."""
-    return Head(*SIGNATURE, float(family_number(family)))
+def user_head(family: Family) -> tuple[float, float, float]:
+    """What the `user` data of a family's actuators begin with, at either door; its parameters follow."""
+    return *SIGNATURE, float(family_number(family))
 
 
 def load_family(family: Family) -> None:
@@ -119,7 +114,7 @@ def load_family(family: Family) -> None:
     if family.INERTIA:
         load_inertia()
     function, text = _compile(family), ctypes.create_string_buffer(reference(family).encode())
-    _SIZES[number], _REFERENCES[number] = sizes, ctypes.addressof(text)
+    _SIZES[number], _REFERENCES[number] = (*sizes, slot_size(family)), ctypes.addressof(text)
     _ADDRESSES[number] = function.address
     _COMPILED[number] = family, (function, text, _COMPILED.get(number))
 
@@ -253,34 +248,10 @@ def is_compiled(number: float) -> bool:
     return 0.0 <= number < 1e6 and u64(addresses_at())[int(number)] != 0
 
 
-@internal
-def state_count(number: int) -> int:
-    """A family's number of states."""
-    return i32(sizes_at())[5 * number]
-
-
-@internal
-def size_of(number: int) -> int:
-    """`slot_size` by a family's number."""
-    return SLOT + 2 * i32(sizes_at())[5 * number] + i32(sizes_at())[5 * number + 1] + 1
-
-
 @internal(inline="always")
-def parameter_count(number: int) -> int:
-    """A family's number of parameters."""
-    return i32(sizes_at())[5 * number + 2]
-
-
-@internal(inline="always")
-def asks_inertia(number: int) -> bool:
-    """A family's `INERTIA`."""
-    return i32(sizes_at())[5 * number + 3] != 0
-
-
-@internal(inline="always")
-def asked_motion(number: int) -> bool:
-    """A family's `MOTION`."""
-    return i32(sizes_at())[5 * number + 4] != 0
+def size_of(number: int, column: int) -> int:
+    """A column of the table of sizes, such as `WHOLE`, by a family's number."""
+    return i32(sizes_at())[6 * number + column]
 
 
 @internal(inline="always")
@@ -297,7 +268,7 @@ def is_called(number: int, text: int) -> bool:
 @internal
 def commit_slot(number: int, slot: int, time: float) -> None:
     """A step was taken and it is `time` now: what was an actuator's candidate has happened."""
-    own, count = f64(slot), state_count(number)
+    own, count = f64(slot), size_of(number, STATES)
     own[0] = time
     for entry in range(SLOT, SLOT + count):
         own[entry] = own[entry + count]
@@ -320,10 +291,10 @@ def advance_slot(
     By address are the parameters and the slot; torque asked for [N*m], position [rad], speed [rad/s] and inertia
     [kg*m^2] are the shaft's.
     """
-    own, size = f64(slot), 8 * state_count(number)
+    own, size = f64(slot), 8 * size_of(number, STATES)
     before = slot + 8 * SLOT
     after = before + size
-    own[2] = call_family(
+    own[2] = call(
         u64(addresses_at())[number],
         *(parameters, timestep, before, after, after + size, desired, position, speed, time, own[1], inertia),
     )

@@ -16,14 +16,14 @@ The callback does two things, both pure functions of (mjModel, mjData):
 The body's frame has x along the joint and z up; bodies attached to it stay at the height of the joint.
 """
 
-import ctypes
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 from numba import types
 
+from codrl_mj.engine.control import callback
 from codrl_mj.engine.families import SIGNATURE
 from codrl_mj.engine.layout import DATA, MODEL
 from codrl_mj.engine.memory import at, f64, internal
@@ -36,15 +36,6 @@ for the eye."""
 _, _, GRAVITY, WAVENUMBER, HEIGHT = range(len(HILL_NAMES))
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 _FIRST, _SECOND = SIGNATURE
-
-
-class HillCallback(NamedTuple):
-    """The compiled callback."""
-
-    passive: Any
-    """ctypes pointer for `mjcb_passive`: adds the hill force and puts the body's geoms on the hill."""
-    owners: tuple[Any, ...]
-    """The numba objects that own the machine code: they must live as long as the pointer."""
 
 
 @internal(inline="always")
@@ -77,8 +68,8 @@ def _place(model: int, data: int, body: int, height: float, slope: float) -> Non
 
 
 @functools.cache
-def compiled_hill() -> HillCallback:
-    """Compile the callback on first use and keep it for the life of the process."""
+def compiled_hill() -> dict[str, Any]:
+    """The callback by MuJoCo's name of it, as `codrl_mj.engine.control.compiled` has those of motors."""
 
     @cfunc(types.void(types.uintp, types.uintp), nogil=True, error_model="numpy")
     def passive(model: int, data: int) -> None:
@@ -96,5 +87,4 @@ def compiled_hill() -> HillCallback:
             DATA.qfrc_passive(data)[MODEL.jnt_dofadr(model)[joint]] -= mass * user[GRAVITY] * cosine
             _place(model, data, body, user[HEIGHT] * sine, user[HEIGHT] * user[WAVENUMBER] * cosine)
 
-    generic = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
-    return HillCallback(generic(passive.address), (passive,))
+    return {"passive": callback(passive)}

@@ -13,8 +13,9 @@ class _CallbackGroup(NamedTuple):
     """Callbacks that are installed together."""
 
     names: tuple[str, ...]
-    """MuJoCo's names, as in `mujoco.set_mjcb_...`; also the fields of what `compile` returns."""
-    compile: Callable[[], Any]
+    """MuJoCo's names, as in `mujoco.set_mjcb_...`."""
+    compile: Callable[[], dict[str, Any]]
+    """() -> the callbacks by these names."""
     remedy: str
     """What else a user could do than to install them."""
 
@@ -29,18 +30,14 @@ class CallbackInUseError(RuntimeError):
     """Another library's MuJoCo callback is installed where ours has to go."""
 
 
-def _present(name: str) -> Any:
-    return getattr(mujoco, f"get_mjcb_{name}")()
-
-
-def _is_ours(name: str) -> bool:
-    """Whether the callback of that name is ours; nothing is compiled to find out."""
-    present = _present(name)
-    return present is not None and present is _INSTALLED.get(name)
-
-
 _INSTALLED: dict[str, Any] = {}
 """What each of MuJoCo's callbacks was last set to."""
+
+
+def _whose(name: str) -> tuple[bool, Any]:
+    """Whether the callback of that name is ours, and what it is, if any; nothing is compiled to find out."""
+    present = getattr(mujoco, f"get_mjcb_{name}")()
+    return present is not None and present is _INSTALLED.get(name), present
 
 
 def installed(*parts: str) -> bool:
@@ -49,7 +46,7 @@ def installed(*parts: str) -> bool:
     Args:
         *parts: as for `install`.
     """
-    return all(_is_ours(name) for part in _chosen(parts) for name in _PARTS[part].names)
+    return all(_whose(name)[0] for _, name in _callbacks(parts))
 
 
 def install(*parts: str) -> None:
@@ -67,17 +64,18 @@ def install(*parts: str) -> None:
         CallbackInUseError: one of the callbacks is somebody else's; nothing was changed.
         LayoutError: the installed MuJoCo's memory is not laid out as its introspection says.
     """
-    chosen = _chosen(parts)
-    for part in chosen:
-        for name in _PARTS[part].names:
-            if _present(name) is not None and not _is_ours(name):
-                raise CallbackInUseError(
-                    f"mujoco.mjcb_{name} is already set, to {_present(name)!r}: refusing to replace it. Remove it with "
-                    f"mujoco.set_mjcb_{name}(None) first, or build the environment with {_PARTS[part].remedy}, which "
-                    "needs no such callback"
-                )
-    missing = [(part, name) for part in chosen for name in _PARTS[part].names if not _is_ours(name)]
-    pointers = [(name, getattr(_PARTS[part].compile(), name)) for part, name in missing]
+    missing = []
+    for part, name in _callbacks(parts):
+        ours, present = _whose(name)
+        if present is not None and not ours:
+            raise CallbackInUseError(
+                f"mujoco.mjcb_{name} is already set, to {present!r}: refusing to replace it. Remove it with "
+                f"mujoco.set_mjcb_{name}(None) first, or build the environment with {_PARTS[part].remedy}, which "
+                "needs no such callback"
+            )
+        if not ours:
+            missing.append((part, name))
+    pointers = [(name, _PARTS[part].compile()[name]) for part, name in missing]
     for name, pointer in pointers:
         getattr(mujoco, f"set_mjcb_{name}")(pointer)
         _INSTALLED[name] = pointer
@@ -85,13 +83,14 @@ def install(*parts: str) -> None:
 
 def uninstall() -> None:
     """Remove all our callbacks; anybody else's stay where they are."""
-    for name in {name for part in _PARTS.values() for name in part.names}:
-        if _is_ours(name):
+    for _, name in _callbacks(tuple(_PARTS)):
+        if _whose(name)[0]:
             getattr(mujoco, f"set_mjcb_{name}")(None)
 
 
-def _chosen(names: tuple[str, ...]) -> tuple[str, ...]:
-    for name in names:
-        if name not in _PARTS:
-            raise ValueError(f"callbacks {name!r}: must be one of {', '.join(_PARTS)}")
-    return names or ("motor",)
+def _callbacks(parts: tuple[str, ...]) -> list[tuple[str, str]]:
+    """Part and name of each of MuJoCo's callbacks that are of some parts, those of motors if none is named."""
+    for part in parts:
+        if part not in _PARTS:
+            raise ValueError(f"callbacks {part!r}: must be one of {', '.join(_PARTS)}")
+    return [(part, name) for part in parts or ("motor",) for name in _PARTS[part].names]

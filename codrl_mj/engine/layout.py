@@ -1,4 +1,8 @@
-"""MuJoCo's structures in functions that numba compiles: `MODEL.actuator_user(model)`, `DATA.time(data)`.
+"""MuJoCo's structures and functions in functions that numba compiles: `MODEL.actuator_user(model)`, `DATA.time(data)`.
+
+Compiled code knows a simulation by two integers, the addresses of its `mjModel` and `mjData`, which must outlive the
+call. A fault that the engine itself finds (an unknown integrator, memory run out) ends the process there, where
+`mujoco.mj_step` would raise `mujoco.FatalError`; our models cause none.
 
 The offsets differ between MuJoCo versions, so none is written down: `mujoco.introspect` describes the structures as
 the C headers declare them, ctypes lays them out by the platform's ABI, and a field is compared with a live object
@@ -12,14 +16,15 @@ from types import ModuleType
 from typing import Any
 
 import mujoco
-from llvmlite import ir
+import numpy as np
 from mujoco.introspect import ast_nodes
 from mujoco.introspect.structs import STRUCTS
 from numba import types
 from numba.core.registry import cpu_target
-from numba.extending import intrinsic
 
-from codrl_mj.plugin import LayoutError
+from codrl_mj.engine.memory import emitted, pointed
+from codrl_mj.kept import external
+from codrl_mj.plugin import LayoutError, library
 
 _SCALARS = {
     "mjtNum": ctypes.c_double,
@@ -203,13 +208,10 @@ def _function(struct_name: str, path: str, node: Any) -> Any:
     element = _KINDS[node.inner_type.name if is_array else node.name]
     kind, at = types.CPointer(element) if is_array else element, offset(struct_name, path)
 
-    @intrinsic
-    def field(typing_context: Any, address: Any) -> Any:  # noqa: ARG001 - numba fixes the arguments
-        def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
-            place = builder.add(arguments[0], context.get_constant(types.uintp, at))
-            return builder.load(builder.inttoptr(place, ir.PointerType(context.get_value_type(kind))))
-
-        return kind(types.uintp), codegen
+    @emitted(lambda address: kind(types.uintp))  # noqa: ARG005 - one
+    def field(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001 - numba fixes them
+        place = builder.add(arguments[0], context.get_constant(types.uintp, at))
+        return builder.load(pointed(builder, place, context.get_value_type(kind)))
 
     cpu_target.typing_context.refresh()  # numba has to know it at once: it may be compiling what names it
     return field
@@ -217,3 +219,22 @@ def _function(struct_name: str, path: str, node: Any) -> Any:
 
 MODEL, DATA = Fields("mjModel"), Fields("mjData")
 """The structures that a simulation is known by."""
+
+
+def addresses(data: mujoco.MjData) -> tuple[int, int]:
+    """The addresses of an `MjData`'s model and of itself, by which compiled code knows them."""
+    return data.model._address, data._address
+
+
+def address_of(owner: Any, name: str) -> int:
+    """Of a field of an `MjModel` or `MjData`, which may be dotted (`opt.timestep`): of an array that of its entries."""
+    live = functools.reduce(getattr, name.split("."), owner)
+    if isinstance(live, np.ndarray):
+        return live.ctypes.data
+    return int(owner._address) + offset("mjModel" if isinstance(owner, mujoco.MjModel) else "mjData", name)
+
+
+@functools.cache
+def engine_function(name: str) -> Any:
+    """A function of MuJoCo's of (model, data), such as `mj_step`, by their addresses, for compiled code."""
+    return external(f"codrl_mj_{name}", getattr(library(), name), types.void(types.uintp, types.uintp))

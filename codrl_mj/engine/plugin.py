@@ -8,36 +8,36 @@ by them is the desired one. As at the other door all parameters are the model's 
 import ctypes
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 from numba import types
 
 from codrl_mj.actuators import BUILT_IN, Ideal, family_number, reference
-from codrl_mj.engine.doors import clip, command, is_disabled, user_of
+from codrl_mj.engine.doors import clip, command, is_disabled, seen_from, user_of
 from codrl_mj.engine.families import (
     HEAD,
+    INERTIA,
+    MOTION,
+    PARAMETERS,
     SIGNATURE,
+    WHOLE,
     advance_slot,
-    asked_motion,
-    asks_inertia,
     commit_slot,
     is_called,
     is_compiled,
     load_family,
     loaded_families,
-    parameter_count,
     size_of,
     slot_size,
 )
-from codrl_mj.engine.inertia import seen_from
 from codrl_mj.engine.layout import DATA, MODEL
 from codrl_mj.engine.memory import at, f64, internal, symbol
 from codrl_mj.kept import cfunc, external, njit
 from codrl_mj.plugin import FAMILY, NAME, complain, library, registered
 
 PLUGIN_HEAD = HEAD + 1
-"""The `user` data begin with `Head` and the actuator's arm [m]."""
+"""The `user` data begin with `user_head` and the actuator's arm [m]."""
 EXTRA_STATES = 2
 """After the actuator's slot: the desired force [N], at the joint's side of the arm; and 1 between a step's first call
 and its end, where further calls within it are stages of RK4."""
@@ -50,15 +50,6 @@ REASONS = (
     "its actuator's user data have fewer numbers than the family has parameters",
     "it was compiled when the family had another number of states or signals",
 )
-
-
-class Functions(NamedTuple):
-    """The compiled functions."""
-
-    plugin: dict[str, Any]
-    """Those of the plugin, by their names in `mjpPlugin`."""
-    owners: tuple[Any, ...]
-    """What they hold addresses of."""
 
 
 _GAINS, _BIASES, _DYNAMICS = mujoco.mjNGAIN, mujoco.mjNBIAS, mujoco.mjNDYN
@@ -115,13 +106,19 @@ def _engine_force(model: int, data: int, actuator: int, length: float, velocity:
     return force
 
 
+_ATTRIBUTE = ctypes.create_string_buffer(FAMILY.encode())
+_attribute_at = symbol("codrl_mj_attribute", ctypes.addressof(_ATTRIBUTE))
+_configuration_of = library().mj_getPluginConfig
+"""(model, instance, address of an attribute's name) -> address of its value."""
+_configuration_of.argtypes = ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p
+_configuration_of.restype = ctypes.c_void_p
+
+
 @functools.cache
-def _verdict() -> tuple[Any, Any]:
-    """(model, instance) -> index into `REASONS`: what is wrong with an instance; and what that holds an address of."""
+def _verdict() -> Any:
+    """(model, instance) -> index into `REASONS`: what is wrong with an instance."""
     wanted = types.uintp(types.uintp, types.int32, types.uintp)
-    configuration_of = external("mj_plugin_configuration", _configuration_function(), wanted)
-    attribute = ctypes.create_string_buffer(FAMILY.encode())
-    attribute_at = symbol("codrl_mj_attribute", ctypes.addressof(attribute))
+    configuration_of = external("mj_plugin_configuration", _configuration_of, wanted)
 
     @njit(nogil=True, error_model="numpy")
     def verdict(model: int, instance: int) -> int:
@@ -134,20 +131,20 @@ def _verdict() -> tuple[Any, Any]:
             if not is_compiled(user[2]):
                 return 2
             number = int(user[2])
-            if not is_called(number, configuration_of(model, instance, attribute_at())):
+            if not is_called(number, configuration_of(model, instance, _attribute_at())):
                 return 3
-            if width < PLUGIN_HEAD + parameter_count(number):
+            if width < PLUGIN_HEAD + size_of(number, PARAMETERS):
                 return 4
-            if MODEL.plugin_statenum(model)[instance] != size_of(number) + EXTRA_STATES:
+            if MODEL.plugin_statenum(model)[instance] != size_of(number, WHOLE) + EXTRA_STATES:
                 return 5
         return 0
 
-    return verdict, attribute
+    return verdict
 
 
 @functools.cache
-def compiled() -> Functions:
-    """Compile the functions on first use and keep them for the life of the process."""
+def compiled() -> dict[str, Any]:
+    """The functions by their names in `mjpPlugin`, compiled on first use and kept for the life of the process."""
 
     @cfunc(types.void(types.uintp, types.uintp, types.int32, types.int32), nogil=True, error_model="numpy")
     def compute(model: int, data: int, instance: int, capability: int) -> None:  # noqa: ARG001
@@ -161,24 +158,25 @@ def compiled() -> Functions:
             number, arm = int(f64(user)[2]), f64(user)[HEAD]
             gear = 1.0 / arm  # as at the other door, which multiplies by it
             # stages 2 to 4 of RK4: a drive is sampled once a step, and its torque held
-            within = own[0] < time <= own[0] + timestep and own[size_of(number) + 1] != 0.0
+            within = own[0] < time <= own[0] + timestep and own[size_of(number, WHOLE) + 1] != 0.0
             held = within and MODEL.opt.integrator(model) == _RK4 and number != _IDEAL
             if not held:
                 length = DATA.actuator_length(data)[out]
                 velocity = DATA.actuator_velocity(data)[out]
                 own[0] = time  # of the committed state, also after somebody set the time
-                motion, force = asked_motion(number), 0.0
+                motion, force = size_of(number, MOTION) != 0, 0.0
                 if motion:
                     asked = command(model, data, actuator) * gear
                 else:
                     force = _engine_force(model, data, actuator, length, velocity)
                     asked = force * arm
-                load = seen_from(model, data, out, gear) if asks_inertia(number) else math.inf
+                load = seen_from(model, data, out, gear) if size_of(number, INERTIA) else math.inf
                 advance_slot(
                     *(number, user + 8 * PLUGIN_HEAD, timestep, slot, asked),
                     *(length * gear, velocity * gear, time, load),
                 )
-                own[size_of(number)], own[size_of(number) + 1] = own[2] * gear if motion else force, 1.0
+                whole = size_of(number, WHOLE)
+                own[whole], own[whole + 1] = own[2] * gear if motion else force, 1.0
             DATA.actuator_force(data)[out] = own[2] * gear
 
     @cfunc(types.void(types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")
@@ -187,16 +185,15 @@ def compiled() -> Functions:
             if MODEL.actuator_plugin(model)[actuator] == instance:
                 number, slot = int(f64(user_of(model, actuator))[2]), _slot_of(model, data, instance)
                 commit_slot(number, slot, DATA.time(data))
-                f64(slot)[size_of(number) + 1] = 0.0
+                f64(slot)[size_of(number, WHOLE) + 1] = 0.0
 
     @cfunc(types.void(types.uintp, types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")
     def reset(model: int, state: int, data: int, instance: int) -> None:  # noqa: ARG001
         for entry in range(MODEL.plugin_statenum(model)[instance]):
             f64(state)[entry] = 0.0
 
-    verdict, attribute = _verdict()
-    judge = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_int)(_judge)
-    complaint = external("codrl_mj_judge", judge, types.int32(types.uintp, types.int32))
+    verdict = _verdict()
+    complaint = external("codrl_mj_judge", _JUDGE, types.int32(types.uintp, types.int32))
 
     @cfunc(types.int32(types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")
     def init(model: int, data: int, instance: int) -> int:  # noqa: ARG001
@@ -204,40 +201,27 @@ def compiled() -> Functions:
             return 0
         return complaint(model, instance)
 
-    functions = {"init": init, "reset": reset, "compute": compute, "advance": advance}
-    return Functions(functions, (attribute, judge))
-
-
-def _configuration_function() -> Any:
-    """(model, instance, address of an attribute's name) -> address of its value."""
-    function = library().mj_getPluginConfig
-    function.argtypes, function.restype = (ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p), ctypes.c_void_p
-    return function
+    return {"init": init, "reset": reset, "compute": compute, "advance": advance}
 
 
 def start(model: int, data: int, instance: int) -> int:
     """The plugin's first `init`, with addresses of mjModel and mjData: from here on MuJoCo calls what is compiled."""
     del data
-    functions = compiled().plugin
     structure = registered()[NAME][1]
-    for name, function in functions.items():
+    for name, function in compiled().items():
         setattr(structure, name, function.address)
     return _judge(model, instance)
 
 
 def states_of(model: int, instance: int) -> int:
     """The plugin's `nstate`: how many numbers of state an instance's actuator has."""
-    return slot_size(_family(_configuration(model, instance))) + EXTRA_STATES
+    return slot_size(_family(model, instance)) + EXTRA_STATES
 
 
-def _configuration(model: int, instance: int) -> str:
-    attribute = ctypes.create_string_buffer(FAMILY.encode())  # held until it has been read
-    text = _configuration_function()(model, instance, ctypes.addressof(attribute))
-    return ctypes.string_at(text).decode() if text else ""
-
-
-def _family(name: str) -> Any:
+def _family(model: int, instance: int) -> Any:
     """The family that a model names. No model has code imported: it is ours, or the user has loaded it."""
+    text = _configuration_of(model, instance, ctypes.addressof(_ATTRIBUTE))
+    name = ctypes.string_at(text).decode() if text else ""
     for family in (*loaded_families(), *BUILT_IN):
         if reference(family) == name:
             return family
@@ -250,11 +234,15 @@ def _family(name: str) -> Any:
 def _judge(model: int, instance: int) -> int:
     """`init` of an instance whose family has yet to be compiled, or that is wrong: 0, or -1 and a warning."""
     try:
-        load_family(_family(_configuration(model, instance)))
-        verdict = _verdict()[0](model, instance)
+        load_family(_family(model, instance))
+        verdict = _verdict()(model, instance)
         if verdict:
             raise ValueError(REASONS[verdict])
     except Exception as error:  # there is nobody to raise it to
         complain(f"plugin instance {instance}: {error}")
         return -1
     return 0
+
+
+_JUDGE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_int)(_judge)
+"""As C calls it."""

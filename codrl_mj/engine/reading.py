@@ -17,14 +17,17 @@ from codrl_mj.actuators import (
     reference,
 )
 from codrl_mj.actuators.noise import LARGEST_KEY
+from codrl_mj.engine.doors import shaft_inertia
 from codrl_mj.engine.families import HEAD, SIGNATURE, loaded_families, signals_at, slot_size
-from codrl_mj.engine.inertia import shaft_inertia
 from codrl_mj.engine.plugin import EXTRA_STATES, PLUGIN_HEAD, REASONS
 from codrl_mj.plugin import FAMILY, NAME, registered
 
 
 def motors(model: mujoco.MjModel) -> dict[int, ActuatorModel]:
     """Our actuators in a compiled model, at both doors.
+
+    To be called before an `MjData` is made of a model from an `.mjb` file or a pickle, whose motors might not be what
+    they were: MuJoCo runs whatever plugin has the number that such a file has kept.
 
     Args:
         model: any MuJoCo model.
@@ -51,20 +54,6 @@ def motors(model: mujoco.MjModel) -> dict[int, ActuatorModel]:
         except ValueError as error:
             raise ValueError(f"{model.actuator(index).name or f'actuator {index}'}: {error}") from None
     return found
-
-
-def check(model: mujoco.MjModel) -> None:
-    """Refuse a model whose motors would not be what they were, such as one from an `.mjb` file or a pickle.
-
-    To be called before an `MjData` is made: MuJoCo runs whatever plugin has the number that such a file has kept.
-
-    Args:
-        model: any MuJoCo model.
-
-    Raises:
-        ValueError: see `motors`.
-    """
-    motors(model)
 
 
 def _family(number: float) -> Family:

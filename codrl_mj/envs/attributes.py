@@ -48,11 +48,25 @@ def written(name: str, value: Any, setup: Setup, model: Any) -> Setup:
     Returns:
         The set-up to go on with.
     """
-    present = read(name, setup, model)
+    present, attribute = read(name, setup, model), setup.task.attributes[name]
     if np.array_equal(value, present):
         return setup
-    try:
-        return _write(name, value, setup, model)
+    try:  # the messages are the remedy, or what the value must be
+        if isinstance(attribute, Fixed):
+            raise AttributeError(attribute.remedy)
+        if isinstance(attribute, Follows):
+            raise AttributeError(f"write {' and '.join(attribute.names)} first")
+        if attribute is Setting.INTEGRATOR:
+            known = " or ".join(f"integrator={name!r}" for name in setup.task.integrators)
+            raise AttributeError(f"it is compiled into the step: make an environment with {known}")
+        if setup.randomization.distributions:
+            raise AttributeError("actuator and model are drawn at every reset: give `randomize` a distribution of it")
+        if isinstance(attribute, ModelNumber):
+            _write_number(name, attribute, value, setup, model)
+            return setup
+        if attribute is Setting.STEP:
+            return _write_step(value, setup, model)
+        return _write_forces(value, setup, model, each=attribute is Setting.FORCES)
     except ValueError as error:
         raise ValueError(f"{name} = {value!r}: {error}") from None
     except AttributeError as error:
@@ -95,26 +109,6 @@ def _number(value: Any, positive: bool) -> float:
         if number > 0.0 or not positive:
             return number
     raise ValueError("must be a finite number" + " > 0" * positive)
-
-
-def _write(name: str, value: Any, setup: Setup, model: Any) -> Setup:
-    """See `written`; the messages are the remedy, or what the value must be."""
-    attribute = setup.task.attributes[name]
-    if isinstance(attribute, Fixed):
-        raise AttributeError(attribute.remedy)
-    if isinstance(attribute, Follows):
-        raise AttributeError(f"write {' and '.join(attribute.names)} first")
-    if attribute is Setting.INTEGRATOR:
-        known = " or ".join(f"integrator={name!r}" for name in setup.task.integrators)
-        raise AttributeError(f"it is compiled into the step: make an environment with {known}")
-    if setup.randomization.distributions:
-        raise AttributeError("actuator and model are drawn at every reset: give `randomize` a distribution of it")
-    if isinstance(attribute, ModelNumber):
-        _write_number(name, attribute, value, setup, model)
-        return setup
-    if attribute is Setting.STEP:
-        return _write_step(value, setup, model)
-    return _write_forces(value, setup, model, each=attribute is Setting.FORCES)
 
 
 def _write_number(name: str, attribute: ModelNumber, value: Any, setup: Setup, model: Any) -> None:

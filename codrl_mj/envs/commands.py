@@ -9,8 +9,8 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel, Command, Ideal
 from codrl_mj.disturbances import OFF, Disturbances
+from codrl_mj.engine.specs import ON_JOINT
 from codrl_mj.physics.disturber import Disturber
-from codrl_mj.specs import ON_JOINT
 from codrl_mj.tasks import Task
 
 
@@ -27,12 +27,8 @@ def command_of(actuator: ActuatorModel, name: str, whose: str = "") -> Command:
         raise ValueError(
             f"action = {name!r}: must be one of {names}, which the {kind} takes; or choose another actuator"
         )
-    return known[name]
-
-
-def fixed_by(command: Command, name: str) -> dict[str, str]:
-    """Fields of an actuator that cannot be drawn under the command of a name -> why."""
-    return {field: f"with action={name!r} {why}" for field, why in command.fixed.items()}
+    command = known[name]
+    return command._replace(fixed={field: f"with action={name!r} {why}" for field, why in command.fixed.items()})
 
 
 class TaskCommands:
@@ -60,7 +56,7 @@ class TaskCommands:
         """What is simulated, one for each motor: the actuator, or what a command leaves of it."""
         self.tracks = self.simulated[0].tracks
         """Whether a force is asked for; otherwise what is delivered counts as desired."""
-        self.fixed = fixed_by(chosen[0], name)
+        self.fixed = chosen[0].fixed
         """Fields of the actuator that cannot be drawn -> why."""
         scales = np.array([command.torque_per_unit / command.actuator.arm_radius for command in chosen])
         limits = [command.limit for command in chosen]
@@ -173,7 +169,7 @@ class ControlCommands:
         """
         self.action_space, model, indices = actions, data.model, list(motors)
         self._scales: np.ndarray | None = None
-        self._disturber: Disturber | None = None
+        self._disturber, self._dofs = Disturber(OFF, 1.0, np.zeros(0), 1), list[int]()
         meant = {index: command for index, command in motors.items() if command is not None}
         remedies = {"action": "use action='force', its own"} if meant else {}
         remedies |= {} if disturbances == OFF else {"disturbances": "they are what can be disturbed"}
@@ -227,11 +223,11 @@ class ControlCommands:
     @property
     def memory(self) -> dict[str, np.ndarray]:
         """The commands on their way and the pulses to come, a live array, if there are disturbances."""
-        return {} if self._disturber is None else {"disturbances": self._disturber.memory}
+        return {"disturbances": self._disturber.memory} if self._disturber.on else {}
 
     def begin(self, key: float) -> None:
         """Forget everything at the start of an episode with this key of random numbers."""
-        if self._disturber is not None:
+        if self._disturber.on:
             self._disturber.reset(np.zeros(1, dtype=int), key)
             self._data.qfrc_applied[self._dofs] = 0.0
 
@@ -241,14 +237,15 @@ class ControlCommands:
             if np.shape(action) != self.action_space.shape:
                 raise ValueError(f"action has shape {np.shape(action)}: must be {self.action_space.shape}")
             action = np.asarray(action, dtype=np.float64) * self._scales
-        if self._disturber is None:
+        if not self._disturber.on:
             return action
         arrived = np.array(action, dtype=np.float64)
         wanted = arrived[self._controls] * self._gains
-        arrived[self._controls] = self._disturber.commands(wanted[np.newaxis])[0] / self._gains
+        commands, loads = (each[0] for each in self._disturber.disturbed(wanted[np.newaxis]))
+        arrived[self._controls] = commands / self._gains
         if self._pulses:
             self._data.qfrc_applied[self._dofs] = 0.0
-            np.add.at(self._data.qfrc_applied, self._dofs, self._disturber.loads()[0])
+            np.add.at(self._data.qfrc_applied, self._dofs, loads)
         return arrived
 
 

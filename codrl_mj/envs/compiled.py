@@ -37,7 +37,7 @@ from codrl_mj.engine.memory import floats, internal, on_stack
 from codrl_mj.envs.setup import Setup
 from codrl_mj.kept import njit
 from codrl_mj.physics.compiled_task import Compiled, Outcomes, compiled_outcomes
-from codrl_mj.physics.rows import Lane, Rows, claim, complain, finish, load, store
+from codrl_mj.physics.rows import BROKEN, CLAIMED, DONE, Lane, Rows, load, store, tallied
 from codrl_mj.physics.stepping import Stepping
 
 RANDOM, OPTIONS = 0, 1
@@ -158,20 +158,13 @@ def _kernels(
 
     @internal
     def look(
-        row: np.ndarray,
-        observation: np.ndarray,
-        state: np.ndarray,
-        model: int,
-        data: int,
-        settings: np.ndarray,
-        memory: np.ndarray,
-        trace: np.ndarray,
+        row: np.ndarray, observation: np.ndarray, state: np.ndarray, model: int, data: int, settings: np.ndarray
     ) -> None:
-        read(state, model, data, settings, memory, trace)
+        read(state, data)
         observe(state, observation)
         if sensors > 0:
             seen = numba.carray(on_stack(len(row) * sensors), (len(row), sensors))
-            observed(row, seen, model, data, settings, memory, trace)
+            observed(row, seen, model, data, settings)
             first = len(observation) - seen.size
             for motor in range(len(row)):
                 for entry in range(sensors):
@@ -189,10 +182,10 @@ def _kernels(
         trace: np.ndarray,
     ) -> tuple[float, bool, bool]:
         before, after = numba.carray(on_stack(size), size), numba.carray(on_stack(size), size)
-        read(before, model, data, settings, memory, trace)
+        read(before, data)
         fine = advance(force, model, data, settings, memory, trace)
         last = trace[len(trace) - 1]
-        look(last, observation, after, model, data, settings, memory, trace)
+        look(last, observation, after, model, data, settings)
         reward = rewarded(before, delivered(last[:, 1]), after, interface[OPTIONS:])
         return reward, ended(after), fine
 
@@ -216,9 +209,9 @@ def _kernels(
         for entry in range(size):
             state[entry] = entries[entry]
         key = generator.random() * LARGEST_KEY if interface[RANDOM] != 0.0 else 0.0
-        start(state, key, model, data, settings, memory, trace)
+        start(state, key, model, data, settings, memory)
         nothing = np.zeros((trace.shape[1], trace.shape[2]))
-        look(nothing, observation, state, model, data, settings, memory, trace)
+        look(nothing, observation, state, model, data, settings)
 
     @compiled
     def step_rows(tally: np.ndarray, at_once: int, lane: Any, rows: Any, interface: np.ndarray, steps: Any) -> None:
@@ -226,7 +219,7 @@ def _kernels(
         stepping, observations, signals, elapsed = steps.stepping, steps.observations, steps.signals, steps.elapsed
         model, data, settings, trace = lane.model, lane.data, lane.settings, lane.trace
         last, count = trace[len(trace) - 1], len(stepping)
-        first = claim(tally, at_once)
+        first = tallied(tally, CLAIMED, at_once)
         while first < count:
             end = min(first + at_once, count)
             for row in range(first, end):
@@ -240,12 +233,12 @@ def _kernels(
                 steps.terminated[row] = over and stepping[row]
                 steps.truncated[row] = elapsed[row] >= steps.limit and stepping[row]
                 if not fine:
-                    complain(tally)
+                    tallied(tally, BROKEN, 1)
                 for motor in range(len(last)):
                     for column in range(len(signals)):
                         signals[column, row, motor] = last[motor, 1 + column]
-            finish(tally, end - first)
-            first = claim(tally, at_once)
+            tallied(tally, DONE, end - first)
+            first = tallied(tally, CLAIMED, at_once)
 
     @compiled
     def observe_rows(which: np.ndarray, lane: Any, rows: Any, observations: np.ndarray) -> None:
@@ -254,6 +247,6 @@ def _kernels(
         nothing, state = np.zeros((trace.shape[1], trace.shape[2])), np.empty(size)
         for row in which:
             load(rows, row, lane)
-            look(nothing, observations[row], state, model, data, settings, rows.memory[row], trace)
+            look(nothing, observations[row], state, model, data, settings)
 
     return Kernels(step, reset, step_rows, observe_rows)

@@ -73,30 +73,26 @@ class EnvConfig:
 
     def __post_init__(self) -> None:
         """Validate, and turn what files and users write into what it stands for, and numpy's values into Python's."""
+        kept = {field.name: _plain(getattr(self, field.name)) for field in dataclasses.fields(self)}
+        world = find_world(kept["task"])
+        kept |= {"task": world.reference, "joint": resolve(kept["joint"], PLAIN)}
+        kept["disturbances"] = resolve(kept["disturbances"], OFF)
         for field in dataclasses.fields(self):
-            self._set(field.name, _plain(getattr(self, field.name)))
-        world = find_world(self.task)
-        self._set("task", world.reference)
-        self._set("disturbances", resolve(self.disturbances, OFF))
-        self._set("joint", resolve(self.joint, PLAIN))
-        for field in dataclasses.fields(self):
-            if field.name not in world.fields and getattr(self, field.name) != field.default:
-                raise ValueError(f"{field.name} = {getattr(self, field.name)!r}: {world.name} has none: leave it out")
-        self._set("actuator", world.actuators(self.actuator))
-        if isinstance(self.levels, list | tuple):
-            self._set("levels", tuple(map(_plain, self.levels)))
-        if self.randomize is not None:
-            self._set("randomize", tuple(f"{path}={one}" for path, one in paths_of(self.randomize).items()))
-        self._set("options", world.options(self.options))
+            if field.name not in world.fields and kept[field.name] != field.default:
+                raise ValueError(f"{field.name} = {kept[field.name]!r}: {world.name} has none: leave it out")
+        kept["actuator"] = world.actuators(kept["actuator"])
+        if isinstance(kept["levels"], list | tuple):
+            kept["levels"] = tuple(map(_plain, kept["levels"]))
+        if kept["randomize"] is not None:
+            kept["randomize"] = tuple(f"{path}={one}" for path, one in paths_of(kept["randomize"]).items())
+        kept["options"] = world.options(kept["options"])
         for name in ("observe_actuator", "allow_unstable"):
-            if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"{name} = {getattr(self, name)!r}: must be true or false")
-        limit = self.max_episode_steps
+            if not isinstance(kept[name], bool):
+                raise ValueError(f"{name} = {kept[name]!r}: must be true or false")
+        limit = kept["max_episode_steps"]
         if limit is not None and (isinstance(limit, bool) or not isinstance(limit, int) or limit < 1):
             raise ValueError(f"max_episode_steps = {limit!r}: must be an integer >= 1")
-
-    def _set(self, name: str, value: Any) -> None:
-        object.__setattr__(self, name, value)
+        vars(self).update(kept)
 
     @classmethod
     def of(cls, task: str, actuator: Any, arguments: Mapping[str, Any]) -> "EnvConfig":
@@ -152,12 +148,6 @@ class EnvConfig:
         return self.world.action_space(self)
 
     @property
-    def as_posed(self) -> "EnvConfig":
-        """The environment without changes of time limit and reward."""
-        posed: dict[str, Any] = dict.fromkeys(self.world.posed)
-        return dataclasses.replace(self, **posed)
-
-    @property
     def code(self) -> set[str | Path]:
         """Modules, by name, and files that decide on what it does: the world's and those of the actuators' families."""
         return {type(one).__module__ for one in self.actuators} | self.world.code(self.options)
@@ -166,10 +156,6 @@ class EnvConfig:
     def interface(self) -> dict[str, Any]:
         """The fields that say what a policy commands and observes: it can do nothing else once it is trained."""
         return {name: getattr(self, name) for name in ("action", "levels", "observe_actuator")}
-
-    def seen_as(self, trained: "EnvConfig") -> "EnvConfig":
-        """This environment with the actions and observations of another: those that a policy was trained with."""
-        return dataclasses.replace(self, **trained.interface)
 
     def as_arguments(self) -> dict[str, Any]:
         """The keyword arguments for `gymnasium.make` with a task's id, without those left at their defaults."""

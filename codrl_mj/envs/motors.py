@@ -15,12 +15,12 @@ from codrl_mj.disturbances import OFF, Disturbances
 from codrl_mj.engine.families import signals_at
 from codrl_mj.engine.plugin import PLUGIN_HEAD
 from codrl_mj.engine.reading import Readout, bring_to_rest, slots
-from codrl_mj.envs.commands import ControlCommands, command_of, fixed_by
+from codrl_mj.engine.specs import matched_by, names_of
+from codrl_mj.envs.commands import ControlCommands, command_of
 from codrl_mj.envs.distributions import paths_of
 from codrl_mj.envs.randomization import Draws, Randomization, put_into
 from codrl_mj.physics.base import diverged, named_signals
 from codrl_mj.physics.variation import without_motors, write_fields
-from codrl_mj.specs import matched_by, names_of
 
 _POSITION = int(mujoco.mjtWarning.mjWARN_BADQPOS)  # followed by those of speeds, accelerations and controls
 
@@ -73,7 +73,7 @@ class Motors:
         self.action_space = self._commands.action_space
         self.controls = self._commands.controls
         """(one of `action_space`) -> the environment's own action, as it arrives."""
-        fixed = [fixed_by(meant[index], settings.action) if index in meant else {} for index in nominal]
+        fixed = [meant[index].fixed if index in meant else {} for index in nominal]
         distributions, timestep = paths_of(settings.randomize), model.opt.timestep
         bare = without_motors(model, nominal) if distributions else model
         randomization = Randomization(
@@ -84,8 +84,8 @@ class Motors:
         self._random = drawn or any(one.random for one in nominal.values())
         self.names = motor_names(model, self.present)
         """What the motors are called."""
-        families = {name: _family(one) for name, one in zip(self.names, self.present.values(), strict=True)}
-        self.sensors = sensor_names(families) if settings.observe_actuator else ()
+        families: list[Family] = list(map(type, self.present.values()))
+        self.sensors = sensor_names(dict(zip(self.names, families, strict=True))) if settings.observe_actuator else ()
         """Names of what `seen` returns, which an observation ends with."""
         self._parameters = list(map(_parameters, self.present.values()))
 
@@ -124,8 +124,9 @@ class Motors:
         values: list[float] = []
         for motor, parameters, slot in zip(self.present.values(), self._parameters, self._slots, strict=True):
             if motor.OBSERVED:
-                start, count = signals_at(_family(motor)), len(_family(motor).Signals._fields)
-                signals = _family(motor).Signals(*slot[start : start + count].tolist())
+                family: Family = type(motor)
+                start, count = signals_at(family), len(family.Signals._fields)
+                signals = family.Signals(*slot[start : start + count].tolist())
                 inputs = Inputs(0.0, 0.0, 0.0, self.data.time, float(slot[1]))
                 values += motor.observe(parameters, self.data.model.opt.timestep, signals, inputs)
         return np.array(values)
@@ -146,11 +147,6 @@ class Motors:
             of = {_POSITION: "position", _POSITION + 1: "speed"}.get(kind, "acceleration")
             what = f"the {of} of {model.joint(joint).name or f'joint {joint}'}"
         raise diverged(who, time, f"{what} is no number, or too large", f"the model's {model.opt.timestep:g} s")
-
-    @property
-    def randomization(self) -> dict[str, Any]:
-        """What the present episode was drawn with, as `info` says; empty if nothing was."""
-        return self.draws.report()
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """What it remembers besides the simulation's state: commands on their way, and draws."""
@@ -191,9 +187,6 @@ def longer(space: spaces.Space, count: int) -> spaces.Box:
     return spaces.Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype.type)
 
 
-def _family(motor: ActuatorModel) -> Family:
-    return type(motor)
-
-
 def _parameters(motor: ActuatorModel) -> Any:
-    return parameters_type(_family(motor))(*motor.numbers)
+    family: Family = type(motor)
+    return parameters_type(family)(*motor.numbers)

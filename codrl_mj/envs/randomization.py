@@ -17,10 +17,10 @@ from codrl_mj.actuators import (
     parameter_paths,
     unchecked,
 )
+from codrl_mj.engine.specs import matched_by, names_of, refuse_unmatched
 from codrl_mj.envs.distributions import MODEL, Choice, Distribution, split_path
 from codrl_mj.fields import did_you_mean
 from codrl_mj.physics.variation import Variation, mounting_of, mounts_of, variable
-from codrl_mj.specs import matched_by, names_of, refuse_unmatched
 
 LIMIT = 1000
 """Draws of an unstable loop in a row after which a reset gives up."""
@@ -116,7 +116,11 @@ class Draws:
                 values[pending, column] = distribution.transform(draws[:, column].copy())
             if drawn.allow_unstable or not drawn.draws_actuator:
                 break
-            pending = pending[self._unstable(rows[pending], values[pending])]
+            unstable, fields = np.zeros(len(pending), dtype=bool), self._fields(rows[pending], values[pending])
+            for family, columns, each in zip(drawn.families, drawn.columns, fields, strict=True):
+                if columns:
+                    unstable |= ~(family.instability(numbers_of(family, each), drawn.timestep) < 1.0)
+            pending = pending[unstable]
             rejected[pending] += 1
             if len(pending) and rejected[pending[0]] == LIMIT:
                 raise ValueError(
@@ -126,14 +130,6 @@ class Draws:
                 )
         self._values[rows], self._rejected[rows] = values, rejected
         self._put(self, rows)
-
-    def _unstable(self, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Which simulations would have a motor that is unstable with drawn values (m, k), shape (m,)."""
-        drawn, unstable = self.randomization, np.zeros(len(rows), dtype=bool)
-        for family, columns, each in zip(drawn.families, drawn.columns, self._fields(rows, values), strict=True):
-            if columns:
-                unstable |= ~(family.instability(numbers_of(family, each), drawn.timestep) < 1.0)
-        return unstable
 
     def _last(self, row: np.ndarray, values: np.ndarray) -> str:
         """What a simulation was drawn with, and what the first refused motor says of itself."""

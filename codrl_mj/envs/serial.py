@@ -73,7 +73,12 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
 
         Also how many sets were `rejected`; empty if nothing is drawn.
         """
-        drawn = [_flat(one) for one in self._of_each("randomization")]
+        drawn = []
+        for one in self._of_each("randomization"):
+            nested = {name: each if isinstance(each, Mapping) else {"": each} for name, each in one.items()}
+            drawn.append(
+                {f"{of}:{name}".rstrip(":"): value for of, each in nested.items() for name, value in each.items()}
+            )
         kinds = {name: np.int64 if name == "rejected" else np.float64 for name in drawn[0]}
         return {name: np.array([one[name] for one in drawn], kind) for name, kind in kinds.items()}
 
@@ -140,9 +145,3 @@ def _limited(limit: int | None, make: Callable[..., Any], arguments: Mapping[str
     """One environment, with a time limit [steps] if one is given."""
     env = make(**arguments)
     return env if limit is None else TimeLimit(env, int(limit))
-
-
-def _flat(drawn: Mapping[str, Any]) -> dict[str, Any]:
-    """What an episode was drawn with, the fields of a pattern's motors beside those of the model."""
-    nested = {name: one if isinstance(one, Mapping) else {"": one} for name, one in drawn.items()}
-    return {f"{name}:{field}".rstrip(":"): value for name, one in nested.items() for field, value in one.items()}

@@ -15,7 +15,8 @@ from codrl_mj.envs.commands import TaskCommands
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.motors import longer, sensor_names
 from codrl_mj.envs.randomization import Randomization
-from codrl_mj.physics import Physics, Plant, Signals, find_physics
+from codrl_mj.own_code import look_up
+from codrl_mj.physics import PHYSICS, Physics, Plant, Signals
 from codrl_mj.physics.base import named_signals
 from codrl_mj.physics.compiled_task import Outcomes, compiled_outcomes
 from codrl_mj.physics.mjcf import task_model
@@ -84,7 +85,7 @@ class Setup:
 
     def simulate(self, physics: str) -> Physics:
         """A new simulation on the given physics."""
-        made = find_physics(physics)(self.plant)
+        made: Physics = look_up(physics, PHYSICS, "physics", anybodys=False)(self.plant)
         if made.scene is None and self.randomization.variation is not None:
             names = ", ".join(self.randomization.in_model)
             raise ValueError(

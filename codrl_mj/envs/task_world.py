@@ -15,8 +15,8 @@ from gymnasium.vector import AutoresetMode
 from codrl_mj.actuators import ActuatorModel
 from codrl_mj.envs.worlds import COMMON, World, described, patterns_of, world_of
 from codrl_mj.fields import did_you_mean, field_docs
+from codrl_mj.own_code import asset_path
 from codrl_mj.tasks import TASKS, Task, find_task, reference_of, register, resolve_actuators
-from codrl_mj.tasks.assets import asset_path
 
 
 class UnknownOptionError(ValueError, TypeError):
@@ -35,6 +35,7 @@ class TaskWorld(World):
         self.time_limit, self.paper = task.max_episode_steps, tuple(task.paper)
         self.default_actuator = task.default_actuator
         self.goal_hold, self.timed = task.goal_hold, task.goal is not None
+        self.option_names = task.options._fields
 
     def make(self, config: Any, **view: Any) -> Any:
         """An environment, made by Gymnasium; `view` as for `codrl_mj.envs.ActuatedEnv`."""
@@ -78,11 +79,6 @@ class TaskWorld(World):
     def changed(self, options: Any) -> dict[str, Any]:
         """Those of the options that are not at their defaults."""
         return {name: value for name, value in options._asdict().items() if value != options._field_defaults[name]}
-
-    @property
-    def option_names(self) -> tuple[str, ...]:
-        """Of the task's options."""
-        return self.task.options._fields
 
     def option_flags(self, config: Any) -> list[tuple[str, Any, str, Any]]:
         """Those of all tasks: another's is refused by its name."""
@@ -190,7 +186,8 @@ class TaskWorld(World):
         setup, motors = Setup.build(config), config.actuators
         of_sensors = [motors[0].SIGNAL_UNITS.get(name.rpartition(".")[2]) for name in setup.sensors]
         seen = described(setup.observation_names, setup.observation_space, [*self.task.observation_units, *of_sensors])
-        at_joint = ["N*m" if unit == "rad" else "N" for unit in self.task.joint_units]
+        driven = [self.task.state_names[self.task.qpos[self.task.qvel.index(at)]] for at in self.task.speeds]
+        at_joint = ["N*m" if name.endswith("[rad]") else "N" for name in driven]
         forced = config.action == "force"
         units = at_joint if forced else [command_of(one, config.action).unit for one in motors]
         commands = setup.commands

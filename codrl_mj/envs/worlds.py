@@ -65,6 +65,8 @@ class World(abc.ABC):
     """How long an episode that succeeds has been at the goal when it ends [s]."""
     timed: bool = False
     """Whether its goal is reached at a time, and not kept all the time."""
+    option_names: tuple[str, ...] = ()
+    """Names of options that it declares; none where they are what its environments take."""
 
     @abc.abstractmethod
     def make(self, config: Any, **view: Any) -> Any:
@@ -125,11 +127,6 @@ class World(abc.ABC):
         """Those of the options that are not at their defaults, by name."""
         return dict(options)
 
-    @property
-    def option_names(self) -> tuple[str, ...]:
-        """Names of options that it declares; none where they are what its environments take."""
-        return ()
-
     def option_flags(self, config: Any) -> list[tuple[str, Any, str, Any]]:
         """Name, type, description and default of the flags for its options."""
         written = tuple(f"{name}={json.dumps(value)}" for name, value in config.options.items())
@@ -159,7 +156,7 @@ class World(abc.ABC):
         Raises:
             ValueError: it is none, or one of its values is out of bounds.
         """
-        from codrl_mj.specs import resolve_patterns
+        from codrl_mj.engine.specs import resolve_patterns
 
         if given in ({}, []) or isinstance(given, list | tuple):
             raise ValueError(f"actuator = {given!r}: must be one for all, or what drives what, such as {{'.*': 'lag'}}")
@@ -172,7 +169,7 @@ class World(abc.ABC):
 
     def overlaid(self, config: Any, patterns: Mapping[str, Any]) -> dict[str, Any]:
         """Pattern -> what drives these motors: `patterns`, and what a configuration has for others, motor by motor."""
-        from codrl_mj.specs import matched_by, names_of
+        from codrl_mj.engine.specs import matched_by, names_of
 
         if all(one == IDEAL for one in config.actuators):
             return dict(patterns)
@@ -283,17 +280,15 @@ def patterns_of(given: Any) -> Mapping[str, Any] | None:
     """What a user wrote for actuators, if it is a mapping of patterns to them; None if it is one for all."""
     if not isinstance(given, Mapping) or {"family", "name"} & given.keys():
         return None
-    parts = [
-        one is None
-        or isinstance(one, str | Path | ActuatorModel)
-        or (isinstance(one, Mapping) and (bool({"family", "name"} & one.keys()) or any(map(_is_part, one.values()))))
-        for one in given.values()
-    ]
-    return given if parts and all(parts) else None
-
-
-def _is_part(value: Any) -> bool:
-    return dataclasses.is_dataclass(value) or isinstance(value, Mapping)
+    for one in given.values():
+        fields = one.items() if isinstance(one, Mapping) else ()
+        of_actuator = any(
+            name in ("family", "name") or dataclasses.is_dataclass(value) or isinstance(value, Mapping)
+            for name, value in fields
+        )
+        if not (one is None or of_actuator or isinstance(one, str | Path | ActuatorModel)):
+            return None
+    return given or None
 
 
 def is_world(word: str) -> bool:

@@ -10,7 +10,7 @@ from typing import Any
 import mujoco
 
 from codrl_mj.actuators import ActuatorModel
-from codrl_mj.specs import matched_by, motorise, names_of, refuse_unmatched, resolve_patterns
+from codrl_mj.engine.specs import matched_by, motorise, names_of, refuse_unmatched, resolve_patterns
 from codrl_mj.tasks import TASKS
 
 
@@ -27,10 +27,18 @@ class Building:
     def motorising(self) -> Iterator[None]:
         """Give motors to every model that this thread builds from XML in a `with` block."""
         token = _PRESENT.set(self)
+        with _LOCK:
+            for name, spec in _SPECS.items() if not _BLOCKS else ():
+                _PLAIN.callback(setattr, mujoco.MjModel, name, vars(mujoco.MjModel)[name])
+                setattr(mujoco.MjModel, name, staticmethod(_loader(getattr(mujoco.MjModel, name), spec)))
+            _BLOCKS.append(self)
         try:
-            with _HOOK:
-                yield
+            yield
         finally:
+            with _LOCK:
+                _BLOCKS.remove(self)
+                if not _BLOCKS:
+                    _PLAIN.close()
             _PRESENT.reset(token)
 
     def motorised(self, plain: mujoco.MjModel, spec: Callable[[], mujoco.MjSpec]) -> mujoco.MjModel:
@@ -49,18 +57,12 @@ class Building:
         if not wanted:
             return plain
         with warnings.catch_warnings():  # MuJoCo's of the model, which building it without motors has shown
-            warnings.filterwarnings("ignore", category=UserWarning, module=r"codrl_mj\.(specs|foreign\.building)")
+            ours = r"codrl_mj\.(engine\.specs|foreign\.building)"
+            warnings.filterwarnings("ignore", category=UserWarning, module=ours)
             return motorise(spec(), wanted, self._allow_unstable).compile()
 
     def check(self, env_id: str = "") -> None:
-        """Refuse patterns that were of no use.
-
-        Args:
-            env_id: of the environment of Gymnasium's that was built, if it was one.
-
-        Raises:
-            ValueError: no model was built, or a pattern matched nothing in any of them.
-        """
+        """Refuse patterns that matched nothing, and an environment, of Gymnasium's if it has an id, without a model."""
         if not self._met and env_id:
             task = next((task.name for task in TASKS.values() if task.gymnasium_id == env_id), None)
             remedy = f"take {task!r}, our task of it that has" if task else "only environments that have can get motors"
@@ -104,31 +106,18 @@ _PRESENT: contextvars.ContextVar[Building | None] = contextvars.ContextVar("pres
 """What the models of this thread are built with."""
 
 
-class _Hook:
-    """Stands in for MuJoCo's two ways to build a model from XML while any thread is in a block of `motorising`."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._users = 0
-        self._plain: dict[str, Any] = {}
-
-    def __enter__(self) -> None:
-        with self._lock:
-            self._users += 1
-            if self._users == 1:
-                for name, spec in (("from_xml_path", _spec_of_path), ("from_xml_string", _spec_of_string)):
-                    self._plain[name] = vars(mujoco.MjModel)[name]
-                    setattr(mujoco.MjModel, name, staticmethod(_loader(getattr(mujoco.MjModel, name), spec)))
-
-    def __exit__(self, *_: object) -> None:
-        with self._lock:
-            self._users -= 1
-            if self._users == 0:
-                for name, plain in self._plain.items():
-                    setattr(mujoco.MjModel, name, plain)
-
-
-_HOOK = _Hook()
+_SPECS: dict[str, Callable[..., mujoco.MjSpec]] = {
+    "from_xml_path": lambda filename, assets=None, vfs=None: mujoco.MjSpec.from_file(
+        filename, include=assets, assets=assets, vfs=vfs
+    ),
+    "from_xml_string": lambda xml, assets=None, vfs=None: mujoco.MjSpec.from_string(
+        xml, include=assets, assets=assets, vfs=vfs
+    ),
+}
+"""MuJoCo's two ways to build a model from XML -> what reads its spec from the same arguments."""
+_LOCK, _PLAIN = threading.Lock(), contextlib.ExitStack()
+_BLOCKS: list[Building] = []
+"""The blocks of `motorising` that any thread is in: while there are any, models are built by `_loader`s."""
 
 
 def _loader(plain: Callable[..., mujoco.MjModel], spec: Callable[..., mujoco.MjSpec]) -> Callable[..., mujoco.MjModel]:
@@ -137,11 +126,3 @@ def _loader(plain: Callable[..., mujoco.MjModel], spec: Callable[..., mujoco.MjS
         return model if building is None else building.motorised(model, lambda: spec(*arguments, **options))
 
     return load
-
-
-def _spec_of_path(filename: str, assets: Any = None, vfs: Any = None) -> mujoco.MjSpec:
-    return mujoco.MjSpec.from_file(filename, include=assets, assets=assets, vfs=vfs)
-
-
-def _spec_of_string(xml: str, assets: Any = None, vfs: Any = None) -> mujoco.MjSpec:
-    return mujoco.MjSpec.from_string(xml, include=assets, assets=assets, vfs=vfs)

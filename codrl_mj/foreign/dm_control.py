@@ -13,10 +13,10 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel
 from codrl_mj.disturbances import OFF, resolve
+from codrl_mj.engine.specs import resolve_patterns
 from codrl_mj.envs.motors import Motors, MotorSettings
 from codrl_mj.fields import did_you_mean
 from codrl_mj.foreign.building import Building
-from codrl_mj.specs import resolve_patterns
 
 
 class MotorisedEnvironment(dm_env.Environment):
@@ -95,7 +95,7 @@ class MotorisedEnvironment(dm_env.Environment):
     @property
     def randomization(self) -> dict[str, Any]:
         """What the present episode was drawn with; empty if nothing was drawn."""
-        return self._motors.randomization
+        return self._motors.draws.report()
 
     def signals(self) -> dict[str, Any]:
         """The motors' signals after the last step, as in `info` of `codrl_mj.make`.

@@ -17,6 +17,7 @@ from gymnasium.utils import RecordConstructorArgs
 from codrl_mj.actuators import ActuatorModel
 from codrl_mj.disturbances import OFF, resolve
 from codrl_mj.engine.reading import bring_to_rest, motors, slots
+from codrl_mj.engine.specs import resolve_patterns
 from codrl_mj.envs.motors import Motors, MotorSettings, longer
 from codrl_mj.envs.recording import StepWatch
 from codrl_mj.envs.snapshots import (
@@ -30,7 +31,6 @@ from codrl_mj.envs.snapshots import (
 )
 from codrl_mj.foreign.building import Building
 from codrl_mj.physics.streams import words_of
-from codrl_mj.specs import resolve_patterns
 
 
 def make(
@@ -88,17 +88,17 @@ def make(
         resolve(disturbances, OFF),
         allow_unstable,
     )
-    spec = copy.copy(entry)
-    spec.entry_point = Motorised(entry.entry_point, settings, env_id)
+    spec, makes = copy.copy(entry), entry.entry_point
+    spec.entry_point = Motorised(load_env_creator(makes) if isinstance(makes, str) else makes, settings, env_id)
     return MotorisedEnv(gymnasium.make(spec, **options))
 
 
 @dataclasses.dataclass(frozen=True)
 class Motorised:
-    """What makes an environment with motors, in place of the entry point that makes it without."""
+    """What makes an environment with motors, in place of what makes it without."""
 
-    entry_point: Any
-    """Makes it without."""
+    creator: Any
+    """A class or function that makes it without."""
     settings: MotorSettings
     """Of the motors."""
     env_id: str
@@ -107,15 +107,11 @@ class Motorised:
     @property
     def metadata(self) -> dict[str, Any]:
         """The environment's, which `gymnasium.make` asks for."""
-        return self._creator.metadata  # an AttributeError where a plain function makes the environment
-
-    @property
-    def _creator(self) -> Any:
-        return load_env_creator(self.entry_point) if isinstance(self.entry_point, str) else self.entry_point
+        return self.creator.metadata  # an AttributeError where a plain function makes the environment
 
     def __call__(self, **options: Any) -> gymnasium.Env:
         """Make it."""
-        creator, building = self._creator, Building(self.settings.simulated, self.settings.allow_unstable)
+        creator, building = self.creator, Building(self.settings.simulated, self.settings.allow_unstable)
         ours = isinstance(creator, type) and issubclass(creator, MujocoEnv)
         with building.motorising():
             env = _with_motors(creator)(**options) if ours else creator(**options)
@@ -241,7 +237,7 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
     @property
     def randomization(self) -> dict[str, Any]:
         """What the present episode was drawn with, as in the reset's info; empty if nothing was drawn."""
-        return self._motors.randomization
+        return self._motors.draws.report()
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Everything that the future depends on, as plain arrays: simulation, motors, generators, draws, time limit.

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any
 
-from codrl_mj.own_code import look_up
 from codrl_mj.physics.analytic import AnalyticPhysics
 from codrl_mj.physics.base import Physics, Plant, Signals, SimulationDivergedError, signal_names, trace_names
 from codrl_mj.physics.mjcf import hills, install_callbacks, motors, needed_callbacks
@@ -27,11 +26,6 @@ def register_physics(name: str, make: Callable[[Plant], Physics]) -> None:
         raise ValueError(f"physics {name!r} is registered already, as {PHYSICS[name]!r}: choose another name")
 
 
-def find_physics(name: str) -> Callable[[Plant], Physics]:
-    """The physics called `name`."""
-    return look_up(name, PHYSICS, "physics", anybodys=False)
-
-
 __all__ = [
     "PHYSICS",
     "AnalyticPhysics",
@@ -40,7 +34,6 @@ __all__ = [
     "Plant",
     "Signals",
     "SimulationDivergedError",
-    "find_physics",
     "hills",
     "install_callbacks",
     "motors",

@@ -1,19 +1,16 @@
 """A task on the installed Gymnasium environment, unmodified, driven with an arbitrary force through its attributes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, Inputs, parameters_type
-from codrl_mj.physics.base import Plant, check_finite
+from codrl_mj.physics.base import Physics, Plant
 
 
-class AnalyticPhysics:
-    """A task on Gymnasium's own equations. See `codrl_mj.physics.base.Physics`."""
-
-    stepping, arguments = None, ()
-    scene = None
+class AnalyticPhysics(Physics):
+    """A task on Gymnasium's own equations."""
 
     def __init__(self, plant: Plant) -> None:
         """Make the Gymnasium environment.
@@ -31,13 +28,11 @@ class AnalyticPhysics:
         task = plant.task
         if task.twin is None:
             raise ValueError(f"physics = 'analytic': {task.name} rebuilds no environment of Gymnasium's; use 'mujoco'")
-        self.plant = plant
+        super().__init__(plant)
         self.timestep = plant.timestep
         self.twin = task.twin()
         self._actuators: list[tuple[float, Any]] = []
         self.set_actuators(plant.actuators)
-        self._disturber = plant.disturber()
-        self.trace = plant.trace()
         self.reset(np.zeros(len(task.state_names)))
 
     def reset(self, state: np.ndarray, key: float = 0.0) -> None:
@@ -45,7 +40,7 @@ class AnalyticPhysics:
         self.state = np.array(state, dtype=np.float64)
         rest = self.plant.family.State(*[0.0] * len(self.plant.family.State._fields))  # type: ignore[attr-defined]
         self._states = [rest] * len(self._actuators)
-        self._time = 0.0
+        self.time = 0.0
         self._key = key
         self._disturber.reset(np.zeros(1, dtype=np.int64), key)
 
@@ -54,44 +49,28 @@ class AnalyticPhysics:
         kind = parameters_type(self.plant.family)
         self._actuators = [(actuator.arm_radius, kind(*actuator.numbers)) for actuator in actuators]
 
-    def set_model(self, fields: Mapping[str, np.ndarray]) -> None:
-        """Gymnasium's environments have no such fields.
-
-        Raises:
-            ValueError: any is given.
-        """
-        if fields:
-            raise ValueError(
-                f"fields = {', '.join(fields)}: they are a MuJoCo model's, which 'analytic' has not; use 'mujoco'"
-            )
-
     def step(self, desired_force: Any) -> None:
         """See `Physics.step`."""
         desired = np.atleast_2d(np.asarray(desired_force, dtype=np.float64))
         several, speeds = len(self._actuators) > 1, list(self.plant.task.speeds)
         for rows in self.trace:
-            commands = self._disturber.commands(desired)[0]
+            commands, loads = (each[0] for each in self._disturber.disturbed(desired))
             for number, (row, command) in enumerate(zip(rows, commands.tolist(), strict=True)):
                 row[:-1] = command, *self._advance(number, command)
             force: Any = rows[:, 1] if several else float(rows[0, 1])
             if self._disturber.on:
-                loads = self._disturber.loads()[0]
                 force = force + (loads if several else float(loads[0]))
             self.state = self.twin(self.state, force, self.timestep, self.plant.integrator)
-            self._time += self.timestep
+            self.time += self.timestep
             rows[:, -1] = self.state[speeds]
         self.check_finite()
-
-    def check_finite(self) -> None:
-        """See `Physics.check_finite`."""
-        check_finite(self.plant.task, self.state, self._time)
 
     def _advance(self, number: int, command: float) -> tuple[float, ...]:
         """Advance an actuator by one integration step: the force that it delivers, and its signals."""
         arm, parameters = self._actuators[number]
         at = self.plant.task.speeds[number]
         position, speed = self.state[[self.plant.task.qpos[self.plant.task.qvel.index(at)], at]].tolist()
-        inputs = Inputs(command * arm, position / arm, speed / arm, self._time, self._key + number)
+        inputs = Inputs(command * arm, position / arm, speed / arm, self.time, self._key + number)
         self._states[number], torque, signals = self.plant.family.advance(
             parameters, self.timestep, self._states[number], inputs
         )
@@ -105,7 +84,7 @@ class AnalyticPhysics:
                     parameters,
                     self.timestep,
                     self.plant.family.Signals(*signals[2:-1].tolist()),
-                    Inputs(0.0, 0.0, 0.0, self._time, self._key + number),
+                    Inputs(0.0, 0.0, 0.0, self.time, self._key + number),
                 )
                 for number, ((_, parameters), signals) in enumerate(zip(self._actuators, row, strict=True))
             ]
@@ -117,20 +96,12 @@ class AnalyticPhysics:
         `memory` and what `set_actuators` changed are not in it. Gymnasium's environment remembers nothing else.
         """
         states = [value for state in self._states for value in state]
-        return np.array([*self.state, *states, self._time, self._key], dtype=np.float64)
+        return np.array([*self.state, *states, self.time, self._key], dtype=np.float64)
 
     def restore(self, snapshot: np.ndarray) -> None:
         """Continue from what `snapshot` returned."""
         size, kind = len(self.plant.task.state_names), self.plant.family.State
         self.state = snapshot[:size].copy()
-        *values, self._time, self._key = snapshot[size:].tolist()
+        *values, self.time, self._key = snapshot[size:].tolist()
         count = len(kind._fields)  # type: ignore[attr-defined]
         self._states = [kind(*values[at * count : (at + 1) * count]) for at in range(len(self._actuators))]
-
-    @property
-    def memory(self) -> np.ndarray:
-        """What the disturbances remember, a live array; empty if nothing."""
-        return self._disturber.memory.reshape(-1)
-
-    def show(self, state: np.ndarray) -> None:
-        """Nothing: there is no scene."""

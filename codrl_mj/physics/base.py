@@ -1,9 +1,10 @@
 """The small interface behind which a task is simulated."""
 
+import abc
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -42,6 +43,11 @@ def named_signals(names: tuple[str, ...], columns: Any) -> Signals:
     else:
         signals["saturated"] = np.zeros(columns[0].shape, dtype=bool) if isinstance(columns[0], np.ndarray) else False
     return signals
+
+
+LARGEST = 1e10
+"""Largest magnitude of a state entry: MuJoCo's `mjMAXVAL`, beyond which it warns and discards forces. A diverging motor
+need not reach infinity there."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -86,47 +92,40 @@ class Plant:
         return not issubclass(self.family, Ideal)
 
     @property
-    def explicit(self) -> bool:
-        """Whether positions are moved by the old velocity."""
-        return self.integrator == "euler"
-
-    @property
     def timestep(self) -> float:
         """Integration step [s]."""
         return self.task.step_duration / self.inner_steps
 
-    def trace(self) -> np.ndarray:
-        """A new `Physics.trace`."""
-        return np.zeros((self.inner_steps, len(self.actuators), len(trace_names(self.family))))
 
-    def disturber(self, simulations: int = 1) -> Disturber:
-        """What disturbs so many simulations."""
-        return Disturber(self.disturbances, self.timestep, self.max_forces, simulations)
-
-
-class Physics(Protocol):
+class Physics(abc.ABC):
     """One simulation of a plant.
 
     Somebody's own is given to `codrl_mj.physics.register_physics`. What it cannot simulate it refuses when it is made.
     """
 
-    plant: Plant
-    """What is simulated."""
-
-    trace: np.ndarray
-    """What each actuator did in each integration step of the last environment step, shape (inner_steps, actuators,
-    columns), float64; columns as in `trace_names`. A live array: the next step overwrites it."""
-    stepping: Any
+    stepping: Any = None
     """The compiled functions of a loop (see `codrl_mj.physics.stepping.Stepping`); None where a step is Python."""
-    arguments: tuple[Any, ...]
+    arguments: tuple[Any, ...] = ()
     """Their last arguments; none where there are none."""
-    scene: tuple[Any, Any] | None
+    scene: tuple[Any, Any] | None = None
     """The `mujoco.MjModel` and `mujoco.MjData` that it runs on; None where there are none."""
 
     state: np.ndarray
     """The mechanical state in the task's order, shape (n,), float64; not changed by later steps. Set, it moves the
     simulation there, the motor left as it is."""
+    time: float
+    """Since the start of the episode [s]."""
 
+    def __init__(self, plant: Plant) -> None:
+        """Take what is simulated, and make what one of it needs on any physics."""
+        self.plant = plant
+        """What is simulated."""
+        self.trace = np.zeros((plant.inner_steps, len(plant.actuators), len(trace_names(plant.family))))
+        """What each actuator did in each integration step of the last environment step, shape (inner_steps, actuators,
+        columns), float64; columns as in `trace_names`. A live array: the next step overwrites it."""
+        self._disturber = Disturber(plant.disturbances, plant.timestep, plant.max_forces, 1)
+
+    @abc.abstractmethod
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
         """Exchange the actuators for others of their family; to be followed by a reset.
 
@@ -139,7 +138,12 @@ class Physics(Protocol):
         Raises:
             ValueError: it has no such fields, because it is not on a MuJoCo model; none at all is never refused.
         """
+        if fields:
+            raise ValueError(
+                f"fields = {', '.join(fields)}: they are a MuJoCo model's, which 'analytic' has not; use 'mujoco'"
+            )
 
+    @abc.abstractmethod
     def reset(self, state: np.ndarray, key: float = 0.0) -> None:
         """Start an episode from `state`, with the actuators at rest.
 
@@ -148,6 +152,7 @@ class Physics(Protocol):
             key: of the random numbers of the episode's disturbances and sensors.
         """
 
+    @abc.abstractmethod
     def observed(self, row: np.ndarray) -> np.ndarray:
         """What the sensors say at present, shape (actuators, k), with k as the family's `OBSERVED`.
 
@@ -155,16 +160,20 @@ class Physics(Protocol):
             row: the last row of `trace`; zeros at the start of an episode.
         """
 
+    @abc.abstractmethod
     def snapshot(self) -> np.ndarray:
         """Simulation and actuators as a vector, shape (k,), float64, without `memory` and exchanged parameters."""
 
+    @abc.abstractmethod
     def restore(self, snapshot: np.ndarray) -> None:
         """Continue from what `snapshot` returned."""
 
     @property
     def memory(self) -> np.ndarray:
         """What the disturbances remember beside, a live array; empty if nothing."""
+        return self._disturber.memory.reshape(-1)
 
+    @abc.abstractmethod
     def step(self, desired_force: Any) -> None:
         """Advance by one environment step, with the desired force (at most the task's `max_force`) held over it.
 
@@ -176,34 +185,27 @@ class Physics(Protocol):
         """
 
     def check_finite(self) -> None:
-        """Raise if the present state is not finite or too large to be trusted; where `stepping` steps, they ask it.
+        """Raise if the state left the finite numbers or is beyond `LARGEST`, saying which entry and when.
 
         Raises:
-            SimulationDivergedError: as it says.
+            SimulationDivergedError: it did.
         """
+        state, task = self.state, self.plant.task
+        if state @ state <= LARGEST:  # the quick answer; false for NaN too
+            return
+        fine = np.abs(state) <= LARGEST
+        if fine.all():
+            return
+        broken = ", ".join(f"{n} = {v:g}" for n, v, ok in zip(task.state_names, state, fine, strict=True) if not ok)
+        raise diverged(task.name, self.time, broken)
 
     def show(self, state: np.ndarray) -> None:
         """Bring the bodies of `scene` to a state, for drawing; the simulation is left alone otherwise."""
+        del state  # without a scene
 
 
 class SimulationDivergedError(ArithmeticError):
     """A simulation left the finite numbers, or the range in which MuJoCo trusts its own."""
-
-
-LARGEST = 1e10
-"""Largest magnitude of a state entry: MuJoCo's `mjMAXVAL`, beyond which it warns and discards forces. A diverging motor
-need not reach infinity there."""
-
-
-def check_finite(task: Task, state: np.ndarray, time: float) -> None:
-    """Raise if `state` is not finite or beyond `LARGEST`, saying which entry of which task and when."""
-    if state @ state <= LARGEST:  # the quick answer; false for NaN too
-        return
-    fine = np.abs(state) <= LARGEST
-    if fine.all():
-        return
-    broken = ", ".join(f"{n} = {v:g}" for n, v, ok in zip(task.state_names, state, fine, strict=True) if not ok)
-    raise diverged(task.name, time, broken)
 
 
 def diverged(who: str, time: float, broken: str, step: str = "inner_steps") -> SimulationDivergedError:

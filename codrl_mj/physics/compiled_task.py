@@ -13,7 +13,7 @@ from numba import types
 from numba.np.unsafe.ndarray import to_fixed_tuple
 
 from codrl_mj.engine.families import compiled_function
-from codrl_mj.engine.memory import entries_type, floats, internal, read, tuple_of
+from codrl_mj.engine.memory import entries_type, floats, internal, row_as, tuple_of
 from codrl_mj.kept import njit
 from codrl_mj.physics.base import LARGEST
 from codrl_mj.tasks import Task
@@ -21,22 +21,10 @@ from codrl_mj.tasks import Task
 Compiled = Callable[..., Any]
 
 
-def compiled_reader(task: Task) -> Compiled:
-    """(qpos, qvel, state (n,)) -> nothing: fills `state`, in the task's order."""
-    return _reader(task.qpos, task.qvel)
-
-
-def compiled_constrain(task: Task) -> Compiled | None:
-    """(qpos, qvel, scratch (n,), integration step [s]) -> nothing: the task's `constrain`, applied in place.
-
-    None for a task without bounds. A state beyond `LARGEST` becomes NaN in all its entries, to be noticed: within its
-    bounds it would look like any other.
-    """
-    return None if task.constrain is None else _keeper(task.constrain, task.state_names, task.qpos, task.qvel)
-
-
 @functools.cache
-def _reader(positions: tuple[int, ...], velocities: tuple[int, ...]) -> Compiled:
+def compiled_reader(positions: tuple[int, ...], velocities: tuple[int, ...]) -> Compiled:
+    """(qpos, qvel, state (n,)) -> nothing: fills `state`, in the order of a task with such `qpos` and `qvel`."""
+
     @internal
     def read(qpos: Any, qvel: Any, state: np.ndarray) -> None:
         for entry in range(len(positions)):
@@ -48,10 +36,17 @@ def _reader(positions: tuple[int, ...], velocities: tuple[int, ...]) -> Compiled
 
 
 @functools.cache
-def _keeper(
-    constrain: Callable[..., Any], names: tuple[str, ...], positions: tuple[int, ...], velocities: tuple[int, ...]
-) -> Compiled:
-    fill, entries = _reader(positions, velocities), entries_type(len(names))
+def compiled_constrain(
+    constrain: Compiled | None, names: tuple[str, ...], positions: tuple[int, ...], velocities: tuple[int, ...]
+) -> Compiled | None:
+    """(qpos, qvel, scratch (n,), integration step [s]) -> nothing: a task's `constrain`, applied in place.
+
+    None for a task without bounds. A state beyond `LARGEST` becomes NaN in all its entries, to be noticed: within its
+    bounds it would look like any other.
+    """
+    if constrain is None:
+        return None
+    fill, entries = compiled_reader(positions, velocities), entries_type(len(names))
     bounded = compiled_function(constrain, names, "Task.state_names", tuple_of(entries), types.float64)
 
     @njit(nogil=True, error_model="numpy")
@@ -59,7 +54,7 @@ def _keeper(
         fill(qpos, qvel, state)
         if not is_fine(state):
             state[:] = np.nan
-        kept = floats(bounded(read(state.ctypes.data, entries), timestep))
+        kept = floats(bounded(row_as(state, entries), timestep))
         for entry in range(len(positions)):
             qpos[entry] = kept[positions[entry]]
         for entry in range(len(velocities)):
@@ -116,23 +111,19 @@ def _compiled(
     reward_of = compiled_function(reward, "", "Task.reward", state, force, state, tuple_of(options_type))
     terminated_at = compiled_function(terminated, "", "Task.terminated", state)
 
-    @internal
-    def of(state: np.ndarray) -> Any:
-        return read(state.ctypes.data, entries)
-
     @compiled
     def observe(state: np.ndarray, observation: np.ndarray) -> None:
-        seen = floats(observation_of(of(state)))
+        seen = floats(observation_of(row_as(state, entries)))
         for entry in range(len(seen)):
             observation[entry] = seen[entry]
 
     @compiled
     def rewarded(before: np.ndarray, force: Any, after: np.ndarray, options: np.ndarray) -> float:
         options_given = options_type(*to_fixed_tuple(options, options_count))
-        return float(reward_of(of(before), force, of(after), options_given))
+        return float(reward_of(row_as(before, entries), force, row_as(after, entries), options_given))
 
     @compiled
     def ended(state: np.ndarray) -> bool:
-        return bool(terminated_at(of(state)))
+        return bool(terminated_at(row_as(state, entries)))
 
     return Outcomes(observe, rewarded, ended)

@@ -18,7 +18,7 @@ from codrl_mj.disturbances import (
     rate_limited,
     whole_and_fraction,
 )
-from codrl_mj.engine.memory import internal, read
+from codrl_mj.engine.memory import internal, row_as
 from codrl_mj.kept import njit
 
 for _function in (delayed, quantised, rate_limited, philox, unit):
@@ -92,20 +92,15 @@ class Disturber:
             self.memory[rows * count + actuator] = 0.0
             self.memory[rows * count + actuator, KEY_COLUMN] = np.asarray(keys) + actuator
 
-    def commands(self, desired: np.ndarray) -> np.ndarray:
-        """The commands [N or N*m], shape (N, n), that arrive at the actuators in the next integration step."""
-        if not self.on:
-            return desired
-        arrived = np.empty(desired.size)
-        compiled_disturbance().commands(self.numbers, self.memory, np.ascontiguousarray(desired).reshape(-1), arrived)
-        return arrived.reshape(desired.shape)
-
-    def loads(self) -> np.ndarray:
-        """The mean loads on the joints [N or N*m] over the next integration step, shape (N, n); a new array."""
-        loads = np.zeros(len(self.memory))
-        if self.on and self.numbers[0, Numbers._fields.index("pulse_force")]:
-            compiled_disturbance().loads(self.numbers, self.memory, loads)
-        return loads.reshape(-1, len(self.numbers))
+    def disturbed(self, desired: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The commands that arrive in the next step, and mean loads on the joints, [N or N*m], each of shape (N, n)."""
+        arrived, loads = desired, np.zeros(desired.shape)
+        if self.on:
+            arrived, plain = np.empty(desired.shape), np.ascontiguousarray(desired)
+            compiled_disturbance().each(
+                self.numbers, self.memory, *(one.reshape(-1) for one in (plain, arrived, loads))
+            )
+        return arrived, loads
 
 
 KEY_COLUMN = KEY - len(PULSE_NAMES)
@@ -119,10 +114,8 @@ class Disturbance(NamedTuple):
     """(`Numbers`, row of memory, force) -> command that arrives in the next integration step."""
     load: Any
     """(`Numbers`, row of memory) -> mean load over it."""
-    commands: Any
-    """(numbers (n, k), memory (m, l), forces (m,), commands (m,)) -> nothing: `command` for every row."""
-    loads: Any
-    """(numbers (n, k), memory (m, l), loads (m,)) -> nothing: `load` for every row."""
+    each: Any
+    """(numbers (n, k), memory (m, l), forces (m,), commands (m,), loads (m,)) -> nothing: both for every row."""
 
 
 @functools.cache
@@ -152,19 +145,11 @@ def compiled_disturbance() -> Disturbance:
         return pulses(own, numbers.timestep, numbers.pulse_force, numbers.pulse_duration, numbers.pulse_interval)
 
     @njit(nogil=True, error_model="numpy")
-    def commands(numbers: np.ndarray, memory: np.ndarray, forces: np.ndarray, commands: np.ndarray) -> None:
+    def each(
+        numbers: np.ndarray, memory: np.ndarray, forces: np.ndarray, commands: np.ndarray, loads: np.ndarray
+    ) -> None:
         for row in range(len(memory)):
-            commands[row] = command(numbers_of(numbers[row % len(numbers)]), memory[row], forces[row])
+            own = row_as(numbers[row % len(numbers)], Numbers)
+            commands[row], loads[row] = command(own, memory[row], forces[row]), load(own, memory[row])
 
-    @njit(nogil=True, error_model="numpy")
-    def loads(numbers: np.ndarray, memory: np.ndarray, loads: np.ndarray) -> None:
-        for row in range(len(memory)):
-            loads[row] = load(numbers_of(numbers[row % len(numbers)]), memory[row])
-
-    return Disturbance(command, load, commands, loads)
-
-
-@internal
-def numbers_of(vector: np.ndarray) -> Numbers:
-    """A vector as the numbers that it holds."""
-    return read(vector.ctypes.data, Numbers)
+    return Disturbance(command, load, each)

@@ -7,8 +7,8 @@ from codrl_mj.actuators import ActuatorModel, Ideal, JointAdditions
 from codrl_mj.engine import HILL_NAMES
 from codrl_mj.engine.families import SIGNATURE, slot_size, user_head
 from codrl_mj.engine.reading import motors
+from codrl_mj.own_code import asset_path
 from codrl_mj.physics.base import Plant
-from codrl_mj.tasks.assets import asset_path
 from codrl_mj.tasks.base import INTEGRATORS
 
 
@@ -94,7 +94,7 @@ def task_model(plant: Plant) -> mujoco.MjModel:
         )
     spec.option.timestep = plant.timestep
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    if plant.explicit:
+    if plant.integrator == "euler":
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     joint = JointAdditions(plant.joint.armature, plant.joint.damping, plant.joint.friction)
     for name, actuator, limit in zip(task.motors, plant.actuators, plant.max_forces.tolist(), strict=True):
@@ -113,7 +113,9 @@ def task_model(plant: Plant) -> mujoco.MjModel:
                 joint_driven.frictionloss += added.friction
                 spec.option.disableflags = flags_with_friction(spec.option.disableflags)
     if all(texture.type != mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
-        _add_sky(spec)
+        kind, gradient = mujoco.mjtTexture.mjTEXTURE_SKYBOX, mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
+        sky = spec.add_texture(type=kind, builtin=gradient, width=64, height=64)  # ours: it would be drawn on black
+        sky.rgb1, sky.rgb2 = [0.93, 0.95, 0.97], [0.76, 0.82, 0.88]
     model = spec.compile()
     if (model.nq, model.nv) != (len(task.qpos), len(task.qvel)):
         raise ValueError(
@@ -124,13 +126,6 @@ def task_model(plant: Plant) -> mujoco.MjModel:
 
 
 _ALONG = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-
-
-def _add_sky(spec: mujoco.MjSpec) -> None:
-    """Give a model without a sky that of our own models: it would be drawn on black."""
-    kind, gradient = mujoco.mjtTexture.mjTEXTURE_SKYBOX, mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
-    sky = spec.add_texture(type=kind, builtin=gradient, width=64, height=64)
-    sky.rgb1, sky.rgb2 = [0.93, 0.95, 0.97], [0.76, 0.82, 0.88]
 
 
 def flags_with_friction(flags: int) -> int:

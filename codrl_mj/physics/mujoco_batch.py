@@ -11,8 +11,9 @@ import numpy as np
 from codrl_mj.actuators import ActuatorModel
 from codrl_mj.engine.families import HEAD
 from codrl_mj.physics.base import LARGEST, Plant, SimulationDivergedError
+from codrl_mj.physics.disturber import Disturber
 from codrl_mj.physics.mjcf import flags_with_friction
-from codrl_mj.physics.mujoco_single import MujocoPhysics, wiring
+from codrl_mj.physics.mujoco_single import MujocoPhysics
 from codrl_mj.physics.rows import Rows, compiled_set_const, lane, part, share
 from codrl_mj.physics.stepping import NOISE_KEY
 from codrl_mj.physics.variation import Variation, bare_model, field_of, mounting_of, write_fields
@@ -38,8 +39,8 @@ class MujocoBatchPhysics:
         self.plant, task = plant, plant.task
         self.num_envs, self._num_threads = len(actuators), num_threads
         self._nominal = MujocoPhysics(plant)
-        self._disturber = plant.disturber(self.num_envs)
-        self._wiring = wiring(self._nominal.model, plant)
+        self._disturber = Disturber(plant.disturbances, plant.timestep, plant.max_forces, self.num_envs)
+        self._wiring = self._nominal.wiring
         self._positions, self._velocities = np.array(task.qpos), np.array(task.qvel)
         self._fields: dict[str, np.ndarray] = {}
         self._rest = self._nominal.snapshot()  # a simulation just reset, motor at rest
@@ -125,10 +126,7 @@ class MujocoBatchPhysics:
 
     @state.setter
     def state(self, states: np.ndarray) -> None:
-        self._place(slice(None), states)
-
-    def _place(self, rows: np.ndarray | slice, states: np.ndarray) -> None:
-        self._qpos[rows], self._qvel[rows] = states[:, self._positions], states[:, self._velocities]
+        self._qpos[:], self._qvel[:] = states[:, self._positions], states[:, self._velocities]
 
     def models(self) -> Iterator[mujoco.MjModel]:
         """One model, which has each simulation's fields in turn; what is only drawn is the first one's."""
@@ -141,7 +139,7 @@ class MujocoBatchPhysics:
         """Start episodes of m simulations, from states (m, n) with keys (m,) of random numbers, motors at rest."""
         self._nominal.install()  # raises if somebody replaced ours since the last episodes
         self._states[rows] = self._rest
-        self._place(rows, states)
+        self._qpos[rows], self._qvel[rows] = states[:, self._positions], states[:, self._velocities]
         if self.plant.motorised:
             for at, one in enumerate(self._wiring):
                 self._act[rows, int(one.act) + NOISE_KEY] = keys + at

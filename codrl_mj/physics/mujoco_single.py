@@ -9,8 +9,8 @@ import numpy as np
 from codrl_mj import engine
 from codrl_mj.actuators import ActuatorModel
 from codrl_mj.engine.families import HEAD
-from codrl_mj.engine.library import addresses
-from codrl_mj.physics.base import Plant, check_finite
+from codrl_mj.engine.layout import addresses
+from codrl_mj.physics.base import Physics, Plant
 from codrl_mj.physics.mjcf import flags_with_friction, needed_callbacks, task_model
 from codrl_mj.physics.stepping import Wiring, compiled_stepping
 from codrl_mj.physics.variation import write_fields
@@ -18,8 +18,8 @@ from codrl_mj.physics.variation import write_fields
 ARM = Wiring._fields.index("arm")
 
 
-class MujocoPhysics:
-    """A task's MJCF model and its data. See `codrl_mj.physics.base.Physics`.
+class MujocoPhysics(Physics):
+    """A task's MJCF model and its data.
 
     One `mj_step` is one integration step. With CartPole's explicit Euler integrator the positions are then moved by the
     old velocity instead of the new one, which for slide and hinge joints is exactly Gymnasium's update. Where the task
@@ -28,16 +28,20 @@ class MujocoPhysics:
 
     def __init__(self, plant: Plant) -> None:
         """Compile the model and install the callbacks that it needs."""
-        self.plant = plant
+        super().__init__(plant)
         self.model = task_model(plant)
         self.data = mujoco.MjData(self.model)
         self._flags = self.model.opt.disableflags
         task = plant.task
         self._qpos_order, self._qvel_order = _progression(task.qpos), _progression(task.qvel)
-        self._disturber = plant.disturber()
-        self.trace = plant.trace()
-        rows = [[*one] for one in wiring(self.model, plant)]
-        self._settings = np.hstack([rows, self._disturber.numbers])
+        self.wiring: list[Wiring] = []
+        """Where the actuators' numbers are in the model."""
+        for name, actuator in zip(task.motors, plant.actuators, strict=True):
+            index = self.model.actuator(name).id
+            dof = self.model.jnt_dofadr[self.model.actuator_trnid[index, 0]]
+            first = max(self.model.actuator_actadr[index], 0)
+            self.wiring.append(Wiring(index, self.model.actuator_ctrladr[index], first, dof, actuator.arm_radius))
+        self._settings = np.hstack([np.array(self.wiring, dtype=np.float64), self._disturber.numbers])
         self._bind()
         self.reset(np.zeros(len(task.state_names)))
 
@@ -66,6 +70,11 @@ class MujocoPhysics:
         self._bind()
 
     @property
+    def time(self) -> float:  # type: ignore[override]
+        """Since the start of the episode [s]."""
+        return self.data.time
+
+    @property
     def state(self) -> np.ndarray:
         """The mechanical state in the task's order, shape (n,), float64, as MuJoCo's data have it now; a new array."""
         state = np.empty(len(self._qpos) + len(self._qvel))
@@ -80,7 +89,7 @@ class MujocoPhysics:
     def reset(self, state: np.ndarray, key: float = 0.0) -> None:
         """See `Physics.reset`."""
         self.install()  # raises if somebody replaced ours since the last episode
-        self.stepping.start(np.asarray(state, dtype=np.float64), float(key), *self.arguments)
+        self.stepping.start(np.asarray(state, dtype=np.float64), float(key), *self.arguments[:-1])
 
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
         """Exchange the actuators for others of their family; to be followed by a reset.
@@ -117,14 +126,10 @@ class MujocoPhysics:
         if not self.stepping.step(desired_force, *self.arguments):
             self.check_finite()
 
-    def check_finite(self) -> None:
-        """See `Physics.check_finite`."""
-        check_finite(self.plant.task, self.state, self.data.time)
-
     def observed(self, row: np.ndarray) -> np.ndarray:
         """See `Physics.observed`."""
         seen = np.empty((len(row), len(self.plant.family.OBSERVED)))
-        self.stepping.observed(row, seen, *self.arguments)
+        self.stepping.observed(row, seen, *self.arguments[:3])
         return seen
 
     def snapshot(self) -> np.ndarray:
@@ -139,22 +144,6 @@ class MujocoPhysics:
     def restore(self, snapshot: np.ndarray) -> None:
         """Continue from what `snapshot` returned."""
         mujoco.mj_setState(self.model, self.data, snapshot, _STATE)
-
-    @property
-    def memory(self) -> np.ndarray:
-        """What the disturbances remember beside the engine's own state, a live array; empty if nothing."""
-        return self._disturber.memory.reshape(-1)
-
-
-def wiring(model: mujoco.MjModel, plant: Plant) -> list[Wiring]:
-    """Where the numbers of a plant's actuators are in its model."""
-    found = []
-    for name, actuator in zip(plant.task.motors, plant.actuators, strict=True):
-        index = model.actuator(name).id
-        dof = model.jnt_dofadr[model.actuator_trnid[index, 0]]
-        control, first = float(model.actuator_ctrladr[index]), max(float(model.actuator_actadr[index]), 0.0)
-        found.append(Wiring(float(index), control, first, float(dof), actuator.arm_radius))
-    return found
 
 
 def _progression(entries: tuple[int, ...]) -> slice:

@@ -101,21 +101,23 @@ class OffscreenRenderer:
         _watch_process()
 
     def _make(self) -> mujoco.Renderer:
+        """With a frame buffer no larger than the image: all of it is cleared for each."""
         egl: Any = sys.modules.get("mujoco.egl")
+        limits, (width, height) = self._model.vis.global_, self._size
+        largest = limits.offwidth, limits.offheight
         try:
             if egl is not None and egl.EGL_DISPLAY:  # MuJoCo makes it once, but SDL (pygame) ends it with its window
                 egl.EGL.eglInitialize(egl.EGL_DISPLAY, None, None)
-            return self._new()
-        except Exception as error:  # each backend raises its own kind, most of them not exported
-            raise RenderingUnavailableError(_no_context(error)) from error
-
-    def _new(self) -> mujoco.Renderer:
-        """With a frame buffer no larger than the image: all of it is cleared for each."""
-        limits, (width, height) = self._model.vis.global_, self._size
-        largest = limits.offwidth, limits.offheight
-        limits.offwidth, limits.offheight = self._size
-        try:
+            limits.offwidth, limits.offheight = self._size
             return mujoco.Renderer(self._model, height=height, width=width)
+        except Exception as error:  # each backend raises its own kind, most of them not exported
+            backend = os.environ.get("MUJOCO_GL", "not set")
+            raise RenderingUnavailableError(
+                f"cannot make an OpenGL context (MUJOCO_GL is {backend}): {type(error).__name__}: {error}. Without a "
+                "display, install a software renderer (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri) and "
+                "set MUJOCO_GL=egl before mujoco is first imported: in the shell, or by importing codrl_mj before "
+                "mujoco"
+            ) from error
         finally:
             limits.offwidth, limits.offheight = largest
 
@@ -137,28 +139,31 @@ class OffscreenRenderer:
         flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = self._pretty
         if not self._sky_apart:
             return self._renderer.render()
-        sky = self._drawn_sky(self._renderer)
+        scene = self._renderer.scene
+        view = bytes(np.concatenate([np.append(camera.forward, camera.up) for camera in scene.camera]))
+        if view != self._sky[0]:  # what the camera sees where there is nothing
+            scene.ngeom, count = 0, scene.ngeom
+            self._sky = view, self._renderer.render()
+            scene.ngeom = count
         flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = False
         image = self._renderer.render()
         flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = True
-        np.copyto(image, sky, where=image == 0)
+        np.copyto(image, self._sky[1], where=image == 0)
         return image
-
-    def _drawn_sky(self, renderer: mujoco.Renderer) -> np.ndarray:
-        """What the camera sees where there is nothing, (height, width, 3), uint8."""
-        scene = renderer.scene
-        view = bytes(np.concatenate([np.append(camera.forward, camera.up) for camera in scene.camera]))
-        if view != self._sky[0]:
-            scene.ngeom, count = 0, scene.ngeom
-            self._sky = view, renderer.render()
-            scene.ngeom = count
-        return self._sky[1]
 
     def close(self) -> None:
         """Free the OpenGL context; harmless when repeated, or when somebody ended the context."""
         renderer, self._renderer = getattr(self, "_renderer", None), None
-        if renderer is not None:
-            _discard(renderer)
+        if renderer is None:
+            return
+        try:  # in its own context: in another's, the same names are that one's buffers
+            current = _make_current(renderer)
+            if current:
+                renderer.close()
+        except Exception:  # it could still be made current, but not be freed: its display has ended
+            current = False
+        if not current:
+            _abandon(renderer)
 
     def __del__(self) -> None:
         """Free the OpenGL context."""
@@ -190,18 +195,6 @@ def _make_current(renderer: mujoco.Renderer) -> bool:
     return True
 
 
-def _discard(renderer: mujoco.Renderer) -> None:
-    """Free what a renderer holds, in its own context: in another's, the same names are that one's buffers."""
-    try:
-        current = _make_current(renderer)
-        if current:
-            renderer.close()
-    except Exception:  # it could still be made current, but not be freed: its display has ended
-        current = False
-    if not current:
-        _abandon(renderer)
-
-
 def _abandon(renderer: mujoco.Renderer | None) -> None:
     """Let go of a renderer whose context is no more, or another process's."""
     egl: Any = sys.modules.get("mujoco.egl")
@@ -223,15 +216,6 @@ def check_view(model: mujoco.MjModel, width: int, height: int, camera: str) -> N
     if camera not in names:
         hint = did_you_mean(camera, names)
         raise ValueError(f"camera = {camera!r}: {hint}The model's cameras are {', '.join(names) or 'none'}")
-
-
-def _no_context(error: Exception) -> str:
-    backend = os.environ.get("MUJOCO_GL", "not set")
-    return (
-        f"cannot make an OpenGL context (MUJOCO_GL is {backend}): {type(error).__name__}: {error}. Without a display, "
-        "install a software renderer (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri) and set MUJOCO_GL=egl "
-        "before mujoco is first imported: in the shell, or by importing codrl_mj before mujoco"
-    )
 
 
 class Window:

@@ -14,11 +14,10 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from codrl_mj.engine.library import address_of, addresses, engine
+from codrl_mj.engine.layout import address_of, addresses, engine_function
 from codrl_mj.engine.memory import copy_bytes, count_on, f64, internal
 from codrl_mj.kept import njit
 from codrl_mj.physics.mujoco_single import ARM, MujocoPhysics
-from codrl_mj.physics.variation import field_of
 
 STATE = mujoco.mjtState
 INTEGRATION = int(STATE.mjSTATE_INTEGRATION)
@@ -76,22 +75,13 @@ def lane(physics: MujocoPhysics, data: mujoco.MjData, fields: Mapping[str, np.nd
     """The lane of other data, with a model of its own, for simulations like this one; the rows have these fields."""
     _, _, settings, memory, trace = physics.arguments
     rows = [
-        (_address(data.model, name), rows.ctypes.data, rows.strides[0], rows[0].nbytes) for name, rows in fields.items()
+        (address_of(data.model, name), rows.ctypes.data, rows.strides[0], rows[0].nbytes)
+        for name, rows in fields.items()
     ]
     parts = [(name, part(data.model, name)) for name in _MOVING]
-    live = [
-        (address_of(data, name), one.start, 1)
-        if name == "time"
-        else (getattr(data, name).ctypes.data, one.start, one.stop - one.start)
-        for name, one in parts
-    ]
+    live = [(address_of(data, name), one.start, one.stop - one.start) for name, one in parts]
     own = settings.copy(), memory, trace.copy()
     return Lane(np.array(rows, np.int64).reshape(-1, 4), np.array(live, np.int64), *addresses(data), *own)
-
-
-def _address(model: mujoco.MjModel, name: str) -> int:
-    """Address of a field of a model."""
-    return address_of(model, name) if name.startswith("opt.") else field_of(model, name).ctypes.data
 
 
 @internal
@@ -131,7 +121,7 @@ def compiled_set_const() -> Any:
 
     `derived` are indices in `Lane.fields`.
     """
-    set_const = engine().set_const
+    set_const = engine_function("mj_setConst")
 
     @njit(nogil=True, error_model="numpy")
     def fill(rows: np.ndarray, lane: Any, derived: np.ndarray) -> None:
@@ -146,29 +136,21 @@ def compiled_set_const() -> Any:
     return fill
 
 
-@internal
-def claim(tally: np.ndarray, count: int) -> int:
-    """The first of so many rows that are this thread's from now on."""
-    return count_on(tally.ctypes.data, count)
+CLAIMED, DONE, BROKEN = range(3)
+"""What a tally counts: rows that a thread has taken, rows that are done, simulations no longer of numbers."""
 
 
 @internal
-def finish(tally: np.ndarray, count: int) -> None:
-    """Say that so many rows that were claimed are done."""
-    count_on(tally[1:].ctypes.data, count)
-
-
-@internal
-def complain(tally: np.ndarray) -> None:
-    """Say that a simulation is no longer one of numbers."""
-    count_on(tally[2:].ctypes.data, 1)
+def tallied(tally: np.ndarray, entry: int, more: int) -> int:
+    """Count so many more; returns what was counted before, as the first of the rows that a thread claims."""
+    return count_on(tally[entry:].ctypes.data, more)
 
 
 @njit(nogil=True)
 def _await(tally: np.ndarray, count: int) -> bool:
     """Whether all rows are done, after a short wait for others."""
     patience = 2000
-    while patience and count_on(tally[1:].ctypes.data, 0) != count:
+    while patience and tallied(tally, DONE, 0) != count:
         patience -= 1
     return patience > 0
 
@@ -198,4 +180,4 @@ def share(function: Any, lanes: Sequence[tuple[Any, ...]], count: int, steps: in
         for one in others:
             if not one.cancel():
                 one.result()
-    return bool(tally[2])
+    return bool(tally[BROKEN])

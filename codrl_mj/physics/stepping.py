@@ -18,13 +18,12 @@ from codrl_mj.actuators import Family
 from codrl_mj.disturbances import OFF
 from codrl_mj.engine.doors import user_of
 from codrl_mj.engine.families import HEAD, Slot, compiled_observe, load_family, signals_at
-from codrl_mj.engine.layout import DATA, MODEL
-from codrl_mj.engine.library import engine
-from codrl_mj.engine.memory import internal, on_stack, read
+from codrl_mj.engine.layout import DATA, MODEL, engine_function
+from codrl_mj.engine.memory import internal, on_stack, row_as
 from codrl_mj.kept import njit
 from codrl_mj.physics.base import Plant
 from codrl_mj.physics.compiled_task import Compiled, compiled_constrain, compiled_reader, is_fine
-from codrl_mj.physics.disturber import KEY_COLUMN, compiled_disturbance, numbers_of
+from codrl_mj.physics.disturber import KEY_COLUMN, Numbers, compiled_disturbance
 
 TORQUE, NOISE_KEY = Slot._fields.index("torque"), Slot._fields.index("noise_key")
 
@@ -54,11 +53,12 @@ class Stepping(NamedTuple):
     """(force, *arguments) -> whether the state is still one of numbers within `LARGEST`: takes one environment step
     under a desired force [N or N*m], or under several, an array (n,). What the actuators did is in `trace`."""
     start: Compiled
-    """(state (n,), key, *arguments) -> nothing: starts an episode, as `Physics.reset` does."""
+    """(state (n,), key, *arguments but the last) -> nothing: starts an episode, as `Physics.reset` does."""
     read: Compiled
-    """(state (n,), *arguments) -> nothing: fills `state` with the present one."""
+    """(state (n,), address of the data) -> nothing: fills `state` with the present one."""
     observed: Compiled
-    """(row of trace (n, c), seen (n, k), *arguments) -> nothing: fills `seen` with what the sensors say at present."""
+    """(row of trace (n, c), seen (n, k), *the first three arguments) -> nothing: fills `seen` with what the sensors say
+    at present."""
 
 
 def compiled_stepping(plant: Plant) -> Stepping:
@@ -66,8 +66,9 @@ def compiled_stepping(plant: Plant) -> Stepping:
     task, disturbed = plant.task, plant.disturbances != OFF
     if plant.motorised:
         load_family(plant.family)
-    kept, reader = compiled_constrain(task), compiled_reader(task)
-    return _stepping(kept, reader, task.qpos, task.qvel, plant.explicit, disturbed, plant.family, plant.motorised)
+    order, explicit = (task.qpos, task.qvel), plant.integrator == "euler"
+    kept = compiled_constrain(task.constrain, task.state_names, *order)
+    return _stepping(kept, compiled_reader(*order), *order, explicit, disturbed, plant.family, plant.motorised)
 
 
 def force_of(forces: Any, actuator: int) -> float:
@@ -93,7 +94,7 @@ def _stepping(
     family: Family,
     motorised: bool,
 ) -> Stepping:
-    engine_step, engine_reset, _ = engine()
+    engine_step, engine_reset = engine_function("mj_step"), engine_function("mj_resetData")
     size, moving = len(positions) + len(velocities), len(positions)
     bounded, constrain = keep is not None, keep or _nothing
     disturbance = compiled_disturbance()
@@ -109,10 +110,10 @@ def _stepping(
         state = numba.carray(on_stack(size), size)
         for inner in range(len(trace)):
             for actuator in range(len(settings)):
-                wiring = wiring_of(settings[actuator])
+                wiring = row_as(settings[actuator], Wiring)
                 command = force_of(force, actuator)
                 if disturbed:
-                    numbers = numbers_of(settings[actuator, WIRING:])
+                    numbers = row_as(settings[actuator, WIRING:], Numbers)
                     command = disturb(numbers, memory[actuator], command)
                     DATA.qfrc_applied(data)[int(wiring.dof)] = disturbing_load(numbers, memory[actuator])
                 ctrl[int(wiring.ctrl)] = command * wiring.arm
@@ -127,7 +128,7 @@ def _stepping(
             if bounded:
                 constrain(qpos, qvel, state, timestep)
             for actuator in range(len(settings)):
-                wiring = wiring_of(settings[actuator])
+                wiring = row_as(settings[actuator], Wiring)
                 row = trace[inner, actuator]
                 if motorised:
                     own = int(wiring.act)
@@ -148,7 +149,6 @@ def _stepping(
         data: int,
         settings: np.ndarray,
         memory: np.ndarray,
-        trace: np.ndarray,  # noqa: ARG001 - it is one of the simulation's arguments
     ) -> None:
         engine_reset(model, data)
         qpos, qvel = DATA.qpos(data), DATA.qvel(data)
@@ -158,35 +158,20 @@ def _stepping(
             qvel[entry] = state[velocities[entry]]
         for actuator in range(len(settings)):
             if motorised:
-                DATA.act(data)[int(wiring_of(settings[actuator]).act) + NOISE_KEY] = key + actuator
+                DATA.act(data)[int(row_as(settings[actuator], Wiring).act) + NOISE_KEY] = key + actuator
             if disturbed:
                 memory[actuator] = 0.0
                 memory[actuator, memory.shape[1] + KEY_COLUMN] = key + actuator
 
     @njit(nogil=True, error_model="numpy")
-    def read(
-        state: np.ndarray,
-        model: int,  # noqa: ARG001 - the arguments of a simulation go together
-        data: int,
-        settings: np.ndarray,  # noqa: ARG001
-        memory: np.ndarray,  # noqa: ARG001
-        trace: np.ndarray,  # noqa: ARG001
-    ) -> None:
+    def read(state: np.ndarray, data: int) -> None:
         read_state(DATA.qpos(data), DATA.qvel(data), state)
 
     @njit(nogil=True, error_model="numpy")
-    def observed(
-        row: np.ndarray,
-        seen: np.ndarray,
-        model: int,
-        data: int,
-        settings: np.ndarray,
-        memory: np.ndarray,  # noqa: ARG001
-        trace: np.ndarray,  # noqa: ARG001
-    ) -> None:
+    def observed(row: np.ndarray, seen: np.ndarray, model: int, data: int, settings: np.ndarray) -> None:
         if seeing:
             for actuator in range(len(settings)):
-                wiring = wiring_of(settings[actuator])
+                wiring = row_as(settings[actuator], Wiring)
                 observe(
                     user_of(model, int(wiring.actuator)) + 8 * HEAD,
                     row[actuator, 2:].ctypes.data,
@@ -197,12 +182,6 @@ def _stepping(
                 )
 
     return Stepping(step, start, read, observed)
-
-
-@internal
-def wiring_of(vector: np.ndarray) -> Wiring:
-    """A row of `settings` as the wiring that it begins with."""
-    return read(vector.ctypes.data, Wiring)
 
 
 @internal

@@ -144,16 +144,22 @@ class Variation:
         }
         for name, column in zip(self.names, np.where(np.isnan(values), self._neutral, values).T, strict=True):
             kind, _, target = name.removeprefix("model.").partition(".")
+            body, each = self._bodies.get(target), column[:, np.newaxis]
             if kind == "mass":
-                body = self._bodies[target]
                 fields["body_mass"][:, body] *= column
-                fields["body_inertia"][:, body] *= column[:, np.newaxis]
+                fields["body_inertia"][:, body] *= each
             elif kind == "length":
-                self._stretch(fields, self._bodies[target], column)
+                fields["body_ipos"][:, body] *= each
+                fields["body_inertia"][:, body, :2] *= each**2
+                fields["body_pos"][:, self._parents == body] *= each[:, np.newaxis]
+                for geom in np.flatnonzero(self._geom_bodies == body).tolist() if "geom_pos" in fields else ():
+                    fields["geom_pos"][:, geom, 2] *= column
+                    if geom in self._geoms_along:
+                        fields["geom_size"][:, geom, self._geoms_along[geom]] *= column
             elif kind == "damping":
-                fields["dof_damping"][:, self._dofs[target]] += column[:, np.newaxis]
+                fields["dof_damping"][:, self._dofs[target]] += each
             else:
-                fields["opt.gravity"] *= column[:, np.newaxis]
+                fields["opt.gravity"] *= each
                 for joint in self._hills:
                     fields["jnt_user"][:, joint, GRAVITY] *= column
         for motor, mounts in enumerate(self._mounts if additions is not None else ()):
@@ -161,18 +167,6 @@ class Variation:
                 if mount is not None and mount.field in fields:
                     fields[mount.field][:, mount.place] += additions[:, motor, entry] * mount.scale  # type: ignore[index]
         return fields
-
-    def _stretch(self, fields: dict[str, np.ndarray], body: int, factor: np.ndarray) -> None:
-        """Multiply the lengths along a body."""
-        fields["body_ipos"][:, body] *= factor[:, np.newaxis]
-        fields["body_inertia"][:, body, :2] *= factor[:, np.newaxis] ** 2
-        for child in np.flatnonzero(self._parents == body).tolist():
-            fields["body_pos"][:, child] *= factor[:, np.newaxis]
-        if "geom_pos" in fields:
-            for geom in np.flatnonzero(self._geom_bodies == body).tolist():
-                fields["geom_pos"][:, geom, 2] *= factor
-                if geom in self._geoms_along:
-                    fields["geom_size"][:, geom, self._geoms_along[geom]] *= factor
 
 
 def _along(model: mujoco.MjModel) -> dict[int, int]:

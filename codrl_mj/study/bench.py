@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from codrl_mj.actuators import Actuator, Drive, GearMotor, SampledLoop, Supply
-from codrl_mj.specs import motorise
+from codrl_mj.engine.specs import motorise
 from codrl_mj.study.doses import REFERENCE_SPEEDS, noise, timestep
 from codrl_mj.study.grid import check_chosen
 from codrl_mj.tasks import find_task

@@ -157,7 +157,8 @@ def _deploy(test: Deployment) -> None:
     from codrl_mj.runs.policies import load_policy
 
     config = load_config(test.run, trust=True)  # ours: found by its configuration
-    result = evaluate(load_policy(test.run), test.env.seen_as(config.env), test.episodes, test.seed)
+    env = dataclasses.replace(test.env, **config.env.interface)
+    result = evaluate(load_policy(test.run), env, test.episodes, test.seed)
     write_json(test.record, result.as_mapping())
 
 

@@ -31,17 +31,15 @@ def resolve_actuators(given: Any, task: Task) -> tuple[Any, ...]:
         raise ValueError(
             f"actuator: {len(each)} actuators for the {count} motors of {task.name}: {', '.join(task.motors)}"
         )
+    for at, one in enumerate(each):  # the task's own in the place of `default`
+        if isinstance(one, Mapping) and one.get("name") == "default":
+            each[at] = {**one, "name": task.default_actuator}
+        elif isinstance(one, str) and one == "default":
+            each[at] = task.default_actuator
     papers = task.paper or (None,) * count
-    actuators = tuple(resolve(_own(one, task), paper, task.name) for one, paper in zip(each, papers, strict=True))
+    actuators = tuple(resolve(one, paper, task.name) for one, paper in zip(each, papers, strict=True))
     check_same_family(actuators)
     return actuators
-
-
-def _own(given: Any, task: Task) -> Any:
-    """What was given, with the name of the task's own actuator in the place of `default`."""
-    if isinstance(given, Mapping) and given.get("name") == "default":
-        return {**given, "name": task.default_actuator}
-    return task.default_actuator if isinstance(given, str) and given == "default" else given
 
 
 def named_actuator(name: str, task: str) -> Any:

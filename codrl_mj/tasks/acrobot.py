@@ -54,8 +54,7 @@ from gymnasium.envs.classic_control import utils
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor
 from codrl_mj.tasks.attributes import Fixed, ModelNumber, Setting, centre, mass
 from codrl_mj.tasks.base import Entries, Task
-from codrl_mj.tasks.trials import Trials, around
-from codrl_mj.tasks.twin import GymnasiumTwin
+from codrl_mj.tasks.twin import GymnasiumTwin, Trials, around
 
 # Gymnasium's Acrobot-v1
 TORQUE = 1.0  # N*m

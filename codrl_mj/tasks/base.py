@@ -14,11 +14,10 @@ from gymnasium import spaces
 
 from codrl_mj import fields
 from codrl_mj.actuators import Actuator, ActuatorModel, Ideal
-from codrl_mj.tasks.assets import asset_path
+from codrl_mj.own_code import asset_path
 from codrl_mj.tasks.attributes import Attribute
 from codrl_mj.tasks.checks import check_fields, check_functions, check_layout
-from codrl_mj.tasks.trials import Trials
-from codrl_mj.tasks.twin import Twin
+from codrl_mj.tasks.twin import Trials, Twin
 
 
 class NoOptions(NamedTuple):
@@ -217,12 +216,6 @@ class Task:
         model = mujoco.MjSpec.from_file(str(asset_path(self.asset))).compile()
         joints = [model.actuator_trnid[model.actuator(name).id, 0] for name in self.motors]
         return tuple(self.qvel[model.jnt_dofadr[joint]] for joint in joints)
-
-    @property
-    def joint_units(self) -> tuple[str, ...]:
-        """Units of the positions of the joints that the motors drive, `rad` or `m`; empty texts where none are told."""
-        half = dict(zip(self.qvel, self.qpos, strict=True))
-        return tuple(_unit(self.state_names[half[speed]]) for speed in self.speeds)
 
     @property
     def observation_units(self) -> tuple[str | None, ...]:

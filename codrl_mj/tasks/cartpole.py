@@ -53,8 +53,7 @@ from gymnasium.envs.classic_control import utils
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor
 from codrl_mj.tasks.attributes import GRAVITY, Fixed, Follows, Setting, centre, mass
 from codrl_mj.tasks.base import Entries, Task
-from codrl_mj.tasks.trials import Trials, around
-from codrl_mj.tasks.twin import GymnasiumTwin
+from codrl_mj.tasks.twin import GymnasiumTwin, Trials, around
 
 # Gymnasium's CartPole-v1
 FORCE = 10.0  # N

@@ -90,7 +90,7 @@ from gymnasium.envs.classic_control import utils
 
 from codrl_mj.tasks.attributes import GRAVITY, Fixed, Setting, centre, mass
 from codrl_mj.tasks.base import Entries, Task
-from codrl_mj.tasks.trials import Trials, around
+from codrl_mj.tasks.twin import Trials, around
 
 MAX_TORQUE = 0.084  # N*m: 2 A, the amplifier's peak current, times kT = 0.042 N*m/A
 ARM_LIMIT = 2.0  # rad

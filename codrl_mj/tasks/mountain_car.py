@@ -47,8 +47,7 @@ from gymnasium.envs.classic_control import utils
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor
 from codrl_mj.tasks.attributes import Attribute, Fixed, ModelNumber, mass
 from codrl_mj.tasks.base import Entries, Task
-from codrl_mj.tasks.trials import Trials, around
-from codrl_mj.tasks.twin import GymnasiumTwin, gymnasium_env
+from codrl_mj.tasks.twin import GymnasiumTwin, Trials, around, gymnasium_env
 
 # Gymnasium's MountainCar-v0 and, but for the goal, its MountainCarContinuous-v0
 FORCE = 1.0  # N

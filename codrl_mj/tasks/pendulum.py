@@ -51,8 +51,7 @@ from gymnasium.envs.classic_control import utils
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor
 from codrl_mj.tasks.attributes import GRAVITY, Fixed, Setting, centre, mass
 from codrl_mj.tasks.base import Entries, Task
-from codrl_mj.tasks.trials import Trials, around
-from codrl_mj.tasks.twin import GymnasiumTwin
+from codrl_mj.tasks.twin import GymnasiumTwin, Trials, around
 
 # Gymnasium's Pendulum-v1
 MAX_TORQUE = 2.0  # N*m

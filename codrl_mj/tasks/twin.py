@@ -1,7 +1,10 @@
-"""A task's twin: the Gymnasium environment that it rebuilds, unmodified, driven through its attributes."""
+"""What a task is compared with by the certificate, and where: its twin, mostly a Gymnasium environment, and trials.
 
-from collections.abc import Mapping
-from typing import Any, Protocol
+The environment is the installed one, unmodified, driven through its attributes.
+"""
+
+import math
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -38,16 +41,14 @@ class GymnasiumTwin:
         """The state after one `step` from a state, with attributes set for it."""
         kept = {name: getattr(self.env, name) for name in attributes}
         try:
-            self._set(attributes)
+            for name, value in attributes.items():
+                setattr(self.env, name, value)
             self.env.state = state
             self.env.step(action)
         finally:
-            self._set(kept)
+            for name, value in kept.items():
+                setattr(self.env, name, value)
         return self.env.state
-
-    def _set(self, attributes: Mapping[str, Any]) -> None:
-        for name, value in attributes.items():
-            setattr(self.env, name, value)
 
 
 def gymnasium_env(env_id: str) -> Any:
@@ -55,3 +56,27 @@ def gymnasium_env(env_id: str) -> Any:
     import gymnasium
 
     return gymnasium.make(env_id, disable_env_checker=True).unwrapped
+
+
+class Trials(NamedTuple):
+    """What the certificate tries a task in; in the units of the task's state."""
+
+    bounds: tuple[float, ...]
+    """States are drawn uniformly within plus and minus these."""
+    edges: tuple[tuple[float, ...], ...]
+    """States on the walls, on the speed limits, on the cut of wrapped angles, and beside them: values of each entry."""
+    start: tuple[float, ...]
+    """Start of a run that stays away from bounds, walls and wrapped angles, where the task's equations are smooth."""
+    steps: int
+    """Environment steps of that run."""
+    balanced_steps: int
+    """Of these, the first ones over which energies are balanced, with integration steps many times finer."""
+    horizon: int | None = None
+    """Environment steps over which two implementations must agree to 1e-9; None for a whole episode. A chaotic task's
+    rounding errors, 1e-16 * exp(lambda t), pass that within one."""
+
+
+def around(value: float) -> tuple[float, ...]:
+    """A bound, the numbers next to it on both sides, and one just inside; and all of them negated."""
+    numbers = (value, math.nextafter(value, math.inf), math.nextafter(value, 0.0), 0.999 * value)
+    return (*numbers, *(-number for number in numbers))

@@ -105,7 +105,8 @@ class TrainConfig:
     @property
     def evaluation_env(self) -> EnvConfig:
         """What policies are evaluated in: the environment without changes of time limit and reward."""
-        return self.env.as_posed
+        changed: dict[str, Any] = dict.fromkeys(self.env.world.posed)
+        return dataclasses.replace(self.env, **changed)
 
     def as_mapping(self) -> dict[str, Any]:
         """The configuration as JSON-serialisable values; `from_mapping` reads it."""

@@ -164,7 +164,7 @@ def provenance(config: TrainConfig) -> dict[str, Any]:
 @functools.cache
 def _code_digest(*others: str | Path) -> str:
     """SHA-256 over the package's Python files and models, and those modules and model files that are none of these."""
-    from codrl_mj.tasks.assets import asset_folder
+    from codrl_mj.own_code import asset_folder
 
     package = Path(__file__).parents[1]
     digest = hashlib.sha256()

@@ -12,7 +12,7 @@ import numpy as np
 from codrl_mj.actuators import IDEAL
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError
 from codrl_mj.tasks import Task, find_task
-from codrl_mj.tasks.trials import Trials
+from codrl_mj.tasks.twin import Trials
 from codrl_mj.validation.compare import both, differences, gymnasium_equations, without_oracle
 from codrl_mj.validation.table import Case, Check, Skipped, check
 

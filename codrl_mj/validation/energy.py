@@ -28,10 +28,10 @@ import mujoco
 import numpy as np
 
 from codrl_mj.actuators import Actuator, ActuatorModel, Motor
+from codrl_mj.own_code import asset_path
 from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.physics import Plant, SimulationDivergedError, hills, trace_names
 from codrl_mj.tasks import Task, find_task
-from codrl_mj.tasks.assets import asset_path
 from codrl_mj.validation.compare import STAND_IN, actuators_named, forces_of, gymnasium_equations, physics_of
 from codrl_mj.validation.convergence import analogues, free_run, ideals, obstacle
 from codrl_mj.validation.table import Case, Check, Family, Skipped, check, of_order, order

@@ -168,7 +168,7 @@ _LATE_FORCE: tuple[Edit, ...] = (
 )
 _EVERY_PASS: Edit = ("if time != f64(slot)[0]:", "if True:")
 _EVERY_STAGE: Edit = ("if DATA.pbase(data) != 0:", "if False:")
-_ADVANCED = "if asks_inertia(number) else math.inf,\n            )\n"
+_ADVANCED = "if size_of(number, INERTIA) else math.inf,\n            )\n"
 _CANDIDATE = SLOT + len(current_loop.State._fields)
 _SHARED_CURRENT: tuple[Edit, ...] = (
     (_COMMIT, f"{_COMMIT}                f64(slot)[{SLOT}] = f64(HIDDEN)[0]\n"),

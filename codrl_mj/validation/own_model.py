@@ -30,8 +30,8 @@ from codrl_mj.actuators import (
     spectral_radius,
 )
 from codrl_mj.engine import load_family
+from codrl_mj.engine.doors import shaft_inertia
 from codrl_mj.engine.families import SLOT, Slot, slot_size
-from codrl_mj.engine.inertia import shaft_inertia
 from codrl_mj.engine.reading import slots
 from codrl_mj.physics import Plant, install_callbacks, motors
 from codrl_mj.physics.mjcf import task_model

@@ -272,7 +272,7 @@ def test_a_place_where_there_is_no_family_is_refused(place, message):
 
 def drawer_motor(folder, **changes):
     """A motor's file of one's own: a copy of one of the catalogue, and what is changed in it."""
-    from codrl_mj.tasks.assets import asset_folder
+    from codrl_mj.own_code import asset_folder
 
     text = (asset_folder() / "motors" / "maxon-re65.toml").read_text()
     for old, new in changes.items():

@@ -15,7 +15,7 @@ commands = st.lists(st.floats(-10, 10), min_size=1, max_size=30)
 
 def _arrivals(disturbances, timestep, given_commands, limit=10.0):
     disturber = Disturber(disturbances, timestep, np.array([limit]), 1)
-    return np.array([disturber.commands(np.array([[command]]))[0, 0] for command in given_commands])
+    return np.array([disturber.disturbed(np.array([[command]]))[0][0, 0] for command in given_commands])
 
 
 @given(commands, st.floats(0.0, 0.2))
@@ -115,7 +115,7 @@ def test_many_are_disturbed_as_one():
     disturbances = Disturbances(command_delay=0.013, command_quantum=0.3, command_rate=100.0)
     values = np.random.default_rng(0).uniform(-10, 10, (30, 17))
     many = Disturber(disturbances, 0.01, np.array([10.0]), 17)
-    together = np.array([many.commands(row[:, np.newaxis])[:, 0] for row in values])
+    together = np.array([many.disturbed(row[:, np.newaxis])[0][:, 0] for row in values])
     alone = np.stack([_arrivals(disturbances, 0.01, column) for column in values.T], axis=1)
     np.testing.assert_array_equal(together, alone)
 
@@ -125,7 +125,7 @@ def test_several_actuators_of_a_simulation_have_each_its_own_limit():
     limits = np.array([10.0, 2.0, 0.5])
     values = np.random.default_rng(0).uniform(-10, 10, (30, 5, 3))
     several = Disturber(disturbances, 0.01, limits, 5)
-    together = np.array([several.commands(rows) for rows in values])
+    together = np.array([several.disturbed(rows)[0] for rows in values])
     for simulation in range(5):
         for actuator, limit in enumerate(limits):
             alone = _arrivals(disturbances, 0.01, values[:, simulation, actuator], limit)

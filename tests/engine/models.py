@@ -7,8 +7,8 @@ import numpy as np
 
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor
 from codrl_mj.engine.families import SLOT, Slot, signals_at
+from codrl_mj.own_code import asset_path
 from codrl_mj.physics.mjcf import drive
-from codrl_mj.tasks.assets import asset_path
 
 FULL = Actuator(
     Motor(resistance=1.2, inductance=0.05, torque_constant=0.8, back_emf_constant=0.7, arm_radius=0.5),

@@ -8,8 +8,8 @@ import pytest
 
 from codrl_mj import engine
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.own_code import asset_path
 from codrl_mj.tasks import TASKS
-from codrl_mj.tasks.assets import asset_path
 from tests.engine.models import (
     CURRENT,
     FULL,

@@ -19,9 +19,9 @@ def _user(head):
 
 
 OURS = _user(HEAD)
-NOT_OURS = _user(HEAD._replace(signature_2=HEAD.signature_2 + 1))
-NO_FAMILY = _user(HEAD._replace(family=(HEAD.family + 1) % 10**6))
-NO_NUMBER = _user(HEAD._replace(family=-1.0))
+NOT_OURS = _user((HEAD[0], HEAD[1] + 1, HEAD[2]))
+NO_FAMILY = _user((*HEAD[:2], (HEAD[2] + 1) % 10**6))
+NO_NUMBER = _user((*HEAD[:2], -1.0))
 
 FOREIGN = {
     "user dynamics and bias without user data": '<general joint="a" dyntype="user" actdim="3" biastype="user"/>',

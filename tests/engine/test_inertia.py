@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from codrl_mj.engine.inertia import MOST_ON_STACK, shaft_inertia
+from codrl_mj.engine.doors import MOST_ON_STACK, shaft_inertia
 
 MODELS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 

@@ -14,9 +14,9 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.own_code import asset_path
 from codrl_mj.physics import PHYSICS
 from codrl_mj.tasks import TASKS
-from codrl_mj.tasks.assets import asset_path
 from tests.engine.models import FULL, changed
 from tests.tasks.faces import every_rebuilt
 

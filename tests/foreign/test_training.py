@@ -251,7 +251,7 @@ def test_an_environment_without_a_time_limit_needs_one():
         with pytest.raises(ValueError, match="registered without a time limit"):
             endless.make()
         limited = dataclasses.replace(endless, max_episode_steps=5)
-        assert limited.as_posed.time_limit == 5
+        assert TrainConfig(limited, SACConfig()).evaluation_env.time_limit == 5
         assert evaluate(RandomPolicy(limited.make().action_space), limited, 1).length.mean == 5
     finally:
         gym.registry.pop("ForeignEndless-v0")

@@ -29,7 +29,7 @@ def _mixed():
 def test_motors_of_both_doors_are_found():
     model = _mixed()
     assert codrl_mj.engine.motors(model) == {0: LOOP, 1: LINE}
-    codrl_mj.engine.check(model)
+    codrl_mj.engine.motors(model)
     assert codrl_mj.engine.motors(arm().compile()) == {}
 
 

@@ -49,7 +49,7 @@ def _reloaded(model, how, tmp_path):
 def test_a_compiled_model_keeps_its_motors(how, tmp_path):
     model = behind_plugin(arm(), TWO)
     again = _reloaded(model, how, tmp_path)
-    codrl_mj.engine.check(again)
+    codrl_mj.engine.motors(again)
     assert codrl_mj.engine.motors(again) == {0: NOISY, 1: Worn()}
     inputs = controls(100, 2)
     np.testing.assert_array_equal(trajectory(again, inputs), trajectory(model, inputs))
@@ -194,22 +194,22 @@ def test_a_model_whose_plugin_has_another_slot_is_refused():
     model.plugin[:] = 0  # as in an .mjb file from a process where plugins were registered in another order
     slot = registered()[NAME][0]
     with pytest.raises(ValueError, match=f"^one: plugin slot = 0: a motor of codrl_mj needs {slot}"):
-        codrl_mj.engine.check(model)
+        codrl_mj.engine.motors(model)
 
 
 def test_a_model_whose_motors_do_not_agree_with_their_plugins_is_refused():
     model = behind_plugin(arm(), TWO)
     model.actuator_user[0, 0] = 1.0
     with pytest.raises(ValueError, match=r"^one: its actuator's user data do not begin with codrl_mj's signature"):
-        codrl_mj.engine.check(model)
+        codrl_mj.engine.motors(model)
     model = behind_plugin(arm(), TWO)
     model.actuator_user[:, 2] = model.actuator_user[::-1, 2]
     with pytest.raises(ValueError, match=r"^one: family = 'codrl_mj.actuators.current_loop:Actuator' of its plugin"):
-        codrl_mj.engine.check(model)
+        codrl_mj.engine.motors(model)
     model.actuator_user[0, 2] = 123.0
     with pytest.raises(ValueError, match=r"^one: family 123 is not known in this process: import its module and call"):
-        codrl_mj.engine.check(model)
+        codrl_mj.engine.motors(model)
     model = behind_plugin(arm(), TWO)
     model.actuator_user[0, 4] = -1.0
     with pytest.raises(ValueError, match=r"^one: Motor\.resistance = -1\.0: must be"):
-        codrl_mj.engine.check(model)
+        codrl_mj.engine.motors(model)

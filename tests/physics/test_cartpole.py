@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from codrl_mj.actuators import IDEAL, NAMED, Actuator, CurrentLoop, Motor
+from codrl_mj.own_code import asset_path
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Plant, SimulationDivergedError, motors, trace_names
 from codrl_mj.tasks import TASKS, named_actuator
-from codrl_mj.tasks.assets import asset_path
 from tests.reference import MotorSimulation
 
 TASK = TASKS["cartpole"]

@@ -8,9 +8,9 @@ import mujoco.batch
 import numpy as np
 import pytest
 
+from codrl_mj.own_code import asset_path
 from codrl_mj.physics import MujocoPhysics, Plant, install_callbacks, motors
 from codrl_mj.tasks import TASKS
-from codrl_mj.tasks.assets import asset_path
 from tests.tasks.faces import NEW, actions, every_rebuilt, ours
 
 
