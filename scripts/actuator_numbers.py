@@ -159,49 +159,18 @@ def _table(heads: Iterable[str], body: Iterable[Iterable[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def _of_tasks(rows: list[dict[str, str]], column: str) -> str:
-    """A table of one number: tasks in rows, named actuators in columns."""
-    names = list(dict.fromkeys(row["actuator"] for row in rows))
-    body = [
-        [task, *(_number(row[column]) for row in rows if row["task"] == task)]
-        for task in dict.fromkeys(row["task"] for row in rows)
-    ]
-    return _table(["task", *(f"`{name}`" for name in names)], body)
-
-
-def _first_steps(rows: list[dict[str, str]]) -> str:
-    """What of the largest force is there after the policy's first step, from task to task, of each actuator."""
+def _ranges(rows: list[dict[str, str]], column: str) -> list[str]:
+    """The least and the largest of a number, from task to task, of each actuator."""
     found: dict[str, list[float]] = {}
     for row in rows:
-        found.setdefault(row["actuator"], []).append(float(row["first_step_percent"]))
-    return ", ".join(f"{min(some):.0f} to {max(some):.0f} % with `{name}`" for name, some in found.items())
-
-
-def _limits(rows: list[dict[str, str]]) -> str:
-    """Stall and no-load speed of each task, which all actuators share: they are the motor's."""
-    units = {"False": ("N·m", "rad/s"), "True": ("N", "m/s")}
-    found: dict[str, list[str]] = {}
-    for row in rows:
-        force, speed = units[row["slide"]]
-        limits = f"{_number(row['stall_torque'])} {force} and {_number(row['no_load_speed'])} {speed}"
-        found.setdefault(limits, []).append(row["task"])
-    return "; ".join(f"{limits} ({', '.join(dict.fromkeys(tasks))})" for limits, tasks in found.items())
-
-
-def _contradictions() -> str:
-    """The motors whose printed values differ from what follows from others by a tenth or more, and by how much."""
-    worst = {name: next(iter(motor_entry(name).numbers.disagreements), None) for name in motor_names()}
-    return ", ".join(
-        f"`{name}` by {100 * abs(one.difference):.0f} % ({one.quantity.replace('_', ' ')})"
-        for name, one in worst.items()
-        if one is not None and abs(one.difference) >= 0.1
-    )
+        found.setdefault(row["actuator"], []).append(float(row[column]))
+    return [" to ".join(dict.fromkeys([_number(min(some)), _number(max(some))])) for some in found.values()]
 
 
 def _motor_line(row: dict[str, str]) -> list[str]:
     """A motor: what is printed, and what is measured."""
     entry = motor_entry(row["motor"])
-    measured = ("stall_torque", "no_load_speed", "continuous_torque", "mechanical_time_constant_ms")
+    measured = ("stall_torque", "no_load_speed", "continuous_torque")
     return [
         f"`{row['motor']}`" + (" t" if entry.numbers.thermal_resistance else ""),
         *(_number(row[name]) for name in ("voltage", "gear_ratio", *measured)),
@@ -211,39 +180,34 @@ def _motor_line(row: dict[str, str]) -> list[str]:
 def page(tables: Mapping[str, list[dict[str, str]]]) -> str:
     """The Markdown page, from the rows of the CSV files and the catalogue."""
     tasks, motors = tables["tasks"], tables["motors"]
-    heads = ("motor", "V", "gear", "stall [N·m]", "no load [rad/s]", "continuous [N·m]", "τm [ms]")
+    heads = ("motor", "V", "gear", "stall [N·m]", "no load [rad/s]", "continuous [N·m]")
+    names = [f"`{name}`" for name in dict.fromkeys(row["actuator"] for row in tasks)]
+    paper = {"settles within 2 % [s]": "settled_2_s", "is there after a policy's step [%]": "first_step_percent"}
     loop = motors[0]
     return f"""# Actuators in numbers
 
-What every actuator that has a name does on a bench: one hinge in the engine, blocked or free. Raw numbers, and the
-motors' constants: [tasks]({TABLES["tasks"]}), [motors]({TABLES["motors"]}).
+What every named [actuator](actuators.md) does on one hinge, blocked or free. More numbers: [tasks]({TABLES["tasks"]}),
+[motors]({TABLES["motors"]}).
 
 ![Share of the largest force that each of the paper's actuators delivers](pictures/actuators_in_numbers.png)
 
 ## The paper's actuators
 
-Seconds until a step to the task's largest force is within 2 % for good (0: within the first integration step):
+A step to the task's largest force, over the tasks (0: within the first integration step; all is there by {LONG:g} s):
 
-{_of_tasks(tasks, "settled_2_s")}
-
-After the policy's first step there is, of the force that was asked for, {_first_steps(tasks)}; after {LONG:g} s, all.
-Stall and no-load speed are the motor's, whatever its loop:
-{_limits(tasks)}.
+{_table(["", *names], [[words, *_ranges(tasks, column)] for words, column in paper.items()])}
 
 ## The catalogue
 
-Each at its own gear and nominal voltage (24 V where none is printed), cold, without a limit of the current. Under a
-loop at 20 kHz all settle within 2 % in {_number(loop["settled_2_ms"])} ms, with a bandwidth of
-{_number(loop["bandwidth_hz"], 4)} Hz: gains are designed for the winding.
+Each at its own gear and nominal voltage (24 V where none is printed), cold, without a limit of the current, which
+settles in {_number(loop["settled_2_ms"])} ms under a loop at 20 kHz (bandwidth {_number(loop["bandwidth_hz"], 4)} Hz).
 
 {_table(heads, map(_motor_line, motors))}
 
-Torques are those of the output that just turns, past friction; *continuous*, at the current that the winding bears for
-good. *τm*: time constant of the free output, R·J/(kT·kE) without a gear. t: has thermal values. –: not printed. Stall,
-no load and τm are measured; they are as printed, to 5 %.
+Torques are the output's, past friction; *continuous*, at the current that the winding bears for good. t: has thermal
+values. –: not printed. Stall and no load are measured; they are as printed, to 5 %.
 
-Datasheets contradict themselves: {_contradictions()}. `codrl-mj motor show NAME` lists all, with the source of
-every value.
+`codrl-mj motor show NAME` has the source of every value, and where a datasheet contradicts itself.
 """
 
 

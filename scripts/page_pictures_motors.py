@@ -44,7 +44,7 @@ def motor_design(out: Path) -> None:
 
 def own_motor(out: Path) -> None:
     """The motor that docs/motors.md writes down."""
-    written = re.search(r"```toml\n(.*?)```", (DOCS / "own_motor.md").read_text(), re.DOTALL)
+    written = re.search(r"```toml\n(.*?)```", (DOCS / "motors.md").read_text(), re.DOTALL)
     with tempfile.TemporaryDirectory() as made:
         Path(made, "my_motor.toml").write_text(written[1] if written else "")
         run("motor", "show", str(Path(made, "my_motor.toml")), "--out", made)

@@ -203,6 +203,23 @@ def fitted(path: Path) -> None:
         shot(folder / "motor" / "report.html", "#held-out", path, height=392)
 
 
+def planned(path: Path) -> None:
+    """The voltage that the plan of docs/identify_logs.md writes, and what a simulated bench answers to its like."""
+    motor, load, names = "maxon-ec45-flat-50w", ("--inertia", "1e-4"), ("voltage", "current", "velocity")
+    with tempfile.TemporaryDirectory() as made:
+        log = Path(made) / "log.csv"
+        words = ("--kind", "prbs", "--amplitude", "5.1", "--clock", "0.002", "--rate", "1000")
+        run("identify", "simulate", motor, *load, *words, "--sensor", "current:noise=0.02", "--out", str(log))
+        rows = np.genfromtxt(log, delimiter=",", names=True)
+    rows = rows[rows["time"] <= 2.0]
+    with drawing(7.0, 3.6, nrows=3, sharex=True) as (figure, axes):
+        for one, name, unit, colour in zip(axes, names, ("V", "A", "rad/s"), (BLUE, ORANGE, RED), strict=True):
+            one.step(rows["time"], rows[name], colour, linewidth=0.6, where="post")
+            one.set_ylabel(f"{name} [{unit}]")
+        axes[-1].set_xlabel("time [s]")
+        save(figure, path)
+
+
 @functools.cache
 def certificate() -> "tempfile.TemporaryDirectory[str]":
     """The certificate of all tasks, in a folder that goes with the process."""
@@ -249,6 +266,7 @@ PICTURES: Mapping[str, Callable[[Path], None]] = {
     "disturbances.svg": disturbed,
     "randomization.svg": drawn,
     "tutorial_fit.png": fitted,
+    "plan.png": planned,
     "certificate.png": certified,
     "convergence.png": converged,
     "learning_curve.png": learnt,

@@ -47,7 +47,7 @@ SHORT = {
 }
 """What takes a reader minutes -> what takes a test seconds."""
 WITH_PYTHON = [name for name, text in PAGES.items() if "```python" in text and name not in ELSEWHERE]
-LONG = {f"docs/{name}.md" for name in ("actuators", "foreign", "identify", "motors", "report", "sarsa", "studies")}
+LONG = {f"docs/{name}.md" for name in ("actuators", "foreign", "identify", "motors", "sarsa", "see", "studies")}
 """What takes more than three seconds even so."""
 COMMANDS = [
     pytest.param(name, command.replace("\\\n", ""), marks=pytest.mark.matrix if name != "README.md" else [])
@@ -74,7 +74,7 @@ def folder_of_a_reader(trained, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     Path("examples").symlink_to(ROOT / "examples")
     Path("half_cheetah.xml").symlink_to(Path(gymnasium.__file__).parent / "envs/mujoco/assets/half_cheetah.xml")
-    written = re.search(r"```toml\n(.*?)```", PAGES["docs/own_motor.md"], re.DOTALL)
+    written = re.search(r"```toml\n(.*?)```", PAGES["docs/motors.md"], re.DOTALL)
     Path("my_motor.toml").write_text(written[1])
     Path("car.yaml").write_text(re.search(r"```yaml\n(.*?)```", PAGES["docs/training.md"], re.DOTALL)[1])
     family = re.search(r"```python\n(import dataclasses\n.*?)```", PAGES["docs/actuators.md"], re.DOTALL)

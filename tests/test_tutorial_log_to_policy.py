@@ -54,17 +54,12 @@ def bench(tmp_path_factory):
 
 
 @pytest.mark.matrix
-def test_the_fit_finds_the_motor_of_the_bench(bench, capsys, monkeypatch):
+def test_the_fit_finds_the_motor_of_the_bench(bench, monkeypatch):
     monkeypatch.chdir(bench)
     real = yaml.safe_load(FILES["real.yaml"])["motor"]
     found = {one["name"]: one for one in json.loads(Path("motor/result.json").read_text())["estimates"]}
     for name in ("resistance", "torque_constant", "back_emf_constant"):
         assert found[name]["low"] <= real[name] <= found[name]["high"]
-    (block,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
-    exec(compile(block, "tutorial_log_to_policy.md", "exec"), {})
-    numbers, drawn = capsys.readouterr().out.splitlines()
-    assert float(numbers.split()[0]) == pytest.approx(real["resistance"], rel=0.02)
-    assert "uniform(" in drawn
 
 
 @pytest.mark.matrix
@@ -72,4 +67,4 @@ def test_the_rest_of_it_runs(bench, monkeypatch):
     monkeypatch.chdir(bench)
     for command in COMMANDS[TRAINING:]:
         run(command, **SHORT)
-    assert [command.split()[0] for command in COMMANDS[TRAINING:]] == ["train", "evaluate", "evaluate", "evaluate"]
+    assert [command.split()[0] for command in COMMANDS[TRAINING:]] == ["train", "evaluate", "evaluate"]
