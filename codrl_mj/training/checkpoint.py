@@ -10,7 +10,6 @@ import hashlib
 import json
 import operator
 import os
-import re
 import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +22,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 
-from codrl_mj.runs import CHECKPOINT
+from codrl_mj.runs import checkpoints
 from codrl_mj.runs.files import writing
 
 KEPT = 2
@@ -164,7 +163,7 @@ def save_checkpoint(folder: Path, state: State, run: str) -> Path:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())  # on the disk before the last but one is deleted
-    there = _checkpoints(folder)
+    there = checkpoints(folder)
     before = [other for other, named in there.items() if named["step"] < step]
     # the rest is of the same step or, damaged, of a later one, from which the run fell back
     for superfluous in there.keys() - {path, *before[1 - KEPT :]}:
@@ -174,8 +173,7 @@ def save_checkpoint(folder: Path, state: State, run: str) -> Path:
 
 def load_checkpoint(folder: Path, run: str) -> State | None:
     """The last checkpoint of a run that is intact; None if there is none. Of damaged ones it warns."""
-    checkpoints = _checkpoints(folder)
-    for left, (path, named) in reversed(list(enumerate(checkpoints.items()))):
+    for left, (path, named) in reversed(list(enumerate(checkpoints(folder).items()))):
         try:
             return _read(path, named["digest"], run)
         except (ValueError, OSError) as error:
@@ -197,12 +195,6 @@ def _read(path: Path, digest: str, run: str) -> State:
         return State(load(content), json.loads(metadata["facts"]))
     except (SafetensorError, KeyError, TypeError) as error:
         raise ValueError(f"it is no checkpoint: {error!r}") from None
-
-
-def _checkpoints(folder: Path) -> dict[Path, re.Match[str]]:
-    """The checkpoints of a folder, the oldest first, and what their names say."""
-    named = {path: CHECKPOINT.fullmatch(path.name) for path in sorted(folder.glob("*"))}
-    return {path: match for path, match in named.items() if match is not None}
 
 
 def _digest(content: bytes) -> str:
