@@ -23,7 +23,7 @@ from stable_baselines3.common.distributions import StateDependentNoiseDistributi
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 
 from codrl_mj.runs import checkpoints
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import below, writing
 
 KEPT = 2
 """Checkpoints that are kept: the last, and the one before in case the last is damaged."""
@@ -105,7 +105,7 @@ def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
         for name in tensors:
             with torch.no_grad():
                 operator.attrgetter(name)(model).copy_(torch.tensor(arrays[f"tensor.{name}"]))
-        begun = envs.restore(_below(arrays, "env."))
+        begun = envs.restore(below("env.", arrays))
         model._last_obs = arrays["last_obs"].copy() if begun is None else begun
         model._last_episode_starts = arrays["last_episode_starts"].copy()
         if begun is not None:  # environments whose state nobody can set
@@ -120,7 +120,7 @@ def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
             for name in _DRAWN:
                 setattr(distribution, name, torch.tensor(arrays[f"noise.{name}"]))
         if hasattr(model, "restore"):
-            model.restore(_below(arrays, "model."))
+            model.restore(below("model.", arrays))
         numpy_state = facts["random.numpy"]
         np.random.set_state(numpy_state | {"state": numpy_state["state"] | {"key": arrays["random.numpy.key"]}})
         model.action_space.np_random.bit_generator.state = facts["random.actions"]
@@ -131,10 +131,6 @@ def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
 
 def _array(value: Any) -> np.ndarray:
     return torch.as_tensor(value).detach().cpu().numpy().copy()
-
-
-def _below(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
 
 def _noises(model: Any) -> list[OrnsteinUhlenbeckActionNoise]:
