@@ -30,7 +30,7 @@ from codrl_mj.cli.terminal import progress_bar, say
 from codrl_mj.envs.worlds import find_world
 from codrl_mj.runs import PROGRESS, RESULT, finished
 from codrl_mj.runs.files import read_json
-from codrl_mj.runs.summaries import last_report
+from codrl_mj.runs.summaries import read_reports
 from codrl_mj.tasks import TASKS
 from codrl_mj.training.config import TrainConfig, default_agent, read_config
 from codrl_mj.training.folder import admit, load_config
@@ -194,8 +194,8 @@ def training_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> Iterator[None
 
         def show() -> None:
             for row, (file, unit, total) in rows.items():
-                report: dict[str, Any] = {name: float(value) for name, value in last_report(file, []).items()}
-                if report:
+                for last in read_reports(file, [])[-1:]:
+                    report: dict[str, Any] = {name: float(value) for name, value in last.items()}
                     bar.update(row, completed=min(int(report[unit]), total), **report)
 
         ended = threading.Event()

@@ -5,7 +5,7 @@ import copy
 import dataclasses
 import json
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import IDEAL, actuator_from_mapping, mapping_of, trusting
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import below, writing
 from codrl_mj.runs.policies import Policy
 
 MakeEnv = Callable[[], gymnasium.Env[Any, Any]]
@@ -153,8 +153,8 @@ def load_episode(path: Path, trust: bool = False) -> Episode:
             ]
         return Episode(
             **{field: arrays[field] for field in _ARRAYS},
-            trace=_within("trace/", arrays),
-            signals=_within("signals/", arrays),
+            trace=below("trace/", arrays),
+            signals=below("signals/", arrays),
             terminated=bool(arrays["terminated"]),
             actuator=tuple(actuators) if several else actuators[0],
             command=str(arrays["command"]),
@@ -163,10 +163,6 @@ def load_episode(path: Path, trust: bool = False) -> Episode:
         )
     except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path} is not the trajectory of an episode: {error}") from None
-
-
-def _within(prefix: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
 
 
 class _Recording:

@@ -181,6 +181,7 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
     if any(world.at_goal(episode) is not None for episode in episodes):
         success = wilson_rate(len(reached), len(episodes))
     driven = [_driven(episode) for episode in episodes]
+    each_motor = (_measures(episodes, [[each[place]] for each in driven]) for place, _ in enumerate(episodes[0].motors))
     return Evaluation(
         task=world.name,
         episodes=len(episodes),
@@ -192,25 +193,14 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
         success=success,
         failure=None if success is None else Interval(1 - success.mean, 1 - success.high, 1 - success.low),
         time_to_goal=quartiles(reached) if world.timed and len(reached) else None,
-        mechanical_work=bootstrap_mean(np.array([sum(one.work for one in each) for each in driven])),
-        **_wear(episodes, driven),
         episode_returns=tuple(returns.tolist()),
         episode_times_to_goal=() if success is None else tuple(goals),
-        motors={
-            name: _of_motor(episodes, [[each[number]] for each in driven])
-            for number, name in enumerate(episodes[0].motors)
+        motors={  # of energies the mean
+            name: {key: value.mean if isinstance(value, Interval) else value for key, value in measures.items()}
+            for name, measures in zip(episodes[0].motors, each_motor, strict=True)
         },
-        **_tracking(episodes, driven),
-        **_electrical(episodes, driven),
+        **_measures(episodes, driven),
     )
-
-
-def _of_motor(episodes: Sequence[Episode], driven: Sequence[Sequence["_Driven"]]) -> dict[str, float | None]:
-    """What one of several motors did: measures by their names, of energies the mean."""
-    measures = _tracking(episodes, driven) | _wear(episodes, driven) | _electrical(episodes, driven)
-    work = float(np.mean([one.work for each in driven for one in each]))
-    means = {name: value.mean if isinstance(value, Interval) else value for name, value in measures.items()}
-    return means | {"mechanical_work": work}
 
 
 def _time_to_goal(world: World, episode: Episode) -> float | None:
@@ -280,33 +270,33 @@ def _driven(episode: Episode) -> list[_Driven]:
     return made
 
 
-def _tracking(episodes: Sequence[Episode], driven: Sequence[Sequence[_Driven]]) -> dict[str, Any]:
-    """The measures of how well the torque follows the desired one, which is held over an environment step."""
-    asked_for_forces = (
-        one.command == "force" or one.actuators[0].commands()[one.command].actuator.tracks for one in episodes
-    )
-    if not all(asked_for_forces):
-        return dict.fromkeys(("tracking_rms", "tracking_percent", "tracking_max", "tracking_lag"))
+def _measures(episodes: Sequence[Episode], driven: Sequence[Sequence[_Driven]]) -> dict[str, Any]:
+    """What motors were asked for and did, of each episode the same ones, on the mean of them.
+
+    How well the torque follows the desired one, which is held over an environment step; what the delivered one does to
+    gears and bearings; what that asks of the supply; the work done.
+    """
     desired = [one.desired for each in driven for one in each]
     actual = [one.actual for each in driven for one in each]
-    asked = np.concatenate(desired)
-    error = asked - np.concatenate(actual)
-    rms, scale = _root_mean_square(error), _root_mean_square(asked)
-    return {
-        "tracking_rms": rms,
-        "tracking_percent": 100 * rms / scale if scale > 0 else None,
-        "tracking_max": float(np.abs(error).max()),
-        "tracking_lag": delay(desired, actual, episodes[0].timestep, len(driven[0])),
-    }
-
-
-def _wear(episodes: Sequence[Episode], driven: Sequence[Sequence[_Driven]]) -> dict[str, Any]:
-    """What the delivered torques do to gears and bearings, on the mean of the motors."""
+    delivered = np.concatenate(actual)
+    found: dict[str, Any] = dict.fromkeys(("tracking_rms", "tracking_percent", "tracking_max", "tracking_lag"))
+    if all(one.command == "force" or one.actuators[0].commands()[one.command].actuator.tracks for one in episodes):
+        asked = np.concatenate(desired)
+        error = asked - delivered
+        rms, scale = _root_mean_square(error), _root_mean_square(asked)
+        found = {
+            "tracking_rms": rms,
+            "tracking_percent": 100 * rms / scale if scale > 0 else None,
+            "tracking_max": float(np.abs(error).max()),
+            "tracking_lag": delay(desired, actual, episodes[0].timestep, len(driven[0])),
+        }
     duration = math.fsum(episode.time[-1] for episode in episodes) * len(driven[0])
-    actual = [one.actual for each in driven for one in each]
     return {
-        "torque_rms": _root_mean_square(np.concatenate(actual)),
+        **found,
+        "torque_rms": _root_mean_square(delivered),
         "reversals": sum(map(sign_changes, actual)) / duration,
+        **_electrical(episodes, driven),
+        "mechanical_work": bootstrap_mean(np.array([sum(one.work for one in each) for each in driven])),
     }
 
 

@@ -22,7 +22,7 @@ from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.runs import BEST, EPISODES, PROGRESS, finished, told_apart
 from codrl_mj.runs.files import check_page, read_json
 from codrl_mj.runs.policies import load_policy
-from codrl_mj.runs.summaries import RunSummary, compare, read_run
+from codrl_mj.runs.summaries import RunSummary, compare, read_reports, read_run
 from codrl_mj.training.folder import load_config
 from codrl_mj.training.history import learning_curves, read_episodes
 
@@ -167,11 +167,12 @@ def _learning(runs: Sequence[Shown]) -> Markup:
     evaluations: list[Curve] = []
     errors: list[Curve] = []
     for place, run in enumerate(runs):
-        reports = _reports(run.summary.path / PROGRESS)
-        steps = reports.get("steps", np.empty(0))
-        evaluated, off = (
-            reports.get(name, np.full(len(steps), np.nan)) for name in ("evaluation_return", "torque_error")
-        )
+        reports = read_reports(run.summary.path / PROGRESS, [])
+        columns = [[row.get(name, "nan") for row in reports] for name in ("steps", "evaluation_return", "torque_error")]
+        try:
+            steps, evaluated, off = np.array(columns, dtype=np.float64)
+        except ValueError:  # a cell is no number
+            steps, evaluated, off = np.empty((3, 0))
         try:
             episodes = read_episodes(run.summary.path / EPISODES)
         except (ValueError, OSError) as error:
@@ -195,18 +196,6 @@ def _learning(runs: Sequence[Shown]) -> Markup:
     if not found and not notes:
         notes.append(page.note("No learning curve yet: no training episode has ended."))
     return page.joined((*notes, page.plots(found)))
-
-
-def _reports(path: Path) -> dict[str, np.ndarray]:
-    """The columns of a training's progress, whole rows only; empty where it cannot be read."""
-    import csv
-
-    try:
-        with path.open(newline="") as file:
-            rows = [row for row in csv.DictReader(file) if None not in row and None not in row.values()]
-        return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]} if rows else {}
-    except (OSError, ValueError, csv.Error):
-        return {}
 
 
 def _evaluation(runs: Sequence[Shown]) -> Markup:

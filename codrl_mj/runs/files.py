@@ -114,6 +114,11 @@ def check_digest(path: Path, content: bytes, expected: Any, beside: str) -> None
         )
 
 
+def below(prefix: str, content: Mapping[str, Any]) -> dict[str, Any]:
+    """What the names with that prefix name, by the rest of them: a file's arrays stand side by side."""
+    return {name.removeprefix(prefix): value for name, value in content.items() if name.startswith(prefix)}
+
+
 def read_json(path: Path, what: str) -> Any:
     """Read JSON; of what is `sealed`, the content alone. `what` the file is goes into the error.
 

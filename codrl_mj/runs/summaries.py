@@ -106,7 +106,7 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
         config = {}
     env = config.get("env")
     env = env if isinstance(env, Mapping) else {}
-    progress = last_report(path / PROGRESS, problems)
+    progress = next(reversed(read_reports(path / PROGRESS, problems)), None)
     result = _mapping(path / RESULT, "result of a run", problems)
     evaluation = _mapping(path / EVALUATION, "policy evaluation", problems)
     missing = [file for file in POLICY_FILES if not (path / file).is_file()]
@@ -164,23 +164,22 @@ def _mapping(path: Path, what: str, problems: list[str]) -> Mapping[str, Any] | 
     return content
 
 
-def last_report(path: Path, problems: list[str]) -> Mapping[str, Any]:
-    """The last whole row of a training's progress, as text; empty if there is none. A last row may be half written.
+def read_reports(path: Path, problems: list[str]) -> list[Mapping[str, str]]:
+    """The whole rows of a training's progress, as text: the last may be half written.
 
-    `problems` gets what is wrong with the table.
+    `problems` gets what is wrong with the table, of which there are then no rows.
     """
     try:
         with path.open(newline="") as file:
             rows = list(csv.DictReader(file))
     except FileNotFoundError:
-        return {}
+        return []
     except (ValueError, OSError, csv.Error) as error:
         problems.append(f"{path.name} cannot be read: {error}")
-        return {}
+        return []
     if rows and "steps" not in rows[0]:
         problems.append(f"{path.name} has no column 'steps'")
-    whole = [row for row in rows[-2:] if None not in row and None not in row.values()]
-    return whole[-1] if whole else {}
+    return [row for row in rows if None not in row and None not in row.values()]
 
 
 def _number(value: Any) -> float | None:
@@ -225,19 +224,17 @@ def _actuator_of(env: Mapping[str, Any], task: str | None, labels: Any) -> str |
         each = [each]
     labels = labels if isinstance(labels, list) else []
     papers = TASKS[task].paper if task in TASKS else ()
-    rows = itertools.zip_longest(each, labels[: len(each)], papers[: len(each)])
-    return ", ".join(dict.fromkeys(_actuator_name(*row) for row in rows))
-
-
-def _actuator_name(actuator: Any, label: Any, paper: Any) -> str:
-    """What to call the actuator of a mapping: its family where that is somebody's, `custom` if it cannot be read."""
-    if label or actuator is None or isinstance(actuator, str):
-        return str(label or actuator or "ideal")
-    try:
-        with trusting(False):
-            return name_of(actuator_from_mapping(actuator), paper)
-    except (ValueError, TypeError, AttributeError):
-        return str(actuator.get("family", "custom")) if isinstance(actuator, Mapping) else "custom"
+    names: list[str] = []
+    for actuator, label, paper in itertools.zip_longest(each, labels[: len(each)], papers[: len(each)]):
+        if label or actuator is None or isinstance(actuator, str):
+            names.append(str(label or actuator or "ideal"))
+            continue
+        try:
+            with trusting(False):
+                names.append(name_of(actuator_from_mapping(actuator), paper))
+        except (ValueError, TypeError, AttributeError):  # somebody's family is called so, what cannot be read is not
+            names.append(str(actuator.get("family", "custom")) if isinstance(actuator, Mapping) else "custom")
+    return ", ".join(dict.fromkeys(names))
 
 
 SORT_KEYS = ("name", "task", "agent", "actuator", "state", "steps", "return", "seconds", "modified")

@@ -11,7 +11,8 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
-from codrl_mj.training.run import TrainingStoppedError, stopping
+from codrl_mj.training import TrainingStoppedError
+from codrl_mj.training.run import stopping
 
 BACKENDS = ("local", "ray")
 """Where calls are computed: in processes of this machine, or on a Ray cluster."""

@@ -10,7 +10,6 @@ import hashlib
 import json
 import operator
 import os
-import re
 import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,8 +22,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 
-from codrl_mj.runs import CHECKPOINT
-from codrl_mj.runs.files import writing
+from codrl_mj.runs import checkpoints
+from codrl_mj.runs.files import below, writing
 
 KEPT = 2
 """Checkpoints that are kept: the last, and the one before in case the last is damaged."""
@@ -106,7 +105,7 @@ def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
         for name in tensors:
             with torch.no_grad():
                 operator.attrgetter(name)(model).copy_(torch.tensor(arrays[f"tensor.{name}"]))
-        begun = envs.restore(_below(arrays, "env."))
+        begun = envs.restore(below("env.", arrays))
         model._last_obs = arrays["last_obs"].copy() if begun is None else begun
         model._last_episode_starts = arrays["last_episode_starts"].copy()
         if begun is not None:  # environments whose state nobody can set
@@ -121,7 +120,7 @@ def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
             for name in _DRAWN:
                 setattr(distribution, name, torch.tensor(arrays[f"noise.{name}"]))
         if hasattr(model, "restore"):
-            model.restore(_below(arrays, "model."))
+            model.restore(below("model.", arrays))
         numpy_state = facts["random.numpy"]
         np.random.set_state(numpy_state | {"state": numpy_state["state"] | {"key": arrays["random.numpy.key"]}})
         model.action_space.np_random.bit_generator.state = facts["random.actions"]
@@ -132,10 +131,6 @@ def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
 
 def _array(value: Any) -> np.ndarray:
     return torch.as_tensor(value).detach().cpu().numpy().copy()
-
-
-def _below(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
 
 def _noises(model: Any) -> list[OrnsteinUhlenbeckActionNoise]:
@@ -164,7 +159,7 @@ def save_checkpoint(folder: Path, state: State, run: str) -> Path:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())  # on the disk before the last but one is deleted
-    there = _checkpoints(folder)
+    there = checkpoints(folder)
     before = [other for other, named in there.items() if named["step"] < step]
     # the rest is of the same step or, damaged, of a later one, from which the run fell back
     for superfluous in there.keys() - {path, *before[1 - KEPT :]}:
@@ -174,8 +169,7 @@ def save_checkpoint(folder: Path, state: State, run: str) -> Path:
 
 def load_checkpoint(folder: Path, run: str) -> State | None:
     """The last checkpoint of a run that is intact; None if there is none. Of damaged ones it warns."""
-    checkpoints = _checkpoints(folder)
-    for left, (path, named) in reversed(list(enumerate(checkpoints.items()))):
+    for left, (path, named) in reversed(list(enumerate(checkpoints(folder).items()))):
         try:
             return _read(path, named["digest"], run)
         except (ValueError, OSError) as error:
@@ -197,12 +191,6 @@ def _read(path: Path, digest: str, run: str) -> State:
         return State(load(content), json.loads(metadata["facts"]))
     except (SafetensorError, KeyError, TypeError) as error:
         raise ValueError(f"it is no checkpoint: {error!r}") from None
-
-
-def _checkpoints(folder: Path) -> dict[Path, re.Match[str]]:
-    """The checkpoints of a folder, the oldest first, and what their names say."""
-    named = {path: CHECKPOINT.fullmatch(path.name) for path in sorted(folder.glob("*"))}
-    return {path: match for path, match in named.items() if match is not None}
 
 
 def _digest(content: bytes) -> str:

@@ -27,6 +27,7 @@ from codrl_mj.runs import (
     PROGRESS,
     RESULT,
     TENSORBOARD,
+    checkpoints,
     finished,
 )
 from codrl_mj.runs.files import check_writable, leftovers, read_json, sealed, write_json
@@ -96,10 +97,9 @@ def unused(run: Path) -> bool:
 
 def standing(run: Path) -> str:
     """What there is to go on from in the folder of a training that was broken off, and how."""
-    names = (CHECKPOINT.fullmatch(path.name) for path in run.glob(f"{CHECKPOINTS}/*"))
-    steps = [int(match["step"]) for match in names if match is not None]
-    if steps:
-        return f"Its last checkpoint is of step {max(steps):,}: continue with codrl-mj train --resume {run}"
+    if kept := checkpoints(run / CHECKPOINTS):
+        step = max(int(named["step"]) for named in kept.values())
+        return f"Its last checkpoint is of step {step:,}: continue with codrl-mj train --resume {run}"
     if (run / BEST / EVALUATION).exists():
         return f"It has no checkpoint to continue from, only its best policy so far, in {run / BEST}: start it anew"
     return "It had no checkpoint yet, and nothing of it is left: start it anew"

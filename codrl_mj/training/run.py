@@ -9,11 +9,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from codrl_mj.runs import CURVE, EVALUATION, RESULT, finished
-from codrl_mj.runs.files import sealed, write_json
+from codrl_mj.runs import finished
 from codrl_mj.training import folder
 from codrl_mj.training.config import TrainConfig
-from codrl_mj.training.folder import TrainingStoppedError
 from codrl_mj.training.history import Progress
 
 
@@ -81,25 +79,8 @@ def train(
                     steps = (config.total_episodes or 0) * (config.env.time_limit or 0) * config.num_envs
                 with contextlib.suppress(LearningEnded):
                     model.learn(steps, callback=watcher, log_interval=None)
-                if asked and not watcher.complete:
-                    raise TrainingStoppedError(
-                        f"stopped after {watcher.saved_steps:,} steps: continue with codrl-mj train --resume {out}",
-                        asked[-1],
-                    )
-                _finish(config, out, model, watcher)
+                watcher.finish()
     return out
-
-
-def _finish(config: TrainConfig, out: Path, model: Any, watcher: Any) -> None:
-    from codrl_mj.runs.policies import save_policy
-    from codrl_mj.training import history
-
-    watcher.boundary(last=True)
-    save_policy(model.policy, config.agent, out)
-    write_json(out / EVALUATION, sealed(watcher.evaluation.as_mapping()))
-    title = f"{config.agent.name.upper()} on {config.task}"
-    history.save_learning_curve(out / CURVE, title, watcher.episodes.array(), watcher.reports.array())
-    write_json(out / RESULT, sealed(watcher.result()))  # marks the run as finished
 
 
 @contextlib.contextmanager

@@ -6,17 +6,16 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 
 from codrl_mj.evaluation import Evaluation, evaluate
-from codrl_mj.runs import BEST, CHECKPOINTS, EPISODES, EVALUATION, PROGRESS, TENSORBOARD
+from codrl_mj.runs import BEST, CHECKPOINTS, CURVE, EPISODES, EVALUATION, PROGRESS, RESULT, TENSORBOARD
 from codrl_mj.runs.files import sealed, write_json
 from codrl_mj.runs.policies import save_policy
-from codrl_mj.training import folder
+from codrl_mj.training import folder, history
 from codrl_mj.training.checkpoint import State, capture, load_checkpoint, restore, save_checkpoint
 from codrl_mj.training.config import EVALUATION_SEED, TrainConfig
 from codrl_mj.training.history import EPISODE_COLUMNS, REPORT_COLUMNS, GrowingTable, Progress
@@ -28,7 +27,7 @@ _REMEMBERED = ("marks", "squares", "samples", "best")
 
 
 class LearningEnded(Exception):  # noqa: N818 - no error
-    """The model is to learn no more: the run is complete, or was asked to stop and has its checkpoint."""
+    """The model is to learn no more: the run is complete."""
 
 
 class Watcher(BaseCallback):
@@ -89,7 +88,8 @@ class Watcher(BaseCallback):
         stopping = bool(self._asked)
         self.boundary(stopping)
         if stopping:
-            raise LearningEnded
+            told = f"stopped after {self.saved_steps:,} steps: continue with codrl-mj train --resume {self._out}"
+            raise folder.TrainingStoppedError(told, self._asked[-1])
 
     def _on_step(self) -> bool:
         # of every step since the last call, where an agent's compiled loop takes several
@@ -170,9 +170,12 @@ class Watcher(BaseCallback):
         self.evaluation = evaluate(self.model.policy, env, episodes, EVALUATION_SEED)
         if self.evaluation.returns.mean > self._best["return"]:
             self._best = {"return": self.evaluation.returns.mean, "steps": self.model.num_timesteps}
-            best = self._out / BEST
-            save_policy(self.model.policy, config.agent, best)
-            write_json(best / EVALUATION, sealed(self.evaluation.as_mapping()))
+            self._keep_policy(self._out / BEST, self.evaluation)
+
+    def _keep_policy(self, place: Path, evaluation: Evaluation) -> None:
+        """Write the policy as it is, with what it was found to be worth."""
+        save_policy(self.model.policy, self._config.agent, place)
+        write_json(place / EVALUATION, sealed(evaluation.as_mapping()))
 
     def _report(self, evaluated: bool) -> None:
         if self.reports.last_mean("steps", 1) == self.model.num_timesteps:
@@ -209,16 +212,22 @@ class Watcher(BaseCallback):
         self.episodes.flush()
         self.saved_steps = self.model.num_timesteps
 
-    def result(self) -> dict[str, Any]:
-        """What a finished run came to."""
-        return {
+    def finish(self) -> None:
+        """Write what a run leaves besides its tables and checkpoints; the result, which marks it as finished, last."""
+        self.boundary(last=True)
+        assert self.evaluation is not None  # of the last boundary
+        self._keep_policy(self._out, self.evaluation)
+        title = f"{self._config.agent.name.upper()} on {self._config.task}"
+        history.save_learning_curve(self._out / CURVE, title, self.episodes.array(), self.reports.array())
+        result = {
             "steps": self.model.num_timesteps,
             "episodes": len(self.episodes.rows),
             "mean_return": self.episodes.last_mean("return"),
-            "evaluation_return": self.evaluation.returns.mean if self.evaluation else math.nan,
+            "evaluation_return": self.evaluation.returns.mean,
             "best": self._best,
             "seconds": self._seconds_before + time.perf_counter() - self._start,
         }
+        write_json(self._out / RESULT, sealed(result))
 
     def close(self) -> None:
         """Close the logger's files."""
