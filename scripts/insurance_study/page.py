@@ -30,6 +30,8 @@ SAYS: Mapping[str, str] = {
     "strength": "random strength alone",
 }
 """What policies of each kind were trained on."""
+PLANNED = 20
+"""Policies of every kind, without which nothing is judged."""
 _AXES: Mapping[str, Sequence[str]] = {"drawn": DRAWN, "remembering": REMEMBERED}
 
 
@@ -144,18 +146,23 @@ def _verdicts(verdicts: Sequence[Verdict]) -> str:
         tested, wanted = verdict.strata
         if tested < wanted:
             says += f" ({tested} of {wanted} comparisons have runs)"
-        fewest = str(min(verdict.runs))
-        rows.append(
-            [verdict.question.name, verdict.outcome, effect_text(verdict), p_text(verdict.corrected), fewest, says]
-        )
+        fewest = min(verdict.runs)
+        judged = [verdict.outcome, effect_text(verdict), p_text(verdict.corrected)]
+        if fewest < PLANNED:  # of a few policies p says nothing, and who looks often finds something
+            judged = ["not yet", effect_text(verdict), "–"]
+        rows.append([verdict.question.name, *judged, str(fewest), says])
     header = ["", "holds", "effect [95 %]", "corrected p", "policies", "says"]
-    return f"## The ten hypotheses\n\n{markdown_table(header, rows)}"
+    return f"""## The ten hypotheses
+
+Nothing is judged before there are {PLANNED} policies of every kind.
+
+{markdown_table(header, rows)}"""
 
 
 def _secondary(verdicts: Sequence[Verdict]) -> str:
     rows = []
     for name in dict.fromkeys(verdict.question.section for verdict in verdicts):
-        mine = [verdict for verdict in verdicts if verdict.question.section == name and verdict.runs != (0, 0)]
+        mine = [one for one in verdicts if one.question.section == name and min(one.runs) >= PLANNED]
         decided = [verdict for verdict in mine if verdict.outcome != "open"]
         beyond = sum(one.effect.low > MARGIN or one.effect.high < -MARGIN for one in decided)
         rows.append([name, *map(str, (len(mine), len(decided), beyond))])

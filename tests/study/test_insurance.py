@@ -12,7 +12,7 @@ from codrl_mj.actuators import Lag
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.study.doses import AXES, FLOORS, posed, timestep
 from codrl_mj.study.evidence import Evidence
-from codrl_mj.study.pages import read_csv
+from codrl_mj.study.pages import read_csv, write_csv
 from codrl_mj.tasks import find_task
 from insurance_study.questions import (
     DOSES,
@@ -148,10 +148,10 @@ def written(tmp_path_factory):
             return 1.0
         return 0.9 if kind in AXES else 0.7 if kind == "random" else 0.5
 
-    grid = InsuranceStudy(root=out / "runs", out=out, seeds=4).grid
-    spread = [-0.02, 0.02, 0.01, -0.01]  # sums to 0
+    grid = InsuranceStudy(root=out / "runs", out=out, seeds=20).grid
+    spread = [-0.02, 0.02, 0.01, -0.01] * 5  # sums to 0
     pretend(grid, lambda trial, seed: FLOORS[trial.arm.task] + 100.0 * (level(trial) + spread[seed]))
-    files = InsuranceStudy(root=out / "runs", out=out, seeds=4).write()[0]
+    files = InsuranceStudy(root=out / "runs", out=out, seeds=20).write()[0]
     return out, list(files)
 
 
@@ -165,13 +165,25 @@ def test_what_is_so_stands_on_the_page(written):
     assert rows["I10"]["outcome"] == "the other way"
     assert rows["I3"]["outcome"] == "yes"
     page = (out / "insurance.md").read_text()
-    assert "| random actuators | 1.00 | 0.70, 0.70; 24 of 24;" in page  # 4 policies on 6 doses
+    assert "| random actuators | 1.00 | 0.70, 0.70; 120 of 120;" in page  # 20 policies on 6 doses
     assert "| the very dose | 1.00 | 0.90, 0.90;" in page
+    assert "not yet" not in page
+
+
+def test_nothing_is_judged_of_fewer_policies_than_are_planned(written, tmp_path):
+    out, _ = written
+    (tmp_path / "insurance").mkdir()
+    rows = [row for row in read_csv(out / "insurance" / "runs.csv") if int(row["seed"]) < 19]
+    write_csv(tmp_path / "insurance" / "runs.csv", rows)
+    InsuranceStudy(root=tmp_path / "runs", out=tmp_path).write()
+    page = (tmp_path / "insurance.md").read_text()
+    assert page.count("| not yet |") == 10
+    assert "| insured | 0 | 0 | 0 |" in page
 
 
 def test_rows_stand_for_run_folders_that_are_gone(written, tmp_path):
     out, _ = written
     shutil.copytree(out / "insurance", tmp_path / "insurance")
-    InsuranceStudy(root=tmp_path / "runs", out=tmp_path, seeds=4).write()
+    InsuranceStudy(root=tmp_path / "runs", out=tmp_path, seeds=20).write()
     for name in ("runs.csv", "hypotheses.csv"):
         assert (tmp_path / "insurance" / name).read_text() == (out / "insurance" / name).read_text()
