@@ -18,13 +18,12 @@ refused; `ideal` is the bare arm, without the rotor.
 | 4 | `arm_velocity` | -inf | inf | rad/s |
 | 5 | `rod_velocity` | -inf | inf | rad/s |
 
-The arm's angle grows counter-clockwise as seen from above. The rod's is 0 upright and grows counter-clockwise as seen
-from outside; it is not wrapped.
+Angles grow counter-clockwise, the arm's as seen from above, the rod's as seen from outside: 0 upright, not wrapped.
 
 ## Action space
 
 `Box(-0.084, 0.084, (1,), float32)`: the desired torque on the arm [N*m]; it saturates at +-0.084, which the motor makes
-of the drive's largest current, 2 A. Command current or voltage with `action="current"` or `action="voltage"`.
+of the drive's largest current, 2 A.
 
 ## Reward
 
