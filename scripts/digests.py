@@ -1,7 +1,7 @@
 """Digests of what a change of the code's structure must leave as it is, to the last bit.
 
 Written on two commits and compared by `--compare`: trajectories of every task through every actuator, command and
-disturbance, and through motors that one can buy; of environments of others; the weights that short trainings of every
+disturbance, and through off-the-shelf motors; of environments of others; the weights that short trainings of every
 agent end with; what is identified from logs that are made here; every preset's configuration; and what every check of
 the quick certificate found at worst, as the number itself. They may depend on the machine and on the versions of the
 packages.

@@ -84,15 +84,15 @@ def page(task_name: str) -> str:
         "integrators": ", ".join(f"`{name}`" for name in task.integrators),
         "options of its own": ", ".join(f"`{name}` (default {value})" for name, value in own) or "none",
         "time limit": f"{task.max_episode_steps} steps",
-        "solved at": "not defined" if task.reward_threshold is None else f"a return of {task.reward_threshold:g}",
         f"`{task.default_actuator}` actuator": _actuator(task_name),
     }
+    if task.reward_threshold is not None:
+        facts["solved at"] = f"a return of {task.reward_threshold:g}"
     rows = "\n".join(f"| {name} | {value} |" for name, value in facts.items())
     return (
         f"# {title}\n\n{says[0].upper()}{says[1:]}\n\n"
         f"![A policy on {title}; below it torque and voltage of the motor]({task_name}.webp)\n\n"
         f"```console\n$ codrl-mj train {task_name} {SCENES[task_name].flags}\n```\n\n"
-        f'In Python it is `gymnasium.make("{task.env_id}")`, after `import codrl_mj`.\n\n'
         f"| | |\n| --- | --- |\n{rows}\n\n{body}\n"
     )
 
@@ -122,8 +122,8 @@ def index() -> str:
         f"| [{_title(name)}]({name}.md) | {_documentation(name)[0].partition(': ')[2]} |" for name in TASKS
     )
     return (
-        "# Environments\n\nChoose a task; all take [the same arguments](arguments.md). `make docs` writes these pages "
-        f"from the docstrings in `codrl_mj/tasks/`.\n\n| environment | task |\n| --- | --- |\n{rows}\n"
+        '# Environments\n\nChoose a task: `gymnasium.make("codrl_mj/Pendulum-v0")`, after `import codrl_mj`. All take '
+        f"[the same arguments](arguments.md).\n\n| environment | task |\n| --- | --- |\n{rows}\n"
     )
 
 

@@ -42,12 +42,11 @@ ELSEWHERE = {
 }
 """Pages whose Python has tests of its own, which look at what comes out."""
 SHORT = {
-    "80_000": "500",
     "episodes=100": "episodes=1",
 }
 """What takes a reader minutes -> what takes a test seconds."""
 WITH_PYTHON = [name for name, text in PAGES.items() if "```python" in text and name not in ELSEWHERE]
-LONG = {f"docs/{name}.md" for name in ("actuators", "foreign", "identify", "motors", "sarsa", "see", "studies")}
+LONG = {f"docs/{name}.md" for name in ("actuators", "foreign", "identify", "motors", "see", "studies")}
 """What takes more than three seconds even so."""
 COMMANDS = [
     pytest.param(name, command.replace("\\\n", ""), marks=pytest.mark.matrix if name != "README.md" else [])

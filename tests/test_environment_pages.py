@@ -120,7 +120,7 @@ def test_every_argument_is_in_the_page_with_its_default_and_the_tasks_own_option
     parameters = dict(list(inspect.signature(ActuatedEnv).parameters.items())[1:-1])  # and without **arguments
     expected = {name: repr(parameter.default) for name, parameter in parameters.items()} | fields
     assert expected.pop("options") == "None"
-    assert rows == expected
+    assert rows == {name: re.sub(r"\(.*\)$", "()", default) for name, default in expected.items()}
     (own,) = (row[1] for row in _table((FOLDER / f"{task}.md").read_text()) if row[0] == "options of its own")
     assert re.findall(r"`(\w+)`", own) == list(TASKS[task].options._fields)
     for option in TASKS[task].options._fields:

@@ -348,7 +348,7 @@ def test_a_twin_without_paper_or_states_is_compared_where_it_can_be():
     assert [(skip.group, skip.name) for skip in result.skipped] == [
         ("dynamics", "all checks"),
         ("trajectories", "runs with the paper, weaker, starved actuators"),
-        ("trajectories", "a run with a motor that one can buy"),
+        ("trajectories", "a run with an off-the-shelf motor"),
     ]
 
 

@@ -203,7 +203,7 @@ class MotorNumbers:
 AT_OUTPUT = ("stall_torque_at_output", "continuous_torque_at_output")
 """Torques past a gear's losses, which do not tell the motor's before its efficiency is known."""
 _LEAST_EFFICIENCY = 0.2
-"""No gear that one can buy for a servo is worse: a derived efficiency below it is a slip of units."""
+"""No off-the-shelf gear for a servo is worse: a derived efficiency below it is a slip of units."""
 OTHER_NAMES = {
     "max_current": "peak_current",
     "voltage": "nominal_voltage",

@@ -1,4 +1,4 @@
-"""`codrl-mj motor list`, `new`, `show`, `design` and `step`: motors that one can buy, and one's own."""
+"""`codrl-mj motor list`, `new`, `show`, `design` and `step`: off-the-shelf motors, and your own."""
 
 import dataclasses
 import math

@@ -47,8 +47,7 @@ class EnvConfig:
     """Instead of inner_steps, the integration step [s], which must divide the environment step."""
     action: str = "force"
     """What the agent commands: the desired `force` (the paper; in an environment of others its own actions), the
-    reference `current`, or the raw terminal `voltage` past the controller (end to end); or what else the actuator's
-    family takes."""
+    reference `current`, or the terminal `voltage` past the controller; or what else the actuator's family takes."""
     levels: tuple[float, ...] | None = None
     """Discrete tasks that command a current [A] or a voltage [V]: the levels that the actions choose from."""
     observe_actuator: bool = False

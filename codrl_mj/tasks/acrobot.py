@@ -3,8 +3,7 @@
 ## Description
 
 Two links (1 kg, 1 m each, centre of mass in the middle, 1 kg m^2 about it) hang from a fixed shoulder under a gravity
-of 9.8 m/s^2. The actuator turns the elbow between them. These are Gymnasium's default ("book") dynamics, without its
-torque noise.
+of 9.8 m/s^2. The actuator turns the elbow. These are Gymnasium's "book" dynamics, without its torque noise.
 
 ## Observation space
 
@@ -18,7 +17,7 @@ torque noise.
 | 5 | `velocity_2` | -9 pi | 9 pi | rad/s |
 
 Angle 1 is the first link's, 0 hanging down; angle 2 the second's relative to the first. Both grow counter-clockwise and
-are wrapped to [-pi, pi] after every integration step.
+are wrapped to [-pi, pi].
 
 ## Action space
 
@@ -30,7 +29,7 @@ are wrapped to [-pi, pi] after every integration step.
 
 ## Start
 
-All four state entries uniform in [-0.1, 0.1], rounded to float32 as Gymnasium does. `reset(options={"low": ..., "high":
+All four state entries uniform in [-0.1, 0.1], in float32. `reset(options={"low": ..., "high":
 ...})` sets the bounds.
 
 ## End
@@ -40,8 +39,7 @@ after 500 steps (100 s).
 
 ## Arguments
 
-[Those of every environment](arguments.md). An environment step is one integration step (RK4, Gymnasium's) when the
-actuator is ideal, and ten with a motor, the paper's choice; the torque is held over each.
+[Those of every environment](arguments.md). RK4 is Gymnasium's, ten steps with a motor the paper's choice.
 """
 
 import math

@@ -14,8 +14,6 @@ There is no friction. The actuator pushes the cart.
 | 2 | `pole_angle`, 0 upright, positive to the right | -0.4189 (24 deg) | 0.4189 (24 deg) | rad |
 | 3 | `pole_velocity` | -inf | inf | rad/s |
 
-Positions' bounds are twice those at which an episode ends.
-
 ## Action space
 
 `Discrete(2)`: the desired force on the cart is -10 N (left) or 10 N (right).
@@ -38,8 +36,8 @@ s), which is success.
 ## Arguments
 
 [Those of every environment](arguments.md), and two of its own: `center_radius` [m], > 0, no limit by default, 0.1 in
-the paper's training; and Gymnasium's `sutton_barto_reward`. One integration step an environment step, the paper's
-choice. Integrators: `euler` (explicit, Gymnasium's default) and `semi-implicit`.
+the paper's training; and Gymnasium's `sutton_barto_reward`. `euler` is explicit,
+Gymnasium's default.
 """
 
 import math

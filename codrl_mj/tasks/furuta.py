@@ -3,9 +3,9 @@
 ## Description
 
 An arm (0.095 kg, 85 mm) turns about a vertical shaft. A rod (0.024 kg, 129 mm) hangs from a hinge at its end and swings
-across it, under a gravity of 9.81 m/s^2. The actuator turns the arm: the rod has none. Its own
-actuator is an off-the-shelf motor, `quanser-qube-servo-2`, behind a drive. The paper's actuators (`paper`, `weak` and
-so on) are refused; `ideal` is the bare arm, without the rotor.
+across it, under a gravity of 9.81 m/s^2. The actuator turns the arm: the rod has none. It is
+an off-the-shelf motor, `quanser-qube-servo-2`, behind a drive. The paper's actuators (`paper`, `weak` and so on) are
+refused; `ideal` is the bare arm, without the rotor.
 
 ## Observation space
 
@@ -18,13 +18,12 @@ so on) are refused; `ideal` is the bare arm, without the rotor.
 | 4 | `arm_velocity` | -inf | inf | rad/s |
 | 5 | `rod_velocity` | -inf | inf | rad/s |
 
-The arm's angle grows counter-clockwise as seen from above. The rod's is 0 upright and grows counter-clockwise as seen
-from outside; it is not wrapped.
+Angles grow counter-clockwise, the arm's as seen from above, the rod's as seen from outside: 0 upright, not wrapped.
 
 ## Action space
 
 `Box(-0.084, 0.084, (1,), float32)`: the desired torque on the arm [N*m]; it saturates at +-0.084, which the motor makes
-of the drive's largest current, 2 A. Command current or voltage with `action="current"` or `action="voltage"`.
+of the drive's largest current, 2 A.
 
 ## Reward
 
@@ -38,29 +37,28 @@ Hanging: arm angle, rod angle less pi, and both velocities uniform in [-0.05, 0.
 
 ## End
 
-The arm is more than 2 rad (115 degrees) off the middle, as in quanser_robots; a bench has no stops there, but a cable.
+The arm is more than 2 rad (115 degrees) off the middle.
 Truncated after 250 steps (5 s). An episode succeeds if the rod is within 0.1 rad of upright over its last second.
 
 ## Arguments
 
 [Those of every environment](arguments.md). The supply is the motor's nominal 18 V; the bench's amplifier is made for 10
 V: set `{"name": "default", "supply": {"voltage": 10.0}}`, and its delay by `disturbances={"command_delay": 0.004}`.
-`physics="analytic"` has the equations in closed form, for actuators without a rotor. An environment step is ten RK4
-steps: a single one loses energy.
+`physics="analytic"` has the equations in closed form, for actuators without a rotor.
 
 ## What to expect
 
-On 10 V PPO's `default` settings balance from all of five seeds, whether they command torque, current or voltage, and
-return 230.8 to 232.7 of 250:
+On 10 V PPO's `default` settings balance from all of five seeds, by torque, current or voltage, and return 231 to 233 of
+250:
 
 ```console
 $ codrl-mj train furuta --env.action voltage --actuator.supply.voltage 10 --seed 0 --out runs/volts
 ```
 
-Beware of a local optimum: whirling the rod, letting it creep through upright, returns 190 and more.
+Beware of a local optimum: whirling the rod returns 190 and more.
 
-On weaker supplies (V) and behind delays (ms) policies lose that were trained on the ideal arm. The mean return over
-three seeds, with the worst in brackets, and [all rows](furuta_supplies.csv) of `scripts/furuta_table.py`:
+Policies trained on the ideal arm lose on weaker supplies (V) and behind delays (ms). The mean return over three seeds,
+the worst in brackets ([all rows](furuta_supplies.csv) of `scripts/furuta_table.py`):
 
 | run on | trained on ideal | at 18 V | at 6 V | at 18 V, 6 ms |
 | --- | ---: | ---: | ---: | ---: |
@@ -70,15 +68,14 @@ three seeds, with the worst in brackets, and [all rows](furuta_supplies.csv) of 
 | 5 V | 34 (1) | 200 (181) | 218 (218) | 56 (1) |
 | 4 ms | 200 (135) | 232 (232) | 224 (221) | 232 (232) |
 
-Train at 18 V: you lose nothing down to 7 V and behind 8 ms, and still swing up at 5 V. Training at 6 V is best at 5 V,
-and costs 3 to 22 where there is more.
+Train at 18 V: you lose nothing down to 7 V and behind 8 ms, and still swing up at 5 V.
 
 ## Where the numbers come from
 
 Masses and lengths are the manual's (Quanser, *QUBE-Servo 2 User Manual*). Arm and rod are uniform: the arm's inertia
 about the shaft is m l^2/3 (some simulators have m l^2/12). Joint damping, 5e-6 and 1e-6 N m s/rad, is what
-quanser_robots and Pyrado identified; others have up to five hundred times that: add it by `joint=` to the arm, by
-`randomize=` of `model.damping.hinge` to the rod. There is no stiction, and the encoder's cable does not pull.
+quanser_robots and Pyrado identified; others have up to five hundred times that: add it by `joint=` to the arm. There
+is no stiction, and the encoder's cable does not pull.
 """
 
 import math

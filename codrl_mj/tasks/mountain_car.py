@@ -2,9 +2,8 @@
 
 ## Description
 
-A car drives on a hill of the shape sin(3 x), and has to rock: its force does not suffice to drive up. Its acceleration
-along x is 0.001 F - 0.0025 cos(3 x), in m/s^2 with F in N: a car of 1000 kg. Renders show Gymnasium's hill to scale, of
-height 0.55 + 0.45 sin(3 x), in m.
+A car on a hill of the shape sin(3 x) is too weak to drive up, and has to rock. Its acceleration along x is
+0.001 F - 0.0025 cos(3 x), in m/s^2 with F in N: a car of 1000 kg.
 
 ## Observation space
 
@@ -13,8 +12,7 @@ height 0.55 + 0.45 sin(3 x), in m.
 | 0 | `position` | -1.2 | 0.6 | m |
 | 1 | `velocity` | -0.07 | 0.07 | m/s |
 
-Every integration step keeps these bounds: the speed is limited before it moves the car, the position afterwards, and
-the left wall stops the car.
+Every integration step keeps these bounds; the left wall stops the car.
 
 ## Action space
 
@@ -34,8 +32,8 @@ At the end of a step x >= 0.5 m with v >= 0, which is success. Truncated after 2
 
 ## Arguments
 
-[Those of every environment](arguments.md); Gymnasium's `goal_velocity` is 0. An environment step is one semi-implicit
-Euler step (Gymnasium's) when the actuator is ideal, and twenty with a motor, the paper's choice.
+[Those of every environment](arguments.md); Gymnasium's `goal_velocity` is 0. Semi-implicit Euler is
+Gymnasium's, twenty steps with a motor the paper's choice.
 """
 
 from typing import Any

@@ -12,8 +12,7 @@ The car and the hill of [MountainCar](mountain_car.md), with a stronger motor. I
 | 0 | `position` | -1.2 | 0.6 | m |
 | 1 | `velocity` | -0.07 | 0.07 | m/s |
 
-The bounds are kept as in MountainCar. Only the observation is rounded to float32; Gymnasium rounds its state in every
-step.
+Only the observation is rounded to float32; Gymnasium rounds its state in every step.
 
 ## Action space
 
@@ -22,7 +21,7 @@ step.
 ## Reward
 
 100 for the step that ends at the goal, minus 0.1 F^2 for the force F [N] that the motor delivered at the end of the
-step. Gymnasium charges for the action, which is the same with an ideal actuator unless it lies outside its space.
+step. Gymnasium charges for the action.
 
 ## Start
 

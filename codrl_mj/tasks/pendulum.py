@@ -2,8 +2,8 @@
 
 ## Description
 
-A uniform rod (1 kg, 1 m) hangs from a pivot under a gravity of 10 m/s^2. The actuator turns the pivot. Two newton
-metres do not lift the rod in one go: it has to be swung.
+A uniform rod (1 kg, 1 m) hangs from a pivot under a gravity of 10 m/s^2. The actuator turns the pivot, too weakly to
+lift the rod in one go.
 
 ## Observation space
 
@@ -17,8 +17,8 @@ The angle theta is 0 upright and grows counter-clockwise; the state's is not wra
 
 ## Action space
 
-`Box(-2, 2, (1,), float32)`: the desired torque [N*m]; it saturates at +-2. Actions become float64 first, where
-Gymnasium computes in float32: give float64 actions, or the two differ by some 1e-8 a step.
+`Box(-2, 2, (1,), float32)`: the desired torque [N*m]; it saturates at +-2. To compare with Gymnasium to
+rounding give float64 actions.
 
 ## Reward
 
@@ -37,8 +37,8 @@ upright and slower than 0.1 rad/s.
 
 ## Arguments
 
-[Those of every environment](arguments.md); Gymnasium's `g` is the model's gravity. One integration step an environment
-step, the paper's choice; semi-implicit Euler, as in the installed Gymnasium (the paper says explicit).
+[Those of every environment](arguments.md); Gymnasium's `g` is the model's gravity. Semi-implicit Euler is
+the installed Gymnasium's (the paper says explicit).
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Motors that one can buy, in every task, against Gymnasium's equations with a rotor, a gear and friction on the joint.
+"""Off-the-shelf motors, in every task, against Gymnasium's equations with a rotor, a gear and friction on the joint.
 
 Gymnasium's environments have no place for what a drive adds to its joint. Their equations, linear in the force, have:
 with a_0 the joint's acceleration under no force and w its slope over the force, an inertia A, a damping D and a

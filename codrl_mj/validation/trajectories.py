@@ -195,4 +195,4 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
         for integrator in task.integrators:
             yield from fitted_run(task, integrator, quick, motor=FITTED[task.name][0])
     else:
-        yield Skipped("a run with a motor that one can buy", "none was chosen for it")
+        yield Skipped("a run with an off-the-shelf motor", "none was chosen for it")
