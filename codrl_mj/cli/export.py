@@ -40,7 +40,7 @@ class Export:
 
     def run(self) -> int:
         """Write the folder, and say what is in it."""
-        from codrl_mj.cli.terminal import print_table, say
+        from codrl_mj.cli.terminal import print_table
         from codrl_mj.deploy import export, network_of
 
         subject = self.source.load(self.run_folder)
@@ -59,7 +59,7 @@ class Export:
         print_table(f"{contract.task}, {agent}, {contract.rate:g} Hz", ("", "name", "unit", "range"), rows)
         weights = network_of(subject.policy).size
         written = f"wrote {self.out}: policy.onnx, contract.json, controller.c ({weights} numbers)"
-        say(f"{written}; try: codrl-mj board test {self.out}")
+        print(f"{written}; try: codrl-mj board test {self.out}")
         return 0
 
 
