@@ -292,7 +292,7 @@ WITH_NUMBERS = [
     # a line, and a number in its JSON by the keys on the way there
     (f"train cartpole {' '.join(TINY)} --out mine", "best return"),
     ("evaluate RUN --episodes 2", "returns mean"),
-    ("runs RUN", "0 evaluation_return"),
+    ("runs RUN", "runs 0 evaluation_return"),
     ("runs --compare RUN RUN", "results seconds 1"),
     ("motor list", "motors 0 stall_torque"),
     ("motor show rev-neo --out pictures", "abilities 0 value"),
@@ -312,9 +312,46 @@ def test_with_json_nothing_else_is_printed(capsys, trained, line, place):
     printed = capsys.readouterr().out
     found = json.loads(printed)
     assert printed == json.dumps(found, indent=2) + "\n"
+    assert '"unit' in printed  # of each number, or of all by their names
     for key in place.split():
         found = found[int(key) if key.isdigit() else key]
     assert isinstance(found, float)
+
+
+LOG = "log.csv --columns time=time:s,voltage=voltage:V,current=current:A,position=position:rad"
+LOGGED = "identify simulate maxon-ec45-flat-50w --out log.csv --amplitude 12 --inertia 1e-4 --duration 1"
+BEHIND = [
+    # lines, separated by ;, the last of which is looked at
+    *(line for line, _ in WITH_NUMBERS),
+    "evaluate RUN RUN --episodes 2",
+    "motor new my_motor.toml",
+    "advise maxon-ec45-flat-50w pendulum --gear-ratio 20",
+    "data",
+    "cache",
+    LOGGED,
+    f"{LOGGED}; identify columns log.csv",
+    f"{LOGGED}; identify check {LOG}",
+    f"{LOGGED}; identify {LOG} --rig free --known load_inertia=1e-4 --out motor",
+    "replay RUN --out run.html",
+    "report RUN --no-film --out run.html",
+    "export RUN --episodes 1",
+]
+
+
+@pytest.mark.parametrize("line", BEHIND)
+def test_80_columns_hold_every_line_but_one_to_copy(capsys, request, monkeypatch, line):
+    run = str(request.getfixturevalue("trained")) if "RUN" in line else ""
+    capsys.readouterr()
+    monkeypatch.setenv("COLUMNS", "80")
+    for one in line.split(";"):
+        assert main(one.replace("RUN", run).split()) in (0, 1)
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    assert "\x1b" not in printed.out
+    wide = [text for text in map(str.rstrip, printed.out.splitlines()) if len(text) > 80]
+    assert all(
+        "codrl-mj " in text or "--columns" in text or text.startswith("wrote ") or "https://" in text for text in wide
+    ), wide
 
 
 @pytest.mark.parametrize("verb", [verb for verb in VERBS if hasattr(find_verb(verb), "as_json")])
@@ -407,7 +444,7 @@ def test_a_module_that_a_run_names_is_imported_only_on_trust(capsys, own_family)
     for line in ("evaluate run --episodes 1", "render run", "train --resume run", "train --config run/config.json"):
         assert "own_family:Slow': needs the module own_family" in refused(capsys, *line.split())
     assert main(["runs", ".", "--out", "runs.json"]) == 0
-    assert [run["actuator"] for run in json.loads(Path("runs.json").read_text())] == ["own_family:Slow"]
+    assert [run["actuator"] for run in json.loads(Path("runs.json").read_text())["runs"]] == ["own_family:Slow"]
     assert not Path("executed").exists()
     assert main(["evaluate", "run", "--episodes", "1", "--trust", "--actuator.delay", "0.05"]) == 0
     assert Path("executed").exists()
@@ -467,10 +504,10 @@ def test_a_certificate_that_is_stopped_exits_with_130_and_leaves_nothing(monkeyp
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        ("", "codrl-mj needs a verb, one of train, evaluate, runs,"),
-        ("", "try codrl-mj motor list, or codrl-mj train cartpole; codrl-mj --help says more"),
+        ("", "codrl-mj needs a verb: try codrl-mj motor list, or codrl-mj train cartpole first; there are train,"),
+        ("", "board, validate; codrl-mj --help says more"),
         ("trian cartpole", "unknown verb 'trian': did you mean 'train'? verbs are train, evaluate,"),
-        ("motor", "codrl-mj motor needs a verb, one of list, new, show,"),
+        ("motor", "codrl-mj motor needs a verb: there are list, new, show,"),
         ("motor lst", "unknown verb 'lst': did you mean 'list'? verbs are list, new, show,"),
         ("motor show", "codrl-mj motor show needs NAME;"),
         ("motor show maxon-ec45", "did you mean 'maxon-ec45-flat-339285' or 'maxon-ec45-flat-50w'?"),

@@ -231,7 +231,12 @@ def test_a_comparison_has_the_settings_that_differ_and_every_result(tmp_path):
     assert [one and one["mean"] for one in comparison.results["evaluation.returns"]] == [401.0, 402.0, None]
     assert "evaluation.peak_voltage" not in comparison.results  # none of them has it
     json.dumps(vars(comparison))
-    assert comparison.units == {"seconds": "s", "evaluation.returns": "reward", "evaluation.tracking_rms": "N*m"}
+    assert comparison.units == {
+        "seconds": "s",
+        "mean_return": "reward",
+        "evaluation.returns": "reward",
+        "evaluation.tracking_rms": "N*m",
+    }
     with pytest.raises(ValueError, match="two or more"):
         compare(runs[:1])
 
@@ -260,7 +265,7 @@ def test_the_verb_lists_runs_in_the_order_asked_for(tmp_path, capsys):
     assert "450.0" in text
     assert "hurt: damaged" in text
     listed = json.loads((tmp_path / "list.json").read_text())
-    assert [run["name"] for run in listed] == rows
+    assert [run["name"] for run in listed["runs"]] == rows
 
 
 def test_the_verb_compares_runs(tmp_path, capsys, monkeypatch):
@@ -272,7 +277,7 @@ def test_the_verb_compares_runs(tmp_path, capsys, monkeypatch):
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert "seed 1 50" in lines
     assert "env.actuator ideal weaker" in lines
-    assert "evaluation.returns 401 [380, 420] 450 [380, 420]" in lines
+    assert "evaluation.returns reward 401 [380, 420] 450 [380, 420]" in lines
     comparison = json.loads((tmp_path / "both.json").read_text())
     assert comparison["names"] == ["a", "b"]
     assert comparison["configuration"]["seed"] == [1, 50]

@@ -12,7 +12,7 @@ from codrl_mj.fields import did_you_mean
 
 _DELIVERED = {
     # field of Delivery: what it is, unit, digits
-    "lag": ("lag: time constant of a first-order one that is as late", "policy steps", ".3g"),
+    "lag": ("lag, as a first-order time constant", "policy steps", ".3g"),
     "dead_time": ("dead time", "policy steps", ".3g"),
     "at_rest": ("delivered of the largest force, at rest", "", ".0%"),
     "at_speed": ("delivered of it at the reference speed", "", ".0%"),
@@ -125,15 +125,17 @@ def _print(name: str, found: Any) -> None:
     if found.losses:
         rows = []
         for one in found.losses:
-            dose = f"{one.dose:.3g}", AXES[one.axis].unit
-            rows.append((one.axis, *dose, *_lost(one.outcome, "at least " * one.beyond), ", ".join(one.between)))
+            unit = AXES[one.axis].unit.rpartition("[")[2].removesuffix("]").removeprefix("missing ")
+            tested = ", ".join(dose.removeprefix(f"{one.axis} ") for dose in one.between)
+            lost = _lost(one.outcome, "at least " * one.beyond)
+            rows.append((one.axis, f"{one.dose:.3g}", unit, *lost, tested))
         title = "What policies lose by it that were trained on ideal forces [shares of the task's span]"
-        print_table(title, ("by", "dose", "unit", *_LOST, "tested at"), rows, right=("dose", *_LOST))
+        print_table(title, ("by", "dose", "unit", *_LOST, "tested at"), rows, right=("dose", *_LOST), whole=_LOST)
         _print_options("What is known of what can be done", found.options)
     say(f"{found.verdict}: {found.reason}" if found.verdict else f"no verdict: {found.reason} (--measure 5)")
 
 
-_LOST = "loss", "95 %", "fail", "success lost"
+_LOST = "loss", "95 %", "fail", "success\nlost"
 
 
 def _print_options(title: str, options: Any) -> None:

@@ -48,7 +48,7 @@ class Test:
 
     def run(self) -> int:
         """Run the episodes and print a table."""
-        from codrl_mj.cli.terminal import print_table, progress_bar, say
+        from codrl_mj.cli.terminal import print_table, progress_bar
         from codrl_mj.deploy import Contract, Link, board_test, write_log
         from codrl_mj.runs.files import check_file
 
@@ -79,7 +79,7 @@ class Test:
         print_table(f"{self.folder} as C on {self.target}", ("", ""), rows)
         if self.log is not None:
             write_log(self.log, Contract.read(self.folder), done.on_board[0])
-            say(f"wrote {self.log}; try: codrl-mj board check {self.folder} {self.log}")
+            print(f"wrote {self.log}; try: codrl-mj board check {self.folder} {self.log}")
         if self.film is not None:
             self._film(self.film, link)
         return int(done.alike < 0.95 * self.episodes and not link.spoils and self.actuator is None)
@@ -162,5 +162,5 @@ class RunBoard:
             ("rows; frames without an answer; late", f"{done.rows}; {done.missed}; {done.late}"),
         ]
         print_table(f"{self.folder} on {self.port}", ("", ""), rows)
-        say(f"wrote {self.out}; try: codrl-mj board check {self.folder} {self.out}")
+        print(f"wrote {self.out}; try: codrl-mj board check {self.folder} {self.out}")
         return int(done.why != "told to")

@@ -60,7 +60,8 @@ class CompareLog:
         columns = list(zip(found.names, found.units, found.errors.tolist(), found.moved.tolist(), strict=True))
         title = f"{self.log.name} through {self.actuator or env.through}: {len(found.starts)} windows"
         rows = [(name, unit or "?", f"{error:.3g}", f"{moved:.3g}") for name, unit, error, moved in columns]
-        print_table(title, ("", "unit", "error (RMS)", "if nothing changed"), rows)
+        heads = "", "unit", "error (RMS)", "if nothing changed"
+        print_table(title, heads, rows, right=heads[2:])
         if self.out is not None:
             _draw(found, self.out)
             say(f"wrote {self.out}")

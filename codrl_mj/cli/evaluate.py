@@ -1,4 +1,4 @@
-"""`codrl-mj evaluate`, and the tables of what is measured, for a terminal of 110 columns."""
+"""`codrl-mj evaluate`, and the tables of what is measured, for a terminal of 80 columns or more."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -140,8 +140,8 @@ _TELLING: Columns = {
     "success": ("success", lambda value: f"{100 * value.mean:.0f} %"),
     "returns": ("return", lambda value: "{:.1f} [{:.1f}, {:.1f}]".format(*value)),
     "time_to_goal": ("time to\ngoal", lambda value: f"{value.median:.1f} s"),
-    "tracking_rms": ("shaft torque\nerror", lambda value: f"{number(value)} N·m"),
-    "saturated_percent": ("saturated", lambda value: f"{value:.1f} %"),
+    "tracking_rms": ("shaft\ntorque\nerror", lambda value: f"{number(value)} N·m"),
+    "saturated_percent": ("satu-\nrated", lambda value: f"{value:.1f} %"),
     "peak_voltage": ("peak\n|u|", lambda value: f"{value:.1f} V"),
     "energy_drawn": ("energy\ndrawn", lambda value: f"{number(value.mean)} J"),
 }

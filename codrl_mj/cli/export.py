@@ -40,7 +40,7 @@ class Export:
 
     def run(self) -> int:
         """Write the folder, and say what is in it."""
-        from codrl_mj.cli.terminal import print_table, say
+        from codrl_mj.cli.terminal import print_table
         from codrl_mj.deploy import export, network_of
 
         subject = self.source.load(self.run_folder)
@@ -61,7 +61,7 @@ class Export:
         if contract.controller["loop"] is None and contract.actuators:
             say("no current loop: the motors differ, have none, or are commanded otherwise")
         written = f"wrote {self.out}: policy.onnx, contract.json, controller.c ({weights} numbers)"
-        say(f"{written}; try: codrl-mj board test {self.out}")
+        print(f"{written}; try: codrl-mj board test {self.out}")
         return 0
 
 

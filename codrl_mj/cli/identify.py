@@ -157,7 +157,7 @@ def print_identified(found: Any) -> None:
         rows.append((one.name, f"{one.value:.4g}", interval, one.unit, one.status, one.why))
     styles = ["" if one.status in USABLE else "yellow" for one in found.estimates]
     columns = "parameter", "value", "95 % interval", "unit", "status", "why"
-    print_table(f"Identified from {', '.join(found.logs)}", columns, rows, right=columns[1:3], styles=styles)
+    print_table(f"Identified from {', '.join(found.logs)}", columns, rows, columns[1:3], ("parameter", "unit"), styles)
     rows = [
         (one.log, kind, f"{one.output} {SIGNALS[one.output]}", f"{one.open_loop:.3g}",
          "" if one.closed_loop is None else f"{one.closed_loop:.3g}")
@@ -168,10 +168,9 @@ def print_identified(found: Any) -> None:
         print_table("Errors of the simulation, mean absolute", heads, rows, right=heads[3:])
     for part, late in found.delays.items():
         if late:
-            print(f"{part}: the input is late by {late} row{'s' if abs(late) > 1 else ''}, which is allowed for")
+            say(f"{part}: the input is late by {late} row{'s' if abs(late) > 1 else ''}, which is allowed for")
     say(*(f"warning: {text}" for text in found.warnings), style="yellow")
-    if found.supply_text:
-        print(found.supply_text)
+    say(found.supply_text)
     if problem := found.problem():
         say(f"not to be used as an actuator: {problem}", style="yellow")
 
@@ -270,7 +269,7 @@ class PlanExperiment:
         bears = None if entry is None else entry.numbers.continuous_current
         limits = self.max_current, math.inf if bears is None else bears
         found = plan(find_drive(self.name), Load(**vars(self.load)), sensing, self.duration, *limits)
-        heads = "kHz", "V", "peak A", "rms A", *(f"{_SHORT[name]}\n≤ {GOALS[name]:.0%}" for name in GOALS)
+        heads = "kHz", "V", "peak\nA", "rms\nA", *(f"{_SHORT[name]}\n≤ {GOALS[name]:.0%}" for name in GOALS)
         rows = []
         for option in found.options:
             mark = "*" if option is found.best else ""
@@ -278,18 +277,34 @@ class PlanExperiment:
             errors = (option.errors.get(name) for name in GOALS)
             texts = (number(error and 100.0 * error, 2) for error in errors)
             rows.append((f"{mark}{option.excitation.kind}", *(f"{one:.3g}" for one in values), *texts))
-        print_table(f"{self.name}: errors to be expected [%]", ("excitation", *heads), rows, right=heads)
+        print_table(
+            f"{self.name}: errors to be expected [%]",
+            ("excitation", *heads),
+            rows,
+            heads,
+            ("excitation", *heads),
+            padding=(0, 0),
+        )
         best = found.best.excitation
         clock = f", a clock of {1e3 * best.clock:.3g} ms" if "prbs" in best.kind else ""
-        print(f"* play {best.kind}, {best.amplitude:.4g} V, {best.duration:g} s{clock}, rows at {found.best.rate:g} Hz")
+        say(f"* play {best.kind}, {best.amplitude:.4g} V, {best.duration:g} s{clock}, rows at {found.best.rate:g} Hz")
         if found.missed:
-            print(f"it misses the goals of {', '.join(found.missed)}: a larger current, a longer log, or other sensors")
+            say(f"it misses the goals of {', '.join(found.missed)}: a larger current, a longer log, or other sensors")
         if found.unknown:
-            print(f"nothing is said of {', '.join(found.unknown)}: 0 on the datasheet")
+            say(f"nothing is said of {', '.join(found.unknown)}: 0 on the datasheet")
         if self.out is not None:
             write_excitation(self.out / "excitation.csv", found.best)
             print(f"wrote {self.out / 'excitation.csv'}: play each voltage [V] until the time [s] of the next")
-        return 0, found
+        units = {
+            "errors": "1",
+            "amplitude": "V",
+            "peak_current": "A",
+            "rms_current": "A",
+            "duration": "s",
+            "clock": "s",
+        }
+        units |= dict.fromkeys(("rate", "frequency", "highest"), "Hz")
+        return 0, {"units": units, **found._asdict()}
 
 
 _SHORT = {
@@ -297,8 +312,8 @@ _SHORT = {
     "inductance": "L",
     "back_emf_constant": "kE",
     "inertia": "J",
-    "coulomb_friction": "Coulomb",
-    "viscous_friction": "viscous",
+    "coulomb_friction": "Cou-\nlomb",
+    "viscous_friction": "vis-\ncous",
 }
 
 
@@ -394,7 +409,7 @@ class ProposeColumns:
 
         found = propose_columns(self.log)
         for doubt in found.doubts:
-            print(f"to be checked: {doubt}")
+            say(f"to be checked: {doubt}")
         rig = " --rig free --known load_inertia=0" if re.search("(position|velocity)=", found.columns) else ""
         print("next (--rig pendulum if one hangs at position 0, load if it lifts one):" if rig else "next:")
         print(f"codrl-mj identify {shlex.quote(str(self.log))} --columns {shlex.quote(found.columns)}{rig} --out motor")

@@ -56,7 +56,7 @@ Settings = tyro.conf.OmitArgPrefixes[Changes]
 _LISTED = {
     # column: header, its unit, SI values to it
     "name": ("name", "", 0.0),
-    "voltage": ("V", "V", 1.0),
+    "voltage": ("at", "V", 1.0),
     "power": ("power", "W", 1.0),
     "continuous_torque": ("continuous", "N·m", 1.0),
     "stall_torque": ("stall", "N·m", 1.0),
@@ -93,7 +93,8 @@ class List:
         scales = [(name, scale) for name, (*_, scale) in _LISTED.items() if name != "name"]
         cells = [(row["name"], *(number(row[name] and row[name] * scale) for name, scale in scales)) for row in rows]
         print_table("Motors of the catalogue", columns, cells, right=columns[1:], whole=columns[:1], padding=(0, 0))
-        print("V: nominal, –: not printed, and taken as 24 V. codrl-mj motor show NAME says where each number is from.")
+        say("at: nominal voltage. –: not printed; a voltage is then taken as 24 V.")
+        print("codrl-mj motor show NAME says where each number is from")
         kinds = {name: KINDS.get(OTHER_NAMES.get(name, name)) for name in rows[0]}
         units = ABILITY_UNITS | {name: kind.unit for name, kind in kinds.items() if kind is not None}
         return 0, {"units": units, "motors": rows}
@@ -153,10 +154,11 @@ def _print_explained(title: str, volts: float, found: dict[str, Any]) -> None:
     if "numbers" in found:
         rows = []
         for row in found["numbers"]:
+            how = row["how"].removeprefix(f"{row['name']} = ")
             estimated = "" if row["name"] not in found["estimated"] else " (estimated)"
-            rows.append((row["name"], number(row["value"], 4), row["unit"], row["how"] + estimated, row["places"]))
+            rows.append((row["name"], number(row["value"], 4), row["unit"], how + estimated, row["places"]))
         columns = "number", "value", "unit", "how it came about", "source"
-        print_table("The motor, at its rotor", columns, rows, right=("value",))
+        print_table("The motor, at its rotor", columns, rows, right=("value",), whole=("number", "unit"))
     show("As it is simulated", "drive")
     if "numbers" in found:
         for kind, texts in (
@@ -173,6 +175,10 @@ _DESIGNED = (
     *("rate\nkHz", "delay\nsamples", "kp\nV/A", "ki\nV/(A·s)", "gain\nmargin dB", "phase\nmargin °"),
     *("cross-\nover Hz", "band-\nwidth Hz", "2 % in\nms", "over-\nshoot %"),
 )
+
+
+_LOOP_UNITS = {"gain_margin": "1", "phase_margin": "deg", "kp": "V/A", "ki": "V/(A*s)", "settling_time": "s"}
+_LOOP_UNITS |= dict.fromkeys(("sample_rate", "phase_crossover", "crossover", "bandwidth"), "Hz") | {"overshoot": "1"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -202,7 +208,7 @@ class Design:
         drive = self.changes.drive(self.name)
         own, every = design(drive), designs(drive)
         late = "a sample of delay" if own.delayed else "no delay"
-        print(f"{self.name} at {own.sample_rate:g} Hz, {late}: kp = {own.kp:.6g} V/A, ki = {own.ki:.6g} V/(A*s)")
+        say(f"{self.name} at {own.sample_rate:g} Hz, {late}: kp = {own.kp:.6g} V/A, ki = {own.ki:.6g} V/(A·s)")
         rows = []
         for (rate, delayed), one in every.items():
             mark = "*" if (rate, delayed) == (own.sample_rate, own.delayed) else ""
@@ -219,14 +225,14 @@ class Design:
             _DESIGNED,
             padding=(0, 0),
         )
-        for why in dict.fromkeys(one for one in every.values() if isinstance(one, str)):
-            print(f"not possible: {why}")
-        say(sampled_too_seldom(drive), drive.assumed)
+        impossible = dict.fromkeys(one for one in every.values() if isinstance(one, str))
+        say(*(f"not possible: {why}" for why in impossible), sampled_too_seldom(drive), drive.assumed)
         if self.out is not None:
             from codrl_mj.pages.diagrams import bode_diagram
 
             save_plot(bode_diagram(drive), self.out / "bode.png")
-        return 0, {**vars(own), "others": [vars(one) for one in every.values() if isinstance(one, LoopDesign)]}
+        others = [one for one in every.values() if isinstance(one, LoopDesign)]
+        return 0, {"units": _LOOP_UNITS, **vars(own), "others": others}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -256,12 +262,12 @@ class Step:
         settled, amplitude = small.settling_time(), float(small.reference[-1])
         responses = steps.recoveries.items()
         recoveries = {k: {"time": one.settling_time(0.05), "undershoot": one.undershoot} for k, one in responses}
-        print(
-            f"{self.name}: a step to {amplitude:.4g} A, {constant * amplitude:.4g} N*m at the rotor, stays within "
-            f"2 % after {number(1e3 * settled, 4)} ms and overshoots by {100.0 * small.overshoot:.2g} %"
+        say(
+            f"{self.name}: a step to {amplitude:.4g} A, {constant * amplitude:.4g} N·m at the rotor, stays within "
+            f"2 % after {number(1e3 * settled, 4)} ms and overshoots by {100.0 * small.overshoot:.2g} %",
+            f"at {steps.speed:.4g} rad/s of the rotor it is asked for {steps.unreachable:.4g} A, out of reach, for "
+            f"20 ms, then {steps.reachable:.4g} A, which it reaches:",
         )
-        asked_text = f"{steps.unreachable:.4g} A, out of reach, for 20 ms, then {steps.reachable:.4g} A"
-        print(f"at {steps.speed:.4g} rad/s of the rotor it is asked for {asked_text}, which it reaches:")
         columns = "anti-windup", "within 5 %\nafter ms", "undershoot\n%"
         rows = [
             (kind, number(1e3 * one["time"]), number(100.0 * one["undershoot"], 2)) for kind, one in recoveries.items()
@@ -274,7 +280,9 @@ class Step:
             save_plot(step_diagram(drive, steps), self.out / "step.png")
         content = {"current": amplitude, "settling_time": settled, "overshoot": small.overshoot}
         asked = {name: getattr(steps, name) for name in ("speed", "unreachable", "reachable")}
-        return 0, {"small": content, "saturated": {**asked, "recoveries": recoveries}}
+        units = {"current": "A", "settling_time": "s", "overshoot": "1", "speed": "rad/s", "unreachable": "A"}
+        units |= {"reachable": "A", "time": "s", "undershoot": "1"}
+        return 0, {"units": units, "small": content, "saturated": {**asked, "recoveries": recoveries}}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -241,7 +241,7 @@ def _share(drive: Any, asked: Any) -> str:
 def _print_ranking(choices: Sequence[tuple[str, Any]], demands: Mapping[str, Any], title: str) -> None:
     """A row for each choice; of several motors, each with what it drives."""
     columns: tuple[str, ...]
-    columns = ("motor", "gear", "supply\n[V]", "power\n[W]", "does\nit", "margin", "rotor's\nshare", "peak\n[A]")
+    columns = ("motor", "gear", "supply\n[V]", "power\n[W]", "does\nit", "mar-\ngin", "rotor\nshare", "peak\n[A]")
     columns += ("rms\n[A]", "drawn\n[J]", "heat\n[J]")
     right, rows = [name for name in columns if name not in ("motor", "does\nit")], []
     several = len(demands) > 1

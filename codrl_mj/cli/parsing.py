@@ -49,8 +49,8 @@ def _refuse(event: Any, kind: Any, called: str) -> None:
     match type(event).__name__:
         case "MissingSubcommand":
             known = ", ".join(event.subcommand_spec.parser_from_name)
-            first = f"try {called} motor list, or {called} train cartpole; " if called == "codrl-mj" else ""
-            raise ValueError(f"{called} needs a verb, one of {known}; {first}{called} --help says more")
+            first = f"try {called} motor list, or {called} train cartpole first; " if called == "codrl-mj" else ""
+            raise ValueError(f"{called} needs a verb: {first}there are {known}; {called} --help says more")
         case "MissingArgs":
             missing = [_called(one.arg) for one in event.missing_arguments]
             raise ValueError(f"{called} needs {', '.join(missing)}; {called} --help says more")

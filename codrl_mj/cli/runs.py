@@ -45,7 +45,8 @@ class Runs:
         else:
             runs = summaries.sort_runs(summaries.find_runs(self.root), self.sort)
             _print_runs(runs)
-            content = [run.as_mapping() for run in runs]
+            units = {"mean_return": "reward", "evaluation_return": "reward", "seconds": "s"}
+            content = {"units": units, "runs": [run.as_mapping() for run in runs]}
         if self.out is not None:
             write_json(self.out, content)
             print(f"wrote {self.out}")
@@ -77,14 +78,16 @@ def _print_runs(runs: Sequence[RunSummary]) -> None:
 
 
 def _print_comparison(comparison: Comparison) -> None:
-    """What differs in the configuration, and the results: a column for each run, at most three at a time."""
-    for begin in range(0, len(comparison.names), 3):
-        chunk = slice(begin, begin + 3)
+    """What differs in the configuration, and the results: a column for each run, as many as fit at a time."""
+    some = 3 if console().width >= 100 else 2
+    for begin in range(0, len(comparison.names), some):
+        chunk = slice(begin, begin + some)
         names = comparison.names[chunk]
         for title, content in (("settings that differ", comparison.configuration), ("results", comparison.results)):
             if content:
-                rows = [(label, *map(number, values[chunk])) for label, values in content.items()]
-                print_table(title, ("", *names), rows, right=names)
+                units = comparison.units if title == "results" else {}
+                rows = [(one, units.get(one, ""), *map(number, values[chunk])) for one, values in content.items()]
+                print_table(title, ("", "unit" if units else "", *names), rows, right=names)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,8 +110,9 @@ class Data:
         from codrl_mj.identify.published import fetch, published
 
         if self.name is None:
-            rows = [(name, one["title"], one["licence"], one["source"]) for name, one in published().items()]
-            print_table("", ("name", "motor and rig", "licence", "source"), rows)
+            rows = [(name, one["title"], one["licence"]) for name, one in published().items()]
+            print_table("", ("name", "motor and rig", "licence"), rows)
+            print("\n".join(f"{name}: {one['source']}" for name, one in published().items()))
             return 0
         files = fetch(self.name, self.out)
         for file in files:

@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import os
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -14,8 +15,8 @@ from rich.text import Text
 
 
 def console() -> Console:
-    """A console on standard output; 110 columns where it goes to a file, which has no width of its own."""
-    return Console() if sys.stdout.isatty() else Console(width=110)
+    """A console on standard output; 110 columns where it goes to a file, unless COLUMNS has another number."""
+    return Console() if sys.stdout.isatty() or "COLUMNS" in os.environ else Console(width=110)
 
 
 def say(*texts: str, style: str | None = None) -> None:

@@ -278,7 +278,7 @@ def _disagreements(numbers: MotorNumbers) -> list[str]:
 def unknown_in_words(names: Sequence[str]) -> str:
     """What is said of a motor's unknown numbers; empty where all are known."""
     words = ", ".join(name.replace("max_", "highest ").replace("_", " ") for name in names)
-    return f"Not known, for no source has it and it follows from nothing that one has: {words}." if words else ""
+    return f"Not known: {words} (no source has it, and no other number implies it)." if words else ""
 
 
 def _value(name: str, value: Any, unit: str) -> dict[str, Any]:

@@ -291,7 +291,8 @@ def compare(runs: Sequence[RunSummary]) -> Comparison:
     for measure in measures:
         results[f"evaluation.{measure}"] = tuple(one.get(measure) for one in evaluations)
     results = {name: values for name, values in results.items() if any(value is not None for value in values)}
-    known_units = {"seconds": "s"} | {f"evaluation.{measure}": unit for measure, unit in measures.items()}
+    known_units = {f"evaluation.{measure}": unit for measure, unit in measures.items()}
+    known_units |= {"seconds": "s", "mean_return": "reward"}
     return Comparison(
         names=tuple(run.name for run in runs),
         configuration={key: values for key, values in settings.items() if any(value != values[0] for value in values)},

@@ -80,7 +80,7 @@ def test_show_says_where_every_number_is_from(capsys):
     ):
         assert part in text
     assert "motor.gear_ratio 50" in text
-    assert "it follows from nothing that one has: rotor inertia" in text
+    assert "Not known: rotor inertia" in text
     assert is_png(Path("pictures/torque_speed.png"))
     content = read(capsys, "show", "rev-neo", "--voltage", "24")
     assert any("torque_constant" in one for one in content["disagreements"])
