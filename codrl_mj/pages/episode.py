@@ -119,8 +119,7 @@ def episode_section(shown: Sequence[Shown], joined: Iterable[Markup] = ()) -> Ma
     """Films, controls and plots of some episodes side by side, and what else follows the clock (`page.clocked`)."""
     lines = _lines(shown)
     end = max(float(one.episode.time[-1]) for one in shown)
-    films = [page.film(_caption(one, len(shown) > 1), one.film.video, one.film.rate, one.film.still)
-             for one in shown if one.film is not None]  # fmt: skip
+    films = [page.part("film", _caption(one, len(shown) > 1), *one.film) for one in shown if one.film is not None]
     notes = [page.note(f"No film of {one.name}: {one.problem}") for one in shown if one.film is None]
     stage = [
         *notes,
@@ -160,9 +159,9 @@ def _caption(one: Shown, named: bool) -> str:
 
 def _selectors(shown: Sequence[Shown]) -> Markup:
     motors = _motors(shown)
-    boxes = [page.selector("Runs", "run", [one.name for one in shown])] if len(shown) > 1 else []
+    boxes = [page.part("selector", "Runs", "run", [one.name for one in shown], None)] if len(shown) > 1 else []
     if len(motors) > 1:
-        boxes.append(page.selector("Motors", "motor", motors, 0 if len(motors) > _MANY else None))
+        boxes.append(page.part("selector", "Motors", "motor", motors, 0 if len(motors) > _MANY else None))
     return Markup('<div class="selectors">{}</div>').format(page.joined(boxes)) if boxes else Markup()
 
 
