@@ -116,30 +116,19 @@ def summary(content: Mapping[str, Any]) -> Markup:
     )
 
 
-def caught_mapping(caught: Sequence[Caught]) -> list[dict[str, Any]]:
-    """What mutations did, for JSON."""
-    rows = []
-    for outcome in caught:
-        clearest = outcome.clearest
-        row: dict[str, Any] = {"mutation": outcome.mutation, "task": outcome.task, "made": outcome.made}
-        row["failed"] = [f"{check.group}: {check.name}" for check in outcome.failed]
-        if clearest is not None:
-            worst = clearest.worst if math.isfinite(clearest.worst) else str(clearest.worst)
-            row |= {"clearest": f"{clearest.group}: {clearest.name}", "worst": worst, "allowed": clearest.tolerance}
-        rows.append(row)
-    return rows
-
-
 def write(certificate: Certificate, folder: Path, caught: Sequence[Caught] = ()) -> tuple[Path, Path]:
     """Write `certificate.json` and `certificate.html` into a folder, whole or not at all; older ones are replaced."""
     content = certificate.as_mapping()
+    for one in caught:
+        row: dict[str, Any] = {"mutation": one.mutation, "task": one.task, "made": one.made}
+        row["failed"] = [f"{check.group}: {check.name}" for check in one.failed]
+        if (clearest := one.clearest) is not None:
+            worst = clearest.worst if math.isfinite(clearest.worst) else str(clearest.worst)
+            row |= {"clearest": f"{clearest.group}: {clearest.name}", "worst": worst, "allowed": clearest.tolerance}
+        content.setdefault("mutations", []).append(row)
     if caught:
-        content |= {
-            "mutations": caught_mapping(caught),
-            "failed by no mutation": [
-                f"{check.group}: {check.task}: {check.name}" for check in unfailed(certificate.checks, caught)
-            ],
-        }
+        blind = unfailed(certificate.checks, caught)
+        content["failed by no mutation"] = [f"{check.group}: {check.task}: {check.name}" for check in blind]
     text, found = json.dumps(content, indent=2, allow_nan=False) + "\n", html(certificate, caught)
     check_writable(folder)
     with writing(folder / JSON_NAME) as json_file, writing(folder / HTML_NAME) as html_file:

@@ -81,9 +81,9 @@ def write(path: Path, text: str) -> Path:
     return path
 
 
-def joined(parts: Iterable[Any], separator: str = "") -> Markup:
+def joined(parts: Iterable[Any]) -> Markup:
     """Parts one after the other; what is no markup is escaped."""
-    return Markup(separator).join(parts)
+    return Markup().join(parts)
 
 
 def paragraph(text: Any, kind: str = "") -> Markup:
