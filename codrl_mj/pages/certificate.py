@@ -12,7 +12,6 @@ from codrl_mj.pages import page
 from codrl_mj.runs.files import check_writable, writing
 from codrl_mj.validation.certificate import GROUPS, Certificate, verdict, versions
 from codrl_mj.validation.mutations import Caught, unfailed
-from codrl_mj.validation.table import Check
 
 JSON_NAME, HTML_NAME = "certificate.json", "certificate.html"
 _CHECKS = ("check", "oracle", "samples", "worst", "allowed", "margin", "unit", "where", "verdict")
@@ -48,17 +47,19 @@ def _group(name: str, title: str, certificate: Certificate) -> page.Section:
         body.append(page.heading(task) if task else Markup())
         caption = f"Checks of {name}{f', {task}' if task else ''}"
         failed = (place for place, check in enumerate(own) if not check.passed)
-        body.append(page.table(caption, _CHECKS, map(_row, own), range(2, 6), True, failed))
+        rows = [
+            (
+                *(check.name, check.oracle, f"{check.samples:,}", f"{check.worst:.2g}", f"{check.tolerance:.2g}"),
+                *(check.margin, check.unit, check.where),
+                page.judged(check.passed, "passed" if check.passed else "FAILED"),
+            )
+            for check in own
+        ]
+        body.append(page.table(caption, _CHECKS, rows, range(2, 6), True, failed))
         body.append(page.plots(plot for check in own for plot in check.plots))
     good = sum(check.passed for check in checks)
     mark = Markup("({})").format(page.judged(good == len(checks), f"{good} of {len(checks)}", "span"))
     return page.Section(name, name.capitalize(), page.joined(body), mark)
-
-
-def _row(check: Check) -> tuple[Any, ...]:
-    worst, allowed = (f"{value:.2g}" for value in (check.worst, check.tolerance))
-    cells = check.name, check.oracle, f"{check.samples:,}", worst, allowed, check.margin, check.unit, check.where
-    return (*cells, page.judged(check.passed, "passed" if check.passed else "FAILED"))
 
 
 def _mutations(certificate: Certificate, caught: Sequence[Caught]) -> page.Section:
@@ -115,30 +116,19 @@ def summary(content: Mapping[str, Any]) -> Markup:
     )
 
 
-def caught_mapping(caught: Sequence[Caught]) -> list[dict[str, Any]]:
-    """What mutations did, for JSON."""
-    rows = []
-    for outcome in caught:
-        clearest = outcome.clearest
-        row: dict[str, Any] = {"mutation": outcome.mutation, "task": outcome.task, "made": outcome.made}
-        row["failed"] = [f"{check.group}: {check.name}" for check in outcome.failed]
-        if clearest is not None:
-            worst = clearest.worst if math.isfinite(clearest.worst) else str(clearest.worst)
-            row |= {"clearest": f"{clearest.group}: {clearest.name}", "worst": worst, "allowed": clearest.tolerance}
-        rows.append(row)
-    return rows
-
-
 def write(certificate: Certificate, folder: Path, caught: Sequence[Caught] = ()) -> tuple[Path, Path]:
     """Write `certificate.json` and `certificate.html` into a folder, whole or not at all; older ones are replaced."""
     content = certificate.as_mapping()
+    for one in caught:
+        row: dict[str, Any] = {"mutation": one.mutation, "task": one.task, "made": one.made}
+        row["failed"] = [f"{check.group}: {check.name}" for check in one.failed]
+        if (clearest := one.clearest) is not None:
+            worst = clearest.worst if math.isfinite(clearest.worst) else str(clearest.worst)
+            row |= {"clearest": f"{clearest.group}: {clearest.name}", "worst": worst, "allowed": clearest.tolerance}
+        content.setdefault("mutations", []).append(row)
     if caught:
-        content |= {
-            "mutations": caught_mapping(caught),
-            "failed by no mutation": [
-                f"{check.group}: {check.task}: {check.name}" for check in unfailed(certificate.checks, caught)
-            ],
-        }
+        blind = unfailed(certificate.checks, caught)
+        content["failed by no mutation"] = [f"{check.group}: {check.task}: {check.name}" for check in blind]
     text, found = json.dumps(content, indent=2, allow_nan=False) + "\n", html(certificate, caught)
     check_writable(folder)
     with writing(folder / JSON_NAME) as json_file, writing(folder / HTML_NAME) as html_file:

@@ -199,8 +199,9 @@ def small_steps(loops: Loops) -> list[Plot]:
     for place, (name, loop) in enumerate(loops.items()):
         step = small_step(*loop)
         settled, asked = step.settling_time(), float(step.reference[-1])
-        shown = slice(0, max(int(3.0 * np.searchsorted(step.time, settled)), 20))
-        time, share = 1e3 * step.time[shown], step.current[shown] / asked
+        shown = max(int(3.0 * np.searchsorted(step.time, settled)), 20)
+        step = Response(*(column[:shown] for column in step))
+        time, share = 1e3 * step.time, step.current / asked
         if len(loops) > 1:
             curves.append(Curve(f"{name}: current", time, share, colour=place))
     title, scaled, voltage = "A small step of the current, the shaft held", None, []
@@ -208,7 +209,7 @@ def small_steps(loops: Loops) -> list[Plot]:
         within = f"within 2 % in {1e3 * settled:.3g} ms" if math.isfinite(settled) else "not settled"
         torque = f"{loop[0].motor.torque_constant * asked:.3g} N·m at the rotor"
         curves = [Curve(f"current, of {asked:.3g} A, {torque}: {within}", time, share, colour=1)]
-        scaled, voltage = ("current [A]", asked), [_voltages(loop[0], {"voltage": step}, (0.0, float(time[-1])))]
+        scaled, voltage = ("current [A]", asked), [_voltages(loop[0], {"voltage": step})]
     curves.append(Curve("asked for", time, np.ones(len(time)), reference=True))
     return [Plot(title, "time [ms]", "share of what is asked for", tuple(curves), scaled=scaled), *voltage]
 
@@ -227,33 +228,30 @@ def recoveries(drive: Drive, steps: Steps) -> list[Plot]:
 
 def _responses(drive: Drive, title: str, responses: Mapping[str, Response], span: tuple[float, float]) -> list[Plot]:
     """Current, with the rotor's torque, and voltage of responses to one reference, within a span [ms]."""
-    currents = []
+    shown = {}
     for label, one in responses.items():
-        shown = _within(one, span)
-        currents.append(Curve(label, 1e3 * one.time[shown], one.current[shown]))
-    asked = Curve("asked for", 1e3 * one.time[shown], one.reference[shown], reference=True, style="step")
+        within = (1e3 * one.time >= span[0]) & (1e3 * one.time <= span[1])
+        shown[label] = Response(*(column[within] for column in one))
+    currents = [Curve(label, 1e3 * one.time, one.current) for label, one in shown.items()]
+    last = list(shown.values())[-1]
+    asked = Curve("asked for", 1e3 * last.time, last.reference, reference=True, style="step")
     torque = "torque of the rotor [N·m]", drive.motor.torque_constant
     return [
         Plot(title, "time [ms]", "current [A]", (*currents, asked), scaled=torque),
-        _voltages(drive, {label.partition(":")[0]: one for label, one in responses.items()}, span),
+        _voltages(drive, {label.partition(":")[0]: one for label, one in shown.items()}),
     ]
 
 
-def _voltages(loop: Looped, responses: Mapping[str, Response], span: tuple[float, float]) -> Plot:
-    """Voltage of responses, within a span [ms] and a supply."""
-    curves = []
-    for label, one in responses.items():
-        shown = _within(one, span)
-        colour = None if len(responses) > 1 else 1
-        curves.append(Curve(label, 1e3 * one.time[shown], one.voltage[shown], style="step", colour=colour))
+def _voltages(loop: Looped, responses: Mapping[str, Response]) -> Plot:
+    """Voltage of responses, within a supply."""
+    colour = None if len(responses) > 1 else 1
+    curves = [
+        Curve(label, 1e3 * one.time, one.voltage, style="step", colour=colour) for label, one in responses.items()
+    ]
     if (limit := loop.voltage_limit) is not None:
         ends = curves[0].x[[0, -1]]
         curves += [Curve("supply", ends, np.full(2, side * limit), reference=True) for side in (1.0, -1.0)]
     return Plot("Its voltage", "time [ms]", "voltage [V]", tuple(curves))
-
-
-def _within(one: Response, span: tuple[float, float]) -> np.ndarray:
-    return (1e3 * one.time >= span[0]) & (1e3 * one.time <= span[1])
 
 
 def held_step(steps: Mapping[str, tuple[ActuatorModel, float, float]]) -> Plot | None:

@@ -119,8 +119,11 @@ def episode_section(shown: Sequence[Shown], joined: Iterable[Markup] = ()) -> Ma
     """Films, controls and plots of some episodes side by side, and what else follows the clock (`page.clocked`)."""
     lines = _lines(shown)
     end = max(float(one.episode.time[-1]) for one in shown)
-    films = [page.film(_caption(one, len(shown) > 1), one.film.video, one.film.rate, one.film.still)
-             for one in shown if one.film is not None]  # fmt: skip
+    films = [page.part("film", _caption(one, len(shown) > 1), *one.film) for one in shown if one.film is not None]
+    motors = _motors(shown)
+    boxes = [page.part("selector", "Runs", "run", [one.name for one in shown], None)] if len(shown) > 1 else []
+    if len(motors) > 1:
+        boxes.append(page.part("selector", "Motors", "motor", motors, 0 if len(motors) > _MANY else None))
     notes = [page.note(f"No film of {one.name}: {one.problem}") for one in shown if one.film is None]
     stage = [
         *notes,
@@ -128,7 +131,7 @@ def episode_section(shown: Sequence[Shown], joined: Iterable[Markup] = ()) -> Ma
             Markup('<div class="films">{}</div>').format(page.joined(films)) if films else "",
             page.part("transport", f"{end:.6g}", f"{min(float(one.episode.time[0]) for one in shown):.6g}"),
         ),
-        _selectors(shown),
+        Markup('<div class="selectors">{}</div>').format(page.joined(boxes)) if boxes else Markup(),
         *joined,
     ]
     diagram = episode_diagram(lines)
@@ -156,14 +159,6 @@ def _caption(one: Shown, named: bool) -> str:
     episode = one.episode
     over = f"{'ended' if episode.terminated else 'time limit'} at {episode.time[-1]:.2f} s"
     return f"{one.name + ': ' if named else ''}seed {one.seed}, return {page.number(episode.total)}, {over}"
-
-
-def _selectors(shown: Sequence[Shown]) -> Markup:
-    motors = _motors(shown)
-    boxes = [page.selector("Runs", "run", [one.name for one in shown])] if len(shown) > 1 else []
-    if len(motors) > 1:
-        boxes.append(page.selector("Motors", "motor", motors, 0 if len(motors) > _MANY else None))
-    return Markup('<div class="selectors">{}</div>').format(page.joined(boxes)) if boxes else Markup()
 
 
 def _motors(shown: Sequence[Shown]) -> list[str]:

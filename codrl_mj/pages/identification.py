@@ -1,7 +1,7 @@
 """What identification found: data and fit, residuals, intervals, correlations, and what to do better on the bench."""
 
+import itertools
 import math
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -110,7 +110,12 @@ def _advice(found: Identified) -> Markup:
         "<b>{}</b> and <b>{}</b> stand for each other (correlation {:+.2f}): give one of them with --known, or excite "
         "what tells them apart."
     )
-    texts += [told.format(*pair) for pair in _strong(found)]
+    texts += [
+        told.format(one.replace("_", " "), other.replace("_", " "), table[one][other])
+        for table in found.correlations.values()
+        for one, other in itertools.combinations(table, 2)
+        if abs(table[one][other]) >= _STRONG
+    ]
     if not found.held_out and found.driven_by:
         texts.append(Markup("No log was held out: keep one back with --holdout, to see what the numbers predict."))
     if len(found.logs) < 2:
@@ -119,15 +124,6 @@ def _advice(found: Identified) -> Markup:
         return page.paragraph("Nothing stands out: every number is identified or given, and a log was held out.")
     texts.append(Markup("<code>codrl-mj identify plan</code> says which excitation tells what."))
     return Markup("<ul>{}</ul>").format(page.joined(Markup("<li>{}</li>").format(text) for text in texts))
-
-
-def _strong(found: Identified) -> Iterable[tuple[str, str, float]]:
-    for table in found.correlations.values():
-        names = list(table)
-        for place, one in enumerate(names):
-            for other in names[place + 1 :]:
-                if abs(table[one][other]) >= _STRONG:
-                    yield one.replace("_", " "), other.replace("_", " "), table[one][other]
 
 
 def _errors(found: Identified) -> Markup:
@@ -184,12 +180,11 @@ def _correlations(found: Identified) -> Markup:
     for part, table in found.correlations.items():
         if len(table) > 1:
             names = [name.replace("_", " ") for name in table]
-            rows = [(name, *map(_share, row.values())) for name, row in zip(names, table.values(), strict=True)]
+            shares = [
+                [Markup("<b>{:+.2f}</b>" if _STRONG <= abs(one) < 1.0 - 1e-9 else "{:+.2f}").format(one) for one in row]
+                for row in (row.values() for row in table.values())
+            ]
+            rows = [(name, *row) for name, row in zip(names, shares, strict=True)]
             caption = f"Correlations of the {part}'s parameters"
             parts.append(page.table(caption, ("", *names), rows, numbers=range(1, 1 + len(names))))
     return page.joined(parts)
-
-
-def _share(value: float) -> Markup:
-    strong = _STRONG <= abs(value) < 1.0 - 1e-9
-    return Markup("<b>{:+.2f}</b>" if strong else "{:+.2f}").format(value)

@@ -55,20 +55,6 @@ def _right(one: LoopDesign, field: str) -> float:
     return 20.0 * math.log10(value) if field == "gain_margin" else value * _SCALES.get(field, 1.0)
 
 
-def rates_table(drive: Drive) -> Markup:
-    """The loop at other sample rates, with and without delay."""
-    own = drive.controller.sample_rate, drive.controller.delayed
-    rows = []
-    for (rate, delayed), one in designs(drive).items():
-        name = f"{rate / 1e3:g} kHz, {'a sample' if delayed else 'no'} delay{' (as it is)' * ((rate, delayed) == own)}"
-        if isinstance(one, str):
-            rows.append((name, "not possible: " + one, *[""] * 5))
-        else:
-            rows.append((name, *(page.number(_right(one, field)) for field, _, _ in _RIGHTS[3:])))
-    columns = ("the loop at", *(f"{label} [{unit}]" for _, label, unit in _RIGHTS[3:]))
-    return page.table("Other sample rates", columns, rows, numbers=range(1, 7), cards=True)
-
-
 def motor_page(name: str, drive: Drive, entry: MotorEntry | None, out: Path) -> Path:
     """Write the page of a motor with its drive, and its datasheet where it has one, to an .html file; return that."""
     known = explain(drive, entry)
@@ -105,12 +91,22 @@ def _abilities(known: Mapping[str, Any], drive: Drive, entry: MotorEntry | None)
 
 
 def _loop(name: str, drive: Drive) -> Markup:
+    """The loop as it is, out of saturation, and at other sample rates, with and without delay."""
     parts = [loop_section({name: (drive, None)})]
     try:
         parts += [page.heading("Out of saturation, by kind of anti-windup"), page.plots(recoveries(drive, step(drive)))]
     except ValueError as error:
         parts = [parts[0], page.note(str(error))]
-    return page.joined((*parts, rates_table(drive)))
+    own = drive.controller.sample_rate, drive.controller.delayed
+    rows = []
+    for (rate, delayed), one in designs(drive).items():
+        name = f"{rate / 1e3:g} kHz, {'a sample' if delayed else 'no'} delay{' (as it is)' * ((rate, delayed) == own)}"
+        if isinstance(one, str):
+            rows.append((name, "not possible: " + one, *[""] * 5))
+        else:
+            rows.append((name, *(page.number(_right(one, field)) for field, _, _ in _RIGHTS[3:])))
+    columns = ("the loop at", *(f"{label} [{unit}]" for _, label, unit in _RIGHTS[3:]))
+    return page.joined((*parts, page.table("Other sample rates", columns, rows, numbers=range(1, 7), cards=True)))
 
 
 def _numbers(known: Mapping[str, Any]) -> Markup:

@@ -39,11 +39,13 @@ class Section(NamedTuple):
 @functools.cache
 def _template(name: str) -> jinja2.Template:
     options: Any = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
-    return jinja2.Environment(loader=jinja2.FileSystemLoader(_HERE), **options).get_template(name)
+    templates = jinja2.Environment(loader=jinja2.FileSystemLoader(_HERE), **options)
+    templates.filters["data"] = _data
+    return templates.get_template(name)
 
 
 def part(name: str, *arguments: Any) -> Markup:
-    """A macro of `parts.html.jinja`, filled in: `transport(end, step)` has the controls of the page's clock [s]."""
+    """A macro of `parts.html.jinja`, filled in, which says there what it takes."""
     return Markup(getattr(_template("parts.html.jinja").module, name)(*arguments))
 
 
@@ -51,7 +53,7 @@ def _text(name: str) -> Markup:
     return Markup((_HERE / name).read_text(encoding="utf-8"))
 
 
-def _data(kind: str, content: bytes) -> Markup:
+def _data(content: bytes, kind: str) -> Markup:
     return Markup("data:{};base64,{}").format(kind, base64.b64encode(content).decode())
 
 
@@ -79,9 +81,9 @@ def write(path: Path, text: str) -> Path:
     return path
 
 
-def joined(parts: Iterable[Any], separator: str = "") -> Markup:
+def joined(parts: Iterable[Any]) -> Markup:
     """Parts one after the other; what is no markup is escaped."""
-    return Markup(separator).join(parts)
+    return Markup().join(parts)
 
 
 def paragraph(text: Any, kind: str = "") -> Markup:
@@ -132,7 +134,7 @@ def table(
 
 def plot(what: Plot, low: bool = False) -> Markup:
     """A plot; less high where it is `low`."""
-    picture = _data("image/svg+xml", still(what, height=2.2 if low else 3.2).encode())
+    picture = _data(still(what, height=2.2 if low else 3.2).encode(), "image/svg+xml")
     axes = f"{what.y_label} over {what.x_label}" if what.clock else what.y_label
     return part("plot", what.title, axes, description(what), Markup(as_json(what)), picture, what.clock, low)
 
@@ -141,26 +143,6 @@ def plots(several: Iterable[Plot]) -> Markup:
     """Plots side by side, where there is room."""
     drawn = [plot(one) for one in several]
     return Markup('<div class="plots">{}</div>').format(joined(drawn)) if drawn else Markup("")
-
-
-def image(picture: bytes, about: str) -> Markup:
-    """A JPEG file's content, and what is seen for those who do not see it."""
-    return Markup('<img src="{}" alt="{}">').format(_data("image/jpeg", picture), about)
-
-
-def film(caption: str, video: bytes, rate: float, poster: bytes | None = None) -> Markup:
-    """A film (MP4, H.264, frames a second), which follows the page's clock and leads it while it plays.
-
-    The poster, a JPEG file's content, is for as long as nothing is seen.
-    """
-    before = poster and _data("image/jpeg", poster)
-    return part("film", caption, _data("video/mp4", video), before, f"{1.0 / rate:.6g}")
-
-
-def selector(legend: str, kind: str, names: Sequence[str], shown: int | None = None) -> Markup:
-    """Chooses by name what the curves with a tag `KIND:PLACE` show, at first the place `shown` alone, or all."""
-    entries = [(f"{kind}:{place}", name, shown in (None, place)) for place, name in enumerate(names)]
-    return part("selector", legend, kind, entries)
 
 
 def clocked(label: str, fragment: str, script: str) -> Markup:

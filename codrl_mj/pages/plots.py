@@ -118,22 +118,13 @@ def as_json(plot: Plot) -> str:
         with np.errstate(over="ignore"):  # beyond float32 is as good as infinite on a screen
             return arrays.setdefault(np.asarray(values, dtype="<f4").tobytes(), len(arrays))
 
-    def drawn(curve: Curve) -> dict[str, Any]:
-        trail = curve.style == "trail"
-        x, y = (curve.x, curve.y) if trail else thinned(curve.x, curve.y)
-        found = {
-            "label": curve.label,
-            "x": stored(x),
-            "y": stored(_drawable(y, plot.y_log)),
-            "style": "reference" if curve.reference else curve.style,
-            "dashed": curve.dashed,
-            "filled": curve.filled,
-            "colour": curve.colour,
-            "shared": curve.shared,
-            "tags": curve.tags,
-        }
-        return found | ({"times": stored(curve.times)} if curve.times is not None else {})
-
+    curves = []
+    for curve in plot.curves:
+        x, y = (curve.x, curve.y) if curve.style == "trail" else thinned(curve.x, curve.y)
+        drawn = {"label": curve.label, "x": stored(x), "y": stored(_drawable(y, plot.y_log))}
+        drawn["style"] = "reference" if curve.reference else curve.style
+        drawn |= {name: getattr(curve, name) for name in ("dashed", "filled", "colour", "shared", "tags")}
+        curves.append(drawn | ({"times": stored(curve.times)} if curve.times is not None else {}))
     content = {
         "title": plot.title,
         "x": {"label": plot.x_label, "log": plot.x_log},
@@ -143,7 +134,7 @@ def as_json(plot: Plot) -> str:
             "most": plot.y_most if plot.y_most is not None else _ceiling(plot),
         },
         "clock": plot.clock,
-        "curves": [drawn(curve) for curve in plot.curves],
+        "curves": curves,
         "shades": [
             {"label": shade.label, "spans": stored(shade.spans.ravel()), "tags": shade.tags} for shade in plot.shades
         ],

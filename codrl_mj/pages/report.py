@@ -75,10 +75,13 @@ def report(
     ]
     on_part("page")
     shown = [run for run in found if run.episode is not None]
+    notes = [page.note(f"No episode of {run.name}: {run.problem}", bad=True) for run in found if run.episode is None]
+    notes += [page.note(f"{run.name}: the policy of its best evaluation acts.") for run in found if run.best]
+    episode = episode_section(shown, joined(shown)) if shown else Markup()
     sections = [
         page.Section("learning", "Learning", _learning(found)),
         page.Section("evaluation", "Evaluation", _evaluation(found)),
-        page.Section("episode", "An episode", _episodes(found, shown, joined)),
+        page.Section("episode", "An episode", page.joined((*notes, episode))),
         page.Section("loop", "The loop between", _loop(found)),
         page.Section("certificate", "Certificate", certified),
         page.Section("settings", "Settings", _settings(found)),
@@ -126,7 +129,7 @@ def _top(runs: Sequence[Shown], shown: Sequence[Shown]) -> Markup:
     told += [page.paragraph(_about(task), "soft") for task in dict.fromkeys(run.summary.task for run in runs) if task]
     for one in shown:
         if one.film is not None:
-            picture = page.image(one.film.still, f"{one.env.task}: the scene of an episode")
+            picture = page.part("image", one.film.still, f"{one.env.task}: the scene of an episode")
             return Markup('<div class="intro"><div>{}</div>{}</div>').format(page.joined(told), picture)
     return page.joined(told)
 
@@ -242,14 +245,6 @@ def _measures(caption: str, columns: Mapping[str, Mapping[str, Any]]) -> Markup:
     return page.table(caption, ("measure", *columns, "unit"), rows, numbers=range(1, 1 + len(columns)))
 
 
-def _episodes(
-    runs: Sequence[Shown], shown: Sequence[Shown], joined: Callable[[Sequence[Shown]], Sequence[Markup]]
-) -> Markup:
-    notes = [page.note(f"No episode of {run.name}: {run.problem}", bad=True) for run in runs if run.episode is None]
-    notes += [page.note(f"{run.name}: the policy of its best evaluation acts.") for run in runs if run.best]
-    return page.joined((*notes, episode_section(shown, joined(shown)) if shown else ""))
-
-
 def replays(shown: Sequence[Shown]) -> list[Markup]:
     """The episodes in three dimensions, to be turned and zoomed: what `joined` of a report may return."""
     from codrl_mj.replay import SCRIPT, library, motion_of_episode, replay
@@ -283,7 +278,12 @@ def _loop(runs: Sequence[Shown]) -> Markup:
                     seen.append(same)
                     loops[name] = loop
                 continue
-            without[_without_loop(name, actuator)] = None
+            if isinstance(actuator, Actuator):
+                why = "no gain on the error of the current, feed-forward alone: there is no loop to be judged."
+            else:
+                about = (type(actuator).__doc__ or type(actuator).__name__).strip().partition("\n")[0]
+                why = f"{about} There is no current loop in it."
+            without[f"{name}: {why}"] = None
             if timestep is None or isinstance(actuator, Ideal):
                 continue
             if all((actuator, timestep) != (one, step) for one, _, step in others.values()):
@@ -298,14 +298,6 @@ def _loop(runs: Sequence[Shown]) -> Markup:
         parts.append(loop_section(dict(list(loops.items())[:_MOST_LOOPS])))
     plot = held_step(others)
     return page.joined((*parts, page.plots([plot] if plot is not None else [])))
-
-
-def _without_loop(name: str, actuator: ActuatorModel) -> str:
-    """Why there is no current loop to be judged."""
-    if isinstance(actuator, Actuator):
-        return f"{name}: no gain on the error of the current, feed-forward alone: there is no loop to be judged."
-    about = (type(actuator).__doc__ or type(actuator).__name__).strip().partition("\n")[0]
-    return f"{name}: {about} There is no current loop in it."
 
 
 def _asked(actuator: ActuatorModel, episode: Episode) -> float:

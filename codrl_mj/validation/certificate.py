@@ -60,6 +60,11 @@ class Certificate:
 
     def as_mapping(self) -> dict[str, Any]:
         """Everything but the plots, for JSON; infinities and NaN as text."""
+        checks: list[dict[str, Any]] = []
+        for check in self.checks:
+            row = {one.name: getattr(check, one.name) for one in dataclasses.fields(check) if one.name != "plots"}
+            text = {name: str(one) for name, one in row.items() if isinstance(one, float) and not math.isfinite(one)}
+            checks.append(row | text | {"samples": int(check.samples), "passed": check.passed})
         return {
             "format": "codrl_mj certificate 1",
             "subject": self.subject,
@@ -68,7 +73,7 @@ class Certificate:
             "seconds": round(self.seconds, 1),
             "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
             "versions": versions(),
-            "checks": [_check_mapping(check) for check in self.checks],
+            "checks": checks,
             "skipped": [dataclasses.asdict(skip) for skip in self.skipped],
         }
 
@@ -78,12 +83,6 @@ def verdict(passed: Sequence[bool]) -> str:
     failed = passed.count(False)
     count = f"of {len(passed)} checks"
     return f"{failed} {count} FAILED" if failed or not passed else f"passed: {len(passed)} {count}"
-
-
-def _check_mapping(check: Check) -> dict[str, Any]:
-    found = {field.name: getattr(check, field.name) for field in dataclasses.fields(check) if field.name != "plots"}
-    text = {name: str(one) for name, one in found.items() if isinstance(one, float) and not math.isfinite(one)}
-    return found | text | {"samples": int(check.samples), "passed": check.passed}
 
 
 def versions() -> dict[str, str]:

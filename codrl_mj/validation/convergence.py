@@ -22,11 +22,19 @@ import mujoco
 import numpy as np
 from scipy import integrate
 
-from codrl_mj.actuators import IDEAL, Actuator, ActuatorModel, CurrentLoop, Motor
+from codrl_mj.actuators import Actuator, ActuatorModel, CurrentLoop, Motor
 from codrl_mj.physics import MujocoPhysics, Plant, SimulationDivergedError, install_callbacks
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.tasks import OURS, Task, find_task
-from codrl_mj.validation.compare import NO_TWIN, Equations, actuators_of, forces_of, gymnasium_equations, physics_of
+from codrl_mj.validation.compare import (
+    NO_TWIN,
+    Equations,
+    actuators_named,
+    actuators_of,
+    forces_of,
+    gymnasium_equations,
+    physics_of,
+)
 from codrl_mj.validation.table import Case, Check, Family, Skipped, check, of_order, order
 
 
@@ -49,7 +57,7 @@ def obstacle(task: Task) -> str:
         return ""
     start, forces, _ = free_run(task)
     free = dataclasses.replace(task, step_duration=task.step_duration / 16, constrain=None)
-    physics = MujocoPhysics(Plant(free, (IDEAL,) * len(task.motors)))
+    physics = MujocoPhysics(Plant(free, actuators_named("ideal", task)))
     physics.reset(start)
     for force in forces.repeat(16, axis=0):
         try:
@@ -89,7 +97,7 @@ def _error(states: np.ndarray, solution: np.ndarray) -> float:
 
 def engine_equations(task: Task) -> Equations:
     """The accelerations that MuJoCo's `mj_forward` finds, whatever its integrator makes of them."""
-    model = task_model(Plant(task, (IDEAL,) * len(task.motors), max_forces=np.full(len(task.motors), 1e9)))
+    model = task_model(Plant(task, actuators_named("ideal", task), max_forces=np.full(len(task.motors), 1e9)))
     install_callbacks(model)
     data, qpos, qvel = mujoco.MjData(model), list(task.qpos), list(task.qvel)
     controls = [model.actuator_ctrladr[model.actuator(name).id] for name in task.motors]
@@ -140,11 +148,6 @@ def solve(
         state = found.y[:, -1]
         rows.append(state[:size])
     return np.array(rows)
-
-
-def ideals(task: Task) -> tuple[ActuatorModel, ...]:
-    """One for each motor."""
-    return (IDEAL,) * len(task.motors)
 
 
 def analogues(task: Task) -> tuple[Actuator, ...]:
@@ -200,7 +203,7 @@ def rate_in_the_bandwidth(task: Task, quick: bool) -> Iterator[Case]:
         kp = motors[0].inductance / lag
         loop = CurrentLoop(kp=kp, ki=kp * motors[0].resistance / motors[0].inductance, max_voltage=math.inf)
         actuators = [Actuator(motor, loop) for motor in motors]
-        ideal = _states(physics[-1][1], task, ideals(task), count, integrator)
+        ideal = _states(physics[-1][1], task, actuators_named("ideal", task), count, integrator)
         for label, kind in physics:
             errors[label].append(_error(_states(kind, task, actuators, count, integrator), ideal))
     bandwidth = 1 / (2 * np.pi * lags)
@@ -224,7 +227,7 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     else:
         equations, whose, ideal = gymnasium_equations(task), f"the equations of {task.oracle}", task.oracle
     start, forces, _ = free_run(task)
-    for case, actuators in (("ideal actuator", ideals(task)), ("motor in the loop", analogues(task))):
+    for case, actuators in (("ideal actuator", actuators_named("ideal", task)), ("motor in the loop", analogues(task))):
         solution = solve(task, equations, start, forces, actuators)
         solved = whose if case == "ideal actuator" else f"{whose} and of the motor"
         for integrator in task.integrators:

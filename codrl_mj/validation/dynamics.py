@@ -4,7 +4,7 @@ The oracle is an unmodified Gymnasium environment that is driven through its att
 """
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import mujoco
 import numpy as np
@@ -23,15 +23,9 @@ EXTREME = 10.0
 """Extreme forces are this many times the largest that a task asks for."""
 
 
-def trials_of(task: Task) -> Trials:
-    """What a task is tried in; it must say so."""
-    assert task.trials is not None
-    return task.trials
-
-
-def grid(task: Task, points: int) -> np.ndarray:
-    """States on a dense grid over the task's bounds, both ends included: shape (points to the power n, n)."""
-    axes = [np.linspace(-bound, bound, points) for bound in trials_of(task).bounds]
+def grid(bounds: Sequence[float], points: int) -> np.ndarray:
+    """States on a dense grid within bounds to either side, ends included: shape (points to the power n, n)."""
+    axes = [np.linspace(-bound, bound, points) for bound in bounds]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
 
 
@@ -53,17 +47,23 @@ def _after_one_step(physics: MujocoPhysics | AnalyticPhysics, states: np.ndarray
     return after
 
 
+def _of_each(gaps: np.ndarray, names: Sequence[str], states: np.ndarray, forces: np.ndarray) -> Case:
+    """Gaps of shape (states, names), each said with its state and force."""
+
+    def where(at: int) -> str:
+        row, entry = divmod(at, len(names))
+        return f"{names[entry]} {np.array2string(states[row], precision=3)}, force {forces[row]:.3g}"
+
+    return Case(gaps, where, len(states))
+
+
 def _stepped(task: Task, integrator: str, states: np.ndarray, forces: np.ndarray, limit: float) -> Case:
     """One step from the states under the forces, which MuJoCo limits itself and Gymnasium is given limited."""
     physics, analytic = both(task, IDEAL, integrator, max_force=limit)
     ours = _after_one_step(physics, states, forces)
     oracle = _after_one_step(analytic, states, np.clip(forces, -limit, limit))
 
-    def where(at: int) -> str:
-        row, entry = divmod(at, states.shape[1])
-        return f"{task.state_names[entry]} from {np.array2string(states[row], precision=3)}, force {forces[row]:.3g}"
-
-    return Case(differences(task, ours, oracle), where, len(states))
+    return _of_each(differences(task, ours, oracle), [f"{name} from" for name in task.state_names], states, forces)
 
 
 @check(
@@ -73,19 +73,19 @@ def _stepped(task: Task, integrator: str, states: np.ndarray, forces: np.ndarray
         for where in ("", " at the bounds", " beyond the force limit")
     ),
 )
-def one_step(task: Task, integrator: str, quick: bool) -> Iterator[tuple[Case, ...]]:
+def one_step(task: Task, trials: Trials, integrator: str, quick: bool) -> Iterator[tuple[Case, ...]]:
     """One integration step with an ideal actuator: from random states under random forces.
 
     And from the task's edges under no, full and extreme forces, which MuJoCo is allowed there; and from a grid under
     commands up to `EXTREME` times the limit, against Gymnasium under the limit.
     """
     generator, limit, flat = np.random.default_rng(0), task.max_force, len(task.state_names) == 2
-    bounds, samples = np.array(trials_of(task).bounds), 200 if quick else 10_000
+    bounds, samples = np.array(trials.bounds), 200 if quick else 10_000
     states = generator.uniform(-bounds, bounds, (samples, len(bounds)))
     forces = generator.uniform(-limit, limit, samples)
-    edges = np.array(list(itertools.product(*trials_of(task).edges)))[:: 5 if quick and not flat else 1]
+    edges = np.array(list(itertools.product(*trials.edges)))[:: 5 if quick and not flat else 1]
     at_edges = _crossed(edges, limit * np.array([-EXTREME, -1.0, 0.0, 1.0, EXTREME]))
-    points = grid(task, 3 if quick else (21 if flat else 5))
+    points = grid(trials.bounds, 3 if quick else (21 if flat else 5))
     beyond = _crossed(points, limit * np.array([-EXTREME, -1.001, 1.001, EXTREME]))
     yield (
         _stepped(task, integrator, states, forces, limit),
@@ -95,9 +95,11 @@ def one_step(task: Task, integrator: str, quick: bool) -> Iterator[tuple[Case, .
 
 
 @check("dynamics", Check("accelerations", "{task.oracle}", TOLERANCE))
-def accelerations(task: Task, points: int) -> Iterator[Case]:
+def accelerations(task: Task, trials: Trials, points: int) -> Iterator[Case]:
     """MuJoCo's `qacc` over a dense grid of states, under no, half, full and extreme forces."""
-    states, forces = _crossed(grid(task, points), task.max_force * np.array([-EXTREME, -1.0, 0.0, 0.5, EXTREME]))
+    states, forces = _crossed(
+        grid(trials.bounds, points), task.max_force * np.array([-EXTREME, -1.0, 0.0, 0.5, EXTREME])
+    )
     physics, _ = both(task, IDEAL, task.integrators[0], max_force=EXTREME * task.max_force)
     equations, velocities = gymnasium_equations(task, dt=1.0), list(task.qvel)
     ours, oracle = (np.empty((len(states), len(task.qvel))) for _ in range(2))
@@ -108,12 +110,8 @@ def accelerations(task: Task, points: int) -> Iterator[Case]:
         ours[row] = physics.data.qacc
         oracle[row] = equations(state, force)[velocities]
 
-    def where(at: int) -> str:
-        row, entry = divmod(at, len(task.qvel))
-        name = task.state_names[task.qvel[entry]].partition(" ")[0]
-        return f"d{name}/dt at {np.array2string(states[row], precision=3)}, force {forces[row]:.3g}"
-
-    yield Case(np.abs(ours - oracle) / np.maximum(1.0, np.abs(oracle)), where, len(states))
+    names = [f"d{task.state_names[entry].partition(' ')[0]}/dt at" for entry in velocities]
+    yield _of_each(np.abs(ours - oracle) / np.maximum(1.0, np.abs(oracle)), names, states, forces)
 
 
 def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
@@ -125,6 +123,6 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
         return
     flat = len(task.state_names) == 2
     points = (9 if flat else 3) if quick else (51 if flat else 7)
-    yield from accelerations(task, points)
+    yield from accelerations(task, task.trials, points)
     for integrator in task.integrators:
-        yield from one_step(task, integrator, quick)
+        yield from one_step(task, task.trials, integrator, quick)

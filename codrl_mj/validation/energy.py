@@ -33,7 +33,7 @@ from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.physics import Plant, SimulationDivergedError, hills, trace_names
 from codrl_mj.tasks import Task, find_task
 from codrl_mj.validation.compare import STAND_IN, actuators_named, forces_of, gymnasium_equations, physics_of
-from codrl_mj.validation.convergence import analogues, free_run, ideals, obstacle
+from codrl_mj.validation.convergence import analogues, free_run, obstacle
 from codrl_mj.validation.table import Case, Check, Family, Skipped, check, of_order, order
 
 ACTUATORS = ("paper", "weak", "weaker", "open_loop")
@@ -252,7 +252,7 @@ def balances(task: Task, integrator: str, quick: bool) -> Iterator[tuple[Case, .
         kept, steps, promised, rounding = ledgers, counts, 1.0, 0.0
         if exact := (balance, integrator) == ("mechanical", "rk4"):
             steps, promised = 2 ** np.arange(3, 7), 2.0 if meter.lossy else 4.0  # finer ones reach rounding
-            kept = _kept(task, integrator, ideals(task), steps)
+            kept = _kept(task, integrator, actuators_named("ideal", task), steps)
         families = []
         for label, of_steps in kept.items():
             residuals = [float(np.abs(ledger.residual(balance)).max()) for ledger in of_steps]

@@ -47,7 +47,6 @@ from codrl_mj.validation.rotors import (
     drive,
     driven_by_voltage,
     motors_on,
-    native_motor_on,
     standard_loops,
 )
 from codrl_mj.validation.table import Case, Check, Family, Skipped, check, of_order, order
@@ -67,17 +66,15 @@ def exact(motor: Motor, timestep: float) -> Actuator:
     return driven_by_voltage(dataclasses.replace(motor, inductance=motor.resistance * timestep / decay))
 
 
-def _voltages(hold: int, count: int) -> np.ndarray:
-    """Random voltages in +-4 V, each held for `hold` steps."""
-    return np.random.default_rng(0).uniform(-4.0, 4.0, count).repeat(hold)
-
-
 def _both(
-    load: Load, motor: Motor, actuator: Actuator, timestep: float, volts: np.ndarray, integrator: str = "Euler"
+    load: Load, motor: Motor, actuator: Actuator, timestep: float, hold: int, count: int, integrator: str = "Euler"
 ) -> tuple[Record, Record, np.ndarray]:
-    """Ours and the native motor, and their differences of angle, speed and current, relative to max(1, size)."""
-    ours = drive(motors_on(load, [actuator], timestep, integrator), volts)
-    native = drive(native_motor_on(load, motor, timestep, integrator), volts)
+    """Ours and the native motor, and their differences of angle, speed and current, relative to max(1, size).
+
+    Both are under `count` random voltages in +-4 V, each held for `hold` steps.
+    """
+    volts = np.random.default_rng(0).uniform(-4.0, 4.0, count).repeat(hold)
+    ours, native = (drive(motors_on(load, [one], timestep, integrator), volts) for one in (actuator, motor))
     pairs = zip(ours[:3], native[:3], strict=True)
     return ours, native, np.max([np.abs(a - b) / np.maximum(1.0, np.abs(b)) for a, b in pairs], axis=(0, 2))
 
@@ -93,11 +90,10 @@ def same_map(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
     shares = (0.1, 1.0) if quick else (0.01, 0.1, 0.3, 1.0)
     for (name, motor), (load, integrator), share in itertools.product(motors.items(), _ON, shares):
         timestep = share * motor.electrical_time_constant
-        volts = _voltages(5, 20 if quick else 100)
-        actuator = exact(motor, timestep)
-        ours, native, difference = _both(load, motor, actuator, timestep, volts, integrator)
+        count = 20 if quick else 100
+        ours, native, difference = _both(load, motor, exact(motor, timestep), timestep, 5, count, integrator)
         at = f"{name} motor, {load.name}, {integrator}, dt = {share:g} L/R, step {difference.argmax() + 1}"
-        time = np.arange(1, len(volts) + 1) * timestep
+        time = np.arange(1, len(difference) + 1) * timestep
         theirs = Curve("<dcmotor>", time, native.current[:, 0], reference=True)
         curves = (Curve("ours", time, ours.current[:, 0]), theirs)
         plot = Plot("Current on the swinging load, Euler", "time [s]", "current [A]", curves)
@@ -111,7 +107,7 @@ def substeps(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
     for (name, motor), load in itertools.product(motors.items(), (HELD, FREE, SWINGING)):
         timestep = 0.2 * motor.electrical_time_constant
         actuators = [driven_by_voltage(motor, int(count)) for count in counts]
-        errors = [_both(load, motor, one, timestep, _voltages(5, 20))[-1].max() for one in actuators]
+        errors = [_both(load, motor, one, timestep, 5, 20)[-1].max() for one in actuators]
         families.append(Family(f"{name}, {load.name}", timestep / counts, np.array(errors)))
     title = "Ours against <dcmotor>, Euler"
     yield of_order(1.0, families, title, "electrical substep [s]", "largest difference [relative]")
@@ -124,8 +120,8 @@ def implicitfast(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
     for (name, motor), load in itertools.product(motors.items(), (FREE, SWINGING)):
         steps, errors = motor.electrical_time_constant / divisors, []
         for divisor, timestep in zip(divisors, steps, strict=True):
-            actuator, volts = exact(motor, timestep), _voltages(int(divisor), 10)
-            errors.append(_both(load, motor, actuator, timestep, volts, "implicitfast")[-1].max())
+            both = _both(load, motor, exact(motor, timestep), timestep, int(divisor), 10, "implicitfast")
+            errors.append(both[-1].max())
         families.append(Family(f"{name}, {load.name}", steps, np.array(errors)))
     title = "Ours against <dcmotor>, implicitfast"
     yield of_order(2.0, families, title, "step [s]", "largest difference [relative]")
@@ -144,11 +140,10 @@ def rk4_check(quick: bool) -> Iterator[Case]:
         timestep = float(share) * motor.electrical_time_constant
         volts = np.ones(math.ceil(3.0 / share))
         currents = (1.0 / motor.resistance) * (1.0 - np.exp(-share * np.arange(1, len(volts) + 1)))
-        models = (
-            motors_on(HELD, [exact(motor, timestep)], timestep, "RK4"),
-            native_motor_on(HELD, motor, timestep, "RK4"),
+        ours[at], native[at] = (
+            np.abs(drive(motors_on(HELD, [one], timestep, "RK4"), volts).current[:, 0] / currents - 1.0).max()
+            for one in (exact(motor, timestep), motor)
         )
-        ours[at], native[at] = (np.abs(drive(one, volts).current[:, 0] / currents - 1.0).max() for one in models)
     native_error = (
         f"; <dcmotor> reads {native[0]:.1%} wrong at dt = {shares[0]:g} L/R, {native[-1]:.0%} at {shares[-1]:g} L/R"
     )

@@ -6,13 +6,13 @@ and is undone when the `with` block ends.
 
 import contextlib
 import dataclasses
-import functools
 import importlib
 import inspect
 import sys
 import types
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from functools import cache, partial
 from typing import Any
 from unittest import mock
 
@@ -46,37 +46,27 @@ def _everywhere(name: str, original: Any, wrong: Any) -> Iterator[None]:
 # -- in a model ---------------------------------------------------------------------------------------------
 
 
+Part = tuple[str, int | tuple[int, int] | None, float]
+"""(array of a model or its options, where in it, factor); of a plain number the place is None."""
+
+
 @contextlib.contextmanager
-def wrong_model(change: Callable[[mujoco.MjModel], None]) -> Iterator[None]:
-    """Every task's model is compiled with the change made to it."""
+def wrong_model(*parts: Part) -> Iterator[None]:
+    """Every task's model is compiled with these parts of it scaled, those that it has."""
     build = mjcf.task_model
 
     def build_wrong(*arguments: Any, **options: Any) -> mujoco.MjModel:
         model = build(*arguments, **options)
-        change(model)
+        for field, at, factor in parts:
+            owner = model.opt if hasattr(model.opt, field) else model
+            if at is None:
+                setattr(owner, field, getattr(owner, field) * factor)
+            elif getattr(owner, field).size:
+                getattr(owner, field)[at] *= factor
         return model
 
     with _everywhere("task_model", build, build_wrong):
         yield
-
-
-def _off(field: str, at: int | tuple[int, int], factor: float) -> Callable[[mujoco.MjModel], None]:
-    """A change that scales a part of one of the model's arrays."""
-
-    def change(model: mujoco.MjModel) -> None:
-        getattr(model, field)[at] *= factor
-
-    return change
-
-
-def _stronger_gravity(model: mujoco.MjModel) -> None:
-    model.opt.gravity[2] *= 1.001
-    if model.nuser_jnt:
-        model.jnt_user[0, GRAVITY] *= 1.001  # the hill's
-
-
-def _slower_clock(model: mujoco.MjModel) -> None:
-    model.opt.timestep *= 1.001
 
 
 # -- in the source text -------------------------------------------------------------------------------------
@@ -104,7 +94,7 @@ _HIDDEN = np.zeros(64)
 """Memory that no simulation owns, one number for each actuator of a model."""
 
 
-@functools.cache
+@cache
 def _wrong_callbacks(edits: tuple[Edit, ...]) -> Callable[[], Any]:
     wrong = edited(control, edits)
     wrong.HIDDEN = _HIDDEN.ctypes.data  # type: ignore[attr-defined]
@@ -123,7 +113,7 @@ def wrong_callback(*edits: Edit) -> Iterator[None]:
             engine.uninstall()
 
 
-@functools.cache
+@cache
 def _wrong_families(module: types.ModuleType, edits: tuple[Edit, ...]) -> tuple[type[ActuatorModel], ...]:
     """The families of a module, made from its edited source."""
     wrong = vars(edited(module, edits)).values()
@@ -179,39 +169,23 @@ _SHARED_CURRENT: tuple[Edit, ...] = (
 # -- in how a simulation is driven --------------------------------------------------------------------------
 
 
-def _stale_command() -> Fault:
-    step = MujocoPhysics.step
-
-    def late(self: Any, desired_force: float) -> Any:
-        force, self.waiting = getattr(self, "waiting", 0.0), desired_force
-        return step(self, force)
-
-    return mock.patch.object(MujocoPhysics, "step", late)
+_STEP, _MAKE, _RESET = MujocoPhysics.step, MujocoPhysics.__init__, MujocoPhysics.reset
 
 
-def _no_bounds() -> Fault:
-    return _everywhere("compiled_constrain", compiled_task.compiled_constrain, lambda *_, **__: None)
+def _late(self: Any, desired_force: float) -> Any:
+    force, self.waiting = getattr(self, "waiting", 0.0), desired_force
+    return _STEP(self, force)
 
 
-def _other_integrator() -> Fault:
-    make = MujocoPhysics.__init__
-
-    def explicit(self: Any, plant: Any) -> None:
-        other = "semi-implicit" if plant.integrator == "euler" else "euler"
-        make(self, dataclasses.replace(plant, integrator=other))
-
-    return mock.patch.object(MujocoPhysics, "__init__", explicit)
+def _explicit(self: Any, plant: Any) -> None:
+    other = "semi-implicit" if plant.integrator == "euler" else "euler"
+    _MAKE(self, dataclasses.replace(plant, integrator=other))
 
 
-def _warm_reset() -> Fault:
-    reset = MujocoPhysics.reset
-
-    def warm(self: Any, state: np.ndarray, key: float = 0.0) -> None:
-        motor = self.data.act.copy()
-        reset(self, state, key)
-        self.data.act[:] = motor
-
-    return mock.patch.object(MujocoPhysics, "reset", warm)
+def _warm(self: Any, state: np.ndarray, key: float = 0.0) -> None:
+    motor = self.data.act.copy()
+    _RESET(self, state, key)
+    self.data.act[:] = motor
 
 
 # -- the list -----------------------------------------------------------------------------------------------
@@ -232,6 +206,7 @@ class Mutation:
 
 
 _PHYSICS = ("dynamics", "trajectories")
+_MECHANICS = (*_PHYSICS, "convergence", "energy")
 _LOOP = ("trajectories", "motor")
 _UNEQUAL_GAINS = tuple(task.name for task in OURS if task.paper[0].controller.kp != task.paper[0].controller.ki)
 _BOUNDED = tuple(task.name for task in OURS if task.constrain is not None)
@@ -241,52 +216,54 @@ _TURNING = ("pendulum", "cartpole", "acrobot")
 difference of 3e-10, where 1e-9 is allowed)."""
 
 
-def _in_model(name: str, change: Callable[[mujoco.MjModel], None], *groups: str) -> Mutation:
-    return Mutation(name, lambda: wrong_model(change), (*_PHYSICS, *groups))
-
-
-def _in_loop(
-    name: str,
-    edit: Edit,
-    groups: tuple[str, ...] = _LOOP,
-    tasks: tuple[str, ...] = Mutation.tasks,
-    everywhere: bool = False,
-) -> Mutation:
-    where = "everywhere" if everywhere else "in the callback"
-    return Mutation(f"{name}, {where}", lambda: wrong_loop(edit, everywhere=everywhere), groups, tasks)
-
-
 MUTATIONS: tuple[Mutation, ...] = (
-    _in_model("a mass off by 0.1 %", _off("body_mass", -1, 1.001), "convergence", "energy"),
-    _in_model("gravity, or the hill, off by 0.1 %", _stronger_gravity),
-    _in_model("a gear off by 1 %", _off("actuator_gear", (0, 0), 1.01), "convergence", "energy"),
-    _in_model("a time step off by 0.1 %", _slower_clock, "convergence", "energy"),
-    _in_model("a wrong clip: the force limit 1 % low", _off("actuator_ctrlrange", 0, 0.99)),
-    _in_loop("a wrong clip: the voltage limit 1 % low", _VOLTAGE_LIMIT),
-    _in_loop("a winding resistance off by 1 %", _RESISTANCE, (*_LOOP, "energy")),
-    _in_loop("the sign of the back-EMF", _BACK_EMF, (*_LOOP, "energy")),
-    _in_loop("the sign of the back-EMF", _BACK_EMF, ("motor", "energy"), everywhere=True),
-    _in_loop("kp and ki swapped", _GAINS, _LOOP, _UNEQUAL_GAINS),
-    _in_loop("kp and ki swapped", _GAINS, ("motor", "convergence"), everywhere=True),
+    Mutation("a mass off by 0.1 %", partial(wrong_model, ("body_mass", -1, 1.001)), _MECHANICS),
+    Mutation(
+        "gravity, or the hill, off by 0.1 %",
+        partial(wrong_model, ("gravity", 2, 1.001), ("jnt_user", (0, GRAVITY), 1.001)),
+        _PHYSICS,
+    ),
+    Mutation("a gear off by 1 %", partial(wrong_model, ("actuator_gear", (0, 0), 1.01)), _MECHANICS),
+    Mutation("a time step off by 0.1 %", partial(wrong_model, ("timestep", None, 1.001)), _MECHANICS),
+    Mutation("a wrong clip: the force limit 1 % low", partial(wrong_model, ("actuator_ctrlrange", 0, 0.99)), _PHYSICS),
+    Mutation("a wrong clip: the voltage limit 1 % low, in the callback", partial(wrong_loop, _VOLTAGE_LIMIT), _LOOP),
+    Mutation("a winding resistance off by 1 %, in the callback", partial(wrong_loop, _RESISTANCE), (*_LOOP, "energy")),
+    Mutation("the sign of the back-EMF, in the callback", partial(wrong_loop, _BACK_EMF), (*_LOOP, "energy")),
+    Mutation(
+        "the sign of the back-EMF, everywhere",
+        partial(wrong_loop, _BACK_EMF, everywhere=True),
+        ("motor", "energy"),
+    ),
+    Mutation("kp and ki swapped, in the callback", partial(wrong_loop, _GAINS), _LOOP, _UNEQUAL_GAINS),
+    Mutation("kp and ki swapped, everywhere", partial(wrong_loop, _GAINS, everywhere=True), ("motor", "convergence")),
     Mutation(
         "a drive's winding off by 1 %, its gains with it",
-        lambda: wrong_loop(_WARM_WINDING, module=drive),
+        partial(wrong_loop, _WARM_WINDING, module=drive),
         _LOOP,
         _TURNING,
     ),
-    Mutation("a force one step late", lambda: wrong_callback(*_LATE_FORCE), (*_LOOP, "convergence", "energy")),
-    Mutation("a stale command", _stale_command, (*_PHYSICS, "convergence")),
-    Mutation("bounds that are not kept", _no_bounds, _PHYSICS, _BOUNDED),
-    Mutation("the other Euler integrator", _other_integrator, _PHYSICS),
+    Mutation("a force one step late", partial(wrong_callback, *_LATE_FORCE), (*_LOOP, "convergence", "energy")),
+    Mutation("a stale command", partial(mock.patch.object, MujocoPhysics, "step", _late), (*_PHYSICS, "convergence")),
+    Mutation(
+        "bounds that are not kept",
+        lambda: _everywhere("compiled_constrain", compiled_task.compiled_constrain, lambda *_, **__: None),
+        _PHYSICS,
+        _BOUNDED,
+    ),
+    Mutation("the other Euler integrator", partial(mock.patch.object, MujocoPhysics, "__init__", _explicit), _PHYSICS),
     Mutation(
         "a motor that runs in every Runge-Kutta stage",
-        lambda: wrong_callback(_EVERY_STAGE),
+        partial(wrong_callback, _EVERY_STAGE),
         ("trajectories",),
         _RUNGE_KUTTA,
     ),
-    Mutation("a motor that runs in every forward pass", lambda: wrong_callback(_EVERY_PASS), ("execution",)),
-    Mutation("a current that simulations share", lambda: wrong_callback(*_SHARED_CURRENT), ("execution",)),
-    Mutation("a reset that leaves the motor running", _warm_reset, ("execution",)),
+    Mutation("a motor that runs in every forward pass", partial(wrong_callback, _EVERY_PASS), ("execution",)),
+    Mutation("a current that simulations share", partial(wrong_callback, *_SHARED_CURRENT), ("execution",)),
+    Mutation(
+        "a reset that leaves the motor running",
+        partial(mock.patch.object, MujocoPhysics, "reset", _warm),
+        ("execution",),
+    ),
 )
 """Every fault, and which groups are shown it."""
 

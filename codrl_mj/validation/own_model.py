@@ -119,17 +119,11 @@ def beside(
 BELOW_ONE = float(np.nextafter(1.0, 0.0))
 
 
-@check("motor", Check("stable: {motor}", "the family's own bound", BELOW_ONE, "instability"))
-def stable_actuator(actuator: ActuatorModel, timestep: float) -> Iterator[Case]:
-    """What the family says of its parameters."""
-    yield Case(actuator.instability(np.array([actuator.numbers]), timestep), f"at a step of {timestep:g} s")
-
-
-@check("motor", Check("stable: {motor}", "the eigenvalues of the discrete closed loop", BELOW_ONE, "spectral radius"))
-def stable_loop(actuator: Actuator, timestep: float) -> Iterator[Case]:
-    """The spectral radius, beside what the family says, which is infinite from 1 on."""
-    radius = spectral_radius(actuator, timestep)
+@check("motor", Check("stable: {motor}", "the family's own bound, a loop's eigenvalues", BELOW_ONE, "instability"))
+def stable(actuator: ActuatorModel, timestep: float) -> Iterator[Case]:
+    """What the family says of its parameters; of a loop, of which that is infinite from 1 on, the spectral radius."""
     found = float(actuator.instability(np.array([actuator.numbers]), timestep)[0])
+    radius = spectral_radius(actuator, timestep) if isinstance(actuator, Actuator) else found
     yield Case(max(found, radius) if radius < 1.0 else radius, f"at a step of {timestep:g} s")
 
 
@@ -147,14 +141,6 @@ def motor_steps(actuator: ActuatorModel, ours: np.ndarray, oracle: np.ndarray) -
     )
 
 
-def _idle(model: mujoco.MjModel, index: int, actuator: ActuatorModel) -> str:
-    """Why a motor has no steps to look at; empty if it has."""
-    group = int(model.actuator_group[index])
-    if 0 <= group < mujoco.mjNGROUP and bool(model.opt.disableactuator >> group & 1):
-        return "its actuator group is disabled: it never runs"
-    return "it is ideal: there is nothing to step" if isinstance(actuator, Ideal) else ""
-
-
 def motor_checks(model: mujoco.MjModel, quick: bool) -> Iterator[Check | Skipped]:
     """The motors of a model whose callbacks are installed: stable, in step with Python, and each loop alone."""
     named = {at: model.actuator(at).name or f"actuator {at}" for at in range(model.nactuator)}
@@ -163,12 +149,14 @@ def motor_checks(model: mujoco.MjModel, quick: bool) -> Iterator[Check | Skipped
         yield Skipped(f"actuators {', '.join(foreign)}", "not motors of codrl_mj, which leaves them alone")
     running = {}
     for at, actuator in ours.items():
-        if reason := _idle(model, at, actuator):
-            yield Skipped(f"steps: {named[at]}", reason)
+        group = int(model.actuator_group[at])
+        if 0 <= group < mujoco.mjNGROUP and bool(model.opt.disableactuator >> group & 1):
+            yield Skipped(f"steps: {named[at]}", "its actuator group is disabled: it never runs")
+        elif isinstance(actuator, Ideal):
+            yield Skipped(f"steps: {named[at]}", "it is ideal: there is nothing to step")
         else:
             running[at] = actuator
     for at, actuator in ours.items():
-        stable = stable_loop if isinstance(actuator, Actuator) else stable_actuator
         yield from stable(actuator, model.opt.timestep, motor=named[at])
     for at, found in beside(model, running, commands(model, 200 if quick else 2000, seed=7)).items():
         yield from motor_steps(running[at], *found, motor=named[at])

@@ -50,43 +50,36 @@ class Record(NamedTuple):
     """Torques that the engine applied to the joints *during* the step [N*m], its `qfrc_actuator`."""
 
 
-def _spec(count: int, load: Load, timestep: float, integrator: str) -> mujoco.MjSpec:
+def motors_on(
+    load: Load, motors: Sequence[ActuatorModel | Motor], timestep: float, integrator: str = "Euler"
+) -> mujoco.MjModel:
+    """Motors, each on a rotor of its own: ours, with the callbacks installed, or MuJoCo's `<dcmotor>` of a winding.
+
+    Where a `Motor` is given in the place of an actuator, it is MuJoCo's, and its control is the terminal voltage [V].
+    """
     spec = mujoco.MjSpec()
     spec.option.timestep = timestep
     spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
-    for index in range(count):
+    for index, motor in enumerate(motors):
         body = spec.worldbody.add_body(name=f"rotor{index}")
         body.explicitinertial = True
         body.mass, body.inertia = 0.5, [_BODY_INERTIA] * 3
         body.ipos = [0.0, 0.0, -0.2 if load.eccentric else 0.0]
         body.add_joint(name=f"hinge{index}", axis=[0, 1, 0], armature=load.inertia - _BODY_INERTIA)
-    return spec
-
-
-def motors_on(
-    load: Load, actuators: Sequence[ActuatorModel], timestep: float, integrator: str = "Euler"
-) -> mujoco.MjModel:
-    """Our motors, each on a rotor of its own, and the callbacks that run them installed."""
-    spec = _spec(len(actuators), load, timestep, integrator)
-    for index, actuator in enumerate(actuators):
         driver = spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=f"hinge{index}")
-        mjcf.drive(driver, actuator, None)
+        if isinstance(motor, Motor):
+            driver.set_to_dcmotor(
+                motorconst=[motor.torque_constant, motor.back_emf_constant],
+                resistance=motor.resistance,
+                inductance=[motor.inductance, 0.0],
+                ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_VOLTAGE),
+            )
+        else:
+            mjcf.drive(driver, motor, None)
     model = spec.compile()
-    install_callbacks(model)
+    if not all(isinstance(motor, Motor) for motor in motors):
+        install_callbacks(model)
     return model
-
-
-def native_motor_on(load: Load, motor: Motor, timestep: float, integrator: str = "Euler") -> mujoco.MjModel:
-    """MuJoCo's `<dcmotor>` of the same winding, its control the terminal voltage [V]."""
-    spec = _spec(1, load, timestep, integrator)
-    driver = spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target="hinge0")
-    driver.set_to_dcmotor(
-        motorconst=[motor.torque_constant, motor.back_emf_constant],
-        resistance=motor.resistance,
-        inductance=[motor.inductance, 0.0],
-        ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_VOLTAGE),
-    )
-    return spec.compile()
 
 
 def driven_by_voltage(motor: Motor, substeps: int = 1) -> Actuator:

@@ -90,12 +90,6 @@ class Growth:
         self._start = end
 
 
-def lyapunov_exponent(logarithms: np.ndarray, step_duration: float) -> float:
-    """The mean rate of growth [1/s], by least squares through the logarithms."""
-    times = step_duration * np.arange(len(logarithms))
-    return float(np.polyfit(times, logarithms, 1)[0])
-
-
 def _run(
     task: Task, actuator: ActuatorModel, integrator: str, steps: int, seed: int
 ) -> tuple[np.ndarray, list[str], Growth]:
@@ -135,7 +129,8 @@ def _run(
 def _plot(task: Task, gaps: np.ndarray, growth: Growth, title: str) -> Plot:
     rounding = np.array(growth.rounding)
     times = task.step_duration * np.arange(1, len(rounding) + 1)
-    exponent = lyapunov_exponent(np.array(growth.logarithms), task.step_duration)
+    begins = task.step_duration * np.arange(len(growth.logarithms))
+    exponent, _ = np.polyfit(begins, growth.logarithms, 1)  # Lyapunov's [1/s]
     curves = (
         Curve("difference found (0 is drawn at 1e-18)", times, np.maximum(gaps[: len(rounding)], 1e-18)),
         Curve("what rounding becomes in the oracle", times, rounding, reference=True),

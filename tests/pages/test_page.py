@@ -28,8 +28,13 @@ def test_names_with_markup_show_as_text_everywhere():
             page.plot(plot),
         ),
         *(page.definitions([(EVIL, EVIL)]), page.folded(EVIL, page.paragraph("p"))),
-        *(page.table(EVIL, (EVIL, "b"), [(EVIL, EVIL)], cards=True), page.selector(EVIL, "run", [EVIL])),
-        *(page.film(EVIL, b"film", 20.0), page.image(b"image", EVIL), page.part("transport", "1", "0.1"), EVIL),
+        *(page.table(EVIL, (EVIL, "b"), [(EVIL, EVIL)], cards=True), page.part("selector", EVIL, "run", [EVIL], None)),
+        *(
+            page.part("film", EVIL, b"film", 20.0, None),
+            page.part("image", b"image", EVIL),
+            page.part("transport", "1", "0.1"),
+            EVIL,
+        ),
     )
     text = page.page(EVIL, EVIL, page.paragraph(EVIL), [page.Section("s", EVIL, page.joined(parts), EVIL)])
     parsed = check_alone(text)
@@ -39,7 +44,9 @@ def test_names_with_markup_show_as_text_everywhere():
 
 
 def test_a_page_has_what_it_was_given_and_its_licence():
-    text = small(page.film("a film", b"bytes of a film", 25.0, b"poster"), page.image(b"picture", "about"))
+    text = small(
+        page.part("film", "a film", b"bytes of a film", 25.0, b"poster"), page.part("image", b"picture", "about")
+    )
     check_alone(text)
     for content in (b"bytes of a film", b"poster", b"picture"):
         assert base64.b64encode(content).decode() in text
