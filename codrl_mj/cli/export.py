@@ -59,7 +59,7 @@ class Export:
         print_table(f"{contract.task}, {agent}, {contract.rate:g} Hz", ("", "name", "unit", "range"), rows)
         weights = network_of(subject.policy).size
         if contract.controller["loop"] is None and contract.actuators:
-            say("no current loop: the motors differ, have none, or are commanded otherwise")
+            print("no current loop: the motors differ, have none, or are commanded otherwise")
         written = f"wrote {self.out}: policy.onnx, contract.json, controller.c ({weights} numbers)"
         print(f"{written}; try: codrl-mj board test {self.out}")
         return 0

@@ -116,10 +116,12 @@ def read_rows(interface: Interface, path: Path) -> RigLog:
         table = np.array(rows, dtype=np.float64)
     except ValueError as error:
         raise ValueError(f"{path}: every cell must be a number: {error}") from None
-    if len(table) < 2:
-        raise ValueError(f"{path}: must have at least two rows, has {len(table)}")
-    for row, place in np.argwhere(~np.isfinite(table))[:1]:
-        raise ValueError(f"{path}: line {row + 2}, {header[place]}: {table[row, place]}: must be a finite number")
+    wrong = [
+        f"line {row + 2}, {header[place]}: {table[row, place]}: must be a finite number"
+        for row, place in np.argwhere(~np.isfinite(table))[:1]
+    ]
+    if wrong or len(table) < 2:
+        raise ValueError(f"{path}: {wrong[0] if wrong else f'must have at least two rows, has {len(table)}'}")
     if (steps := np.diff(table[:, where["time"]])).min() <= 0.0:
         raise ValueError(f"{path}: line {int(steps.argmin()) + 3}: time must increase from row to row")
     sent = [where[one["name"]] for one in interface.actions]

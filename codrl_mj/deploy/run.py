@@ -4,7 +4,7 @@ import contextlib
 import csv
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -62,20 +62,13 @@ def run_board(
         RuntimeError: the board has no sensors, or there is none at the port.
     """
     contract = Contract.read(folder)
-    kind, late_after = DRIVE if drive else WATCH, float(contract.late["after"])
-    nothing, rows, missed, in_a_row, late, why = np.zeros(len(contract.observations)), 0, 0, 0, 0, ""
+    rows, missed, in_a_row, late, why = 0, 0, 0, 0, "told to"
     with _opened(port, baud) as line, writing(log) as part, part.open("w", newline="") as file:
-        table, wire = csv.writer(file), Wire(contract, line.fileno(), line.fileno())
+        table = csv.writer(file)
         table.writerow(columns(contract) + motor_columns(contract))
-        began = due = time.monotonic()
+        asking = _asked(contract, Wire(contract, line.fileno(), line.fileno()), DRIVE if drive else WATCH)
         try:
-            for sequence in range(1, 10**9):
-                now = time.monotonic() - began
-                if ended() or now >= seconds:
-                    why = "told to"
-                    break
-                stamp = int(1e6 * now) + 1
-                answer = wire.asked(wire.frame(sequence, stamp, nothing, kind), sequence, late_after)
+            for now, answer in asking:
                 in_a_row = 0 if answer else in_a_row + 1
                 missed += answer is None
                 if answer is not None:
@@ -83,22 +76,38 @@ def run_board(
                         raise RuntimeError(f"{port}: the board has no sensors: give it wire_sense (docs/deploy.md)")
                     rows, late = rows + 1, late + bool(answer.status & LATE)
                     if not answer.status & DAMAGED:  # whose bytes are no observation
-                        table.writerow([stamp / 1e6, *answer.observation, *answer.command, *answer.motors.ravel()])
+                        table.writerow([now, *answer.observation, *answer.command, *answer.motors.ravel()])
                     if on_answer is not None:
                         on_answer(answer)
-                if drive and (why := _wrong(contract, answer, in_a_row)):
+                wrong = _wrong(contract, answer, in_a_row) if drive else ""
+                if wrong or ended() or now >= seconds:
+                    why = wrong or why
                     break
-                due += 1.0 / contract.rate
-                wait = due - time.monotonic()
-                if wait < -1.0 / contract.rate:  # after a pause no burst of frames
-                    due -= wait
-                time.sleep(max(0.0, wait))
         except (KeyboardInterrupt, OSError) as error:  # what was logged is kept
             why = f"interrupted: {error or type(error).__name__}"
-        with contextlib.suppress(OSError):
-            stamp = int(1e6 * (time.monotonic() - began)) + 2
-            wire.asked(wire.frame(sequence + 1, stamp, nothing, WATCH), sequence + 1, late_after)
+        finally:
+            with contextlib.suppress(OSError, RuntimeError):
+                asking.close()
     return BoardRun(rows, missed, late, why)
+
+
+def _asked(contract: Contract, wire: Wire, kind: int) -> Generator[tuple[float, Answer | None]]:
+    """Time [s] and answer of a frame each at the policy's rate; closed, a last one puts the command to safety."""
+    nothing, within, period = np.zeros(len(contract.observations)), float(contract.late["after"]), 1.0 / contract.rate
+    began = due = time.monotonic()
+    sequence = 0
+    try:
+        while True:
+            sequence, stamp = sequence + 1, int(1e6 * (time.monotonic() - began)) + 1
+            yield stamp / 1e6, wire.asked(wire.frame(sequence, stamp, nothing, kind), sequence, within)
+            due += period
+            wait = due - time.monotonic()
+            if wait < -period:  # after a pause no burst of frames
+                due -= wait
+            time.sleep(max(0.0, wait))
+    finally:
+        stamp = int(1e6 * (time.monotonic() - began)) + 2
+        wire.asked(wire.frame(sequence + 1, stamp, nothing, WATCH), sequence + 1, within)
 
 
 def _opened(port: str, baud: int) -> Any:
