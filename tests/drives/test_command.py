@@ -131,7 +131,7 @@ def test_design_prints_the_gains_and_the_margins(capsys):
     printed(capsys, "design", "quanser-qube-servo-2", "--bandwidth", "1500")
     arguments = ("design", "quanser-qube-servo-2", "--bandwidth", "2000", "--delayed", "--out", "pictures")
     text = printed(capsys, *arguments)
-    assert "20000 Hz, a sample of delay: kp = 8.98171 V/A, ki = 78374 V/(A*s)" in text
+    assert "20000 Hz, a sample of delay: kp = 8.98171 V/A, ki = 78374 V/(A·s)" in text
     assert re.search(r"\*20 +1 ", text)
     assert "not possible: SampledLoop.bandwidth = 2000: must be <= 1591.55 Hz" in text
     assert is_png(Path("pictures/bode.png"))
