@@ -55,3 +55,9 @@ def _only_our_tasks():
     yield
     for name in set(TASKS) - OURS:
         registry.pop(TASKS.pop(name).env_id, None)
+
+
+@pytest.fixture(autouse=True)
+def _as_wide_as_a_file(monkeypatch):
+    """Processes of a parallel run have a COLUMNS of their own."""
+    monkeypatch.delenv("COLUMNS", raising=False)

@@ -140,6 +140,6 @@ def test_an_unknown_task_is_answered_with_those_there_are(script, capsys):
 
 def test_the_documented_commands_are_understood(script):
     commands = re.findall(r"^\$ python scripts/train_custom_agent\.py (.*)$", PAGE, re.MULTILINE)
-    assert len(commands) >= 2
+    assert commands
     for command in commands:
         tyro.cli(script.Options, args=shlex.split(command)).check()
