@@ -1,5 +1,7 @@
 """Settings and fixtures of the whole suite."""
 
+import os
+
 import hypothesis
 import mujoco
 import pytest
@@ -57,7 +59,7 @@ def _only_our_tasks():
         registry.pop(TASKS.pop(name).env_id, None)
 
 
-@pytest.fixture(autouse=True)
-def _as_wide_as_a_file(monkeypatch):
+@pytest.fixture(autouse=True, scope="session")
+def _as_wide_as_a_file():
     """Processes of a parallel run have a COLUMNS of their own."""
-    monkeypatch.delenv("COLUMNS", raising=False)
+    os.environ.pop("COLUMNS", None)
