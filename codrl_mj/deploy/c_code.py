@@ -13,12 +13,12 @@ from codrl_mj.fields import check_names
 from codrl_mj.own_code import asset_path
 
 FILES = ("controller.h", "controller.c", "main.c", "wire.h", "wire.c", "board.c", "board.ld")
-BOARDS = {  # name -> bytes of flash memory for a program, and of RAM
-    "arduino-uno": (32_256, 2_048),
-    "arduino-due": (524_288, 98_304),
-    "nucleo-f446re": (524_288, 131_072),
-    "raspberry-pi-pico": (2_097_152, 270_336),
-    "teensy-4.1": (8_126_464, 1_048_576),
+BOARDS = {  # name -> bytes of flash memory for a program, of RAM; whether an AVR: constants lie in RAM, a double has 4
+    "arduino-uno": (32_256, 2_048, True),
+    "arduino-due": (524_288, 98_304, False),
+    "nucleo-f446re": (524_288, 131_072, False),
+    "raspberry-pi-pico": (2_097_152, 270_336, False),
+    "teensy-4.1": (8_126_464, 1_048_576, False),
 }
 CODE = 6_000  # bytes beside the weights: 2,400 with tanhf, of a Cortex-M4 by gcc -O2; the rest for start-up and drivers
 
@@ -98,11 +98,10 @@ def check_board(board: str, network: Network | Tiles, double: bool = False) -> N
     """Refuse a policy that does not fit a board of `BOARDS`, with both sizes."""
     check_names([board], BOARDS, "board")
     size = 8 if double else 4
-    flash, ram = BOARDS[board]
-    if board == "arduino-uno" and double:
-        raise ValueError("board arduino-uno: its double has 4 bytes: leave out --float64, or name a larger board")
-    copied = size * network.size if board == "arduino-uno" else 0  # AVR's compiler copies constants to RAM
-    needs = ("flash", size * network.size + CODE, flash), ("RAM", size * network.working + copied, ram)
+    flash, ram, avr = BOARDS[board]
+    if avr and double:
+        raise ValueError(f"board {board}: its double has 4 bytes: leave out --float64, or name a larger board")
+    needs = ("flash", size * network.size + CODE, flash), ("RAM", size * (network.working + avr * network.size), ram)
     for what, needed, there in needs:
         if needed > there:
             raise ValueError(

@@ -62,11 +62,12 @@ def run_board(
         RuntimeError: the board has no sensors, or there is none at the port.
     """
     contract = Contract.read(folder)
-    rows, missed, in_a_row, late, why = 0, 0, 0, 0, "told to"
+    rows, missed, in_a_row, late, why = 0, 0, 0, 0, ""
     with _opened(port, baud) as line, writing(log) as part, part.open("w", newline="") as file:
         table = csv.writer(file)
         table.writerow(columns(contract) + motor_columns(contract))
-        asking = _asked(contract, Wire(contract, line.fileno(), line.fileno()), DRIVE if drive else WATCH)
+        wire = Wire(contract, line.fileno(), line.fileno())
+        asking = _asked(contract, wire, DRIVE if drive else WATCH, lambda now: ended() or now >= seconds)
         try:
             for now, answer in asking:
                 in_a_row = 0 if answer else in_a_row + 1
@@ -79,26 +80,26 @@ def run_board(
                         table.writerow([now, *answer.observation, *answer.command, *answer.motors.ravel()])
                     if on_answer is not None:
                         on_answer(answer)
-                wrong = _wrong(contract, answer, in_a_row) if drive else ""
-                if wrong or ended() or now >= seconds:
-                    why = wrong or why
+                if drive and (why := _wrong(contract, answer, in_a_row)):
                     break
         except (KeyboardInterrupt, OSError) as error:  # what was logged is kept
             why = f"interrupted: {error or type(error).__name__}"
         finally:
             with contextlib.suppress(OSError, RuntimeError):
                 asking.close()
-    return BoardRun(rows, missed, late, why)
+    return BoardRun(rows, missed, late, why or "told to")
 
 
-def _asked(contract: Contract, wire: Wire, kind: int) -> Generator[tuple[float, Answer | None]]:
-    """Time [s] and answer of a frame each at the policy's rate; closed, a last one puts the command to safety."""
+def _asked(
+    contract: Contract, wire: Wire, kind: int, ended: Callable[[float], bool]
+) -> Generator[tuple[float, Answer | None]]:
+    """Time [s] and answer of a frame each at the policy's rate, until it ended; then one that puts it to safety."""
     nothing, within, period = np.zeros(len(contract.observations)), float(contract.late["after"]), 1.0 / contract.rate
     began = due = time.monotonic()
     sequence = 0
     try:
-        while True:
-            sequence, stamp = sequence + 1, int(1e6 * (time.monotonic() - began)) + 1
+        while not ended(now := time.monotonic() - began):
+            sequence, stamp = sequence + 1, int(1e6 * now) + 1
             yield stamp / 1e6, wire.asked(wire.frame(sequence, stamp, nothing, kind), sequence, within)
             due += period
             wait = due - time.monotonic()
