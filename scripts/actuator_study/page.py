@@ -46,17 +46,10 @@ def write(collected: Collected, out: Path) -> list[Path]:
     """
     folder, scores = out / FOLDER, Scores(collected, FLOORS, [at_home(ideal(task)) for task in SECONDS])
     first, others = judge(scores, primary(), primary=True), judge(scores, secondary())
-    rows = {
-        RUNS: run_rows(collected, scores.of),
-        TRIALS: trial_rows(collected, scores.of),
-        HYPOTHESES: (verdict.row(len(first)) for verdict in (*first, *others)),
-    }
-    for name, table in rows.items():
-        write_csv(folder / name, list(table))
+    tables = write_tables(folder, collected, scores, first, others)
     evidence = Evidence.read(folder / RUNS)
     said = list(advised.rows(evidence))
     write_csv(folder / ADVISED, said)
-    write_json(folder / TOTALS, collected.totals._asdict())
     drawn = _draw(scores, evidence, folder)
     parts = [
         "# What does an actuator cost?\n",
@@ -71,7 +64,22 @@ def write(collected: Collected, out: Path) -> list[Path]:
         _missing(collected),
     ]
     write_page(out / PAGE, parts)
-    return [out / PAGE, *drawn.values(), *(folder / name for name in (*rows, ADVISED, TOTALS))]
+    return [out / PAGE, *drawn.values(), *tables, folder / ADVISED]
+
+
+def write_tables(
+    folder: Path, collected: Collected, scores: Scores, first: Sequence[Verdict], others: Sequence[Verdict]
+) -> list[Path]:
+    """Write a row for every policy and test, for every trial and for every question, and what the trainings took."""
+    tables = {
+        RUNS: run_rows(collected, scores.of),
+        TRIALS: trial_rows(collected, scores.of),
+        HYPOTHESES: (verdict.row(len(first)) for verdict in (*first, *others)),
+    }
+    for name, table in tables.items():
+        write_csv(folder / name, list(table))
+    write_json(folder / TOTALS, collected.totals._asdict())
+    return [folder / name for name in (*tables, TOTALS)]
 
 
 def _draw(scores: Scores, evidence: Evidence, folder: Path) -> dict[str, Path]:

@@ -8,12 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from actuator_study.arms import DRAWN
-from actuator_study.page import HYPOTHESES, TRIALS, effect_text, p_text
-from codrl_mj.runs.files import write_json
+from actuator_study.page import HYPOTHESES, TRIALS, effect_text, p_text, write_tables
 from codrl_mj.study.doses import AXES, FLOORS, at_home, ideal
-from codrl_mj.study.pages import COLOURS, TITLES, conclusions, legend, markdown_table, save, write_csv, write_page
+from codrl_mj.study.pages import COLOURS, TITLES, conclusions, legend, markdown_table, save, write_page
 from codrl_mj.study.questions import MARGIN, Scores, Verdict, judge
-from codrl_mj.study.trials import FAILED, RUNS, TOTALS, Collected, Trial, run_rows, trial_rows
+from codrl_mj.study.trials import FAILED, RUNS, Collected, Trial
 from insurance_study.questions import DOSES, KINDS, REMEMBERED, TASKS, home, primary, reach, secondary, under
 
 PAGE, FOLDER, FIGURE = "insurance.md", "insurance", "insured.svg"
@@ -69,14 +68,7 @@ def write(collected: Collected, out: Path) -> list[Path]:
     """
     folder, scores = out / FOLDER, Scores(collected, FLOORS, [at_home(ideal(task)) for task in TASKS])
     first, others = judge(scores, primary(), primary=True), judge(scores, secondary())
-    rows = {
-        RUNS: run_rows(collected, scores.of),
-        TRIALS: trial_rows(collected, scores.of),
-        HYPOTHESES: (verdict.row(len(first)) for verdict in (*first, *others)),
-    }
-    for name, table in rows.items():
-        write_csv(folder / name, list(table))
-    write_json(folder / TOTALS, collected.totals._asdict())
+    tables = write_tables(folder, collected, scores, first, others)
     draw(folder / FIGURE, scores)
     parts = [
         "# What insures a policy?\n",
@@ -88,7 +80,7 @@ def write(collected: Collected, out: Path) -> list[Path]:
         _method(collected),
     ]
     write_page(out / PAGE, parts)
-    return [out / PAGE, folder / FIGURE, *(folder / name for name in (*rows, TOTALS))]
+    return [out / PAGE, folder / FIGURE, *tables]
 
 
 def _kinds(collected: Collected, scores: Scores) -> str:
