@@ -464,3 +464,20 @@ def test_a_log_is_written_from_an_episode(folder, tmp_path):
     assert check_log(folder, tmp_path / "one.csv").rows == len(done.on_board[0].time)
     actions, _ = OnnxPolicy(folder).predict(done.on_board[0].observation[:-1])
     np.testing.assert_allclose(done.on_board[0].action, actions, atol=1e-6)
+
+
+def test_a_weight_that_is_no_number_fails_the_golden_check_and_fast_math_does_not_compile(folder, tmp_path):
+    program = tmp_path / "golden"
+    spoilt = tmp_path / "controller.c"
+    text = (folder / "controller.c").read_text()
+    start = text.index("bias_0[")
+    brace = text.index("{", start) + 1
+    spoilt.write_text(f"{text[:brace]}0.0f / 0.0f, {text[text.index(',', brace) + 1 :]}")
+    sources = [str(spoilt), str(folder / "main.c")]
+    subprocess.run(["cc", "-std=c99", f"-I{folder}", *sources, "-lm", "-o", str(program)], check=True)
+    if "levels" not in Contract.read(folder).actions[0]:  # of levels one is chosen all the same
+        assert subprocess.run([program], check=False, capture_output=True).returncode == 1
+    fast = subprocess.run(
+        ["cc", "-ffast-math", "-c", f"-I{folder}", sources[1], "-o", str(program)], capture_output=True
+    )
+    assert b"without -ffast-math" in fast.stderr
