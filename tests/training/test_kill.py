@@ -13,7 +13,7 @@ import pytest
 
 from codrl_mj.cli import main
 from codrl_mj.runs import files, policies
-from codrl_mj.training import checkpoint, folder, history, run, watcher
+from codrl_mj.training import checkpoint, folder, history, watcher
 from tests.matrix import but
 from tests.training.interruptions import differing, kill_test, outcome
 
@@ -115,15 +115,19 @@ def die():
 
 
 def die_at_call(owner, name, which):
-    """Have a function die at its n-th call."""
+    """Have a function die at its n-th call, or at the one whose arguments are said."""
     original, calls = getattr(owner, name), iter(range(1, 10**9))
 
     def dying(*arguments, **keywords):
-        if next(calls) == which:
+        if which(*arguments) if callable(which) else next(calls) == which:
             die()
         return original(*arguments, **keywords)
 
     setattr(owner, name, dying)
+
+
+def is_result(path, _):
+    return path.name == folder.RESULT
 
 
 KILLED_WHILE = {
@@ -134,7 +138,7 @@ KILLED_WHILE = {
     "deleting an old checkpoint": lambda: die_at_call(Path, "unlink", 2),
     "exchanging the best policy's files": lambda: die_at_call(policies, "write_json", 2),
     "writing the best policy": lambda: die_at_call(watcher, "write_json", 1),
-    "marking the run as finished": lambda: die_at_call(run, "write_json", 2),
+    "marking the run as finished": lambda: die_at_call(watcher, "write_json", is_result),
 }
 
 
