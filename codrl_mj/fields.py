@@ -150,6 +150,13 @@ def leaves(mapping: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return found
 
 
+def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """What two mappings have otherwise, by dotted names: both values, `absent` where one has none."""
+    mine, others = leaves(one), leaves(other)
+    pairs = {name: (mine.get(name, "absent"), others.get(name, "absent")) for name in [*mine, *others]}
+    return {name: pair for name, pair in pairs.items() if repr(pair[0]) != repr(pair[1])}
+
+
 def did_you_mean(name: object, known: Iterable[str]) -> str:
     """A question with the nearest known names and a space, for the message about an unknown one; or nothing."""
     near = _nearest(name, known)

@@ -14,7 +14,8 @@ from codrl_mj.pages import report
 from codrl_mj.runs.summaries import SORT_KEYS, compare, find_runs, read_run, sort_runs
 from codrl_mj.tasks import named_actuator
 from codrl_mj.training.config import TrainConfig
-from codrl_mj.training.folder import load_config, start_folder
+from codrl_mj.training.folder import load_config
+from tests.training.interruptions import begin
 
 PROGRESS = "steps,episodes,mean_return,steps_per_second,seconds\n"
 UNITS = {"returns": "reward", "tracking_rms": "N*m", "peak_voltage": "V"}
@@ -105,10 +106,9 @@ def test_motors_keep_their_names(tmp_path):
     own = actuator_over(geared, {"motor": {"resistance": 0.5}})
     assert read_run(make_run(tmp_path / "one", geared)).actuator == "kraken-x60"
     assert read_run(make_run(tmp_path / "two", own)).actuator == "drive"
-    (tmp_path / "three").mkdir()
     patterns = {"a": "kraken-x60", "b": {"label": "drawer", **own.as_mapping()}, "c": None}
     config = TrainConfig(EnvConfig("HalfCheetah-v5", patterns))
-    start_folder(tmp_path / "three", config)
+    begin(tmp_path / "three", config)
     assert read_run(tmp_path / "three").actuator == "kraken-x60, drawer, ideal"
     assert load_config(tmp_path / "three").env.through == config.env.through == "kraken-x60, drawer, ideal"
     sentence = " ".join(report._sentence(read_run(tmp_path / "three")).split())

@@ -11,7 +11,7 @@ from codrl_mj.agents import AgentConfig, agent_from_mapping, check_fits
 from codrl_mj.agents.ppo import PPOConfig
 from codrl_mj.agents.presets import ELSEWHERE, find_preset
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.fields import check, check_names, integer, leaves
+from codrl_mj.fields import check, check_names, integer
 
 EVALUATION_SEED = 1_000_000
 """Seed of the first episode in which a trained policy is evaluated, away from those that trainings start from."""
@@ -153,16 +153,6 @@ class TrainConfig:
         check_names(agent, base.agent.as_mapping(), "key", "agent.")
         agent = agent_from_mapping(base.agent.as_mapping() | dict(agent))
         return dataclasses.replace(base, env=EnvConfig.from_mapping(env, base.env), agent=agent, **given)
-
-    def differences(self, other: "TrainConfig") -> list[str]:
-        """What differs from another configuration, a line a field."""
-        mine, others = leaves(self.as_mapping()), leaves(other.as_mapping())
-        absent = "absent"
-        return [
-            f"{name}: {mine.get(name, absent)!r} and {others.get(name, absent)!r}"
-            for name in dict.fromkeys([*mine, *others])
-            if repr(mine.get(name, absent)) != repr(others.get(name, absent))
-        ]
 
 
 def default_agent(task: str) -> str:

@@ -14,6 +14,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from codrl_mj.actuators import label_of, labelled, trusting
+from codrl_mj.fields import differing
 from codrl_mj.runs import (
     BEST,
     CHECKPOINT,
@@ -30,7 +31,7 @@ from codrl_mj.runs import (
     checkpoints,
     finished,
 )
-from codrl_mj.runs.files import check_writable, leftovers, read_json, sealed, write_json
+from codrl_mj.runs.files import check_writable, leftovers, read_json
 from codrl_mj.training.config import TrainConfig
 
 _FILES = {CONFIG, RESULT, EVALUATION, PROGRESS, EPISODES, CURVE, *POLICY_FILES}
@@ -72,22 +73,24 @@ def load_config(run: Path, trust: bool = False) -> TrainConfig:
         raise ValueError(f"{run / CONFIG}: not a run configuration: {error}") from None
 
 
-def admit(run: Path, config: TrainConfig, resume: bool, accept_changes: bool) -> bool:
+def admit(run: Path, config: TrainConfig, resume: bool, accept_changes: bool) -> dict[str, Any] | None:
     """Refuse, before anything is made or compiled, a folder in which a training can neither begin nor go on.
 
-    Whether there is a training to go on with, finished or not.
+    What a new run is, to be written once it begins; None where there is one to go on with, finished or not.
     """
     check_writable(run)
     if (run / LOCK).exists():
         with owned(run):
             pass
-    exists = (run / CONFIG).exists()
+    exists, made_with = (run / CONFIG).exists(), provenance(config)
     if resume and exists:
-        check_same(run, config, accept_changes)
-    elif run.exists() and not unused(run):
+        check_same(run, config, made_with, accept_changes)
+        return None
+    if run.exists() and not unused(run):
         remedy = "continue it with --resume, " if exists and not finished(run) else ""
         raise FileExistsError(f"run folder {run} exists already: {remedy}choose another --out, or delete it")
-    return resume and exists
+    labels = [label_of(one) for one in config.actuators]
+    return {"train": config.as_mapping(), **made_with, **({"labels": labels} if any(labels) else {})}
 
 
 def unused(run: Path) -> bool:
@@ -116,30 +119,20 @@ def _sweep(run: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def start_folder(run: Path, config: TrainConfig) -> None:
-    """Write what the run is, before anything else is in the folder."""
-    labels = [label_of(one) for one in config.actuators]
-    known = {"labels": labels} if any(labels) else {}
-    write_json(run / CONFIG, sealed({"train": config.as_mapping(), **provenance(config), **known}))
-
-
-def check_same(run: Path, config: TrainConfig, accept_changes: bool) -> None:
+def check_same(run: Path, config: TrainConfig, now: Mapping[str, Any], accept_changes: bool) -> None:
     """Raise unless a run folder's training can be continued to the result that it would have had uninterrupted."""
-    differences = load_config(run, trust=True).differences(config)  # as its caller does, who names it
-    if differences:
+    begun = load_config(run, trust=True)  # as its caller does, who names it
+    if other := differing(begun.as_mapping(), config.as_mapping()):
+        told = "; ".join(f"{name}: {there!r} and {asked!r}" for name, (there, asked) in other.items())
         raise ValueError(
-            f"{run} was started with another configuration (there, and asked for): {'; '.join(differences)}. A run "
-            "continues as it began: choose another run folder for other settings"
+            f"{run} was started with another configuration (there, and asked for): {told}. A run continues as it "
+            "began: choose another run folder for other settings"
         )
-    then, now = read_json(run / CONFIG, "run configuration"), provenance(config)
+    then = read_json(run / CONFIG, "run configuration")
     versions = then.get("versions")
     if not isinstance(versions, Mapping):
         raise ValueError(f"{run / CONFIG}: not a run configuration: versions = {versions!r}: must be a mapping")
-    changed = [
-        f"{name} was {versions.get(name, 'absent')}, is {now['versions'].get(name, 'absent')}"
-        for name in dict.fromkeys([*versions, *now["versions"]])
-        if now["versions"].get(name) != versions.get(name)
-    ]
+    changed = [f"{name} was {was}, is {is_now}" for name, (was, is_now) in differing(versions, now["versions"]).items()]
     if then.get("code") != now["code"]:
         changed.append(f"the code of codrl_mj was {str(then.get('code'))[:8]}, is {now['code'][:8]}")
     if changed and not accept_changes:

@@ -9,7 +9,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from codrl_mj.runs import finished
+from codrl_mj.runs import CONFIG, finished
+from codrl_mj.runs.files import sealed, write_json
 from codrl_mj.training import folder
 from codrl_mj.training.config import TrainConfig
 from codrl_mj.training.history import Progress
@@ -54,8 +55,8 @@ def train(
         RunInUseError: another process trains in `out`.
         TrainingStoppedError: a signal asked to stop.
     """
-    exists = folder.admit(out, config, resume, accept_changes)
-    if exists and finished(out):
+    record = folder.admit(out, config, resume, accept_changes)
+    if record is None and finished(out):
         return out
     if wandb is not None and importlib.util.find_spec("wandb") is None:
         raise ValueError(f"wandb = {wandb!r}: Weights & Biases is not installed: pip install wandb")
@@ -66,14 +67,14 @@ def train(
     from codrl_mj.training.watcher import LearningEnded, Watcher
 
     torch.set_num_threads(1)  # networks this small run several times slower on two
-    with folder.taken(out, exists), stopping(signal.SIGINT, signal.SIGTERM) as asked:
+    with folder.taken(out, record is None), stopping(signal.SIGINT, signal.SIGTERM) as asked:
         envs = ActuatedVecEnv(config.env.world.vector(config.env, config.num_envs))
         with contextlib.closing(envs), _reporting_to(wandb, out, config):
             model = config.agent.make_model(envs, config.seed)
             watcher = Watcher(config, out, asked, on_progress, tensorboard)
             with contextlib.closing(watcher), watcher.explaining():
-                if not exists:
-                    folder.start_folder(out, config)
+                if record is not None:
+                    write_json(out / CONFIG, sealed(record))  # before anything else is in the folder
                 steps = config.total_steps
                 if steps is None:  # those of the longest possible episodes where these are counted
                     steps = (config.total_episodes or 0) * (config.env.time_limit or 0) * config.num_envs

@@ -11,7 +11,9 @@ from pathlib import Path
 from codrl_mj.agents import DDPGConfig, DQNConfig, PPOConfig, SACConfig, SARSAConfig, TD3Config
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.runs.files import sealed, write_json
 from codrl_mj.training import TrainConfig, TrainingStoppedError, train
+from codrl_mj.training.folder import admit
 from codrl_mj.training.watcher import Watcher
 
 RANDOMIZE = {"motor.inductance": "uniform(0.05, 0.15)", "controller.kp": "choice(0.5, 1)"}
@@ -31,6 +33,11 @@ def _kill_test():
 
 kill_test = _kill_test()
 outcome, differing = kill_test.outcome, kill_test.differing
+
+
+def begin(run, config):
+    """Leave a run folder in which a training has begun, and nothing is learned."""
+    write_json(run / "config.json", sealed(admit(run, config, resume=False, accept_changes=False)))
 
 
 def tiny(task, agent, num_envs=1, steps=240, env=None, actuator="paper", **others):

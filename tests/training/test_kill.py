@@ -13,7 +13,7 @@ import pytest
 
 from codrl_mj.cli import main
 from codrl_mj.runs import files, policies
-from codrl_mj.training import checkpoint, folder, history, watcher
+from codrl_mj.training import checkpoint, folder, history, run, watcher
 from tests.matrix import but
 from tests.training.interruptions import differing, kill_test, outcome
 
@@ -131,7 +131,7 @@ def is_result(path, _):
 
 
 KILLED_WHILE = {
-    "taking the folder": lambda: die_at_call(folder, "start_folder", 1),
+    "taking the folder": lambda: die_at_call(run, "write_json", 1),
     "writing the configuration": lambda: die_at_call(files.json, "dumps", 3),
     "beginning the tables": lambda: die_at_call(history.csv, "writer", 2),
     "writing a checkpoint": lambda: die_at_call(checkpoint.os, "fsync", 3),

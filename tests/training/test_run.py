@@ -24,8 +24,9 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy, evaluate, run_episodes
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.training import EVALUATION_SEED, TrainConfig, history, load_config, train, watcher
-from codrl_mj.training.folder import owned, start_folder
+from codrl_mj.training.folder import owned
 from codrl_mj.training.watcher import Watcher
+from tests.training.interruptions import begin
 
 TINY_PPO = PPOConfig(rollout_steps=256, batch_size=64, epochs=2, hidden=(8, 8))
 ENV = EnvConfig("cartpole", "weaker", options={"center_radius": 0.1})
@@ -244,7 +245,8 @@ def test_a_folder_that_holds_something_is_refused_and_untouched(tmp_path, holds,
     (out / holds).parent.mkdir(parents=True)
     (out / holds).write_text("mine")
     if begun:
-        start_folder(out, TINY)
+        begin(tmp_path / "new", TINY)
+        (tmp_path / "new/config.json").rename(out / "config.json")
     before = sorted(out.rglob("*"))
     with pytest.raises(FileExistsError, match="exists already") as caught:
         train(TINY, out)
@@ -321,7 +323,7 @@ def test_weights_that_are_no_numbers_are_named_and_not_kept(tmp_path, monkeypatc
 @pytest.mark.parametrize("line", ["train cartpole --out run", "train --resume run", "train --resume run --seed 4"])
 def test_a_folder_in_use_or_of_another_training_is_refused_before_anything_is_made(tmp_path, monkeypatch, capsys, line):
     monkeypatch.chdir(tmp_path)
-    start_folder(tmp_path / "run", TrainConfig.preset("cartpole", "ppo"))
+    begin(tmp_path / "run", TrainConfig.preset("cartpole", "ppo"))
     monkeypatch.setattr(PPOConfig, "make_model", lambda *_: pytest.fail("it was made"))
     with contextlib.nullcontext() if "4" in line else owned(tmp_path / "run"):
         assert main(line.split()) == 2

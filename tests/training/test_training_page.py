@@ -9,7 +9,8 @@ import pytest
 
 from codrl_mj import cli
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.training import TrainConfig, folder, read_config
+from codrl_mj.training import TrainConfig, read_config
+from tests.training.interruptions import begin
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = (DOCS / "training.md").read_text()
@@ -21,7 +22,7 @@ def elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (block,) = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
     Path("car.yaml").write_text(block)
-    folder.start_folder(Path("runs/mine"), TrainConfig(EnvConfig("cartpole")))
+    begin(Path("runs/mine"), TrainConfig(EnvConfig("cartpole")))
 
 
 @pytest.mark.parametrize("command", re.findall(r"^\$ codrl-mj (.*)$|`codrl-mj ([a-z]+ [^`A-Z]*)`", PAGE, re.MULTILINE))
