@@ -155,7 +155,7 @@ def network_of(policy: Policy) -> Network | Tiles:
     Raises:
         ValueError: it cannot be taken out.
     """
-    from codrl_mj.agents.sarsa_algorithm import TileCodingPolicy
+    from codrl_mj.agents.tile_coding import TileCodingPolicy
 
     if isinstance(policy, TileCodingPolicy):
         factors = np.ones(policy.observation_space.shape or (), np.float32)

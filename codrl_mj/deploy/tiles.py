@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.agents.sarsa_kernels import choose_actions
-from codrl_mj.agents.tile_coding import TileCoder
+from codrl_mj.agents.tile_coding import TileCoder, choose_actions
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,8 +19,7 @@ import codrl_mj
 from codrl_mj.agents import find_agent
 from codrl_mj.agents.presets import PRESETS
 from codrl_mj.agents.sarsa import SARSAConfig
-from codrl_mj.agents.sarsa_algorithm import SARSA
-from codrl_mj.agents.sarsa_kernels import FORGOTTEN
+from codrl_mj.agents.sarsa_algorithm import FORGOTTEN, SARSA
 from codrl_mj.physics.base import SimulationDivergedError
 from codrl_mj.runs.policies import load_policy, save_policy
 from codrl_mj.tasks import find_task
