@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -59,6 +59,10 @@ class Program(abc.ABC):
     def write(self) -> tuple[Iterable[Path], Mapping[str, str]]:
         """Write the page of all results that there are: the files, and what failed."""
 
+    def publish(self) -> None:
+        """Write what there is, each time that all of a seed is computed: run folders do not outlive a machine."""
+        self.write()
+
     def run(self) -> int:
         """Compute what is missing and write the page; 1 if something failed."""
         grid, workers = self.grid, Workers(self.jobs, self.backend, self.address)
@@ -71,7 +75,7 @@ class Program(abc.ABC):
         if not self.only_page:
             import matplotlib  # noqa: F401 - what is missing is missed now and not in the end
 
-            compute(grid, workers, self.accept_changes)
+            compute(grid, workers, self.accept_changes, self.publish)
         files, failures = self.write()
         for file in files:
             print(f"wrote {file}")
@@ -100,13 +104,15 @@ def main(kind: type[Program], arguments: Sequence[str] | None = None) -> int:
         return 2
 
 
-def compute(grid: Grid, workers: Workers, accept_changes: bool = False) -> None:
+def compute(
+    grid: Grid, workers: Workers, accept_changes: bool = False, on_seed: Callable[[], None] = lambda: None
+) -> None:
     """Compute what of a grid is missing, with a progress bar each for its trainings and its tests."""
     counts = {"training": len(grid.cells()), "test": len(grid.deployments())}
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=_console()) as bar:
         rows = {kind: bar.add_task(f"{kind}s", total=count) for kind, count in counts.items()}
-        grid.compute(workers, accept_changes, lambda kind: bar.advance(rows[kind]))
+        grid.compute(workers, accept_changes, lambda kind: bar.advance(rows[kind]), on_seed)
 
 
 def _print_costs(grid: Grid) -> float:

@@ -189,6 +189,7 @@ class Grid:
         workers: Workers = Workers(),  # noqa: B008 - frozen
         accept_changes: bool = False,
         on_cell: Callable[[str], None] = lambda _: None,
+        on_seed: Callable[[], None] = lambda: None,
     ) -> None:
         """Train and test what is missing. What fails is recorded in `root/failures` and stops nothing else.
 
@@ -196,6 +197,7 @@ class Grid:
             workers: what computes it.
             accept_changes: continue begun trainings even if code or packages have changed since.
             on_cell: called with `training` or `test` when one is finished or has failed.
+            on_seed: called when all of a seed's are, unless they were before.
 
         Raises:
             ValueError: Ray is asked for and not installed.
@@ -213,6 +215,8 @@ class Grid:
             )
             ready = {called(*key): test for key, test in tests.items() if key[1] == seed and finished(test.run)}
             deploy_cells(ready, workers, lambda _: on_cell("test"))
+            if waiting or ready:
+                on_seed()
 
     def collect(self) -> "Collected":
         """All that is there, without computing anything.

@@ -1,7 +1,7 @@
 """The paper's experiments done again, as a program: their grid, and what it writes."""
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +12,6 @@ from rich.table import Table
 from codrl_mj.fields import integer
 from codrl_mj.study.grid import check_chosen
 from codrl_mj.study.pages import write_csv
-from codrl_mj.study.parallel import Workers
 from codrl_mj.study.program import Program
 from codrl_mj.study.trials import Arm, Grid
 from reproduction.arms import ARMS, TASKS, PaperArm
@@ -24,29 +23,6 @@ from reproduction.rows import RUNS, complete, identity, read_trained
 from reproduction.value_iteration import Mesh
 
 _COLOURS = {CONFIRMED: "green", COMPATIBLE: "cyan", NOT_CONFIRMED: "red"}
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Publishing(Grid):
-    """A grid that is computed seed by seed, and publishes rows after each."""
-
-    publish: Callable[[], None]
-    """Writes the rows of what is finished."""
-
-    def compute(
-        self,
-        workers: Workers = Workers(),  # noqa: B008 - frozen
-        accept_changes: bool = False,
-        on_cell: Callable[[str], None] = lambda _: None,
-    ) -> None:
-        """Train and test what is missing."""
-
-        def only(seed: int) -> Callable[[Arm], range]:
-            return lambda arm: range(seed, seed + (seed in self.seeds_of(arm)))
-
-        for seed in sorted({seed for _, seed in self.cells()}):
-            Grid(self.root, self.trials, only(seed), self.episodes).compute(workers, accept_changes, on_cell)
-            self.publish()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -105,9 +81,7 @@ class Reproduction(Program):
             return range(next(lacking, planned), planned)
 
         seeds = {arm.name: left(arm) for arm in every.arms}
-        return Publishing(
-            every.root, every.trials, lambda arm: seeds[arm.name], self.test_episodes, publish=self.publish
-        )
+        return dataclasses.replace(every, seeds_of=lambda arm: seeds[arm.name])
 
     def _seeds(self, arm: Arm) -> int:
         return self.sarsa_seeds if arm.config.agent.name == "sarsa" else self.seeds

@@ -302,11 +302,15 @@ def test_from_the_command_line_a_small_study_is_computed_and_goes_on(tmp_path, m
     call += ["--tasks", "mountain_car", "--seeds", "1", "--episodes", "2", "--total-steps", "400"]
     assert main(ActuatorStudy, [*call, "--dry-run"]) == 0
     assert "mountain_car: ideal" in capsys.readouterr().out
+    published = []
+    monkeypatch.setattr(ActuatorStudy, "publish", lambda study: published.append(study.write()))
     assert main(ActuatorStudy, call) == 0
+    assert len(published) == 1  # when all of the seed was computed
     run = next((tmp_path / "runs").glob("mountain_car-*/result.json"))
     before = run.stat().st_mtime_ns
     assert main(ActuatorStudy, call) == 0
     assert run.stat().st_mtime_ns == before
+    assert len(published) == 1
     page = tmp_path / "out" / "actuators.md"
     assert "1 of 1 trainings" in page.read_text()
     shutil.rmtree(tmp_path / "runs")  # its rows stand for it
