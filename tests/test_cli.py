@@ -796,15 +796,22 @@ def test_the_program_refuses_bad_input_with_status_2_and_one_line(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("code", ["import codrl_mj", "import codrl_mj.cli; codrl_mj.cli.main(['--help'])"])
-def test_neither_the_import_nor_the_help_loads_anything_heavy(code):
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import codrl_mj",
+        *(f"import codrl_mj.cli; codrl_mj.cli.main({words.split()})" for words in ("--help", "motor list")),
+        "import codrl_mj.catalogue as motors; [motors.motor_entry(one) for one in motors.motor_names()]",
+    ],
+)
+def test_neither_the_import_nor_the_help_nor_looking_a_motor_up_loads_anything_heavy(code):
     check = f"""
 import sys
 try:
     {code}
 except SystemExit:
     pass
-heavy = "torch", "numba", "stable_baselines3", "scipy", "matplotlib", "imageio", "dm_control", "rich.progress"
+heavy = "torch", "numba", "stable_baselines3", "scipy", "matplotlib", "imageio", "dm_control", "rich.progress", "pint"
 print("loaded:", [name for name in heavy if name in sys.modules])
 """
     done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, timeout=60, check=True)

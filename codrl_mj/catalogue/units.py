@@ -21,6 +21,25 @@ _SPELLINGS = (
     (r"(?<=[A-Za-z])-(?=[A-Za-z])", "*"),  # lb-ft, N-m
 )
 
+_USUAL = {
+    "": {"": 1.0},
+    "A": {"A": 1.0, "mA": 1e-3},
+    "H": {"H": 1.0, "mH": 1e-3, "uH": 1e-6},
+    "K/W": {"K/W": 1.0},
+    "N*m": {"N*m": 1.0, "Nm": 1.0, "N*cm": 0.01, "mN*m": 1e-3, "mNm": 1e-3, "kgf*mm": 0.00980665},
+    "N*m*s/rad": {"N*m*s/rad": 1.0, "N*m/(rad/s)": 1.0},
+    "N*m/A": {"N*m/A": 1.0, "Nm/A": 1.0, "mN*m/A": 1e-3, "mNm/A": 1e-3, "Wb": 1.0},
+    "V": {"V": 1.0},
+    "V*s/rad": {"V/(rad/s)": 1.0, "V/rpm": 9.549296585513721, "mV/rpm": 9.54929658551372e-3, "Wb": 1.0},
+    "degC": {"degC": 1.0},
+    "kg*m^2": {"kg*m^2": 1.0, "gcm2": 1.0000000000000001e-07, "gcm²": 1.0000000000000001e-07},
+    "ohm": {"ohm": 1.0, "mohm": 1e-3},
+    "rad/s": {"rad/s": 1.0, "rpm": 0.10471975511965977},
+    "rad/s/V": {"rpm/V": 0.10471975511965977},
+    "s": {"s": 1.0, "ms": 1e-3},
+}
+"""SI unit -> what datasheets mostly print, and its size in it: pint's own, which takes longer to load than all else."""
+
 
 class Kind(NamedTuple):
     """What may be printed in a field."""
@@ -87,6 +106,8 @@ def in_si(number: Any, unit: str, kind: str | None, of: str = "this quantity", w
     With `weights` a mass stands for its weight where that alone makes sense: kg*cm, oz*in. The error says what is wrong
     with it as a unit `of` something, and leaves the remedy to who asks.
     """
+    if kind is not None and unit in (usual := _USUAL.get(kind, {})):
+        return number * usual[unit]
     registry = unit_registry()
     for spelling, plain in _SPELLINGS:
         unit = re.sub(spelling, plain, unit)

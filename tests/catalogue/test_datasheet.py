@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from codrl_mj.catalogue import Datasheet, derivation, from_datasheet
+from codrl_mj.catalogue import Datasheet, derivation, from_datasheet, units
 from codrl_mj.catalogue.datasheet import KINDS, named
 
 UNITS = {  # by definition: SI value of one unit
@@ -57,6 +57,13 @@ POLOLU = {
     "no_load_current": "0.2 A",
     "inductance": "1.3 mH",
 }
+
+
+@pytest.mark.parametrize(("kind", "unit"), [(kind, unit) for kind, sizes in units._USUAL.items() for unit in sizes])
+def test_usual_units_have_pint_s_sizes_to_the_bit(kind, unit, monkeypatch):
+    numbers = [units.in_si(number, unit, kind, weights=True) for number in (1.0, 0.1, 12345.678, -3e-7)]
+    monkeypatch.setattr(units, "_USUAL", {})
+    assert numbers == [units.in_si(number, unit, kind, weights=True) for number in (1.0, 0.1, 12345.678, -3e-7)]
 
 
 @st.composite
