@@ -70,11 +70,8 @@ def insured(path: Path, evidence: Evidence) -> bool:
             for number, (kind, label) in enumerate(kinds.items()):
                 found = evidence.outcome(task, trained.get(kind, kind), f"{name} {axis.trained[task]:g}")
                 if found is not None:
-                    drawn, at, scores = True, place + 0.19 * (number - 1.5), np.maximum(1.0 - found.lost, _LOWEST)
-                    colour = COLOURS[number]
-                    dots = np.linspace(-0.05, 0.05, len(scores))
-                    panel.plot(at + dots, np.sort(scores), ".", color=colour, markersize=3.5, alpha=0.7, label=label)
-                    panel.plot([at - 0.07, at + 0.07], [np.mean(scores)] * 2, color=colour, lw=1.5)
+                    drawn = True
+                    dots(panel, place + 0.19 * (number - 1.5), 1.0 - found.lost, COLOURS[number], label)
         named = [f"{axis.title} {axis.trained[task]:g}" for axis in AXES.values()]
         panel.set_xticks(range(len(AXES)), named)
         panel.set(title=TITLES[task], ylabel="score [share of the span]")
@@ -84,6 +81,14 @@ def insured(path: Path, evidence: Evidence) -> bool:
         legend(figure, 4)
     save(figure, path)
     return drawn
+
+
+def dots(panel: Any, at: float, scores: Sequence[float] | np.ndarray, colour: str, label: str) -> None:
+    """Draw every policy's score as a dot, and a line at their mean; what is below the panel is drawn at its end."""
+    clipped = np.sort(np.maximum(scores, _LOWEST))
+    spread = np.linspace(-0.045, 0.045, len(clipped))
+    panel.plot(at + spread, clipped, ".", color=colour, markersize=3.5, alpha=0.7, label=label)
+    panel.plot([at - 0.06, at + 0.06], [np.mean(clipped)] * 2, color=colour, lw=1.5)
 
 
 def bars(path: Path, scores: Scores, groups: Mapping[str, Sequence[tuple[str, Trial]]], title: str) -> None:
@@ -107,8 +112,8 @@ def bars(path: Path, scores: Scores, groups: Mapping[str, Sequence[tuple[str, Tr
                 at = place + 0.8 * ((number + 0.5) / len(each) - 0.5)
                 kind = labels.index(label)
                 colour, marker = COLOURS[kind % len(COLOURS)], MARKERS[kind % len(MARKERS)]
-                dots = np.maximum(values, _LOWEST)
-                axes.plot(np.full(len(dots), at + 0.06), dots, ".", color=colour, markersize=3, alpha=0.6)
+                seen = np.maximum(values, _LOWEST)
+                axes.plot(np.full(len(seen), at + 0.06), seen, ".", color=colour, markersize=3, alpha=0.6)
                 _bars(axes, np.array([at]), [bootstrap_mean(values)], colour, marker, label)
     axes.set_xticks(range(len(groups)), groups)
     axes.set(ylabel="score [share of the span]", title=title, xlim=(-0.5, len(groups) - 0.5))

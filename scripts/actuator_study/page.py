@@ -265,20 +265,24 @@ def p_text(value: float) -> str:
     return "<0.001" if value < 0.001 else f"{value:.3f}"
 
 
-def _secondary(verdicts: Sequence[Verdict], drawn: Mapping[str, Path]) -> str:
-    """How many of each question's secondary comparisons were decided, what was explored, and the figure of loops."""
+def decided_table(verdicts: Sequence[Verdict], titles: Mapping[str, str], least: int = 1) -> str:
+    """How many comparisons of each section, by its title, were decided, of those with at least so many policies."""
     rows = []
-    for name, title in QUESTIONS.items():
-        mine = [verdict for verdict in verdicts if verdict.question.section == name and verdict.runs != (0, 0)]
+    for name, title in titles.items():
+        mine = [one for one in verdicts if one.question.section == name and min(one.runs) >= least]
         decided = [verdict for verdict in mine if verdict.outcome != "open"]
         beyond = sum(one.effect.low > MARGIN or one.effect.high < -MARGIN for one in decided)
         rows.append([title, *map(str, (len(mine), len(decided), beyond))])
-    header = ["secondary comparisons", "of", "differ", f"by more than {MARGIN:g}"]
+    return markdown_table(["secondary comparisons", "of", "decided", f"by more than {MARGIN:g}"], rows, numbers=3)
+
+
+def _secondary(verdicts: Sequence[Verdict], drawn: Mapping[str, Path]) -> str:
+    """How many of each question's secondary comparisons were decided, what was explored, and the figure of loops."""
     return f"""## The other comparisons
 
 With a false discovery rate of 5 %, and by how much by the 95 % interval:
 
-{markdown_table(header, rows, numbers=3)}
+{decided_table(verdicts, QUESTIONS)}
 What was explored beyond the plan, without p, stands in [trials]({FOLDER}/{TRIALS}): loops without anti-windup, and the
 paper's loop otherwise.
 

@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from actuator_study.arms import DRAWN
-from actuator_study.page import HYPOTHESES, TRIALS, effect_text, p_text, write_tables
+from actuator_study.figures import dots
+from actuator_study.page import HYPOTHESES, TRIALS, decided_table, effect_text, p_text, write_tables
 from codrl_mj.study.doses import AXES, FLOORS, at_home, ideal
 from codrl_mj.study.pages import COLOURS, TITLES, conclusions, legend, markdown_table, save, write_page
-from codrl_mj.study.questions import MARGIN, Scores, Verdict, judge
+from codrl_mj.study.questions import Scores, Verdict, judge
 from codrl_mj.study.trials import FAILED, RUNS, Collected, Trial
 from insurance_study.questions import DOSES, KINDS, REMEMBERED, TASKS, home, primary, reach, secondary, under
 
@@ -117,12 +118,8 @@ def draw(path: Path, scores: Scores) -> None:
             for number, kind in enumerate(shown):
                 if axis in _AXES.get(kind, AXES):
                     values = list(scores.of(under(KINDS[kind](task, axis), axis)).values())
-                    clipped = np.sort(np.maximum(values, -0.1))
-                    at, colour = place + 0.14 * (number - 2.5), COLOURS[number]
-                    spread = np.linspace(-0.045, 0.045, len(values))
-                    panel.plot(at + spread, clipped, ".", color=colour, ms=3.5, alpha=0.7, label=SAYS[kind])
                     if values:
-                        panel.plot([at - 0.06, at + 0.06], [np.mean(clipped)] * 2, color=colour, lw=1.5)
+                        dots(panel, place + 0.14 * (number - 2.5), values, COLOURS[number], SAYS[kind])
         panel.set_xticks(range(len(AXES)), [f"{one.title} {DOSES[task][name]:g}" for name, one in AXES.items()])
         panel.set(title=TITLES[task], ylabel="score [share of the span]")
         panel.grid(axis="y", color="0.9")
@@ -152,16 +149,10 @@ Nothing is judged before there are {PLANNED} policies of every kind.
 
 
 def _secondary(verdicts: Sequence[Verdict]) -> str:
-    rows = []
-    for name in dict.fromkeys(verdict.question.section for verdict in verdicts):
-        mine = [one for one in verdicts if one.question.section == name and min(one.runs) >= PLANNED]
-        decided = [verdict for verdict in mine if verdict.outcome != "open"]
-        beyond = sum(one.effect.low > MARGIN or one.effect.high < -MARGIN for one in decided)
-        rows.append([name, *map(str, (len(mine), len(decided), beyond))])
-    header = ["secondary comparisons", "of", "decided", f"by more than {MARGIN:g}"]
+    titles = {one.question.section: one.question.section for one in verdicts}
     return f"""Others, each of one task, with a false discovery rate of 5 %:
 
-{markdown_table(header, rows, numbers=3)}"""
+{decided_table(verdicts, titles, PLANNED)}"""
 
 
 def _method(collected: Collected) -> str:
