@@ -41,9 +41,8 @@ class Model(abc.ABC):
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Least and largest values of the free parameters, each of shape (p,)."""
-        ends = ([getattr(PARAMETERS[name], end) for name in self.names] for end in ("least", "most"))
-        lower, upper = map(np.array, ends)
-        return lower, upper
+        free = [PARAMETERS[name] for name in self.names]
+        return np.array([one.least for one in free]), np.array([one.most for one in free])
 
     def all_values(self, values: np.ndarray) -> dict[str, float]:
         """Free and known parameters by name."""
