@@ -4,7 +4,6 @@ from codrl_mj.actuators.current_loop import Actuator, CurrentLoop, Motor, Supply
 from codrl_mj.actuators.drive import Drive, VoltageDrive
 from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.ideal import IDEAL, Ideal
-from codrl_mj.actuators.identified import identified_ranges
 from codrl_mj.actuators.lag import Lag
 from codrl_mj.actuators.model import (
     BUILT_IN,
@@ -26,6 +25,7 @@ from codrl_mj.actuators.named import (
     actuator_over,
     check_same_family,
     find_family,
+    identified_ranges,
     label_of,
     labelled,
     mapping_of,

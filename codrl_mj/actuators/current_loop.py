@@ -249,15 +249,6 @@ class Actuator(ActuatorModel):
     supply: Supply | None = part(Supply())
     """What feeds the drive; None: `controller.max_voltage`, whatever the current."""
 
-    def __post_init__(self) -> None:
-        """Validate."""
-        for field, kind in (("motor", Motor), ("controller", CurrentLoop), ("supply", Supply)):
-            if not isinstance(getattr(self, field), kind) and not (field == "supply" and self.supply is None):
-                raise ValueError(
-                    f"Actuator.{field} = {getattr(self, field)!r}: must be a {kind.__name__}; "
-                    "to build an actuator from nested mappings use Actuator.from_mapping"
-                )
-
     @property
     def arm_radius(self) -> float:
         """The motor's arm [m]."""

@@ -133,6 +133,13 @@ class ActuatorModel:
     def __post_init__(self) -> None:
         """Validate."""
         fields.check(self)
+        for name, kind in fields.parts(type(self)).items():
+            given = getattr(self, name)
+            if not isinstance(given, kind) and given is not getattr(type(self), name):  # None, or the default
+                raise ValueError(
+                    f"{type(self).__name__}.{name} = {given!r}: must be a {kind.__name__}; to build one from nested "
+                    f"mappings use {type(self).__name__}.from_mapping"
+                )
 
     @staticmethod
     def advance(parameters: Any, timestep: float, state: Any, inputs: Inputs) -> tuple[Any, float, Any]:

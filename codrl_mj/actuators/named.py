@@ -12,18 +12,12 @@ from codrl_mj.actuators.current_loop import Actuator, CurrentLoop
 from codrl_mj.actuators.drive import Drive
 from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.ideal import IDEAL, Ideal
-from codrl_mj.actuators.identified import usable_fields
 from codrl_mj.actuators.model import FAMILIES, ActuatorModel, Family, check_family, family_name
 from codrl_mj.own_code import look_up
 
 
 def _with_loop(paper: Actuator, **gains: float) -> Actuator:
     return dataclasses.replace(paper, controller=CurrentLoop(**gains))  # type: ignore[arg-type]
-
-
-def _open_loop(paper: Actuator) -> Actuator:
-    slow = dataclasses.replace(paper.motor, inductance=0.5)
-    return Actuator(slow, CurrentLoop(kp=0.0, kff=slow.resistance))
 
 
 NAMED: dict[str, tuple[str, Callable[[Actuator], ActuatorModel]]] = {
@@ -34,7 +28,12 @@ NAMED: dict[str, tuple[str, Callable[[Actuator], ActuatorModel]]] = {
         lambda paper: _with_loop(paper, kp=1.0, ki=1.0),
     ),
     "weaker": ("a weaker loop: kp = ki = 0.2", lambda paper: _with_loop(paper, kp=0.2, ki=0.2)),
-    "open_loop": ("no feedback, u = R*i_ref + kE*omega, and a slow winding: L = 0.5 H", _open_loop),
+    "open_loop": (
+        "no feedback, u = R*i_ref + kE*omega, and a slow winding: L = 0.5 H",
+        lambda paper: Actuator(
+            dataclasses.replace(paper.motor, inductance=0.5), CurrentLoop(kp=0.0, kff=paper.motor.resistance)
+        ),
+    ),
 }
 """Name -> (what it is, function from the task's paper actuator to the actuator): variations of the task's own motor, so
 that a name means the same kind of actuator on every task."""
@@ -177,7 +176,7 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
             )
         return NAMED[given][1](paper)
     if given not in FAMILIES and Path(given).suffix in _FILES:
-        return actuator_from_file(Path(given), paper, whose)
+        return _from_file(Path(given), paper, whose)
     from codrl_mj.catalogue import motor_entry, motor_names
 
     if given in motor_names() or Path(given).suffix == ".toml":
@@ -196,23 +195,61 @@ _CHANGED = ", changed"
 _FILES = (".yaml", ".yml", ".json")
 
 
-def actuator_from_file(path: Path, paper: Actuator | None, whose: str) -> Any:
-    """Read an actuator from a YAML or JSON file that holds a mapping of its fields."""
+def _read(path: Path) -> tuple[dict[str, Any], Mapping[str, Any]]:
+    """An actuator's fields as its file has them, and what `codrl-mj identify` wrote beside them: `intervals`, `logs`.
+
+    Refuses a file that is no mapping, and one whose motor was not identified: it has a `problem`.
+    """
     import yaml
 
     if not path.is_file():
         raise FileNotFoundError(f"no actuator file at {path}")
     try:
         fields = yaml.safe_load(path.read_text())
-        if not isinstance(fields, Mapping):
+        if not isinstance(fields, dict):
             raise ValueError(f"{fields!r}: must be a mapping of an actuator's fields")
+        section = fields.pop("identified", None)
+        section = section if isinstance(section, Mapping) else {}
+        if section.get("problem"):
+            raise ValueError(f"identified from {', '.join(map(str, section.get('logs', ())))}: {section['problem']}")
+    except (yaml.YAMLError, ValueError) as error:
+        raise ValueError(f"{path}: {error}") from None
+    return fields, section
+
+
+def _from_file(path: Path, paper: Actuator | None, whose: str) -> Any:
+    """An actuator from a YAML or JSON file that holds a mapping of its fields."""
+    fields, _ = _read(path)
+    try:
         if Path(str(fields.get("name"))).suffix in _FILES:
             raise ValueError(f"name = {fields['name']!r}: must be an actuator's name, and no file")
-        made = resolve(usable_fields(fields), paper, whose)
-    except (yaml.YAMLError, UnicodeDecodeError, ValueError, TypeError) as error:
+        made = resolve(fields, paper, whose)
+    except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
     stem = path.stem if path.stem not in ("actuator", "actuators") else path.absolute().parent.name
     return made if label_of(made) else labelled(_unshared(made), stem)
+
+
+def identified_ranges(path: Path | str) -> dict[str, str]:
+    """What `randomize` draws of an identified actuator: every ratio alike within each interval, or every number.
+
+    Args:
+        path: the actuator's file.
+
+    Returns:
+        Field -> distribution, as text.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it has no intervals, or must not be used.
+    """
+    _, section = _read(Path(path))
+    if not section:
+        raise ValueError(f"{path}: has no intervals; must be a file that `codrl-mj identify` wrote")
+    return {
+        name: f"{'loguniform' if low > 0.0 else 'uniform'}({float(low)!r}, {float(high)!r})"
+        for name, (low, high) in section.get("intervals", {}).items()
+    }
 
 
 def actuator_over(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:

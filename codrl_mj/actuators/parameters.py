@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections import namedtuple
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from codrl_mj import fields
@@ -57,13 +57,9 @@ def field_values(actuator: Any) -> tuple[float, ...]:
 
 def unchecked(cls: Any, values: Iterable[float]) -> Any:
     """An actuator of numbers as they are, for what follows from them: a tenth of the time of one that is checked."""
-    return _filled(cls, iter(values))
-
-
-def _filled(cls: Any, values: Iterator[float]) -> Any:
-    made = object.__new__(cls)
+    left, made = iter(values), object.__new__(cls)
     for name, part in _outline(cls):
-        vars(made)[name] = next(values) if part is None else _filled(part, values)
+        vars(made)[name] = next(left) if part is None else unchecked(part, left)
     return made
 
 

@@ -160,13 +160,11 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
             at_amperes = 1.0
         now = Shaft(moving.inertia, moving.others, speed)
         winding, next_speed, means = shaft.turn(parameters, resistance, period, samples, winding, now, True, given)
-        position += 0.5 * period * (speed + next_speed)
-        speed = next_speed
+        position, speed = position + 0.5 * period * (speed + next_speed), next_speed
         at_volts += means.saturated
         amperes, volts = amperes + means.current / count, volts + means.voltage / count
         torque += means.torque / count
         power, loss = power + means.power / count, loss + means.heat / count
-    waiting -= 1.0
     mean = Means(amperes, volts, torque, at_volts, power, loss)
     followed = drive.end(parameters, timestep, inputs.time, heat, resistance, winding, moving, mean)
     temperature = shaft.temperature_of(parameters, Heat(followed.winding_rise, followed.housing_rise))
@@ -185,10 +183,9 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
         integral,
         target,
         asked,
-        waiting,
+        waiting - 1.0,
     )
-    at_limit = max(at_volts, at_amperes, too_warm)
-    limits = at_limit, at_volts, at_amperes, too_warm
+    limits = max(at_volts, at_amperes, too_warm), at_volts, at_amperes, too_warm
     return after_step, torque, Signals(amperes, given, volts, temperature, error, *limits, power, loss)
 
 
@@ -210,12 +207,6 @@ class Servo(Drive):
 
     loop: ServoLoop = ServoLoop()
     """The loops around the drive's."""
-
-    def __post_init__(self) -> None:
-        """Validate."""
-        super().__post_init__()
-        if not isinstance(self.loop, ServoLoop):
-            raise ValueError(f"Servo.loop = {self.loop!r}: must be a ServoLoop")
 
     def commands(self) -> Mapping[str, Command]:
         """A `position` [rad] or [m] within `loop.max_position`; or a `velocity` that is reached without a load."""

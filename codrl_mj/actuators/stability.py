@@ -27,6 +27,18 @@ class _Unlimited:
         return False
 
 
+def _closed_loops(family: Any, numbers: np.ndarray, timestep: float) -> tuple[np.ndarray, np.ndarray]:
+    """What an electrical step makes of (current, integral, error), (to, from, actuator), and how many are in a step."""
+    parameters = columns(family, numbers)
+    dt = timestep / parameters.substeps
+    current, integral, error = np.eye(3)[:, :, np.newaxis]  # all states of all actuators at once: (state, actuator)
+    after = family.electrical_step(parameters, dt, current, integral, error, 0.0, 0.0, 0.0, _Unlimited())[:3]
+    matrices = np.stack([np.broadcast_to(entry, (3, len(numbers))) for entry in after])
+    # what no gain reads is no part of the loop: 0 instead of the eigenvalue of a state of its own
+    read = np.stack([np.ones(len(numbers), dtype=bool), parameters.ki > 0, parameters.kd > 0])
+    return np.where(read[:, np.newaxis] & read, matrices, 0.0), parameters.substeps
+
+
 def spectral_radii(family: Any, numbers: np.ndarray, timestep: float) -> np.ndarray:
     """`spectral_radius` of many actuators at once.
 
@@ -38,16 +50,9 @@ def spectral_radii(family: Any, numbers: np.ndarray, timestep: float) -> np.ndar
     Returns:
         Shape (m,); the radius of each does not depend on the others, to the last bit.
     """
-    parameters = columns(family, numbers)
-    substeps = parameters.substeps
-    current, integral, error = np.eye(3)[:, :, np.newaxis]  # all states of all actuators at once: (state, actuator)
     with np.errstate(all="ignore"):
-        dt = timestep / substeps
-        after = family.electrical_step(parameters, dt, current, integral, error, 0.0, 0.0, 0.0, _Unlimited())[:3]
-        matrices = np.stack([np.broadcast_to(entry, (3, len(numbers))) for entry in after])  # (to, from, actuator)
-        # what no gain reads is no part of the loop: 0 instead of the eigenvalue of a state of its own
-        read = np.stack([np.ones(len(numbers), dtype=bool), parameters.ki > 0, parameters.kd > 0])
-        matrices = np.moveaxis(np.where(read[:, np.newaxis] & read, matrices, 0.0), 2, 0)
+        loops, substeps = _closed_loops(family, numbers, timestep)
+        matrices = np.moveaxis(loops, 2, 0)
         finite = np.isfinite(matrices).all(axis=(1, 2))
         values = np.linalg.eigvals(np.where(finite[:, np.newaxis, np.newaxis], matrices, 0.0))
         radii = np.abs(values.astype(np.complex128)).max(axis=1)
@@ -65,16 +70,8 @@ def stability_radii(family: Any, numbers: np.ndarray, timestep: float) -> np.nda
     Returns:
         Shape (m,): below 1 exactly where the spectral radii are.
     """
-    parameters = columns(family, numbers)
-    nothing, one = np.zeros(len(numbers)), np.ones(len(numbers))
-    units = (one, nothing, nothing), (nothing, one, nothing), (nothing, nothing, one)
-    dt = timestep / parameters.substeps
     with np.errstate(all="ignore"):
-        after = [family.electrical_step(parameters, dt, *unit, 0.0, 0.0, 0.0, _Unlimited())[:3] for unit in units]
-        read = (np.ones(len(numbers), dtype=bool), parameters.ki > 0.0, parameters.kd > 0.0)
-        (a, b, c), (d, e, f), (g, h, i) = (
-            [np.where(read[to] & read[source], after[source][to], 0.0) for source in range(3)] for to in range(3)
-        )
+        (a, b, c), (d, e, f), (g, h, i) = _closed_loops(family, numbers, timestep)[0]
         # z^3 + two z^2 + one z + zero
         two = -(a + e + i)
         linear = (a * e - b * d) + (a * i - c * g) + (e * i - f * h)
@@ -113,18 +110,14 @@ def check_stable(actuator: Any, timestep: float) -> None:
     radius = spectral_radius(actuator, timestep)
     if radius < 1.0:
         return
+    gains = actuator.controller
+    remedy = f"Lower the gains (kp = {gains.kp:g}, ki = {gains.ki:g}, kd = {gains.kd:g}): more substeps do not help"
+    for substeps in (gains.substeps * 2**doubling for doubling in range(1, 11)):
+        finer = dataclasses.replace(actuator, controller=dataclasses.replace(gains, substeps=substeps))
+        if spectral_radius(finer, timestep) < 1.0:
+            remedy = f"Set controller.substeps = {substeps}, lower the gains, or shorten the step"
+            break
     raise UnstableError(
         f"actuator: the current loop is unstable at a step of {timestep:g} s: spectral radius {radius:.4g}, must be "
-        f"< 1. {_remedy(actuator, timestep)}, or pass allow_unstable=True to study it as it is"
+        f"< 1. {remedy}, or pass allow_unstable=True to study it as it is"
     )
-
-
-def _remedy(actuator: Any, timestep: float) -> str:
-    """The smallest power-of-two number of electrical substeps that stabilises the loop, else smaller gains."""
-    for doubling in range(1, 11):
-        substeps = actuator.controller.substeps * 2**doubling
-        finer = dataclasses.replace(actuator.controller, substeps=substeps)
-        if spectral_radius(dataclasses.replace(actuator, controller=finer), timestep) < 1.0:
-            return f"Set controller.substeps = {substeps}, lower the gains, or shorten the step"
-    gains = actuator.controller
-    return f"Lower the gains (kp = {gains.kp:g}, ki = {gains.ki:g}, kd = {gains.kd:g}): more substeps do not help"

@@ -6,8 +6,10 @@ behind the gear, where the simulation has it: at no load it is gear_efficiency*k
 """
 
 import dataclasses
+import functools
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from types import CodeType
 from typing import Any, NamedTuple
 
 from codrl_mj.catalogue.units import Kind, Reading
@@ -16,108 +18,97 @@ NAME = r"[a-z]\w+"
 """A quantity in a formula."""
 
 
-class Rule(NamedTuple):
-    """How one quantity follows from others: the names in the formula, in their order, are the function's arguments."""
-
-    quantity: str
-    needs: tuple[str, ...]
-    formula: str
-    function: Callable[..., float]
+@functools.cache
+def compiled(formula: str) -> CodeType:
+    """A formula to be evaluated among known quantities; its `co_names` are those that it needs."""
+    return compile(formula, "a rule of the catalogue", "eval")
 
 
-def _rule(quantity: str, formula: str) -> Rule:
-    needs = tuple(dict.fromkeys(re.findall(NAME, formula)))
-    return Rule(quantity, needs, formula, eval(f"lambda {', '.join(needs)}: {formula}"))
-
-
-# Torques at the output, past a gear's losses, have names of their own. The first rule whose needs are known is taken.
+# A quantity, and how it follows from others. Torques at the output, past a gear's losses, have names of their own. The
+# first rule whose needs are known is taken.
 RULES = (
-    _rule("resistance", "nominal_voltage / stall_current"),
-    _rule("resistance", "mechanical_time_constant * torque_constant * back_emf_constant / rotor_inertia"),
-    _rule(
+    ("resistance", "nominal_voltage / stall_current"),
+    ("resistance", "mechanical_time_constant * torque_constant * back_emf_constant / rotor_inertia"),
+    (
         "resistance",
         "nominal_voltage * (no_load_speed - continuous_speed) "
         "/ (continuous_current * no_load_speed - no_load_current * continuous_speed)",
     ),
-    _rule("stall_current", "nominal_voltage / resistance"),
-    _rule("back_emf_constant", "1 / speed_constant"),
-    _rule("back_emf_constant", "(nominal_voltage - resistance * no_load_current) / no_load_speed"),
-    _rule("torque_constant", "stall_torque / (stall_current - no_load_current)"),
-    _rule("torque_constant", "continuous_torque / (continuous_current - no_load_current)"),
-    _rule(
-        "torque_constant", "stall_torque_at_output / (gear_ratio * gear_efficiency * (stall_current - no_load_current))"
-    ),
-    _rule("torque_constant", "back_emf_constant"),
-    _rule("back_emf_constant", "torque_constant"),
-    _rule("back_emf_constant", "(nominal_voltage - resistance * continuous_current) / continuous_speed"),
-    _rule(
-        "gear_efficiency", "stall_torque_at_output / (gear_ratio * torque_constant * (stall_current - no_load_current))"
-    ),
-    _rule(
+    ("stall_current", "nominal_voltage / resistance"),
+    ("back_emf_constant", "1 / speed_constant"),
+    ("back_emf_constant", "(nominal_voltage - resistance * no_load_current) / no_load_speed"),
+    ("torque_constant", "stall_torque / (stall_current - no_load_current)"),
+    ("torque_constant", "continuous_torque / (continuous_current - no_load_current)"),
+    ("torque_constant", "stall_torque_at_output / (gear_ratio * gear_efficiency * (stall_current - no_load_current))"),
+    ("torque_constant", "back_emf_constant"),
+    ("back_emf_constant", "torque_constant"),
+    ("back_emf_constant", "(nominal_voltage - resistance * continuous_current) / continuous_speed"),
+    ("gear_efficiency", "stall_torque_at_output / (gear_ratio * torque_constant * (stall_current - no_load_current))"),
+    (
         "gear_efficiency",
         "continuous_torque_at_output / (gear_ratio * torque_constant * (continuous_current - no_load_current))",
     ),
-    _rule("rotor_inertia", "mechanical_time_constant * torque_constant * back_emf_constant / resistance"),
-    _rule("inductance", "electrical_time_constant * resistance"),
-    _rule("continuous_current", "continuous_torque / torque_constant + no_load_current"),
-    _rule(
+    ("rotor_inertia", "mechanical_time_constant * torque_constant * back_emf_constant / resistance"),
+    ("inductance", "electrical_time_constant * resistance"),
+    ("continuous_current", "continuous_torque / torque_constant + no_load_current"),
+    (
         "continuous_current",
         "continuous_torque_at_output / (gear_ratio * gear_efficiency * torque_constant) + no_load_current",
     ),
-    _rule("thermal_resistance", "thermal_resistance_winding + thermal_resistance_housing"),
+    ("thermal_resistance", "thermal_resistance_winding + thermal_resistance_housing"),
 )
 _LOAD = "the shaft's torque is kT*(I - I0) here, many makers print kT*I; iron saturates at stall; warm motors give less"
 _SPEED = "iron losses and brushes are not in the model; many print a warm motor's speed, or a limit of the drive"
 CHECKS = (
-    # what a printed quantity should be, by the numbers that were found, and what to make of a difference
+    # a printed quantity, what it should be by the numbers that were found, and what to make of a difference
     (
-        _rule("torque_constant", "back_emf_constant"),
+        "torque_constant",
+        "back_emf_constant",
         "equal in SI for an ideal motor. A smaller torque constant is lost in iron, or saturates at stall; a larger "
         "one would make energy: distrust the stall torque, or the conventions of current and voltage",
     ),
     (
-        _rule("speed_constant", "1 / back_emf_constant"),
+        "speed_constant",
+        "1 / back_emf_constant",
         "two ways to print one number; rounding, or the one includes losses",
     ),
     (
-        _rule("stall_current", "nominal_voltage / resistance"),
+        "stall_current",
+        "nominal_voltage / resistance",
         "rounding, or the resistance is without brushes and leads, or the stall current was measured on a warm motor",
     ),
-    (_rule("stall_torque", "torque_constant * (stall_current - no_load_current)"), _LOAD),
+    ("stall_torque", "torque_constant * (stall_current - no_load_current)", _LOAD),
     (
-        _rule(
-            "stall_torque_at_output",
-            "gear_ratio * gear_efficiency * torque_constant * (stall_current - no_load_current)",
-        ),
+        "stall_torque_at_output",
+        "gear_ratio * gear_efficiency * torque_constant * (stall_current - no_load_current)",
         _LOAD,
     ),
-    (_rule("continuous_torque", "torque_constant * (continuous_current - no_load_current)"), _LOAD),
+    ("continuous_torque", "torque_constant * (continuous_current - no_load_current)", _LOAD),
     (
-        _rule(
-            "continuous_torque_at_output",
-            "gear_ratio * gear_efficiency * torque_constant * (continuous_current - no_load_current)",
-        ),
+        "continuous_torque_at_output",
+        "gear_ratio * gear_efficiency * torque_constant * (continuous_current - no_load_current)",
         _LOAD,
     ),
-    (_rule("no_load_speed", "(nominal_voltage - resistance * no_load_current) / back_emf_constant"), _SPEED),
-    (_rule("continuous_speed", "(nominal_voltage - resistance * continuous_current) / back_emf_constant"), _SPEED),
+    ("no_load_speed", "(nominal_voltage - resistance * no_load_current) / back_emf_constant", _SPEED),
+    ("continuous_speed", "(nominal_voltage - resistance * continuous_current) / back_emf_constant", _SPEED),
     (
-        _rule("mechanical_time_constant", "resistance * rotor_inertia / (torque_constant * back_emf_constant)"),
+        "mechanical_time_constant",
+        "resistance * rotor_inertia / (torque_constant * back_emf_constant)",
         "rounding; some print it with a gear's or an encoder's inertia",
     ),
     (
-        _rule("electrical_time_constant", "inductance / resistance"),
+        "electrical_time_constant",
+        "inductance / resistance",
         "rounding; inductance depends on the frequency it is measured at",
     ),
     (
-        _rule(
-            "no_load_current",
-            "(coulomb_friction + viscous_friction * no_load_speed) / (gear_efficiency * torque_constant)",
-        ),
+        "no_load_current",
+        "(coulomb_friction + viscous_friction * no_load_speed) / (gear_efficiency * torque_constant)",
         "friction varies with temperature and from motor to motor",
     ),
     (
-        _rule("thermal_resistance", "thermal_resistance_winding + thermal_resistance_housing"),
+        "thermal_resistance",
+        "thermal_resistance_winding + thermal_resistance_housing",
         "the housing's depends on what it is mounted on",
     ),
 )
@@ -280,18 +271,18 @@ class _Derivation:
                     value, place = value * ratio**power, f"{place} * {ratio:g}^{power}"
             self.known[at], self.how[at] = value, f"{name} = {printed}{place}, printed"
 
-    def _number(self, name: str) -> str:
-        """A known quantity with its unit."""
-        return f"{self.known[name]:.4g} {self._units[name]}".strip()
+    def _tells(self, formula: str) -> bool:
+        """Whether all is known that a formula needs."""
+        return self.known.keys() >= {*compiled(formula).co_names}
 
     def _filled(self, formula: str) -> str:
-        """A formula with numbers for names."""
-        return re.sub(NAME, lambda match: self._number(match[0]), formula)
+        """A formula with numbers and their units for names."""
+        return re.sub(NAME, lambda match: f"{self.known[match[0]]:.4g} {self._units[match[0]]}".strip(), formula)
 
     def _follow(self, name: str, formula: str, value: Any, more: str = "") -> None:
         """What a quantity is by a formula, and in a sentence."""
         self.known[name] = value
-        self.how[name] = f"{name} = {formula} = {self._filled(formula)} = {self._number(name)}{more}"
+        self.how[name] = f"{name} = {formula} = {self._filled(formula)} = {self._filled(name)}{more}"
 
     def named(self, formula: str) -> list[str]:
         """The quantities in a formula."""
@@ -311,15 +302,14 @@ class _Derivation:
     def apply_rules(self) -> None:
         """Apply the first rule that tells something new, until none does."""
         known = self.known
-        while new := next((r for r in RULES if r.quantity not in known and known.keys() >= {*r.needs}), None):
+        while new := next((rule for rule in RULES if rule[0] not in known and self._tells(rule[1])), None):
+            quantity, formula = new
             try:
-                value = new.function(*(known[name] for name in new.needs))
+                self._follow(quantity, formula, eval(compiled(formula), {}, known))
             except ZeroDivisionError as error:
                 raise ValueError(
-                    f"datasheet.{new.quantity}: {new.formula} = {self._filled(new.formula)} divides by 0; "
-                    "check these values"
+                    f"datasheet.{quantity}: {formula} = {self._filled(formula)} divides by 0; check these values"
                 ) from error
-            self._follow(new.quantity, new.formula, value)
 
     def settle_gear(self, strict: bool, tolerance: float) -> None:
         """Without a gear its ratio and efficiency are 1; a derived efficiency must be one."""
@@ -365,9 +355,9 @@ class _Derivation:
     def disagreements(self, printed: set[str]) -> tuple[Disagreement, ...]:
         """What is printed and also follows, otherwise; the worst first."""
         found = []
-        for (quantity, needs, formula, function), reading in CHECKS:
-            if quantity in printed and self.known.keys() >= {*needs}:
-                value, computed = self.known[quantity], function(*(self.known[name] for name in needs))
+        for quantity, formula, reading in CHECKS:
+            if quantity in printed and self._tells(formula):
+                value, computed = self.known[quantity], eval(compiled(formula), {}, self.known)
                 if abs(computed - value) > 1e-9 * abs(value):
                     text = f"{formula} = {self._filled(formula)}"
                     found.append(Disagreement(quantity, value, computed, self._units[quantity], text, reading))

@@ -253,6 +253,10 @@ def explain(drive: Drive, entry: MotorEntry | None = None) -> dict[str, Any]:
     derived = entry.numbers.derived
     sources = {name: _sources(derived[name], entry) for name in names if name in derived}
     cited = list(dict.fromkeys(source for several in sources.values() for source in several))
+    rounded = [one.quantity for one in entry.numbers.disagreements if abs(one.difference) < _ROUNDED]
+    told = [str(one) for one in entry.numbers.disagreements if one.quantity not in rounded]
+    if rounded:
+        told.append(f"less than {_ROUNDED:.0%}, by rounding: {', '.join(rounded)}")
     return found | {
         **{name: getattr(entry, name) for name in ("manufacturer", "product", "kind")},
         "numbers": [
@@ -262,17 +266,10 @@ def explain(drive: Drive, entry: MotorEntry | None = None) -> dict[str, Any]:
         ],
         "cited": cited,
         "unknown": [name for name in names if name not in derived],
-        "disagreements": _disagreements(entry.numbers),
+        "disagreements": told,
         "estimated": dict(entry.estimated),
         "notes": entry.notes,
     }
-
-
-def _disagreements(numbers: MotorNumbers) -> list[str]:
-    """What a datasheet contradicts itself in, and in one sentence what it only rounds."""
-    rounded = [one.quantity for one in numbers.disagreements if abs(one.difference) < _ROUNDED]
-    told = list(map(str, numbers.disagreements[: len(numbers.disagreements) - len(rounded)]))
-    return [*told, f"less than {_ROUNDED:.0%}, by rounding: {', '.join(rounded)}"] if rounded else told
 
 
 def unknown_in_words(names: Sequence[str]) -> str:

@@ -221,9 +221,26 @@ def design(one: Looped, timestep: float | None = None) -> LoopDesign:
     """
     loop = _sampled(one, timestep)
     one.check(1.0 / loop.rate if timestep is None else timestep)
-    margins = _margins(open_loop(one, timestep), closed_loop(one, timestep), loop.rate)
-    step = small_step(one, timestep)
-    return LoopDesign(loop.rate, loop.delayed, *loop.gains, *margins, step.settling_time(), step.overshoot)
+    opened, closed, step = open_loop(one, timestep), closed_loop(one, timestep), small_step(one, timestep)
+    # margins are searched for on the unit circle, which slow loops and the pole at z = 1 leave exact; python-control's,
+    # by the roots of polynomials, are not. At half the sample rate, z = -1, the loop is real: without a crossing before
+    # it the gain margin is read there
+    turned = _first_below(lambda z: -opened(z).imag, loop.rate)
+    turned = 0.5 * loop.rate if math.isnan(turned) else turned
+    crossover = _first_below(lambda z: abs(opened(z)) - 1.0, loop.rate)
+    at_crossover = opened(_point(crossover, loop.rate)) if crossover > 0.0 else math.nan
+    return LoopDesign(
+        loop.rate,
+        loop.delayed,
+        *loop.gains,
+        gain_margin=float(1.0 / abs(opened(_point(turned, loop.rate)))),
+        phase_margin=180.0 + math.degrees(np.angle(at_crossover)),
+        phase_crossover=turned,
+        crossover=crossover,
+        bandwidth=_first_below(lambda z: abs(closed(z)) - math.sqrt(0.5), loop.rate),
+        settling_time=step.settling_time(),
+        overshoot=step.overshoot,
+    )
 
 
 def designs(drive: Drive, rates: Any = None) -> dict[tuple[float, bool], LoopDesign | str]:
@@ -242,21 +259,6 @@ def designs(drive: Drive, rates: Any = None) -> dict[tuple[float, bool], LoopDes
             except ValueError as error:
                 found[rate, delayed] = str(error)
     return found
-
-
-def _margins(opened: Any, closed: Any, rate: float) -> tuple[float, float, float, float, float]:
-    """Gain margin, phase margin [deg], phase crossover, crossover and bandwidth [Hz].
-
-    They are searched for on the unit circle, which slow loops and the pole at z = 1 leave exact; python-control's
-    margins, by the roots of polynomials, are not. At half the sample rate, z = -1, the loop is real: without a
-    crossing before, the gain margin is read there.
-    """
-    turned = _first_below(lambda z: -opened(z).imag, rate)
-    turned = 0.5 * rate if math.isnan(turned) else turned
-    crossover = _first_below(lambda z: abs(opened(z)) - 1.0, rate)
-    bandwidth = _first_below(lambda z: abs(closed(z)) - math.sqrt(0.5), rate)
-    left = 180.0 + math.degrees(np.angle(opened(_point(crossover, rate)))) if crossover > 0.0 else math.nan
-    return float(1.0 / abs(opened(_point(turned, rate)))), left, turned, crossover, bandwidth
 
 
 def _point(frequency: Any, rate: float) -> Any:

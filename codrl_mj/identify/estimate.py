@@ -39,14 +39,10 @@ class Model(abc.ABC):
     steps: ClassVar[np.ndarray]  # steps of finite differences of the state, shape (s,)
 
     @property
-    def lower(self) -> np.ndarray:
-        """Least values, shape (p,)."""
-        return np.array([PARAMETERS[name].least for name in self.names])
-
-    @property
-    def upper(self) -> np.ndarray:
-        """Largest values, shape (p,)."""
-        return np.array([PARAMETERS[name].most for name in self.names])
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Least and largest values of the free parameters, each of shape (p,)."""
+        free = [PARAMETERS[name] for name in self.names]
+        return np.array([one.least for one in free]), np.array([one.most for one in free])
 
     def all_values(self, values: np.ndarray) -> dict[str, float]:
         """Free and known parameters by name."""
@@ -178,7 +174,7 @@ class _Problem:
         found = self.solve(values)
         self.known, self.slopes, self.origin = [one.state for one in found], [], values.copy()
         model, made = self.model, []
-        inward = np.where(values + DIFFERENCE * model.scales > model.upper, -1.0, 1.0)
+        inward = np.where(values + DIFFERENCE * model.scales > model.bounds[1], -1.0, 1.0)
         moves = np.diag(inward * DIFFERENCE * model.scales)
         moved = [model.at(values + move) for move in moves]
         for segment, (state, residuals, own) in zip(self.segments, found, strict=True):
@@ -227,7 +223,8 @@ def refit(
 
     if states is None:
         states = [settled_state(model, start, one) for one in segments]
-    values = np.clip(start, model.lower, model.upper)
+    lower, upper = model.bounds
+    values = np.clip(start, lower, upper)
     if scale is None:
         simulate = model.at(values)
         left = [_residuals(simulate, one, state) for one, state in zip(segments, states, strict=True)]
@@ -236,9 +233,9 @@ def refit(
     if model.names and most:
         values = least_squares(
             problem.residuals,
-            np.clip(values, model.lower + 1e-9 * model.scales, model.upper - 1e-9 * model.scales),
+            np.clip(values, lower + 1e-9 * model.scales, upper - 1e-9 * model.scales),
             lambda values: np.concatenate(problem.jacobians(values)),
-            bounds=(model.lower, model.upper),
+            bounds=model.bounds,
             x_scale=model.scales,
             loss="soft_l1",
             f_scale=scale,

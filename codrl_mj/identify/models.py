@@ -45,11 +45,7 @@ class WindingModel(Model):
         number = self.all_values(values)
         resistance, inductance = number["resistance"], number["inductance"]
         constant = number.get("back_emf_constant", 0.0) * number["gear_ratio"]
-
-        def currents(segment: Segment, state: np.ndarray) -> np.ndarray:
-            return winding(segment.times, segment.inputs, segment.speeds, state[0], resistance, inductance, constant)
-
-        return currents
+        return lambda one, state: winding(one.times, one.inputs, one.speeds, state[0], resistance, inductance, constant)
 
     def segments(self, logs: Sequence[Log], turned: Sequence[np.ndarray] | None = None) -> list[Segment]:
         """The logs, cut into a block each, in which voltage and speed drive the current; speeds may be given."""
@@ -161,11 +157,7 @@ class ShaftModel(Model):
         from codrl_mj.identify.simulation import moving
 
         moved, output = self.moved(values), int(self.output == "velocity")
-
-        def motion(segment: Segment, state: np.ndarray) -> np.ndarray:
-            return moving(segment.times, segment.inputs, segment.slopes, state[0], state[1], moved)[output]
-
-        return motion
+        return lambda one, state: moving(one.times, one.inputs, one.slopes, state[0], state[1], moved)[output]
 
     def segments(self, logs: Sequence[Log], shortest: float = SHAFT_STEP) -> list[Segment]:
         """The logs, cut; rows that are nearer than `shortest` [s] are taken together."""

@@ -34,24 +34,25 @@ class Cells(NamedTuple):
 
     def numbers(self, name: str) -> np.ndarray:
         """A column as numbers, NaN where it is empty."""
-        return np.array([self._number(name, place, one) for place, one in enumerate(self.columns[name])])
-
-    def _number(self, name: str, place: int, one: Any) -> float:
-        if isinstance(one, int | float):
-            return float(one)
-        text = "" if one is None else str(one).strip()
-        try:
-            if text.lower() in _WORDS:
-                return _WORDS[text.lower()]
-            if STAMP.match(text):
-                day = "" if "-" in text[:5] else "1970-01-01T"
-                stamp = datetime.datetime.fromisoformat(day + text.replace(",", "."))
-                return (stamp.replace(tzinfo=stamp.tzinfo or datetime.UTC)).timestamp()
-            return float(text.replace(",", ".") if self.commas else text)
-        except ValueError:
-            remedy = "write a decimal point" if "," in text else "leave such rows out, or map another column"
-            where = f"line {self.lines[place]}" if self.lines else f"row {place + 1}"
-            raise ValueError(f"column {name} in {where} is {text!r}, must be a number; {remedy}") from None
+        found = np.empty(len(self.columns[name]))
+        for place, one in enumerate(self.columns[name]):
+            text = "" if one is None else str(one).strip()
+            try:
+                if isinstance(one, int | float):
+                    found[place] = one
+                elif text.lower() in _WORDS:
+                    found[place] = _WORDS[text.lower()]
+                elif STAMP.match(text):
+                    day = "" if "-" in text[:5] else "1970-01-01T"
+                    stamp = datetime.datetime.fromisoformat(day + text.replace(",", "."))
+                    found[place] = stamp.replace(tzinfo=stamp.tzinfo or datetime.UTC).timestamp()
+                else:
+                    found[place] = float(text.replace(",", ".") if self.commas else text)
+            except ValueError:
+                remedy = "write a decimal point" if "," in text else "leave such rows out, or map another column"
+                where = f"line {self.lines[place]}" if self.lines else f"row {place + 1}"
+                raise ValueError(f"column {name} in {where} is {text!r}, must be a number; {remedy}") from None
+        return found
 
 
 def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
@@ -200,38 +201,30 @@ def _csv(text: str) -> Cells:
 
 def _is_filled(row: Sequence[str]) -> bool:
     """Whether a row is one of the table's: numbers for the most part, or nothing but what stands for a missing one."""
-    missing = sum(cell.lower() in ("", "null", "none", "na") for cell in row)
-    return missing == len(row) or 2 * sum(map(_is_number, row)) > len(row) - missing
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text.replace(",", "."))
-    except ValueError:
-        return bool(STAMP.match(text))
-    return True
+    missing, numbers = sum(cell.lower() in ("", "null", "none", "na") for cell in row), 0
+    for cell in row:
+        try:
+            float(cell.replace(",", "."))
+            numbers += 1
+        except ValueError:
+            numbers += bool(STAMP.match(cell))
+    return missing == len(row) or 2 * numbers > len(row) - missing
 
 
 def _json(content: Any) -> Cells:
-    if isinstance(content, dict):
-        constants = {name: float(one) for name, one in content.items() if isinstance(one, int | float)}
-        lists = {name: one for name, one in content.items() if isinstance(one, list) and one}
-        tables = [one for one in lists.values() if isinstance(one[0], dict)]
-        if len(tables) == 1:
-            return Cells(_by_column(tables[0]), constants, [])
-        if not tables and lists and len({len(one) for one in lists.values()}) == 1:
-            return Cells(lists, constants, [])
-    elif isinstance(content, list) and content and all(isinstance(row, dict) for row in content):
-        return Cells(_by_column(content), {}, [])
+    given = content if isinstance(content, dict) else {"": content}
+    constants = {name: float(one) for name, one in given.items() if isinstance(one, int | float)}
+    lists = {name: one for name, one in given.items() if isinstance(one, list) and one}
+    tables = [one for one in lists.values() if isinstance(one[0], dict)]
+    if len(tables) == 1 and all(isinstance(row, dict) for row in tables[0]):
+        names = dict.fromkeys(name for row in tables[0] for name in row)
+        return Cells({name: [row.get(name) for row in tables[0]] for name in names}, constants, [])
+    if isinstance(content, dict) and not tables and lists and len({len(one) for one in lists.values()}) == 1:
+        return Cells(lists, constants, [])
     raise ValueError(
         "JSON must be a list of rows, an object with one such list and numbers beside it, or an object of columns of "
         "the same length"
     )
-
-
-def _by_column(rows: list[dict[str, Any]]) -> dict[str, list[Any]]:
-    names = dict.fromkeys(name for row in rows for name in row)
-    return {name: [row.get(name) for row in rows] for name in names}
 
 
 # -- proposed, for a person to read before it is used -----------------------------------------------------------------

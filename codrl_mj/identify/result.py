@@ -243,17 +243,10 @@ class Identified:
             del one["trace"]
         return found
 
-    def as_file(self) -> dict[str, Any]:
-        """What an actuator's file holds: a drive's fields, and `identified`, which has its intervals or its problem."""
-        problem = self.problem()
-        section: dict[str, Any] = {"logs": list(self.logs)}
-        if problem is not None:
-            return {"identified": section | {"problem": problem}}
-        intervals = {name: list(ends) for name, ends in self.intervals().items()}
-        return {**self.actuator().as_mapping(), "identified": section | {"intervals": intervals}}
-
     def write(self, folder: Path) -> list[Path]:
         """Write actuator.yaml and result.json into a folder, whole or not at all.
+
+        The actuator's file has a drive's fields and `identified`: their intervals; or that alone, with the problem.
 
         Returns:
             Their paths.
@@ -261,7 +254,13 @@ class Identified:
         import yaml
 
         actuator, result = folder / ACTUATOR, folder / "result.json"
+        section: dict[str, Any] = {"logs": list(self.logs)}
+        if problem := self.problem():
+            content = {"identified": section | {"problem": problem}}
+        else:
+            intervals = {name: list(ends) for name, ends in self.intervals().items()}
+            content = {**self.actuator().as_mapping(), "identified": section | {"intervals": intervals}}
         with writing(actuator) as temporary:
-            temporary.write_text(yaml.safe_dump(self.as_file(), sort_keys=False))
+            temporary.write_text(yaml.safe_dump(content, sort_keys=False))
         write_json(result, self.as_mapping())
         return [actuator, result]

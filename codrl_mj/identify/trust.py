@@ -349,7 +349,8 @@ def unknown_directions(fit: Fit, scales: np.ndarray) -> list[dict[str, float]]:
         direction = np.linalg.eigh(matrix * np.outer(own, own))[1][:, 0]  # a unit vector, in the scales
         place = int(np.argmax(np.abs(direction)))
         step = UNKNOWN * own[place] * np.sign(direction[place])
-        if not model.lower[place] <= values[place] + step <= model.upper[place]:
+        bounds = PARAMETERS[model.names[place]]
+        if not bounds.least <= values[place] + step <= bounds.most:
             step = -step
         start = np.clip(values + step / own[place] / direction[place] * direction * own, 0.2 * values, None)
         rest = dataclasses.replace(

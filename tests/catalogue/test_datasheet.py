@@ -339,10 +339,11 @@ def test_without_strictness_a_contradiction_is_only_listed():
 
 
 def test_the_rules_speak_of_fields():
-    for rule in (*derivation.RULES, *(check for check, _ in derivation.CHECKS)):
-        assert {rule.quantity, *rule.needs} <= {*KINDS, *derivation.AT_OUTPUT}, rule.formula
-    assert derivation.RULES[0].needs == ("nominal_voltage", "stall_current")
-    assert derivation.RULES[0].function(12.0, 133.0) == 12.0 / 133.0
+    for quantity, formula in (*derivation.RULES, *(check[:2] for check in derivation.CHECKS)):
+        assert {quantity, *derivation.compiled(formula).co_names} <= {*KINDS, *derivation.AT_OUTPUT}, formula
+    first = derivation.compiled(derivation.RULES[0][1])
+    assert first.co_names == ("nominal_voltage", "stall_current")
+    assert eval(first, {}, {"nominal_voltage": 12.0, "stall_current": 133.0}) == 12.0 / 133.0
 
 
 def test_pint_is_imported_only_when_a_datasheet_is_read():
