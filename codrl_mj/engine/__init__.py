@@ -1,8 +1,8 @@
 """The only code that touches raw mjModel and mjData memory: structure layout, compiled families, doors, reading."""
 
+from codrl_mj.engine.control import CallbackInUseError, install, installed, uninstall
 from codrl_mj.engine.families import load_family
 from codrl_mj.engine.hill import HILL_NAMES
-from codrl_mj.engine.install import CallbackInUseError, install, installed, uninstall
 from codrl_mj.engine.layout import LayoutError
 from codrl_mj.engine.reading import Readout, clear_motors, motors, signals
 

@@ -1,5 +1,7 @@
 """MuJoCo's control and bias callbacks for our actuators, compiled to C functions by numba: the five tasks' door.
 
+Here they, and that of hills, are installed into MuJoCo, too.
+
 They are pure functions of (mjModel, mjData): which actuators are ours, and their parameters, is read from the model;
 all state is in `data.act`. Nothing is cached on disk: the structure offsets are compiled in as constants.
 """
@@ -7,6 +9,7 @@ all state is in `data.act`. Nothing is cached on disk: the structure offsets are
 import ctypes
 import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import mujoco
@@ -24,8 +27,9 @@ from codrl_mj.engine.families import (
     is_compiled,
     size_of,
 )
+from codrl_mj.engine.hill import compiled_hill
 from codrl_mj.engine.layout import DATA, MODEL
-from codrl_mj.engine.memory import at, f64, internal
+from codrl_mj.engine.memory import at, callback, f64, internal
 from codrl_mj.kept import cfunc
 
 _USER_DYNAMICS, _USER_BIAS = int(mujoco.mjtDyn.mjDYN_USER), int(mujoco.mjtBias.mjBIAS_USER)
@@ -95,8 +99,81 @@ def compiled() -> dict[str, Any]:
     return {"control": callback(control), "act_bias": callback(act_bias, ctypes.c_double, ctypes.c_int)}
 
 
-def callback(function: Any, returned: Any = None, *more: Any) -> Any:
-    """What MuJoCo's setters take for a compiled function of (mjModel, mjData) and `more`; it keeps that alive."""
-    made: Any = ctypes.CFUNCTYPE(returned, ctypes.c_void_p, ctypes.c_void_p, *more)(function.address)
-    made.owner = function
-    return made
+# -- installing them, without trampling on anybody else's ------------------------------------------------------
+
+_PARTS: dict[str, tuple[tuple[str, ...], Callable[[], dict[str, Any]], str]] = {
+    "motor": (("control", "act_bias"), compiled, "actuator='ideal' or physics='analytic'"),
+    "hill": (("passive",), compiled_hill, "physics='analytic'"),
+}
+"""Callbacks that are installed together: MuJoCo's names, as in `mujoco.set_mjcb_...`; what compiles them, by these
+names; and what else a user could do than to install them."""
+
+
+class CallbackInUseError(RuntimeError):
+    """Another library's MuJoCo callback is installed where ours has to go."""
+
+
+_INSTALLED: dict[str, Any] = {}
+"""What each of MuJoCo's callbacks was last set to."""
+
+
+def _whose(name: str) -> tuple[bool, Any]:
+    """Whether the callback of that name is ours, and what it is, if any; nothing is compiled to find out."""
+    present = getattr(mujoco, f"get_mjcb_{name}")()
+    return present is not None and present is _INSTALLED.get(name), present
+
+
+def installed(*parts: str) -> bool:
+    """Whether MuJoCo runs our callbacks at present.
+
+    Args:
+        *parts: as for `install`.
+    """
+    return all(_whose(name)[0] for _, name in _callbacks(parts))
+
+
+def install(*parts: str) -> None:
+    """Install the callbacks that run our motors, or our hills; harmless when they are installed already.
+
+    The callbacks are process-wide, as all of MuJoCo's are. They act on actuators and joints that carry our signature in
+    their user data and on nothing else: other models, and foreign actuators and joints of the same model, behave as
+    without them. A process in which no model has a hill need not pay for the hill's callback.
+
+    Args:
+        *parts: `motor` (`mjcb_control` and `mjcb_act_bias`), `hill` (`mjcb_passive`), or both; none means `motor`.
+
+    Raises:
+        ValueError: no such part.
+        CallbackInUseError: one of the callbacks is somebody else's; nothing was changed.
+        LayoutError: the installed MuJoCo's memory is not laid out as its introspection says.
+    """
+    missing = []
+    for part, name in _callbacks(parts):
+        ours, present = _whose(name)
+        if present is not None and not ours:
+            raise CallbackInUseError(
+                f"mujoco.mjcb_{name} is already set, to {present!r}: refusing to replace it. Remove it with "
+                f"mujoco.set_mjcb_{name}(None) first, or build the environment with {_PARTS[part][2]}, which "
+                "needs no such callback"
+            )
+        if not ours:
+            missing.append((part, name))
+    pointers = [(name, _PARTS[part][1]()[name]) for part, name in missing]
+    for name, pointer in pointers:
+        getattr(mujoco, f"set_mjcb_{name}")(pointer)
+        _INSTALLED[name] = pointer
+
+
+def uninstall() -> None:
+    """Remove all our callbacks; anybody else's stay where they are."""
+    for _, name in _callbacks(tuple(_PARTS)):
+        if _whose(name)[0]:
+            getattr(mujoco, f"set_mjcb_{name}")(None)
+
+
+def _callbacks(parts: tuple[str, ...]) -> list[tuple[str, str]]:
+    """Part and name of each of MuJoCo's callbacks that are of some parts, those of motors if none is named."""
+    for part in parts:
+        if part not in _PARTS:
+            raise ValueError(f"callbacks {part!r}: must be one of {', '.join(_PARTS)}")
+    return [(part, name) for part in parts or ("motor",) for name in _PARTS[part][0]]

@@ -23,10 +23,9 @@ from typing import Any
 import mujoco
 from numba import types
 
-from codrl_mj.engine.control import callback
 from codrl_mj.engine.families import SIGNATURE
 from codrl_mj.engine.layout import DATA, MODEL
-from codrl_mj.engine.memory import at, f64, internal
+from codrl_mj.engine.memory import at, callback, f64, internal
 from codrl_mj.kept import cfunc
 
 HILL_NAMES = ("signature_1", "signature_2", "gravity", "wavenumber", "height")

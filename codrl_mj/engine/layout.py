@@ -21,6 +21,7 @@ from mujoco.introspect import ast_nodes
 from mujoco.introspect.structs import STRUCTS
 from numba import types
 from numba.core.registry import cpu_target
+from numba.core.typing.ctypes_utils import from_ctypes
 
 from codrl_mj.engine.memory import emitted, pointed
 from codrl_mj.kept import external
@@ -33,16 +34,17 @@ _SCALARS = {
     "int": ctypes.c_int,
     "unsigned int": ctypes.c_uint,
     "char": ctypes.c_char,
-    "bool": ctypes.c_bool,
-    "mjtBool": ctypes.c_bool,
+    "bool": ctypes.c_ubyte,
+    "mjtBool": ctypes.c_ubyte,
     "mjtByte": ctypes.c_ubyte,
     "unsigned char": ctypes.c_ubyte,
-    "size_t": ctypes.c_size_t,
+    "size_t": ctypes.c_int64,
     "mjtSize": ctypes.c_int64,
     "int64_t": ctypes.c_int64,
     "uint64_t": ctypes.c_uint64,
-    "uintptr_t": ctypes.c_size_t,
+    "uintptr_t": ctypes.c_int64,
 }
+"""C types as ctypes has them and, by numba's table, compiled code, which counts with signed numbers."""
 
 
 def _ctype(node: Any) -> Any:
@@ -160,18 +162,6 @@ def _is_shown(owner: Any, field: str) -> bool:
     return isinstance(live, int | float) or getattr(live, "size", 0) > 0
 
 
-_KINDS = {
-    "mjtNum": types.float64,
-    "int": types.int32,
-    "mjtSize": types.int64,
-    "size_t": types.int64,
-    "uintptr_t": types.int64,
-    "mjtByte": types.uint8,
-    "mjtBool": types.uint8,
-    "bool": types.uint8,
-}
-
-
 class Fields(ModuleType):
     """The fields of a structure, each a function of the structure's address for compiled code.
 
@@ -205,7 +195,7 @@ class Fields(ModuleType):
 def _function(struct_name: str, path: str, node: Any) -> Any:
     """What reads a field, compiled into whoever calls it."""
     is_array = isinstance(node, ast_nodes.PointerType)
-    element = _KINDS[node.inner_type.name if is_array else node.name]
+    element = from_ctypes(_SCALARS[node.inner_type.name if is_array else node.name])
     kind, at = types.CPointer(element) if is_array else element, offset(struct_name, path)
 
     @emitted(lambda address: kind(types.uintp))  # noqa: ARG005 - one

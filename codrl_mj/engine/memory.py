@@ -2,6 +2,7 @@
 
 # ruff: noqa: ARG001, ARG005 - numba fixes the arguments
 
+import ctypes
 import functools
 import inspect
 from collections import namedtuple
@@ -152,3 +153,10 @@ def _as_floats(context: Any, builder: Any, signature: Any, arguments: Any) -> li
         context.cast(builder, builder.extract_value(arguments[0], at), kind, types.float64)
         for at, kind in enumerate(signature.args[0])
     ]
+
+
+def callback(function: Any, returned: Any = None, *more: Any) -> Any:
+    """What MuJoCo's setters take for a compiled function of (mjModel, mjData) and `more`; it keeps that alive."""
+    made: Any = ctypes.CFUNCTYPE(returned, ctypes.c_void_p, ctypes.c_void_p, *more)(function.address)
+    made.owner = function
+    return made

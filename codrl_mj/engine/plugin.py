@@ -114,32 +114,29 @@ _configuration_of.argtypes = ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p
 _configuration_of.restype = ctypes.c_void_p
 
 
-@functools.cache
-def _verdict() -> Any:
-    """(model, instance) -> index into `REASONS`: what is wrong with an instance."""
-    wanted = types.uintp(types.uintp, types.int32, types.uintp)
-    configuration_of = external("mj_plugin_configuration", _configuration_of, wanted)
+_configured = external("mj_plugin_configuration", _configuration_of, types.uintp(types.uintp, types.int32, types.uintp))
+"""The same for compiled code."""
 
-    @njit(nogil=True, error_model="numpy")
-    def verdict(model: int, instance: int) -> int:
-        for actuator in range(MODEL.nactuator(model)):
-            if MODEL.actuator_plugin(model)[actuator] != instance:
-                continue
-            width, user = MODEL.nuser_actuator(model), f64(user_of(model, actuator))
-            if width < PLUGIN_HEAD or user[0] != _FIRST or user[1] != _SECOND or not user[HEAD] > 0.0:
-                return 1
-            if not is_compiled(user[2]):
-                return 2
-            number = int(user[2])
-            if not is_called(number, configuration_of(model, instance, _attribute_at())):
-                return 3
-            if width < PLUGIN_HEAD + size_of(number, PARAMETERS):
-                return 4
-            if MODEL.plugin_statenum(model)[instance] != size_of(number, WHOLE) + EXTRA_STATES:
-                return 5
-        return 0
 
-    return verdict
+@njit(nogil=True, error_model="numpy")
+def _verdict(model: int, instance: int) -> int:
+    """Index into `REASONS`: what is wrong with an instance."""
+    for actuator in range(MODEL.nactuator(model)):
+        if MODEL.actuator_plugin(model)[actuator] != instance:
+            continue
+        width, user = MODEL.nuser_actuator(model), f64(user_of(model, actuator))
+        if width < PLUGIN_HEAD or user[0] != _FIRST or user[1] != _SECOND or not user[HEAD] > 0.0:
+            return 1
+        if not is_compiled(user[2]):
+            return 2
+        number = int(user[2])
+        if not is_called(number, _configured(model, instance, _attribute_at())):
+            return 3
+        if width < PLUGIN_HEAD + size_of(number, PARAMETERS):
+            return 4
+        if MODEL.plugin_statenum(model)[instance] != size_of(number, WHOLE) + EXTRA_STATES:
+            return 5
+    return 0
 
 
 @functools.cache
@@ -192,12 +189,11 @@ def compiled() -> dict[str, Any]:
         for entry in range(MODEL.plugin_statenum(model)[instance]):
             f64(state)[entry] = 0.0
 
-    verdict = _verdict()
     complaint = external("codrl_mj_judge", _JUDGE, types.int32(types.uintp, types.int32))
 
     @cfunc(types.int32(types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")
     def init(model: int, data: int, instance: int) -> int:  # noqa: ARG001
-        if verdict(model, instance) == 0:
+        if _verdict(model, instance) == 0:
             return 0
         return complaint(model, instance)
 
@@ -235,7 +231,7 @@ def _judge(model: int, instance: int) -> int:
     """`init` of an instance whose family has yet to be compiled, or that is wrong: 0, or -1 and a warning."""
     try:
         load_family(_family(model, instance))
-        verdict = _verdict()(model, instance)
+        verdict = _verdict(model, instance)
         if verdict:
             raise ValueError(REASONS[verdict])
     except Exception as error:  # there is nobody to raise it to

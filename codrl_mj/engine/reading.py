@@ -48,69 +48,59 @@ def motors(model: mujoco.MjModel) -> dict[int, ActuatorModel]:
         ours = instance >= 0 and model.plugin[instance] == slot
         if not ours and (len(user) < HEAD or tuple(user[:2]) != SIGNATURE):
             continue
-        read = _behind_callback if instance < 0 else _behind_plugin
         try:
-            found[index] = read(model, index)
+            found[index] = _motor_at(model, index, slot)
         except ValueError as error:
             raise ValueError(f"{model.actuator(index).name or f'actuator {index}'}: {error}") from None
     return found
 
 
-def _family(number: float) -> Family:
-    known = {family_number(family): family for family in (*BUILT_IN, *loaded_families())}
-    if number not in known:
-        raise ValueError(
-            f"family {number:g} is not known in this process: import its module and call "
-            "codrl_mj.engine.load_family first"
-        )
-    return known[int(number)]
-
-
-def _made(family: Family, user: np.ndarray, head: int, arm: float) -> ActuatorModel:
-    names = parameters_type(family)._fields
-    if len(user) < head + len(names):
-        raise ValueError(f"user = {list(user)}: a {family.__name__} needs {head} numbers and {', '.join(names)}")
-    return family.from_numbers(user[head : head + len(names)], arm)
-
-
-def _behind_plugin(model: mujoco.MjModel, index: int) -> ActuatorModel:
-    user, instance, slot = model.actuator_user[index], model.actuator_plugin[index], registered()[NAME][0]
-    if model.plugin[instance] != slot:
+def _motor_at(model: mujoco.MjModel, index: int, slot: int) -> ActuatorModel:
+    """The motor of an actuator that is ours; `slot` is where our plugin is."""
+    user, instance = model.actuator_user[index], model.actuator_plugin[index]
+    behind_plugin = instance >= 0
+    if behind_plugin and model.plugin[instance] != slot:
         raise ValueError(
             f"plugin slot = {model.plugin[instance]}: a motor of codrl_mj needs {slot}, where its plugin is. The model "
             "was compiled where others were registered before it: compile it here, from XML or a spec"
         )
-    if len(user) < PLUGIN_HEAD or tuple(user[:2]) != SIGNATURE:
+    if behind_plugin and (len(user) < PLUGIN_HEAD or tuple(user[:2]) != SIGNATURE):
         raise ValueError(REASONS[1])
-    family = _family(user[2])
-    name = bytes(model.plugin_attr[model.plugin_attradr[instance] :]).partition(b"\0")[0].decode()
-    if name != reference(family):
-        raise ValueError(f"{FAMILY} = {name!r} of its plugin: its user data are those of {reference(family)}")
-    if model.plugin_statenum[instance] != slot_size(family) + EXTRA_STATES:
-        raise ValueError(REASONS[5])
-    return _made(family, user, PLUGIN_HEAD, user[HEAD])
-
-
-def _behind_callback(model: mujoco.MjModel, index: int) -> ActuatorModel:
-    user = model.actuator_user[index]
-    family = _family(user[2])
-    size = slot_size(family)
-    expected = {
-        "dyntype": (model.actuator_dyntype[index], mujoco.mjtDyn.mjDYN_USER, 'dyntype="user"'),
-        "biastype": (model.actuator_biastype[index], mujoco.mjtBias.mjBIAS_USER, 'biastype="user"'),
-        "actdim": (model.actuator_actnum[index], size, f'actdim="{size}"'),
-        "delay": (model.actuator_delay[index], 0.0, 'delay="0"'),
-        "gaintype": (model.actuator_gaintype[index], mujoco.mjtGain.mjGAIN_FIXED, 'gaintype="fixed"'),
-        "gainprm": (model.actuator_gainprm[index, 0], 0.0, 'gainprm="0"'),
-        "actlimited": (model.actuator_actlimited[index], False, 'actlimited="false"'),
-    }
-    for field, (value, wanted, remedy) in expected.items():
-        if value != wanted:
-            raise ValueError(f"{field} = {value:g}: a motor of codrl_mj needs {remedy}")
-    gear = model.actuator_gear[model.actuator_outadr[index]]
-    if not gear[0] > 0 or np.any(gear[1:]):
-        raise ValueError(f"gear = {gear}: a motor of codrl_mj needs gear = 1/arm > 0 and no other entry")
-    return _made(family, user, HEAD, 1.0 / gear[0])
+    known: dict[float, Family] = {family_number(family): family for family in (*BUILT_IN, *loaded_families())}
+    family = known.get(user[2])
+    if family is None:
+        raise ValueError(
+            f"family {user[2]:g} is not known in this process: import its module and call "
+            "codrl_mj.engine.load_family first"
+        )
+    size, names = slot_size(family), parameters_type(family)._fields
+    if behind_plugin:
+        name = bytes(model.plugin_attr[model.plugin_attradr[instance] :]).partition(b"\0")[0].decode()
+        if name != reference(family):
+            raise ValueError(f"{FAMILY} = {name!r} of its plugin: its user data are those of {reference(family)}")
+        if model.plugin_statenum[instance] != size + EXTRA_STATES:
+            raise ValueError(REASONS[5])
+        head, arm = PLUGIN_HEAD, user[HEAD]
+    else:
+        expected = {
+            "dyntype": (model.actuator_dyntype[index], mujoco.mjtDyn.mjDYN_USER, 'dyntype="user"'),
+            "biastype": (model.actuator_biastype[index], mujoco.mjtBias.mjBIAS_USER, 'biastype="user"'),
+            "actdim": (model.actuator_actnum[index], size, f'actdim="{size}"'),
+            "delay": (model.actuator_delay[index], 0.0, 'delay="0"'),
+            "gaintype": (model.actuator_gaintype[index], mujoco.mjtGain.mjGAIN_FIXED, 'gaintype="fixed"'),
+            "gainprm": (model.actuator_gainprm[index, 0], 0.0, 'gainprm="0"'),
+            "actlimited": (model.actuator_actlimited[index], False, 'actlimited="false"'),
+        }
+        for field, (value, wanted, remedy) in expected.items():
+            if value != wanted:
+                raise ValueError(f"{field} = {value:g}: a motor of codrl_mj needs {remedy}")
+        gear = model.actuator_gear[model.actuator_outadr[index]]
+        if not gear[0] > 0 or np.any(gear[1:]):
+            raise ValueError(f"gear = {gear}: a motor of codrl_mj needs gear = 1/arm > 0 and no other entry")
+        head, arm = HEAD, 1.0 / gear[0]
+    if len(user) < head + len(names):
+        raise ValueError(f"user = {list(user)}: a {family.__name__} needs {head} numbers and {', '.join(names)}")
+    return family.from_numbers(user[head : head + len(names)], arm)
 
 
 def slots(data: mujoco.MjData, actuators: Mapping[int, ActuatorModel]) -> dict[int, np.ndarray]:

@@ -183,7 +183,15 @@ def _drive(spec: mujoco.MjSpec, model: mujoco.MjModel, index: int, actuator: Act
     if actuator.MOTION:  # its own loops take the place of the model's
         target.gaintype, target.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE
         target.gainprm[:], target.biasprm[:] = [1.0] + [0.0] * (mujoco.mjNGAIN - 1), 0.0
-    target.classname = _default_for(spec, target, name)
+    # XML has no other place for gain and bias of a plugin's actuator than a default class: without them a saved model
+    # would have other forces, and other derivatives of them in the implicit integrators. A class that differs in
+    # nothing from its parent is not saved: then it is the parent
+    default, fields = spec.default, ("gaintype", "gainprm", "biastype", "biasprm")
+    if not all(np.array_equal(getattr(target, field), getattr(default.actuator, field)) for field in fields):
+        default = spec.add_default(name, default)
+        for field in fields:
+            setattr(default.actuator, field, getattr(target, field))
+    target.classname = default
     control = model.actuator_ctrladr[index]
     target.inheritrange = 0.0
     target.ctrllimited, target.ctrlrange = int(model.actuator_ctrllimited[control]), model.actuator_ctrlrange[control]
@@ -200,18 +208,3 @@ def _drive(spec: mujoco.MjSpec, model: mujoco.MjModel, index: int, actuator: Act
         on_joint = mujoco.mjtTrn(model.actuator_trntype[index]) in ON_JOINT
         driven = spec.joint(target.target) if on_joint else spec.tendon(target.target)
         driven.frictionloss += added.friction * abs(model.actuator_gear[model.actuator_outadr[index], 0])
-
-
-def _default_for(spec: mujoco.MjSpec, target: mujoco.MjsActuator, name: str) -> mujoco.MjsDefault:
-    """A default class with an actuator's gain and bias, for which XML has no other place in a plugin's actuator.
-
-    Without them a saved and loaded model would have other forces, and other derivatives of them in the implicit
-    integrators. A class that differs in nothing from its parent is not saved: then it is the parent.
-    """
-    fields = ("gaintype", "gainprm", "biastype", "biasprm")
-    if all(np.array_equal(getattr(target, field), getattr(spec.default.actuator, field)) for field in fields):
-        return spec.default
-    made = spec.add_default(name, spec.default)
-    for field in fields:
-        setattr(made.actuator, field, getattr(target, field))
-    return made

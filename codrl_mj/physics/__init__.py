@@ -1,15 +1,13 @@
 """Simulation of a task: in MuJoCo or on Gymnasium's analytic dynamics, behind one small interface, by name."""
 
 from collections.abc import Callable
-from typing import Any
 
 from codrl_mj.physics.analytic import AnalyticPhysics
-from codrl_mj.physics.base import Physics, Plant, Signals, SimulationDivergedError, signal_names, trace_names
+from codrl_mj.physics.base import PHYSICS, Physics, Plant, Signals, SimulationDivergedError, signal_names, trace_names
 from codrl_mj.physics.mjcf import hills, install_callbacks, motors, needed_callbacks
 from codrl_mj.physics.mujoco_single import MujocoPhysics
 
-PHYSICS: dict[str, Callable[[Plant], Any]] = {"mujoco": MujocoPhysics, "analytic": AnalyticPhysics}
-"""The physics that an environment can be built on, by name: what makes a simulation of a plant."""
+PHYSICS.update(mujoco=MujocoPhysics, analytic=AnalyticPhysics)
 
 
 def register_physics(name: str, make: Callable[[Plant], Physics]) -> None:

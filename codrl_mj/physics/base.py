@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -139,8 +139,9 @@ class Physics(abc.ABC):
             ValueError: it has no such fields, because it is not on a MuJoCo model; none at all is never refused.
         """
         if fields:
+            own = next((name for name, make in PHYSICS.items() if make is type(self)), type(self).__name__)
             raise ValueError(
-                f"fields = {', '.join(fields)}: they are a MuJoCo model's, which 'analytic' has not; use 'mujoco'"
+                f"fields = {', '.join(fields)}: they are a MuJoCo model's, which {own!r} has not; use 'mujoco'"
             )
 
     @abc.abstractmethod
@@ -202,6 +203,10 @@ class Physics(abc.ABC):
     def show(self, state: np.ndarray) -> None:
         """Bring the bodies of `scene` to a state, for drawing; the simulation is left alone otherwise."""
         del state  # without a scene
+
+
+PHYSICS: dict[str, Callable[[Plant], Any]] = {}
+"""The physics that an environment can be built on, by name: what makes a simulation of a plant."""
 
 
 class SimulationDivergedError(ArithmeticError):

@@ -1,6 +1,5 @@
 """Disturbs the commands and loads of many actuators, of one simulation or of many: the same compiled code."""
 
-import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -97,9 +96,7 @@ class Disturber:
         arrived, loads = desired, np.zeros(desired.shape)
         if self.on:
             arrived, plain = np.empty(desired.shape), np.ascontiguousarray(desired)
-            compiled_disturbance().each(
-                self.numbers, self.memory, *(one.reshape(-1) for one in (plain, arrived, loads))
-            )
+            _disturb_each(self.numbers, self.memory, *(one.reshape(-1) for one in (plain, arrived, loads)))
         return arrived, loads
 
 
@@ -107,49 +104,33 @@ KEY_COLUMN = KEY - len(PULSE_NAMES)
 """Where a row of a disturber's memory holds the key of the episode's random numbers."""
 
 
-class Disturbance(NamedTuple):
-    """Compiled functions; `memory` is a `Disturber`'s."""
-
-    command: Any
-    """(`Numbers`, row of memory, force) -> command that arrives in the next integration step."""
-    load: Any
-    """(`Numbers`, row of memory) -> mean load over it."""
-    each: Any
-    """(numbers (n, k), memory (m, l), forces (m,), commands (m,), loads (m,)) -> nothing: both for every row."""
+_pulses = internal(pulse_load)
 
 
-@functools.cache
-def compiled_disturbance() -> Disturbance:
-    """The functions, compiled as they are used."""
-    pulses = internal(pulse_load)
+@internal
+def disturb(numbers: Numbers, memory: np.ndarray, force: float) -> tuple[float, float]:
+    """The command that arrives in the next integration step, and the mean load over it; `memory` is an actuator's."""
+    length = len(memory) - _AFTER_HISTORY
+    for entry in range(length - 1, 0, -1):
+        memory[entry] = memory[entry - 1]
+    memory[0] = force
+    arrived = delayed(memory[int(numbers.delay_steps)], memory[length - 1], numbers.delay_fraction)
+    if numbers.quantum != 0.0:
+        arrived = quantised(arrived, numbers.quantum, numbers.limit)
+    if numbers.change != 0.0:
+        arrived = rate_limited(arrived, memory[length], numbers.change)
+        memory[length] = arrived
+    if numbers.pulse_force == 0.0:
+        return arrived, 0.0
+    own = memory[len(memory) - len(PULSE_NAMES) :]
+    load = _pulses(own, numbers.timestep, numbers.pulse_force, numbers.pulse_duration, numbers.pulse_interval)
+    return arrived, load
 
-    @internal
-    def command(numbers: Numbers, memory: np.ndarray, force: float) -> float:
-        length = len(memory) - _AFTER_HISTORY
-        for entry in range(length - 1, 0, -1):
-            memory[entry] = memory[entry - 1]
-        memory[0] = force
-        arrived = delayed(memory[int(numbers.delay_steps)], memory[length - 1], numbers.delay_fraction)
-        if numbers.quantum != 0.0:
-            arrived = quantised(arrived, numbers.quantum, numbers.limit)
-        if numbers.change != 0.0:
-            arrived = rate_limited(arrived, memory[length], numbers.change)
-            memory[length] = arrived
-        return arrived
 
-    @internal
-    def load(numbers: Numbers, memory: np.ndarray) -> float:
-        if numbers.pulse_force == 0.0:
-            return 0.0
-        own = memory[len(memory) - len(PULSE_NAMES) :]
-        return pulses(own, numbers.timestep, numbers.pulse_force, numbers.pulse_duration, numbers.pulse_interval)
-
-    @njit(nogil=True, error_model="numpy")
-    def each(
-        numbers: np.ndarray, memory: np.ndarray, forces: np.ndarray, commands: np.ndarray, loads: np.ndarray
-    ) -> None:
-        for row in range(len(memory)):
-            own = row_as(numbers[row % len(numbers)], Numbers)
-            commands[row], loads[row] = command(own, memory[row], forces[row]), load(own, memory[row])
-
-    return Disturbance(command, load, each)
+@njit(nogil=True, error_model="numpy")
+def _disturb_each(
+    numbers: np.ndarray, memory: np.ndarray, forces: np.ndarray, commands: np.ndarray, loads: np.ndarray
+) -> None:
+    for row in range(len(memory)):
+        own = row_as(numbers[row % len(numbers)], Numbers)
+        commands[row], loads[row] = disturb(own, memory[row], forces[row])

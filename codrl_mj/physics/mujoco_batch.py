@@ -14,7 +14,7 @@ from codrl_mj.physics.base import LARGEST, Plant, SimulationDivergedError
 from codrl_mj.physics.disturber import Disturber
 from codrl_mj.physics.mjcf import flags_with_friction
 from codrl_mj.physics.mujoco_single import MujocoPhysics
-from codrl_mj.physics.rows import Rows, compiled_set_const, lane, part, share
+from codrl_mj.physics.rows import Rows, derive_fields, lane, part, share
 from codrl_mj.physics.stepping import NOISE_KEY
 from codrl_mj.physics.variation import Variation, bare_model, field_of, mounting_of, write_fields
 
@@ -115,7 +115,7 @@ class MujocoBatchPhysics:
         for name in DERIVED:
             self.field(name)
         derived = np.array([list(self._fields).index(name) for name in DERIVED])
-        compiled_set_const()(rows, self._lane(), derived)
+        derive_fields(rows, self._lane(), derived)
 
     @property
     def state(self) -> np.ndarray:

@@ -115,25 +115,19 @@ def store(rows: Rows, row: int, lane: Lane) -> None:
             kept[entry] = live[entry]
 
 
-@functools.cache
-def compiled_set_const() -> Any:
-    """(rows (m,), lane, derived (d,)) -> nothing: fills the fields that MuJoCo derives from others.
+_set_const = engine_function("mj_setConst")
 
-    `derived` are indices in `Lane.fields`.
-    """
-    set_const = engine_function("mj_setConst")
 
-    @njit(nogil=True, error_model="numpy")
-    def fill(rows: np.ndarray, lane: Any, derived: np.ndarray) -> None:
-        lane = Lane(*lane)
-        for row in rows:
-            load_fields(row, lane)
-            set_const(lane.model, lane.data)
-            for field in derived:
-                source, first, stride, size = lane.fields[field]
-                copy_bytes(first + row * stride, source, size)
-
-    return fill
+@njit(nogil=True, error_model="numpy")
+def derive_fields(rows: np.ndarray, lane: Any, derived: np.ndarray) -> None:
+    """Fill the fields that MuJoCo derives from others, by their indices in `Lane.fields`, of rows (m,)."""
+    lane = Lane(*lane)
+    for row in rows:
+        load_fields(row, lane)
+        _set_const(lane.model, lane.data)
+        for field in derived:
+            source, first, stride, size = lane.fields[field]
+            copy_bytes(first + row * stride, source, size)
 
 
 CLAIMED, DONE, BROKEN = range(3)

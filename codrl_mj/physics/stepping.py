@@ -23,7 +23,7 @@ from codrl_mj.engine.memory import internal, on_stack, row_as
 from codrl_mj.kept import njit
 from codrl_mj.physics.base import Plant
 from codrl_mj.physics.compiled_task import Compiled, compiled_constrain, compiled_reader, is_fine
-from codrl_mj.physics.disturber import KEY_COLUMN, Numbers, compiled_disturbance
+from codrl_mj.physics.disturber import KEY_COLUMN, Numbers, disturb
 
 TORQUE, NOISE_KEY = Slot._fields.index("torque"), Slot._fields.index("noise_key")
 
@@ -97,8 +97,6 @@ def _stepping(
     engine_step, engine_reset = engine_function("mj_step"), engine_function("mj_resetData")
     size, moving = len(positions) + len(velocities), len(positions)
     bounded, constrain = keep is not None, keep or _nothing
-    disturbance = compiled_disturbance()
-    disturb, disturbing_load = (disturbance.command, disturbance.load) if disturbed else (_nothing, _nothing)
     first, count = signals_at(family), len(family.Signals._fields)
     seeing = bool(family.OBSERVED)
     observe = compiled_observe(family) if seeing else _nothing
@@ -114,8 +112,7 @@ def _stepping(
                 command = force_of(force, actuator)
                 if disturbed:
                     numbers = row_as(settings[actuator, WIRING:], Numbers)
-                    command = disturb(numbers, memory[actuator], command)
-                    DATA.qfrc_applied(data)[int(wiring.dof)] = disturbing_load(numbers, memory[actuator])
+                    command, DATA.qfrc_applied(data)[int(wiring.dof)] = disturb(numbers, memory[actuator], command)
                 ctrl[int(wiring.ctrl)] = command * wiring.arm
                 trace[inner, actuator, 0] = command
             if explicit:

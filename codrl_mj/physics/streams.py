@@ -1,7 +1,6 @@
 """Many NumPy generators drawn from at once, each exactly as if it were alone."""
 
 import ctypes
-import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,6 +13,20 @@ from codrl_mj.kept import external, njit
 WORDS = 6
 """Numbers that hold one generator's state: PCG64's state and increment (two words each), and its spare 32 bits."""
 _LOW = 2**64 - 1
+_next_double = external(
+    "next_double",
+    ctypes.cast(np.random.PCG64(0).ctypes.next_double, ctypes.c_void_p),
+    types.float64(types.uintp),
+)
+"""(address of a generator's state) -> the next number in [0, 1); NumPy's own."""
+
+
+@njit
+def _fill(addresses: np.ndarray, drawn: np.ndarray) -> None:
+    """Fill rows from the generators at the given addresses."""
+    for row in range(len(addresses)):
+        for column in range(drawn.shape[1]):
+            drawn[row, column] = _next_double(addresses[row])
 
 
 class Streams:
@@ -28,9 +41,8 @@ class Streams:
         self._bind()
 
     def _bind(self) -> None:
-        interfaces = [generator.bit_generator.ctypes for generator in self.generators]
-        self._addresses = np.array([interface.state_address for interface in interfaces], dtype=np.uintp)
-        self._fill = _filler(ctypes.cast(interfaces[0].next_double, ctypes.c_void_p).value)
+        addresses = [generator.bit_generator.ctypes.state_address for generator in self.generators]
+        self._addresses = np.array(addresses, dtype=np.uintp)
 
     def __getstate__(self) -> dict[str, Any]:
         return {"generators": self.generators}
@@ -49,7 +61,7 @@ class Streams:
     def random(self, rows: np.ndarray, count: int) -> np.ndarray:
         """The next `count` numbers in [0, 1) of each of the streams `rows` (m,), which are different: (m, count)."""
         drawn = np.empty((len(rows), count))
-        self._fill(self._addresses[rows], drawn)
+        _fill(self._addresses[rows], drawn)
         return drawn
 
     def state(self) -> np.ndarray:
@@ -84,17 +96,3 @@ def set_words(generator: np.random.Generator, words: np.ndarray) -> None:
         "has_uint32": row[4],
         "uinteger": row[5],
     }
-
-
-@functools.cache
-def _filler(next_double: int) -> Any:
-    """A compiled function that fills rows from the generators at the given addresses."""
-    draw = external("next_double", ctypes.c_void_p(next_double), types.float64(types.uintp))
-
-    @njit
-    def fill(addresses: np.ndarray, drawn: np.ndarray) -> None:
-        for row in range(len(addresses)):
-            for column in range(drawn.shape[1]):
-                drawn[row, column] = draw(addresses[row])
-
-    return fill

@@ -28,14 +28,13 @@ Options = Any
 """A task's options: a `NamedTuple` of floats and flags whose fields have defaults."""
 Entries = Any
 """A sequence of numbers, or of arrays with one number for each of N states."""
-_KINDS = {
-    "euler": "EULER",
-    "semi-implicit": "EULER",
-    "rk4": "RK4",
-    "implicit": "IMPLICIT",
-    "implicitfast": "IMPLICITFAST",
+INTEGRATORS = {
+    "euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "semi-implicit": mujoco.mjtIntegrator.mjINT_EULER,
+    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
+    "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
 }
-INTEGRATORS = {name: getattr(mujoco.mjtIntegrator, f"mjINT_{kind}") for name, kind in _KINDS.items()}
 """Integrators by name, and what a model has to have for them; with `euler` positions are moved by the old velocity."""
 
 

@@ -99,12 +99,12 @@ class Twin(GymnasiumTwin):
     """
 
     env_id = "MountainCar-v0"
-    _source, _strength = env_id, "force"  # m/s^2 per N
 
-    def __init__(self) -> None:
-        """Make the Gymnasium environment, with the strength of the one that it stands for."""
+    def __init__(self, source: str = env_id, strength: str = "force") -> None:
+        """Make the Gymnasium environment, with the `strength` [m/s^2 per N] of the one that it stands for."""
         super().__init__()
-        setattr(self.env, self._strength, getattr(gymnasium_env(self._source), self._strength))
+        self._strength = strength
+        setattr(self.env, strength, getattr(gymnasium_env(source), strength))
 
     def __call__(self, state: np.ndarray, force: float, timestep: float, integrator: str) -> np.ndarray:
         """One `step` to the right with `force` set to the force's effect, of either sign."""

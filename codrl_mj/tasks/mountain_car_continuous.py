@@ -37,6 +37,7 @@ At the end of a step x >= 0.45 m with v >= 0, which is success. Truncated after 
 """
 
 import dataclasses
+import functools
 from typing import Any
 
 import numpy as np
@@ -62,16 +63,6 @@ def reward(state: Entries, force: Any, next_state: Entries, options: Any) -> Any
     return 100.0 * terminated(next_state) - 0.1 * (force * force)
 
 
-class Twin(mountain_car.Twin):
-    """`MountainCarEnv` again, with the `power` of `Continuous_MountainCarEnv`.
-
-    The continuous environment's equations are the same, but written so that they cannot be scaled (its gravity is no
-    attribute), and it rounds its state to float32.
-    """
-
-    _source, _strength = "MountainCarContinuous-v0", "power"
-
-
 TASK = dataclasses.replace(
     mountain_car.TASK,
     name="mountain_car_continuous",
@@ -80,7 +71,9 @@ TASK = dataclasses.replace(
     reward_threshold=90.0,
     agent="ddpg",
     gymnasium_id="MountainCarContinuous-v0",
-    twin=Twin,
+    # its own equations are the same, but written so that they cannot be scaled (its gravity is no attribute), and it
+    # rounds its state to float32
+    twin=functools.partial(mountain_car.Twin, "MountainCarContinuous-v0", "power"),
     asset="mountain_car_continuous.xml",
     max_force=FORCE,
     forces=None,

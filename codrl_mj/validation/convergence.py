@@ -222,7 +222,6 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
         return
     if task.twin is None:
         yield Skipped("equations of motion that are not MuJoCo's", NO_TWIN)
-    if task.twin is None:
         equations, whose, ideal = engine_equations(task), "MuJoCo's own accelerations", "MuJoCo"
     else:
         equations, whose, ideal = gymnasium_equations(task), f"the equations of {task.oracle}", task.oracle

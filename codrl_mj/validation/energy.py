@@ -211,21 +211,6 @@ def step_by_step(task: Task, quick: bool) -> Iterator[Case]:
                 yield Case(ledger.identity, where, samples)
 
 
-def _balance_plot(task: Task, integrator: str, ledger: Ledger) -> Plot:
-    flows = {
-        "supplied: integral of u i": ledger.supplied,
-        "copper loss": ledger.copper,
-        "magnetic energy": ledger.magnetic,
-        "kinetic + potential energy": ledger.mechanical,
-        "residual": ledger.residual("whole"),
-    }
-    if ledger.lost.any():
-        flows["dampers and medium"] = ledger.lost
-    curves = tuple(Curve(label, ledger.time, values) for label, values in flows.items())
-    title = f"{task.name} in MuJoCo, {integrator}: energy at the coarsest step"
-    return Plot(title, "time [s]", "energy [J]", curves)
-
-
 def _kept(
     task: Task, integrator: str, actuators: Sequence[ActuatorModel], counts: np.ndarray
 ) -> dict[str, list[Ledger]]:
@@ -263,7 +248,19 @@ def balances(task: Task, integrator: str, quick: bool) -> Iterator[tuple[Case, .
         title = f"{task.name}, {integrator}: {balance} balance"
         case = of_order(promised, families, title, "integration step [s]", "largest residual of the run [J]")
         if balance == "whole":
-            case = case._replace(plots=(*case.plots, _balance_plot(task, integrator, ledgers["MuJoCo"][0])))
+            ledger = ledgers["MuJoCo"][0]
+            flows = {
+                "supplied: integral of u i": ledger.supplied,
+                "copper loss": ledger.copper,
+                "magnetic energy": ledger.magnetic,
+                "kinetic + potential energy": ledger.mechanical,
+                "residual": ledger.residual("whole"),
+            }
+            if ledger.lost.any():
+                flows["dampers and medium"] = ledger.lost
+            curves = tuple(Curve(label, ledger.time, values) for label, values in flows.items())
+            title = f"{task.name} in MuJoCo, {integrator}: energy at the coarsest step"
+            case = case._replace(plots=(*case.plots, Plot(title, "time [s]", "energy [J]", curves)))
         cases.append(case)
     yield tuple(cases)
 

@@ -6,7 +6,6 @@ and is undone when the `with` block ends.
 
 import contextlib
 import dataclasses
-import importlib
 import inspect
 import sys
 import types
@@ -104,9 +103,9 @@ def _wrong_callbacks(edits: tuple[Edit, ...]) -> Callable[[], Any]:
 @contextlib.contextmanager
 def wrong_callback(*edits: Edit) -> Iterator[None]:
     """MuJoCo runs a callback that was compiled from edited source."""
-    parts = importlib.import_module("codrl_mj.engine.install")._PARTS  # the package's `install` is the function
+    names, _, remedy = control._PARTS["motor"]
     engine.uninstall()
-    with mock.patch.dict(parts, motor=parts["motor"]._replace(compile=_wrong_callbacks(edits))):
+    with mock.patch.dict(control._PARTS, motor=(names, _wrong_callbacks(edits), remedy)):
         try:
             yield
         finally:

@@ -91,6 +91,18 @@ def test_the_analytic_physics_refuses_fields_of_a_model_and_names_them():
         physics.set_model({"body_mass": np.ones((1, 2)), "body_ipos": np.zeros((1, 2, 3))})
 
 
+def test_a_physics_of_somebodys_own_refuses_them_by_its_own_name(monkeypatch):
+    class Mine(AnalyticPhysics):
+        """Of nobody else."""
+
+    physics = Mine(Plant(TASKS["pendulum"], [IDEAL]))
+    with pytest.raises(ValueError, match="which 'Mine' has not"):
+        physics.set_model({"body_mass": np.ones((1, 2))})
+    monkeypatch.setitem(PHYSICS, "mine", Mine)
+    with pytest.raises(ValueError, match="which 'mine' has not"):
+        physics.set_model({"body_mass": np.ones((1, 2))})
+
+
 def test_the_ideal_actuator_delivers_what_is_desired_and_has_no_current():
     _, torque, signals = IDEAL.advance((), 0.01, IDEAL.State(), Inputs(3.0, 1.0, 2.0, 0.5, 7.0))
     assert torque == 3.0
