@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.deploy.contract import Interface
-from codrl_mj.deploy.log import RigLog, read_rows
+from codrl_mj.deploy.log import read_rows
 from codrl_mj.envs.config import EnvConfig
 
 WINDOW, ROWS = 0.5, 10
@@ -65,43 +65,37 @@ def compare(env: EnvConfig, path: Path, window: float | None = None, actuator: A
     """
     env = dataclasses.replace(env, randomize=None)
     interface = Interface.between(env)
-    rows = read_rows(interface, path)
+    time, observed, commands = read_rows(interface, path)
     length = max(round(WINDOW * interface.rate), ROWS) if window is None else round(window * interface.rate)
     if window is not None and length < 2:
         raise ValueError(f"window = {window:g} s: must be at least {2 / interface.rate:g} s, two rows of the log")
-    starts = np.arange(0, len(rows.time), length)
+    starts = np.arange(0, len(time), length)
     tried = env if actuator is None else dataclasses.replace(env, actuator=dict.fromkeys(env.driven, actuator))
     if env.action == "force" and interface.levels is None:
         forces = np.array(
             [_per_ampere(new) / _per_ampere(old) for new, old in zip(tried.actuators, env.actuators, strict=True)]
         )
-        rows = rows._replace(commands=rows.commands * forces)
+        commands = commands * forces
+    simulated, actions = [], interface.actions_of(commands)
     with contextlib.closing(tried.make()) as made:
-        simulated = _simulated(made.unwrapped, interface, rows, starts)
+        moved: Any = made.unwrapped
+        if (task := getattr(moved, "task", None)) is None:
+            raise ValueError(f"{interface.task}: only a task's state can be set to what was observed: must be a task")
+        observation, _ = moved.reset(seed=0)
+        for row, action in enumerate(actions):
+            if row in starts:
+                moved.state = _state_of(task, observed[row], moved.state)
+                observation = observed[row]
+            simulated.append(observation)
+            observation = moved.step(action)[0]
     names, units = ([one[key] for one in interface.observations] for key in ("name", "unit"))
-    return RigComparison(names, units, rows.time, rows.observed, simulated, starts)
+    return RigComparison(names, units, time, observed, np.array(simulated), starts)
 
 
 def _per_ampere(actuator: Any) -> float:
     """Force [N] or torque [N*m] at the joint for an ampere; 1 of what has no motor."""
     motor = getattr(actuator, "motor", None)
     return 1.0 if motor is None else float(motor.torque_constant / actuator.arm_radius)
-
-
-def _simulated(env: Any, interface: Interface, rows: RigLog, starts: np.ndarray) -> np.ndarray:
-    """What an environment observes under the commands of a log, shape (n, k)."""
-    task = getattr(env, "task", None)
-    if task is None:
-        raise ValueError(f"{interface.task}: only a task's state can be set to what was observed: must be a task")
-    observation, _ = env.reset(seed=0)
-    seen, actions = [], interface.actions_of(rows.commands)
-    for row, action in enumerate(actions):
-        if row in starts:
-            env.state = _state_of(task, rows.observed[row], env.state)
-            observation = rows.observed[row]
-        seen.append(observation)
-        observation = env.step(action)[0]
-    return np.array(seen)
 
 
 def _state_of(task: Any, observed: np.ndarray, near: np.ndarray) -> np.ndarray:

@@ -59,26 +59,21 @@ class Control:
 
 
 def controls(
-    settings: Any, scale: float | None = None, ends: Mapping[str, float] = MappingProxyType({})
+    settings: Any,
+    scale: float | None = None,
+    ends: Mapping[str, float] = MappingProxyType({}),
+    path: tuple[str, ...] = (),
 ) -> list[Control]:
-    """Numbers, words and flags in an actuator or disturbances, and in its parts.
+    """Numbers, words and flags in an actuator or disturbances, and in its parts, of which `path` leads to this one.
 
     The slider of an infinite voltage ends at `scale` [V], without which infinite fields are left out; that of a field
     that is 0 where `ends` says so by its name.
     """
-    found = [
-        dataclasses.replace(one, high=ends[one.path[-1]]) if one.value == 0 and one.path[-1] in ends else one
-        for one in _within(settings, (), scale)
-    ]
-    return [one for one in found if not (one.endless and one.high is None)]
-
-
-def _within(settings: Any, path: tuple[str, ...], scale: float | None) -> list[Control]:
     found, nested = [], parts(type(settings))
     for field in dataclasses.fields(settings):
         value, own = getattr(settings, field.name), (*path, field.name)
         if field.name in nested:
-            found += _within(field.metadata.get("absent") if value is None else value, own, scale)
+            found += controls(field.metadata.get("absent") if value is None else value, scale, ends, own)
         elif "options" in field.metadata:
             found.append(Control(own, "", value, options=field.metadata["options"]))
         elif isinstance(value, bool):
@@ -86,8 +81,9 @@ def _within(settings: Any, path: tuple[str, ...], scale: float | None) -> list[C
         elif isinstance(value, int | float):
             unit = field.metadata.get("unit", "")
             low, high = field.metadata.get("between", (None, None))
-            ends = _slider(value, low, high, scale if unit == "V" else None)
-            found.append(Control(own, unit, value, *ends))
+            low, high = _slider(value, low, high, scale if unit == "V" else None)
+            one = Control(own, unit, value, low, ends.get(field.name, high) if value == 0 else high)
+            found += [] if one.endless and one.high is None else [one]
     return found
 
 
@@ -239,15 +235,19 @@ class Session:
         action, _ = self.policy.predict(np.asarray(self.observation)[np.newaxis], deterministic=True)
         try:
             self.observation, reward, terminated, truncated, _ = self.env.step(action[0])
-            began_anew = any(
-                self.data.warning[kind].number for kind in _DIVERGED
-            )  # by itself, from numbers that are none
+            # from numbers that are none it begins anew by itself
+            began_anew = any(self.data.warning[kind].number for kind in _DIVERGED)
             if began_anew or not np.isfinite(np.asarray(self.observation)).all():
                 raise ArithmeticError("the simulation left the finite numbers")
         except ArithmeticError as error:
             self.problem, self._diverged = f"{error}; reset, and set what drives it otherwise", True
             return False
-        self._remember()
+        rows = self.recorder.trace
+        for row in rows:
+            self.time += self.recorder.step_duration / len(rows)
+            self.signals.append((self.time, row.copy()))
+        while self.signals and self.signals[0][0] < self.time - HISTORY:
+            self.signals.popleft()
         self.total += float(reward)
         self._steps += 1
         self.ended = "ended" if terminated or truncated else "past the time limit" * (self._steps >= self._limit)
@@ -290,14 +290,6 @@ class Session:
             mujoco.mj_kinematics(self.model, self.data)
         else:
             physics.show(physics.state)
-
-    def _remember(self) -> None:
-        rows = self.recorder.trace
-        for row in rows:
-            self.time += self.recorder.step_duration / len(rows)
-            self.signals.append((self.time, row.copy()))
-        while self.signals and self.signals[0][0] < self.time - HISTORY:
-            self.signals.popleft()
 
     def _nothing(self) -> Any:
         """The action that does nothing; None if there is none."""
