@@ -15,11 +15,11 @@ from codrl_mj.actuators import drive, shaft, stability
 from codrl_mj.actuators.drive import ARM, Drive
 from codrl_mj.actuators.model import Command, Inputs, UnstableError
 from codrl_mj.actuators.shaft import Means, Shaft
-from codrl_mj.fields import check, choice, real
+from codrl_mj.fields import Checked, choice, real
 
 
 @dataclasses.dataclass(frozen=True)
-class ServoLoop:
+class ServoLoop(Checked):
     """The outer loops of a servo, all as seen at the output shaft: at a hinge's joint, or the wheel that moves a slide.
 
     Raises:
@@ -52,7 +52,7 @@ class ServoLoop:
 
     def __post_init__(self) -> None:
         """Validate."""
-        check(self)
+        super().__post_init__()
         unused = "inertia_feed_forward" if self.controls == "position" else "velocity_feed_forward"
         if getattr(self, unused) != 0.0:
             raise ValueError(
