@@ -112,7 +112,7 @@ def end(
     winding: Winding,
     moving: Shaft,
     means: Means,
-) -> tuple[tuple[float, ...], float]:
+) -> tuple[tuple[float, float, float, float, float, float, float, float, float], float]:
     """The entries of `State` after a step, from temperatures and shaft at its beginning, and how warm the winding is.
 
     The mean current heats.
