@@ -17,7 +17,7 @@ __all__ = ["OFF", "PLAIN", "Disturbances", "Joint", "resolve"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Disturbances:
+class Disturbances(fields.Checked):
     """Imperfections between the agent and its actuator, and loads on the joint; each is off at 0, its default.
 
     The command is the desired force [N] or torque [N*m] at the joint. On its way to the actuator it is first
@@ -48,7 +48,7 @@ class Disturbances:
 
     def __post_init__(self) -> None:
         """Validate."""
-        fields.check(self)
+        super().__post_init__()
         for name in ("pulse_duration", "pulse_interval"):
             value = getattr(self, name)
             if self.pulse_force and not value:
@@ -67,7 +67,7 @@ OFF = Disturbances()
 
 
 @dataclasses.dataclass(frozen=True)
-class Joint:
+class Joint(fields.Checked):
     """What is added to the actuated joints of the model; nothing by default. MuJoCo physics only.
 
     Raises:
@@ -80,10 +80,6 @@ class Joint:
     """Coulomb friction [N or N*m], >= 0."""
     armature: float = real(0.0, least=0, unit="kg")
     """Inertia [kg or kg*m^2], >= 0, such as a rotor's behind a gear."""
-
-    def __post_init__(self) -> None:
-        """Validate."""
-        fields.check(self)
 
 
 PLAIN = Joint()

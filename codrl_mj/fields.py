@@ -103,20 +103,28 @@ def reals(default: tuple[float, ...] | None = None) -> Any:
     return _bounded(default, holds, "a tuple of finite numbers")
 
 
-def check(settings: Any) -> None:
-    """Refuse a field out of bounds, of a dataclass made with the functions above, and store numbers as Python's own."""
-    for field in dataclasses.fields(settings):
-        if "bound" not in field.metadata:
-            continue
-        holds, text, optional, kind = field.metadata["bound"]
-        value = getattr(settings, field.name)
-        if value is None and optional:
-            continue
-        if not holds(value):
-            none = " or none" if optional else ""
-            raise ValueError(f"{type(settings).__name__}.{field.name} = {value!r}: must be {text}{none}")
-        if kind is not None:
-            object.__setattr__(settings, field.name, kind(value))
+@dataclasses.dataclass(frozen=True)
+class Checked:
+    """Base of dataclasses whose fields are made with the functions above.
+
+    Raises:
+        ValueError: a field is out of bounds; the message names it, its value and the bound.
+    """
+
+    def __post_init__(self) -> None:
+        """Refuse a field out of bounds, and store numbers as Python's own."""
+        for field in dataclasses.fields(self):
+            if "bound" not in field.metadata:
+                continue
+            holds, text, optional, kind = field.metadata["bound"]
+            value = getattr(self, field.name)
+            if value is None and optional:
+                continue
+            if not holds(value):
+                none = " or none" if optional else ""
+                raise ValueError(f"{type(self).__name__}.{field.name} = {value!r}: must be {text}{none}")
+            if kind is not None:
+                object.__setattr__(self, field.name, kind(value))
 
 
 def check_names(

@@ -16,11 +16,11 @@ import numpy as np
 
 from codrl_mj.actuators import noise, stability
 from codrl_mj.actuators.model import ActuatorModel, Command, Inputs, UnstableError
-from codrl_mj.fields import check, flag, integer, part, real
+from codrl_mj.fields import Checked, flag, integer, part, real
 
 
 @dataclasses.dataclass(frozen=True)
-class Motor:
+class Motor(Checked):
     """A brushed DC motor: a winding (R, L) whose current makes torque and whose speed makes voltage.
 
     L di/dt = u - kE*omega - R*i and torque = kT*i (the paper, eqs. for the current update and the torque).
@@ -41,10 +41,6 @@ class Motor:
     """Arm r [m] between shaft and load, > 0: torque = r*F and omega = v/r. On a hinge it is the inverse of the
     gear ratio (no unit). The paper: 0.15 for CartPole, else 1."""
 
-    def __post_init__(self) -> None:
-        """Validate."""
-        check(self)
-
     @property
     def electrical_time_constant(self) -> float:
         """L/R [s]: how fast the current would follow a voltage step with no loop around it."""
@@ -52,7 +48,7 @@ class Motor:
 
 
 @dataclasses.dataclass(frozen=True)
-class CurrentLoop:
+class CurrentLoop(Checked):
     """The PID loop that chooses the motor's terminal voltage from desired and measured current.
 
     u = sat(kp*e + ki*I + kd*D + kff*i_ref + kE*omega, +-max_voltage), with e = i_ref - i.
@@ -85,13 +81,9 @@ class CurrentLoop:
     current_noise: float = real(0.0, least=0.0, unit="A")
     """Standard deviation [A] of the current sensor's white noise, >= 0: a new value for each electrical step."""
 
-    def __post_init__(self) -> None:
-        """Validate."""
-        check(self)
-
 
 @dataclasses.dataclass(frozen=True)
-class Supply:
+class Supply(Checked):
     """What feeds the drive: a voltage behind a resistance.
 
     Raises:
@@ -103,10 +95,6 @@ class Supply:
     the controller's `max_voltage`."""
     resistance: float = real(0.0, least=0.0, unit="ohm")
     """Resistance [ohm], >= 0: the voltage that is available sags by resistance*|current|."""
-
-    def __post_init__(self) -> None:
-        """Validate."""
-        check(self)
 
 
 class State(NamedTuple):

@@ -112,22 +112,16 @@ def end(
     winding: Winding,
     moving: Shaft,
     means: Means,
-) -> State:
-    """The state after a step, from temperatures and shaft at its beginning: its mean current heats."""
+) -> tuple[tuple[float, float, float, float, float, float, float, float, float], float]:
+    """The entries of `State` after a step, from temperatures and shaft at its beginning, and how warm the winding is.
+
+    The mean current heats.
+    """
     if shaft.is_warming(parameters):
         heat = shaft.heated(parameters, timestep, heat, resistance * means.current * means.current)
     own = means.torque / moving.inertia
-    return State(
-        winding.current,
-        winding.integral,
-        winding.pending,
-        heat.winding,
-        heat.housing,
-        own,
-        moving.speed,
-        moving.others,
-        time + timestep,
-    )
+    kept = winding.current, winding.integral, winding.pending, heat.winding, heat.housing
+    return (*kept, own, moving.speed, moving.others, time + timestep), shaft.temperature_of(parameters, heat)
 
 
 def _advance(
@@ -140,8 +134,7 @@ def _advance(
     reference = limited(parameters, timestep, heat, resistance, asked) if closed else asked
     samples = max(int(timestep * parameters.sample_rate + 0.5), 1)
     winding, _, means = shaft.turn(parameters, resistance, timestep, samples, winding, moving, closed, reference)
-    after = end(parameters, timestep, inputs.time, heat, resistance, winding, moving, means)
-    temperature = shaft.temperature_of(parameters, Heat(after.winding_rise, after.housing_rise))
+    after, temperature = end(parameters, timestep, inputs.time, heat, resistance, winding, moving, means)
     shown = reference if closed else means.current
     less, warm = reference != asked, abs(reference) < parameters.max_current
     signals = Signals(
@@ -156,7 +149,7 @@ def _advance(
         means.power,
         means.heat,
     )
-    return after, means.torque, signals
+    return State(*after), means.torque, signals
 
 
 def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Signals]:

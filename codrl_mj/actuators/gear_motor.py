@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.fields import check, real
+from codrl_mj.fields import Checked, real
 
 
 @dataclasses.dataclass(frozen=True)
-class GearMotor:
+class GearMotor(Checked):
     """A DC motor, or a brushless one seen from its drive, with its gear: what a datasheet says.
 
     Brushless motors: terminal quantities, line to line, of the equivalent DC motor.
@@ -67,7 +67,7 @@ class GearMotor:
 
     def __post_init__(self) -> None:
         """Validate."""
-        check(self)
+        super().__post_init__()
         if not self.max_temperature > self.ambient_temperature:
             raise ValueError(
                 f"GearMotor.max_temperature = {self.max_temperature:g}: must be above ambient_temperature = "

@@ -91,7 +91,7 @@ BUILT_IN: list[Any] = []
 
 
 @dataclasses.dataclass(frozen=True)
-class ActuatorModel:
+class ActuatorModel(fields.Checked):
     """Base of every family of actuators: a frozen dataclass whose fields are made with `codrl_mj.fields`.
 
     A family has a name, says its states and signals as `NamedTuple`s of floats, and defines `advance`. The other
@@ -132,7 +132,7 @@ class ActuatorModel:
 
     def __post_init__(self) -> None:
         """Validate."""
-        fields.check(self)
+        super().__post_init__()
         for name, kind in fields.parts(type(self)).items():
             given = getattr(self, name)
             if not isinstance(given, kind) and given is not getattr(type(self), name):  # None, or the default

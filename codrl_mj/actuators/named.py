@@ -15,19 +15,17 @@ from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.model import FAMILIES, ActuatorModel, Family, check_family, family_name
 from codrl_mj.own_code import look_up
 
-
-def _with_loop(paper: Actuator, **gains: float) -> Actuator:
-    return dataclasses.replace(paper, controller=CurrentLoop(**gains))  # type: ignore[arg-type]
-
-
 NAMED: dict[str, tuple[str, Callable[[Actuator], ActuatorModel]]] = {
     "ideal": ("force = desired force: no motor at all", lambda _: IDEAL),
     "paper": ("the paper's motor and gains for the task", lambda paper: paper),
     "weak": (
         "the paper's motor under a weak loop: kp = ki = 1",
-        lambda paper: _with_loop(paper, kp=1.0, ki=1.0),
+        lambda paper: dataclasses.replace(paper, controller=CurrentLoop(kp=1.0, ki=1.0)),
     ),
-    "weaker": ("a weaker loop: kp = ki = 0.2", lambda paper: _with_loop(paper, kp=0.2, ki=0.2)),
+    "weaker": (
+        "a weaker loop: kp = ki = 0.2",
+        lambda paper: dataclasses.replace(paper, controller=CurrentLoop(kp=0.2, ki=0.2)),
+    ),
     "open_loop": (
         "no feedback, u = R*i_ref + kE*omega, and a slow winding: L = 0.5 H",
         lambda paper: Actuator(

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 from collections import namedtuple
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -88,12 +89,8 @@ def is_arm(path: str) -> bool:
 @functools.cache
 def field_paths(cls: type) -> tuple[str, ...]:
     """Dotted paths of all fields of a family, those of its parts too."""
-    nested = fields.parts(cls)
-    inner = (
-        [f"{f.name}.{path}" for path in field_paths(nested[f.name])] if f.name in nested else [f.name]
-        for f in dataclasses.fields(cls)
-    )
-    return tuple(path for paths in inner for path in paths)
+    inner = ([f"{name}.{path}" for path in field_paths(part)] if part else [name] for name, part in _outline(cls))
+    return tuple(itertools.chain.from_iterable(inner))
 
 
 @functools.cache

@@ -18,6 +18,7 @@ quadratic in E and l is then what p*E^2 + q*E*l + r*l^2 loses in a sample, for s
 """
 
 import math
+from typing import Any
 
 
 def designed_gains(resistance: float, inductance: float, sample_time: float, bandwidth: float) -> tuple[float, float]:
@@ -102,44 +103,40 @@ def until(bound: float, start: float, rate: float, most: int) -> int:
 
 
 def run_samples(
+    parameters: Any,
     current: float,
     integral: float,
     pending: float,
     reference: float,
     back_emf: float,
     compensated: float,
-    voltage: float,
-    sag: float,
-    deadband: float,
     samples: int,
     resistance: float,
     decay: float,
     lasting: float,
     kp: float,
     ki: float,
-    anti_windup: float,
-    delayed: float,
 ) -> tuple[float, float, float, float, float, int]:
     """Any PI loop, sample by sample: i [A], the integral [V], the pending voltage, and then what `jump` finds.
 
-    `ki` is the integral gain per sample [V/A], `compensated` the part of the back-EMF [V] that is added to the voltage,
-    `sag` the supply's resistance [ohm], `deadband` what the bridge loses [V], `decay` e, and `lasting` m. A `delayed`
-    loop applies the voltage of the sample before, `pending`. `anti_windup` is 0 for back-calculation with the tracking
-    time kp/ki, 1 for clamping, 2 for none.
+    Its `parameters` are a `Drive`'s, but for the gains: `ki` is the integral gain per sample [V/A]. `compensated` is
+    the part of the back-EMF [V] that is added to the voltage, `decay` e, and `lasting` m. A delayed loop applies the
+    voltage of the sample before, `pending`. Back-calculation has the tracking time kp/ki.
     """
     total, drawn, saturated, gain = 0.0, 0.0, 0, kp + ki
     tracking = ki / gain if gain > 0.0 else 0.0
+    voltage, sag, deadband = parameters.supply_voltage, parameters.supply_resistance, parameters.deadband
     for _ in range(samples):
         limit = max(voltage - sag * abs(current), 0.0) if sag > 0.0 else voltage
         error = reference - current
         asked = gain * error + integral + compensated
         applied = min(max(asked, -limit), limit)
-        if anti_windup == 0.0:
+        if parameters.anti_windup == 0.0:  # back-calculation
             integral += ki * error + tracking * (applied - asked)
-        elif anti_windup == 2.0 or applied == asked or (asked - applied) * error < 0.0:
+        elif parameters.anti_windup == 2.0 or applied == asked or (asked - applied) * error < 0.0:
             integral += ki * error
         saturated += applied != asked
-        if delayed != 0.0:
+        if parameters.delayed != 0.0:
             applied, pending = min(max(pending, -limit), limit), applied
         if deadband > 0.0:
             applied = math.copysign(max(abs(applied) - deadband, 0.0), applied)

@@ -3,14 +3,14 @@
 import dataclasses
 import math
 
-from codrl_mj.fields import check, choice, flag, real
+from codrl_mj.fields import Checked, choice, flag, real
 
 DEFAULT_BANDWIDTH = 0.349 / (2 * math.pi)
 """Bandwidth of the loop over its sample rate: 60 degrees of phase margin with one and a half samples of delay."""
 
 
 @dataclasses.dataclass(frozen=True)
-class SampledLoop:
+class SampledLoop(Checked):
     """The PI current loop of a drive, at a sample rate of its own.
 
     Raises:
@@ -40,7 +40,7 @@ class SampledLoop:
 
     def __post_init__(self) -> None:
         """Validate."""
-        check(self)
+        super().__post_init__()
         most = self.sample_rate / (2 * math.pi)
         if self.bandwidth > most:
             raise ValueError(

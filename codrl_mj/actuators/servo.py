@@ -14,12 +14,12 @@ import numpy as np
 from codrl_mj.actuators import drive, shaft, stability
 from codrl_mj.actuators.drive import ARM, Drive
 from codrl_mj.actuators.model import Command, Inputs, UnstableError
-from codrl_mj.actuators.shaft import Heat, Means, Shaft
-from codrl_mj.fields import check, choice, real
+from codrl_mj.actuators.shaft import Means, Shaft
+from codrl_mj.fields import Checked, choice, real
 
 
 @dataclasses.dataclass(frozen=True)
-class ServoLoop:
+class ServoLoop(Checked):
     """The outer loops of a servo, all as seen at the output shaft: at a hinge's joint, or the wheel that moves a slide.
 
     Raises:
@@ -52,7 +52,7 @@ class ServoLoop:
 
     def __post_init__(self) -> None:
         """Validate."""
-        check(self)
+        super().__post_init__()
         unused = "inertia_feed_forward" if self.controls == "position" else "velocity_feed_forward"
         if getattr(self, unused) != 0.0:
             raise ValueError(
@@ -146,14 +146,14 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
     at_volts, at_amperes, too_warm = 0.0, 0.0, 0.0
     for _ in range(count):
         if waiting <= 0.0:
-            asked, after = demand(parameters, period * every, target, rate, position, speed, integral)
+            asked, grown = demand(parameters, period * every, target, rate, position, speed, integral)
             waiting = float(every)
         else:
-            after = integral
+            grown = integral
         wanted = min(max(asked, -most), most) / constant
         given = drive.limited(parameters, timestep, heat, resistance, wanted)
-        if given == asked / constant or (after - integral) * asked < 0.0:
-            integral = after  # it does not wind up
+        if given == asked / constant or (grown - integral) * asked < 0.0:
+            integral = grown  # it does not wind up
         if given != wanted and abs(given) < parameters.max_current:
             too_warm = 1.0
         elif given != asked / constant:
@@ -166,27 +166,12 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
         torque += means.torque / count
         power, loss = power + means.power / count, loss + means.heat / count
     mean = Means(amperes, volts, torque, at_volts, power, loss)
-    followed = drive.end(parameters, timestep, inputs.time, heat, resistance, winding, moving, mean)
-    temperature = shaft.temperature_of(parameters, Heat(followed.winding_rise, followed.housing_rise))
+    after, temperature = drive.end(parameters, timestep, inputs.time, heat, resistance, winding, moving, mean)
     error = (target - (inputs.position if parameters.controls == 0.0 else inputs.speed)) / parameters.gear_ratio
     at_volts = 1.0 if at_volts > 0.0 else 0.0
-    after_step = State(
-        followed.current,
-        followed.integral,
-        followed.pending,
-        followed.winding_rise,
-        followed.housing_rise,
-        followed.acceleration,
-        followed.speed,
-        followed.others,
-        followed.due,
-        integral,
-        target,
-        asked,
-        waiting - 1.0,
-    )
     limits = max(at_volts, at_amperes, too_warm), at_volts, at_amperes, too_warm
-    return after_step, torque, Signals(amperes, given, volts, temperature, error, *limits, power, loss)
+    signals = Signals(amperes, given, volts, temperature, error, *limits, power, loss)
+    return State(*after, integral, target, asked, waiting - 1.0), torque, signals
 
 
 @dataclasses.dataclass(frozen=True)

@@ -172,23 +172,19 @@ def run_over(
         elif designed:
             kp, ki = sampled.designed_gains(resistance, parameters.inductance, sample_time, y * parameters.sample_rate)
         current, integral, pending, total, drawn, saturated = sampled.run_samples(
+            parameters,
             winding.current,
             winding.integral if closed else 0.0,
             winding.pending,
             asked,
             back_emf,
             compensated,
-            voltage,
-            parameters.supply_resistance,
-            parameters.deadband,
             samples,
             resistance,
             1.0 - lost,
             lost / x,
             kp,
             ki,
-            parameters.anti_windup,
-            parameters.delayed,
         )
         after = Winding(current, integral, pending)
     change = (after.current - winding.current) / lost

@@ -6,11 +6,11 @@ from typing import Any, ClassVar
 
 from gymnasium import spaces
 
-from codrl_mj.fields import check, factors
+from codrl_mj.fields import Checked, factors
 
 
 @dataclasses.dataclass(frozen=True)
-class AgentConfig:
+class AgentConfig(Checked):
     """Settings of an agent, and how to make it from them. Subclasses add the fields.
 
     Raises:
@@ -28,7 +28,7 @@ class AgentConfig:
             value = getattr(self, field.name)
             if isinstance(value, list):
                 object.__setattr__(self, field.name, tuple(value))
-        check(self)
+        super().__post_init__()
 
     def make_model(self, env: Any, seed: int) -> Any:
         """The agent, ready to learn.

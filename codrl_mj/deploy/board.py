@@ -16,7 +16,7 @@ from codrl_mj.deploy.contract import Contract
 from codrl_mj.deploy.wire import BEYOND, REFUSED, Wire
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import Episode, run_episodes
-from codrl_mj.fields import check, check_names, integer, real
+from codrl_mj.fields import Checked, check_names, integer, real
 
 SOURCES = ("controller.c", "wire.c", "board.c")
 _STRICT = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-Wconversion"]
@@ -66,7 +66,7 @@ class OnnxPolicy:
 
 
 @dataclasses.dataclass(frozen=True)
-class Link:
+class Link(Checked):
     """What stands between a board and what it controls; nothing unless something is said.
 
     Raises:
@@ -86,10 +86,6 @@ class Link:
     """Bits of the converter that measures the current, over the drive's range both ways. 0: exact."""
     pwm_bits: int = integer(0, least=0)
     """Bits of the bridge's voltages, over the supply both ways. 0: exact."""
-
-    def __post_init__(self) -> None:
-        """Validate."""
-        check(self)
 
     def encoded(self, contract: Contract, observation: np.ndarray) -> np.ndarray:
         """An observation (k,) as encoders with so many counts say it."""

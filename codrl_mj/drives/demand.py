@@ -161,17 +161,18 @@ def _gathered(source: str, env: Any, ran: Sequence[Any]) -> dict[str, Demand]:
         driven = list(motors(model)) or [
             model.actuator(name).id for name in made.get_wrapper_attr("recorder").motor_names
         ]
+    speeds, forces = ([np.column_stack([one.trace[name]]) for one in ran] for name in ("speed", "actual_force"))
     found = {}
     for number, index in enumerate(driven):
         name = ran[0].motors[number] if ran[0].motors else ""
-        before = [np.append(one.first_speeds[number], _of_motor(one.trace["speed"], number)) for one in ran]
+        before = [np.append(one.first_speeds[number], each[:, number]) for one, each in zip(ran, speeds, strict=True)]
         kind, joint = mujoco.mjtTrn(model.actuator_trntype[index]), model.actuator_trnid[index, 0]
         sliding = kind in ON_JOINT and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
         gear = abs(float(model.actuator_gear[model.actuator_outadr[index], 0])) or 1.0
         found[name] = Demand(
             source=f"{source}: {name}" if name else source,
             duration=np.full(sum(len(one) - 1 for one in before), ran[0].timestep),
-            torque=gear * np.concatenate([_of_motor(one.trace["actual_force"], number) for one in ran]),
+            torque=gear * np.concatenate([force[:, number] for force in forces]),
             speed=np.concatenate([one[:-1] for one in before]) / gear,
             acceleration=np.concatenate([np.diff(one) / ran[0].timestep for one in before]) / gear,
             episodes=len(ran),
@@ -180,7 +181,3 @@ def _gathered(source: str, env: Any, ran: Sequence[Any]) -> dict[str, Demand]:
             model_gear=gear,
         )
     return found
-
-
-def _of_motor(values: np.ndarray, number: int) -> np.ndarray:
-    return values[:, number] if values.ndim > 1 else values

@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from codrl_mj.actuators import Drive
-from codrl_mj.fields import check, check_names, real
+from codrl_mj.fields import Checked, check_names, real
 from codrl_mj.identify.estimate import Model, refit
 from codrl_mj.identify.log import Log, Segment
 from codrl_mj.identify.models import ShaftModel, WindingModel
@@ -39,7 +39,7 @@ _PHASE = 0.37  # of a row, by which the rows miss the excitation's clock
 
 
 @dataclasses.dataclass(frozen=True)
-class Sensing:
+class Sensing(Checked):
     """What is measured, how well."""
 
     current_noise: float = real(0.01, above=0.0, unit="")
@@ -52,7 +52,7 @@ class Sensing:
 
     def __post_init__(self) -> None:
         """Validate."""
-        check(self)
+        super().__post_init__()
         check_names([self.voltage], ("together", "instantaneous", "mean"), "voltage")
 
 

@@ -36,11 +36,12 @@ class Cells(NamedTuple):
         """A column as numbers, NaN where it is empty."""
         found = np.empty(len(self.columns[name]))
         for place, one in enumerate(self.columns[name]):
+            if isinstance(one, int | float):
+                found[place] = one
+                continue
             text = "" if one is None else str(one).strip()
             try:
-                if isinstance(one, int | float):
-                    found[place] = one
-                elif text.lower() in _WORDS:
+                if text.lower() in _WORDS:
                     found[place] = _WORDS[text.lower()]
                 elif STAMP.match(text):
                     day = "" if "-" in text[:5] else "1970-01-01T"

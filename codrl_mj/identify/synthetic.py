@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 
 from codrl_mj.actuators import Drive
-from codrl_mj.fields import check, check_names, real
+from codrl_mj.fields import Checked, check_names, real
 from codrl_mj.identify.columns import KINDS
 from codrl_mj.identify.log import Log
 from codrl_mj.runs.files import writing
 
 
 @dataclasses.dataclass(frozen=True)
-class Excitation:
+class Excitation(Checked):
     """A voltage over time."""
 
     kind: str = "prbs"
@@ -38,7 +38,7 @@ class Excitation:
 
     def __post_init__(self) -> None:
         """Validate."""
-        check(self)
+        super().__post_init__()
         check_names([self.kind], EXCITATIONS, "excitation")
 
     @property
@@ -79,7 +79,7 @@ EXCITATIONS: dict[str, Callable[[Excitation, np.ndarray], np.ndarray]] = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Load:
+class Load(Checked):
     """What the output shaft moves."""
 
     inertia: float = real(0.0, least=0.0, unit="kg*m^2")
@@ -91,17 +91,13 @@ class Load:
     locked: bool = False
     """Whether the shaft is held."""
 
-    def __post_init__(self) -> None:
-        """Validate."""
-        check(self)
-
 
 FREE = Load()  # nothing but the rotor
 SEEN = "current", "position", "velocity", "torque", "bus", "voltage", "duty"  # what a simulated log has
 
 
 @dataclasses.dataclass(frozen=True)
-class Sensor:
+class Sensor(Checked):
     """How a signal is read: value -> gain * value(time - delay) + bias + noise, then rounded."""
 
     noise: float = real(0.0, least=0.0, unit="")
@@ -117,10 +113,6 @@ class Sensor:
     outliers: float = real(0.0, least=0.0, most=1.0)
     """Share of values, in [0, 1], that are off by 3 to 10 of the signal's standard deviations."""
 
-    def __post_init__(self) -> None:
-        """Validate."""
-        check(self)
-
     def seen(self, values: np.ndarray, random: np.random.Generator) -> np.ndarray:
         """What is read of values, shape (n,), that are as old as they are."""
         seen = self.gain * values + self.bias + self.noise * random.standard_normal(len(values))
@@ -131,7 +123,7 @@ class Sensor:
 
 
 @dataclasses.dataclass(frozen=True)
-class Sampler:
+class Sampler(Checked):
     """When rows are written."""
 
     rate: float = real(5000.0, above=0.0, unit="Hz")
@@ -142,10 +134,6 @@ class Sampler:
     """Share of rows that are lost, in [0, 0.9]."""
     mean_voltage: bool = False
     """Whether the voltage is the mean from a row to the next, and not what it is at the row."""
-
-    def __post_init__(self) -> None:
-        """Validate."""
-        check(self)
 
 
 def run(drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, position: float = 0.0) -> Log:

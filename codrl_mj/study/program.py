@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from codrl_mj.fields import check, integer
+from codrl_mj.fields import Checked, integer
 from codrl_mj.runs.files import check_writable
 from codrl_mj.study.parallel import Workers
 from codrl_mj.study.trials import Grid, numbers_as_text
@@ -20,7 +20,7 @@ from codrl_mj.training import TrainingStoppedError
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Program(abc.ABC):
+class Program(Checked, abc.ABC):
     """A script that trains and tests much, unless that is done already, and writes a page of it.
 
     Raises:
@@ -45,10 +45,6 @@ class Program(abc.ABC):
     """Only list the trainings, which of them are finished, and what the rest would take."""
     only_page: bool = False
     """Only write the page, of what there is."""
-
-    def __post_init__(self) -> None:
-        """Validate."""
-        check(self)
 
     @property
     @abc.abstractmethod

@@ -39,7 +39,7 @@ INTEGRATORS = {
 
 
 @dataclass(frozen=True)
-class Task:
+class Task(fields.Checked):
     """One task, defined once; every face (single, batched, analytic, dm_control) is built from it.
 
     A function of a state takes the state's entries, in Gymnasium's own order: `state[0]`, `state[1]` and so on, each a
@@ -140,7 +140,7 @@ class Task:
 
     def __post_init__(self) -> None:
         """Validate, and fill in what follows from the rest."""
-        fields.check(self)
+        super().__post_init__()
         check_fields(self)
         fields.check_names(self.integrators, INTEGRATORS, "integrator", every=True)
         asset_path(self.asset)

@@ -11,14 +11,14 @@ from codrl_mj.agents import AgentConfig, agent_from_mapping, check_fits
 from codrl_mj.agents.ppo import PPOConfig
 from codrl_mj.agents.presets import ELSEWHERE, find_preset
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.fields import check, check_names, integer
+from codrl_mj.fields import Checked, check_names, integer
 
 EVALUATION_SEED = 1_000_000
 """Seed of the first episode in which a trained policy is evaluated, away from those that trainings start from."""
 
 
 @dataclasses.dataclass(frozen=True)
-class TrainConfig:
+class TrainConfig(Checked):
     """What to train, on what, for how long.
 
     Raises:
@@ -50,7 +50,7 @@ class TrainConfig:
             if not isinstance(getattr(self, name), kind):
                 raise ValueError(f"TrainConfig.{name} = {getattr(self, name)!r}: must be a {kind.__name__}")
         check_fits(self.agent.known_as(), self.env)
-        check(self)
+        super().__post_init__()
         if self.total_steps is None and self.total_episodes is None:
             raise ValueError("TrainConfig.total_steps = None: must be an integer >= 1, or total_episodes must be one")
         if self.total_steps is None and self.env.time_limit is None:

@@ -13,7 +13,7 @@ import numpy as np
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.evaluation.measures import Interval, Quartiles, bootstrap_mean, quartiles
-from codrl_mj.fields import check, integer
+from codrl_mj.fields import Checked, integer
 from codrl_mj.tasks import TASKS
 
 TASK = "mountain_car_continuous"
@@ -22,7 +22,7 @@ DISCOUNTS = (0.85, 0.9, 0.95, 0.99, 0.999)
 
 
 @dataclasses.dataclass(frozen=True)
-class Mesh:
+class Mesh(Checked):
     """Where values are computed; between its points they are interpolated."""
 
     positions: int = integer(121, least=2)
@@ -38,7 +38,7 @@ class Mesh:
         Raises:
             ValueError: a number is out of bounds.
         """
-        check(self)
+        super().__post_init__()
         if self.forces % 2 == 0:
             raise ValueError(f"Mesh.forces = {self.forces}: must be an odd number")
 

@@ -149,6 +149,7 @@ def test_the_closed_form_is_the_stepping(name, rate, bandwidth, samples, command
     resistance, inductance, _, voltage = WINDINGS[name]
     x = resistance / rate / inductance
     kp, ki = designed_gains(resistance, inductance, 1 / rate, bandwidth * rate)
+    parameters = parameters_type(Drive)(*drive(name, rate).numbers)
     current, integral, stepped, volts = 0.0, 0.0, 0.0, 0.0
     for reference, back_emf in commands:
         reference, back_emf = ((2 * one - 1) * amplitude * voltage for one in (reference, 0.4 * back_emf))
@@ -157,9 +158,9 @@ def test_the_closed_form_is_the_stepping(name, rate, bandwidth, samples, command
         current, integral, total, drawn, _ = jump(
             current, integral, reference, *limits, samples, x, bandwidth, -math.expm1(-x)
         )
-        winding = (voltage, 0.0, 0.0, samples, resistance, math.exp(-x), -math.expm1(-x) / x)
+        winding = (samples, resistance, math.exp(-x), -math.expm1(-x) / x)
         stepped, volts, _, expected, expected_drawn, _ = run_samples(
-            stepped, volts, 0.0, reference, back_emf, back_emf, *winding, kp, ki, 0.0, 0.0
+            parameters, stepped, volts, 0.0, reference, back_emf, back_emf, *winding, kp, ki
         )
         unit = voltage / resistance * max(1.0, amplitude)
         assert abs(current - stepped) <= 1e-13 * unit
