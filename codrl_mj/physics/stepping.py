@@ -96,10 +96,8 @@ def _stepping(
 ) -> Stepping:
     engine_step, engine_reset = engine_function("mj_step"), engine_function("mj_resetData")
     size, moving = len(positions) + len(velocities), len(positions)
-    bounded = keep is not None
     first, count = signals_at(family), len(family.Signals._fields)
-    seeing = bool(family.OBSERVED)
-    observe: Any = compiled_observe(family) if seeing else None
+    observe = compiled_observe(family) if family.OBSERVED else None
 
     @njit(nogil=True, error_model="numpy")
     def step(force: Any, model: int, data: int, settings: np.ndarray, memory: np.ndarray, trace: np.ndarray) -> bool:
@@ -122,7 +120,7 @@ def _stepping(
             if explicit:
                 for entry in range(moving):
                     qpos[entry] = state[entry]
-            if bounded:
+            if keep is not None:
                 keep(qpos, qvel, state, timestep)
             for actuator in range(len(settings)):
                 wiring = row_as(settings[actuator], Wiring)
@@ -166,7 +164,7 @@ def _stepping(
 
     @njit(nogil=True, error_model="numpy")
     def observed(row: np.ndarray, seen: np.ndarray, model: int, data: int, settings: np.ndarray) -> None:
-        if seeing:
+        if observe is not None:
             for actuator in range(len(settings)):
                 wiring = row_as(settings[actuator], Wiring)
                 observe(
