@@ -111,5 +111,5 @@ def load_inertia() -> Any:
 
 
 def shaft_inertia(model: mujoco.MjModel, data: mujoco.MjData, output: int, gear: float) -> float:
-    """What `inertia` finds of a simulation whose `mj_fwdPosition` has run."""
+    """What `seen_from` finds of a simulation whose `mj_fwdPosition` has run."""
     return float(load_inertia().ctypes(model._address, data._address, output, gear))

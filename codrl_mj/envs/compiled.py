@@ -131,16 +131,6 @@ def compiled_kernels(setup: Setup, physics: Any) -> Kernels:
     return _kernels(physics.stepping, compiled_outcomes(task), task.initial_state, size, single, sensors)
 
 
-@internal
-def _only(delivered: np.ndarray) -> float:
-    return delivered[0]
-
-
-@internal
-def _each(delivered: np.ndarray) -> np.ndarray:
-    return delivered
-
-
 @functools.cache
 def _kernels(
     stepping: Stepping,
@@ -154,7 +144,6 @@ def _kernels(
     observe, rewarded, ended = outcomes.observe, outcomes.reward, outcomes.terminated
     compiled = njit(nogil=True, error_model="numpy")
     initial_entries = internal(initial_state)
-    delivered = _only if single else _each
 
     @internal
     def look(
@@ -186,7 +175,10 @@ def _kernels(
         fine = advance(force, model, data, settings, memory, trace)
         last = trace[len(trace) - 1]
         look(last, observation, after, model, data, settings)
-        reward = rewarded(before, delivered(last[:, 1]), after, interface[OPTIONS:])
+        if single:  # decided where it is compiled: one is a number, several are an array
+            reward = rewarded(before, last[0, 1], after, interface[OPTIONS:])
+        else:
+            reward = rewarded(before, last[:, 1], after, interface[OPTIONS:])
         return reward, ended(after), fine
 
     @compiled

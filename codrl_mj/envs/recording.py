@@ -25,9 +25,7 @@ class StepWatch:
         self._moments = np.empty((model.nout, model.nv))
         self.step_duration = float(model.opt.timestep)
         """Environment step [s], known once a step was taken."""
-        names = motors.readout.names
-        self.signal_names = (*(name for name in names if name != "saturated"), "saturated")
-        self.trace_names = (*names, "speed")
+        self.signal_names, self.trace_names = tuple(motors.signals()), (*motors.readout.names, "speed")
         self.command, self.motor_names = command, motors.names
 
     @property

@@ -59,13 +59,13 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
         super().__init__(makers, autoreset_mode=AutoresetMode.SAME_STEP)
         self.max_episode_steps = max_episode_steps
         self.signals: Signals | None = None  # of the last step, each an array of shape (N,) or (N, motors)
-        self._signal_names = self._of_each("signal_names")[0]
-        self.arm_radii = np.array([one.arm_radius for one in self._of_each("motors")[0].values()])
+        self._signal_names = self.get_attr("signal_names")[0]
+        self.arm_radii = np.array([one.arm_radius for one in self.get_attr("motors")[0].values()])
 
     @property
     def task(self) -> Any:
         """The task of the first environment."""
-        return self._of_each("task")[0]
+        return self.get_attr("task")[0]
 
     @property
     def randomization(self) -> dict[str, Array]:
@@ -74,17 +74,13 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
         Also how many sets were `rejected`; empty if nothing is drawn.
         """
         drawn = []
-        for one in self._of_each("randomization"):
+        for one in self.get_attr("randomization"):
             nested = {name: each if isinstance(each, Mapping) else {"": each} for name, each in one.items()}
             drawn.append(
                 {f"{of}:{name}".rstrip(":"): value for of, each in nested.items() for name, value in each.items()}
             )
         kinds = {name: np.int64 if name == "rejected" else np.float64 for name in drawn[0]}
         return {name: np.array([one[name] for one in drawn], kind) for name, kind in kinds.items()}
-
-    def _of_each(self, name: str) -> list[Any]:
-        """An attribute of every environment, wherever among its wrappers that is."""
-        return [env.get_wrapper_attr(name) for env in self.envs]
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Advance every environment by one step; those whose episode ends start another at once."""
@@ -105,7 +101,7 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
 
     def snapshot(self) -> dict[str, Array]:
         """Everything that the future depends on, as plain arrays: the environments' own, and their bookkeeping."""
-        each = [snapshot() for snapshot in self._of_each("snapshot")]
+        each = self.call("snapshot")
         return {
             **{name: np.stack([one[name] for one in each]) for name in each[0]},
             "elapsed": np.stack([elapsed_steps(env) for env in self.envs]),
@@ -124,8 +120,8 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
         check_snapshot(snapshot, self.snapshot())
         own = {name: values for name, values in snapshot.items() if name not in ("elapsed", "observations")}
         begun = [
-            restore({name: values[row] for name, values in own.items()})
-            for row, restore in enumerate(self._of_each("restore"))
+            env.get_wrapper_attr("restore")({name: values[row] for name, values in own.items()})
+            for row, env in enumerate(self.envs)
         ]
         self.signals = None  # of a step that was not this one's past
         if begun[0] is not None:

@@ -272,10 +272,6 @@ def _own_actions(world: World, options: str) -> "spaces.Space[Any]":
         return env.action_space
 
 
-def _kinds() -> list[Any]:
-    return [importlib.import_module(kind) for kind in _KINDS]
-
-
 def patterns_of(given: Any) -> Mapping[str, Any] | None:
     """What a user wrote for actuators, if it is a mapping of patterns to them; None if it is one for all."""
     if not isinstance(given, Mapping) or {"family", "name"} & given.keys():
@@ -298,18 +294,18 @@ def is_world(word: str) -> bool:
     """
     if word in TASKS or re.fullmatch(r"[\w.]+:[\w.]+", word) is not None:
         return True
-    return any(kind.claims(word) for kind in _kinds()) and not Path(word).is_dir()
+    return any(kind.claims(word) for kind in map(importlib.import_module, _KINDS)) and not Path(word).is_dir()
 
 
 def find_world(name: Any) -> World:
     """The world called `name`: a task's name, an environment's id, or `module:NAME` of a world or a task."""
     if isinstance(name, str):
-        for kind in _kinds():
+        for kind in map(importlib.import_module, _KINDS):
             if kind.claims(name):
                 return kind.find(name)
         if ":" in name:
             return world_of(load_object(name))
-    return _kinds()[0].find(name)  # says what there is
+    return importlib.import_module(_KINDS[0]).find(name)  # says what there is
 
 
 @functools.singledispatch

@@ -19,7 +19,7 @@ from codrl_mj.disturbances import OFF
 from codrl_mj.engine.doors import user_of
 from codrl_mj.engine.families import HEAD, Slot, compiled_observe, load_family, signals_at
 from codrl_mj.engine.layout import DATA, MODEL, engine_function
-from codrl_mj.engine.memory import internal, on_stack, row_as
+from codrl_mj.engine.memory import on_stack, row_as
 from codrl_mj.kept import njit
 from codrl_mj.physics.base import Plant
 from codrl_mj.physics.compiled_task import Compiled, compiled_constrain, compiled_reader, is_fine
@@ -96,10 +96,8 @@ def _stepping(
 ) -> Stepping:
     engine_step, engine_reset = engine_function("mj_step"), engine_function("mj_resetData")
     size, moving = len(positions) + len(velocities), len(positions)
-    bounded, constrain = keep is not None, keep or _nothing
     first, count = signals_at(family), len(family.Signals._fields)
-    seeing = bool(family.OBSERVED)
-    observe = compiled_observe(family) if seeing else _nothing
+    observe = compiled_observe(family) if family.OBSERVED else None
 
     @njit(nogil=True, error_model="numpy")
     def step(force: Any, model: int, data: int, settings: np.ndarray, memory: np.ndarray, trace: np.ndarray) -> bool:
@@ -122,8 +120,8 @@ def _stepping(
             if explicit:
                 for entry in range(moving):
                     qpos[entry] = state[entry]
-            if bounded:
-                constrain(qpos, qvel, state, timestep)
+            if keep is not None:
+                keep(qpos, qvel, state, timestep)
             for actuator in range(len(settings)):
                 wiring = row_as(settings[actuator], Wiring)
                 row = trace[inner, actuator]
@@ -166,7 +164,7 @@ def _stepping(
 
     @njit(nogil=True, error_model="numpy")
     def observed(row: np.ndarray, seen: np.ndarray, model: int, data: int, settings: np.ndarray) -> None:
-        if seeing:
+        if observe is not None:
             for actuator in range(len(settings)):
                 wiring = row_as(settings[actuator], Wiring)
                 observe(
@@ -179,8 +177,3 @@ def _stepping(
                 )
 
     return Stepping(step, start, read, observed)
-
-
-@internal
-def _nothing(*arguments: Any) -> float:  # noqa: ARG001 - in the place of another
-    return 0.0

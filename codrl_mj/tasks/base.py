@@ -226,7 +226,7 @@ class Task(fields.Checked):
         ):
             same = [k for k, one in enumerate(states) if np.array_equal(entry, one)]
             plain = "1" if (least, most) == (-1.0, 1.0) else None
-            units.append(_unit(self.state_names[same[0]]) or None if same else plain)
+            units.append(self.state_names[same[0]].partition("[")[2].rstrip("]") or None if same else plain)
         return tuple(units)
 
     def bounds(self, options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
@@ -252,11 +252,6 @@ class Task(fields.Checked):
         for column, entry in zip(states.T, self.initial_state(draws.T), strict=True):
             column[:] = entry
         return states
-
-
-def _unit(name: str) -> str:
-    """The unit that a name such as `x_dot [m/s]` ends in; an empty text where it has none."""
-    return name.partition("[")[2].rstrip("]")
 
 
 class _Asked(UserDict[str, Any]):
