@@ -180,7 +180,7 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
     success = None
     if any(world.at_goal(episode) is not None for episode in episodes):
         success = wilson_rate(len(reached), len(episodes))
-    driven = [_driven(episode) for episode in episodes]
+    driven = [driven_in(episode) for episode in episodes]
     each_motor = (_measures(episodes, [[each[place]] for each in driven]) for place, _ in enumerate(episodes[0].motors))
     return Evaluation(
         task=world.name,
@@ -214,7 +214,7 @@ def _time_to_goal(world: World, episode: Episode) -> float | None:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Driven:
+class Driven:
     """What one motor did in an episode, at its shaft."""
 
     actuator: ActuatorModel
@@ -247,7 +247,7 @@ class _Driven:
         return np.append(0.0, self.signals["current"])
 
 
-def _driven(episode: Episode) -> list[_Driven]:
+def driven_in(episode: Episode) -> list[Driven]:
     """What each motor did."""
     several = isinstance(episode.actuator, tuple)
     made = []
@@ -257,7 +257,7 @@ def _driven(episode: Episode) -> list[_Driven]:
         arm, force, speed = actuator.arm_radius, own.pop("actual_force"), own.pop("speed")
         shown = {name: own[name] for name in actuator.Signals._fields if name in own}  # others are of other families
         made.append(
-            _Driven(
+            Driven(
                 actuator,
                 episode.timestep,
                 arm * np.repeat(asked, episode.inner_steps),
@@ -270,7 +270,7 @@ def _driven(episode: Episode) -> list[_Driven]:
     return made
 
 
-def _measures(episodes: Sequence[Episode], driven: Sequence[Sequence[_Driven]]) -> dict[str, Any]:
+def _measures(episodes: Sequence[Episode], driven: Sequence[Sequence[Driven]]) -> dict[str, Any]:
     """What motors were asked for and did, of each episode the same ones, on the mean of them.
 
     How well the torque follows the desired one, which is held over an environment step; what the delivered one does to
@@ -304,7 +304,7 @@ def _root_mean_square(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _electrical(episodes: Sequence[Episode], driven: Sequence[Sequence[_Driven]]) -> dict[str, Any]:
+def _electrical(episodes: Sequence[Episode], driven: Sequence[Sequence[Driven]]) -> dict[str, Any]:
     """What was asked of the actuators: of any but the ideal one, and of windings, as far as the family shows it."""
     each = (f"{limit}_saturated" for limit in ("voltage", "current", "temperature"))
     limits = {f"{name}_percent": name for name in ("saturated", *each)}
@@ -338,7 +338,7 @@ def _electrical(episodes: Sequence[Episode], driven: Sequence[Sequence[_Driven]]
     }
 
 
-def _energies(one: _Driven) -> tuple[float, float, float, float, float]:
+def _energies(one: Driven) -> tuple[float, float, float, float, float]:
     """Energy [J] drawn, returned, lost in the winding and left in it; the integral of the squared current [A^2*s]."""
     assert one.actuator.winding is not None
     resistance, inductance = one.actuator.winding

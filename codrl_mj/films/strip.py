@@ -18,16 +18,6 @@ _LIMITS = {"voltage_saturated": SATURATED, "current_saturated": "#E69F00", "temp
 """Signals of families with several limits, and their colours."""
 
 
-def of_motor(episode: Episode, motor: int) -> Episode:
-    """An episode as that of one of its motors alone: its actuator, its columns of signals and trace."""
-    signals, trace = (
-        {name: values if values.ndim == 1 else values[:, motor] for name, values in table.items()}
-        for table in (episode.signals, episode.trace)
-    )
-    actuator = episode.actuator[motor] if isinstance(episode.actuator, tuple) else episode.actuator
-    return dataclasses.replace(episode, signals=signals, trace=trace, actuator=actuator)
-
-
 def draw_text(text: str, width: int, height: int, colour: str = "#22313F") -> np.ndarray:
     """One line of bold text, centred: an image, shape (height, width, 3), uint8."""
     figure = _figure(width, height)
@@ -48,7 +38,8 @@ def draw_strip(
     length = round(scale * end)
     content = _figure(length + MARGIN, body)
     if isinstance(episode.actuator, tuple):
-        episode = of_motor(episode, motor)
+        own = {name: values[:, motor] for name, values in episode.signals.items()}
+        episode = dataclasses.replace(episode, signals=own, actuator=episode.actuator[motor])
     actuator, lines = episode.actuator, []
     for bottom, height, plot, label in (
         (TIME_HEIGHT + VOLTAGE_HEIGHT + GAP, TORQUE_HEIGHT, _plot_torque, torque_label(task, actuator, motor)),

@@ -79,7 +79,7 @@ def episode_diagram(lines: Sequence[Any]) -> Plot | None:
         return None
     for line in own:
         ratio = line.actuator.motor.gear_ratio if isinstance(line.actuator, Drive) else 1.0
-        speed, torque = line.speed / ratio, line.actual * ratio
+        speed, torque = line.turning / ratio, line.actual * ratio
         free = no_load_speed(line.actuator)
         width = max(1.15 * free if np.isfinite(free) else 0.0, 1.1 * float(np.abs(speed).max()), 1e-6)
         most = max(float(np.abs(torque).max()), float(np.abs(line.desired).max()) * ratio, 1e-9)
@@ -91,7 +91,7 @@ def episode_diagram(lines: Sequence[Any]) -> Plot | None:
             labels = f"{line.before}lowest possible", f"{line.before}highest possible"
             curves += envelope(labels, grid, ends, colour=0, dashed=True, **belongs)
         kept = slice(None, None, max(line.stride, len(speed) // 3000, 1))
-        times = line.episode.timestep * np.arange(len(speed))[kept]
+        times = line.timestep * np.arange(len(speed))[kept]
         label = f"{line.before}episode"
         curves.append(Curve(label, speed[kept], torque[kept], style="trail", colour=1, times=times, **belongs))
     title = "Torque and speed, within what the motor can do"

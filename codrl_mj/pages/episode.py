@@ -10,9 +10,9 @@ import numpy as np
 from markupsafe import Markup
 
 from codrl_mj.actuators import Ideal
-from codrl_mj.evaluation import Episode, run_episodes
+from codrl_mj.evaluation import run_episodes
+from codrl_mj.evaluation.evaluate import Driven, driven_in
 from codrl_mj.films.film import Clip, clip, record
-from codrl_mj.films.strip import of_motor
 from codrl_mj.pages import page
 from codrl_mj.pages.diagrams import episode_diagram
 from codrl_mj.pages.plots import POINTS, Curve, Plot, Shade, spans
@@ -61,54 +61,33 @@ def show(name: str, env: Any, policy: Any, seed: int, filmed: bool = True) -> Sh
 
 
 @dataclasses.dataclass(frozen=True)
-class _MotorLine:
-    """One motor of one run: what its curves are called, and when they are shown."""
+class _MotorLine(Driven):
+    """What one motor of one run did; what its curves are called, and when they are shown."""
 
     before: str
     """Of their labels."""
     place: int | None
     """Among all of them; None where it is the only one. Its colour beside others."""
     tags: tuple[str, ...]
-    episode: Episode
-    """Of this motor alone."""
     stride: int
     """Every so many integration steps are drawn."""
 
     @property
-    def actuator(self) -> Any:
-        return self.episode.actuator
-
-    @property
-    def desired(self) -> np.ndarray:
-        """Torque asked for at the shaft in each integration step [N*m]."""
-        asked = np.asarray(self.episode.signals["desired_force"], dtype=float)
-        return np.repeat(asked, self.episode.inner_steps) * self.actuator.arm_radius
-
-    @property
-    def actual(self) -> np.ndarray:
-        """And delivered."""
-        return self.trace("actual_force") * self.actuator.arm_radius
-
-    @property
-    def speed(self) -> np.ndarray:
-        """Of the shaft at the end of each [rad/s]."""
-        return self.trace("speed") / self.actuator.arm_radius
-
-    def trace(self, name: str) -> np.ndarray:
-        """A column of the trace."""
-        return np.asarray(self.episode.trace[name], dtype=float)
+    def turning(self) -> np.ndarray:
+        """Velocity of the shaft at the end of each integration step [rad/s]."""
+        return self.speed[1:] / self.actuator.arm_radius
 
     def has(self, *names: str) -> bool:
         """Whether its family has these signals."""
-        return not isinstance(self.actuator, Ideal) and set(names) <= set(self.actuator.Signals._fields)
+        return not isinstance(self.actuator, Ideal) and set(names) <= self.signals.keys()
 
     def curve(self, label: str, values: np.ndarray, colour: int, held: bool = True, dashed: bool = False) -> Curve:
         """A curve over the integration steps; what is held begins with them, what is not is at their ends."""
         kept = slice(None, None, self.stride)
         values = np.asarray(values, dtype=float)
-        time = self.episode.timestep * (np.arange(len(values)) + (not held))
+        time = self.timestep * (np.arange(len(values)) + (not held))
         if held:
-            time, values = np.append(time[kept], time[-1] + self.episode.timestep), np.append(values[kept], values[-1])
+            time, values = np.append(time[kept], time[-1] + self.timestep), np.append(values[kept], values[-1])
         else:
             time, values = time[kept], values[kept]
         style: Any = {"style": "step" if held else "line", "colour": colour, "dashed": dashed}
@@ -117,10 +96,10 @@ class _MotorLine:
 
 def episode_section(shown: Sequence[Shown], joined: Iterable[Markup] = ()) -> Markup:
     """Films, controls and plots of some episodes side by side, and what else follows the clock (`page.clocked`)."""
-    lines = _lines(shown)
+    motors = list(dict.fromkeys(name for one in shown for name in one.episode.motors or ("motor",)))
+    lines = _lines(shown, motors)
     end = max(float(one.episode.time[-1]) for one in shown)
     films = [page.part("film", _caption(one, len(shown) > 1), *one.film) for one in shown if one.film is not None]
-    motors = _motors(shown)
     boxes = [page.part("selector", "Runs", "run", [one.name for one in shown], None)] if len(shown) > 1 else []
     if len(motors) > 1:
         boxes.append(page.part("selector", "Motors", "motor", motors, 0 if len(motors) > _MANY else None))
@@ -161,23 +140,20 @@ def _caption(one: Shown, named: bool) -> str:
     return f"{one.name + ': ' if named else ''}seed {one.seed}, return {page.number(episode.total)}, {over}"
 
 
-def _motors(shown: Sequence[Shown]) -> list[str]:
-    """Names of the motors of all runs."""
-    return list(dict.fromkeys(name for one in shown for name in one.episode.motors or ("motor",)))
-
-
-def _lines(shown: Sequence[Shown]) -> list[_MotorLine]:
-    """Every motor of every run."""
-    motors, pairs = _motors(shown), [(one, k) for one in shown for k in range(max(len(one.episode.motors), 1))]
+def _lines(shown: Sequence[Shown], motors: list[str]) -> list[_MotorLine]:
+    """Every motor of every run; by the names of all."""
+    pairs = [(one, number, motor) for one in shown for number, motor in enumerate(driven_in(one.episode))]
     most = max(POINTS // 4, _BUDGET // (10 * len(pairs)))
     stride = max(-(-len(one.episode.trace["speed"]) // most) for one in shown)
     made = []
-    for place, (one, motor) in enumerate(pairs):
+    for place, (one, number, motor) in enumerate(pairs):
         names = one.episode.motors or ("motor",)
-        words = [one.name] * (len(shown) > 1) + [names[motor]] * (len(names) > 1)
-        tags = f"run:{shown.index(one)}", f"motor:{motors.index(names[motor])}"
+        words = [one.name] * (len(shown) > 1) + [names[number]] * (len(names) > 1)
+        tags = f"run:{shown.index(one)}", f"motor:{motors.index(names[number])}"
         before = f"{', '.join(words)}: " if words else ""
-        made.append(_MotorLine(before, place if len(pairs) > 1 else None, tags, of_motor(one.episode, motor), stride))
+        made.append(
+            _MotorLine(**vars(motor), before=before, place=place if len(pairs) > 1 else None, tags=tags, stride=stride)
+        )
     return made
 
 
@@ -195,22 +171,22 @@ def _motor_plots(lines: Sequence[_MotorLine]) -> list[Plot]:
         torque += [line.curve("actual", line.actual, 1), line.curve("desired", line.desired, 0, dashed=True)]
         error.append(line.curve("desired less actual", line.desired - line.actual, 4))
         if line.has("current"):
-            current.append(line.curve("current", line.trace("current"), 1, held=False))
+            current.append(line.curve("current", line.signals["current"], 1, held=False))
         if line.has("current", "reference_current"):
-            current.append(line.curve("reference", line.trace("reference_current"), 0, dashed=True))
+            current.append(line.curve("reference", line.signals["reference_current"], 0, dashed=True))
         if line.has("voltage"):
-            voltage.append(line.curve("voltage", line.trace("voltage"), 2))
-        power.append(line.curve("mechanical", line.actual * line.speed, 1))
+            voltage.append(line.curve("voltage", line.signals["voltage"], 2))
+        power.append(line.curve("mechanical", line.actual * line.turning, 1))
         if line.has("electrical_power", "copper_loss"):
-            power.append(line.curve("electrical", line.trace("electrical_power"), 2, dashed=True))
-            power.append(line.curve("heat in the winding", line.trace("copper_loss"), 4))
+            power.append(line.curve("electrical", line.signals["electrical_power"], 2, dashed=True))
+            power.append(line.curve("heat in the winding", line.signals["copper_loss"], 4))
         elif line.has("current", "voltage"):
-            amperes, volts = line.trace("current"), line.trace("voltage")
+            amperes, volts = line.signals["current"], line.signals["voltage"]
             power.append(line.curve("electrical", volts * amperes, 2, dashed=True))
             if line.actuator.winding is not None:
                 power.append(line.curve("heat in the winding", line.actuator.winding[0] * amperes**2, 4))
-        if line.has("temperature") and np.ptp(line.trace("temperature")) > 0.0:
-            warmth.append(line.curve("winding", line.trace("temperature"), 4, held=False))
+        if line.has("temperature") and np.ptp(line.signals["temperature"]) > 0.0:
+            warmth.append(line.curve("winding", line.signals["temperature"], 4, held=False))
     title = "Force" if force else "Torque at the shaft"
     found = [Plot(title, _TIME, unit, tuple(torque), clock=True, shades=_shades(lines, "saturated"))]
     if any(np.ptp(curve.y) > 0.0 or curve.y.any() for curve in error):
@@ -237,8 +213,8 @@ def _shades(lines: Sequence[_MotorLine], *names: str) -> tuple[Shade, ...]:
     found = []
     for line, name in itertools.product(lines, names):
         if line.has(name):
-            times = line.episode.timestep * np.arange(len(line.trace(name)) + 1)
-            found.append(Shade(line.before + name.replace("_", " "), spans(times, line.trace(name)), line.tags))
+            times = line.timestep * np.arange(len(line.signals[name]) + 1)
+            found.append(Shade(line.before + name.replace("_", " "), spans(times, line.signals[name]), line.tags))
     return tuple(found)
 
 
@@ -265,12 +241,12 @@ _KNOWN = (
 
 def _other_signals(lines: Sequence[_MotorLine]) -> list[Plot]:
     """Signals that only some families have."""
-    names = dict.fromkeys(name for line in lines for name in line.actuator.Signals._fields if name not in _KNOWN)
+    names = dict.fromkeys(name for line in lines for name in line.signals if name not in _KNOWN)
     found = []
     for name in names:
         own = [line for line in lines if line.has(name)]
         unit = page.unit(own[0].actuator.SIGNAL_UNITS.get(name, "")) if own else ""
-        curves = tuple(line.curve(name.replace("_", " "), line.trace(name), 3) for line in own)
+        curves = tuple(line.curve(name.replace("_", " "), line.signals[name], 3) for line in own)
         if own:
             title = name.replace("_", " ").capitalize()
             found.append(Plot(title, _TIME, f"{name.replace('_', ' ')} [{unit}]", curves, clock=True))
