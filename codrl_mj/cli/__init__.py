@@ -123,7 +123,7 @@ def _run(arguments: list[str], traced: bool) -> int:
         rest = words[1 + name.count(" ") :]
         kind = find_verb(name)  # or the one that it makes for a line on which its flags depend
         verb = parse(kind.for_line(rest) if hasattr(kind, "for_line") else kind, f"codrl-mj {name}", rest)
-        _check_outputs(getattr(verb, "verb", verb))
+        _check_outputs(verb)
         return _answer(verb)
     except BrokenPipeError:  # whoever read the output has enough of it, such as head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left is flushed at exit

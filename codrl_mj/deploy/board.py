@@ -91,11 +91,6 @@ class Link:
         """Validate."""
         check(self)
 
-    @property
-    def spoils(self) -> bool:
-        """Whether anything is between them."""
-        return self != Link()
-
     def encoded(self, contract: Contract, observation: np.ndarray) -> np.ndarray:
         """An observation (k,) as encoders with so many counts say it."""
         if not self.counts:
@@ -111,7 +106,7 @@ class Link:
         return seen
 
 
-class Board:
+class Board(contextlib.AbstractContextManager["Board"]):
     """A policy that is computed by the exported C, in a process of its own, and asked frame by frame in lock step.
 
     A context manager: the process ends with it. Where no answer comes, the contract's command for safety is taken.
@@ -177,9 +172,6 @@ class Board:
                 self._samples = held.enter_context(loop_on_board(trained, drive, amperes, *steps))
             self._held = held.pop_all()
 
-    def __enter__(self) -> "Board":
-        return self
-
     def __exit__(self, *_: object) -> None:
         self._held.close()
 
@@ -204,7 +196,7 @@ class Board:
         self.frames += 1
         safe = np.array(self.contract.late["command"])
         observation = self.link.encoded(self.contract, observation)
-        frame = bytearray(self._wire.frame(self.frames, self.frames * self.contract.period_us, observation))
+        frame = bytearray(self._wire.frame(self.frames, self.frames * round(1e6 / self.contract.rate), observation))
         if self.random.random() < self.link.lost:
             self.unanswered += 1
             return safe

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.deploy.contract import Interface
-from codrl_mj.deploy.log import RigLog, read_rows
+from codrl_mj.deploy.log import read_rows
 from codrl_mj.envs.config import EnvConfig
 
 WINDOW, ROWS = 0.5, 10
@@ -76,32 +76,26 @@ def compare(env: EnvConfig, path: Path, window: float | None = None, actuator: A
             [_per_ampere(new) / _per_ampere(old) for new, old in zip(tried.actuators, env.actuators, strict=True)]
         )
         rows = rows._replace(commands=rows.commands * forces)
+    simulated, actions = [], interface.actions_of(rows.commands)
     with contextlib.closing(tried.make()) as made:
-        simulated = _simulated(made.unwrapped, interface, rows, starts)
+        moved: Any = made.unwrapped
+        if (task := getattr(moved, "task", None)) is None:
+            raise ValueError(f"{interface.task}: only a task's state can be set to what was observed: must be a task")
+        observation, _ = moved.reset(seed=0)
+        for row, action in enumerate(actions):
+            if row in starts:
+                moved.state = _state_of(task, rows.observed[row], moved.state)
+                observation = rows.observed[row]
+            simulated.append(observation)
+            observation = moved.step(action)[0]
     names, units = ([one[key] for one in interface.observations] for key in ("name", "unit"))
-    return RigComparison(names, units, rows.time, rows.observed, simulated, starts)
+    return RigComparison(names, units, rows.time, rows.observed, np.array(simulated), starts)
 
 
 def _per_ampere(actuator: Any) -> float:
     """Force [N] or torque [N*m] at the joint for an ampere; 1 of what has no motor."""
     motor = getattr(actuator, "motor", None)
     return 1.0 if motor is None else float(motor.torque_constant / actuator.arm_radius)
-
-
-def _simulated(env: Any, interface: Interface, rows: RigLog, starts: np.ndarray) -> np.ndarray:
-    """What an environment observes under the commands of a log, shape (n, k)."""
-    task = getattr(env, "task", None)
-    if task is None:
-        raise ValueError(f"{interface.task}: only a task's state can be set to what was observed: must be a task")
-    observation, _ = env.reset(seed=0)
-    seen, actions = [], interface.actions_of(rows.commands)
-    for row, action in enumerate(actions):
-        if row in starts:
-            env.state = _state_of(task, rows.observed[row], env.state)
-            observation = rows.observed[row]
-        seen.append(observation)
-        observation = env.step(action)[0]
-    return np.array(seen)
 
 
 def _state_of(task: Any, observed: np.ndarray, near: np.ndarray) -> np.ndarray:

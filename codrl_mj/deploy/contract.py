@@ -32,10 +32,6 @@ GOLDEN = 200
 LATE = 1.5
 """Periods after which a command that has not come is late."""
 _PACKAGES = ("codrl-mj", "mujoco", "gymnasium", "numpy", "stable-baselines3", "torch")
-_ENTRIES = (
-    *("task", "agent", "rate", "observations", "actions", "actuators", "assumed", "controller", "limits", "late"),
-    *("golden", "versions"),
-)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -193,18 +189,14 @@ class Contract(Interface):
         content = read_json(path, "contract")
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise ValueError(f"{path}: not a contract of this program: its format must be {FORMAT!r}")
-        if missing := [name for name in _ENTRIES if name not in content]:
+        entries = [field.name for field in dataclasses.fields(cls)]
+        if missing := [name for name in entries if name not in content]:
             raise ValueError(f"{path}: has no {', '.join(missing)}: export it anew")
-        return cls(**{name: content[name] for name in _ENTRIES})
+        return cls(**{name: content[name] for name in entries})
 
     def write(self, folder: Path) -> None:
         """Write `contract.json` into a folder, whole or not at all, with a digest of itself."""
         write_json(folder / FILE, sealed({"format": FORMAT, **dataclasses.asdict(self)}))
-
-    @property
-    def period_us(self) -> int:
-        """Microseconds between two actions."""
-        return round(1e6 / self.rate)
 
     def within(self, observations: np.ndarray) -> np.ndarray:
         """Whether observations (N, k) are finite and within the limits, shape (N,)."""

@@ -55,53 +55,6 @@ class Network:
     squashed: bool
     """Whether the layers end in -1 to 1, which stand for `low` and `high`."""
 
-    @classmethod
-    def of(cls, policy: Policy) -> "Network":
-        """What a policy computes that Stable-Baselines3's PPO, SAC, TD3, DDPG or DQN trained.
-
-        Args:
-            policy: as `codrl_mj.runs.policies.load_policy` returns it.
-
-        Raises:
-            ValueError: it is none of these, or has parts that are no factors and dense layers.
-        """
-        from stable_baselines3.common.policies import ActorCriticPolicy
-        from stable_baselines3.dqn.policies import DQNPolicy
-        from stable_baselines3.sac.policies import SACPolicy
-        from stable_baselines3.td3.policies import TD3Policy
-
-        one: Any = policy
-        squashed = isinstance(one, SACPolicy | TD3Policy)
-        if isinstance(one, ActorCriticPolicy) and not one.squash_output:
-            extractor, parts = one.pi_features_extractor, [*one.mlp_extractor.policy_net, one.action_net]
-        elif isinstance(one, SACPolicy):
-            extractor, parts = one.actor.features_extractor, [*one.actor.latent_pi, one.actor.mu]
-        elif isinstance(one, TD3Policy):
-            extractor, parts = one.actor.features_extractor, [*one.actor.mu]
-        elif isinstance(one, DQNPolicy):
-            extractor, parts = one.q_net.features_extractor, [*one.q_net.q_net]
-        else:
-            raise ValueError(
-                f"policy: a {type(one).__name__} cannot be exported: it must be of PPO, SAC, TD3, DDPG or DQN, which "
-                "are dense layers, or SARSA's"
-            )
-        seen, acts = one.observation_space, one.action_space
-        if not isinstance(seen, spaces.Box) or len(seen.shape) != 1:
-            raise ValueError(f"policy: observations are {seen}: must be vectors")
-        layers = _layers(parts)
-        if isinstance(one, SACPolicy):  # its distribution ends in it
-            layers[-1] = dataclasses.replace(layers[-1], activation="Tanh")
-        factors, gains = getattr(extractor, "factors", None), getattr(one, "largest", None)
-        outputs = len(layers[-1].bias)
-        return cls(
-            np.ones(seen.shape, np.float32) if factors is None else factors.numpy().copy(),
-            tuple(layers),
-            np.ones(outputs, np.float32) if gains is None else gains.numpy().astype(np.float32),
-            acts.low.astype(np.float32) if isinstance(acts, spaces.Box) else None,
-            acts.high.astype(np.float32) if isinstance(acts, spaces.Box) else None,
-            squashed,
-        )
-
     def graph(self, node: Any) -> str:
         """The name of what an ONNX graph gives that computes it, by `node(kind, *inputs, **attributes)`."""
         values = node("Mul", "observation", self.factors)
@@ -150,17 +103,56 @@ class Network:
 
 
 def network_of(policy: Policy) -> Network | Tiles:
-    """What a policy computes: dense layers, or the tiles of SARSA.
+    """What a policy computes: dense layers, of Stable-Baselines3's PPO, SAC, TD3, DDPG or DQN; or the tiles of SARSA.
+
+    Args:
+        policy: as `codrl_mj.runs.policies.load_policy` returns it.
 
     Raises:
-        ValueError: it cannot be taken out.
+        ValueError: it is none of these, or has parts that are no factors and dense layers.
     """
     from codrl_mj.agents.tile_coding import TileCodingPolicy
 
     if isinstance(policy, TileCodingPolicy):
         factors = np.ones(policy.observation_space.shape or (), np.float32)
         return Tiles(policy.coder, policy.table.copy(), factors)
-    return Network.of(policy)
+
+    from stable_baselines3.common.policies import ActorCriticPolicy
+    from stable_baselines3.dqn.policies import DQNPolicy
+    from stable_baselines3.sac.policies import SACPolicy
+    from stable_baselines3.td3.policies import TD3Policy
+
+    one: Any = policy
+    squashed = isinstance(one, SACPolicy | TD3Policy)
+    if isinstance(one, ActorCriticPolicy) and not one.squash_output:
+        extractor, parts = one.pi_features_extractor, [*one.mlp_extractor.policy_net, one.action_net]
+    elif isinstance(one, SACPolicy):
+        extractor, parts = one.actor.features_extractor, [*one.actor.latent_pi, one.actor.mu]
+    elif isinstance(one, TD3Policy):
+        extractor, parts = one.actor.features_extractor, [*one.actor.mu]
+    elif isinstance(one, DQNPolicy):
+        extractor, parts = one.q_net.features_extractor, [*one.q_net.q_net]
+    else:
+        raise ValueError(
+            f"policy: a {type(one).__name__} cannot be exported: it must be of PPO, SAC, TD3, DDPG or DQN, which "
+            "are dense layers, or SARSA's"
+        )
+    seen, acts = one.observation_space, one.action_space
+    if not isinstance(seen, spaces.Box) or len(seen.shape) != 1:
+        raise ValueError(f"policy: observations are {seen}: must be vectors")
+    layers = _layers(parts)
+    if isinstance(one, SACPolicy):  # its distribution ends in it
+        layers[-1] = dataclasses.replace(layers[-1], activation="Tanh")
+    scales, gains = getattr(extractor, "factors", None), getattr(one, "largest", None)
+    outputs = len(layers[-1].bias)
+    return Network(
+        np.ones(seen.shape, np.float32) if scales is None else scales.numpy().copy(),
+        tuple(layers),
+        np.ones(outputs, np.float32) if gains is None else gains.numpy().astype(np.float32),
+        acts.low.astype(np.float32) if isinstance(acts, spaces.Box) else None,
+        acts.high.astype(np.float32) if isinstance(acts, spaces.Box) else None,
+        squashed,
+    )
 
 
 def _layers(parts: list[Any]) -> list[Layer]:

@@ -130,13 +130,10 @@ def _wrong(contract: Contract, answer: Answer | None, in_a_row: int) -> str:
     if answer.status & (DAMAGED | NOT_FINITE):
         return "the board took a frame for damaged" if answer.status & DAMAGED else "a sensor says no finite number"
     if answer.status & BEYOND or not contract.within(answer.observation[np.newaxis])[0]:
-        return f"beyond the limits: {dict(zip(_names(contract), answer.observation.round(4).tolist(), strict=True))}"
+        names = [one["name"] for one in contract.observations]
+        return f"beyond the limits: {dict(zip(names, answer.observation.round(4).tolist(), strict=True))}"
     bounds = [one.get("levels") or [one.get("least"), one.get("most")] for one in contract.actions]
     most = [math.inf if None in some else max(map(abs, some)) for some in bounds]
     if not (np.abs(answer.command) <= np.array(most) * (1.0 + 1e-6)).all():
         return f"the command is {answer.command.tolist()}, beyond what the policy was trained with"
     return ""
-
-
-def _names(contract: Contract) -> list[str]:
-    return [one["name"] for one in contract.observations]

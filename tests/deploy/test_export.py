@@ -15,7 +15,7 @@ from codrl_mj.actuators import Actuator
 from codrl_mj.agents import AGENTS
 from codrl_mj.agents.models import ScaledObservation
 from codrl_mj.cli import main
-from codrl_mj.deploy import Contract, Network, board_test, export, network_of, onnx_model
+from codrl_mj.deploy import Contract, board_test, export, network_of, onnx_model
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.runs.policies import load_policy, save_policy
 
@@ -87,7 +87,7 @@ def test_the_policy_that_is_exported_takes_its_most_likely_action():
     policy, _ = trained("pendulum", "ppo")
     seen = observed(policy.observation_space, 100)
     drawn = policy.predict(seen, deterministic=False)[0]
-    assert np.abs(Network.of(policy)(seen) - drawn).max() > 0.1
+    assert np.abs(network_of(policy)(seen) - drawn).max() > 0.1
 
 
 def test_factors_of_the_observation_are_inside():
@@ -97,7 +97,7 @@ def test_factors_of_the_observation_are_inside():
     scaled.load_state_dict(plain.state_dict())
     seen = observed(plain.observation_space, 50)
     twice = seen * np.array([2.0, 1.0, 1.0, 1.0, 1.0, 1.0], np.float32)
-    np.testing.assert_allclose(Network.of(scaled)(seen), Network.of(plain)(twice), atol=1e-6)
+    np.testing.assert_allclose(network_of(scaled)(seen), network_of(plain)(twice), atol=1e-6)
 
 
 def test_the_table_is_the_policy(tmp_path):
@@ -120,14 +120,14 @@ def test_the_table_is_the_policy(tmp_path):
 def test_other_policies_are_refused():
     policy, _ = trained("mountain_car", "sarsa")
     with pytest.raises(ValueError, match="TileCodingPolicy cannot be exported: it must be of PPO, SAC, TD3, DDPG or"):
-        Network.of(policy)
+        network_of(policy)
 
 
 def test_a_layer_of_another_kind_is_named():
     policy, _ = trained("pendulum", "ppo")
     policy.mlp_extractor.policy_net[1] = torch.nn.ELU()
     with pytest.raises(ValueError, match="a layer is ELU"):
-        Network.of(policy)
+        network_of(policy)
 
 
 # -- the folder ---------------------------------------------------------------------------------------------
