@@ -43,13 +43,10 @@ class CompareLog:
         from codrl_mj.deploy import Contract, compare
         from codrl_mj.deploy.contract import FILE
         from codrl_mj.envs.config import EnvConfig
-        from codrl_mj.runs.files import check_file
         from codrl_mj.training.folder import load_config
 
-        if self.out is not None:
-            check_file(self.out)
-            if self.out.suffix != ".png":
-                raise ValueError(f"--out {self.out}: the suffix must be .png")
+        if self.out is not None and self.out.suffix != ".png":
+            raise ValueError(f"--out {self.out}: the suffix must be .png")
         exported = (self.run_folder / FILE).is_file()
         env = (
             EnvConfig.from_mapping(Contract.read(self.run_folder).assumed)

@@ -131,11 +131,6 @@ def with_environment(verb: Any, arguments: Sequence[str]) -> Any:
     return made
 
 
-def through(actuators: Sequence[str], name: str) -> str:
-    """What to call what `--actuators`, or else `--actuator`, says."""
-    return "-".join(dict.fromkeys(Path(each.rpartition("=")[2]).stem for each in actuators)) or name
-
-
 def environment(verb: Any, task: str, name: str, known: EnvConfig) -> EnvConfig:
     """The environment that a verb's flags, those of `environment_fields`, describe; `known` has their defaults."""
     as_known = name in (AS_TRAINED, AS_CONFIGURED)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from codrl_mj.cli.environments import AS_TRAINED, ActuatorName, with_environment
-from codrl_mj.cli.subject import Source, SubjectWord, policy_and_environment
+from codrl_mj.cli.subject import Source, policy_and_environment
 from codrl_mj.cli.terminal import progress_bar
 from codrl_mj.envs.worlds import is_world
 from codrl_mj.fields import did_you_mean
@@ -20,7 +20,13 @@ from codrl_mj.runs import told_apart
 class OfEpisodes:
     """What acts, in what, and from which seed."""
 
-    subject: SubjectWord
+    subject: Annotated[
+        tyro.conf.Positional[str],
+        tyro.conf.arg(
+            help="Run folder, a folder with a policy alone, or a Stable-Baselines3 zip (see --trust); or a task name "
+            "or an environment's id, for random actions."
+        ),
+    ]
     source: tyro.conf.OmitArgPrefixes[Source] = Source()
     actuator_name: ActuatorName = AS_TRAINED
     seed: int = 0

@@ -14,15 +14,6 @@ from codrl_mj.fields import did_you_mean
 from codrl_mj.runs import CONFIG, finished
 from codrl_mj.tasks import TASKS
 
-SubjectWord = Annotated[
-    tyro.conf.Positional[str],
-    tyro.conf.arg(
-        help="Run folder, a folder with a policy alone, or a Stable-Baselines3 zip (see --trust); or a task name or an "
-        "environment's id, for random actions."
-    ),
-]
-"""The word that says what a verb is about."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Subject:

@@ -23,7 +23,6 @@ from codrl_mj.cli.environments import (
     environment_fields,
     flags,
     scan,
-    through,
 )
 from codrl_mj.cli.parsing import AsJson
 from codrl_mj.cli.terminal import progress_bar, say
@@ -143,7 +142,8 @@ class Train:
                 if field.name not in _OWN_FLAGS
             },
         )
-        parts = config.task, config.agent.name, through(self.actuators, self.actuator_name), str(config.seed)
+        through = "-".join(dict.fromkeys(Path(each.rpartition("=")[2]).stem for each in self.actuators))
+        parts = config.task, config.agent.name, through or self.actuator_name, str(config.seed)
         families = (family_name(type(each)) for each in config.env.actuators)
         own = any(":" in one for one in (*parts, *families))  # module:NAME
         following = "next: codrl-mj evaluate" + (" --trust" if own else "")

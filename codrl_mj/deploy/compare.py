@@ -65,18 +65,18 @@ def compare(env: EnvConfig, path: Path, window: float | None = None, actuator: A
     """
     env = dataclasses.replace(env, randomize=None)
     interface = Interface.between(env)
-    rows = read_rows(interface, path)
+    time, observed, commands = read_rows(interface, path)
     length = max(round(WINDOW * interface.rate), ROWS) if window is None else round(window * interface.rate)
     if window is not None and length < 2:
         raise ValueError(f"window = {window:g} s: must be at least {2 / interface.rate:g} s, two rows of the log")
-    starts = np.arange(0, len(rows.time), length)
+    starts = np.arange(0, len(time), length)
     tried = env if actuator is None else dataclasses.replace(env, actuator=dict.fromkeys(env.driven, actuator))
     if env.action == "force" and interface.levels is None:
         forces = np.array(
             [_per_ampere(new) / _per_ampere(old) for new, old in zip(tried.actuators, env.actuators, strict=True)]
         )
-        rows = rows._replace(commands=rows.commands * forces)
-    simulated, actions = [], interface.actions_of(rows.commands)
+        commands = commands * forces
+    simulated, actions = [], interface.actions_of(commands)
     with contextlib.closing(tried.make()) as made:
         moved: Any = made.unwrapped
         if (task := getattr(moved, "task", None)) is None:
@@ -84,12 +84,12 @@ def compare(env: EnvConfig, path: Path, window: float | None = None, actuator: A
         observation, _ = moved.reset(seed=0)
         for row, action in enumerate(actions):
             if row in starts:
-                moved.state = _state_of(task, rows.observed[row], moved.state)
-                observation = rows.observed[row]
+                moved.state = _state_of(task, observed[row], moved.state)
+                observation = observed[row]
             simulated.append(observation)
             observation = moved.step(action)[0]
     names, units = ([one[key] for one in interface.observations] for key in ("name", "unit"))
-    return RigComparison(names, units, rows.time, rows.observed, np.array(simulated), starts)
+    return RigComparison(names, units, time, observed, np.array(simulated), starts)
 
 
 def _per_ampere(actuator: Any) -> float:

@@ -3,7 +3,6 @@
 import csv
 import dataclasses
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -75,18 +74,7 @@ def _measured(contract: Contract, episode: Episode) -> np.ndarray:
     return before.reshape(steps, -1)
 
 
-class RigLog(NamedTuple):
-    """A log, as it was recorded."""
-
-    time: np.ndarray
-    """[s], shape (n,), increasing."""
-    observed: np.ndarray
-    """Shape (n, k)."""
-    commands: np.ndarray
-    """Shape (n, m), in the units of the interface's actions."""
-
-
-def read_rows(interface: Interface, path: Path) -> RigLog:
+def read_rows(interface: Interface, path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Read a log that a controller recorded.
 
     Args:
@@ -94,6 +82,10 @@ def read_rows(interface: Interface, path: Path) -> RigLog:
         path: comma-separated columns `name:unit`: `time:s`, the observations in the order in which they came, and the
             commands that were sent. Columns are known by their names; a unit that is left out is not compared. Those
             of `motor_columns` are passed over.
+
+    Returns:
+        Time [s], shape (n,), increasing; what was observed, shape (n, k); and the commands, shape (n, m), in the units
+            of the interface's actions.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -133,7 +125,7 @@ def read_rows(interface: Interface, path: Path) -> RigLog:
             raise ValueError(
                 f"{path}: action {one['name']!r}: its unit is {told[place][1]}, must be {one['unit']}: convert it"
             )
-    return RigLog(table[:, where["time"]], table[:, seen], table[:, sent])
+    return (table[:, where["time"]], table[:, seen], table[:, sent])
 
 
 def check_log(folder: Path, path: Path) -> LogCheck:

@@ -25,10 +25,9 @@ from codrl_mj.kept import external
 WITHIN = 5000
 """Milliseconds after which a sample counts as not answered."""
 _POLL_IN = 1 << 32
-_PLACES = {"to": 0, "amperes": 2, "current": 3, "voltage": 4, "samples": 5, "lost": 6}
-_TABLE = np.zeros(32)  # see `_PLACES`; 1: what `poll` is told; from 8 on a sample, from 16 on its answer
+_TABLE = np.zeros(32)  # these, and 1: what `poll` is told; from 8 on a sample, from 16 on its answer
 _table_at = symbol("codrl_mj_board", _TABLE.ctypes.data)
-_TO, _AMPERES, _CURRENT, _VOLTAGE, _SAMPLES, _LOST = _PLACES.values()
+_TO, _AMPERES, _CURRENT, _VOLTAGE, _SAMPLES, _LOST = 0, 2, 3, 4, 5, 6
 _C: Any = ctypes.CDLL(None)
 _size = types.uintp
 _write = external("codrl_mj_board_write", _C.write, types.int64(types.int32, _size, _size))

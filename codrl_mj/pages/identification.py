@@ -143,36 +143,32 @@ def _errors(found: Identified) -> Markup:
 
 
 def _looked_at(one: Trace) -> Markup:
-    """Data and simulation of a log, residuals and their autocorrelation."""
-    unit = SIGNALS[one.output]
+    """Data and simulation of a log, residuals and their autocorrelation, which is small of noise."""
+    from scipy.signal import correlate
+
+    unit, what = SIGNALS[one.output], f"{one.log}: {one.output}"
     gaps = one.starts[1:]
     time, simulated = (np.insert(values, gaps, np.nan) for values in (one.time, one.simulated))
     time = np.where(np.isnan(time), np.interp(np.arange(len(time)), np.flatnonzero(~np.isnan(time)), one.time), time)
     residuals = one.measured - one.simulated
     curves = Curve("measured", one.time, one.measured, colour=0), Curve("simulated", time, simulated, colour=1)
     off = Curve("residual", time, np.insert(residuals, gaps, np.nan), colour=4)
-    what = f"{one.log}: {one.output}"
-    fit = Plot(what, "time [s]", f"{one.output} [{unit}]", curves)
-    left = Plot(f"{what}, residuals", "time [s]", f"measured less simulated [{unit}]", (off,))
-    return page.plots((fit, left, _autocorrelation(what, one.time, residuals)))
-
-
-def _autocorrelation(what: str, time: np.ndarray, residuals: np.ndarray) -> Plot:
-    """Of residuals; within the bounds, residuals know nothing of each other."""
-    from scipy.signal import correlate
-
     centred = residuals - residuals.mean()
     whole = correlate(centred, centred, method="fft")[len(centred) - 1 :]
-    count = min(_LAGS, len(centred) // 2)
-    lags = float(np.median(np.diff(time))) * np.arange(count + 1)
-    bound = 1.96 / math.sqrt(len(centred))
-    ends = lags[[0, -1]]
-    curves = (
+    count, bound = min(_LAGS, len(centred) // 2), 1.96 / math.sqrt(len(centred))
+    lags = float(np.median(np.diff(one.time))) * np.arange(count + 1)
+    shares = (
         Curve("autocorrelation", lags, whole[: count + 1] / max(whole[0], 1e-300), colour=3),
-        Curve("95 % of noise", ends, np.full(2, bound), reference=True),
-        Curve("95 % of noise, below", ends, np.full(2, -bound), reference=True),
+        Curve("95 % of noise", lags[[0, -1]], np.full(2, bound), reference=True),
+        Curve("95 % of noise, below", lags[[0, -1]], np.full(2, -bound), reference=True),
     )
-    return Plot(f"{what}, autocorrelation of residuals", "lag [s]", "share", curves)
+    return page.plots(
+        (
+            Plot(what, "time [s]", f"{one.output} [{unit}]", curves),
+            Plot(f"{what}, residuals", "time [s]", f"measured less simulated [{unit}]", (off,)),
+            Plot(f"{what}, autocorrelation of residuals", "lag [s]", "share", shares),
+        )
+    )
 
 
 def _correlations(found: Identified) -> Markup:

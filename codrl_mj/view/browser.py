@@ -199,25 +199,21 @@ class Browser:
         again.on_update(lambda _: setattr(session, "again", again.value))
         self._pushes()
         self._signals()
-        for pattern, actuator in session.config.driven.items():
-            self._actuator(pattern, actuator)
+        for pattern, actuator in session.config.driven.items():  # a folder for each part of what drives a motor
+            several = f" {pattern}" if len(session.config.driven) > 1 else ""
+            own = actuator.family or type(actuator).__name__
+            change, found = functools.partial(session.set_actuator, pattern), controls(actuator, self._supply)
+            for part, fields in itertools.groupby(
+                found, lambda one, own=own: one.path[0] if len(one.path) > 1 else own
+            ):
+                self._settings(f"{part}{several}", fields, actuator, change)
+            if not found:
+                gui.add_markdown(f"Nothing can be set of {own}{several}: begin with `--actuator`.")
         disturbances = session.config.disturbances
         ends = {"command_delay": _DELAY_STEPS * session.recorder.step_duration}
         self._settings(
             "delay and disturbances", controls(disturbances, ends=ends), disturbances, session.set_disturbance
         )
-
-    def _actuator(self, pattern: str, actuator: Any) -> None:
-        """A folder for each part of what drives a motor, or the motors of a pattern."""
-        several = f" {pattern}" if len(self.session.config.driven) > 1 else ""
-        own = actuator.family or type(actuator).__name__
-
-        change = functools.partial(self.session.set_actuator, pattern)
-        found = controls(actuator, self._supply)
-        for part, fields in itertools.groupby(found, lambda one: one.path[0] if len(one.path) > 1 else own):
-            self._settings(f"{part}{several}", fields, actuator, change)
-        if not found:
-            self.server.gui.add_markdown(f"Nothing can be set of {own}{several}: begin with `--actuator`.")
 
     def _pushes(self) -> None:
         gui, session = self.server.gui, self.session

@@ -239,15 +239,19 @@ class Session:
         action, _ = self.policy.predict(np.asarray(self.observation)[np.newaxis], deterministic=True)
         try:
             self.observation, reward, terminated, truncated, _ = self.env.step(action[0])
-            began_anew = any(
-                self.data.warning[kind].number for kind in _DIVERGED
-            )  # by itself, from numbers that are none
+            # from numbers that are none it begins anew by itself
+            began_anew = any(self.data.warning[kind].number for kind in _DIVERGED)
             if began_anew or not np.isfinite(np.asarray(self.observation)).all():
                 raise ArithmeticError("the simulation left the finite numbers")
         except ArithmeticError as error:
             self.problem, self._diverged = f"{error}; reset, and set what drives it otherwise", True
             return False
-        self._remember()
+        rows = self.recorder.trace
+        for row in rows:
+            self.time += self.recorder.step_duration / len(rows)
+            self.signals.append((self.time, row.copy()))
+        while self.signals and self.signals[0][0] < self.time - HISTORY:
+            self.signals.popleft()
         self.total += float(reward)
         self._steps += 1
         self.ended = "ended" if terminated or truncated else "past the time limit" * (self._steps >= self._limit)
@@ -290,14 +294,6 @@ class Session:
             mujoco.mj_kinematics(self.model, self.data)
         else:
             physics.show(physics.state)
-
-    def _remember(self) -> None:
-        rows = self.recorder.trace
-        for row in rows:
-            self.time += self.recorder.step_duration / len(rows)
-            self.signals.append((self.time, row.copy()))
-        while self.signals and self.signals[0][0] < self.time - HISTORY:
-            self.signals.popleft()
 
     def _nothing(self) -> Any:
         """The action that does nothing; None if there is none."""
