@@ -63,13 +63,13 @@ VERBS = {
     "identify columns": "identify:ProposeColumns",
     "identify plan": "identify:PlanExperiment",
     "identify simulate": "identify:SimulateLog",
-    "identify compare": "compare:CompareLog",
+    "identify compare": "deploy:CompareLog",
     "data": "runs:Data",
     "cache": "runs:Cache",
-    "export": "export:Export",
-    "board test": "board:Test",
-    "board check": "board:CheckLog",
-    "board run": "board:RunBoard",
+    "export": "deploy:Export",
+    "board test": "deploy:Test",
+    "board check": "deploy:CheckLog",
+    "board run": "deploy:RunBoard",
     "validate": "validate:Validate",
 }
 """The words of every verb -> its module, which is imported when it is called, and its class."""

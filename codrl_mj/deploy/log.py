@@ -11,8 +11,6 @@ from codrl_mj.deploy.contract import Contract, Interface
 from codrl_mj.evaluation import Episode
 from codrl_mj.runs.files import writing
 
-TIME = ("time", "s")
-
 
 @dataclasses.dataclass(frozen=True)
 class LogCheck:
@@ -34,7 +32,7 @@ class LogCheck:
 
 def columns(interface: Interface) -> list[str]:
     """What a log's columns are called: `time:s`, observations and commands, `name:unit`."""
-    named = [TIME, *((one["name"], one["unit"]) for one in (*interface.observations, *interface.actions))]
+    named = [("time", "s"), *((one["name"], one["unit"]) for one in (*interface.observations, *interface.actions))]
     return [f"{name}:{unit}" if unit else name for name, unit in named]
 
 

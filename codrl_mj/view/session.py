@@ -59,35 +59,30 @@ class Control:
 
 
 def controls(
-    settings: Any, scale: float | None = None, ends: Mapping[str, float] = MappingProxyType({})
+    settings: Any,
+    scale: float | None = None,
+    ends: Mapping[str, float] = MappingProxyType({}),
+    path: tuple[str, ...] = (),
 ) -> list[Control]:
-    """Numbers, words and flags in an actuator or disturbances, and in its parts.
+    """Numbers, words and flags in an actuator or disturbances, and in its parts, of which `path` leads to this one.
 
     The slider of an infinite voltage ends at `scale` [V], without which infinite fields are left out; that of a field
     that is 0 where `ends` says so by its name.
     """
-    found = [
-        dataclasses.replace(one, high=ends[one.path[-1]]) if one.value == 0 and one.path[-1] in ends else one
-        for one in _within(settings, (), scale)
-    ]
-    return [one for one in found if not (one.endless and one.high is None)]
-
-
-def _within(settings: Any, path: tuple[str, ...], scale: float | None) -> list[Control]:
     found, nested = [], parts(type(settings))
     for field in dataclasses.fields(settings):
         value, own = getattr(settings, field.name), (*path, field.name)
         if field.name in nested:
-            found += _within(field.metadata.get("absent") if value is None else value, own, scale)
+            found += controls(field.metadata.get("absent") if value is None else value, scale, ends, own)
         elif "options" in field.metadata:
             found.append(Control(own, "", value, options=field.metadata["options"]))
         elif isinstance(value, bool):
             found.append(Control(own, "", value))
         elif isinstance(value, int | float):
             unit = field.metadata.get("unit", "")
-            low, high = field.metadata.get("between", (None, None))
-            ends = _slider(value, low, high, scale if unit == "V" else None)
-            found.append(Control(own, unit, value, *ends))
+            low, high = _slider(value, *field.metadata.get("between", (None, None)), scale if unit == "V" else None)
+            one = Control(own, unit, value, low, ends.get(field.name, high) if value == 0 else high)
+            found += [] if one.endless and one.high is None else [one]
     return found
 
 
