@@ -77,10 +77,15 @@ class Advise:
             )
         if self.measure is not None and self.measure < 2:
             raise ValueError(f"--measure {self.measure}: must be >= 2, or there is no interval")
+        named: Any = self.actuator
+        if self.gear_ratio is not None or self.voltage is not None:
+            motor = {} if self.gear_ratio is None else {"motor": {"gear_ratio": self.gear_ratio}}
+            supply = {} if self.voltage is None else {"supply": {"voltage": self.voltage}}
+            named = {"name": self.actuator, **motor, **supply}
         found = None
         if known:
             try:
-                actuator = posed(self.task, self._named()).actuator
+                actuator = posed(self.task, named).actuator
             except ValueError as error:
                 given = {"--gear-ratio": self.gear_ratio, "--voltage": self.voltage}
                 about = ", ".join(flag for flag, value in given.items() if value is not None)
@@ -94,7 +99,7 @@ class Advise:
             from codrl_mj.study.parallel import Workers
             from codrl_mj.study.program import compute
 
-            asked = measurement(self._named(), self.task, self.measure, self.root)
+            asked = measurement(named, self.task, self.measure, self.root)
             compute(asked.grid, Workers(self.jobs))
             options = asked.judged(asked.grid.collect())
             measured = {"options": options, "verdict": decide(options)}
@@ -103,14 +108,6 @@ class Advise:
             say(f"measured: {measured['verdict']}{more}")
         units = {name: unit or "1" for name, (_, unit, _) in _DELIVERED.items()} | {"loss": "share of the task's span"}
         return 0, {"units": units, "advice": found, "measured": measured}
-
-    def _named(self) -> Any:
-        changed: dict[str, Any] = {}
-        if self.gear_ratio is not None:
-            changed["motor"] = {"gear_ratio": self.gear_ratio}
-        if self.voltage is not None:
-            changed["supply"] = {"voltage": self.voltage}
-        return {"name": self.actuator, **changed} if changed else self.actuator
 
 
 def _print(name: str, found: Any) -> None:

@@ -275,9 +275,10 @@ class Step:
         print_table("", columns, rows, right=columns[1:])
         say(sampled_too_seldom(drive), drive.assumed)
         if self.out is not None:
-            from codrl_mj.pages.diagrams import step_diagram
+            from codrl_mj.pages import diagrams
 
-            save_plot(step_diagram(drive, steps), self.out / "step.png")
+            shown = [*diagrams.small_steps({"": (drive, None)}), *diagrams.recoveries(drive, steps)]
+            save_plot(shown, self.out / "step.png")
         content = {"current": amplitude, "settling_time": settled, "overshoot": small.overshoot}
         asked = {name: getattr(steps, name) for name in ("speed", "unreachable", "reachable")}
         units = {"current": "A", "settling_time": "s", "overshoot": "1", "speed": "rad/s", "unreachable": "A"}

@@ -188,11 +188,6 @@ def _upright(label: str, x: float, low: float, high: float) -> Curve:
     return Curve(label, np.array([x, x * (1.0 + 1e-6)]), np.array([low, high]), colour=3)
 
 
-def step_diagram(drive: Drive, steps: Steps) -> list[Plot]:
-    """Current and voltage of the steps that `codrl_mj.drives.step` took with a drive."""
-    return [*small_steps({"": (drive, None)}), *recoveries(drive, steps)]
-
-
 def small_steps(loops: Loops) -> list[Plot]:
     """Small steps of the current, the shaft held, as shares of what is asked for; of one alone with its voltage."""
     curves = []

@@ -203,10 +203,8 @@ class Browser:
             several = f" {pattern}" if len(session.config.driven) > 1 else ""
             own = actuator.family or type(actuator).__name__
             change, found = functools.partial(session.set_actuator, pattern), controls(actuator, self._supply)
-            for part, fields in itertools.groupby(
-                found, lambda one, own=own: one.path[0] if len(one.path) > 1 else own
-            ):
-                self._settings(f"{part}{several}", fields, actuator, change)
+            for part, fields in itertools.groupby(found, lambda one: one.path[:-1][:1]):
+                self._settings(f"{(*part, own)[0]}{several}", fields, actuator, change)
             if not found:
                 gui.add_markdown(f"Nothing can be set of {own}{several}: begin with `--actuator`.")
         disturbances = session.config.disturbances

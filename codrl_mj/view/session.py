@@ -80,7 +80,8 @@ def controls(
             found.append(Control(own, "", value))
         elif isinstance(value, int | float):
             unit = field.metadata.get("unit", "")
-            low, high = _slider(value, *field.metadata.get("between", (None, None)), scale if unit == "V" else None)
+            low, high = field.metadata.get("between", (None, None))
+            low, high = _slider(value, low, high, scale if unit == "V" else None)
             one = Control(own, unit, value, low, ends.get(field.name, high) if value == 0 else high)
             found += [] if one.endless and one.high is None else [one]
     return found
