@@ -197,7 +197,7 @@ def _motor_plots(lines: Sequence[_MotorLine]) -> list[Plot]:
     if voltage:
         curves = (*voltage, *_voltage_limits(lines, voltage))
         split = [line for line in lines if line.has("voltage_saturated")]  # the only limit of others is the voltage's
-        others = [line for line in lines if line not in split and line.has("voltage")]
+        others = [line for line in lines if line.has("voltage") and not line.has("voltage_saturated")]
         shades = _shades(split, "voltage_saturated") + _shades(others, "saturated")
         found.append(Plot("Voltage and its limit", _TIME, "voltage [V]", curves, clock=True, shades=shades))
     found += _other_signals(lines)
