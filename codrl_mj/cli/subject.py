@@ -23,6 +23,8 @@ class Subject:
     """What chooses the actions."""
     env: EnvConfig
     """The environment it was trained in, as far as that is known."""
+    agent: str
+    """Who was trained, as far as that is known; else what kind of policy it is."""
     run: Path | None = None
     """The run folder that says so; None if there is none."""
 
@@ -77,7 +79,7 @@ class Source:
                     f"{path}, or take its best one so far with --which best"
                 )
             policy = load_policy(path / BEST if self.which == "best" else path, self.trust)
-            return Subject(policy, config.env, path)
+            return Subject(policy, config.env, config.agent.known_as(), path)
         if self.which == "best":
             raise ValueError(f"--which best: {path} is no run folder and holds one policy alone: leave --which out")
         if self.task is None:
@@ -88,7 +90,7 @@ class Source:
             raise ValueError(f"{path} does not say which algorithm made it: name it with --agent, such as --agent ppo")
         else:
             policy = load_sb3_zip(path, self.agent or "", self.trust)
-        return Subject(policy, EnvConfig(self.task))
+        return Subject(policy, EnvConfig(self.task), self.agent or type(policy).__name__)
 
 
 def policy_and_environment(verb: Any) -> tuple[Any, EnvConfig, str]:

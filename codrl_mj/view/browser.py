@@ -24,18 +24,16 @@ _AXES = {"x": 0, "y": 1, "z": 2}
 _WANTED = ("desired", "reference")  # signals that are drawn first
 _HUGE = 1e30  # what is beyond it has diverged
 _DELAY_STEPS = 5  # environment steps, where the slider of the delay ends
+_SUPPLY = 48.0  # V, where that of an unlimited voltage ends
 _FLAT = ("box", "cylinder", "mesh", "plane")
 
 
 class Browser:
     """Serves a session until it is closed."""
 
-    def __init__(self, session: Session, port: int, title: str, supply: float = 48.0) -> None:
-        """Begin to serve a session, which from now on this alone touches, at a port or the next free one.
-
-        The slider of an unlimited voltage ends at `supply` [V].
-        """
-        self.session, self._supply = session, supply
+    def __init__(self, session: Session, port: int, title: str) -> None:
+        """Begin to serve a session, which from now on this alone touches, at a port or the next free one."""
+        self.session = session
         self.playing, self._speed, self._budget, self._real = True, 1.0, 0.0, 1.0
         self._deeds: queue.SimpleQueue[tuple[Any, Callable[[], None]]] = queue.SimpleQueue()
         self._refusal = ""
@@ -202,7 +200,7 @@ class Browser:
         for pattern, actuator in session.config.driven.items():  # a folder for each part of what drives a motor
             several = f" {pattern}" if len(session.config.driven) > 1 else ""
             own = actuator.family or type(actuator).__name__
-            change, found = functools.partial(session.set_actuator, pattern), controls(actuator, self._supply)
+            change, found = functools.partial(session.set_actuator, pattern), controls(actuator, _SUPPLY)
             for part, fields in itertools.groupby(found, lambda one: one.path[:-1][:1]):
                 self._settings(f"{(*part, own)[0]}{several}", fields, actuator, change)
             if not found:

@@ -5,8 +5,6 @@ There is no server in it; its one window is MuJoCo's own viewer, on a machine wi
 
 import dataclasses
 import math
-import os
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -301,15 +299,6 @@ class Session:
             least = min(forces, key=lambda action: forces[action])
             return least if math.isclose(forces[least], 0.0, abs_tol=1e-12) else None
         return None
-
-
-def check_display() -> None:
-    """Refuse where there is no display."""
-    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise RuntimeError(
-            "--native needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set: leave it out to see the "
-            "simulation in a browser, also through ssh -L 8080:localhost:8080"
-        )
 
 
 def run_native(session: Session) -> None:
