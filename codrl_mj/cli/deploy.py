@@ -130,8 +130,7 @@ class Test:
             from codrl_mj.films.film import check_film
 
             check_film(self.film, 640, 480)
-        names = ("lost", "damaged", "late", "counts", "current_bits", "pwm_bits")
-        link = Link(**{name: getattr(self, name) for name in names})
+        link = Link(self.lost, self.damaged, self.late, self.counts, self.current_bits, self.pwm_bits)
         with progress_bar("{task.completed}/{task.total} episodes") as bar:
             row = bar.add_task(f"on {self.target}", total=self.episodes)
             given = self.folder, self.target, self.episodes, self.seed, link, self.loop, self.actuator

@@ -95,20 +95,16 @@ class Source:
 
 def policy_and_environment(verb: Any) -> tuple[Any, EnvConfig, str]:
     """What acts, in what, and a title for both, by a verb's `subject` and its flags: random actions of a task or id."""
-    if is_world(verb.subject):
-        from codrl_mj.evaluation import RandomPolicy
-
-        known = EnvConfig(verb.subject)
-        env = environment(verb, known.task, verb.actuator_name, known)
-        actions = env.action_space
-        if env.action != "force":
-            with contextlib.closing(env.make()) as made:
-                actions = made.action_space
-        return RandomPolicy(actions, verb.seed), env, f"{Path(verb.subject).name} on {env.through}"
-    if not Path(verb.subject).exists():
+    if not (random := is_world(verb.subject)) and not Path(verb.subject).exists():
         hint = did_you_mean(verb.subject, TASKS)
         raise FileNotFoundError(f"no run configuration at {verb.subject}/{CONFIG}: {hint}It is no run and no task")
-    loaded = verb.source.load(Path(verb.subject))
-    env = environment(verb, loaded.env.task, verb.actuator_name, loaded.env)
-    loaded.check_interface(env)
-    return loaded.policy, env, f"{Path(verb.subject).name} on {env.through}"
+    subject = Subject(None, EnvConfig(verb.subject), "") if random else verb.source.load(Path(verb.subject))
+    env = environment(verb, subject.env.task, verb.actuator_name, subject.env)
+    subject.check_interface(env)
+    policy = subject.policy
+    if random:
+        from codrl_mj.evaluation import RandomPolicy
+
+        with contextlib.closing(env.make()) as made:
+            policy = RandomPolicy(made.action_space, verb.seed)
+    return policy, env, f"{Path(verb.subject).name} on {env.through}"
