@@ -49,19 +49,14 @@ class Export:
         from codrl_mj.deploy import export, network_of
 
         subject = self.source.load(self.run_folder)
-        agent = self.source.agent or type(subject.policy).__name__
-        if subject.run is not None:
-            from codrl_mj.training.folder import load_config
-
-            agent = load_config(subject.run, self.source.trust).agent.known_as()
         given = self.out, self.episodes, self.seed, self.float64, self.board, dict(map(_limit, self.limit))
-        contract = export(subject.policy, subject.env, agent, *given)
+        contract = export(subject.policy, subject.env, subject.agent, *given)
         rows = [
             (side, one["name"], one.get("unit") or "?", _bounds(one))
             for side, several in (("observation", contract.observations), ("action", contract.actions))
             for one in several
         ]
-        print_table(f"{contract.task}, {agent}, {contract.rate:g} Hz", ("", "name", "unit", "range"), rows)
+        print_table(f"{contract.task}, {subject.agent}, {contract.rate:g} Hz", ("", "name", "unit", "range"), rows)
         weights = network_of(subject.policy).size
         if contract.controller["loop"] is None and contract.actuators:
             print("no current loop: the motors differ, have none, or are commanded otherwise")
@@ -135,8 +130,7 @@ class Test:
             from codrl_mj.films.film import check_film
 
             check_film(self.film, 640, 480)
-        names = ("lost", "damaged", "late", "counts", "current_bits", "pwm_bits")
-        link = Link(**{name: getattr(self, name) for name in names})
+        link = Link(self.lost, self.damaged, self.late, self.counts, self.current_bits, self.pwm_bits)
         with progress_bar("{task.completed}/{task.total} episodes") as bar:
             row = bar.add_task(f"on {self.target}", total=self.episodes)
             given = self.folder, self.target, self.episodes, self.seed, link, self.loop, self.actuator

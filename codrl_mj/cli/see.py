@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -135,12 +137,16 @@ class LiveView(OfEpisodes):
 
     def run(self: Any) -> int:
         """Serve until Ctrl-C."""
-        from codrl_mj.view.session import Session, check_display, run_native
+        from codrl_mj.view.session import Session, run_native
 
         if not 1 <= self.port <= 65535:
             raise ValueError(f"--port {self.port}: must be from 1 to 65535")
         if self.native:
-            check_display()
+            if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+                raise RuntimeError(
+                    "--native needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set: leave it out to see the "
+                    "simulation in a browser, also through ssh -L 8080:localhost:8080"
+                )
         else:
             try:
                 from codrl_mj.view.browser import Browser

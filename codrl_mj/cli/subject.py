@@ -23,6 +23,8 @@ class Subject:
     """What chooses the actions."""
     env: EnvConfig
     """The environment it was trained in, as far as that is known."""
+    agent: str
+    """Who was trained, as far as that is known; else what kind of policy it is."""
     run: Path | None = None
     """The run folder that says so; None if there is none."""
 
@@ -77,7 +79,7 @@ class Source:
                     f"{path}, or take its best one so far with --which best"
                 )
             policy = load_policy(path / BEST if self.which == "best" else path, self.trust)
-            return Subject(policy, config.env, path)
+            return Subject(policy, config.env, config.agent.known_as(), path)
         if self.which == "best":
             raise ValueError(f"--which best: {path} is no run folder and holds one policy alone: leave --which out")
         if self.task is None:
@@ -88,25 +90,21 @@ class Source:
             raise ValueError(f"{path} does not say which algorithm made it: name it with --agent, such as --agent ppo")
         else:
             policy = load_sb3_zip(path, self.agent or "", self.trust)
-        return Subject(policy, EnvConfig(self.task))
+        return Subject(policy, EnvConfig(self.task), self.agent or type(policy).__name__)
 
 
 def policy_and_environment(verb: Any) -> tuple[Any, EnvConfig, str]:
     """What acts, in what, and a title for both, by a verb's `subject` and its flags: random actions of a task or id."""
-    if is_world(verb.subject):
-        from codrl_mj.evaluation import RandomPolicy
-
-        known = EnvConfig(verb.subject)
-        env = environment(verb, known.task, verb.actuator_name, known)
-        actions = env.action_space
-        if env.action != "force":
-            with contextlib.closing(env.make()) as made:
-                actions = made.action_space
-        return RandomPolicy(actions, verb.seed), env, f"{Path(verb.subject).name} on {env.through}"
-    if not Path(verb.subject).exists():
+    if not (random := is_world(verb.subject)) and not Path(verb.subject).exists():
         hint = did_you_mean(verb.subject, TASKS)
         raise FileNotFoundError(f"no run configuration at {verb.subject}/{CONFIG}: {hint}It is no run and no task")
-    loaded = verb.source.load(Path(verb.subject))
-    env = environment(verb, loaded.env.task, verb.actuator_name, loaded.env)
-    loaded.check_interface(env)
-    return loaded.policy, env, f"{Path(verb.subject).name} on {env.through}"
+    subject = Subject(None, EnvConfig(verb.subject), "") if random else verb.source.load(Path(verb.subject))
+    env = environment(verb, subject.env.task, verb.actuator_name, subject.env)
+    subject.check_interface(env)
+    policy = subject.policy
+    if random:
+        from codrl_mj.evaluation import RandomPolicy
+
+        with contextlib.closing(env.make()) as made:
+            policy = RandomPolicy(made.action_space, verb.seed)
+    return policy, env, f"{Path(verb.subject).name} on {env.through}"

@@ -123,7 +123,7 @@ def read_rows(interface: Interface, path: Path) -> tuple[np.ndarray, np.ndarray,
             raise ValueError(
                 f"{path}: action {one['name']!r}: its unit is {told[place][1]}, must be {one['unit']}: convert it"
             )
-    return (table[:, where["time"]], table[:, seen], table[:, sent])
+    return table[:, where["time"]], table[:, seen], table[:, sent]
 
 
 def check_log(folder: Path, path: Path) -> LogCheck:

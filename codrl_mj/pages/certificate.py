@@ -33,7 +33,8 @@ def html(certificate: Certificate, caught: Sequence[Caught] = ()) -> str:
     sections = [_group(name, title, certificate) for name, title in GROUPS.items()]
     skipped = [(skip.name, skip.group, skip.reason) for skip in certificate.skipped]
     left = page.table("What was not checked", ("what", "group", "why"), skipped, cards=True) if skipped else Markup()
-    sections += [_mutations(certificate, caught), page.Section("skipped", "Not checked", left)]
+    sections += [_mutations(certificate, caught)] if caught else []
+    sections.append(page.Section("skipped", "Not checked", left))
     return page.page(
         f"Is the port right? {certificate.subject}", "Certificate of validation", page.joined(top), sections
     )
@@ -63,8 +64,6 @@ def _group(name: str, title: str, certificate: Certificate) -> page.Section:
 
 
 def _mutations(certificate: Certificate, caught: Sequence[Caught]) -> page.Section:
-    if not caught:
-        return page.Section("mutations", "Mutations", Markup())
     rows = []
     for one in caught:
         clearest, cells = one.clearest, [one.mutation, one.task or "the motor", f"{len(one.failed)} of {one.made}"]

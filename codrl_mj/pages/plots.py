@@ -174,14 +174,14 @@ def description(plot: Plot) -> str:
     return f"{plot.y_label} over {plot.x_label}. {'; '.join(told[:12])}{'; and more' if len(told) > 12 else ''}."
 
 
-def still(plot: Plot, width: float = 6.4, height: float = 3.2) -> str:
-    """The plot, its first twelve curves, as the text of an SVG file of this size [in], transparent and small."""
+def still(plot: Plot, height: float = 3.2) -> str:
+    """The plot, its first twelve curves, as the text of an SVG file of this height [in], transparent and small."""
     import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "codrl_mj", "path.simplify_threshold": 0.5}):
-        figure = Figure(figsize=(width, height))
+        figure = Figure(figsize=(6.4, height))
         figure.subplots_adjust(0.13, 0.17, 0.985 if plot.scaled is None else 0.87, 0.97)
         FigureCanvasSVG(figure)
         axes = figure.subplots()

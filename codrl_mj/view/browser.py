@@ -11,7 +11,6 @@ import numpy as np
 import trimesh
 from viser import uplot
 
-from codrl_mj.fields import field_docs
 from codrl_mj.replay.scene import TRIANGLES, Shape, first_view, mesh, read_poses, shapes, thinned
 from codrl_mj.view.local import LocalServer
 from codrl_mj.view.session import Control, Session, controls
@@ -24,18 +23,16 @@ _AXES = {"x": 0, "y": 1, "z": 2}
 _WANTED = ("desired", "reference")  # signals that are drawn first
 _HUGE = 1e30  # what is beyond it has diverged
 _DELAY_STEPS = 5  # environment steps, where the slider of the delay ends
+_SUPPLY = 48.0  # V, where that of an unlimited voltage ends
 _FLAT = ("box", "cylinder", "mesh", "plane")
 
 
 class Browser:
     """Serves a session until it is closed."""
 
-    def __init__(self, session: Session, port: int, title: str, supply: float = 48.0) -> None:
-        """Begin to serve a session, which from now on this alone touches, at a port or the next free one.
-
-        The slider of an unlimited voltage ends at `supply` [V].
-        """
-        self.session, self._supply = session, supply
+    def __init__(self, session: Session, port: int, title: str) -> None:
+        """Begin to serve a session, which from now on this alone touches, at a port or the next free one."""
+        self.session = session
         self.playing, self._speed, self._budget, self._real = True, 1.0, 0.0, 1.0
         self._deeds: queue.SimpleQueue[tuple[Any, Callable[[], None]]] = queue.SimpleQueue()
         self._refusal = ""
@@ -202,16 +199,14 @@ class Browser:
         for pattern, actuator in session.config.driven.items():  # a folder for each part of what drives a motor
             several = f" {pattern}" if len(session.config.driven) > 1 else ""
             own = actuator.family or type(actuator).__name__
-            change, found = functools.partial(session.set_actuator, pattern), controls(actuator, self._supply)
+            change, found = functools.partial(session.set_actuator, pattern), controls(actuator, _SUPPLY)
             for part, fields in itertools.groupby(found, lambda one: one.path[:-1][:1]):
-                self._settings(f"{(*part, own)[0]}{several}", fields, actuator, change)
+                self._settings(f"{(*part, own)[0]}{several}", fields, change)
             if not found:
                 gui.add_markdown(f"Nothing can be set of {own}{several}: begin with `--actuator`.")
         disturbances = session.config.disturbances
         ends = {"command_delay": _DELAY_STEPS * session.recorder.step_duration}
-        self._settings(
-            "delay and disturbances", controls(disturbances, ends=ends), disturbances, session.set_disturbance
-        )
+        self._settings("delay and disturbances", controls(disturbances, ends=ends), session.set_disturbance)
 
     def _pushes(self) -> None:
         gui, session = self.server.gui, self.session
@@ -262,29 +257,22 @@ class Browser:
                 )
                 self._plots.append(([session.recorder.trace_names.index(name) for name in names], handle))
 
-    def _settings(
-        self, title: str, found: Iterable[Control], settings: Any, change: Callable[[tuple[str, ...], Any], None]
-    ) -> None:
+    def _settings(self, title: str, found: Iterable[Control], change: Callable[[tuple[str, ...], Any], None]) -> None:
         """A folder with what has a slider, and within it one with what has to be typed."""
         gui, found = self.server.gui, list(found)
         slid = [one for one in found if one.high is not None or one.options or isinstance(one.value, bool)]
         typed = [one for one in found if one not in slid]
         with gui.add_folder(title, expand_by_default=False):
             for one in slid:
-                self._field(one, settings, change)
+                self._field(one, change)
             if typed:
                 with gui.add_folder("more", expand_by_default=False):
                     for one in typed:
-                        self._field(one, settings, change)
+                        self._field(one, change)
 
-    def _field(self, one: Control, settings: Any, change: Callable[[tuple[str, ...], Any], None]) -> None:
-        gui = self.server.gui
+    def _field(self, one: Control, change: Callable[[tuple[str, ...], Any], None]) -> None:
+        gui, hint = self.server.gui, one.about
         label = one.path[-1].replace("_", " ") + (f" [{one.unit}]" if one.unit else "")
-        part: Any = settings
-        for name in one.path[:-1]:
-            part = getattr(part, name, None)
-        kind: Any = type(part)
-        hint = field_docs(kind).get(one.path[-1]) if part is not None else None
         handle: Any
         if one.options:
             handle = gui.add_dropdown(label, one.options, initial_value=one.value, hint=hint)

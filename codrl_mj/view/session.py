@@ -5,8 +5,6 @@ There is no server in it; its one window is MuJoCo's own viewer, on a machine wi
 
 import dataclasses
 import math
-import os
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -19,7 +17,7 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import actuator_over
 from codrl_mj.evaluation import RandomPolicy
-from codrl_mj.fields import parts
+from codrl_mj.fields import field_docs, parts
 
 _FOREVER = 10**9  # environment steps
 _DIVERGED = mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC
@@ -45,6 +43,8 @@ class Control:
     """Of a number: where its slider ends; None where a scale for it is not known, so that it is typed."""
     options: tuple[str, ...] = ()
     """Of a word: what it may be."""
+    about: str | None = None
+    """What its documentation says."""
 
     @property
     def endless(self) -> bool:
@@ -69,20 +69,20 @@ def controls(
     The slider of an infinite voltage ends at `scale` [V], without which infinite fields are left out; that of a field
     that is 0 where `ends` says so by its name.
     """
-    found, nested = [], parts(type(settings))
+    found, nested, docs = [], parts(type(settings)), field_docs(type(settings))
     for field in dataclasses.fields(settings):
-        value, own = getattr(settings, field.name), (*path, field.name)
+        value, own, about = getattr(settings, field.name), (*path, field.name), docs.get(field.name)
         if field.name in nested:
             found += controls(field.metadata.get("absent") if value is None else value, scale, ends, own)
         elif "options" in field.metadata:
-            found.append(Control(own, "", value, options=field.metadata["options"]))
+            found.append(Control(own, "", value, options=field.metadata["options"], about=about))
         elif isinstance(value, bool):
-            found.append(Control(own, "", value))
+            found.append(Control(own, "", value, about=about))
         elif isinstance(value, int | float):
             unit = field.metadata.get("unit", "")
             low, high = field.metadata.get("between", (None, None))
             low, high = _slider(value, low, high, scale if unit == "V" else None)
-            one = Control(own, unit, value, low, ends.get(field.name, high) if value == 0 else high)
+            one = Control(own, unit, value, low, ends.get(field.name, high) if value == 0 else high, about=about)
             found += [] if one.endless and one.high is None else [one]
     return found
 
@@ -301,15 +301,6 @@ class Session:
             least = min(forces, key=lambda action: forces[action])
             return least if math.isclose(forces[least], 0.0, abs_tol=1e-12) else None
         return None
-
-
-def check_display() -> None:
-    """Refuse where there is no display."""
-    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise RuntimeError(
-            "--native needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set: leave it out to see the "
-            "simulation in a browser, also through ssh -L 8080:localhost:8080"
-        )
 
 
 def run_native(session: Session) -> None:

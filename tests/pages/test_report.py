@@ -172,7 +172,12 @@ def test_several_motors_can_be_chosen():
         field: {name: np.stack([values, 2.0 * values], axis=1) for name, values in getattr(one, field).items()}
         for field in ("trace", "signals")
     }
-    two = dataclasses.replace(one, **arrays, actuator=(one.actuator,) * 2, motors=("left", "right"))
+    both = {
+        "actuator": (one.actuator,) * 2,
+        "motors": ("left", "right"),
+        "first_speeds": np.repeat(one.first_speeds, 2),
+    }
+    two = dataclasses.replace(one, **arrays, **both)
     section = str(episode_section([Shown("arm", env, two, None, "none was asked for", 0)]))
     expected = [
         (f"{side}: {what}", f"motor:{place}") for place, side in enumerate(two.motors) for what in ("actual", "desired")
