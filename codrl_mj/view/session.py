@@ -69,7 +69,8 @@ def controls(
     The slider of an infinite voltage ends at `scale` [V], without which infinite fields are left out; that of a field
     that is 0 where `ends` says so by its name.
     """
-    found, nested, docs = [], parts(type(settings)), field_docs(type(settings))
+    kind: Any = type(settings)
+    found, nested, docs = [], parts(kind), field_docs(kind)
     for field in dataclasses.fields(settings):
         value, own, about = getattr(settings, field.name), (*path, field.name), docs.get(field.name)
         if field.name in nested:
