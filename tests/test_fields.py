@@ -10,8 +10,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from codrl_mj.fields import (
+    Checked,
     build,
-    check,
     check_names,
     choice,
     did_you_mean,
@@ -36,9 +36,7 @@ NOT_REAL = st.sampled_from([True, False, np.True_, "1", None, [1.0], (1.0,), 1j,
 
 def _settings(field):
     """A class of one field, checked when it is made."""
-    return dataclasses.make_dataclass(
-        "Settings", [("field", object, field)], frozen=True, namespace={"__post_init__": check}
-    )
+    return dataclasses.make_dataclass("Settings", [("field", object, field)], frozen=True, bases=(Checked,))
 
 
 def _refusal(kind, value):
@@ -159,24 +157,20 @@ def test_tuples_hold_what_they_say(field, good, bad, bound):
 
 
 @dataclasses.dataclass(frozen=True)
-class Inner:
+class Inner(Checked):
     """A part."""
 
     gain: float = real(1.0, least=0.0)
     limit: float = real(2.0, above=0.0)
 
-    __post_init__ = check
-
 
 @dataclasses.dataclass(frozen=True)
-class Outer:
+class Outer(Checked):
     """With a part that is there and one that may be."""
 
     size: int = integer(1, least=1)
     always: Inner = Inner()
     maybe: Inner | None = part(Inner())
-
-    __post_init__ = check
 
 
 @given(st.floats(0, 10), st.integers(1, 9), st.none() | st.floats(0, 10))
