@@ -9,6 +9,8 @@ import itertools
 import math
 import numbers
 import textwrap
+import types
+import typing
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -223,6 +225,17 @@ def parts(cls: type) -> dict[str, type]:
         elif dataclasses.is_dataclass(field.default):
             found[field.name] = type(field.default)
     return found
+
+
+@functools.cache
+def declared_parts(cls: Any) -> dict[str, Any]:
+    """The `parts` of a dataclass that are declared as a class, or a union of some: as what."""
+    try:
+        hints = typing.get_type_hints(cls)
+    except NameError:  # names that only a type checker sees
+        return {}
+    declared = {name: hints[name] for name in parts(cls) if hints[name] is not Any}
+    return {name: hint for name, hint in declared.items() if isinstance(hint, type | types.UnionType)}
 
 
 def _bounded(

@@ -37,6 +37,11 @@ def test_importing_the_motor_imports_no_engine():
     assert _python(program) == "[]"
 
 
+def test_a_board_s_log_is_checked_without_what_trains():
+    program = "import sys, codrl_mj.deploy; print([n for n in ('torch', 'stable_baselines3') if n in sys.modules])"
+    assert _python(program) == "[]"
+
+
 BACKEND = "print(os.environ.get('MUJOCO_GL'))"
 
 

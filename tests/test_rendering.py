@@ -13,7 +13,7 @@ from PIL import Image
 from codrl_mj.actuators import IDEAL, Actuator, Drive, Motor
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import Episode, RandomPolicy, run_episodes
-from codrl_mj.films.film import Panel, film
+from codrl_mj.films.film import Filmed, Panel, film
 from codrl_mj.films.strip import torque_label
 from codrl_mj.own_code import asset_path
 from codrl_mj.physics import Plant, signal_names
@@ -366,3 +366,11 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     with pytest.raises(OSError, match="file"):
         film([made_up(1.0, 1.0)], tmp_path / "file" / "film.mp4", WIDTH, HEIGHT)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_an_environment_that_does_not_render_images_is_refused_before_its_episode_begins():
+    with (
+        contextlib.closing(EnvConfig("pendulum").make()) as env,
+        pytest.raises(ValueError, match="'rgb_array' for a film"),
+    ):
+        Filmed(env)

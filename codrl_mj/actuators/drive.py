@@ -73,31 +73,18 @@ class Signals(NamedTuple):
 
 
 def limited(parameters: Any, timestep: float, heat: Heat, resistance: float, asked: float) -> float:
-    """The current [A] that the loop is given: what is asked for, within `max_current` and what the winding bears.
-
-    That is what takes it to `max_temperature` within the step, and no further: more than it can bear for long while the
-    motor is cold, the continuous current at the limit.
-    """
+    """The current [A] that the loop is given: what is asked for, within `max_current` and what the winding bears."""
     most = parameters.max_current
     if parameters.max_temperature < math.inf and shaft.is_warming(parameters):
-        cooled = shaft.heated(parameters, timestep, heat, 0.0)
-        by_a_watt = shaft.heated(parameters, timestep, Heat(0.0, 0.0), 1.0)
-        room = parameters.max_temperature - parameters.ambient_temperature - cooled.winding - cooled.housing
-        most = min(most, math.sqrt(max(room, 0.0) / (resistance * (by_a_watt.winding + by_a_watt.housing))))
+        most = min(most, shaft.thermal_limit(parameters, timestep, heat, resistance))
     return min(max(asked, -most), most)
 
 
 def begin(parameters: Any, timestep: float, state: Any, inputs: Inputs) -> tuple[Winding, Heat, Shaft]:
     """Winding, temperatures and shaft at the beginning of a step, from a state that has the entries of `State`."""
-    inertia, others = inputs.inertia, 0.0
-    if parameters.load_inertia > 0.0:
-        inertia = parameters.rotor_inertia + parameters.load_inertia / (parameters.gear_ratio * parameters.gear_ratio)
-    inertia = inertia if inertia > 0.0 else math.inf
+    inertia, others = shaft.inertia_of(parameters, inputs.inertia), 0.0
     if state.due > 0.0 and abs(inputs.time - state.due) < 0.5 * timestep and inertia < math.inf:
-        # half of it is what was taken in the last step: two joints that move each other, each with a stiff motor, would
-        # answer to what the other did a step ago, back and forth
-        shown = (inputs.speed - state.speed) / timestep - state.acceleration
-        others = 0.5 * shown + 0.5 * state.others
+        others = shaft.others_after(timestep, inputs.speed - state.speed, state.acceleration, state.others)
     moving = Shaft(inertia, others, inputs.speed)
     winding = Winding(state.current, state.integral, state.pending)
     return winding, Heat(state.winding_rise, state.housing_rise), moving

@@ -133,12 +133,15 @@ class ActuatorModel(fields.Checked):
     def __post_init__(self) -> None:
         """Validate."""
         super().__post_init__()
-        for name, kind in fields.parts(type(self)).items():
-            given = getattr(self, name)
-            if not isinstance(given, kind) and given is not getattr(type(self), name):  # None, or the default
+        family: Any = type(self)
+        kinds = fields.declared_parts(family)
+        for field in dataclasses.fields(self) if kinds else ():
+            given = getattr(self, field.name)
+            if given is not field.default and not isinstance(given, kinds.get(field.name, object)):
+                kind = fields.parts(family)[field.name].__name__
                 raise ValueError(
-                    f"{type(self).__name__}.{name} = {given!r}: must be a {kind.__name__}; to build one from nested "
-                    f"mappings use {type(self).__name__}.from_mapping"
+                    f"{family.__name__}.{field.name} = {given!r}: must be a {kind}; to build one from nested mappings "
+                    f"use {family.__name__}.from_mapping"
                 )
 
     @staticmethod

@@ -98,6 +98,33 @@ def heated(parameters: Any, duration: float, heat: Heat, watts: float) -> Heat:
     )
 
 
+def thermal_limit(parameters: Any, duration: float, heat: Heat, resistance: float) -> float:
+    """The current [A] that takes the winding to `max_temperature` within some time [s], and no further.
+
+    While the motor is cold that is more than it can bear for long; at the limit it falls to the continuous current.
+    """
+    cooled, by_a_watt = heated(parameters, duration, heat, 0.0), heated(parameters, duration, Heat(0.0, 0.0), 1.0)
+    room = parameters.max_temperature - parameters.ambient_temperature - cooled.winding - cooled.housing
+    return math.sqrt(max(room, 0.0) / (resistance * (by_a_watt.winding + by_a_watt.housing)))
+
+
+def inertia_of(parameters: Any, inertia: float) -> float:
+    """Inertia [kg*m^2] that the rotor moves, by `load_inertia` or the model's; `inf` where the speed is held."""
+    if parameters.load_inertia > 0.0:
+        inertia = parameters.rotor_inertia + parameters.load_inertia / (parameters.gear_ratio * parameters.gear_ratio)
+    return inertia if inertia > 0.0 else math.inf
+
+
+def others_after(timestep: float, change: float, own: float, others: float) -> float:
+    """Acceleration [rad/s^2] of the rotor by all but its motor, from what the last step showed.
+
+    Half of it is what was taken then: two joints that move each other, each with a stiff motor, would answer to what
+    the other did a step ago, back and forth. From the rotor's change of speed in the step [rad/s] and, [rad/s^2], its
+    acceleration by the motor's torque and what was taken for that by all else.
+    """
+    return 0.5 * (change / timestep - own) + 0.5 * others
+
+
 def friction(parameters: Any, duration: float, torque: float, shaft: Shaft) -> float:
     """Torque [N*m] that Stribeck friction and the gear take from the motor's, by an implicit step.
 

@@ -52,13 +52,12 @@ class SARSAConfig(AgentConfig):
         Raises:
             ValueError: there is more than one environment, or its observations or actions do not go with the tiles.
         """
-        from codrl_mj.agents.sarsa_algorithm import SARSA
-        from codrl_mj.agents.tile_coding import TileCodingPolicy
+        from codrl_mj.agents.sarsa_algorithm import SARSA, TileCodingPolicy
 
         return SARSA(TileCodingPolicy, env, self, seed=seed)
 
     def make_policy(self, observation_space: spaces.Box, action_space: spaces.Space[Any]) -> Any:
         """See `AgentConfig.make_policy`."""
-        from codrl_mj.agents.tile_coding import TileCodingPolicy
+        from codrl_mj.agents.sarsa_algorithm import TileCodingPolicy
 
         return TileCodingPolicy(observation_space, action_space, self)

@@ -9,12 +9,21 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+import torch
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import safe_mean
 
-from codrl_mj.agents.tile_coding import TileCoder, TileCodingPolicy, action_value, choose_action, find_tiles
+from codrl_mj.agents.tile_coding import (
+    TileCoder,
+    action_value,
+    choose_action,
+    choose_actions,
+    find_tiles,
+    make_coder,
+)
 from codrl_mj.envs import ActuatedVectorEnv
 from codrl_mj.envs.compiled import arguments, compiled_kernels
 from codrl_mj.envs.sb3 import ActuatedVecEnv
@@ -161,6 +170,55 @@ def run_episode(
         seen_reward = float(np.float32(reward))  # what Stable-Baselines3's environments hand out
         action = learn(learner, generator, action, seen_reward, observation, terminated)
     return total, length, terminated, True
+
+
+class TileCodingPolicy(BasePolicy):
+    """Acts by action values that are linear in the active tiles: greedily, or epsilon-greedily.
+
+    Of equally good actions a greedy one (`deterministic=True`) is the first. `predict(..., deterministic=False)` draws
+    from the policy's `generator`; training draws from the algorithm's own generator, so that no evaluation
+    changes it.
+    """
+
+    def __init__(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], config: Any) -> None:
+        """Make a policy that knows nothing yet."""
+        if not isinstance(action_space, spaces.Discrete) or action_space.start != 0:
+            raise ValueError(
+                f"action_space = {action_space}: SARSA has a weight for every action: must be Discrete, from 0"
+            )
+        if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
+            raise ValueError(
+                f"observation_space = {observation_space}: must be a Box with one axis, to be covered by tiles"
+            )
+        tilings, intervals, angles = config.tilings, config.intervals, config.angles
+        used = slice(2 * angles, len(intervals) + angles)
+        if used.stop > observation_space.shape[0]:
+            raise ValueError(
+                f"intervals = {intervals}, angles = {angles}: are of {used.stop} observation entries, but there "
+                f"are {observation_space.shape[0]}; give one interval for an angle or any other entry"
+            )
+        super().__init__(observation_space, action_space)
+        low = observation_space.low[used].tolist() if config.low is None else config.low
+        high = observation_space.high[used].tolist() if config.high is None else config.high
+        self.config, self.coder = config, make_coder(low, high, tilings, intervals, angles)
+        self.generator = np.random.default_rng()
+        size = self.coder.size, int(action_space.n)
+        weights = torch.full(size, config.initial_value / tilings, dtype=torch.float64)
+        self.weights = torch.nn.Parameter(weights, requires_grad=False)
+
+    @property
+    def table(self) -> np.ndarray:
+        """The weights, shape (tiles, actions), float64; what is written to it is written to the policy."""
+        return self.weights.numpy()
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> torch.Tensor:
+        epsilon, generator = self.config.epsilon, self.generator
+        return torch.from_numpy(
+            choose_actions(observation.numpy(), self.coder, self.table, deterministic, epsilon, generator)
+        )
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {"observation_space": self.observation_space, "action_space": self.action_space, "config": self.config}
 
 
 class CompiledEpisodes:

@@ -1,4 +1,4 @@
-"""Tile coding: a point in space as the tiles that it lies in, one in each of several displaced grids; a policy.
+"""Tile coding: a point in space as the tiles that it lies in, one in each of several displaced grids; actions by tiles.
 
 Sutton and Barto, *Reinforcement Learning: An Introduction* (2018), section 9.5.4, with the displacements of Sutton's
 tiles3: along axis j (from 0), tiling t is displaced by (2 j + 1) t n-ths of a tile, where n is the number of tilings.
@@ -7,12 +7,9 @@ Without hashing: every tile has an index of its own.
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import torch
-from gymnasium import spaces
-from stable_baselines3.common.policies import BasePolicy
 
 from codrl_mj.kept import njit
 
@@ -170,52 +167,3 @@ def choose_actions(
         else:
             actions[row] = choose_action(weights, tiles, epsilon, generator)
     return actions
-
-
-class TileCodingPolicy(BasePolicy):
-    """Acts by action values that are linear in the active tiles: greedily, or epsilon-greedily.
-
-    Of equally good actions a greedy one (`deterministic=True`) is the first. `predict(..., deterministic=False)` draws
-    from the policy's `generator`; training draws from the algorithm's own generator, so that no evaluation
-    changes it.
-    """
-
-    def __init__(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], config: Any) -> None:
-        """Make a policy that knows nothing yet."""
-        if not isinstance(action_space, spaces.Discrete) or action_space.start != 0:
-            raise ValueError(
-                f"action_space = {action_space}: SARSA has a weight for every action: must be Discrete, from 0"
-            )
-        if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
-            raise ValueError(
-                f"observation_space = {observation_space}: must be a Box with one axis, to be covered by tiles"
-            )
-        tilings, intervals, angles = config.tilings, config.intervals, config.angles
-        used = slice(2 * angles, len(intervals) + angles)
-        if used.stop > observation_space.shape[0]:
-            raise ValueError(
-                f"intervals = {intervals}, angles = {angles}: are of {used.stop} observation entries, but there "
-                f"are {observation_space.shape[0]}; give one interval for an angle or any other entry"
-            )
-        super().__init__(observation_space, action_space)
-        low = observation_space.low[used].tolist() if config.low is None else config.low
-        high = observation_space.high[used].tolist() if config.high is None else config.high
-        self.config, self.coder = config, make_coder(low, high, tilings, intervals, angles)
-        self.generator = np.random.default_rng()
-        size = self.coder.size, int(action_space.n)
-        weights = torch.full(size, config.initial_value / tilings, dtype=torch.float64)
-        self.weights = torch.nn.Parameter(weights, requires_grad=False)
-
-    @property
-    def table(self) -> np.ndarray:
-        """The weights, shape (tiles, actions), float64; what is written to it is written to the policy."""
-        return self.weights.numpy()
-
-    def _predict(self, observation: Any, deterministic: bool = False) -> torch.Tensor:
-        epsilon, generator = self.config.epsilon, self.generator
-        return torch.from_numpy(
-            choose_actions(observation.numpy(), self.coder, self.table, deterministic, epsilon, generator)
-        )
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {"observation_space": self.observation_space, "action_space": self.action_space, "config": self.config}

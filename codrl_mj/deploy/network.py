@@ -111,7 +111,7 @@ def network_of(policy: Policy) -> Network | Tiles:
     Raises:
         ValueError: it is none of these, or has parts that are no factors and dense layers.
     """
-    from codrl_mj.agents.tile_coding import TileCodingPolicy
+    from codrl_mj.agents.sarsa_algorithm import TileCodingPolicy
 
     if isinstance(policy, TileCodingPolicy):
         factors = np.ones(policy.observation_space.shape or (), np.float32)

@@ -1,7 +1,5 @@
 """MuJoCo's control and bias callbacks for our actuators, compiled to C functions by numba: the five tasks' door.
 
-Here they, and that of hills, are installed into MuJoCo, too.
-
 They are pure functions of (mjModel, mjData): which actuators are ours, and their parameters, is read from the model;
 all state is in `data.act`. Nothing is cached on disk: the structure offsets are compiled in as constants.
 """
@@ -99,7 +97,7 @@ def compiled() -> dict[str, Any]:
     return {"control": callback(control), "act_bias": callback(act_bias, ctypes.c_double, ctypes.c_int)}
 
 
-# -- installing them, without trampling on anybody else's ------------------------------------------------------
+# -- installing them, and that of hills, without trampling on anybody else's -----------------------------------
 
 _PARTS: dict[str, tuple[tuple[str, ...], Callable[[], dict[str, Any]], str]] = {
     "motor": (("control", "act_bias"), compiled, "actuator='ideal' or physics='analytic'"),

@@ -42,6 +42,8 @@ class Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def __init__(self, env: "gymnasium.Env[Any, Any]", pretty: bool = False) -> None:
         """Film an environment; pretty are shadows and multisampling, which on a CPU cost ten times the rest."""
+        if env.render_mode != "rgb_array":
+            raise ValueError(f"render_mode = {env.render_mode!r}: must be 'rgb_array' for a film")
         super().__init__(env)
         if not pretty and hasattr(env.unwrapped, "model"):
             quality = env.unwrapped.model.vis.quality

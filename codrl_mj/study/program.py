@@ -56,8 +56,14 @@ class Program(Checked, abc.ABC):
         """Write the page of all results that there are: the files, and what failed."""
 
     def publish(self) -> None:
-        """Write what there is, each time that all of a seed is computed: run folders do not outlive a machine."""
-        self.write()
+        """Write what there is, each time that all of a seed is computed: run folders do not outlive a machine.
+
+        What cannot be written now is written in the end, or refused there.
+        """
+        try:
+            self.write()
+        except (OSError, ValueError) as error:
+            print(f"not published yet: {error}", file=sys.stderr)
 
     def run(self) -> int:
         """Compute what is missing and write the page; 1 if something failed."""

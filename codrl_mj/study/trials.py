@@ -197,7 +197,7 @@ class Grid:
             workers: what computes it.
             accept_changes: continue begun trainings even if code or packages have changed since.
             on_cell: called with `training` or `test` when one is finished or has failed.
-            on_seed: called when all of a seed's are, unless they were before.
+            on_seed: called when all of a seed's are, unless nothing came of it.
 
         Raises:
             ValueError: Ray is asked for and not installed.
@@ -215,7 +215,7 @@ class Grid:
             )
             ready = {called(*key): test for key, test in tests.items() if key[1] == seed and finished(test.run)}
             deploy_cells(ready, workers, lambda _: on_cell("test"))
-            if waiting or ready:
+            if any(map(finished, waiting)) or any(test.record.is_file() for test in ready.values()):
                 on_seed()
 
     def collect(self) -> "Collected":

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -45,6 +46,37 @@ class Nested(ActuatorModel):
     on: bool = flag(True)
     always: Inner = Inner(gain=3.0)
     maybe: Inner | None = part(Inner(gain=4.0))
+
+
+@dataclasses.dataclass(frozen=True)
+class Finer(Inner):
+    """A kind of such a part."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Other:
+    """What has the fields of one and is none."""
+
+    gain: float = real(1.0, least=0.0)
+    count: int = integer(2, least=1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Open(Nested):
+    """A family that declares less of its parts than it has by default."""
+
+    always: Inner = Finer(gain=3.0)
+    maybe: Any = part(Inner(gain=4.0))
+
+
+def test_parts_are_what_a_family_declares_and_not_what_it_has_by_default():
+    assert Open(always=Inner(), maybe=Other(gain=2.0)).maybe.gain == 2.0
+    assert Nested(always=Finer(), maybe=None).maybe is None
+    for name in ("always", "maybe"):
+        with pytest.raises(ValueError, match=rf"Nested\.{name} = Other\(.*\): must be a Inner; .*Nested\.from_mapping"):
+            Nested(**{name: Other()})
+    with pytest.raises(ValueError, match=r"Nested\.always = None: must be a Inner"):
+        Nested(always=None)
 
 
 @given(of_every_family)

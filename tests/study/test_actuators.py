@@ -365,3 +365,10 @@ def test_a_stranger_recomputes_the_numbers_without_the_package():
             found = trials[task, trained, f"{axis} {dose}"]
             assert float(mean) == pytest.approx(float(found["score"]), abs=6e-4)
             assert int(failed) == round(20 * float(found["failed"]))
+
+
+def test_what_cannot_be_published_yet_stops_no_study(tmp_path, monkeypatch, capsys):
+    study = ActuatorStudy(root=tmp_path, out=tmp_path)
+    monkeypatch.setattr(ActuatorStudy, "write", lambda _: (_ for _ in ()).throw(ValueError("a damaged file")))
+    study.publish()
+    assert capsys.readouterr().err == "not published yet: a damaged file\n"
