@@ -242,7 +242,11 @@ def certificate() -> Entries:
 
 MOTORS = {
     "geared": {"name": "maxon-ec45-flat-50w", "motor": {"gear_ratio": 20}},
-    "warm": {"family": "drive", "motor": {"max_temperature": 60.0}, "supply": {"voltage": 6.0, "resistance": 0.5}},
+    "warm": {
+        "name": "maxon-ec45-flat-50w",
+        "motor": {"gear_ratio": 20, "max_temperature": 25.5},
+        "supply": {"voltage": 6.0, "resistance": 0.5},
+    },
     "lag": "lag",
     "torque_speed": "torque_speed",
     "servo": "servo",
@@ -258,6 +262,7 @@ def behind_motors() -> Entries:
         for name, actuator in MOTORS.items():
             for num_envs in (None, 4):
                 arguments = {"actuator": actuator, "allow_unstable": True}
+                arguments |= {"action": "position"} if name == "servo" else {}  # refused where an angle wraps
                 try:
                     digested = trajectory(task, num_envs, arguments, SIGNALS[:5], 60)
                 except ValueError:
