@@ -21,7 +21,7 @@ from codrl_mj.deploy.loops import current_loop
 from codrl_mj.deploy.network import network_of
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes
-from codrl_mj.fields import check_names, did_you_mean, leaves
+from codrl_mj.fields import check_names, did_you_mean, differing
 from codrl_mj.runs.files import read_json, sealed, write_json
 from codrl_mj.runs.policies import Policy
 
@@ -219,11 +219,11 @@ class Contract(Interface):
                 raise ValueError(f"actuator {name!r}: missing: the policy was trained through {mine['fields']}")
             theirs = _told(mapping_of(actuators[name]))
             if theirs["sha256"] != mine["sha256"]:
-                one, other = (leaves(side["fields"] or {}) for side in (mine, theirs))
-                where = next((path for path in {**one, **other} if one.get(path) != other.get(path)), "family")
+                found = differing(mine["fields"] or {}, theirs["fields"] or {})
+                where, (wanted, given) = next(iter(found.items()), ("family", (None, None)))
                 raise ValueError(
-                    f"actuator {name!r}: {where} = {other.get(where)}, must be {one.get(where)}, through which the "
-                    "policy was trained; evaluate it on yours, or train through that"
+                    f"actuator {name!r}: {where} = {given}, must be {wanted}, through which the policy was trained; "
+                    "evaluate it on yours, or train through that"
                 )
 
 
