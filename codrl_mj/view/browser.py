@@ -200,8 +200,8 @@ class Browser:
             several = f" {pattern}" if len(session.config.driven) > 1 else ""
             own = actuator.family or type(actuator).__name__
             change, found = functools.partial(session.set_actuator, pattern), controls(actuator, _SUPPLY)
-            for part, fields in itertools.groupby(found, lambda one: one.path[:-1][:1]):
-                self._settings(f"{(*part, own)[0]}{several}", fields, change)
+            for part, fields in itertools.groupby(found, lambda one: one.path[0] if len(one.path) > 1 else own):  # noqa: B023
+                self._settings(f"{part}{several}", fields, change)
             if not found:
                 gui.add_markdown(f"Nothing can be set of {own}{several}: begin with `--actuator`.")
         disturbances = session.config.disturbances
