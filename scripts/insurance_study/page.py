@@ -11,9 +11,10 @@ from actuator_study.arms import DRAWN
 from actuator_study.figures import dots
 from actuator_study.page import HYPOTHESES, TRIALS, decided_table, effect_text, p_text, write_tables
 from codrl_mj.study.doses import AXES, FLOORS, at_home, ideal
-from codrl_mj.study.pages import COLOURS, TITLES, conclusions, legend, markdown_table, save, write_page
-from codrl_mj.study.questions import Scores, Verdict, judge
+from codrl_mj.study.pages import COLOURS, TITLES, conclusions, legend, markdown_table, save, write_csv, write_page
+from codrl_mj.study.questions import MARGIN, Scores, Verdict, judge
 from codrl_mj.study.trials import FAILED, RUNS, Collected, Trial
+from insurance_study.learning import LEARNING, learning_rows, still_rising
 from insurance_study.questions import DOSES, KINDS, REMEMBERED, TASKS, home, primary, reach, secondary, under
 
 PAGE, FOLDER, FIGURE = "insurance.md", "insurance", "insured.svg"
@@ -70,6 +71,9 @@ def write(collected: Collected, out: Path) -> list[Path]:
     folder, scores = out / FOLDER, Scores(collected, FLOORS, [at_home(ideal(task)) for task in TASKS])
     first, others = judge(scores, primary(), primary=True), judge(scores, secondary())
     tables = write_tables(folder, collected, scores, first, others)
+    spans = {task: ceiling - FLOORS[task] for task, ceiling in scores.ceilings.items()}
+    learned = learning_rows(collected, folder / LEARNING)
+    write_csv(folder / LEARNING, learned)
     draw(folder / FIGURE, scores)
     parts = [
         "# What insures a policy?\n",
@@ -78,10 +82,13 @@ def write(collected: Collected, out: Path) -> list[Path]:
         f"![Scores by what policies were trained on]({FOLDER}/{FIGURE})\n",
         _verdicts(first),
         _secondary(others),
-        _method(collected),
+        _method(
+            collected,
+            still_rising(learned, spans, MARGIN),
+        ),
     ]
     write_page(out / PAGE, parts)
-    return [out / PAGE, folder / FIGURE, *tables]
+    return [out / PAGE, folder / FIGURE, folder / LEARNING, *tables]
 
 
 def _kinds(collected: Collected, scores: Scores) -> str:
@@ -155,7 +162,7 @@ def _secondary(verdicts: Sequence[Verdict]) -> str:
 {decided_table(verdicts, titles, PLANNED)}"""
 
 
-def _method(collected: Collected) -> str:
+def _method(collected: Collected, rising: tuple[int, int]) -> str:
     totals, wanted = collected.totals, len(collected.grid.cells())
     done, tests = sum(map(len, collected.evaluations.values())), len(collected.grid.deployments())
     reaches = "; ".join(
@@ -166,5 +173,7 @@ def _method(collected: Collected) -> str:
 of {tests} tests of {wanted} policies are there ({totals.seconds / 3600:.1f} hours of one core at hand). Random
 actuators reach up to (policy steps, share, policy steps): {reaches}. `scripts/study_insurance.py`
 ([how](../studies.md)) writes this page, [every policy]({FOLDER}/{RUNS}), [trials]({FOLDER}/{TRIALS}) with medians and
-failures, and [every comparison]({FOLDER}/{HYPOTHESES})."""
+failures, [every comparison]({FOLDER}/{HYPOTHESES}), and [what was returned in tenths of the
+training]({FOLDER}/{LEARNING}). Of {rising[1]} kinds of training {rising[0]} had not levelled off: in their last tenth
+they return more than in the eighth, on the mean by more than {MARGIN:g} of the span."""
     return "## How it was measured\n\n" + textwrap.fill(" ".join(text.split()), 120, break_long_words=False) + "\n"

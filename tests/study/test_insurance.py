@@ -14,6 +14,7 @@ from codrl_mj.study.doses import AXES, FLOORS, posed, timestep
 from codrl_mj.study.evidence import Evidence
 from codrl_mj.study.pages import read_csv, write_csv
 from codrl_mj.tasks import find_task
+from insurance_study.learning import still_rising
 from insurance_study.questions import (
     DOSES,
     HARMLESS,
@@ -187,3 +188,24 @@ def test_rows_stand_for_run_folders_that_are_gone(written, tmp_path):
     InsuranceStudy(root=tmp_path / "runs", out=tmp_path, seeds=20).write()
     for name in ("runs.csv", "hypotheses.csv"):
         assert (tmp_path / "insurance" / name).read_text() == (out / "insurance" / name).read_text()
+
+
+def test_what_policies_returned_in_tenths_of_their_training_is_published(written, tmp_path):
+    out, _ = written
+    rows = read_csv(out / "insurance" / "learning.csv")
+    assert len(rows) == 20 * len({trial.arm.name for trial in trials()})
+    assert [float(rows[0][f"tenth_{number}"]) for number in range(1, 11)] == [2 * at + 1.5 for at in range(10)]
+    assert len({row["run"] for row in rows}) == len(rows)
+    shutil.copytree(out / "insurance", tmp_path / "insurance")  # without the runs
+    InsuranceStudy(root=tmp_path / "runs", out=tmp_path, seeds=20).write()
+    assert (tmp_path / "insurance" / "learning.csv").read_text() == (out / "insurance" / "learning.csv").read_text()
+
+
+def test_of_how_many_kinds_of_training_the_returns_still_rise():
+    def runs(task, trained, *rises):
+        return [{"task": task, "trained": trained, "tenth_8": 10.0, "tenth_10": 10.0 + rise} for rise in rises]
+
+    rows = [*runs("a", "up", 4.0, 8.0), *runs("a", "level", 4.0, 4.0), *runs("a", "down", -9.0)]
+    rows += [*runs("b", "wide span", 8.0), *runs("c", "no span", 99.0)]
+    rows.append({"task": "a", "trained": "no episode", "tenth_8": "", "tenth_10": "5"})
+    assert still_rising(rows, {"a": 100.0, "b": 1000.0}, 0.05) == (1, 4)
