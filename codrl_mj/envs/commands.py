@@ -97,14 +97,12 @@ class TaskCommands:
         array, (limit, scale, count) = np.asarray(action), self._box
         if array.shape != (count,) or array.dtype.kind != "f":
             raise ValueError(f"action = {action!r}: not in {self.action_space}")
-        if count == 1:
-            command = float(array[0])
-            if command != command:
-                raise ValueError(f"action = {action!r}: not in {self.action_space}")
-            return min(max(command, -limit), limit) * scale
+        if count == 1 and -limit <= (command := float(array[0])) <= limit:  # quickly
+            return command * scale
         if np.isnan(array).any():
             raise ValueError(f"action = {action!r}: not in {self.action_space}")
-        return np.clip(array.astype(np.float64), -limit, limit) * scale
+        forces = np.clip(array.astype(np.float64), -limit, limit) * scale
+        return float(forces[0]) if count == 1 else forces
 
     def forces(self, actions: Any) -> np.ndarray:
         """What `force` does, for a batch (N, ...): forces (N,), or with several motors (N, n), float64."""

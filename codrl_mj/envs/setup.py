@@ -160,7 +160,7 @@ class Setup:
     def _columns(self) -> tuple[str, ...]:
         return ("desired_force", "actual_force", *self.plant.family.Signals._fields)
 
-    def signals(self, columns: Sequence[Any], desired: Any) -> Signals:
+    def signals(self, columns: Sequence[Any] | np.ndarray, desired: Any) -> Signals:
         """A trace's columns, numbers or arrays, as signals: the force [N or N*m] that the agent `desired` is theirs.
 
         Where an actuator tracks no force, what was delivered counts as desired.

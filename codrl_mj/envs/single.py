@@ -91,7 +91,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         self.signal_names, self.trace_names = signal_names(family := self.setup.plant.family), trace_names(family)
         """Of the actuators' signals in `info`; of the columns of `trace`."""
         self._observation_shape = self.observation_space.shape
-        self._compiled: tuple[Any, tuple[Any, ...]] | None = None  # its step, and its simulation's arguments
+        self._compiled: tuple[Any, tuple[Any, ...], np.ndarray] | None = None  # step, its arguments, trace's last row
         self._offer_attributes(self.task)
 
     @property
@@ -205,31 +205,29 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         if self._compiled is None:
             if self.physics.stepping is None:
                 return self._step_apart(force)
-            self._compiled = compiled_kernels(self.setup, self.physics).step, arguments(self.setup, self.physics)
-        step, simulation = self._compiled
+            kernels, row = compiled_kernels(self.setup, self.physics), self.physics.trace[-1]
+            self._compiled = kernels.step, arguments(self.setup, self.physics), row.T if len(row) > 1 else row[0]
+        step, simulation, columns = self._compiled
         observation = np.empty(self._observation_shape, np.float32)
         reward, terminated, fine = step(force, observation, *simulation)
         if not fine:
             self.physics.check_finite()
         if self.render_mode == "human":
             self.render()
-        return observation, reward, terminated, False, self._info(force)
+        row = columns.tolist() if columns.ndim == 1 else columns.copy()
+        return observation, reward, terminated, False, self.setup.signals(row, force)
 
     def _step_apart(self, force: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """What the compiled step does, in parts, for a physics that is Python."""
         physics, setup = self.physics, self.setup
         before = physics.state
         physics.step(force)
-        info, after = self._info(force), physics.state
+        row, after = physics.trace[-1], physics.state
+        info = setup.signals(row.T.copy() if len(row) > 1 else row[0].tolist(), force)
         if self.render_mode == "human":
             self.render()
         reward, terminated = setup.outcome(before, info["actual_force"], after)
         return setup.observation(physics, physics.trace[-1]), reward, terminated, False, info
-
-    def _info(self, force: Any) -> dict[str, Any]:
-        """What the actuators did in the last step, which asked for a force."""
-        row = self.physics.trace[-1]
-        return self.setup.signals(row.T.copy() if len(row) > 1 else row[0].tolist(), force)
 
     @property
     def randomization(self) -> dict[str, Any]:

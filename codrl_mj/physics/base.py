@@ -37,9 +37,8 @@ def signal_names(family: Family) -> tuple[str, ...]:
 def named_signals(names: tuple[str, ...], columns: Any) -> Signals:
     """Numbers of one actuator, or arrays of several, by the names of the first of them; `saturated` is a flag."""
     signals = dict(zip(names, columns, strict=False))
-    saturated = signals.pop("saturated", None)
-    if saturated is not None:
-        signals["saturated"] = saturated > 0.0  # which NaN is not
+    if "saturated" in signals:
+        signals["saturated"] = signals.pop("saturated") > 0.0  # the last of them; false for NaN
     else:
         signals["saturated"] = np.zeros(columns[0].shape, dtype=bool) if isinstance(columns[0], np.ndarray) else False
     return signals

@@ -24,12 +24,9 @@ def learning_rows(collected: Collected, published: Path) -> list[dict[str, Any]]
     for (name, seed), folder in collected.folders.items():
         if (folder / RESULT).is_file():
             task, _, trained = name.partition(": ")
-            row = {"task": task, "trained": trained, "seed": seed} | _tenths(folder) | {"run": folder.name}
+            found.append({"task": task, "trained": trained, "seed": seed} | _tenths(folder) | {"run": folder.name})
         elif folder.name in known:
-            row = known[folder.name]
-        else:
-            continue
-        found.append(row)
+            found.append(dict(known[folder.name]))
     return found
 
 
