@@ -1,7 +1,8 @@
 """What makes environments of whatever world: one, or many at once."""
 
+import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -9,8 +10,8 @@ from gymnasium.vector import VectorEnv
 
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.serial import SerialVectorEnv
-from codrl_mj.envs.task_world import claims
-from codrl_mj.envs.worlds import find_world
+from codrl_mj.envs.task_world import TaskWorld
+from codrl_mj.envs.worlds import find_world, patterns_of
 from codrl_mj.foreign import environments
 
 
@@ -37,17 +38,18 @@ def make(
         gymnasium.error.UnregisteredEnv: there is no such environment.
         ValueError: names or arguments that are unknown, or do not go with each other; the message has the remedy.
     """
-    by_pattern = actuator if isinstance(actuator, Mapping) else {".*": "ideal" if actuator is None else actuator}
-    if not isinstance(env, str) and not hasattr(env, "make"):  # a function or class
-        return environments.make(env, by_pattern, **arguments)
-    if not isinstance(env, str):
+    if isinstance(env, EnvConfig):
         return env.make(**arguments)
-    world: Any = find_world(env)
-    given = {} if actuator is None else {"actuator": actuator}
-    if claims(env):
+    world = find_world(env) if isinstance(env, str) else None
+    if isinstance(world, TaskWorld):
+        given = {} if actuator is None else {"actuator": actuator}
         return gymnasium.make(world.task.env_id, **given, **arguments)
-    if ":" in env:
-        return EnvConfig(env, **given, **arguments).make()
+    if isinstance(env, str) and ":" in env:
+        view = {name: arguments.pop(name) for name in ("render_mode",) if name in arguments}
+        limit = arguments.pop("max_episode_steps", None)
+        config = EnvConfig.of(env, "default" if actuator is None else actuator, arguments)
+        return dataclasses.replace(config, max_episode_steps=limit).make(**view)
+    by_pattern = patterns_of(actuator) or {".*": "ideal" if actuator is None else actuator}
     return environments.make(env, by_pattern, **arguments)
 
 

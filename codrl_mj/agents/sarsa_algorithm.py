@@ -231,7 +231,7 @@ class CompiledEpisodes:
         """Make the simulation for one that `can_run` says it can."""
         self.env = env
         vector: Any = env.env
-        self._physics: Any = vector.setup.simulate("mujoco")
+        self._physics: Any = vector.setup.simulate()
         self._step = compiled_kernels(vector.setup, self._physics).step
         self._arguments = arguments(vector.setup, self._physics)
         self._forces = vector.setup.commands.action_forces

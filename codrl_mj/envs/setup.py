@@ -83,8 +83,9 @@ class Setup:
 
     # -- simulations -----------------------------------------------------------------------------------------
 
-    def simulate(self, physics: str) -> Physics:
-        """A new simulation on the given physics."""
+    def simulate(self) -> Physics:
+        """A new simulation."""
+        physics = self.config.physics
         made: Physics = look_up(physics, PHYSICS, "physics", anybodys=False)(self.plant)
         if made.scene is None and self.randomization.variation is not None:
             names = ", ".join(self.randomization.in_model)

@@ -70,9 +70,9 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
             ValueError: an argument is unknown or out of bounds, or the current loop is unstable; the message names it.
             CallbackInUseError: another library's MuJoCo callback is installed.
         """
-        config = EnvConfig.of(task, actuator, arguments)
+        config = EnvConfig.of(task, actuator, {"physics": physics, **arguments})
         self.setup = Setup.build(config)
-        self.physics = self.setup.simulate(physics)
+        self.physics = self.setup.simulate()
         into = functools.partial(put_into, self.physics)
         self._draws = Draws(self.setup.randomization, [self.setup.plant.actuators], into)
         self.render_mode = render_mode

@@ -433,6 +433,15 @@ def test_a_speed_that_cannot_be_held_is_refused_and_one_that_is_wrong_warned_of(
         light.check_shaft(0.002, 1e-7)
 
 
+def test_a_physics_that_holds_the_speed_over_a_step_judges_it_so():
+    """On MuJoCo the drive follows its speed within the step; Gymnasium's equations hold it."""
+    drive = Drive(GearMotor(0.315, 0.4e-3, 0.0203, 0.0203, 0.0, gear_ratio=120.0), SampledLoop(20e3), Supply(24.0))
+    assert 0.05 * 120**2 * 0.0203**2 / (0.315 / 3) > 2  # its rod has an inertia of 1/3 kg*m^2
+    codrl_mj.make("pendulum", drive, inner_steps=1).close()
+    with pytest.raises(ValueError, match=r"over which that is held, must be < 2; shorten the step"):
+        codrl_mj.make("pendulum", drive, inner_steps=1, physics="analytic")
+
+
 def test_several_drives_on_a_joint_are_judged_together():
     """None follows what the others do within a step."""
     resistance, inductance, constant, voltage = WINDINGS["dcx22l"]

@@ -112,3 +112,21 @@ def test_a_live_session_runs_it():
     assert session.problem is None
     assert session.step()
     assert session.config.driven["drive"].motor.resistance == 0.3
+
+
+def test_make_takes_of_a_world_or_task_by_its_place_what_it_says_it_takes():
+    with codrl_mj.make(NAME, "lag", render_mode="rgb_array", max_episode_steps=7, target=0.5) as env:
+        assert (env.render_mode, env.unwrapped._target) == ("rgb_array", 0.5)
+        env.reset(seed=0)
+        assert [env.step(np.zeros(1))[3] for _ in range(7)] == [False] * 6 + [True]
+    with codrl_mj.make("codrl_mj.tasks.cartpole:TASK", "lag", center_radius=0.1, max_episode_steps=9) as env:
+        assert env.unwrapped.setup.config.options.center_radius == 0.1
+        assert env.spec.max_episode_steps == 9
+
+
+def test_make_takes_an_actuators_fields_for_an_environment_of_others():
+    fields = {"family": "lag", "time_constant": 0.03}
+    with codrl_mj.make("InvertedPendulum-v5", fields) as env:
+        assert [one.time_constant for one in env.get_wrapper_attr("motors").values()] == [0.03]
+    with codrl_mj.make("InvertedPendulum-v5", {"slider": fields}) as env:
+        assert [one.time_constant for one in env.get_wrapper_attr("motors").values()] == [0.03]
