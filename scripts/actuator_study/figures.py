@@ -126,7 +126,7 @@ def bars(path: Path, scores: Scores, groups: Mapping[str, Sequence[tuple[str, Tr
 def chart(path: Path, evidence: Evidence) -> bool:
     """Draw what to do about an actuator that is late or short of voltage and nothing else, a panel for each task.
 
-    A task on which nothing was trained through a dose is hatched.
+    A task on which nothing was trained through one thing alone is hatched.
 
     Returns:
         Whether anything could be drawn: the results of a task are all there.
@@ -165,7 +165,7 @@ def chart(path: Path, evidence: Evidence) -> bool:
     for panel in panels[::3]:
         panel.set_ylabel("voltage there is [needed voltage]")
     handles = [Patch(facecolor=colour, edgecolor="0.6", label=name) for name, colour in _REGIONS.items()]
-    handles.append(Patch(facecolor="white", edgecolor="0.4", hatch="//", label="nothing was trained through a dose"))
+    handles.append(Patch(facecolor="white", edgecolor="0.4", hatch="//", label="trained through whole motors at most"))
     figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize="small")
     save(figure, path)
     return True

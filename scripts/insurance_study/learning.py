@@ -41,15 +41,15 @@ def _tenths(folder: Path) -> dict[str, Any]:
     return {"steps": steps} | dict(zip(TENTHS, means, strict=True))
 
 
-def still_rising(rows: Sequence[Mapping[str, Any]], spans: Mapping[str, float], margin: float) -> tuple[int, int]:
-    """Of how many arms the mean return of the last tenth is above that of the eighth by a margin, in shares of spans.
+def still_rising(rows: Sequence[Mapping[str, Any]], spans: Mapping[str, float], margin: float) -> tuple[list[str], int]:
+    """The arms whose mean return of the last tenth is above that of the eighth by a margin, in shares of spans.
 
     Returns:
-        How many, and of how many arms; of a task without a span none is counted.
+        Their names, and of how many arms; of a task without a span none is counted.
     """
-    arms: dict[tuple[str, str], list[float]] = {}
+    arms: dict[str, list[float]] = {}
     for row in rows:
         last, before = (float(row[TENTHS[at]]) if row[TENTHS[at]] not in (None, "") else math.nan for at in (9, 7))
         if row["task"] in spans and not math.isnan(last - before):
-            arms.setdefault((row["task"], row["trained"]), []).append((last - before) / spans[row["task"]])
-    return sum(float(np.mean(rises)) > margin for rises in arms.values()), len(arms)
+            arms.setdefault(f"{row['task']}: {row['trained']}", []).append((last - before) / spans[row["task"]])
+    return [name for name, rises in arms.items() if float(np.mean(rises)) > margin], len(arms)

@@ -22,8 +22,8 @@ PAGE, FOLDER, FIGURE = "insurance.md", "insurance", "insured.svg"
 SAYS: Mapping[str, str] = {
     "ideal": "ideal forces",
     "matched": "the very dose",
-    "drawn": "doses of the very thing, drawn",
-    "remembering": "the very dose, seeing its last commands",
+    "drawn": "doses of the very thing, drawn (four of them)",
+    "remembering": "the very dose, seeing its last commands (lag, delay)",
     "random": "random actuators",
     "half": "random actuators, half the reach",
     "double": "random actuators, twice the reach",
@@ -70,7 +70,7 @@ def write(collected: Collected, out: Path) -> list[Path]:
     """
     folder, scores = out / FOLDER, Scores(collected, FLOORS, [at_home(ideal(task)) for task in TASKS])
     first, others = judge(scores, primary(), primary=True), judge(scores, secondary())
-    tables = write_tables(folder, collected, scores, first, others)
+    tables = write_tables(folder, collected, scores, first, others, PLANNED)
     spans = {task: ceiling - FLOORS[task] for task, ceiling in scores.ceilings.items()}
     learned = learning_rows(collected, folder / LEARNING)
     write_csv(folder / LEARNING, learned)
@@ -82,10 +82,7 @@ def write(collected: Collected, out: Path) -> list[Path]:
         f"![Scores by what policies were trained on]({FOLDER}/{FIGURE})\n",
         _verdicts(first),
         _secondary(others),
-        _method(
-            collected,
-            still_rising(learned, spans, MARGIN),
-        ),
+        _method(collected, *still_rising(learned, spans, MARGIN)),
     ]
     write_page(out / PAGE, parts)
     return [out / PAGE, folder / FIGURE, folder / LEARNING, *tables]
@@ -106,9 +103,8 @@ def _kinds(collected: Collected, scores: Scores) -> str:
     header = ["trained on", *(text for task in TASKS for text in (f"{TITLES[task]}: ideal", "six doses"))]
     return f"""## What each kind of training comes to
 
-Mean score on ideal forces. Then on the six doses: mean, median; how many policies fail (lose more than {FAILED:g});
-success.
-Drawn doses were tested on four of them, remembering on lag and delay.
+Mean score on ideal forces. Then on the six doses: mean, median; how many tests failed, a policy's on a dose each (it
+lost more than {FAILED:g}); success.
 
 {markdown_table(header, rows)}"""
 
@@ -119,14 +115,14 @@ def draw(path: Path, scores: Scores) -> None:
 
     figure = Figure(figsize=(11.0, 8.4), layout="constrained")
     panels: Any = figure.subplots(len(TASKS), 1, sharey=True)
-    shown = [kind for kind in SAYS if kind not in ("half", "double", "strength")]
+    shown = {"ideal": 0, "random": 1, "drawn": 2, "matched": 3, "remembering": 4, "pushes": 5}  # colours of the kinds
     for panel, task in zip(panels, TASKS, strict=True):
         for place, axis in enumerate(AXES):
-            for number, kind in enumerate(shown):
+            for number, kind in enumerate(kind for kind in SAYS if kind in shown):
                 if axis in _AXES.get(kind, AXES):
                     values = list(scores.of(under(KINDS[kind](task, axis), axis)).values())
                     if values:
-                        dots(panel, place + 0.14 * (number - 2.5), values, COLOURS[number], SAYS[kind])
+                        dots(panel, place + 0.14 * (number - 2.5), values, COLOURS[shown[kind]], SAYS[kind])
         panel.set_xticks(range(len(AXES)), [f"{one.title} {DOSES[task][name]:g}" for name, one in AXES.items()])
         panel.set(title=TITLES[task], ylabel="score [share of the span]")
         panel.grid(axis="y", color="0.9")
@@ -145,7 +141,7 @@ def _verdicts(verdicts: Sequence[Verdict]) -> str:
         fewest = min(verdict.runs)
         judged = [verdict.outcome, effect_text(verdict), p_text(verdict.corrected)]
         if fewest < PLANNED:  # of a few policies p says nothing, and who looks often finds something
-            judged = ["not yet", effect_text(verdict), "–"]
+            judged = ["not judged yet", effect_text(verdict), "–"]
         rows.append([verdict.question.name, *judged, str(fewest), says])
     header = ["", "holds", "effect [95 %]", "corrected p", "policies", "says"]
     return f"""## The ten hypotheses
@@ -157,12 +153,14 @@ Nothing is judged before there are {PLANNED} policies of every kind.
 
 def _secondary(verdicts: Sequence[Verdict]) -> str:
     titles = {one.question.section: one.question.section for one in verdicts}
+    if all(min(one.runs) < PLANNED for one in verdicts):
+        return f"The {len(verdicts)} others, each of one task, are not judged yet either.\n"
     return f"""Others, each of one task, with a false discovery rate of 5 %:
 
 {decided_table(verdicts, titles, PLANNED)}"""
 
 
-def _method(collected: Collected, rising: tuple[int, int]) -> str:
+def _method(collected: Collected, rising: Sequence[str], count: int) -> str:
     totals, wanted = collected.totals, len(collected.grid.cells())
     done, tests = sum(map(len, collected.evaluations.values())), len(collected.grid.deployments())
     reaches = "; ".join(
@@ -174,6 +172,7 @@ of {tests} tests of {wanted} policies are there ({totals.seconds / 3600:.1f} hou
 actuators reach up to (policy steps, share, policy steps): {reaches}. `scripts/study_insurance.py`
 ([how](../studies.md)) writes this page, [every policy]({FOLDER}/{RUNS}), [trials]({FOLDER}/{TRIALS}) with medians and
 failures, [every comparison]({FOLDER}/{HYPOTHESES}), and [what was returned in tenths of the
-training]({FOLDER}/{LEARNING}). Of {rising[1]} kinds of training {rising[0]} had not levelled off: in their last tenth
-they return more than in the eighth, on the mean by more than {MARGIN:g} of the span."""
+training]({FOLDER}/{LEARNING}). Of {count} kinds of training {len(rising)} had not levelled off
+({"; ".join(rising) or "none"}): in their last tenth they return more than in the eighth, on the mean by more than
+{MARGIN:g} of the span."""
     return "## How it was measured\n\n" + textwrap.fill(" ".join(text.split()), 120, break_long_words=False) + "\n"

@@ -20,7 +20,7 @@ def pretend(grid, score, leaving_out=()):
         if cell not in leaving_out:
             folders[cell].mkdir(parents=True)
             (folders[cell] / "config.json").write_text(json.dumps({"train": config.as_mapping(), "code": "c0de" * 16}))
-            (folders[cell] / "episodes.csv").write_text(_episodes(config.total_steps))
+            (folders[cell] / "episodes.csv").write_text(_episodes(config.total_steps or 2000))
             (folders[cell] / "result.json").write_text(json.dumps({"steps": config.total_steps, "seconds": 10.0}))
     for trial in grid.trials:
         for seed in grid.seeds_of(trial.arm):

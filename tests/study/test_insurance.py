@@ -168,7 +168,7 @@ def test_what_is_so_stands_on_the_page(written):
     page = (out / "insurance.md").read_text()
     assert "| random actuators | 1.00 | 0.70, 0.70; 120 of 120;" in page  # 20 policies on 6 doses
     assert "| the very dose | 1.00 | 0.90, 0.90;" in page
-    assert "not yet" not in page
+    assert "not judged" not in page
 
 
 def test_nothing_is_judged_of_fewer_policies_than_are_planned(written, tmp_path):
@@ -178,8 +178,10 @@ def test_nothing_is_judged_of_fewer_policies_than_are_planned(written, tmp_path)
     write_csv(tmp_path / "insurance" / "runs.csv", rows)
     InsuranceStudy(root=tmp_path / "runs", out=tmp_path).write()
     page = (tmp_path / "insurance.md").read_text()
-    assert page.count("| not yet |") == 10
-    assert "| insured | 0 | 0 | 0 |" in page
+    assert page.count("| not judged yet |") == 10
+    assert "The 266 others, each of one task, are not judged yet either." in page
+    judged = read_csv(tmp_path / "insurance" / "hypotheses.csv")
+    assert {(row["outcome"], row["p"], row["corrected_p"]) for row in judged} == {("not judged", "", "")}
 
 
 def test_rows_stand_for_run_folders_that_are_gone(written, tmp_path):
@@ -208,4 +210,4 @@ def test_of_how_many_kinds_of_training_the_returns_still_rise():
     rows = [*runs("a", "up", 4.0, 8.0), *runs("a", "level", 4.0, 4.0), *runs("a", "down", -9.0)]
     rows += [*runs("b", "wide span", 8.0), *runs("c", "no span", 99.0)]
     rows.append({"task": "a", "trained": "no episode", "tenth_8": "", "tenth_10": "5"})
-    assert still_rising(rows, {"a": 100.0, "b": 1000.0}, 0.05) == (1, 4)
+    assert still_rising(rows, {"a": 100.0, "b": 1000.0}, 0.05) == (["a: up"], 4)
