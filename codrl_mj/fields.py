@@ -43,7 +43,7 @@ def real(
 
     def holds(value: Any) -> bool:
         return (
-            (_is_real(value) or (infinite and _is_infinite(value)))
+            _is_real(value, infinite)
             and (above is None or value > above)
             and (least is None or value >= least)
             and (below is None or value < below)
@@ -251,12 +251,9 @@ def _bounded(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def _is_real(value: Any) -> bool:
-    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _is_infinite(value: Any) -> bool:
-    return isinstance(value, numbers.Real) and math.isinf(value)
+def _is_real(value: Any, infinite: bool = False) -> bool:
+    real = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    return real and (math.isfinite(value) or (infinite and math.isinf(value)))
 
 
 def _is_integer(value: Any) -> bool:

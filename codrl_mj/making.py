@@ -10,7 +10,6 @@ from gymnasium.vector import VectorEnv
 
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.serial import SerialVectorEnv
-from codrl_mj.envs.task_world import TaskWorld
 from codrl_mj.envs.worlds import find_world, patterns_of
 from codrl_mj.foreign import environments
 
@@ -38,12 +37,12 @@ def make(
         gymnasium.error.UnregisteredEnv: there is no such environment.
         ValueError: names or arguments that are unknown, or do not go with each other; the message has the remedy.
     """
-    if isinstance(env, EnvConfig):
+    if hasattr(env, "make"):
         return env.make(**arguments)
-    world = find_world(env) if isinstance(env, str) else None
-    if isinstance(world, TaskWorld):
+    env_id = find_world(env).env_id if isinstance(env, str) else ""
+    if env_id:
         given = {} if actuator is None else {"actuator": actuator}
-        return gymnasium.make(world.task.env_id, **given, **arguments)
+        return gymnasium.make(env_id, **given, **arguments)
     if isinstance(env, str) and ":" in env:
         view = {name: arguments.pop(name) for name in ("render_mode",) if name in arguments}
         limit = arguments.pop("max_episode_steps", None)

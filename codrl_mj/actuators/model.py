@@ -10,7 +10,7 @@ import functools
 import hashlib
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -276,7 +276,7 @@ class ActuatorModel(fields.Checked):
         values |= {path: arm_radius for path in field_paths(family_of(cls)) if is_arm(path)}
         return from_values(cls, values)
 
-    def replaced(self, values: Mapping[str, Any]) -> Any:
+    def replaced(self, values: Mapping[str, Any]) -> Self:
         """A copy with other values of some fields.
 
         Args:

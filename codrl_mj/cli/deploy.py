@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.cli.parsing import AsJson
+from codrl_mj.cli.parsing import AsJson, Trust, named_numbers
 from codrl_mj.cli.subject import Source
 
 Exported = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FOLDER", help="What export wrote.")]
@@ -49,7 +49,8 @@ class Export:
         from codrl_mj.deploy import export, network_of
 
         subject = self.source.load(self.run_folder)
-        given = self.out, self.episodes, self.seed, self.float64, self.board, dict(map(_limit, self.limit))
+        limits = named_numbers("--limit", self.limit, "arm_velocity=30")
+        given = self.out, self.episodes, self.seed, self.float64, self.board, limits
         contract = export(subject.policy, subject.env, subject.agent, *given)
         rows = [
             (side, one["name"], one.get("unit") or "?", _bounds(one))
@@ -63,14 +64,6 @@ class Export:
         written = f"wrote {self.out}: policy.onnx, contract.json, controller.c ({weights} numbers)"
         print(f"{written}; try: codrl-mj board test {self.out}")
         return 0
-
-
-def _limit(text: str) -> tuple[str, float]:
-    name, _, most = text.partition("=")
-    try:
-        return name, float(most)
-    except ValueError:
-        raise ValueError(f"--limit {text}: must be NAME=NUMBER, such as arm_velocity=30") from None
 
 
 def _bounds(entry: dict[str, Any]) -> str:
@@ -257,8 +250,7 @@ class CompareLog:
     """Time [s] after which the simulation begins anew; half a second, or ten rows, unless told otherwise."""
     out: Path | None = None
     """PNG file for curves of what was observed and simulated."""
-    trust: bool = False
-    """Import the modules of a run's own task or actuator, which executes them."""
+    trust: Trust = False
     as_json: AsJson = False
 
     def run(self) -> tuple[int, Any]:

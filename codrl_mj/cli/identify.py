@@ -10,9 +10,12 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from codrl_mj.cli.environments import flags
 from codrl_mj.cli.motor import MotorName
-from codrl_mj.cli.parsing import AsJson
+from codrl_mj.cli.parsing import AsJson, named_numbers
 from codrl_mj.cli.terminal import number, print_table, progress_bar, say
+from codrl_mj.identify.plan import Sensing
+from codrl_mj.identify.synthetic import FREE, Load, Sampler
 
 Columns = Annotated[
     str,
@@ -76,7 +79,7 @@ class Identify:
         from codrl_mj.identify.reading import read_log
 
         logs, held_out = ([read_log(path, self.columns) for path in paths] for paths in (self.logs, self.holdout))
-        known = _numbers(self.known)
+        known = named_numbers("--known", self.known, "mgl=2.81, in SI units")
         base: Any = None if self.motor is None else find_drive(self.motor)
         if base is not None and "gear_ratio" in known:
             base = base.replaced({"motor.gear_ratio": known["gear_ratio"]})
@@ -130,20 +133,6 @@ class Identify:
         for log in wrong:
             say(f"warning: {log.name}, which is held out, has errors, and is left out", style="yellow")
         return [log for log in held_out if not any(log is one for one in wrong)]
-
-
-def _numbers(texts: tuple[str, ...]) -> dict[str, float]:
-    """NAME=VALUE, each."""
-    found: dict[str, float] = {}
-    for text in texts:
-        name, _, value = text.partition("=")
-        if name in found:
-            raise ValueError(f"known {name}: given twice; give it one value")
-        try:
-            found[name] = float(value)
-        except ValueError:
-            raise ValueError(f"known {text!r}: must be NAME=NUMBER in SI units, such as mgl=2.81") from None
-    return found
 
 
 def print_identified(found: Any) -> None:
@@ -221,18 +210,8 @@ def print_findings(title: str, findings: Sequence[Any]) -> None:
     print_table(title, ("", "check", "row", "what", "remedy"), rows, right=["row"], styles=styles)
 
 
-@dataclasses.dataclass(frozen=True)
-class Turned:
-    """What the motor turns on the bench."""
-
-    inertia: float = 0.0
-    """Inertia of the load [kg*m^2], at the output, besides the rotor's."""
-    gravity: float = 0.0
-    """m*g*l [N*m] of a pendulum that hangs at position 0."""
-    torque: Annotated[float, tyro.conf.arg(name="against")] = 0.0
-    """Constant torque [N*m] against the motor."""
-    locked: tyro.conf.FlagCreatePairsOff[bool] = False
-    """The shaft is held."""
+LOAD, SENSING, SAMPLER = flags(Load, FREE), flags(Sensing, Sensing()), flags(Sampler, Sampler())
+"""Their fields as flags."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -244,13 +223,8 @@ class PlanExperiment:
     """
 
     name: MotorName
-    load: tyro.conf.OmitArgPrefixes[Turned] = Turned()
-    current_noise: float = 0.01
-    """Noise of the current (standard deviation) as a share of the largest current."""
-    encoder: float = 4096.0
-    """Steps of the position for a turn of the output."""
-    voltage: Literal["together", "instantaneous", "mean"] = "together"
-    """The voltage changes together with the rows; else a row has what it is at the time, or its mean to the next."""
+    load: tyro.conf.OmitArgPrefixes[LOAD] = LOAD()  # type: ignore[valid-type]
+    sensing: tyro.conf.OmitArgPrefixes[SENSING] = SENSING()  # type: ignore[valid-type]
     duration: float = 4.0
     """Of a log [s]."""
     max_current: float = math.inf
@@ -262,10 +236,9 @@ class PlanExperiment:
     def run(self) -> tuple[int, Any]:
         """Print the options, the best one last."""
         from codrl_mj.drives import find_drive, find_entry
-        from codrl_mj.identify.plan import GOALS, Sensing, plan, write_excitation
-        from codrl_mj.identify.synthetic import Load
+        from codrl_mj.identify.plan import GOALS, plan, write_excitation
 
-        sensing, entry = Sensing(self.current_noise, self.encoder, self.voltage), find_entry(self.name)
+        sensing, entry = Sensing(**vars(self.sensing)), find_entry(self.name)
         bears = None if entry is None else entry.numbers.continuous_current
         limits = self.max_current, math.inf if bears is None else bears
         found = plan(find_drive(self.name), Load(**vars(self.load)), sensing, self.duration, *limits)
@@ -328,7 +301,7 @@ class SimulateLog:
     name: MotorName
     out: Path
     """File to write, .csv or .csv.gz."""
-    load: tyro.conf.OmitArgPrefixes[Turned] = Turned()
+    load: tyro.conf.OmitArgPrefixes[LOAD] = LOAD()  # type: ignore[valid-type]
     kind: Literal["slow_sine", "square", "chirp", "prbs", "locked_prbs"] = "prbs"
     """Excitation."""
     amplitude: float | None = None
@@ -339,14 +312,7 @@ class SimulateLog:
     """Of sine and square, where the chirp begins [Hz]; 2 of a square, 0.5 of others."""
     clock: float | None = None
     """Of a PRBS [s]; 4 L/R unless given."""
-    rate: float = 5000.0
-    """Rows a second [Hz]."""
-    jitter: float = 0.0
-    """Standard deviation of the stamps, as a share of the period."""
-    dropped: float = 0.0
-    """Share of rows that are lost."""
-    mean_voltage: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Rows have the mean voltage to the next row."""
+    sampler: tyro.conf.OmitArgPrefixes[SAMPLER] = SAMPLER()  # type: ignore[valid-type]
     sag: float = 0.0
     """Resistance of the supply [ohm], of which the logged voltage knows nothing."""
     sensor: tuple[str, ...] = ()
@@ -358,7 +324,7 @@ class SimulateLog:
         """Write the log."""
         from codrl_mj.actuators import Supply
         from codrl_mj.drives import find_drive
-        from codrl_mj.identify.synthetic import Excitation, Load, Sampler, simulate, write_log
+        from codrl_mj.identify.synthetic import Excitation, simulate, write_log
 
         if not self.out.name.endswith((".csv", ".csv.gz")):
             raise ValueError(f"out = {self.out}: must end in .csv or .csv.gz")
@@ -369,8 +335,8 @@ class SimulateLog:
         frequency = (2.0 if self.kind == "square" else 0.5) if self.frequency is None else self.frequency
         amplitude = 0.5 * drive.voltage_limit if self.amplitude is None else self.amplitude
         excitation = Excitation(self.kind, amplitude, self.duration, frequency, clock=clock)
-        sampler = Sampler(self.rate, self.jitter, self.dropped, self.mean_voltage)
-        log = simulate(drive, excitation, Load(**vars(self.load)), _sensors(self.sensor), sampler, self.seed)
+        load, sampler = Load(**vars(self.load)), Sampler(**vars(self.sampler))
+        log = simulate(drive, excitation, load, _sensors(self.sensor), sampler, self.seed)
         columns = write_log(self.out, log)
         print(f"wrote {self.out}: {len(log.time)} rows; read it by --columns '{columns}'")
         return 0

@@ -9,7 +9,7 @@ import tyro
 from rich.text import Text
 
 from codrl_mj.cli.motor import save_plot
-from codrl_mj.cli.parsing import AsJson
+from codrl_mj.cli.parsing import AsJson, Trust
 from codrl_mj.cli.terminal import print_table, say
 
 Asked = Annotated[
@@ -24,9 +24,6 @@ Asked = Annotated[
 OfMotor = Annotated[
     str | None,
     tyro.conf.arg(metavar="NAME", help="Of a run with several motors, the one that is asked about, by its name."),
-]
-Trust = Annotated[
-    bool, tyro.conf.arg(help="Import the modules of a run folder's task or agent if these are somebody's own.")
 ]
 
 

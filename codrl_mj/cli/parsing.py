@@ -24,6 +24,28 @@ AsJson = Annotated[
     tyro.conf.arg(name="json", help="Print JSON and nothing else: in SI units, or with the unit beside the number."),
 ]
 """Type of a verb's field for which its `run` returns not only the exit status, but what to print as JSON."""
+Trust = Annotated[
+    bool,
+    tyro.conf.arg(
+        help="Import the modules that a run folder names as its task, agent or actuator if these are somebody's own, "
+        "which executes them."
+    ),
+]
+"""Type of a verb's field that lets it import what a run folder names."""
+
+
+def named_numbers(flag: str, texts: Sequence[str], example: str) -> dict[str, float]:
+    """What a flag has: NAME=NUMBER, each once."""
+    found: dict[str, float] = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        if name in found:
+            raise ValueError(f"{flag} {name}: given twice; give it one value")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            raise ValueError(f"{flag} {text}: must be NAME=NUMBER, such as {example}") from None
+    return found
 
 
 def parse(kind: Any, called: str, words: Sequence[str], about: str | None = None) -> Any:

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from codrl_mj.cli.environments import AS_TRAINED, ActuatorName, with_environment
+from codrl_mj.cli.parsing import Trust
 from codrl_mj.cli.subject import Source, policy_and_environment
 from codrl_mj.cli.terminal import progress_bar
 from codrl_mj.envs.worlds import is_world
@@ -212,9 +213,7 @@ class Report:
     """Show it in three dimensions too, on the same clock: 0.7 MB more."""
     certificate: Path | None = None
     """A certificate.json, or its folder, to be summed up; unless given, that in a run folder, if there is one."""
-    trust: bool = False
-    """Import the modules that a run folder names as its task, agent or actuator if these are somebody's own, which
-    executes them."""
+    trust: Trust = False
 
     def run(self) -> int:
         """Write the page."""

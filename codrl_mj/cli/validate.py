@@ -11,7 +11,7 @@ from rich.text import Text
 
 from codrl_mj.cli.parsing import AsJson
 from codrl_mj.cli.terminal import console, print_table, progress_bar, say
-from codrl_mj.tasks import TASKS, find_task
+from codrl_mj.tasks import TASKS
 from codrl_mj.validation import GROUPS, Caught, Certificate, Check
 
 
@@ -44,13 +44,11 @@ class Validate:
     def run(self) -> tuple[int, Any]:
         """Validate and print a table for each group."""
         from codrl_mj.validation import own_model, try_mutations, validate, validate_model
-        from codrl_mj.validation.mutations import faulty, unfailed
+        from codrl_mj.validation.mutations import as_mapping, faulty, unfailed
 
         if self.model is not None and (self.tasks or self.mutations):
             raise ValueError("--model: give a model or tasks, and no --mutations, which are faults of the tasks")
         tasks = faulty(self.tasks) if self.mutations else self.tasks
-        for task in self.tasks:
-            find_task(task)
         model = None if self.model is None else own_model.load(self.model)
         with progress_bar("{task.completed}/{task.total}") as bar:
             row = bar.add_task("validating", total=None)
@@ -73,17 +71,7 @@ class Validate:
             for file in write(certificate, self.out, caught):
                 print(f"wrote {file}")
         failed = not certificate.passed or blind or not all(outcome.failed for outcome in caught)
-        faults = [
-            {
-                "fault": one.mutation,
-                "task": one.task,
-                "checks": one.made,
-                "failed": [check.name for check in one.failed],
-            }
-            for one in caught
-        ]
-        told = {"mutations": faults, "failed_by_no_fault": [check.name for check in blind]} if self.mutations else {}
-        return int(bool(failed)), certificate.as_mapping() | told
+        return int(bool(failed)), certificate.as_mapping() | as_mapping(certificate, caught)
 
 
 _FRAMED: dict[str, Any] = {"box": box.HEAVY_HEAD, "pad_edge": True, "padding": (0, 1)}

@@ -1,6 +1,5 @@
 """Which motor of the catalogue, with which gear: the smallest that does it with a margin."""
 
-import dataclasses
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -44,8 +43,7 @@ class Candidate(NamedTuple):
 
     def behind(self, gear: float) -> Drive:
         """The drive for an actuator of a model with a gear of its own, which the arm undoes: `Demand.model_gear`."""
-        motor = self.drive.motor
-        return dataclasses.replace(self.drive, motor=dataclasses.replace(motor, arm_radius=gear * motor.arm_radius))
+        return self.drive.replaced({"motor.arm_radius": gear * self.drive.motor.arm_radius})
 
     @property
     def power(self) -> float:
@@ -162,8 +160,7 @@ def geared(drive: Drive, demand: Demand, continuous: float | None = None) -> Dri
 
     def at(logarithm: float) -> Drive:
         ratio = math.exp(logarithm)
-        change = {"arm_radius": own / ratio} if demand.linear else {"gear_ratio": ratio}
-        return dataclasses.replace(drive, motor=dataclasses.replace(motor, **change))
+        return drive.replaced({"motor.arm_radius": own / ratio} if demand.linear else {"motor.gear_ratio": ratio})
 
     def load(logarithm: float) -> float:
         asked = operation(demand, at(logarithm))

@@ -160,8 +160,8 @@ def respond(one: Looped, references: Any, speed: float = 0.0, timestep: float | 
         integral = 0.0 if one.controller.bemf_compensation else back_emf
         state = state._replace(integral=integral, pending=back_emf, speed=speed)
     else:
-        right = dataclasses.replace(one.controller, substeps=1, current_bias=0.0, current_noise=0.0)
-        one = dataclasses.replace(one, controller=right)
+        right = {"substeps": 1, "current_bias": 0.0, "current_noise": 0.0}
+        one = one.replaced({f"controller.{name}": value for name, value in right.items()})
     family: Any = type(one)
     parameters, rows = parameters_type(family)(*one.numbers), []
     for reference in references:
@@ -243,19 +243,18 @@ def design(one: Looped, timestep: float | None = None) -> LoopDesign:
     )
 
 
-def designs(drive: Drive, rates: Any = None) -> dict[tuple[float, bool], LoopDesign | str]:
-    """`design` without and with the delay of a sample; a text says why there is none.
+def designs(drive: Drive) -> dict[tuple[float, bool], LoopDesign | str]:
+    """`design` at its own rate and at `RATES`, without and with the delay of a sample; a text says why there is none.
 
-    Args:
-        drive: whose bandwidth is kept, or gains where they are given.
-        rates: sample rates [Hz]; None: `RATES` and the drive's own.
+    Its bandwidth is kept, or its gains where they are given.
     """
     found: dict[tuple[float, bool], LoopDesign | str] = {}
-    for rate in sorted({drive.controller.sample_rate, *RATES}) if rates is None else rates:
+    for rate in sorted({drive.controller.sample_rate, *RATES}):
         for delayed in (False, True):
             try:
-                loop = dataclasses.replace(drive.controller, sample_rate=rate, delayed=delayed)
-                found[rate, delayed] = design(dataclasses.replace(drive, controller=loop))
+                found[rate, delayed] = design(
+                    drive.replaced({"controller.sample_rate": rate, "controller.delayed": delayed})
+                )
             except ValueError as error:
                 found[rate, delayed] = str(error)
     return found
@@ -323,8 +322,7 @@ def step(drive: Drive) -> Steps:
     reachable = 0.4 / 1.8 * unreachable
     spans = (_UNREACHABLE, unreachable), (_AFTER, reachable)
     references = np.concatenate([np.full(round(time * loop.sample_rate), current) for time, current in spans])
-    kinds = {kind: dataclasses.replace(loop, anti_windup=kind) for kind in ANTI_WINDUPS}
     recoveries = {
-        kind: respond(dataclasses.replace(drive, controller=one), references, speed) for kind, one in kinds.items()
+        kind: respond(drive.replaced({"controller.anti_windup": kind}), references, speed) for kind in ANTI_WINDUPS
     }
     return Steps(small_step(drive), speed, unreachable, reachable, recoveries)

@@ -35,11 +35,11 @@ class TaskWorld(World):
         self.time_limit, self.paper = task.max_episode_steps, tuple(task.paper)
         self.default_actuator = task.default_actuator
         self.goal_hold, self.timed = task.goal_hold, task.goal is not None
-        self.option_names = task.options._fields
+        self.option_names, self.env_id = task.options._fields, task.env_id
 
     def make(self, config: Any, **view: Any) -> Any:
         """An environment, made by Gymnasium; `view` as for `codrl_mj.envs.ActuatedEnv`."""
-        return gymnasium.make(self.task.env_id, disable_env_checker=True, **config.as_arguments(), **view)
+        return gymnasium.make(self.env_id, disable_env_checker=True, **config.as_arguments(), **view)
 
     def vector(self, config: Any, num_envs: int, **arguments: Any) -> Any:
         """Some environments as one: stepped together by the engine, or one by one where another physics steps them."""

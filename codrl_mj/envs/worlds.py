@@ -65,6 +65,8 @@ class World(abc.ABC):
     """How long an episode that succeeds has been at the goal when it ends [s]."""
     timed: bool = False
     """Whether its goal is reached at a time, and not kept all the time."""
+    env_id: str = ""
+    """Its id with Gymnasium, if `gymnasium.make` makes it with the fields of an `EnvConfig`."""
     option_names: tuple[str, ...] = ()
     """Names of options that it declares; none where they are what its environments take."""
 

@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from codrl_mj.actuators import Drive
-from codrl_mj.fields import Checked, check_names, real
+from codrl_mj.fields import Checked, choice, real
 from codrl_mj.identify.estimate import Model, refit
 from codrl_mj.identify.log import Log, Segment
 from codrl_mj.identify.models import ShaftModel, WindingModel
@@ -46,14 +46,9 @@ class Sensing(Checked):
     """Standard deviation of the current's noise as a share of the largest current, > 0."""
     encoder: float = real(4096.0, above=0.0, unit="")
     """Steps of the position a turn of the output, > 0."""
-    voltage: Literal["together", "instantaneous", "mean"] = "together"
+    voltage: Literal["together", "instantaneous", "mean"] = choice("together", "together", "instantaneous", "mean")
     """How the rows have the voltage: `together`, it changes when a row is written and not in between; else it changes
     by a clock of its own, and a row has what it is at the time, or its mean to the next row."""
-
-    def __post_init__(self) -> None:
-        """Validate."""
-        super().__post_init__()
-        check_names([self.voltage], ("together", "instantaneous", "mean"), "voltage")
 
 
 class Option(NamedTuple):
@@ -171,7 +166,7 @@ def _expected(truth: Mapping[str, float], load: Load, sensing: Sensing, log: Log
     if load.locked:
         return errors
     known = {name: truth[name] for name in PARAMETERS if name in truth and name not in ("inertia", "rotor_inertia")}
-    known |= {"mgl": load.gravity, "constant_torque": load.torque}
+    known |= {"mgl": load.gravity, "constant_torque": load.against}
     known = {name: value for name, value in known.items() if name not in GOALS or value == 0.0}
     shaft = ShaftModel(
         rig="free", friction="coulomb", driven_by="current", output="position", known=known, segment=_SEGMENT

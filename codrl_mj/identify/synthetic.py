@@ -83,10 +83,10 @@ class Load(Checked):
     """What the output shaft moves."""
 
     inertia: float = real(0.0, least=0.0, unit="kg*m^2")
-    """[kg*m^2], >= 0, besides the rotor's."""
+    """Inertia [kg*m^2] at the output, >= 0, besides the rotor's."""
     gravity: float = real(0.0, least=0.0, unit="N*m")
     """m*g*l [N*m] of a pendulum, >= 0, that hangs at position 0."""
-    torque: float = real(0.0, unit="N*m")
+    against: float = real(0.0, unit="N*m")
     """Constant torque [N*m] against the motor, as of a lifted weight."""
     locked: bool = False
     """Whether the shaft is held."""
@@ -159,7 +159,7 @@ def run(drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, po
             f"motor.rotor_inertia = {motor.rotor_inertia:g} and load.inertia = {load.inertia:g}: one must be > 0; "
             "give the load its inertia, or lock the shaft"
         )
-    numbers = {**vars(motor), "inertia": inertia, "mgl": load.gravity, "constant_torque": load.torque}
+    numbers = {**vars(motor), "inertia": inertia, "mgl": load.gravity, "constant_torque": load.against}
     parts = winding, moved(numbers, motor.torque_constant * motor.gear_ratio)
     states = driven(period, shares, float(limit), float(sag), parts, locked, float(position))
     names = "voltage", "current", "velocity", "position", "bus"

@@ -1,7 +1,6 @@
 """The certificate as files: JSON, and a page with plots."""
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from markupsafe import Markup
 from codrl_mj.pages import page
 from codrl_mj.runs.files import check_writable, writing
 from codrl_mj.validation.certificate import GROUPS, Certificate, verdict, versions
-from codrl_mj.validation.mutations import Caught, unfailed
+from codrl_mj.validation.mutations import Caught, as_mapping, unfailed
 
 JSON_NAME, HTML_NAME = "certificate.json", "certificate.html"
 _CHECKS = ("check", "oracle", "samples", "worst", "allowed", "margin", "unit", "where", "verdict")
@@ -117,18 +116,8 @@ def summary(content: Mapping[str, Any]) -> Markup:
 
 def write(certificate: Certificate, folder: Path, caught: Sequence[Caught] = ()) -> tuple[Path, Path]:
     """Write `certificate.json` and `certificate.html` into a folder, whole or not at all; older ones are replaced."""
-    content = certificate.as_mapping()
-    for one in caught:
-        row: dict[str, Any] = {"mutation": one.mutation, "task": one.task, "made": one.made}
-        row["failed"] = [f"{check.group}: {check.name}" for check in one.failed]
-        if (clearest := one.clearest) is not None:
-            worst = clearest.worst if math.isfinite(clearest.worst) else str(clearest.worst)
-            row |= {"clearest": f"{clearest.group}: {clearest.name}", "worst": worst, "allowed": clearest.tolerance}
-        content.setdefault("mutations", []).append(row)
-    if caught:
-        blind = unfailed(certificate.checks, caught)
-        content["failed by no mutation"] = [f"{check.group}: {check.task}: {check.name}" for check in blind]
-    text, found = json.dumps(content, indent=2, allow_nan=False) + "\n", html(certificate, caught)
+    text = json.dumps(certificate.as_mapping() | as_mapping(certificate, caught), indent=2, allow_nan=False) + "\n"
+    found = html(certificate, caught)
     check_writable(folder)
     with writing(folder / JSON_NAME) as json_file, writing(folder / HTML_NAME) as html_file:
         json_file.write_text(text, encoding="utf-8")

@@ -9,17 +9,15 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any
+from typing import Any, Literal
 
+from codrl_mj.fields import Checked, choice
 from codrl_mj.training import TrainingStoppedError
 from codrl_mj.training.run import stopping
 
-BACKENDS = ("local", "ray")
-"""Where calls are computed: in processes of this machine, or on a Ray cluster."""
-
 
 @dataclasses.dataclass(frozen=True)
-class Workers:
+class Workers(Checked):
     """What computes the calls.
 
     Raises:
@@ -28,15 +26,14 @@ class Workers:
 
     jobs: int = -1
     """Calls at once, >= 1; -1 for one on each CPU (of the cluster)."""
-    backend: str = "local"
+    backend: Literal["local", "ray"] = choice("local", "local", "ray")
     """`local`: processes of this machine; `ray`: a Ray cluster, whose machines all see the run folders."""
     address: str | None = None
     """Of the Ray cluster, such as `auto` or `ray://head:10001`; None starts Ray on this machine."""
 
     def __post_init__(self) -> None:
         """Validate."""
-        if self.backend not in BACKENDS:
-            raise ValueError(f"backend = {self.backend!r}: must be one of {', '.join(BACKENDS)}")
+        super().__post_init__()
         if isinstance(self.jobs, bool) or not isinstance(self.jobs, int) or (self.jobs < 1 and self.jobs != -1):
             raise ValueError(f"jobs = {self.jobs!r}: must be an integer >= 1, or -1 for one on each CPU")
 

@@ -5,7 +5,6 @@ import dataclasses
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
 
 import tyro
 from rich.console import Console
@@ -33,12 +32,7 @@ class Program(Checked, abc.ABC):
     """Folder for the page, its figures and its tables."""
     seeds: int = integer(5, least=1)
     """Training runs of each kind, with seeds from 0."""
-    jobs: int = -1
-    """Trainings at once; -1 for one on each CPU."""
-    backend: Literal["local", "ray"] = "local"
-    """Where: in processes of this machine, or on a Ray cluster whose machines all see the run folders."""
-    address: str | None = None
-    """Of the Ray cluster, such as auto or ray://head:10001; without one Ray is started on this machine."""
+    workers: tyro.conf.OmitArgPrefixes[Workers] = Workers()
     accept_changes: bool = False
     """Continue begun trainings even if the code or a package is no longer the one that they were started with."""
     dry_run: bool = False
@@ -67,7 +61,7 @@ class Program(Checked, abc.ABC):
 
     def run(self) -> int:
         """Compute what is missing and write the page; 1 if something failed."""
-        grid, workers = self.grid, Workers(self.jobs, self.backend, self.address)
+        grid, workers = self.grid, self.workers
         if self.dry_run:
             left = _print_costs(grid)
             print(f"about {left:.2f} core hours are left: {left / workers.cores:.2f} hours with {workers.cores} jobs")

@@ -110,7 +110,6 @@ def _certify(
     parts: Sequence[tuple[str, str, Outcomes]],
     skipped: Sequence[Skipped],
     quick: bool,
-    on_check: Callable[[Check], object],
     on_part: Progress,
 ) -> Certificate:
     """Make the parts: a group, a task or model, and its outcomes as they come, which are then said to be of these.
@@ -127,7 +126,6 @@ def _certify(
                 skips.append(dataclasses.replace(outcome, group=group, task=task))
             else:
                 found.append(dataclasses.replace(outcome, group=group, task=task))
-                on_check(found[-1])
     on_part(len(parts), len(parts), "done")
     return Certificate(subject, tuple(found), tuple(skips), quick, time.perf_counter() - started)
 
@@ -147,7 +145,6 @@ def validate(
     *,
     quick: bool = False,
     groups: Sequence[str] | None = None,
-    on_check: Callable[[Check], object] = unheard,
     on_part: Progress = unheard,
 ) -> Certificate:
     """Check that the port is right.
@@ -159,7 +156,6 @@ def validate(
         tasks: a task, several, or None for all that are registered.
         quick: fewer states, runs and step sizes: seconds instead of minutes.
         groups: some of `GROUPS`; None for all of them.
-        on_check: called with each outcome as it arrives.
         on_part: called as each group and task begins.
 
     Raises:
@@ -185,7 +181,7 @@ def validate(
         for task in ([None, *others] if group in WITHOUT_TASK else names)
     ]
     subject = "all tasks" if len(names) == len(TASKS) else ", ".join(names)
-    return _certify(subject, parts, (), quick, on_check, on_part)
+    return _certify(subject, parts, (), quick, on_part)
 
 
 def validate_model(
@@ -193,7 +189,6 @@ def validate_model(
     name: str = "model",
     *,
     quick: bool = False,
-    on_check: Callable[[Check], object] = unheard,
     on_part: Progress = unheard,
 ) -> Certificate:
     """Put a model of your own, with any number of our motors, through the checks that apply to it.
@@ -202,7 +197,6 @@ def validate_model(
         model: a compiled model; it is not changed.
         name: its name in the certificate.
         quick: fewer simulations and steps.
-        on_check: called with each outcome as it arrives.
         on_part: called as each part begins.
 
     Raises:
@@ -222,4 +216,4 @@ def validate_model(
         ("execution", name, execution.model_checks(subject, quick, execution.FULL_STATE)),
     ]
     unknown = [Skipped("all checks", reason, group, name) for group, reason in own_model.UNKNOWN.items()]
-    return _certify(name, parts, unknown, quick, on_check, on_part)
+    return _certify(name, parts, unknown, quick, on_part)

@@ -156,10 +156,9 @@ def analogues(task: Task) -> tuple[Actuator, ...]:
     The paper's kD is a difference of two samples, whose limit is an impulse wherever the command jumps; the
     compensation would hide the back-EMF.
     """
-    smooth: dict[str, Any] = {"kd": 0.0, "max_voltage": math.inf, "bemf_compensation": False, "integral_leak": 0.0}
-    return tuple(
-        dataclasses.replace(one, controller=dataclasses.replace(one.controller, **smooth)) for one in actuators_of(task)
-    )
+    smooth = {"kd": 0.0, "max_voltage": math.inf, "bemf_compensation": False, "integral_leak": 0.0}
+    changes = {f"controller.{name}": value for name, value in smooth.items()}
+    return tuple(one.replaced(changes) for one in actuators_of(task))
 
 
 @check("convergence", order("order, {integrator}, {case}", "DOP853 at 1e-12 on {whose}"))

@@ -11,7 +11,6 @@ The motor of the oracle is written here anew: the winding by scipy's matrix expo
 loop that cancels its pole. Nothing of `codrl_mj.actuators` is in it but the numbers of a `Drive`.
 """
 
-import dataclasses
 import math
 from collections.abc import Iterator
 
@@ -177,7 +176,7 @@ def drive_checks(quick: bool) -> Iterator[tuple[Case, ...]]:
     jumping = {name: resolve({"name": name, **given}, None, name) for name in motor_names()}
     benches = [Bench(one, timestep) for one in jumping.values()]
     stepping = [
-        dataclasses.replace(one, controller=dataclasses.replace(one.controller, kp=bench.kp, ki=bench.ki * 20e3))
+        one.replaced({"controller.kp": bench.kp, "controller.ki": bench.ki * 20e3})
         for one, bench in zip(jumping.values(), benches, strict=True)
     ]
     stalls = np.array([one.motor.torque_constant * one.voltage_limit / one.motor.resistance for one in stepping])

@@ -7,6 +7,7 @@ and is undone when the `with` block ends.
 import contextlib
 import dataclasses
 import inspect
+import math
 import sys
 import types
 import warnings
@@ -25,7 +26,7 @@ from codrl_mj.engine.families import SLOT, replaced
 from codrl_mj.engine.hill import GRAVITY
 from codrl_mj.physics import MujocoPhysics, compiled_task, mjcf
 from codrl_mj.tasks import OURS, find_task
-from codrl_mj.validation.certificate import WITHOUT_TASK, Progress, unheard, validate
+from codrl_mj.validation.certificate import WITHOUT_TASK, Certificate, Progress, unheard, validate
 from codrl_mj.validation.table import Check
 
 Fault = contextlib.AbstractContextManager[object]
@@ -338,6 +339,20 @@ def try_mutations(
             results.append(Caught(mutation.name, task, failed, len(made)))
     on_part(len(mutations), len(mutations), "done")
     return results
+
+
+def as_mapping(certificate: Certificate, caught: Sequence[Caught]) -> dict[str, Any]:
+    """What faults did, for JSON, beside what the certificate has; nothing where none was made."""
+    rows: list[dict[str, Any]] = []
+    for one in caught:
+        row: dict[str, Any] = {"mutation": one.mutation, "task": one.task, "made": one.made}
+        row["failed"] = [f"{check.group}: {check.name}" for check in one.failed]
+        if (clearest := one.clearest) is not None:
+            worst = clearest.worst if math.isfinite(clearest.worst) else str(clearest.worst)
+            row |= {"clearest": f"{clearest.group}: {clearest.name}", "worst": worst, "allowed": clearest.tolerance}
+        rows.append(row)
+    blind = [f"{check.group}: {check.task}: {check.name}" for check in unfailed(certificate.checks, caught)]
+    return {"mutations": rows, "failed by no mutation": blind} if rows else {}
 
 
 def unfailed(checks: Sequence[Check], caught: Sequence[Caught]) -> list[Check]:

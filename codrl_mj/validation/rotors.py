@@ -150,10 +150,9 @@ def standard_loops() -> dict[str, Loop]:
 
 def unlimited(loop: Loop, substeps: int) -> Actuator:
     """The loop's actuator where it is linear: without limit and sensor errors, with so many electrical substeps."""
-    controller = dataclasses.replace(
-        loop.actuator.controller, substeps=substeps, max_voltage=math.inf, current_bias=0.0, current_noise=0.0
-    )
-    return dataclasses.replace(loop.actuator, controller=controller, supply=None)
+    linear = {"substeps": substeps, "max_voltage": math.inf, "current_bias": 0.0, "current_noise": 0.0}
+    changes = {f"controller.{name}": value for name, value in linear.items()}
+    return loop.actuator.replaced({**changes, "supply": None})
 
 
 def run(actuator: Actuator, timestep: float, torques: np.ndarray, speeds: np.ndarray) -> Record:

@@ -7,7 +7,6 @@ not what chaos made of it.
 """
 
 import copy
-import dataclasses
 import math
 from collections.abc import Iterator
 
@@ -158,8 +157,7 @@ def whole_runs(
     """
     actuator = named_actuator("paper" if actuator_name == STARVED else actuator_name, task.name)
     if actuator_name == STARVED:
-        loop = dataclasses.replace(actuator.controller, max_voltage=0.5, bemf_compensation=False)
-        actuator = dataclasses.replace(actuator, controller=loop)
+        actuator = actuator.replaced({"controller.max_voltage": 0.5, "controller.bemf_compensation": False})
     steps = min(longest, task.max_episode_steps or UNLIMITED_STEPS)
     horizon = min(steps, (task.trials and task.trials.horizon) or steps)
     for seed in seeds:

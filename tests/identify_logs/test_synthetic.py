@@ -18,7 +18,7 @@ def changed(**fields):
     return dataclasses.replace(DRIVE, motor=dataclasses.replace(MOTOR, **fields))
 
 
-@pytest.mark.parametrize("load", [LOAD, Load(1e-3, gravity=0.4), Load(1e-3, torque=0.05)])
+@pytest.mark.parametrize("load", [LOAD, Load(1e-3, gravity=0.4), Load(1e-3, against=0.05)])
 def test_motion_is_what_scipy_integrates(load):
     drive = changed(coulomb_friction=0.0)
     course = run(drive, Excitation("chirp", 12.0, 0.5, highest=50.0), load, position=0.3)
@@ -28,7 +28,7 @@ def test_motion_is_what_scipy_integrates(load):
     def slope(_, state, voltage):
         current, speed, angle = state
         torque = motor.torque_constant * current - motor.viscous_friction * speed
-        outside = (load.gravity * np.sin(angle / ratio) + load.torque) / ratio
+        outside = (load.gravity * np.sin(angle / ratio) + load.against) / ratio
         voltage_left = voltage - motor.resistance * current - motor.back_emf_constant * speed
         return voltage_left / motor.inductance, (torque - outside) / inertia, speed
 
@@ -72,7 +72,7 @@ def test_friction_holds_slows_and_heats_what_it_has_to():
 
 def test_a_gear_loses_its_share():
     drive = changed(gear_efficiency=0.8, coulomb_friction=0.0, viscous_friction=0.0)
-    course = run(drive, Excitation("square", 6.0, 4.0, frequency=0.1), Load(1e-3, torque=0.3))
+    course = run(drive, Excitation("square", 6.0, 4.0, frequency=0.1), Load(1e-3, against=0.3))
     assert course.signals["current"][-1] * 0.036 * 5.0 * 0.8 == pytest.approx(0.3, rel=1e-6)
 
 
