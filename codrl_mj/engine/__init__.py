@@ -1,4 +1,4 @@
-"""The only code that touches raw mjModel and mjData memory: structure layout, compiled families, doors, reading."""
+"""Raw mjModel and mjData memory for compiled code: structure layout, compiled families, doors, reading."""
 
 from codrl_mj.engine.control import CallbackInUseError, install, installed, uninstall
 from codrl_mj.engine.families import load_family

@@ -1,4 +1,4 @@
-"""MuJoCo's control and bias callbacks for our actuators, compiled to C functions by numba: the five tasks' door.
+"""MuJoCo's control and bias callbacks for our actuators, compiled to C functions by numba: the door of tasks.
 
 They are pure functions of (mjModel, mjData): which actuators are ours, and their parameters, is read from the model;
 all state is in `data.act`. Nothing is cached on disk: the structure offsets are compiled in as constants.
@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 from numba import types
 
-from codrl_mj.engine.doors import command, is_disabled, seen_from, user_of
+from codrl_mj.engine.doors import command, inertia_at, is_disabled, user_of
 from codrl_mj.engine.families import (
     HEAD,
     INERTIA,
@@ -85,7 +85,7 @@ def compiled() -> dict[str, Any]:
                 DATA.actuator_length(data)[out],
                 DATA.actuator_velocity(data)[out],
                 time,
-                seen_from(model, data, out, 1.0) if size_of(number, INERTIA) else math.inf,
+                inertia_at(model, data, out, 1.0) if size_of(number, INERTIA) else math.inf,
             )
 
     @cfunc(types.float64(types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")

@@ -60,7 +60,7 @@ def is_disabled(model: int, actuator: int) -> bool:
 
 
 @internal
-def seen_from(model: int, data: int, output: int, gear: float) -> float:
+def inertia_at(model: int, data: int, output: int, gear: float) -> float:
     """The inertia [kg*m^2] at an actuator's output, through a gear; `load_inertia` must have been called.
 
     To be compiled takes a second, which only families that ask for it are to pay.
@@ -92,7 +92,7 @@ def _eliminated(model: int, data: int, output: int, gear: float, turned: Any) ->
 
 @functools.cache
 def load_inertia() -> Any:
-    """Compile what `seen_from` calls, once a process; returns what owns the machine code.
+    """Compile what `inertia_at` calls, once a process; returns what owns the machine code.
 
     With its moment m, the gear times a row of `actuator_moment`, and the inertia matrix M = L^T*D*L that
     `mj_fwdPosition` has factorised, it is 1/(m*M^-1*m): how hard it is to turn with all other joints free. Infinite
@@ -111,5 +111,5 @@ def load_inertia() -> Any:
 
 
 def shaft_inertia(model: mujoco.MjModel, data: mujoco.MjData, output: int, gear: float) -> float:
-    """What `seen_from` finds of a simulation whose `mj_fwdPosition` has run."""
+    """What `inertia_at` finds of a simulation whose `mj_fwdPosition` has run."""
     return float(load_inertia().ctypes(model._address, data._address, output, gear))

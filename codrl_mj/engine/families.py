@@ -53,7 +53,7 @@ STATES, SIGNALS, PARAMETERS, INERTIA, MOTION, WHOLE = range(6)
 """Columns of the table of sizes: a family's numbers of states, signals and parameters, whether it asks for the inertia
 and is asked for motions, and its `slot_size`."""
 _SIZES = np.zeros((10**6, 6), dtype=np.int32)
-"""They, likewise."""
+"""The sizes of a family, by its number."""
 _REFERENCES = np.zeros(10**6, dtype=np.uintp)
 """Address of its `reference`, as C has strings, likewise."""
 _COMPILED: dict[int, tuple[Family, Any]] = {}
@@ -108,8 +108,8 @@ def load_family(family: Family) -> None:
         )
     if other is not None and family_sizes(other) != sizes:
         raise ValueError(
-            f"family {reference(family)} has {sizes} states, signals and parameters, and {family_sizes(other)} when it "
-            "was loaded before: give it another name, or start Python anew"
+            f"family {reference(family)} has {sizes[:3]} states, signals and parameters, and {family_sizes(other)[:3]} "
+            "when it was loaded before: give it another name, or start Python anew"
         )
     if family.INERTIA:
         load_inertia()

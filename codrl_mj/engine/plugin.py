@@ -14,7 +14,7 @@ import mujoco
 from numba import types
 
 from codrl_mj.actuators import BUILT_IN, Ideal, family_number, reference
-from codrl_mj.engine.doors import clip, command, is_disabled, seen_from, user_of
+from codrl_mj.engine.doors import clip, command, inertia_at, is_disabled, user_of
 from codrl_mj.engine.families import (
     HEAD,
     INERTIA,
@@ -153,9 +153,10 @@ def compiled() -> dict[str, Any]:
                 continue
             user, out = user_of(model, actuator), MODEL.actuator_outadr(model)[actuator]
             number, arm = int(f64(user)[2]), f64(user)[HEAD]
+            whole = size_of(number, WHOLE)
             gear = 1.0 / arm  # as at the other door, which multiplies by it
             # stages 2 to 4 of RK4: a drive is sampled once a step, and its torque held
-            within = own[0] < time <= own[0] + timestep and own[size_of(number, WHOLE) + 1] != 0.0
+            within = own[0] < time <= own[0] + timestep and own[whole + 1] != 0.0
             held = within and MODEL.opt.integrator(model) == _RK4 and number != _IDEAL
             if not held:
                 length = DATA.actuator_length(data)[out]
@@ -167,12 +168,11 @@ def compiled() -> dict[str, Any]:
                 else:
                     force = _engine_force(model, data, actuator, length, velocity)
                     asked = force * arm
-                load = seen_from(model, data, out, gear) if size_of(number, INERTIA) else math.inf
+                load = inertia_at(model, data, out, gear) if size_of(number, INERTIA) else math.inf
                 advance_slot(
                     *(number, user + 8 * PLUGIN_HEAD, timestep, slot, asked),
                     *(length * gear, velocity * gear, time, load),
                 )
-                whole = size_of(number, WHOLE)
                 own[whole], own[whole + 1] = own[2] * gear if motion else force, 1.0
             DATA.actuator_force(data)[out] = own[2] * gear
 

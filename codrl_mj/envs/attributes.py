@@ -122,7 +122,7 @@ def _write_number(name: str, attribute: ModelNumber, value: Any, setup: Setup, m
         return
     if varies:
         factors = np.full((1, len(varies)), (number / read(name, setup, model)) ** power)
-        fields = Variation(model, varies).fields(factors, drawn=True)
+        fields = Variation(model, varies).fields(factors, shown=True)
         only = attribute.only or fields
         write_fields(model, {name: rows for name, rows in fields.items() if name in only})
     _place(attribute, model)[0] = (number / attribute.scale) ** power

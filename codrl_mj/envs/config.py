@@ -157,7 +157,7 @@ class EnvConfig:
         return {name: getattr(self, name) for name in ("action", "levels", "observe_actuator")}
 
     def as_arguments(self) -> dict[str, Any]:
-        """The keyword arguments for `gymnasium.make` with a task's id, without those left at their defaults."""
+        """The keyword arguments for `gymnasium.make` with a task's id, without those that are None or off."""
         names = [name for name in self.world.fields if name not in ("task", "options")]
         arguments = {name: getattr(self, name) for name in names} | {"randomize": self.distributions or None}
         given = {name: value for name, value in arguments.items() if value is not None and value not in (OFF, PLAIN)}

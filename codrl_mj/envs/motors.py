@@ -12,8 +12,7 @@ from gymnasium import spaces
 from codrl_mj.actuators import ActuatorModel, Command, Family, Inputs, parameters_type
 from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.disturbances import OFF, Disturbances
-from codrl_mj.engine.families import signals_at
-from codrl_mj.engine.plugin import PLUGIN_HEAD
+from codrl_mj.engine.families import HEAD, signals_at
 from codrl_mj.engine.reading import Readout, bring_to_rest, slots
 from codrl_mj.engine.specs import matched_by, names_of
 from codrl_mj.envs.commands import ControlCommands, command_of
@@ -27,7 +26,7 @@ _POSITION = int(mujoco.mjtWarning.mjWARN_BADQPOS)  # followed by those of speeds
 
 @dataclasses.dataclass(frozen=True)
 class MotorSettings:
-    """What an environment of others is to have of motors, as `codrl_mj.make` takes it."""
+    """What motors an environment of others has, as `codrl_mj.make` takes it."""
 
     actuators: Mapping[str, ActuatorModel]
     """Pattern -> actuator."""
@@ -93,7 +92,7 @@ class Motors:
         """Exchange the motors for others of their families; to be followed by a reset."""
         for index, one in zip(self.present, actuators, strict=True):
             numbers = (one.arm_radius, *one.numbers)
-            self.data.model.actuator_user[index, PLUGIN_HEAD - 1 : PLUGIN_HEAD - 1 + len(numbers)] = numbers
+            self.data.model.actuator_user[index, HEAD : HEAD + len(numbers)] = numbers
             self.present[index] = one
         self._parameters = list(map(_parameters, actuators))
 
@@ -101,10 +100,6 @@ class Motors:
         """Change fields of the model, as `Variation.fields` returns them for one simulation, before a reset."""
         write_fields(self.data.model, fields)
         mujoco.mj_setConst(self.data.model, self.data)
-
-    def draw(self, generator: np.random.Generator) -> None:
-        """Draw motors and model of the next episode; to be followed by a reset."""
-        self.draws.draw(lambda rows, count: generator.random((len(rows), count)), np.zeros(1, dtype=int))
 
     def begin(self, generator: np.random.Generator) -> None:
         """Bring all to rest after a reset: motors, with keys of their own for noise, and commands on their way."""

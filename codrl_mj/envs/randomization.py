@@ -100,6 +100,10 @@ class Draws:
         self._values = np.full((len(motors), len(randomization.distributions)), np.nan)
         self._rejected = np.zeros(len(motors), dtype=np.int64)
 
+    def draw_one(self, generator: np.random.Generator) -> None:
+        """Draw anew for the only simulation."""
+        self.draw(lambda rows, count: generator.random((len(rows), count)), np.zeros(1, dtype=int))
+
     def draw(self, random: Uniforms, rows: np.ndarray) -> None:
         """Draw anew for the simulations `rows` (m,), which are to be reset afterwards.
 
@@ -172,7 +176,7 @@ class Draws:
         return list(map(numbers_of, families, fields)), arms, additions
 
     def model_fields(
-        self, rows: np.ndarray, additions: np.ndarray | None = None, drawn: bool = False
+        self, rows: np.ndarray, additions: np.ndarray | None = None, shown: bool = False
     ) -> dict[str, np.ndarray]:
         """The drawn fields of some simulations' models; see `Variation.fields`."""
         variation = self.randomization.variation
@@ -181,7 +185,7 @@ class Draws:
         additions = self.parameters(rows)[2] if additions is None else additions
         names = list(self.randomization.distributions)
         columns = np.array([names.index(name) for name in variation.names], dtype=int)
-        return variation.fields(self._values[np.ix_(rows, columns)], additions, drawn)
+        return variation.fields(self._values[np.ix_(rows, columns)], additions, shown)
 
     def report(self, row: int = 0) -> dict[str, Any]:
         """What `info` says of a simulation's draw: values by field, those of a pattern together; NaN before one."""
@@ -227,7 +231,7 @@ def put_into(simulation: Any, draws: Draws, rows: np.ndarray) -> None:
     if draws.randomization.draws_actuator:
         simulation.set_actuators(draws.motors())
     if draws.randomization.variation is not None:
-        simulation.set_model(draws.model_fields(rows, drawn=True))
+        simulation.set_model(draws.model_fields(rows, shown=True))
 
 
 def put_into_batch(physics: Any, draws: Draws, rows: np.ndarray) -> None:

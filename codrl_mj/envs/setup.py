@@ -49,7 +49,8 @@ class Setup:
 
     def _check(self) -> None:
         """Refuse what does not go together: with each other, with the step, with what the motors move."""
-        plant, _, unstable = self.plant, self.sensors, self.config.allow_unstable
+        plant, unstable = self.plant, self.config.allow_unstable
+        _ = self.sensors  # which are refused where there is nothing to observe
         if not self.randomization.draws_actuator:  # else every draw is checked
             for one in plant.actuators:
                 one.check_at(plant.timestep, unstable)
@@ -107,7 +108,7 @@ class Setup:
         return drawn or any(one.random for one in self.plant.actuators)
 
     def keys(self, random: Callable[[int], np.ndarray]) -> np.ndarray:
-        """Keys of the random numbers of m episodes' disturbances and sensors, shape (m,); 0 where none is needed.
+        """Keys of the random numbers of m episodes' disturbances and sensors, shape (m,); one 0 where none is needed.
 
         They come of `random`: (count) -> numbers uniform in [0, 1), shape (m, count).
         """
@@ -159,7 +160,7 @@ class Setup:
 
     @functools.cached_property
     def _columns(self) -> tuple[str, ...]:
-        return ("desired_force", "actual_force", *self.plant.family.Signals._fields)
+        return ("desired_force", "actual_force", *self.plant.family.Signals._fields)  # all but the trace's last
 
     def signals(self, columns: Sequence[Any] | np.ndarray, desired: Any) -> Signals:
         """A trace's columns, numbers or arrays, as signals: the force [N or N*m] that the agent `desired` is theirs.

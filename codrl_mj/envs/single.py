@@ -80,7 +80,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         self._view = {"width": width, "height": height, "camera": camera, "pretty": pretty}
         self._renderer: OffscreenRenderer | None = None
         self._window: Window | None = None
-        self._drawn: Any = None
+        self._shown: Any = None
         if render_mode is not None:
             check_view(self._scene().scene[0], width, height, camera)
         self.action_space = self.setup.commands.action_space
@@ -183,7 +183,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         super().reset(seed=seed)
         generator, setup = self.np_random, self.setup
         initial = setup.task.initial(generator, options)
-        self._draws.draw(lambda rows, count: generator.random((len(rows), count)), np.zeros(1, dtype=int))
+        self._draws.draw_one(generator)
         self.physics.reset(initial, float(setup.keys(lambda count: generator.random((1, count)))[0]))
         if self.render_mode == "human":
             self.render()
@@ -291,17 +291,17 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         """What is drawn: the simulation itself, or the task's ideal model where the physics has none."""
         if self.physics.scene is not None:
             return self.physics
-        if self._drawn is None:
-            self._drawn = MujocoPhysics(Plant(self.task, [IDEAL] * len(self.task.motors)))
-        return self._drawn
+        if self._shown is None:
+            self._shown = MujocoPhysics(Plant(self.task, [IDEAL] * len(self.task.motors)))
+        return self._shown
 
     def close(self) -> None:
         """Free the OpenGL context, and close the window."""
         for shown in (self._renderer, self._window):
             if shown is not None:
                 shown.close()
-        self._renderer = self._window = self._drawn = None
+        self._renderer = self._window = self._shown = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the renderer, the window and the compiled step, which a copy makes anew."""
-        return self.__dict__ | {"_renderer": None, "_window": None, "_drawn": None, "_compiled": None}
+        return self.__dict__ | {"_renderer": None, "_window": None, "_shown": None, "_compiled": None}

@@ -150,7 +150,7 @@ class TaskWorld(World):
         return self.task.action_space
 
     def default_agent(self, config: Any) -> str:  # noqa: ARG002
-        """The task's: of the five the paper's."""
+        """The task's; of five of ours the paper's."""
         return str(self.task.agent)
 
     def view(self, config: Any, width: int, height: int, camera: str | None) -> None:  # noqa: ARG002

@@ -20,7 +20,7 @@ from codrl_mj.physics import Signals
 from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
 from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
 from codrl_mj.physics.streams import Streams
-from codrl_mj.physics.variation import DRAWN, VARIED, field_of, write_fields
+from codrl_mj.physics.variation import SHOWN, VARIED, field_of, write_fields
 from codrl_mj.tasks import Task
 
 Array = np.ndarray
@@ -168,8 +168,8 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         if np.shape(value) not in ((), (self.num_envs,)):
             raise ValueError(f"{name} = {value!r}: must be one number, or {self.num_envs}, one for each environment")
         fields = {field: self.physics.field(field).copy() for field in VARIED}
-        looks = {field: np.array([field_of(self.physics.model, field)] * self.num_envs) for field in DRAWN}
-        looks |= {field: rows.copy() for field, rows in self._looks.items() if field in DRAWN}
+        looks = {field: np.array([field_of(self.physics.model, field)] * self.num_envs) for field in SHOWN}
+        looks |= {field: rows.copy() for field, rows in self._looks.items() if field in SHOWN}
         numbers = np.broadcast_to(value, self.num_envs).tolist()
         for row, (model, number) in enumerate(zip(self.physics.models(), numbers, strict=True)):
             write_fields(model, looks, row)
@@ -375,7 +375,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             return None
         if self._renderer is None:
             self._renderer = OffscreenRenderer(self.physics.model, **self._view)  # type: ignore[arg-type]
-        write_fields(self.physics.model, self._draws.model_fields(np.array([row]), drawn=True))
+        write_fields(self.physics.model, self._draws.model_fields(np.array([row]), shown=True))
         write_fields(self.physics.model, self._looks, row)
         self.physics.show(row)
         return self._renderer.render(self.physics.data)

@@ -307,7 +307,7 @@ def find_world(name: Any) -> World:
                 return kind.find(name)
         if ":" in name:
             return world_of(load_object(name))
-    return importlib.import_module(_KINDS[0]).find(name)  # says what there is
+    return importlib.import_module(_KINDS[0]).find(name)  # which refuses it, and says what there is
 
 
 @functools.singledispatch

@@ -49,7 +49,7 @@ class MotorisedEnvironment(dm_env.Environment):
     def reset(self) -> dm_env.TimeStep:
         """Start an episode, the motors at rest; composer environments build their model anew."""
         if self._settings.randomize is not None:
-            self._motors.draw(self._generator)
+            self._motors.draws.draw_one(self._generator)
         with self._building.motorising():
             timestep = self._environment.reset()
         self._ended = False

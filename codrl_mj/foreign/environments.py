@@ -208,7 +208,7 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         if seed is not None:
             own = np.random.SeedSequence(seed, spawn_key=(1,))  # independent of the environment's
             self._generator = np.random.Generator(np.random.PCG64(own))
-        self._motors.draw(self._generator)
+        self._motors.draws.draw_one(self._generator)
         observation, info = self.env.reset(seed=seed, options=options)
         self._begun = True
         self._motors.begin(self._generator)

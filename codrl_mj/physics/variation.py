@@ -15,15 +15,15 @@ from codrl_mj.physics.base import Plant
 from codrl_mj.physics.mjcf import hills, task_model
 from codrl_mj.tasks import TASKS
 
-DRAWN = ("geom_pos", "geom_size")
-"""Fields that only what is drawn depends on."""
+SHOWN = ("geom_pos", "geom_size")
+"""Fields that only pictures depend on."""
 _FIELDS = {
     "mass": ("body_mass", "body_inertia"),
-    "length": ("body_ipos", "body_inertia", "body_pos", *DRAWN),
+    "length": ("body_ipos", "body_inertia", "body_pos", *SHOWN),
     "damping": ("dof_damping",),
     "gravity": ("opt.gravity", "jnt_user"),
 }
-VARIED = tuple(dict.fromkeys(name for names in _FIELDS.values() for name in names if name not in DRAWN))
+VARIED = tuple(dict.fromkeys(name for names in _FIELDS.values() for name in names if name not in SHOWN))
 """Fields that the dynamics depend on."""
 
 
@@ -130,17 +130,17 @@ class Variation:
         self._hills = hills(model)
 
     def fields(
-        self, values: np.ndarray, additions: np.ndarray | None = None, drawn: bool = False
+        self, values: np.ndarray, additions: np.ndarray | None = None, shown: bool = False
     ) -> dict[str, np.ndarray]:
         """The varied fields of the model, by name (`opt.` before an option's), shape (m, ...).
 
         `values`, shape (m, k), has a column for each of `names`, NaN where it is as it was; `additions` are as
-        `mounting_of` has them; `drawn` includes the fields that only what is drawn depends on.
+        `mounting_of` has them; `shown` includes the fields that only pictures depend on.
         """
         fields = {
             field: np.repeat(nominal[np.newaxis], len(values), axis=0)
             for field, nominal in self._nominal.items()
-            if drawn or field not in DRAWN
+            if shown or field not in SHOWN
         }
         for name, column in zip(self.names, np.where(np.isnan(values), self._neutral, values).T, strict=True):
             kind, _, target = name.removeprefix("model.").partition(".")

@@ -121,7 +121,11 @@ class Evidence:
             raise ValueError(f"{path}: has no column {lacking[0]!r}: give the {RUNS} of the study")
         for number, row in enumerate(rows, start=2):
             for key in ("score", "success"):
-                if row[key] and not _finite(row[key]):
+                try:
+                    finite = math.isfinite(float(row[key] or 0.0))
+                except ValueError:
+                    finite = False
+                if not finite:
                     raise ValueError(f"{path}, line {number}: {key} = {row[key]!r}: must be a finite number")
         return cls(rows)
 
@@ -177,10 +181,3 @@ class Evidence:
 def _interval(values: Sequence[float] | np.ndarray) -> Interval:
     sample = np.asarray(values, dtype=float)
     return effect([Stratum(sample, np.zeros_like(sample), paired=True)])
-
-
-def _finite(text: str | None) -> bool:
-    try:
-        return math.isfinite(float(text or "nan"))
-    except ValueError:
-        return False
