@@ -33,7 +33,7 @@ def row(name: str, study: ActuatorStudy) -> dict[str, object]:
     step = find_task("pendulum").step_duration
     held = round(GOAL_HOLD / step) + 1
     worst: list[np.ndarray] = []
-    tests = study.grid.deployments()
+    tests = study.grid.deployments
     policies = [tests[f"pendulum: {name}", seed] for seed in range(study.seeds)]
     policies = [test for test in policies if finished(test.run)]
     for test in policies:

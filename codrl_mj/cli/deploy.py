@@ -255,7 +255,7 @@ class CompareLog:
 
     def run(self) -> tuple[int, Any]:
         """Compare, print a table, draw."""
-        from codrl_mj.cli.terminal import print_table, say
+        from codrl_mj.cli.terminal import print_table
         from codrl_mj.deploy import Contract, compare
         from codrl_mj.deploy.contract import FILE
         from codrl_mj.envs.config import EnvConfig
@@ -277,7 +277,6 @@ class CompareLog:
         print_table(title, heads, rows, right=heads[2:])
         if self.out is not None:
             _draw(found, self.out)
-            say(f"wrote {self.out}")
         keys = ("name", "unit", "error", "if_nothing_changed")
         return 0, [dict(zip(keys, row, strict=True)) for row in columns]
 
@@ -286,11 +285,12 @@ def _draw(found: Any, out: Path) -> None:
     """Logged and simulated curves of every entry, cut where the simulation begins anew."""
     import numpy as np
 
-    from codrl_mj.pages.plots import Curve, Plot, save
+    from codrl_mj.cli.motor import save_plot
+    from codrl_mj.pages.plots import Curve, Plot
 
     cut = found.simulated.copy()
     cut[found.starts[1:] - 1] = np.nan
-    save(
+    save_plot(
         [
             Plot(
                 name,

@@ -33,7 +33,7 @@ class OfEpisodes:
     source: tyro.conf.OmitArgPrefixes[Source] = Source()
     actuator_name: ActuatorName = AS_TRAINED
     seed: int = 0
-    """Seed of the episode."""
+    """Seed of the episode, or of the first."""
 
     for_line = classmethod(with_environment)
 
@@ -127,8 +127,6 @@ class LiveView(OfEpisodes):
     Example: codrl-mj view runs/cartpole-ppo-weaker-0, or codrl-mj view furuta (random actions).
     """
 
-    seed: int = 0
-    """Seed of the first episode."""
     policies: tuple[Path, ...] = ()
     """Other run folders whose policies can be chosen."""
     port: int = 8080

@@ -20,7 +20,7 @@ from codrl_mj.evaluation import RandomPolicy, evaluate
 from codrl_mj.study.bench import Delivery, commanded, delivered, doses, redesign
 from codrl_mj.study.doses import AXES, FLOORS, REAL, SECONDS, generic, ideal, posed
 from codrl_mj.study.evidence import Evidence, Loss, Outcome, total
-from codrl_mj.study.questions import MARGIN
+from codrl_mj.study.questions import MARGIN, Scores
 from codrl_mj.study.trials import Arm, Collected, Grid, Trial
 from codrl_mj.training import TrainConfig, load_config
 
@@ -213,16 +213,13 @@ class Measurement(NamedTuple):
         floor = FLOORS.get(env.task) if self.home.arm == _ideal_arm(env.task) else None
         if floor is None:
             floor = evaluate(RandomPolicy(env.action_space), env, RANDOM_EPISODES).returns.mean
-        level, succeeded = (_values(collected, self.home, name) for name in ("returns", "success"))
-        span = float(np.mean(level)) - floor
-        if span <= 0.0:
+        scores, succeeded = Scores(collected, {env.task: floor}, [self.home]), _values(collected, self.home, "success")
+        if not scores.ceilings:
             raise ValueError(f"{env.task}: ideal-trained policies are no better than random actions: train more seeds")
         options = {}
         for name, trial in self.options.items():
-            lost = (np.mean(level) - _values(collected, trial, "returns")) / span
-            missed = (
-                np.mean(succeeded) - _values(collected, trial, "success") if len(succeeded) else np.zeros_like(lost)
-            )
+            lost = 1.0 - np.array(list(scores.of(trial).values()))
+            missed = np.mean(succeeded) - _values(collected, trial, "success") if len(succeeded) else 0.0 * lost
             options[name] = Prospect(outcome := Outcome(lost, missed), outcome)
         return options
 

@@ -5,6 +5,7 @@ task's largest one, supplies in shares of what the task's motor needs.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -222,6 +223,7 @@ def arm(task: str, name: str, env: EnvConfig) -> Arm:
     return Arm(f"{task}: {name}", config, SECONDS[task])
 
 
+@functools.cache
 def ideal(task: str) -> Arm:
     """Trained on forces that come as they are asked for."""
     return arm(task, "ideal", posed(task))

@@ -104,7 +104,7 @@ def compute(
     grid: Grid, workers: Workers, accept_changes: bool = False, on_seed: Callable[[], None] = lambda: None
 ) -> None:
     """Compute what of a grid is missing, with a progress bar each for its trainings and its tests."""
-    counts = {"training": len(grid.cells()), "test": len(grid.deployments())}
+    counts = {"training": len(grid.cells), "test": len(grid.deployments)}
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=_console()) as bar:
         rows = {kind: bar.add_task(f"{kind}s", total=count) for kind, count in counts.items()}

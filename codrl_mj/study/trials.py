@@ -145,24 +145,27 @@ class Grid:
             if twice:
                 raise ValueError(f"{kind} {twice[0]!r}: stands for several: give each a name of its own")
 
-    @property
+    @functools.cached_property
     def arms(self) -> tuple[Arm, ...]:
         """Every arm once."""
         return tuple({trial.arm.name: trial.arm for trial in self.trials}.values())
 
+    @functools.cached_property
     def cells(self) -> dict[tuple[str, int], TrainConfig]:
         """The trainings by arm and seed: first seeds first, so that a part says something of all; the longest first."""
         every = [(arm, seed) for arm in self.arms for seed in self.seeds_of(arm)]
         every.sort(key=lambda cell: (cell[1], -cell[0].seconds))
         return {(arm.name, seed): arm.training(seed) for arm, seed in every}
 
+    @functools.cached_property
     def folders(self) -> dict[tuple[str, int], Path]:
         """The run folders by arm and seed."""
-        return {cell: cell_folder(self.root, config) for cell, config in self.cells().items()}
+        return {cell: cell_folder(self.root, config) for cell, config in self.cells.items()}
 
+    @functools.cached_property
     def deployments(self) -> dict[tuple[str, int], Deployment]:
         """The tests by trial and seed, whether the policies are trained or not."""
-        folders = self.folders()
+        folders = self.folders
         return {
             (trial.name, seed): Deployment(folders[trial.arm.name, seed], trial.env, self.episodes, EVALUATION_SEED)
             for trial in self.trials
@@ -172,7 +175,7 @@ class Grid:
     @functools.cached_property
     def rows(self) -> dict[tuple[str, int], dict[str, float | None]]:
         """Published measures of tests of these very trainings, by trial and seed."""
-        tests, found = self.deployments(), {}
+        tests, found = self.deployments, {}
         for row in [] if self.published is None else read_csv(self.published / RUNS):
             key = f"{row['task']}: {row['trained']} on {row['tested']}", int(row["seed"])
             if key in tests and tests[key].run.name == row["run"]:
@@ -181,7 +184,7 @@ class Grid:
 
     def _untested(self) -> dict[tuple[str, int], Deployment]:
         """The tests of which there is neither a file nor a row."""
-        tests = self.deployments()
+        tests = self.deployments
         return {key: test for key, test in tests.items() if key not in self.rows and not test.record.is_file()}
 
     def compute(
@@ -203,7 +206,7 @@ class Grid:
             ValueError: Ray is asked for and not installed.
             TrainingStoppedError: a signal asked to stop.
         """
-        cells, folders, tests = self.cells(), self.folders(), self._untested()
+        cells, folders, tests = self.cells, self.folders, self._untested()
         needed = {test.run for test in tests.values()}
         for seed in sorted({seed for _, seed in cells}):  # trained and tested, so that a part says something of all
             runs = {folders[cell]: config for cell, config in cells.items() if cell[1] == seed}
@@ -224,7 +227,7 @@ class Grid:
         Raises:
             ValueError: a file of a run is damaged.
         """
-        folders, tests = self.folders(), self.deployments()
+        folders, tests = self.folders, self.deployments
         at_hand = {cell: folder for cell, folder in folders.items() if finished(folder)}
         arm_of = {trial.name: trial.arm.name for trial in self.trials}
         done = at_hand | {cell: folders[cell] for trial, seed in self.rows if (cell := (arm_of[trial], seed))}
@@ -269,7 +272,7 @@ class Grid:
         Raises:
             ValueError: a file of a finished run is damaged.
         """
-        folders = self.folders()
+        folders = self.folders
         untested = collections.Counter(test.run for test in self._untested().values())
         found = []
         for arm in self.arms:

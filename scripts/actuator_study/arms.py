@@ -1,6 +1,7 @@
 """Who is trained on what, in the study of what an actuator costs. docs/results/plan.md has the reasons."""
 
 import dataclasses
+import functools
 from typing import Any
 
 from codrl_mj.actuators import Drive
@@ -36,6 +37,7 @@ def otherwise(env: EnvConfig, **fields: Any) -> EnvConfig:
     return dataclasses.replace(env, actuator=env.actuator.replaced(changes))
 
 
+@functools.cache
 def drawn(task: str, axis: str, trained: float | None = None) -> Arm:
     """Trained on doses that are drawn anew for every episode, evenly from none to `drawn_up_to`.
 
@@ -62,6 +64,7 @@ def designed(task: str) -> Drive:
     return redesigned(named_actuator("paper", task), task)
 
 
+@functools.cache
 def matched(task: str, axis: str) -> Arm:
     """Trained through one dose of one thing."""
     return arm(task, axis, AXES[axis].at(task, AXES[axis].trained[task]))

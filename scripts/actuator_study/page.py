@@ -359,8 +359,8 @@ def _missing(collected: Collected) -> str:
 
 def _method(collected: Collected, scores: Scores) -> str:
     grid, totals = collected.grid, collected.totals
-    done, wanted = totals.trainings, len(grid.cells())
-    tested, tests = sum(map(len, collected.evaluations.values())), len(grid.deployments())
+    done, wanted = totals.trainings, len(grid.cells)
+    tested, tests = sum(map(len, collected.evaluations.values())), len(grid.deployments)
     codes = ", ".join(f"`{code}` ({count})" for code, count in sorted(totals.codes.items())) or "none"
     known = [f"{task} {FLOORS[task]:g} to {ceiling:.1f}" for task, ceiling in scores.ceilings.items()]
     runs = max(len(grid.seeds_of(grid.arms[0])), 2)

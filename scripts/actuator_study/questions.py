@@ -1,6 +1,7 @@
 """The hypotheses of the study, as they were written down before it: docs/results/plan.md has them in words."""
 
 import dataclasses
+import functools
 from collections.abc import Iterable
 from typing import Any
 
@@ -23,6 +24,7 @@ def _contrasts(axis: str, one: Any, other: Any) -> tuple[Contrast, ...]:
     return tuple(Contrast(_trained_dose(one(task), axis), _trained_dose(other(task), axis)) for task in TRAINED)
 
 
+@functools.cache
 def _generic(task: str) -> Arm:
     return generic(ideal(task))
 
@@ -102,6 +104,7 @@ def _mean_wrong(task: str, names: Iterable[str]) -> list[Contrast]:
     return [Contrast(Trial(nominal, name, motors[name]), on_loop(nominal, "weaker")) for name in names]
 
 
+@functools.cache
 def primary() -> list[Question]:
     """The twelve that are corrected together."""
     numbered = enumerate(AXES, start=1)
@@ -179,6 +182,7 @@ def primary() -> list[Question]:
     ]
 
 
+@functools.cache
 def secondary() -> list[Question]:
     """All others, by section; each is one contrast."""
     found: list[tuple[str, str, Trial, Trial]] = []
@@ -227,6 +231,7 @@ def secondary() -> list[Question]:
     ]
 
 
+@functools.cache
 def trials() -> tuple[Trial, ...]:
     """Every trial of the study once."""
     pairs = [pair for question in (*primary(), *secondary()) for pair in question.contrasts]

@@ -161,8 +161,8 @@ def _secondary(verdicts: Sequence[Verdict]) -> str:
 
 
 def _method(collected: Collected, rising: Sequence[str], count: int) -> str:
-    totals, wanted = collected.totals, len(collected.grid.cells())
-    done, tests = sum(map(len, collected.evaluations.values())), len(collected.grid.deployments())
+    totals, wanted = collected.totals, len(collected.grid.cells)
+    done, tests = sum(map(len, collected.evaluations.values())), len(collected.grid.deployments)
     reaches = "; ".join(
         f"{TITLES[task]} {', '.join(f'{axis} {reach(task, axis):g}' for axis in ('lag', 'weakness', 'delay'))}"
         for task in TASKS

@@ -1,5 +1,6 @@
 """Who is trained on what, and the hypotheses as they were written down before: docs/results/insurance_plan.md."""
 
+import functools
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -40,6 +41,7 @@ def late(task: str, **fields: float) -> Late:
     return Late(held=round(definition.step_duration / timestep(task)), largest=definition.max_force, **fields)
 
 
+@functools.cache
 def generic(task: str, share: float = 1.0, named: str = "random", pushed: bool = True, late_too: bool = True) -> Arm:
     """Trained on random strength, lag and delay, and random pushes: on a share of what the rule says."""
     step, force = find_task(task).step_duration, find_task(task).max_force
@@ -55,6 +57,7 @@ def generic(task: str, share: float = 1.0, named: str = "random", pushed: bool =
     return arm(task, named, posed(task, late(task), randomize=drawn, **fields))
 
 
+@functools.cache
 def pushes(task: str) -> Arm:
     """Trained on random pushes and nothing else."""
     step, force = find_task(task).step_duration, find_task(task).max_force
@@ -77,11 +80,13 @@ def double(task: str) -> Arm:
     return generic(task, 2.0, "random, double")
 
 
+@functools.cache
 def through(task: str, axis: str) -> Arm:
     """Trained through the dose of one thing."""
     return arm(task, axis, AXES[axis].at(task, DOSES[task][axis]))
 
 
+@functools.cache
 def drawn(task: str, axis: str) -> Arm:
     """Trained on doses of one thing that are drawn for every episode, from none to twice the trained one."""
     return drawn_doses(task, axis, DOSES[task][axis])
@@ -93,6 +98,7 @@ def remembered(task: str, axis: str, dose: float) -> EnvConfig:
     return posed(task, late(task, **{{"lag": "time_constant"}.get(axis, axis): seconds}), observe_actuator=True)
 
 
+@functools.cache
 def remembering(task: str, axis: str) -> Arm:
     """Trained through the dose of one thing, seeing its last four commands."""
     return arm(task, f"{axis}, remembering", remembered(task, axis, DOSES[task][axis]))
@@ -167,6 +173,7 @@ AT_HOME: Mapping[str, tuple[str, tuple[str, ...], str]] = {
 """Hypothesis -> kind, axes, what it says: equivalence."""
 
 
+@functools.cache
 def primary() -> list[Question]:
     """The ten that are corrected together."""
     better = [
@@ -178,6 +185,7 @@ def primary() -> list[Question]:
     return sorted(better + equal, key=lambda one: int(one.name[1:]))
 
 
+@functools.cache
 def secondary() -> list[Question]:
     """All others, each of one task: each axis by itself, other doses, and what each kind costs at home."""
     found: list[tuple[str, str, tuple[Contrast, ...]]] = []
@@ -205,6 +213,7 @@ def secondary() -> list[Question]:
     return [Question(f"S{number}", *one) for number, one in enumerate(found, start=1)]
 
 
+@functools.cache
 def trials() -> tuple[Trial, ...]:
     """Every trial of the study once, those of the first study's arms among them."""
     both = [pair for question in (*primary(), *secondary()) for pair in question.contrasts]

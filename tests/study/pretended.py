@@ -15,8 +15,8 @@ def pretend(grid, score, leaving_out=()):
         score: (trial, seed) -> mean return.
         leaving_out: (arm, seed) of trainings that are not to be there.
     """
-    folders, tests = grid.folders(), grid.deployments()
-    for cell, config in grid.cells().items():
+    folders, tests = grid.folders, grid.deployments
+    for cell, config in grid.cells.items():
         if cell not in leaving_out:
             folders[cell].mkdir(parents=True)
             (folders[cell] / "config.json").write_text(json.dumps({"train": config.as_mapping(), "code": "c0de" * 16}))

@@ -120,7 +120,7 @@ def test_the_plan_is_what_is_computed():
     plan, planned = (RESULTS / "plan.md").read_text(), trials()
     grid = ActuatorStudy().grid
     assert set(planned) <= set(grid.trials)
-    counts = len(grid.arms), len(grid.cells()), len(planned) * 20
+    counts = len(grid.arms), len(grid.cells), len(planned) * 20
     assert "{} arms, 20 seeds each: {} trainings, {} tests of {} episodes".format(*counts, grid.episodes) in plan
     assert [hypothesis.name for hypothesis in primary()] == [f"P{number}" for number in range(1, 13)]
     for name, axis in AXES.items():
@@ -279,7 +279,7 @@ def test_the_page_has_every_number_in_a_file(study, tmp_path):
     page = files["actuators.md"].read_text()
     assert f"{float(first['effect']):+.3f} [{float(first['low']):+.3f}, {float(first['high']):+.3f}]" in page
     assert len(page.splitlines()) <= 190
-    assert len(list(csv.DictReader(files["runs.csv"].open()))) == len(study.deployments())
+    assert len(list(csv.DictReader(files["runs.csv"].open()))) == len(study.deployments)
     assert sum(file.stat().st_size for name, file in files.items() if name.endswith(".svg")) < 500_000
     assert f"({FOLDER}/chart.svg)" in page
     evidence = Evidence.read(files["runs.csv"])

@@ -58,7 +58,7 @@ def done(tmp_path_factory):
         mesh=Mesh(31, 31, 5),
     )
     hill = dataclasses.replace(plan, tasks=("mountain_car",), sarsa_seeds=1)
-    hill.every.folders()[BLOCKED.name, 0].write_text("a file in the way")
+    hill.every.folders[BLOCKED.name, 0].write_text("a file in the way")
     reported = []
     hill.grid.compute(Workers(jobs=1), on_cell=reported.append)
     findings = plan.findings()
@@ -71,7 +71,7 @@ def test_every_arm_is_trained_tested_and_read(done):
     assert (reported.count("training"), reported.count("test")) == (6, 5)
     for arm in HILL[:-1]:
         (row,) = findings.runs[arm.name]
-        folder = plan.every.folders()[arm.name, 0]
+        folder = plan.every.folders[arm.name, 0]
         assert (row["seed"], row["run"]) == ("0", folder.name)
         expected = evaluate(load_policy(folder), arm.config.evaluation_env, 3, EVALUATION_SEED)
         assert float(row["returns"]) == expected.returns.mean
@@ -253,7 +253,7 @@ def test_published_verdicts_are_of_the_claims_as_they_are():
 def test_finished_runs_are_not_trained_again(done):
     plan, _, _, _, _ = done
     hill = dataclasses.replace(plan, tasks=("mountain_car",), sarsa_seeds=1)
-    results = [folder / "result.json" for folder in hill.every.folders().values() if (folder / "result.json").is_file()]
+    results = [folder / "result.json" for folder in hill.every.folders.values() if (folder / "result.json").is_file()]
     assert len(results) == 5
     before = [path.stat().st_mtime_ns for path in results]
     hill.grid.compute(Workers(jobs=1))
@@ -276,11 +276,11 @@ def test_costs_are_those_of_finished_runs_or_estimates(done):
 def test_the_whole_is_estimated_at_less_than_four_hours_of_two_cores(tmp_path):
     grid = Reproduction(root=tmp_path, out=tmp_path).grid
     assert sum(cost.left for cost in grid.costs()) < 2 * 4 * 3600
-    assert len(grid.cells()) == sum(30 if arm.task == "mountain_car" else 5 for arm in ARMS)
+    assert len(grid.cells) == sum(30 if arm.task == "mountain_car" else 5 for arm in ARMS)
 
 
 def test_all_arms_first_seeds_are_trained_first_and_the_longest_before_the_others(tmp_path):
-    order = list(Reproduction(root=tmp_path, out=tmp_path).grid.cells())
+    order = list(Reproduction(root=tmp_path, out=tmp_path).grid.cells)
     seeds = [seed for _, seed in order]
     assert seeds == sorted(seeds)
     seconds = {arm.name: arm.seconds for arm in ARMS}
@@ -403,7 +403,7 @@ def test_failures_show_in_the_exit_status(done, tmp_path, capsys):
 @pytest.mark.matrix
 def test_a_test_that_failed_is_said(done, tmp_path):
     plan, _, _, _, _ = done
-    folder = plan.every.folders()[HILL[0].name, 0]
+    folder = plan.every.folders[HILL[0].name, 0]
     broken, content = folder / "policy.json", (folder / "policy.json").read_text()
     shorter = dataclasses.replace(plan, tasks=("mountain_car",), test_episodes=2)
     broken.write_text("{")
