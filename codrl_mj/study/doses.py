@@ -101,8 +101,7 @@ def needed_voltage(task: str) -> float:
 
 def supplied(task: str, volts: float) -> Drive:
     """A motor of 1 ohm whose loop settles in a fraction of an integration step, on a supply."""
-    step = timestep(task)
-    constant = motor_constant(task)
+    step, constant = timestep(task), motor_constant(task)
     motor = GearMotor(1.0, step / 20.0, constant, constant, rotor_inertia=0.0)
     loop = SampledLoop(sample_rate=20.0 / step, max_current=find_task(task).max_force / constant)
     return Drive(motor, loop, Supply(volts))
