@@ -1,8 +1,10 @@
 """`codrl-mj render`, `replay`, `view` and `report`: an episode as a film, in three dimensions, live, and of a run."""
 
+import contextlib
 import dataclasses
 import functools
 import os
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -69,7 +71,8 @@ class Render(OfEpisodes):
         if self.trajectory is not None and self.trajectory.suffix != ".npz":
             raise ValueError(f"--trajectory {self.trajectory}: the suffix is {self.trajectory.suffix!r}, must be .npz")
         policy, env, title = policy_and_environment(self)
-        panel = record(policy, env, self.seed, self.width, self.height, self.camera, self.pretty)
+        view = self.width, self.height, self.camera, self.pretty
+        panel = record(policy, env, self.seed, *view)
         episode = panel.episode
         title = f"{title}: return {episode.total:.0f}"
         if self.motor is not None and self.motor not in episode.motors:
@@ -81,15 +84,7 @@ class Render(OfEpisodes):
         panel = dataclasses.replace(panel, title=title, motor=strip)
         with progress_bar("{task.completed}/{task.total} frames") as bar:
             row = bar.add_task("filming", total=None)
-            film(
-                [panel],
-                self.out,
-                self.width,
-                self.height,
-                self.camera,
-                self.pretty,
-                lambda done, total: bar.update(row, completed=done, total=total),
-            )
+            film([panel], self.out, *view, lambda done, total: bar.update(row, completed=done, total=total))
         print(f"wrote {self.out}")
         if self.trajectory is not None:
             save_episode(episode, self.trajectory)
@@ -136,6 +131,7 @@ class LiveView(OfEpisodes):
 
     def run(self: Any) -> int:
         """Serve until Ctrl-C."""
+        from codrl_mj.training.run import stopping
         from codrl_mj.view.session import Session, run_native
 
         if not 1 <= self.port <= 65535:
@@ -162,10 +158,10 @@ class LiveView(OfEpisodes):
             return 0
         shown = Browser(session, self.port, title)
         print(f"{shown.url} (on this machine alone; Ctrl-C ends it)", flush=True)
-        try:
-            shown.run()
-        finally:
-            shown.close()
+        with stopping(signal.SIGINT) as asked, contextlib.closing(shown):  # not amidst what libraries have locked
+            shown.run(lambda: bool(asked))
+        if asked:
+            signal.raise_signal(signal.SIGINT)
         return 0
 
     def _policies(self: Any, given: Any, env: Any) -> dict[str, Callable[[], Any]]:

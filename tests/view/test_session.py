@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+import signal
 from pathlib import Path
 
 import mujoco
@@ -171,6 +172,28 @@ def test_an_endless_voltage_ends_at_the_end_of_its_slider():
     assert ("supply", "voltage") not in [one.path for one in controls(Actuator())]
 
 
+def test_a_ctrl_c_waits_for_the_end_of_a_step_and_closes_the_server(monkeypatch, capsys):
+    done = []
+
+    class Fake:
+        url = "http://127.0.0.1:0"
+
+        def __init__(self, *_):
+            pass
+
+        def run(self, until):
+            signal.raise_signal(signal.SIGINT)
+            done.append(f"asked to end: {until()}")
+
+        def close(self):
+            done.append("closed")
+
+    monkeypatch.setattr("codrl_mj.view.browser.Browser", Fake)
+    assert main(["view", "cartpole"]) == 130
+    assert done == ["asked to end: True", "closed"]
+    assert "stopped" in capsys.readouterr().err
+
+
 def test_the_command_line_offers_the_runs_policy_and_those_of_others(monkeypatch, capsys, tmp_path):
     seen = {}
 
@@ -180,7 +203,8 @@ def test_the_command_line_offers_the_runs_policy_and_those_of_others(monkeypatch
         def __init__(self, session, _port, title):
             seen.update(session=session, title=title)
 
-        def run(self):
+        def run(self, until):
+            assert not until()
             assert seen["session"].step()
 
         def close(self):
