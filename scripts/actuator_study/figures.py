@@ -141,7 +141,7 @@ def chart(path: Path, evidence: Evidence) -> bool:
         return False
     figure = Figure(figsize=(10.0, 6.4), layout="constrained")
     panels: Any = figure.subplots(2, 3, sharex=True, sharey=True).ravel()
-    none = dict.fromkeys(AXES, 0.0)
+    none, seen = dict.fromkeys(AXES, 0.0), set[int]()
     for panel, task in zip(panels, tasks, strict=False):
         points = tests_through(evidence, task)
         regions = np.array(
@@ -153,6 +153,7 @@ def chart(path: Path, evidence: Evidence) -> bool:
                 for lack in lacks
             ]
         )
+        seen.update(regions.flat)
         colours = ListedColormap(list(_REGIONS.values()))
         panel.pcolormesh(lags, 1.0 - lacks, regions, cmap=colours, vmin=-0.5, vmax=len(_REGIONS) - 0.5, rasterized=True)
         if task not in arms.TRAINED:
@@ -164,7 +165,8 @@ def chart(path: Path, evidence: Evidence) -> bool:
         panel.set_xlabel("time constant of the loop, a third of\nits settling time to 5 % [policy steps]")
     for panel in panels[::3]:
         panel.set_ylabel("voltage there is [needed voltage]")
-    handles = [Patch(facecolor=colour, edgecolor="0.6", label=name) for name, colour in _REGIONS.items()]
+    shown = [one for number, one in enumerate(_REGIONS.items()) if number in seen]
+    handles = [Patch(facecolor=colour, edgecolor="0.6", label=name) for name, colour in shown]
     handles.append(Patch(facecolor="white", edgecolor="0.4", hatch="//", label="trained through whole motors at most"))
     figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize="small")
     save(figure, path)
