@@ -253,13 +253,13 @@ class Grid:
         )
 
     def _totals(self, at_hand: Mapping[tuple[str, int], Path], done: int, missing: int) -> "Totals":
-        """What trainings took: those whose folders are at hand, beside what is published of all that have rows."""
-        arm_of = {trial.name: trial.arm.name for trial in self.trials}
-        have_rows = {(arm_of[trial], seed) for trial, seed in self.rows}
-        before, file = Totals(0, 0, 0.0, {}), (self.published or self.root) / TOTALS
+        """What trainings took: those at hand with tests, which get rows, beside what is published of all that have."""
+        tests, before, file = self.deployments, Totals(0, 0, 0.0, {}), (self.published or self.root) / TOTALS
+        have_rows = {tests[key].run for key in self.rows}
+        tested = {test.run for test in tests.values() if test.record.is_file()}
         if self.rows and file.is_file() and len(read_csv(file.with_name(RUNS))) == len(self.rows):
             before = Totals(**read_json(file, "totals of a study"))
-        new = [folder for cell, folder in at_hand.items() if not before.trainings or cell not in have_rows]
+        new = [one for one in at_hand.values() if one in tested and not (before.trainings and one in have_rows)]
         if before.trainings and not new:
             return before
         codes = [str(read_json(folder / "config.json", "run configuration").get("code"))[:8] for folder in new]

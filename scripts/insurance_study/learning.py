@@ -18,15 +18,15 @@ TENTHS = tuple(f"tenth_{number}" for number in range(1, 11))
 
 
 def learning_rows(collected: Collected, published: Path) -> list[dict[str, Any]]:
-    """A row for every run that is at hand, and the published ones of the others."""
+    """The published row of every run, whose name stands for its configuration, or else one of what is at hand."""
     known = {row["run"]: row for row in read_csv(published)}
     found: list[dict[str, Any]] = []
     for (name, seed), folder in collected.folders.items():
-        if (folder / RESULT).is_file():
+        if folder.name in known:
+            found.append(dict(known[folder.name]))
+        elif (folder / RESULT).is_file():
             task, _, trained = name.partition(": ")
             found.append({"task": task, "trained": trained, "seed": seed} | _tenths(folder) | {"run": folder.name})
-        elif folder.name in known:
-            found.append(dict(known[folder.name]))
     return found
 
 

@@ -211,3 +211,18 @@ def test_of_how_many_kinds_of_training_the_returns_still_rise():
     rows += [*runs("b", "wide span", 8.0), *runs("c", "no span", 99.0)]
     rows.append({"task": "a", "trained": "no episode", "tenth_8": "", "tenth_10": "5"})
     assert still_rising(rows, {"a": 100.0, "b": 1000.0}, 0.05) == (["a: up"], 4)
+
+
+def test_what_trainings_took_is_counted_once_however_often_the_page_is_written(tmp_path):
+    study = InsuranceStudy(root=tmp_path / "runs", out=tmp_path, seeds=1, tasks=("furuta",))
+    grid = study.grid
+    pretend(grid, lambda trial, _: FLOORS[trial.arm.task] + 100.0)
+    untested = grid.folders["furuta: random", 0]
+    shutil.move(untested / "deployments", tmp_path / "later")
+    for _ in range(3):
+        study.write()
+        assert study.grid.collect().totals.seconds == 10.0 * (len(grid.arms) - 1)
+    shutil.move(tmp_path / "later", untested / "deployments")
+    for _ in range(3):
+        study.write()
+        assert study.grid.collect().totals.seconds == 10.0 * len(grid.arms)
