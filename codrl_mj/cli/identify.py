@@ -224,7 +224,9 @@ class PlanExperiment:
 
     name: MotorName
     load: tyro.conf.OmitArgPrefixes[LOAD] = LOAD()  # type: ignore[valid-type]
+    """What the motor turns on the bench."""
     sensing: tyro.conf.OmitArgPrefixes[SENSING] = SENSING()  # type: ignore[valid-type]
+    """What is measured, how well."""
     duration: float = 4.0
     """Of a log [s]."""
     max_current: float = math.inf
@@ -302,6 +304,7 @@ class SimulateLog:
     out: Path
     """File to write, .csv or .csv.gz."""
     load: tyro.conf.OmitArgPrefixes[LOAD] = LOAD()  # type: ignore[valid-type]
+    """What the motor turns on the bench."""
     kind: Literal["slow_sine", "square", "chirp", "prbs", "locked_prbs"] = "prbs"
     """Excitation."""
     amplitude: float | None = None
@@ -313,6 +316,7 @@ class SimulateLog:
     clock: float | None = None
     """Of a PRBS [s]; 4 L/R unless given."""
     sampler: tyro.conf.OmitArgPrefixes[SAMPLER] = SAMPLER()  # type: ignore[valid-type]
+    """When rows are written."""
     sag: float = 0.0
     """Resistance of the supply [ohm], of which the logged voltage knows nothing."""
     sensor: tuple[str, ...] = ()
