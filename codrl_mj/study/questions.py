@@ -113,13 +113,15 @@ class Verdict(NamedTuple):
     effect: Interval
     """Mean difference of scores [shares of the span], with its 95 % interval; NaN without any contrast."""
     p: float
-    """Of the test, uncorrected: of no difference, or, of `equivalent`, of one as large as the margin."""
+    """Of the test, uncorrected: of no difference, or, of `equivalent`, of one as large as the margin; NaN: not judged."""
     corrected: float
     """The same after the correction for the number of questions that are judged together."""
 
     @property
-    def outcome(self) -> Literal["yes", "no", "the other way", "open"]:
+    def outcome(self) -> Literal["yes", "no", "the other way", "open", "not judged"]:
         """Whether it holds; `no` of one that says `equivalent`: the interval lies beyond the margin."""
+        if np.isnan(self.p):
+            return "not judged"
         if self.corrected < LEVEL:
             return "yes" if self.question.kind == "equivalent" or self.effect.mean > 0 else "the other way"
         beyond = self.effect.low > MARGIN or self.effect.high < -MARGIN
@@ -158,22 +160,25 @@ class Verdict(NamedTuple):
             "effect": self.effect.mean,
             "low": self.effect.low,
             "high": self.effect.high,
-            "p": self.p,
-            "corrected_p": self.corrected,
+            "p": None if np.isnan(self.p) else self.p,
+            "corrected_p": None if np.isnan(self.corrected) else self.corrected,
             "outcome": self.outcome,
             "seeds_to_close": self.seeds_to_close(questions) if self.outcome == "open" else None,
             "compared": "; ".join(pair.name for pair in asked.contrasts),
         }
 
 
-def judge(scores: Scores, questions: Sequence[Question], primary: bool = False) -> list[Verdict]:
+def judge(scores: Scores, questions: Sequence[Question], primary: bool = False, least: int = 0) -> list[Verdict]:
     """Test questions, and correct their p together.
+
+    Of none, or fewer than `least` policies, p says nothing, and who looks often finds something: it is not judged, and
+    counts with p = 1.
 
     Args:
         scores: of the study.
         questions: all that are corrected together.
-        primary: whether by Holm, where a question of which nothing is there yet counts with p = 1; others are
-            corrected by Benjamini and Hochberg.
+        primary: whether by Holm; others are corrected by Benjamini and Hochberg.
+        least: policies of every kind, without which nothing is judged.
     """
     tested = []
     for question in questions:
@@ -184,10 +189,10 @@ def judge(scores: Scores, questions: Sequence[Question], primary: bool = False) 
         found = {task: stratum for task, pairs in by_task.items() if (stratum := scores.stratum(pairs)) is not None}
         strata, counts = list(found.values()), (sum(len(by_task[task]) for task in found), len(question.contrasts))
         if not strata:
-            tested.append((question, (0, 0), counts, Interval(np.nan, np.nan, np.nan), 1.0))
+            tested.append((question, (0, 0), counts, Interval(*[np.nan] * 3), np.nan))
             continue
         fewest = min(len(stratum.one) for stratum in strata), min(len(stratum.other) for stratum in strata)
         p = equivalence_p(strata, MARGIN) if question.kind == "equivalent" else permutation_p(strata)
-        tested.append((question, fewest, counts, effect(strata), p))
-    corrected = (holm if primary else false_discovery)([p for *_, p in tested])
-    return [Verdict(*one, float(p)) for one, p in zip(tested, corrected, strict=True)]
+        tested.append((question, fewest, counts, effect(strata), p if min(fewest) >= least else np.nan))
+    corrected = (holm if primary else false_discovery)([1.0 if np.isnan(p) else p for *_, p in tested])
+    return [Verdict(*one, float(p) if one[-1] <= 1.0 else np.nan) for one, p in zip(tested, corrected, strict=True)]

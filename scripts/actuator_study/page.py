@@ -69,24 +69,13 @@ def write(collected: Collected, out: Path) -> list[Path]:
 
 
 def write_tables(
-    folder: Path,
-    collected: Collected,
-    scores: Scores,
-    first: Sequence[Verdict],
-    others: Sequence[Verdict],
-    least: int = 1,
+    folder: Path, collected: Collected, scores: Scores, first: Sequence[Verdict], others: Sequence[Verdict]
 ) -> list[Path]:
-    """Write a row for every policy and test, for every trial and for every question, and what the trainings took.
-
-    Of fewer than `least` policies a question says nothing.
-    """
-    nothing: dict[str, Any] = {"p": None, "corrected_p": None, "outcome": "not judged", "seeds_to_close": None}
+    """Write a row for every policy and test, for every trial and for every question, and what the trainings took."""
     tables = {
         RUNS: run_rows(collected, scores.of),
         TRIALS: trial_rows(collected, scores.of),
-        HYPOTHESES: (
-            verdict.row(len(first)) | (nothing if min(verdict.runs) < least else {}) for verdict in (*first, *others)
-        ),
+        HYPOTHESES: (verdict.row(len(first)) for verdict in (*first, *others)),
     }
     for name, table in tables.items():
         write_csv(folder / name, list(table))
@@ -312,14 +301,16 @@ def effect_text(verdict: Verdict) -> str:
 
 def p_text(value: float) -> str:
     """A probability, to three digits."""
+    if np.isnan(value):
+        return "–"
     return "<0.001" if value < 0.001 else f"{value:.3f}"
 
 
-def decided_table(verdicts: Sequence[Verdict], titles: Mapping[str, str], least: int = 1) -> str:
-    """How many comparisons of each section, by its title, were decided, of those with at least so many policies."""
+def decided_table(verdicts: Sequence[Verdict], titles: Mapping[str, str]) -> str:
+    """How many comparisons of each section, by its title, were decided, of those that were judged."""
     rows = []
     for name, title in titles.items():
-        mine = [one for one in verdicts if one.question.section == name and min(one.runs) >= least]
+        mine = [one for one in verdicts if one.question.section == name and not np.isnan(one.p)]
         decided = [verdict for verdict in mine if verdict.outcome != "open"]
         beyond = sum(one.effect.low > MARGIN or one.effect.high < -MARGIN for one in decided)
         rows.append([title, *map(str, (len(mine), len(decided), beyond))])

@@ -69,8 +69,9 @@ def write(collected: Collected, out: Path) -> list[Path]:
         The files that were written.
     """
     folder, scores = out / FOLDER, Scores(collected, FLOORS, [at_home(ideal(task)) for task in TASKS])
-    first, others = judge(scores, primary(), primary=True), judge(scores, secondary())
-    tables = write_tables(folder, collected, scores, first, others, PLANNED)
+    first = judge(scores, primary(), primary=True, least=PLANNED)
+    others = judge(scores, secondary(), least=PLANNED)
+    tables = write_tables(folder, collected, scores, first, others)
     spans = {task: ceiling - FLOORS[task] for task, ceiling in scores.ceilings.items()}
     learned = learning_rows(collected, folder / LEARNING)
     write_csv(folder / LEARNING, learned)
@@ -138,11 +139,8 @@ def _verdicts(verdicts: Sequence[Verdict]) -> str:
         tested, wanted = verdict.strata
         if tested < wanted:
             says += f" ({tested} of {wanted} comparisons have runs)"
-        fewest = min(verdict.runs)
         judged = [verdict.outcome, effect_text(verdict), p_text(verdict.corrected)]
-        if fewest < PLANNED:  # of a few policies p says nothing, and who looks often finds something
-            judged = ["not judged yet", effect_text(verdict), "–"]
-        rows.append([verdict.question.name, *judged, str(fewest), says])
+        rows.append([verdict.question.name, *judged, str(min(verdict.runs)), says])
     header = ["", "holds", "effect [95 %]", "corrected p", "policies", "says"]
     return f"""## The ten hypotheses
 
@@ -153,11 +151,11 @@ Nothing is judged before there are {PLANNED} policies of every kind.
 
 def _secondary(verdicts: Sequence[Verdict]) -> str:
     titles = {one.question.section: one.question.section for one in verdicts}
-    if all(min(one.runs) < PLANNED for one in verdicts):
+    if all(np.isnan(one.p) for one in verdicts):
         return f"The {len(verdicts)} others, each of one task, are not judged yet either.\n"
     return f"""Others, each of one task, with a false discovery rate of 5 %:
 
-{decided_table(verdicts, titles, PLANNED)}"""
+{decided_table(verdicts, titles)}"""
 
 
 def _method(collected: Collected, rising: Sequence[str], count: int) -> str:

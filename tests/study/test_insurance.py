@@ -178,7 +178,7 @@ def test_nothing_is_judged_of_fewer_policies_than_are_planned(written, tmp_path)
     write_csv(tmp_path / "insurance" / "runs.csv", rows)
     InsuranceStudy(root=tmp_path / "runs", out=tmp_path).write()
     page = (tmp_path / "insurance.md").read_text()
-    assert page.count("| not judged yet |") == 10
+    assert page.count("| not judged |") == 10
     assert "The 266 others, each of one task, are not judged yet either." in page
     judged = read_csv(tmp_path / "insurance" / "hypotheses.csv")
     assert {(row["outcome"], row["p"], row["corrected_p"]) for row in judged} == {("not judged", "", "")}
