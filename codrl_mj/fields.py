@@ -8,6 +8,7 @@ import inspect
 import itertools
 import math
 import numbers
+import re
 import textwrap
 import types
 import typing
@@ -165,6 +166,16 @@ def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, tup
     mine, others = leaves(one), leaves(other)
     pairs = {name: (mine.get(name, "absent"), others.get(name, "absent")) for name in [*mine, *others]}
     return {name: pair for name, pair in pairs.items() if repr(pair[0]) != repr(pair[1])}
+
+
+def check_pattern(pattern: str) -> None:
+    """Refuse what is no regular expression of names."""
+    try:
+        re.compile(pattern)
+    except (re.error, TypeError) as error:
+        raise ValueError(
+            f"{pattern!r}: must be a regular expression ({error}); '.*' is any name, 'leg.*' those of a leg"
+        ) from None
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:

@@ -70,7 +70,7 @@ def test_nothing_is_drawn_by_default():
     drawn = EnvConfig("cartpole", randomize=WRITTEN)
     assert drawn != plain
     assert dataclasses.replace(drawn, randomize=None) == plain
-    assert "randomize" not in drawn.interface  # it is no part of what an agent commands and sees
+    assert "randomize" not in drawn.policy_fields  # it is no part of what an agent commands and sees
 
 
 REFUSED = {
@@ -89,7 +89,7 @@ REFUSED = {
         {"arm": {"model.gravity": "uniform(1, 2)"}},
         "randomize: arm:model.gravity: model.gravity is the model's, not a motor's: leave 'arm' out",
     ),
-    "no expression": (["(:a=uniform(0, 1)"], "randomize: (:a: '(' must be a regular expression (missing ), "),
+    "no expression": (["(:a=uniform(0, 1)"], "randomize: (:a: '(': must be a regular expression (missing ), "),
     "bounds": (["a=uniform(2, 1)"], "randomize: a: 'uniform(2, 1)': Uniform.high = 1: must be >= low = 2"),
 }
 

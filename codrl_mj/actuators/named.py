@@ -79,7 +79,7 @@ def name_of(actuator: ActuatorModel, paper: Actuator | None = None) -> str:
     return label_of(actuator) or next(same, family)
 
 
-def names_of(actuators: Iterable[ActuatorModel], papers: Iterable[Actuator] | None = None) -> str:
+def names_together(actuators: Iterable[ActuatorModel], papers: Iterable[Actuator] | None = None) -> str:
     """What to call several, each name once."""
     pairs = itertools.zip_longest(actuators, papers or ())
     return ", ".join(dict.fromkeys(name_of(one, paper) for one, paper in pairs))

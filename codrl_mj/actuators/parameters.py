@@ -71,7 +71,7 @@ def _outline(cls: Any) -> tuple[tuple[str, Any], ...]:
     return tuple((field.name, nested.get(field.name)) for field in dataclasses.fields(cls))
 
 
-def options_of(cls: type, path: str) -> tuple[str, ...]:
+def choices_of(cls: type, path: str) -> tuple[str, ...]:
     """The words that a field at a dotted path can be; empty if it is a number."""
     owner: Any = cls
     for name in path.split("."):

@@ -30,8 +30,8 @@ class Subject:
 
     def check_interface(self, env: EnvConfig) -> None:
         """Refuse an environment in which the policy would command or observe something else than in its training."""
-        for name, trained in self.env.interface.items() if self.run is not None else ():
-            if (value := env.interface[name]) != trained:
+        for name, trained in self.env.policy_fields.items() if self.run is not None else ():
+            if (value := env.policy_fields[name]) != trained:
                 flag = f"--env.{name.replace('_', '-')}"
                 raise ValueError(
                     f"{flag} = {value!r}: the policy of {self.run} was trained with {trained!r} and knows nothing "

@@ -1,7 +1,7 @@
 """MuJoCo's control and bias callbacks for our actuators, compiled to C functions by numba: the door of tasks.
 
 They are pure functions of (mjModel, mjData): which actuators are ours, and their parameters, is read from the model;
-all state is in `data.act`. Nothing is cached on disk: the structure offsets are compiled in as constants.
+all state is in `data.act`. The structures' offsets are compiled in: code kept on disk has them in its key.
 """
 
 import ctypes
@@ -55,7 +55,7 @@ def _is_ours(model: int, actuator: int) -> bool:
 
 
 @functools.cache
-def compiled() -> dict[str, Any]:
+def compiled_motors() -> dict[str, Any]:
     """MuJoCo's names of the callbacks -> what its setters take; compiled on first use, kept for the process's life.
 
     `control` advances the actuators, `act_bias` is the torque that they deliver.
@@ -100,7 +100,7 @@ def compiled() -> dict[str, Any]:
 # -- installing them, and that of hills, without trampling on anybody else's -----------------------------------
 
 _PARTS: dict[str, tuple[tuple[str, ...], Callable[[], dict[str, Any]], str]] = {
-    "motor": (("control", "act_bias"), compiled, "actuator='ideal' or physics='analytic'"),
+    "motor": (("control", "act_bias"), compiled_motors, "actuator='ideal' or physics='analytic'"),
     "hill": (("passive",), compiled_hill, "physics='analytic'"),
 }
 """Callbacks that are installed together: MuJoCo's names, as in `mujoco.set_mjcb_...`; what compiles them, by these

@@ -68,7 +68,7 @@ def _place(model: int, data: int, body: int, height: float, slope: float) -> Non
 
 @functools.cache
 def compiled_hill() -> dict[str, Any]:
-    """The callback by MuJoCo's name of it, as `codrl_mj.engine.control.compiled` has those of motors."""
+    """The callback by MuJoCo's name of it, as `codrl_mj.engine.control.compiled_motors` has those of motors."""
 
     @cfunc(types.void(types.uintp, types.uintp), nogil=True, error_model="numpy")
     def passive(model: int, data: int) -> None:

@@ -140,7 +140,7 @@ def _verdict(model: int, instance: int) -> int:
 
 
 @functools.cache
-def compiled() -> dict[str, Any]:
+def compiled_entries() -> dict[str, Any]:
     """The functions by their names in `mjpPlugin`, compiled on first use and kept for the life of the process."""
 
     @cfunc(types.void(types.uintp, types.uintp, types.int32, types.int32), nogil=True, error_model="numpy")
@@ -204,7 +204,7 @@ def start(model: int, data: int, instance: int) -> int:
     """The plugin's first `init`, with addresses of mjModel and mjData: from here on MuJoCo calls what is compiled."""
     del data
     structure = registered()[NAME][1]
-    for name, function in compiled().items():
+    for name, function in compiled_entries().items():
         setattr(structure, name, function.address)
     return _judge(model, instance)
 

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from codrl_mj.actuators import ActuatorModel, reference, resolve
 from codrl_mj.engine.families import load_family, user_head
 from codrl_mj.engine.reading import check_shafts
-from codrl_mj.fields import did_you_mean
+from codrl_mj.fields import check_pattern, did_you_mean
 from codrl_mj.plugin import FAMILY, NAME
 
 ON_JOINT = {mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT}
@@ -84,12 +84,7 @@ def resolve_patterns(actuators: Mapping[str, Any], whose: str) -> dict[str, Actu
     if not isinstance(actuators, Mapping):
         raise ValueError(f"actuators = {actuators!r}: must be a mapping of patterns, such as {{'.*': 'lag'}}")
     for pattern in actuators:
-        try:
-            re.compile(pattern)
-        except (re.error, TypeError) as error:
-            raise ValueError(
-                f"{pattern!r}: must be a regular expression ({error}); '.*' is any name, 'leg.*' a leg's"
-            ) from None
+        check_pattern(pattern)
     return {pattern: resolve(given, None, whose) for pattern, given in actuators.items()}
 
 
@@ -106,18 +101,18 @@ def names_of(model: mujoco.MjModel) -> list[list[str]]:
     return names
 
 
-def matched_by(pattern: str, names: list[list[str]]) -> list[int]:
-    """Indices of the actuators that a pattern matches, by their `names_of`."""
-    return [index for index, own in enumerate(names) if any(re.fullmatch(pattern, name) for name in own)]
-
-
-def refuse_unmatched(pattern: str, names: list[list[str]]) -> NoReturn:
-    """Say that a pattern matches none of the actuators with these `names_of`."""
-    known = list(dict.fromkeys(name for own in names for name in own))
-    raise ValueError(
-        f"{pattern!r}: no actuator has such a name, nor drives anything that has; "
-        f"{did_you_mean(pattern, known)}there are {', '.join(known) or 'none'}"
-    )
+def matched_by(pattern: str, names: list[list[str]], needed: bool = True) -> list[int]:
+    """Indices of the actuators that a pattern matches, by their `names_of`: of one at least if it is `needed`."""
+    matched = [
+        index for index, own in enumerate(names) if any(name == pattern or re.fullmatch(pattern, name) for name in own)
+    ]
+    if needed and not matched:
+        known = list(dict.fromkeys(name for own in names for name in own))
+        raise ValueError(
+            f"{pattern!r}: no actuator has such a name, nor drives anything that has; "
+            f"{did_you_mean(pattern, known)}there are {', '.join(known) or 'none'}"
+        )
+    return matched
 
 
 def _chosen(
@@ -127,11 +122,8 @@ def _chosen(
     found: dict[int, tuple[str, ActuatorModel]] = {}
     names = names_of(model)
     for pattern, actuator in resolve_patterns(actuators, f"the model {spec.modelname!r}").items():
-        matched = matched_by(pattern, names)
-        if not matched:
-            refuse_unmatched(pattern, names)
         joints: dict[str, int] = {}
-        for index in matched:
+        for index in matched_by(pattern, names):
             target = spec.actuators[index]
             if index in found:
                 raise ValueError(f"{_call(target, index)}: both {found[index][0]!r} and {pattern!r} match it")

@@ -40,8 +40,8 @@ from codrl_mj.physics.compiled_task import Compiled, Outcomes, compiled_outcomes
 from codrl_mj.physics.rows import BROKEN, CLAIMED, DONE, Lane, Rows, load, store, tallied
 from codrl_mj.physics.stepping import Stepping
 
-RANDOM, OPTIONS = 0, 1
-"""In `interface`: whether an episode's disturbances or sensors need a key, and the first of the task's options."""
+NEEDS_KEY, FIRST_OPTION = 0, 1
+"""In `options`: whether an episode's disturbances or sensors need a key, and the first of the task's options."""
 
 
 class VectorStep(NamedTuple):
@@ -68,7 +68,7 @@ class VectorStep(NamedTuple):
 
 
 class Kernels(NamedTuple):
-    """Compiled functions; `arguments` are (interface, *those of `codrl_mj.physics.stepping`)."""
+    """Compiled functions; `arguments` are (options, *those of `codrl_mj.physics.stepping`)."""
 
     step: Compiled
     """(force, observation (k,) float32, *arguments) -> (reward, terminated, fine): takes one environment step under a
@@ -79,7 +79,7 @@ class Kernels(NamedTuple):
     """(generator, low, high, observation, *arguments) -> nothing: starts an episode from a state that the numpy
     `Generator` draws between `low` and `high` (see `Task.bounds`), and fills the observation."""
     step_rows: Compiled
-    """(tally, rows at once, lane, rows, interface, `VectorStep`) -> nothing: `step` for every row; see
+    """(tally, rows at once, lane, rows, options, `VectorStep`) -> nothing: `step` for every row; see
     `codrl_mj.physics.rows.share`."""
     observe_rows: Compiled
     """(which (m,), lane, rows, observations (N, k)) -> nothing: observes rows where episodes start."""
@@ -163,7 +163,7 @@ def _kernels(
     def step(
         force: Any,
         observation: np.ndarray,
-        interface: np.ndarray,
+        options: np.ndarray,
         model: int,
         data: int,
         settings: np.ndarray,
@@ -176,9 +176,9 @@ def _kernels(
         last = trace[len(trace) - 1]
         look(last, observation, after, model, data, settings)
         if single:  # decided where it is compiled: one is a number, several are an array
-            reward = rewarded(before, last[0, 1], after, interface[OPTIONS:])
+            reward = rewarded(before, last[0, 1], after, options[FIRST_OPTION:])
         else:
-            reward = rewarded(before, last[:, 1], after, interface[OPTIONS:])
+            reward = rewarded(before, last[:, 1], after, options[FIRST_OPTION:])
         return reward, ended(after), fine
 
     @compiled
@@ -187,7 +187,7 @@ def _kernels(
         low: np.ndarray,
         high: np.ndarray,
         observation: np.ndarray,
-        interface: np.ndarray,
+        options: np.ndarray,
         model: int,
         data: int,
         settings: np.ndarray,
@@ -200,13 +200,13 @@ def _kernels(
         entries = floats(initial_entries(draws))
         for entry in range(size):
             state[entry] = entries[entry]
-        key = generator.random() * LARGEST_KEY if interface[RANDOM] != 0.0 else 0.0
+        key = generator.random() * LARGEST_KEY if options[NEEDS_KEY] != 0.0 else 0.0
         start(state, key, model, data, settings, memory)
         nothing = np.zeros((trace.shape[1], trace.shape[2]))
         look(nothing, observation, state, model, data, settings)
 
     @compiled
-    def step_rows(tally: np.ndarray, at_once: int, lane: Any, rows: Any, interface: np.ndarray, steps: Any) -> None:
+    def step_rows(tally: np.ndarray, at_once: int, lane: Any, rows: Any, options: np.ndarray, steps: Any) -> None:
         steps, lane, rows = VectorStep(*steps), Lane(*lane), Rows(*rows)
         stepping, observations, signals, elapsed = steps.stepping, steps.observations, steps.signals, steps.elapsed
         model, data, settings, trace = lane.model, lane.data, lane.settings, lane.trace
@@ -217,7 +217,7 @@ def _kernels(
             for row in range(first, end):
                 load(rows, row, lane)
                 reward, over, fine = step(
-                    steps.forces[row], observations[row], interface, model, data, settings, rows.memory[row], trace
+                    steps.forces[row], observations[row], options, model, data, settings, rows.memory[row], trace
                 )
                 store(rows, row, lane)
                 elapsed[row] += 1

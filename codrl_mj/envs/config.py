@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from codrl_mj.actuators import ActuatorModel, mapping_of, names_of
+from codrl_mj.actuators import ActuatorModel, mapping_of, names_together
 from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint, resolve
 from codrl_mj.envs.distributions import Distribution, paths_of
 from codrl_mj.envs.worlds import World, find_world
@@ -129,7 +129,7 @@ class EnvConfig:
     @property
     def through(self) -> str:
         """What to call the actuators."""
-        return names_of(self.actuators, self.world.paper)
+        return names_together(self.actuators, self.world.paper)
 
     @property
     def distributions(self) -> dict[str, Distribution]:
@@ -152,7 +152,7 @@ class EnvConfig:
         return {type(one).__module__ for one in self.actuators} | self.world.code(self.options)
 
     @property
-    def interface(self) -> dict[str, Any]:
+    def policy_fields(self) -> dict[str, Any]:
         """The fields that say what a policy commands and observes: it can do nothing else once it is trained."""
         return {name: getattr(self, name) for name in ("action", "levels", "observe_actuator")}
 

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from codrl_mj.fields import did_you_mean
+from codrl_mj.fields import check_pattern, did_you_mean
 
 MODEL = "model."
 """What paths of the model's fields begin with."""
@@ -202,13 +202,8 @@ def paths_of(randomize: Any) -> dict[str, Distribution]:
         try:
             if pattern and field.startswith(MODEL):
                 raise ValueError(f"{field} is the model's, not a motor's: leave {pattern!r} out")
-            re.compile(pattern)
+            check_pattern(pattern)
             found[path] = one if isinstance(one, Distribution) else parse(one)
-        except re.error as error:
-            raise ValueError(
-                f"randomize: {path}: {pattern!r} must be a regular expression ({error}); '.*' is any motor, 'leg.*' "
-                "those of a leg"
-            ) from None
         except ValueError as error:
             raise ValueError(f"randomize: {path}: {error}") from None
     return found

@@ -11,13 +11,13 @@ from codrl_mj.actuators import (
     ActuatorModel,
     Family,
     Ideal,
+    choices_of,
     field_paths,
     field_values,
-    options_of,
     parameter_paths,
     unchecked,
 )
-from codrl_mj.engine.specs import matched_by, names_of, refuse_unmatched
+from codrl_mj.engine.specs import matched_by, names_of
 from codrl_mj.envs.distributions import MODEL, Choice, Distribution, split_path
 from codrl_mj.fields import did_you_mean
 from codrl_mj.physics.variation import Variation, mounting_of, mounts_of, variable
@@ -266,8 +266,6 @@ def _matched(
         try:
             every = list(range(len(indices)))
             own = [] if field.startswith(MODEL) else matched_by(pattern, called) if pattern else every
-            if not own and not field.startswith(MODEL):
-                refuse_unmatched(pattern, called)
             _check_known(field, [simulated[at] for at in own], varied, whose)
             if any(split_path(other)[1] == field and {*own} & {*those} for other, those in matched.items()):
                 raise ValueError("it is drawn by another pattern, too")
@@ -311,7 +309,7 @@ def _check(field: str, distribution: Distribution, motor: ActuatorModel, fixed: 
         raise ValueError("the ideal actuator has no motor and no controller to draw; choose another actuator")
     if field in fixed:
         raise ValueError(f"{fixed[field]}; draw it with action='force'")
-    kind, words = _kind(type(motor), field), options_of(type(motor), field)
+    kind, words = _kind(type(motor), field), choices_of(type(motor), field)
     if words:
         if not isinstance(distribution, Choice) or any(value not in range(len(words)) for value in distribution.values):
             numbered = ", ".join(f"{place} for {word}" for place, word in enumerate(words))

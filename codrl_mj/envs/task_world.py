@@ -1,7 +1,6 @@
 """Tasks as worlds: what an `EnvConfig` of one can have besides, and how its environments are made."""
 
 import dataclasses
-import re
 import typing
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,7 +13,7 @@ from gymnasium.vector import AutoresetMode
 
 from codrl_mj.actuators import ActuatorModel
 from codrl_mj.envs.worlds import COMMON, World, described, patterns_of, world_of
-from codrl_mj.fields import did_you_mean, field_docs
+from codrl_mj.fields import check_pattern, field_docs
 from codrl_mj.own_code import asset_path
 from codrl_mj.tasks import TASKS, Task, find_task, reference_of, register, resolve_actuators
 
@@ -105,18 +104,13 @@ class TaskWorld(World):
 
     def _by_pattern(self, patterns: Mapping[str, Any]) -> dict[str, Any]:
         """Motor -> what a pattern of the motors' names gives it, as a motor with several."""
-        motors, found = self.task.motors, {}
+        from codrl_mj.engine.specs import matched_by  # which imports numba
+
+        names, found = [[motor] for motor in self.task.motors], {}
         for pattern, given in patterns.items():
-            try:
-                matched = [motor for motor in motors if motor == pattern or re.fullmatch(pattern, motor)]
-            except (re.error, TypeError) as error:
-                raise ValueError(f"{pattern!r}: must be a motor, or a regular expression of them ({error})") from None
-            if not matched:
-                raise ValueError(
-                    f"{pattern!r}: no motor of {self.name} has such a name; {did_you_mean(pattern, motors)}there are "
-                    f"{', '.join(motors)}"
-                )
-            for motor in matched:
+            check_pattern(pattern)
+            for index in matched_by(pattern, names):
+                motor = names[index][0]
                 if motor in found:
                     raise ValueError(f"{motor}: {pattern!r} and another pattern match it")
                 found[motor] = given

@@ -268,8 +268,8 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             )
         stepping = ~self._ended  # in NEXT_STEP mode, environments that ended are reset instead
         steps = self._steps(forces, stepping)
-        kernels, interface = self._compiled()
-        broken = self.physics.step(kernels.step_rows, interface, steps)
+        kernels, options = self._compiled()
+        broken = self.physics.step(kernels.step_rows, options, steps)
         rewards, terminated, truncated = steps.rewards, steps.terminated, steps.truncated
         self.signals = signals = self.setup.signals([forces, *steps.signals.reshape(-1, *forces.shape)], forces)
         if broken:
@@ -300,10 +300,10 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         )
 
     def _compiled(self) -> tuple[Kernels, Array]:
-        """The compiled functions, and the interface to the agent that they are given."""
+        """The compiled functions, and the options that they are given."""
         if self._kernels is None:
-            interface, *_ = arguments(self.setup, self.physics)
-            self._kernels = compiled_kernels(self.setup, self.physics), interface
+            options, *_ = arguments(self.setup, self.physics)
+            self._kernels = compiled_kernels(self.setup, self.physics), options
         return self._kernels
 
     def _finish(self, infos: dict[str, Any]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any
 import mujoco
 
 from codrl_mj.actuators import ActuatorModel
-from codrl_mj.engine.specs import matched_by, motorise, names_of, refuse_unmatched, resolve_patterns
+from codrl_mj.engine.specs import matched_by, motorise, names_of, resolve_patterns
 from codrl_mj.tasks import TASKS
 
 
@@ -53,7 +53,11 @@ class Building:
         """
         names = names_of(plain)
         self._met.append(names)
-        wanted = {pattern: actuator for pattern, actuator in self.actuators.items() if matched_by(pattern, names)}
+        wanted = {
+            pattern: actuator
+            for pattern, actuator in self.actuators.items()
+            if matched_by(pattern, names, needed=False)
+        }
         if not wanted:
             return plain
         with warnings.catch_warnings():  # MuJoCo's of the model, which building it without motors has shown
@@ -74,8 +78,7 @@ class Building:
                 "codrl_mj.motorise"
             )
         for pattern in self.actuators:
-            if not any(matched_by(pattern, names) for names in self._met):
-                refuse_unmatched(pattern, [own for names in self._met for own in names])
+            matched_by(pattern, [own for names in self._met for own in names])
 
 
 @contextlib.contextmanager

@@ -145,13 +145,13 @@ class MujocoBatchPhysics:
                 self._act[rows, int(one.act) + NOISE_KEY] = keys + at
         self._disturber.reset(rows, keys)
 
-    def step(self, kernel: Any, interface: np.ndarray, steps: Any) -> bool:
+    def step(self, kernel: Any, options: np.ndarray, steps: Any) -> bool:
         """Take an environment step of every simulation; `kernel` is `Kernels.step_rows` of `codrl_mj.envs.compiled`.
 
         Returns whether one of them is no longer one of numbers.
         """
         self._lane()
-        return share(kernel, self._lanes, self.num_envs, self.plant.inner_steps, self._rows, interface, tuple(steps))
+        return share(kernel, self._lanes, self.num_envs, self.plant.inner_steps, self._rows, options, tuple(steps))
 
     def observe(self, kernel: Any, rows: np.ndarray, observations: np.ndarray) -> None:
         """Observe simulations where episodes start; `kernel` is `Kernels.observe_rows`."""

@@ -157,7 +157,7 @@ def _deploy(test: Deployment) -> None:
     from codrl_mj.runs.policies import load_policy
 
     config = load_config(test.run, trust=True)  # ours: found by its configuration
-    env = dataclasses.replace(test.env, **config.env.interface)
+    env = dataclasses.replace(test.env, **config.env.policy_fields)
     result = evaluate(load_policy(test.run), env, test.episodes, test.seed)
     write_json(test.record, result.as_mapping())
 

@@ -113,7 +113,9 @@ class Verdict(NamedTuple):
     effect: Interval
     """Mean difference of scores [shares of the span], with its 95 % interval; NaN without any contrast."""
     p: float
-    """Of the test, uncorrected: of no difference, or, of `equivalent`, of one as large as the margin; NaN: not judged."""
+    """Of the test, uncorrected: of no difference, or, of `equivalent`, of one as large as the margin.
+
+    NaN: not judged."""
     corrected: float
     """The same after the correction for the number of questions that are judged together."""
 
