@@ -87,7 +87,7 @@ def test_the_wheel_has_every_module_model_and_the_type_marker(wheel):
     assert len(models) >= 5
     replay = {f"codrl_mj/replay/{name}" for name in ("page.html", "replay.css", "replay.js")}
     three = {f"codrl_mj/replay/three/{name}" for name in ("three.min.js", "LICENSE", "README.md")}
-    others = {"codrl_mj/py.typed", "codrl_mj/_assets/study/runs.csv"}
+    others = {"codrl_mj/py.typed", *(f"codrl_mj/_assets/study/{one}/runs.csv" for one in ("actuators", "insurance"))}
     assert names >= modules | models | settings | presets | replay | three | pages | others
     assert not [name for name in names if name.startswith(("tests", "scripts", "assets", "docs"))]
 

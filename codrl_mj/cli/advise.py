@@ -90,7 +90,7 @@ class Advise:
                 given = {"--gear-ratio": self.gear_ratio, "--voltage": self.voltage}
                 about = ", ".join(flag for flag, value in given.items() if value is not None)
                 raise ValueError(f"{about}: {error}" if about else str(error)) from error
-            found = advise(actuator, self.task, Evidence.read(self.evidence))
+            found = advise(actuator, self.task, Evidence.read(*filter(None, [self.evidence])))
             _print(self.actuator, found)
             say(actuator.assumed)
         measured = None

@@ -27,6 +27,8 @@ from codrl_mj.training import TrainConfig, load_config
 IDEAL, COMMAND, LOOP = "train on ideal", "command more", "design the loop"
 RANDOMISE, THROUGH = "randomise", "train through it"
 BUY, MEASURE = "buy another", "measure it"
+RANDOM = ("generic", "random")
+"""Arms of the two studies that were trained on random actuators, of two reaches."""
 OPTIONS = (IDEAL, COMMAND, LOOP, RANDOMISE, THROUGH)
 """What can be done about an actuator, what takes least first; beside it one may buy another, or has to measure it."""
 
@@ -52,7 +54,8 @@ def decide(options: Mapping[str, Prospect]) -> str:
 
     The first of `OPTIONS` that loses nothing that matters; where none does, the first that is within `MARGIN` of the
     best of those that surely lose less, by more than `MARGIN`, than policies that never met the actuator; where there
-    is none, `BUY` if every option surely loses too much, and else `MEASURE`.
+    is none, `BUY` if every option surely loses too much, and of none but the first it is unknown how much; else
+    `MEASURE`.
     """
     known = {name: options[name] for name in OPTIONS if name in options}
     for name, option in known.items():
@@ -64,7 +67,9 @@ def decide(options: Mapping[str, Prospect]) -> str:
     if better:
         best = min(most[name].mean for name in better)
         return next(name for name in better if most[name].mean <= best + MARGIN)
-    return BUY if all(option.least is not None and option.least.hurt for option in known.values()) else MEASURE
+    tried = all(option.most is not None for name, option in known.items() if name != IDEAL)  # that none of it wins
+    lost = all(option.least is not None and option.least.hurt for option in known.values())
+    return BUY if tried and lost else MEASURE
 
 
 class Advice(NamedTuple):
@@ -144,9 +149,10 @@ def known(evidence: Evidence, task: str, asked: Mapping[str, float], tests: Test
 
 def tests_through(evidence: Evidence, task: str) -> Tests:
     """Doses that policies were tested at, and what they lost, of those trained on random actuators or through them."""
+    every = [(f"{axis} {dose:g}", {axis: dose}) for axis, known in AXES.items() for dose in known.doses[1:]]
     trained = {axis: known.trained[task] for axis, known in AXES.items() if task in known.trained}
     tests: dict[str, list[tuple[str, str, dict[str, float]]]] = {
-        RANDOMISE: [("generic", f"{axis} {dose:g}", {axis: dose}) for axis, dose in trained.items()],
+        RANDOMISE: [(arm, *one) for arm in RANDOM for one in every],
         THROUGH: [(axis, f"{axis} {dose:g}", {axis: dose}) for axis, dose in trained.items()],
     }
     for name, real in REAL.get(task, {}).items():

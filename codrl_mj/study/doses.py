@@ -156,7 +156,7 @@ class Axis:
     doses: tuple[float, ...]
     """Six of them, the first is none."""
     trained: Mapping[str, float]
-    """Task -> the one of them that is trained through, chosen before the study in a pilot with other seeds."""
+    """Task -> the one of them that is trained through, chosen before: in a pilot with others, or by a plan's rule."""
     at: Callable[[str, float], EnvConfig]
     """(task, dose) -> the environment."""
     own_motor: bool = False
@@ -168,21 +168,21 @@ AXES: Mapping[str, Axis] = {
         "Lag",
         "time constant [policy steps]",
         (0.0, 0.25, 0.5, 1.0, 2.0, 4.0),
-        {"pendulum": 2.0, "furuta": 0.5},
+        {"pendulum": 2.0, "furuta": 0.5, "acrobot": 2.0},
         lag,
     ),
     "weakness": Axis(
         "Weakness",
         "missing share of the force",
         (0.0, 0.1, 0.25, 0.4, 0.55, 0.7),
-        {"pendulum": 0.25, "furuta": 0.55},
+        {"pendulum": 0.25, "furuta": 0.55, "acrobot": 0.4},
         weakness,
     ),
     "supply": Axis(
         "Supply",
         "missing share of the voltage",
         (0.0, 0.2, 0.35, 0.5, 0.6, 0.7),
-        {"pendulum": 0.35, "furuta": 0.6},
+        {"pendulum": 0.35, "furuta": 0.6, "acrobot": 0.5},
         supply,
         own_motor=True,
     ),
@@ -190,21 +190,21 @@ AXES: Mapping[str, Axis] = {
         "Delay",
         "delay [policy steps]",
         (0.0, 0.5, 1.0, 2.0, 3.0, 4.0),
-        {"pendulum": 2.0, "furuta": 0.5},
+        {"pendulum": 2.0, "furuta": 0.5, "acrobot": 3.0},
         delay,
     ),
     "friction": Axis(
         "Friction",
         "Coulomb friction [largest force]",
         (0.0, 0.02, 0.05, 0.1, 0.2, 0.3),
-        {"pendulum": 0.1, "furuta": 0.2},
+        {"pendulum": 0.1, "furuta": 0.2, "acrobot": 0.3},
         friction,
     ),
     "noise": Axis(
         "Noise",
         "current noise [largest current]",
         (0.0, 0.1, 0.2, 0.4, 0.8, 1.6),
-        {"pendulum": 0.8, "furuta": 0.8},
+        {"pendulum": 0.8, "furuta": 0.8, "acrobot": 1.6},
         noise,
         own_motor=True,
     ),

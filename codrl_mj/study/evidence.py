@@ -1,4 +1,4 @@
-"""What policies lost when the study tested them, policy by policy: read from the rows that it publishes."""
+"""What policies lost when the studies tested them, policy by policy: read from the rows that these publish."""
 
 import csv
 import functools
@@ -18,8 +18,9 @@ from codrl_mj.study.trials import FAILED, RUNS
 SPARED = 0.1
 """Share of policies that may fail, and of success that may be lost, where nothing is said to be lost."""
 _PACKAGE = Path(__file__).parents[1]
-EVIDENCE = (_PACKAGE / "_assets" / "study", _PACKAGE.parent / "docs" / "results" / "actuators")
-"""Where the study's rows lie: in a wheel, in a checkout."""
+EVIDENCE = (_PACKAGE / "_assets" / "study", _PACKAGE.parent / "docs" / "results")
+"""Where the studies' folders with their rows lie: in a wheel, in a checkout."""
+STUDIES = ("actuators", "insurance")
 _COLUMNS = ("task", "trained", "tested", "seed", "score", "success")
 
 
@@ -109,24 +110,23 @@ class Evidence:
         self._curve = functools.cache(self._curve_of)
 
     @classmethod
-    def read(cls, file: Path | None = None) -> "Evidence":
-        """Read a file; that of the checkout or the wheel unless one is given, and none if there is none."""
-        there = [file] if file is not None else [folder / RUNS for folder in EVIDENCE]
-        path = next((path for path in there if path.is_file() or file is not None), None)
-        if path is None:
-            return cls([])
-        with path.open(newline="", encoding="utf-8") as opened:
-            rows = list(csv.DictReader(opened))
-        if lacking := [name for name in _COLUMNS if rows and name not in rows[0]]:
-            raise ValueError(f"{path}: has no column {lacking[0]!r}: give the {RUNS} of the study")
-        for number, row in enumerate(rows, start=2):
-            for key in ("score", "success"):
-                try:
-                    finite = math.isfinite(float(row[key] or 0.0))
-                except ValueError:
-                    finite = False
-                if not finite:
-                    raise ValueError(f"{path}, line {number}: {key} = {row[key]!r}: must be a finite number")
+    def read(cls, *files: Path) -> "Evidence":
+        """Read files; those of the checkout or the wheel unless some are given, and none if there are none."""
+        there = [path for folder in EVIDENCE for study in STUDIES if (path := folder / study / RUNS).is_file()]
+        rows: list[dict[str, str]] = []
+        for path in files or there:
+            with path.open(newline="", encoding="utf-8") as opened:
+                rows += (found := list(csv.DictReader(opened)))
+            if lacking := [name for name in _COLUMNS if found and name not in found[0]]:
+                raise ValueError(f"{path}: has no column {lacking[0]!r}: give the {RUNS} of the study")
+            for number, row in enumerate(found, start=2):
+                for key in ("score", "success"):
+                    try:
+                        finite = math.isfinite(float(row[key] or 0.0))
+                    except ValueError:
+                        finite = False
+                    if not finite:
+                        raise ValueError(f"{path}, line {number}: {key} = {row[key]!r}: must be a finite number")
         return cls(rows)
 
     def without(self, *tested: str) -> "Evidence":

@@ -14,7 +14,7 @@ from actuator_study.questions import on_loop, on_motor, primary, secondary, thro
 from codrl_mj.runs.files import write_json
 from codrl_mj.study.advice import BUY, IDEAL, RANDOMISE, THROUGH
 from codrl_mj.study.doses import AXES, FLOORS, SECONDS, at_home, ideal
-from codrl_mj.study.evidence import Evidence, Outcome
+from codrl_mj.study.evidence import STUDIES, Evidence, Outcome
 from codrl_mj.study.inference import detectable
 from codrl_mj.study.pages import TITLES, conclusions, markdown_table, write_csv, write_page
 from codrl_mj.study.questions import LEVEL, MARGIN, Scores, Verdict, judge
@@ -48,7 +48,7 @@ def write(collected: Collected, out: Path) -> list[Path]:
     folder, scores = out / FOLDER, Scores(collected, FLOORS, [at_home(ideal(task)) for task in SECONDS])
     first, others = judge(scores, primary(), primary=True), judge(scores, secondary())
     tables = write_tables(folder, collected, scores, first, others)
-    evidence = Evidence.read(folder / RUNS)
+    evidence = Evidence.read(*(path for study in STUDIES if (path := out / study / RUNS).is_file()))
     said = list(advised.rows(evidence))
     write_csv(folder / ADVISED, said)
     drawn = _draw(scores, evidence, folder)

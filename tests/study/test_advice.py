@@ -228,6 +228,7 @@ UNKNOWN = Prospect(None, None)
         ({IDEAL: known(0.5), RANDOMISE: known(0.48), THROUGH: known(0.47)}, BUY),
         ({IDEAL: known(0.5), RANDOMISE: UNKNOWN, THROUGH: known(0.47)}, MEASURE),
         ({IDEAL: known(0.5), THROUGH: UNKNOWN}, MEASURE),
+        ({IDEAL: known(0.5), THROUGH: Prospect(None, known(0.2).least)}, MEASURE),  # 0.2 at least, which would win
         ({IDEAL: Prospect(None, known(0.0).least), THROUGH: UNKNOWN}, MEASURE),  # beyond tests, which cost nothing
     ],
 )
@@ -240,8 +241,12 @@ def test_verdicts(evidence):
     assert advise(Lag(0.0), "pendulum", evidence).verdict == IDEAL
     assert advise(Lag(2 * step), "pendulum", evidence).verdict == THROUGH  # which keeps all but 0.02
     assert advise(Lag(3 * step), "pendulum", evidence).verdict == MEASURE  # more than was trained through
-    untried = advise(Lag(3 * find_task("acrobot").step_duration), "acrobot", evidence)
+    untried = advise(Lag(3 * find_task("cartpole").step_duration), "cartpole", evidence)
     assert (untried.verdict, untried.options[THROUGH]) == (MEASURE, UNKNOWN)
+    random = [{**row, "trained": "random", "score": "0.99"} for row in evidence.rows if row["tested"] == "lag 4"]
+    known_of = advise(Lag(3 * find_task("cartpole").step_duration), "cartpole", Evidence([*evidence.rows, *random]))
+    assert known_of.verdict == RANDOMISE  # no less lag was tested, and cost 0.01
+    assert known_of.options[RANDOMISE].most.loss.mean == pytest.approx(0.01, abs=2e-3)
     late = advise(named_actuator("weaker", "pendulum"), "pendulum", evidence)
     assert late.verdict == LOOP
     assert late.options[LOOP].most.loss.mean < 0.05
