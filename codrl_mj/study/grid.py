@@ -5,6 +5,7 @@ from their checkpoints.
 """
 
 import dataclasses
+import functools
 import hashlib
 import json
 import time
@@ -36,7 +37,7 @@ class Deployment:
     seed: int = 0
     """Seed of the first episode."""
 
-    @property
+    @functools.cached_property
     def record(self) -> Path:
         """The JSON file of the result, in the run folder."""
         identity = {**vars(self), "env": self.env.as_mapping(), "run": None}

@@ -15,6 +15,7 @@ from codrl_mj.study.evidence import Evidence
 from codrl_mj.study.pages import read_csv, write_csv
 from codrl_mj.tasks import find_task
 from insurance_study.learning import still_rising
+from insurance_study.page import PLANNED
 from insurance_study.questions import (
     DOSES,
     HARMLESS,
@@ -104,6 +105,7 @@ def test_the_plan_is_what_is_computed():
     plan = (RESULTS / "insurance_plan.md").read_text()
     arms = {trial.arm.name for trial in trials() if new(trial)}
     assert f"{len(arms)} new arms" in plan
+    assert f"p before {PLANNED} policies of every kind" in plan
     assert f"All others ({len(secondary())}, each of one task)" in " ".join(plan.split())
     for number, question in enumerate(primary(), start=1):
         line = next(line for line in plan.splitlines() if line.startswith(f"| I{number} |"))
@@ -139,7 +141,7 @@ def test_random_actuators_reach_as_far_as_they_are_said_to():
 def written(tmp_path_factory):
     """Matched training keeps 0.9 at its doses, random actuators 0.7, all else half; at home nothing is lost.
 
-    Commands that are seen change nothing.
+    Commands that are seen change nothing. Four policies of every kind are all that is planned.
     """
     out = tmp_path_factory.mktemp("insurance")
 
@@ -149,11 +151,12 @@ def written(tmp_path_factory):
             return 1.0
         return 0.9 if kind in AXES else 0.7 if kind == "random" else 0.5
 
-    grid = InsuranceStudy(root=out / "runs", out=out, seeds=20).grid
-    spread = [-0.02, 0.02, 0.01, -0.01] * 5  # sums to 0
-    pretend(grid, lambda trial, seed: FLOORS[trial.arm.task] + 100.0 * (level(trial) + spread[seed]))
-    files = InsuranceStudy(root=out / "runs", out=out, seeds=20).write()[0]
-    return out, list(files)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("insurance_study.page.PLANNED", 4)
+        study = InsuranceStudy(root=out / "runs", out=out, seeds=4)
+        spread = [-0.02, 0.02, 0.01, -0.01]  # sums to 0
+        pretend(study.grid, lambda trial, seed: FLOORS[trial.arm.task] + 100.0 * (level(trial) + spread[seed]))
+        yield out, list(study.write()[0])
 
 
 def test_what_is_so_stands_on_the_page(written):
@@ -166,7 +169,7 @@ def test_what_is_so_stands_on_the_page(written):
     assert rows["I10"]["outcome"] == "the other way"
     assert rows["I3"]["outcome"] == "yes"
     page = (out / "insurance.md").read_text()
-    assert "| random actuators | 1.00 | 0.70, 0.70; 120 of 120;" in page  # 20 policies on 6 doses
+    assert "| random actuators | 1.00 | 0.70, 0.70; 24 of 24;" in page  # 4 policies on 6 doses
     assert "| the very dose | 1.00 | 0.90, 0.90;" in page
     assert "not judged" not in page
 
@@ -174,9 +177,9 @@ def test_what_is_so_stands_on_the_page(written):
 def test_nothing_is_judged_of_fewer_policies_than_are_planned(written, tmp_path):
     out, _ = written
     (tmp_path / "insurance").mkdir()
-    rows = [row for row in read_csv(out / "insurance" / "runs.csv") if int(row["seed"]) < 19]
+    rows = [row for row in read_csv(out / "insurance" / "runs.csv") if int(row["seed"]) < 3]
     write_csv(tmp_path / "insurance" / "runs.csv", rows)
-    InsuranceStudy(root=tmp_path / "runs", out=tmp_path).write()
+    InsuranceStudy(root=tmp_path / "runs", out=tmp_path, seeds=4).write()
     page = (tmp_path / "insurance.md").read_text()
     assert page.count("| not judged |") == 10
     assert "The 266 others, each of one task, are not judged yet either." in page
@@ -184,23 +187,19 @@ def test_nothing_is_judged_of_fewer_policies_than_are_planned(written, tmp_path)
     assert {(row["outcome"], row["p"], row["corrected_p"]) for row in judged} == {("not judged", "", "")}
 
 
+def test_what_policies_returned_in_tenths_of_their_training_is_published(written):
+    rows = read_csv(written[0] / "insurance" / "learning.csv")
+    assert len(rows) == 4 * len({trial.arm.name for trial in trials()})
+    assert [float(rows[0][f"tenth_{number}"]) for number in range(1, 11)] == [2 * at + 1.5 for at in range(10)]
+    assert len({row["run"] for row in rows}) == len(rows)
+
+
 def test_rows_stand_for_run_folders_that_are_gone(written, tmp_path):
     out, _ = written
     shutil.copytree(out / "insurance", tmp_path / "insurance")
-    InsuranceStudy(root=tmp_path / "runs", out=tmp_path, seeds=20).write()
-    for name in ("runs.csv", "hypotheses.csv"):
+    InsuranceStudy(root=tmp_path / "runs", out=tmp_path, seeds=4).write()
+    for name in ("runs.csv", "hypotheses.csv", "learning.csv"):
         assert (tmp_path / "insurance" / name).read_text() == (out / "insurance" / name).read_text()
-
-
-def test_what_policies_returned_in_tenths_of_their_training_is_published(written, tmp_path):
-    out, _ = written
-    rows = read_csv(out / "insurance" / "learning.csv")
-    assert len(rows) == 20 * len({trial.arm.name for trial in trials()})
-    assert [float(rows[0][f"tenth_{number}"]) for number in range(1, 11)] == [2 * at + 1.5 for at in range(10)]
-    assert len({row["run"] for row in rows}) == len(rows)
-    shutil.copytree(out / "insurance", tmp_path / "insurance")  # without the runs
-    InsuranceStudy(root=tmp_path / "runs", out=tmp_path, seeds=20).write()
-    assert (tmp_path / "insurance" / "learning.csv").read_text() == (out / "insurance" / "learning.csv").read_text()
 
 
 def test_of_how_many_kinds_of_training_the_returns_still_rise():
@@ -219,10 +218,10 @@ def test_what_trainings_took_is_counted_once_however_often_the_page_is_written(t
     pretend(grid, lambda trial, _: FLOORS[trial.arm.task] + 100.0)
     untested = grid.folders["furuta: random", 0]
     shutil.move(untested / "deployments", tmp_path / "later")
-    for _ in range(3):
+    for _ in range(2):
         study.write()
         assert study.grid.collect().totals.seconds == 10.0 * (len(grid.arms) - 1)
     shutil.move(tmp_path / "later", untested / "deployments")
-    for _ in range(3):
+    for _ in range(2):
         study.write()
         assert study.grid.collect().totals.seconds == 10.0 * len(grid.arms)
