@@ -1,4 +1,4 @@
-"""The energy balances close, and every one of them fails when the physics are made wrong."""
+"""Every energy balance fails when the physics are made wrong."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedE
 from codrl_mj.tasks import TASKS
 from codrl_mj.validation import energy, validate
 from codrl_mj.validation.energy import Meter, hill_potential, keep
-from tests.validation.mutations import euler, failed, looks_complete, rusty, scaled, scaled_motor, wrong_model
+from tests.validation.mutations import euler, failed, once, rusty, scaled, scaled_motor, wrong_model
 
 pytestmark = pytest.mark.usefixtures("bare_engine")
 
@@ -20,22 +20,10 @@ def orders(task, *balances):
     return {f"order, {balance} balance, {name}" for balance in balances for name in TASKS[task].integrators}
 
 
-def failures(task):
+def failures(monkeypatch, task):
+    """The checks that fail of a fault in MuJoCo: analytic runs, which it does not move, are made once."""
+    monkeypatch.setattr(energy, "keep", once(energy.keep, MujocoPhysics))
     return failed(energy.checks(task, quick=True))
-
-
-@pytest.mark.parametrize("task", list(TASKS))
-def test_every_check_passes_and_can_be_looked_at(task):
-    checks = list(energy.checks(task, quick=True))
-    assert {check.name for check in checks} == {STEPS} | orders(task, "electrical", "mechanical", "whole")
-    for check in checks:
-        assert check.passed, check
-        assert looks_complete(check, "energy")
-    whole = next(check for check in checks if "whole" in check.name)
-    assert whole.plots[1].y_label == "energy [J]"
-
-
-# -- it can fail --------------------------------------------------------------------------------------------
 
 
 FAULTS = [
@@ -60,7 +48,7 @@ FAULTS = [
 @pytest.mark.parametrize(("task", "fault", "how", "seen_by"), FAULTS)
 def test_a_wrong_model_fails_the_balances_that_it_breaks(monkeypatch, task, fault, how, seen_by):
     wrong_model(monkeypatch, fault)
-    found = failures(task)
+    found = failures(monkeypatch, task)
     expected = orders(task, *(set(seen_by) - {STEPS})) | ({STEPS} & set(seen_by))
     assert found == expected if how == "==" else found >= expected
 
