@@ -37,11 +37,11 @@ def _step(physics, force):
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_one_step_is_gymnasiums_from_ten_thousand_states_under_as_many_forces(integrator):
+def test_one_step_is_gymnasiums_from_two_thousand_states_under_as_many_forces(integrator):
     generator = np.random.default_rng(0)
     high = np.array([2.4, 5.0, np.pi, 10.0])
-    states = generator.uniform(-high, high, (10_000, 4))
-    forces = generator.uniform(-10.0, 10.0, 10_000)
+    states = generator.uniform(-high, high, (2000, 4))
+    forces = generator.uniform(-10.0, 10.0, 2000)
     physics, env = MujocoPhysics(Plant(TASK, [IDEAL], 1, integrator)), _gymnasium(integrator)
     found, expected = np.empty_like(states), np.empty_like(states)
     for index, (state, force) in enumerate(zip(states, forces, strict=True)):
@@ -114,11 +114,11 @@ def _linear(state, generator):
     return float(np.clip(state @ (3.0, 5.0, 40.0, 10.0), -10.0, 10.0))
 
 
-def episode_errors(actuator, policy, integrator="euler", inner_steps=1, steps=500, seed=0):
+def episode_errors(actuator, policy, integrator="euler", inner_steps=1, steps=500):
     """Largest distance between both physics over an episode that no end interrupts; each acts on its own state."""
     both = [kind(Plant(TASK, [actuator], inner_steps, integrator)) for kind in (MujocoPhysics, AnalyticPhysics)]
-    start, worst = np.random.default_rng(seed).uniform(-0.05, 0.05, 4), 0.0
-    generators = [np.random.default_rng(seed) for _ in both]
+    start, worst = np.random.default_rng(0).uniform(-0.05, 0.05, 4), 0.0
+    generators = [np.random.default_rng(0) for _ in both]
     for physics in both:
         physics.reset(start)
     for _ in range(steps):
@@ -135,8 +135,7 @@ def episode_errors(actuator, policy, integrator="euler", inner_steps=1, steps=50
 @pytest.mark.parametrize(("policy", "steps"), [(_random, 500), (_linear, 500), (_bang_bang, 150)])
 @pytest.mark.parametrize("name", NAMED)
 def test_both_physics_agree_over_a_long_episode_with_every_actuator(name, policy, steps):
-    errors = [episode_errors(named_actuator(name, "cartpole"), policy, steps=steps, seed=seed) for seed in range(3)]
-    assert max(errors) <= 1e-9
+    assert episode_errors(named_actuator(name, "cartpole"), policy, steps=steps) <= 1e-9
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)

@@ -11,7 +11,7 @@ from codrl_mj.physics.compiled_task import compiled_constrain
 from codrl_mj.tasks import TASKS
 from tests.tasks.faces import NEW, SPEED_LIMITED, actions, desired_force, gymnasiums, random_states
 
-COUNT = 10_000
+COUNT = 2000
 
 
 def _largest_error(task, inner_steps, states, forces):
@@ -31,20 +31,14 @@ def _forces(task, count):
     return np.random.default_rng(1).uniform(-1, 1, count) * TASKS[task].max_force
 
 
-@pytest.mark.parametrize("task", ["pendulum", "mountain_car", "mountain_car_continuous"])
-def test_any_force_from_any_state(task):
-    assert _largest_error(task, 1, random_states(task, 0, COUNT), _forces(task, COUNT)) <= 1e-12
-
-
-@pytest.mark.parametrize(("share", "tolerance"), [(0.75, 1e-12), (1.0, 1e-10)])
-def test_any_torque_from_any_state_of_acrobot(share, tolerance):
+def test_any_torque_from_any_state_of_acrobot():
     """At full speed a step of 0.2 s magnifies rounding errors.
 
     The second link then turns by 5 rad, and RK4 reaches speeds of 3000 rad/s before they are clipped. With ten steps of
     0.02 s, 1e-12 holds everywhere (`test_inner_steps`).
     """
-    states = random_states("acrobot", 0, COUNT) * [1, 1, share, share]
-    assert _largest_error("acrobot", 1, states, _forces("acrobot", COUNT)) <= tolerance
+    states = random_states("acrobot", 0, COUNT)
+    assert _largest_error("acrobot", 1, states, _forces("acrobot", COUNT)) <= 1e-10
 
 
 @pytest.mark.parametrize("task", NEW)
