@@ -89,8 +89,8 @@ def test_unknown_fields_and_types_are_refused():
         layout._ctype(layout.ast_nodes.ValueType(name="quaternion128"))
 
 
-def _check():
-    for owner, field in {*USED, *STACK}:
+def _check(*first):
+    for owner, field in (*first, *USED, *STACK):
         layout.check_field(owner, field)
 
 
@@ -122,6 +122,7 @@ def test_a_field_that_has_moved_is_refused(struct_name, field, monkeypatch):
 def test_a_scalar_that_changed_places_with_another_is_refused(struct_name, field, monkeypatch):
     members = list(layout.struct(struct_name)._fields_)
     place = [name for name, _ in members].index(field)
+    most_likely = ("mjModel", f"opt.{field}") if struct_name == "mjOption" else (struct_name, field)
     for other_place, (other, kind) in enumerate(members):
         if other == field or kind is not members[place][1] or other in INDISTINGUISHABLE.get(field, ()):
             continue
@@ -130,7 +131,7 @@ def test_a_scalar_that_changed_places_with_another_is_refused(struct_name, field
         with monkeypatch.context() as patch:
             _corrupt(patch, struct_name, swapped)
             with pytest.raises(LayoutError):
-                _check()
+                _check(most_likely)
 
 
 @pytest.mark.parametrize("owner", ["mjModel", "mjData"])
