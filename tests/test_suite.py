@@ -19,7 +19,9 @@ from codrl_mj.actuators import IDEAL, NAMED, Actuator, CurrentLoop, Motor
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.physics import SimulationDivergedError
 from codrl_mj.tasks import TASKS, named_actuator
+from tests.conftest import REPRESENTATIVES
 from tests.engine.models import FULL, changed
+from tests.matrix import but
 from tests.tasks.faces import every_rebuilt
 
 VOLTAGES = (-12.0, -1.0, 0.0, 12.0)
@@ -41,11 +43,12 @@ def _contract(domain, task_name, options):
 
     class Contract(test_utils.EnvironmentTestMixin, TestCase):
         def make_object_under_test(self):
-            return suite.load(domain, task_name, task_kwargs={"random": 0}, **options)
+            config = EnvConfig(domain, max_episode_steps=30)
+            return suite.load(config, task_name, task_kwargs={"random": 0}, **options)
 
         def make_action_sequence(self):
             spec, generator = self.environment.action_spec(), np.random.default_rng(0)
-            for _ in range(TASKS[domain].max_episode_steps + 5):
+            for _ in range(35):
                 if isinstance(spec, specs.DiscreteArray):
                     yield spec.dtype.type(generator.integers(spec.num_values))
                 else:
@@ -356,7 +359,7 @@ def test_a_diverging_simulation_raises_and_works_again_after_reset(task, tmp_pat
 # -- pixels -------------------------------------------------------------------------------------------------
 
 
-@every_task
+@pytest.mark.parametrize("task", but(REPRESENTATIVES, TASKS))
 def test_pixels_show_the_present_state_and_change_nothing(task):
     env, blind = (suite.load(task, task_kwargs={"random": 3}, actuator="ideal") for _ in range(2))
     wrapped = pixels.Wrapper(env, render_kwargs={"height": 48, "width": 64, "camera_id": "fixed"})
