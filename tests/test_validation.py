@@ -639,10 +639,6 @@ def test_plots_can_be_looked_at(certificate):
             for curve in plot.curves:
                 assert len(curve.x) == len(curve.y) > 2
                 assert np.isfinite(curve.y).all()
-        if check.group == "convergence":
-            assert check.plots[0].curves[-1].reference
-        if "whole balance" in check.name:
-            assert check.plots[1].y_label == "energy [J]"
 
 
 def test_the_json_holds_the_verdict_and_every_number(tmp_path):

@@ -1,15 +1,14 @@
-"""With the paper's actuator: MuJoCo against the analytic physics, and against itself in batches and copies."""
+"""With the paper's actuator: MuJoCo against the analytic physics, and against itself in copies."""
 
 import copy
 import pickle
 
 import mujoco
-import mujoco.batch
 import numpy as np
 import pytest
 
 from codrl_mj.own_code import asset_path
-from codrl_mj.physics import MujocoPhysics, Plant, install_callbacks, motors
+from codrl_mj.physics import motors
 from codrl_mj.tasks import TASKS
 from tests.tasks.faces import NEW, actions, every_rebuilt, ours
 
@@ -70,38 +69,6 @@ def test_the_stored_model_opens_without_us(task, bare_engine):
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, 100)
     assert np.isfinite(data.qpos).all()
-
-
-@pytest.mark.parametrize("task", NEW)
-def test_a_batch_is_bit_identical_to_a_loop(task):
-    """Every simulation with its own start and control; RK4 (Acrobot) and the hill (mountain cars) included."""
-    definition, simulations, steps = TASKS[task], 16, 200
-    model = MujocoPhysics(
-        Plant(definition, definition.paper, definition.motor_inner_steps, definition.integrators[0])
-    ).model
-    install_callbacks(model)
-    generator = np.random.default_rng(0)
-    starts = np.array([definition.initial(generator, None) for _ in range(simulations)])
-    qpos, qvel = starts[:, list(definition.qpos)], starts[:, list(definition.qvel)]
-    controls = generator.uniform(-1, 1, (steps, simulations, 1)) * definition.max_force
-
-    batch = mujoco.batch.Batch(model, simulations, nthread=2)
-    batch.bind("qpos")[:], batch.bind("qvel")[:] = qpos, qvel
-    ctrl, passive, poses = (batch.bind(field) for field in ("ctrl", "qfrc_passive", "geom_xpos"))
-    serial = [mujoco.MjData(model) for _ in range(simulations)]
-    for index, data in enumerate(serial):
-        data.qpos[:], data.qvel[:] = qpos[index], qvel[index]
-    for step in range(steps):
-        ctrl[:] = controls[step]
-        batch.step()
-        for index, data in enumerate(serial):
-            data.ctrl[:] = controls[step, index]
-            mujoco.mj_step(model, data)
-    for field in ("qpos", "qvel", "act"):
-        np.testing.assert_array_equal(batch.bind(field), [getattr(data, field) for data in serial])
-    assert np.abs(batch.bind("act")).max() > 0
-    np.testing.assert_array_equal(passive, [data.qfrc_passive for data in serial])
-    np.testing.assert_array_equal(poses, [data.geom_xpos for data in serial])
 
 
 @pytest.mark.parametrize("physics", ["mujoco", "analytic"])
