@@ -1,6 +1,7 @@
 """Who imports whom: read from the source, so that a cycle or a shortcut fails here."""
 
 import ast
+import functools
 import re
 import sys
 from graphlib import TopologicalSorter
@@ -146,17 +147,20 @@ def _files(layer):
     return [path for path in EVERY_FILE if _layer(_module(path)) == layer]
 
 
+@functools.cache
 def _modules(path):
     """Every module that a file imports anywhere, with `from a import b` as both a and a.b."""
+    found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            yield node.module
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return found
 
 
+@functools.cache
 def _ours(path):
     """Our layers that a file imports; names that are no module or package of ours are attributes of it."""
     names = {name.removeprefix("codrl_mj.") for name in _modules(path) if name.startswith("codrl_mj.")}
@@ -174,7 +178,7 @@ EVERY_FILE = sorted(PACKAGE.rglob("*.py"))
 def test_the_reader_sees_what_is_there():
     """The oracle itself: known imports are found."""
     assert {"actuators", "engine", "tasks"} <= set().union(*map(_ours, _files("physics")))
-    assert "mujoco" in set(_modules(PACKAGE / "engine" / "control.py"))
+    assert "mujoco" in _modules(PACKAGE / "engine" / "control.py")
     assert len(EVERY_FILE) > 20
 
 

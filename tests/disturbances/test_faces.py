@@ -17,6 +17,7 @@ from tests.matrix import but
 WEAK = {"controller": {"kp": 1.0, "ki": 0.5, "max_voltage": 3.0}}
 ALL = {"disturbances": MOST, "joint": RUBBED, "actuator": imperfect(WEAK)}
 """Everything at once; on the analytic physics without a joint's."""
+two_tasks = pytest.mark.parametrize("task", but(["pendulum", "cartpole"], TASKS))
 SIGNALS = ("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated")
 
 
@@ -36,7 +37,7 @@ def _plain(task, **arguments):
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-@pytest.mark.parametrize("task", TASKS)
+@two_tasks
 def test_many_are_as_one_bit_for_bit(task, mode, threads):
     ours = _vector(task, mode=mode, num_threads=threads)
     theirs = SyncVectorEnv([lambda: _single(task)] * 4, autoreset_mode=mode)
@@ -51,7 +52,7 @@ def test_many_are_as_one_bit_for_bit(task, mode, threads):
             np.testing.assert_array_equal(got[4][name], expected[4][name])
 
 
-@pytest.mark.parametrize("task", but(["pendulum", "cartpole"], TASKS))
+@two_tasks
 def test_both_physics_agree_with_everything_that_both_have(task):
     mujoco, analytic = (_single(task, joint=None, physics=physics) for physics in ("mujoco", "analytic"))
     np.testing.assert_array_equal(mujoco.reset(seed=1)[0], analytic.reset(seed=1)[0])
@@ -66,7 +67,7 @@ def test_both_physics_agree_with_everything_that_both_have(task):
             break
 
 
-@pytest.mark.parametrize("task", TASKS)
+@two_tasks
 def test_copies_and_restored_snapshots_go_on_alike(task):
     env = _vector(task)
     env.reset(seed=2)
@@ -130,7 +131,7 @@ def test_stable_baselines_gets_them_too():
         np.testing.assert_array_equal(envs.step(action)[0], reference.step(action)[0])
 
 
-@pytest.mark.parametrize("task", TASKS)
+@two_tasks
 def test_seeds_draw_the_same_initial_states_with_disturbances_and_without(task):
     disturbed, plain = _single(task), _plain(task)
     disturbed.reset(seed=11)
@@ -139,7 +140,7 @@ def test_seeds_draw_the_same_initial_states_with_disturbances_and_without(task):
 
 
 @pytest.mark.parametrize("physics", ["mujoco", "analytic"])
-@pytest.mark.parametrize("task", TASKS)
+@two_tasks
 def test_off_is_bit_for_bit_as_without(task, physics):
     zero = {**WEAK, "controller": {**WEAK["controller"], "current_noise": 0.0, "current_bias": 0.0}, "supply": {}}
     off = _single(task, disturbances={}, joint={}, actuator=zero, physics=physics)

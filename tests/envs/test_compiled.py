@@ -1,6 +1,7 @@
 """The compiled step and reset: against a plain composition of their parts, in loops of one's own, in copies."""
 
 import copy
+import itertools
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 
@@ -18,7 +19,7 @@ from codrl_mj.envs.compiled import compiled_env
 from codrl_mj.physics import SimulationDivergedError
 from codrl_mj.tasks import TASKS, named_actuator
 from tests.matrix import but
-from tests.tasks.faces import actions, desired_force, every_rebuilt, random_states
+from tests.tasks.faces import REBUILT, actions, desired_force, every_rebuilt, random_states
 
 every_task = pytest.mark.parametrize("task", TASKS)
 NOISY = {"controller": {"current_noise": 0.05, "current_bias": 0.1}, "supply": {"resistance": 0.01}}
@@ -30,7 +31,8 @@ SETUPS = {
     "sensing": {"observe_actuator": True, "actuator": NOISY},
     "voltage": {"observe_actuator": True, "action": "voltage", "actuator": NOISY},
 }
-every_setup = pytest.mark.parametrize("kind", but(["motor", "disturbed"], SETUPS))
+KEPT = [("pendulum", "motor"), ("cartpole", "disturbed")]
+every_setup = pytest.mark.parametrize(("task", "kind"), but(KEPT, itertools.product(REBUILT, SETUPS)))
 
 
 def _env(task, kind="motor", **more):
@@ -101,7 +103,6 @@ def _episode(step, reset, forces, chosen, generator, low, high, rows, rewards, a
     return len(chosen)
 
 
-@every_rebuilt
 @every_setup
 def test_a_compiled_loop_is_the_loop_over_the_environment_bit_for_bit(task, kind):
     ours, theirs = _env(task, kind), _env(task, kind)
@@ -137,7 +138,6 @@ def test_what_python_has_to_do_is_not_offered_as_compiled():
     assert compiled_env(ActuatedEnv("pendulum", randomize={"motor.inductance": Uniform(0.08, 0.12)})) is None
 
 
-@every_rebuilt
 @every_setup
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
 def test_a_copy_goes_on_by_itself(task, kind, copied):
@@ -169,7 +169,7 @@ def test_what_a_user_writes_into_the_data_is_where_the_step_begins():
     assert env.state[1] == pytest.approx(1.0 + 0.05 * 15.0, rel=1e-12)  # 3 g / 2 l sin(theta)
 
 
-@every_task
+@pytest.mark.parametrize("task", but(["pendulum", "cartpole"], TASKS))
 def test_a_state_that_is_no_number_is_an_error_and_a_reset_helps(task):
     env = _env(task)
     env.reset(seed=0)
