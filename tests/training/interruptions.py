@@ -82,7 +82,10 @@ CASES = {
         actuator={"name": "paper", **NOISY},
     ),
     "ddpg, several environments": tiny(
-        "pendulum", DDPGConfig(**_SMALL, actor_units=(8,), joint_units=(8,)), 3, env={"physics": "analytic"}
+        "pendulum",
+        DDPGConfig(**_SMALL, actor_units=(8,), joint_units=(8,), train_every=4, gradient_steps=1),
+        3,
+        env={"physics": "analytic"},
     ),
     "ddpg, trained after episodes": tiny(
         "pendulum",

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from codrl_mj.cli import main
-from codrl_mj.training import load_config
+from codrl_mj.training import history, load_config
 
 TINY = "--total-steps 128 --num-envs 2 --agent.rollout-steps 64 --agent.batch-size 32 --agent.epochs 1 --agent.hidden 8"
 TINY += " --evaluation-episodes 1 --no-tensorboard"
@@ -17,6 +17,7 @@ TINY += " --evaluation-episodes 1 --no-tensorboard"
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(history, "save_learning_curve", lambda *_: None)
 
 
 @pytest.fixture(scope="module")
@@ -194,7 +195,8 @@ def test_flags_win_over_the_file_and_leave_the_rest_of_it(tmp_path):
 
 
 def test_the_task_is_found_behind_flags_and_beside_folders_of_its_name():
-    assert main(["train", "--out", "pendulum", "--total-steps", "10", "pendulum", "--agent.learning-starts", "10"]) == 0
+    line = "train --out pendulum --total-steps 10 pendulum --evaluation-episodes 1 --no-tensorboard"
+    assert main([*line.split(), "--agent.learning-starts", "10"]) == 0
     config = load_config(Path("pendulum"))
     assert (config.task, config.agent.name) == ("pendulum", "ddpg")
 

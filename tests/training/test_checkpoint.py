@@ -23,28 +23,32 @@ from tests.training.interruptions import CASES, TERMINATE, differing, interrupt,
 CONFIG = CASES["ppo, one optimiser"]
 
 
-@pytest.fixture(autouse=True)
-def quick(monkeypatch):
-    monkeypatch.setattr(watcher, "REPORT_INTERVAL", 40)
-    monkeypatch.setattr(TrainConfig, "evaluation_env", property(lambda config: config.env))
-    monkeypatch.setattr(history, "save_learning_curve", lambda *_: None)
+@pytest.fixture(autouse=True, scope="module")
+def quick():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(watcher, "REPORT_INTERVAL", 40)
+        patch.setattr(TrainConfig, "evaluation_env", property(lambda config: config.env))
+        patch.setattr(history, "save_learning_curve", lambda *_: None)
+        yield
 
 
 @pytest.fixture(scope="module")
 def expected(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(watcher, "REPORT_INTERVAL", 40)
-        patch.setattr(TrainConfig, "evaluation_env", property(lambda config: config.env))
-        return outcome(resume(CONFIG, tmp_path_factory.mktemp("uninterrupted") / "run"))
+    return outcome(resume(CONFIG, tmp_path_factory.mktemp("uninterrupted") / "run"))
 
 
-@pytest.fixture
-def stopped(tmp_path):
-    """A run that was stopped after 192 of 240 steps, with two checkpoints."""
-    out = tmp_path / "run"
+@pytest.fixture(scope="module")
+def stopped_once(tmp_path_factory):
+    out = tmp_path_factory.mktemp("stopped") / "run"
     interrupt(CONFIG, out, 180, TERMINATE)
     assert [path.name[:17] for path in checkpoints(out)] == ["step-000000000128", "step-000000000192"]
     return out
+
+
+@pytest.fixture
+def stopped(stopped_once, tmp_path):
+    """A run that was stopped after 192 of 240 steps, with two checkpoints."""
+    return shutil.copytree(stopped_once, tmp_path / "run")
 
 
 def checkpoints(out):
@@ -256,7 +260,7 @@ def test_where_nothing_can_be_written_the_error_is_one_line_and_the_run_goes_on_
     assert error.endswith(f"continue with codrl-mj train --resume {stopped}\n")
     assert {path.name: path.read_bytes() for path in checkpoints(stopped)} == before
     assert [path for path in stopped.rglob(".*") if path.name != ".lock"] == []
-    assert main(["train", "--resume", str(stopped)]) == 0
+    assert main(["train", "--resume", str(stopped), "--no-tensorboard"]) == 0
     assert differing(expected, outcome(stopped)) == []
 
 

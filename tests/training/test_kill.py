@@ -19,9 +19,9 @@ from tests.training.interruptions import differing, kill_test, outcome
 
 PROGRAM = Path(sys.executable).with_name("codrl-mj")
 INTERVAL = 500
-LINE = f"cartpole --actuator weaker --num-envs 4 --total-steps 4000 --checkpoint-interval {INTERVAL} --agent ppo"
+LINE = f"cartpole --actuator weaker --num-envs 4 --total-steps 2500 --checkpoint-interval {INTERVAL} --agent ppo"
 LINE += " --agent.rollout-steps 256 --agent.batch-size 64 --agent.epochs 2 --agent.hidden 8 --no-tensorboard"
-LINE += " --evaluation-interval 2000 --evaluation-episodes 2"
+LINE += " --evaluation-interval 1000 --evaluation-episodes 2"
 ROLLOUT = 256
 
 
@@ -87,7 +87,7 @@ MOMENTS = random.Random(7)
 @pytest.mark.parametrize(
     ("number", "steps", "wait"),
     [
-        pytest.param(number, MOMENTS.randint(1, 2500), MOMENTS.uniform(0.0, 0.05), marks=marks)
+        pytest.param(number, MOMENTS.randint(1, 1500), MOMENTS.uniform(0.0, 0.05), marks=marks)
         for number, *marks in (
             ("SIGKILL",),
             *((number, pytest.mark.matrix) for number in ("SIGTERM", "SIGINT", "SIGKILL", "SIGKILL")),

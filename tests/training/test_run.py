@@ -30,13 +30,19 @@ from tests.training.interruptions import begin
 
 TINY_PPO = PPOConfig(rollout_steps=256, batch_size=64, epochs=2, hidden=(8, 8))
 ENV = EnvConfig("cartpole", "weaker", options={"center_radius": 0.1})
-TINY = TrainConfig(ENV, TINY_PPO, 1, 1000, num_envs=4)
+TINY = TrainConfig(ENV, TINY_PPO, 1, 500, num_envs=4, evaluation_episodes=5)
 UNSTABLE = Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=100.0))
 
 
 def within(**changes):
     """The tiny training in another environment."""
     return dataclasses.replace(TINY, env=dataclasses.replace(ENV, **changes))
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """No picture at the end, but of `run`."""
+    monkeypatch.setattr(history, "save_learning_curve", lambda *_: None)
 
 
 @pytest.fixture(scope="module")
@@ -71,9 +77,11 @@ def test_ppo_learns_to_balance(tmp_path):
 
 def test_the_same_seed_gives_the_same_weights_and_another_seed_others(run, tmp_path):
     out, _ = run
-    torch.manual_seed(99)  # what the process drew before does not matter
+    torch.manual_seed(99)  # what the process drew before does not matter, nor that torch had more threads
     np.random.seed(99)
+    torch.set_num_threads(2)
     assert same_weights(out, train(TINY, tmp_path / "again"))
+    assert torch.get_num_threads() == 1
     assert not same_weights(out, train(dataclasses.replace(TINY, seed=2), tmp_path / "other"))
 
 
@@ -82,12 +90,6 @@ def test_the_actuator_and_the_task_option_reach_the_training(run, tmp_path):
     assert not same_weights(out, train(within(actuator="ideal"), tmp_path / "ideal"))
     free = train(within(options=None), tmp_path / "free")
     assert not same_weights(out, free)
-
-
-def test_training_uses_one_thread_even_where_torch_had_more(tmp_path):
-    torch.set_num_threads(2)
-    train(TINY, tmp_path / "run")
-    assert torch.get_num_threads() == 1
 
 
 # -- the run folder -----------------------------------------------------------------------------------------
@@ -126,7 +128,7 @@ def read_csv(path):
 
 def test_progress_is_reported_and_written_at_the_ends_of_rollouts(run):
     out, reports = run
-    assert [report.steps for report in reports] == [1024]  # 1000 rounded up to whole rollouts
+    assert [report.steps for report in reports] == [512]  # 500 rounded up to whole rollouts
     (row,) = read_csv(out / "progress.csv")
     (report,) = reports
     assert row.keys() == {field.name for field in dataclasses.fields(report)}
@@ -155,25 +157,24 @@ def test_every_episode_is_in_the_table(run):
 def test_the_result_and_the_evaluation_agree_with_an_evaluation_of_the_saved_policy(run):
     out, (report,) = run
     result, evaluation = (json.loads((out / f"{name}.json").read_text()) for name in ("result", "evaluation"))
-    anew = evaluate(load_policy(out), EnvConfig("cartpole", "weaker"), episodes=20, seed=EVALUATION_SEED)
+    anew = evaluate(load_policy(out), EnvConfig("cartpole", "weaker"), episodes=5, seed=EVALUATION_SEED)
     assert evaluation["returns"]["mean"] == anew.returns.mean == result["evaluation_return"]
     assert result["steps"] == report.steps
     assert result["episodes"] == report.episodes
-    assert result["best"] == {"return": anew.returns.mean, "steps": 1024}  # the only evaluation
+    assert result["best"] == {"return": anew.returns.mean, "steps": 512}  # the only evaluation
 
 
 def test_a_report_has_the_evaluation_that_took_place_then_and_no_other(tmp_path, monkeypatch):
-    monkeypatch.setattr(watcher, "REPORT_INTERVAL", 2500)
-    monkeypatch.setattr(history, "save_learning_curve", lambda *_: None)
-    config = dataclasses.replace(TINY, total_steps=5000, evaluation_interval=2000, evaluation_episodes=2)
+    monkeypatch.setattr(watcher, "REPORT_INTERVAL", 1250)
+    config = dataclasses.replace(TINY, total_steps=2500, evaluation_interval=1000, evaluation_episodes=2)
     rows = read_csv(train(config, tmp_path / "run") / "progress.csv")
     found = {int(row["steps"]): math.isfinite(float(row["evaluation_return"])) for row in rows}
-    assert found == {2048: True, 2560: False, 4096: True, 5120: True}  # 2560: the report alone; 5120: the end
+    assert found == {1024: True, 1280: False, 2048: True, 2560: True}  # 1280: the report alone; 2560: the end
 
 
 def test_the_best_policy_is_kept_though_a_worse_one_comes_last(tmp_path):
     ppo = dataclasses.replace(TINY_PPO, learning_rate=0.05)  # unsteady
-    config = dataclasses.replace(TINY, agent=ppo, total_steps=6000, evaluation_interval=256, evaluation_episodes=5)
+    config = dataclasses.replace(TINY, agent=ppo, total_steps=3000, evaluation_interval=256, evaluation_episodes=5)
     out = train(config, tmp_path / "run")
     evaluations = [float(row["evaluation_return"]) for row in read_csv(out / "progress.csv")]
     result = json.loads((out / "result.json").read_text())
@@ -221,10 +222,10 @@ def test_weights_and_biases_gets_the_configuration(tmp_path, monkeypatch):
 
 
 def test_episodes_can_be_counted_instead_of_steps(tmp_path):
-    config = dataclasses.replace(TINY, total_steps=None, total_episodes=30, num_envs=1)
+    config = dataclasses.replace(TINY, total_steps=None, total_episodes=20, num_envs=1)
     out = train(config, tmp_path / "run")
-    assert len(read_csv(out / "episodes.csv")) == 30
-    assert json.loads((out / "result.json").read_text())["episodes"] == 30
+    assert len(read_csv(out / "episodes.csv")) == 20
+    assert json.loads((out / "result.json").read_text())["episodes"] == 20
 
 
 def test_the_saved_policy_plays(run):
@@ -282,7 +283,7 @@ def test_a_training_that_breaks_off_before_it_learned_anything_does_not_block_th
             with pytest.raises(ZeroDivisionError):
                 train(TINY, path)
     assert (out.parent.exists(), list(kept.iterdir())) == (False, [])  # what was there stays
-    assert json.loads((train(TINY, out) / "result.json").read_text())["steps"] == 1024
+    assert json.loads((train(TINY, out) / "result.json").read_text())["steps"] == 512
 
 
 @pytest.mark.parametrize("theirs", ["config.json", ".lock", "best", "tensorboard/events"])
@@ -313,7 +314,7 @@ def test_weights_that_are_no_numbers_are_named_and_not_kept(tmp_path, monkeypatc
         return model
 
     monkeypatch.setattr(PPOConfig, "make_model", diverging)
-    often = dataclasses.replace(TINY, checkpoint_interval=256)
+    often = dataclasses.replace(TINY, total_steps=1000, checkpoint_interval=256)
     message = r"weights of ppo became no finite numbers by step 512: .* Lower agent\.learning_rate = 0\.001, or"
     with pytest.raises(FloatingPointError, match=message):
         train(often, tmp_path / "run")
