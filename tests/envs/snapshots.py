@@ -15,7 +15,7 @@ from tests.envs.vectors import random_actions
 from tests.tasks.faces import actions
 
 PHYSICS = ("mujoco", "analytic")
-STEPS = 300
+STEPS = 120
 NUM_ENVS = 3
 DRIVE = {
     "controller.kp": LogUniform(0.3, 15.0),  # some draws are unstable, and rejected

@@ -370,17 +370,15 @@ NO_ACTION = {
 
 @every_task
 @every_command
-@pytest.mark.parametrize("index", range(11))
-def test_what_is_no_action_is_refused_and_changes_nothing(task, command, index):
-    bad = NO_ACTION["table" if task in DISCRETE else "box"]
-    action = bad[index % len(bad)]
+def test_what_is_no_action_is_refused_and_changes_nothing(task, command):
     env = make(task, command).unwrapped
     env.reset(seed=0)
     state = env.state
-    with pytest.raises(ValueError, match=r"^action = .*: not in (Box|Discrete)"):
-        env.step(action)
-    np.testing.assert_array_equal(env.state, state)
-    assert env.data.time == 0.0
+    for action in NO_ACTION["table" if task in DISCRETE else "box"]:
+        with pytest.raises(ValueError, match=r"^action = .*: not in (Box|Discrete)"):
+            env.step(action)
+        np.testing.assert_array_equal(env.state, state)
+        assert env.data.time == 0.0
 
 
 @pytest.mark.parametrize("task", CONTINUOUS)
@@ -478,11 +476,11 @@ def test_the_checkers_complain_about_nothing_but_the_spaces(check, task, command
 
 @every_task
 @every_face
-def test_every_observation_of_a_hundred_episodes_is_in_the_space(task, command, observe):
+def test_every_observation_of_thirty_episodes_is_in_the_space(task, command, observe):
     env = make(task, command, observe_actuator=observe, max_episode_steps=12)
     space = env.observation_space
     env.action_space.seed(0)
-    for seed in range(100):
+    for seed in range(30):
         observation, _ = env.reset(seed=seed)
         over = False
         while not over:
@@ -495,20 +493,19 @@ def test_every_observation_of_a_hundred_episodes_is_in_the_space(task, command, 
 @every_task
 @every_face
 @every_physics
-@pytest.mark.parametrize(
-    "duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"]
-)
-def test_a_copy_made_mid_episode_continues_bit_for_bit(task, command, observe, physics, duplicate):
+def test_a_copy_made_mid_episode_continues_bit_for_bit(task, command, observe, physics):
     env = make(task, command, observe_actuator=observe, physics=physics)
     env.reset(seed=1)
     actions = sampled(env, 24)
     rows(env, actions[:11])
-    twin = duplicate(env)
-    np.testing.assert_array_equal(rows(twin, actions[11:]), rows(env, actions[11:]))
-    if physics == "mujoco":  # one model, the copy's own: changing it changes the copy
-        model = twin.unwrapped.model
-        assert model is twin.unwrapped.data.model
-        assert model is not env.unwrapped.model
+    twins = copy.deepcopy(env), pickle.loads(pickle.dumps(env))
+    expected = rows(env, actions[11:])
+    for twin in twins:
+        np.testing.assert_array_equal(rows(twin, actions[11:]), expected)
+        if physics == "mujoco":  # one model, the copy's own: changing it changes the copy
+            model = twin.unwrapped.model
+            assert model is twin.unwrapped.data.model
+            assert model is not env.unwrapped.model
 
 
 def test_the_default_command_is_the_force():

@@ -15,6 +15,7 @@ from codrl_mj.physics import SimulationDivergedError
 from codrl_mj.tasks import TASKS
 from tests.engine.models import changed
 from tests.envs.vectors import MODES, assert_same, batched, looped, random_actions
+from tests.matrix import but
 from tests.tasks.faces import REBUILT
 
 every_task = pytest.mark.parametrize("task", TASKS)
@@ -220,7 +221,7 @@ def test_a_diverging_environment_is_named_and_the_others_go_on_once_it_is_reset(
     np.testing.assert_array_equal(fresh.step(actions[:1])[0][0], observations[2])
 
 
-@every_task
+@pytest.mark.parametrize("task", but(["pendulum", "cartpole"], TASKS))
 def test_time_goes_on_for_the_others_when_one_diverges(task, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # the engine writes a log
     env = ActuatedVectorEnv(2, task, max_episode_steps=5)
