@@ -78,11 +78,12 @@ def test_learns_what_stable_baselines3_learns_from_the_same_rollout(case):
     collect(ours)
     theirs.rollout_buffer = copy.deepcopy(ours.rollout_buffer)
     theirs.set_logger(Logger(None, []))
+    start = copy.deepcopy(theirs.policy.state_dict())
     for model in (ours, theirs):
         np.random.seed(3)
         model.train()
     assert ours._n_updates == theirs._n_updates
-    learnt, taught, start = (model.policy.state_dict() for model in (ours, theirs, pair(case)[0]))
+    learnt, taught = (model.policy.state_dict() for model in (ours, theirs))
     torch.testing.assert_close(dict(learnt), dict(taught), rtol=0, atol=1e-5)
     assert max(float((taught[name] - start[name]).abs().max()) for name in taught) > 3e-3
 
@@ -148,24 +149,22 @@ def test_state_dependent_noise_lasts_for_its_steps():
 
 
 @pytest.mark.parametrize("case", ["discrete", "state-dependent"])
-@pytest.mark.parametrize("back", [False, True], ids=["ours", "theirs"])
-def test_a_saved_model_goes_on_in_stable_baselines3_and_theirs_here(case, back, tmp_path):
+def test_a_saved_model_goes_on_in_stable_baselines3_and_theirs_here(case, tmp_path):
     """Weights and Adam's moments are in the file: the next update is the same."""
     ours, theirs, envs = pair(case)
     collect(ours)
     theirs.rollout_buffer = copy.deepcopy(ours.rollout_buffer)
-    saved = theirs if back else ours
-    saved.set_logger(Logger(None, []))
-    saved.train()
-    saved.save(tmp_path / "model")
-    reader = FastPPO if back else PPO
-    read = reader.load(tmp_path / "model", env=envs, device="cpu")
-    read.rollout_buffer = copy.deepcopy(ours.rollout_buffer)
-    read.set_logger(Logger(None, []))
-    for model in (saved, read):
-        np.random.seed(3)
-        model.train()
-    torch.testing.assert_close(dict(read.policy.state_dict()), dict(saved.policy.state_dict()), rtol=0, atol=1e-5)
+    for saved, reader in ((ours, PPO), (theirs, FastPPO)):
+        saved.set_logger(Logger(None, []))
+        saved.train()
+        saved.save(tmp_path / "model")
+        read = reader.load(tmp_path / "model", env=envs, device="cpu")
+        read.rollout_buffer = copy.deepcopy(ours.rollout_buffer)
+        read.set_logger(Logger(None, []))
+        for model in (saved, read):
+            np.random.seed(3)
+            model.train()
+        torch.testing.assert_close(dict(read.policy.state_dict()), dict(saved.policy.state_dict()), rtol=0, atol=1e-5)
 
 
 def test_moments_of_other_networks_are_refused():

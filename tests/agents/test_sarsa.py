@@ -107,10 +107,10 @@ def test_every_weight_starts_at_its_share_of_the_initial_value():
 def test_equally_good_actions_are_chosen_alike_and_a_greedy_policy_takes_the_first():
     env = Chain(actions=4)
     env.step = lambda action: (env.history[-1].append(action), (np.zeros(1, np.float32), 0.0, True, False, {}))[1]
-    model = SARSAConfig(epsilon=0.0, **TABLE).make_model(env, 0).learn(4000)
+    model = SARSAConfig(epsilon=0.0, **TABLE).make_model(env, 0).learn(1000)
     counts = np.bincount([int(episode[0]) for episode in env.history if episode], minlength=4)
-    assert counts.sum() == 4000
-    assert abs(counts - 1000).max() < 5 * np.sqrt(4000 * 0.25 * 0.75)
+    assert counts.sum() == 1000
+    assert abs(counts - 250).max() < 5 * np.sqrt(1000 * 0.25 * 0.75)
     assert model.predict(np.zeros(1, np.float32), deterministic=True)[0] == 0
 
 

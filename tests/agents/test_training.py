@@ -136,7 +136,7 @@ def test_the_same_seed_gives_the_same_weights_and_another_seed_does_not(agent):
 
     def train(seed):
         model = make_model(config, task, seed)
-        model.learn(128)
+        model.learn(64)
         return weights(model.policy)
 
     first, again, other = train(5), train(5), train(6)
