@@ -4,6 +4,8 @@ The oracle is the reference motor (`tests.reference`) and Gymnasium's own step: 
 environment makes one side of its pair leave the oracle, and both sides alike.
 """
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -37,6 +39,7 @@ OFF = {  # feature -> the change that takes it away, and what else both sides of
 }
 
 
+@functools.cache
 def _episode(task, physics, actuator):
     """States and forces of an episode under random actions, as the environment and as the oracle have them."""
     env, driver = ActuatedEnv(task, actuator=actuator, physics=physics), TASKS[task].twin()
