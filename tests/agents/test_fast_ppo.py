@@ -29,6 +29,7 @@ CASES = {
         {"state_dependent_noise": True, "noise_steps": 4, "entropy_coefficient": 0.01, "hidden": (8, 8)},
     ),
 }
+FILLED = ("observations", "actions", "rewards", "episode_starts", "values", "log_probs", "advantages", "returns")
 
 
 class Nothing(BaseCallback):
@@ -109,16 +110,7 @@ def test_fills_the_buffer_as_stable_baselines3_does_for_the_same_actions(case):
     mine = ours.rollout_buffer
     theirs.policy.forward = Replayed(theirs.policy, mine.actions)
     collect(theirs)
-    for name in (
-        "observations",
-        "actions",
-        "rewards",
-        "episode_starts",
-        "values",
-        "log_probs",
-        "advantages",
-        "returns",
-    ):
+    for name in FILLED:
         np.testing.assert_allclose(getattr(mine, name), getattr(theirs.rollout_buffer, name), rtol=1e-5, atol=1e-5)
     assert mine.episode_starts[1:].any()
 

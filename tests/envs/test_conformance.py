@@ -20,7 +20,6 @@ from tests.reference import MotorSimulation
 from tests.tasks.faces import REBUILT, every_rebuilt
 
 INFO_KEYS = {"desired_force", "actual_force", "current", "reference_current", "voltage", "saturated"}
-every_task = pytest.mark.parametrize("task", TASKS)
 every_physics = pytest.mark.parametrize("physics", PHYSICS)
 every_actuator = pytest.mark.parametrize("actuator", NAMED)
 

@@ -92,7 +92,6 @@ def test_a_drawn_field_acts_as_in_a_drive_that_has_it(name):
 
 
 IN_TURN = ["everything", "motor.resistance", "motor.rotor_inertia", "motor.coulomb_friction", "motor.gear_ratio"]
-"""Of all these the motor's numbers alone, or what the model has on the joint, or both have to follow."""
 
 
 @pytest.mark.parametrize("name", but(IN_TURN, ["everything", *NOMINAL]))

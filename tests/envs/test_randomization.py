@@ -17,11 +17,9 @@ from codrl_mj.actuators import Actuator, CurrentLoop, Supply, actuator_over, spe
 from codrl_mj.actuators.stability import spectral_radii, stability_radii
 from codrl_mj.engine.families import HEAD
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.tasks import TASKS, named_actuator
+from codrl_mj.tasks import named_actuator
 from tests.envs.vectors import MODES, assert_equal_episodes, assert_same, batched, looped, random_actions
 from tests.tasks.faces import actions, every_rebuilt, gymnasiums, random_states
-
-every_task = pytest.mark.parametrize("task", TASKS)
 
 DRIVE = {
     "controller.kp": LogUniform(0.3, 15.0),  # straddles instability on every task

@@ -15,8 +15,6 @@ from tests.envs.snapshots import everything
 from tests.envs.vectors import assert_equal_episodes, assert_same, batched, looped, random_actions
 from tests.tasks.faces import every_rebuilt
 
-every_task = pytest.mark.parametrize("task", TASKS)
-
 
 @every_rebuilt
 def test_on_mujoco_it_is_the_batched_environment(task):

@@ -16,7 +16,6 @@ from tests.envs.snapshots import PHYSICS, STEPS, everything, run_several, run_si
 from tests.envs.vectors import assert_same
 from tests.tasks.faces import actions, every_rebuilt
 
-every_task = pytest.mark.parametrize("task", TASKS)
 both_physics = pytest.mark.parametrize("physics", PHYSICS)
 
 

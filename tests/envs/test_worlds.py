@@ -93,7 +93,7 @@ def test_ideal_motors_change_nothing():
         f"evaluate {{run}} --trust --actuator {MOTOR} --episodes 1",
         f"render {NAME} --actuators dr.*=lag --env.max-episode-steps 10 --out {{run}}/random.mp4",
         "runs {runs}",
-        "render {run} --trust --out {run}/film.mp4",
+        "render {run} --trust --env.max-episode-steps 10 --out {run}/film.mp4",
         "replay {run} --trust --out {run}/replay.html",
         "report {run} --trust --no-film --out {run}/report.html",
         "motor choose {run} --trust",

@@ -22,7 +22,7 @@ from codrl_mj.drives import demand_of, demands_of
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy, evaluate, load_episode, run_episodes, save_episode
 from codrl_mj.runs.summaries import read_run
-from codrl_mj.training import TrainConfig, load_config, train
+from codrl_mj.training import TrainConfig, history, load_config, train
 from codrl_mj.training.config import read_config
 from tests.foreign.models import BareEnv
 from tests.matrix import but
@@ -37,7 +37,7 @@ EVERYTHING = {
     "disturbances": {"command_delay": 0.12},
     "randomize": {".*": {"motor.resistance": "uniform(0.9, 1.1)"}},
 }
-SMALL = SACConfig(learning_starts=40, batch_size=16, buffer_size=150, hidden=(8,))
+SMALL = SACConfig(learning_starts=40, batch_size=16, buffer_size=150, hidden=(8,), train_every=4, gradient_steps=1)
 
 
 def config(env, num_envs=1):
@@ -54,6 +54,7 @@ CASES = {
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(history, "save_learning_curve", lambda *_: None)
 
 
 @pytest.fixture(scope="module")

@@ -51,6 +51,7 @@ def tiny(task, agent, num_envs=1, steps=240, env=None, actuator="paper", **other
 _SMALL = {"learning_starts": 40, "batch_size": 16, "buffer_size": 150}  # the buffer fills, and is written over
 _PPO = {"rollout_steps": 32, "batch_size": 16, "epochs": 2, "hidden": (8, 8)}
 _NETS = {"hidden": (8,)}
+_UNITS = {"actor_units": (8,), "joint_units": (8,)}
 
 CASES = {
     "ppo, one optimiser": tiny(
@@ -77,19 +78,16 @@ CASES = {
     ),
     "ddpg": tiny(
         "pendulum",
-        DDPGConfig(**_SMALL, actor_units=(8,), joint_units=(8,), critic_learning_rate=2e-3),
+        DDPGConfig(**_SMALL, **_UNITS, critic_learning_rate=2e-3),
         env={"disturbances": DISTURBANCES, "observe_actuator": True},
         actuator={"name": "paper", **NOISY},
     ),
     "ddpg, several environments": tiny(
-        "pendulum",
-        DDPGConfig(**_SMALL, actor_units=(8,), joint_units=(8,), train_every=4, gradient_steps=1),
-        3,
-        env={"physics": "analytic"},
+        "pendulum", DDPGConfig(**_SMALL, **_UNITS, train_every=4, gradient_steps=1), 3, env={"physics": "analytic"}
     ),
     "ddpg, trained after episodes": tiny(
         "pendulum",
-        DDPGConfig(**_SMALL, actor_units=(8,), joint_units=(8,), train_every=None, gradient_steps=5),
+        DDPGConfig(**_SMALL, **_UNITS, train_every=None, gradient_steps=5),
         total_episodes=8,
         env={"randomize": RANDOMIZE},
     ),
