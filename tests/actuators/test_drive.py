@@ -8,7 +8,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
@@ -133,14 +133,13 @@ def test_what_is_drawn_is_heat_work_and_field_as_a_fine_integration_has_them(loo
 _share = st.floats(0.0, 1.0)
 
 
-@settings(max_examples=300, deadline=None)
 @example("pmg132", 40e3, 0.349, 40, [(1.0, 1.0)] * 3, 10.0)
 @example("1331t", 10e3, 1.0, 1, [(0.6, 0.2), (0.4, 0.9)], 1.0)
 @given(
     st.sampled_from(sorted(WINDINGS)),
     st.sampled_from(RATES),
     st.sampled_from([0.262, 0.349]) | st.floats(0.01, 1.0),
-    st.integers(1, 400),
+    st.integers(1, 200),
     st.lists(st.tuples(_share, _share), min_size=1, max_size=8),
     st.sampled_from([0.1, 0.5, 1.0, 2.0, 10.0]),
 )
@@ -205,11 +204,11 @@ def test_the_margins_are_those_of_the_design(name, rate):
     closed = control.feedback(computed, 1)
     for share in (0.3, 1.0, 2.0):
         omega = share * bandwidth
-        times = np.arange(4000) / rate
+        times = np.arange(400) / rate
         # one sample a step: a frequency sweep of the loop itself
         torques = 1e-3 * motor.torque_constant * np.sin(omega * times)
-        currents = [step[0].current for step in responses(one, 1 / rate, torques, np.zeros(4000))]
-        late = slice(2000, None)
+        currents = [step[0].current for step in responses(one, 1 / rate, torques, np.zeros(400))]
+        late = slice(200, None)
         basis = np.stack([np.sin(omega * times[late]), np.cos(omega * times[late])], axis=1)
         real, imaginary = np.linalg.lstsq(basis, np.array(currents)[late] / 1e-3, rcond=None)[0]
         # the state is that at the step's end: one sample ahead

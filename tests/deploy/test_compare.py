@@ -1,6 +1,7 @@
 """A log of a rig beside the simulation under its commands."""
 
 import csv
+import functools
 import json
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from codrl_mj.cli import main
 from codrl_mj.deploy import Contract, OnnxPolicy, board_test, compare, export, write_log
+from codrl_mj.deploy.contract import Interface
 from codrl_mj.drives import find_drive
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes
@@ -18,19 +20,25 @@ FURUTA = EnvConfig("furuta")
 TASKS = {"furuta": "ppo", "acrobot": "dqn", "mountain_car_continuous": "td3"}
 
 
-def logged(folder, task, **changes):
-    """A log of an episode of a policy with random weights, its contract, the environment and the episode."""
-    env = EnvConfig(task, **changes)
-    export(trained(task, TASKS[task])[0], env, TASKS[task], folder / "out", 1)
-    (episode,) = run_episodes(OnnxPolicy(folder / "out"), env.make, 1, seed=3)
-    contract = Contract.read(folder / "out")
-    write_log(folder / "rig.csv", contract, episode)
-    return folder / "rig.csv", contract, env, episode
+@pytest.fixture(scope="module")
+def logged(tmp_path_factory):
+    """Of a task a log of an episode of a policy with random weights, its contract, the environment and the episode."""
+
+    @functools.cache
+    def made(task):
+        folder, env = tmp_path_factory.mktemp(task), EnvConfig(task)
+        export(trained(task, TASKS[task])[0], env, TASKS[task], folder / "out", 1)
+        (episode,) = run_episodes(OnnxPolicy(folder / "out"), env.make, 1, seed=3)
+        contract = Contract.read(folder / "out")
+        write_log(folder / "rig.csv", contract, episode)
+        return folder / "rig.csv", contract, env, episode
+
+    return made
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_a_rig_that_is_the_simulation_does_what_it_does(tmp_path, task):
-    log, _, env, episode = logged(tmp_path, task)
+def test_a_rig_that_is_the_simulation_does_what_it_does(logged, task):
+    log, _, env, episode = logged(task)
     found = compare(env, log)
     assert found.simulated.shape == episode.observation[:-1].shape
     np.testing.assert_array_equal(found.simulated[found.starts], found.logged[found.starts])
@@ -38,18 +46,18 @@ def test_a_rig_that_is_the_simulation_does_what_it_does(tmp_path, task):
     assert (found.moved > 100.0 * found.errors).all()
 
 
-def test_another_motor_is_seen_and_what_identifies_it_takes_the_difference_away(tmp_path):
+def test_another_motor_is_seen_and_what_identifies_it_takes_the_difference_away(logged, tmp_path):
     (drive,) = FURUTA.driven.values()
     real = drive.replaced({"motor.torque_constant": 0.03, "motor.viscous_friction": 3e-5})
-    export(trained("furuta", "ppo")[0], FURUTA, "ppo", tmp_path / "out", 1)
-    done = board_test(tmp_path / "out", episodes=1, actuator=real)  # its loop knows the motor of the training alone
-    write_log(tmp_path / "rig.csv", Contract.read(tmp_path / "out"), done.on_board[0])
+    log, contract, *_ = logged("furuta")
+    done = board_test(log.parent / "out", episodes=1, actuator=real)  # its loop knows the motor of the training alone
+    write_log(tmp_path / "rig.csv", contract, done.on_board[0])
     as_trained, as_it_is = (compare(FURUTA, tmp_path / "rig.csv", actuator=one).errors for one in (None, real))
     assert (as_trained > 20.0 * as_it_is).all()
 
 
-def test_windows_begin_at_what_was_observed_and_the_motor_goes_on(tmp_path):
-    log, contract, env, episode = logged(tmp_path, "furuta")
+def test_windows_begin_at_what_was_observed_and_the_motor_goes_on(logged):
+    log, contract, env, episode = logged("furuta")
     found = compare(env, log, 0.2)
     assert found.starts.tolist() == list(range(0, len(episode.time), round(0.2 * contract.rate)))
     whole = compare(env, log, 1e3)
@@ -59,8 +67,8 @@ def test_windows_begin_at_what_was_observed_and_the_motor_goes_on(tmp_path):
     np.testing.assert_allclose(found.moved, np.sqrt(((held - found.logged) ** 2).mean(axis=0)))
 
 
-def test_a_log_has_what_the_motor_did(tmp_path):
-    log, contract, _, episode = logged(tmp_path, "furuta")
+def test_a_log_has_what_the_motor_did(logged):
+    log, contract, _, episode = logged("furuta")
     rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(log.open())]
     assert [row["motor_voltage:V"] for row in rows[1:]] == episode.signals["voltage"][:-1].tolist()
     assert rows[0]["motor_current:A"] == 0.0
@@ -70,9 +78,9 @@ def test_a_log_has_what_the_motor_did(tmp_path):
     assert 1.0 / contract.rate == pytest.approx(rows[1]["time:s"])
 
 
-def test_from_the_command_line(tmp_path, capsys):
-    log, *_ = logged(tmp_path, "furuta")
-    line = ["identify", "compare", str(tmp_path / "out"), str(log)]
+def test_from_the_command_line(logged, tmp_path, capsys):
+    log, *_ = logged("furuta")
+    line = ["identify", "compare", str(log.parent / "out"), str(log)]
     assert main([*line, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert [one["name"] for one in told] == ["cos_arm", "sin_arm", "cos_rod", "sin_rod", "arm_velocity", "rod_velocity"]
@@ -83,9 +91,9 @@ def test_from_the_command_line(tmp_path, capsys):
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_what_cannot_be_compared_is_said(tmp_path, capsys):
-    log, *_ = logged(tmp_path, "furuta")
-    line = ["identify", "compare", str(tmp_path / "out"), str(log)]
+def test_what_cannot_be_compared_is_said(logged, tmp_path, capsys):
+    log, *_ = logged("furuta")
+    line = ["identify", "compare", str(log.parent / "out"), str(log)]
     for more, says in {
         ("--window", "0.01"): "window = 0.01 s: must be at least 0.04 s, two rows of the log",
         ("--out", str(tmp_path / "a.pdf")): "the suffix must be .png",
@@ -102,7 +110,6 @@ def test_what_cannot_be_compared_is_said(tmp_path, capsys):
 def test_identify_reads_what_a_board_logged(tmp_path):
     drive = find_drive("maxon-ec45-flat-50w").replaced({"motor.gear_ratio": 20.0, "motor.coulomb_friction": 0.0})
     env = EnvConfig("pendulum", actuator=drive, inner_steps=50)
-    export(trained("pendulum", "ddpg")[0], env, "ddpg", tmp_path / "out", 1)
 
     class Slow:
         random = np.random.default_rng(0)
@@ -113,15 +120,11 @@ def test_identify_reads_what_a_board_logged(tmp_path):
             return self.held, None
 
     Slow.held = np.zeros((1, 1), np.float32)
-    logs = []
-    for seed in (3, 4):
-        (episode,) = run_episodes(Slow(), env.make, 1, seed)
-        write_log(tmp_path / f"{seed}.csv", Contract.read(tmp_path / "out"), episode)
-        columns = (
-            'time="time:s":s,torque="motor:N*m":N*m,position=unwrap(atan2("sin_angle:1","cos_angle:1"),2*pi)+pi:rad'
-        )
-        logs.append(read_log(tmp_path / f"{seed}.csv", columns))
-    found = identify(logs, rig="pendulum", known={"viscous_friction": 0.0})
+    (episode,) = run_episodes(Slow(), env.make, 1, 3)
+    write_log(tmp_path / "log.csv", Interface.between(env), episode)
+    columns = 'time="time:s":s,torque="motor:N*m":N*m,position=unwrap(atan2("sin_angle:1","cos_angle:1"),2*pi)+pi:rad'
+    log = read_log(tmp_path / "log.csv", columns)
+    found = identify([log], rig="pendulum", known={"viscous_friction": 0.0})
     rotor = 20.0**2 * drive.motor.rotor_inertia
     for name, value in {"inertia": 1.0 / 3.0 + rotor, "mgl": 5.0}.items():
         assert found[name].status == "identified"

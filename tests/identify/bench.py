@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 from scipy.linalg import expm
+from scipy.signal import lfilter
 
 from codrl_mj.identify import Log, read_log
 from codrl_mj.identify.simulation import Moved, moving
@@ -49,9 +50,10 @@ def motor_log(kind="prbs", rate=5000, duration=2.0, noise=0.01, step=0.0, seed=0
     if kind != "locked":
         system[1, :2], system[2, 1] = [CONSTANT / INERTIA, -VISCOUS / INERTIA], 1.0
     exact = expm(system / LOOP)
-    states = np.zeros((len(time), 3))
-    for row in range(len(time) - 1):
-        states[row + 1] = exact[:3, :3] @ states[row] + exact[:3, 3] * volts[row]
+    poles, modes = np.linalg.eig(exact[:3, :3])
+    gains = np.linalg.solve(modes, exact[:3, 3])
+    each = [lfilter([0.0, gain], [1.0, -pole], volts) for gain, pole in zip(gains, poles, strict=True)]
+    states = np.real(modes @ each).T
     every = round(LOOP / rate)
     current, position = states[::every, 0], states[::every, 2]
     current = current + noise * np.abs(states[:, 0]).max() * random.standard_normal(len(current))

@@ -72,7 +72,8 @@ def test_columns_are_proposed_with_the_line_to_type_next(capsys):
     assert "rig is not given (--rig on the command line" in said(capsys, f"log.csv --columns {columns}", 2)
 
 
-def test_a_plan_is_printed_and_its_excitation_written(capsys, tmp_path):
+def test_a_plan_is_printed_and_its_excitation_written(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr("codrl_mj.identify.plan.RATES", (1e3, 5e3))
     text = said(capsys, "plan maxon-ec45-flat-50w --inertia 1e-4 --duration 1 --out plan")
     assert "* play prbs" in text
     assert "viscous_friction: 0 on the datasheet" in text
