@@ -98,7 +98,7 @@ def test_reversing_everything_reverses_the_result(actuator, dt, state, torque, s
 @pytest.mark.parametrize("resistance", [0.5, 2.0])
 def test_stall_current_is_supply_over_resistance(u_max, resistance):
     actuator = Actuator(Motor(resistance=resistance, torque_constant=0.3), CurrentLoop(kp=1e6, max_voltage=u_max))
-    current, *_, voltage = _run(actuator, 0.01, 2000, torque=1e5, speed=0.0)
+    current, *_, voltage = _run(actuator, 0.01, 600, torque=1e5, speed=0.0)
     assert voltage == u_max
     assert current == pytest.approx(u_max / resistance, rel=1e-12)
 
@@ -122,7 +122,7 @@ def test_no_current_flows_at_the_no_load_speed():
 def test_the_saturated_torque_speed_curve_is_the_straight_line_of_the_datasheet(speed):
     motor = Motor(resistance=1.5, torque_constant=0.06, back_emf_constant=0.06)
     actuator = Actuator(motor, CurrentLoop(kp=1e9, max_voltage=24.0))
-    torque = motor.torque_constant * _run(actuator, 0.01, 3000, torque=1e5, speed=speed)[0]
+    torque = motor.torque_constant * _run(actuator, 0.01, 200, torque=1e5, speed=speed)[0]
     stall, no_load = 0.06 * 24.0 / 1.5, 24.0 / 0.06
     assert torque == pytest.approx(stall * (1.0 - speed / no_load), rel=1e-9)
 
@@ -132,10 +132,10 @@ def test_a_proportional_loop_reaches_its_share_of_the_reference(speed):
     motor = Motor(resistance=2.0, torque_constant=0.5, back_emf_constant=0.7)
     compensated = Actuator(motor, CurrentLoop(kp=6.0, max_voltage=INFINITE))
     reference = 1.2 / 0.5
-    assert _run(compensated, 0.01, 1000, 1.2, speed)[0] == pytest.approx(reference * 6.0 / 8.0, rel=1e-12)
+    assert _run(compensated, 0.01, 100, 1.2, speed)[0] == pytest.approx(reference * 6.0 / 8.0, rel=1e-12)
     plain = _one_substep(compensated, bemf_compensation=False)
     expected = (6.0 * reference - 0.7 * speed) / 8.0
-    assert _run(plain, 0.01, 1000, 1.2, speed)[0] == pytest.approx(expected, rel=1e-12)
+    assert _run(plain, 0.01, 100, 1.2, speed)[0] == pytest.approx(expected, rel=1e-12)
 
 
 def test_an_integral_removes_the_steady_state_error():
@@ -270,7 +270,7 @@ def test_the_integral_of_a_constant_error_settles_at_error_over_leak(leak):
         integral = _run(actuator, 0.05, steps, torque=0.0, speed=0.0, state=(0.0, 1.0, 0.0))[1]
         assert integral == pytest.approx(factor**steps, rel=1e-12)
     integral = 0.0
-    for _ in range(5000):
+    for _ in range(1200):
         integral = advance(actuator, 0.05, 0.0, integral, 0.0, 2.0, 0.0)[1]
     assert integral == pytest.approx(2.0 / leak, rel=1e-12)
 

@@ -92,8 +92,9 @@ def test_current_and_temperature_are_those_of_mujoco_s_own_motor():
             data.ctrl[:], other.ctrl[:] = HOT.torque_constant * volts, volts
             mujoco.mj_step(ours, data)
             mujoco.mj_step(theirs, other)
-            read = readout(data)
-            unequal.append(abs(read["temperature"].item() - 20.0 - other.act[0]))
+            if step % 20 == 19:
+                read = readout(data)
+                unequal.append(abs(read["temperature"].item() - 20.0 - other.act[0]))
         assert other.act[0] > 10.0
         assert read["current"].item() == pytest.approx(other.act[1], rel=1e-3)
         ends[timestep] = max(unequal)

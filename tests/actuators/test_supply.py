@@ -78,7 +78,7 @@ def test_the_stall_current_is_that_of_the_limit_that_binds(open_circuit, most, r
     actuator = Actuator(motor, loop, Supply(open_circuit, resistance))
     for sign in (1.0, -1.0):
         state = actuator.State(0.0, 0.0, 0.0)
-        for _ in range(2000):
+        for _ in range(200):
             state, torque, signals = _advance(actuator, 0.01, state, sign * 1e5, 0.0)
         assert state.current == pytest.approx(sign * stalled, rel=1e-12)
         assert torque == 0.5 * state.current

@@ -29,7 +29,7 @@ every_rate = pytest.mark.parametrize("rate", [10e3, 40e3])
 with_and_without_delay = pytest.mark.parametrize("delayed", [False, True], ids=["no delay", "delayed"])
 
 
-def measured(drive, frequency, samples=1600):
+def measured(drive, frequency, samples=400):
     """The simulated loop's complex gain from reference to sampled current at a frequency [Hz]."""
     angle = 2 * math.pi * frequency / drive.controller.sample_rate * np.arange(samples)
     amplitude = 1e-3 * drive.voltage_limit / drive.motor.resistance

@@ -76,7 +76,7 @@ def test_what_the_logs_do_not_tell_is_asked_for_or_taken_from_a_motor():
 def test_a_motor_with_a_gear_is_identified_at_its_rotor(known):
     """A log of the output: kE of 1 V*s/rad there is 0.05 at the rotor of a gear of 20; of a wrong gear it is none."""
     base = Drive().replaced({"motor.gear_ratio": 20.0 if not known else 1.0}).as_mapping()
-    log = bench.motor_log("sine", duration=2.0)
+    log = bench.motor_log("sine", 2000)
     log = replaced(log, "position", log.signals["position"] / 20.0)
     found = identify([log], "free", {**known, "load_inertia": 0.0}, base=base)
     assert (found["gear_ratio"].value, found["gear_ratio"].status) == (20.0, "given")
@@ -129,11 +129,11 @@ def write_csv(path, log):
 
 
 def test_the_command_line_identifies_and_draws_within_the_intervals(tmp_path, capsys):
-    log = write_csv(tmp_path / "bench.csv", bench.motor_log("locked", duration=4.0))
+    log = write_csv(tmp_path / "bench.csv", bench.motor_log("locked", 2000, 2.5))
     columns = "time=t:s,voltage=mean(voltage):V,current=current:A,position=position:rad"
     out = tmp_path / "motor"
     known = ["--known", "torque_constant=0.05", "back_emf_constant=0.05", "rotor_inertia=2e-5"]
-    wrong = bench.motor_log("locked", duration=1.0)
+    wrong = bench.motor_log("locked", 2000, 1.0)
     wrong = write_csv(tmp_path / "wrong.csv", replaced(wrong, "current", -wrong.signals["current"]))
     given = ["identify", log, "--columns", columns, *known, "--out", str(out), "--holdout", wrong]
     assert main(given) == 0
