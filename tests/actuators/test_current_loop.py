@@ -139,14 +139,14 @@ def test_a_proportional_loop_reaches_its_share_of_the_reference(speed):
 
 
 def test_an_integral_removes_the_steady_state_error():
-    current, *_ = _run(Actuator(controller=CurrentLoop(kp=1.0, ki=5.0)), 0.01, 5000, torque=1.7, speed=2.0)
+    current, *_ = _run(Actuator(controller=CurrentLoop(kp=1.0, ki=5.0)), 0.01, 1300, torque=1.7, speed=2.0)
     assert current == pytest.approx(1.7, rel=1e-12)
 
 
 def test_a_leaking_integral_leaves_the_error_of_its_finite_gain():
     # a leak makes the integral's gain ki/leak at rest: i = ref*(kp + ki/leak)/(R + kp + ki/leak)
     loop = CurrentLoop(kp=1.0, ki=5.0, integral_leak=2.0)
-    current, *_ = _run(Actuator(controller=loop), 0.01, 5000, torque=1.7, speed=0.0)
+    current, *_ = _run(Actuator(controller=loop), 0.01, 1300, torque=1.7, speed=0.0)
     assert current == pytest.approx(1.7 * 3.5 / 4.5, rel=1e-12)
 
 

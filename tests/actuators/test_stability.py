@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from codrl_mj.actuators import (
@@ -233,6 +233,7 @@ def test_a_derivative_gain_beyond_the_inductance_is_unstable_at_any_step_and_the
 # -- many at once -------------------------------------------------------------------------------------------
 
 
+@settings(max_examples=40)
 @given(st.lists(actuators, min_size=1, max_size=4), timesteps)
 def test_many_radii_are_each_the_one_to_the_last_bit(several, dt):
     radii = spectral_radii(Actuator, np.array([one.numbers for one in several]), dt)
@@ -247,6 +248,7 @@ def test_the_radius_is_that_of_the_matrix(actuator, dt):
     assert spectral_radius(one, dt) == pytest.approx(np.abs(values).max(), rel=1e-6, abs=1e-6)
 
 
+@settings(max_examples=30)
 @given(st.lists(actuators, min_size=1, max_size=10), timesteps)
 def test_the_quick_test_is_below_one_exactly_where_the_radii_are(several, dt):
     numbers = np.array([one.numbers for one in several])
