@@ -1,7 +1,6 @@
 """One step of the current loop: against the paper's algorithm written out by hand, and against closed forms."""
 
 import dataclasses
-import itertools
 import math
 
 import numpy as np
@@ -209,11 +208,6 @@ def test_back_emf_opposes_the_current_of_a_moving_motor():
     motor = Motor(resistance=2.0, inductance=0.5, torque_constant=0.5, back_emf_constant=0.0)
     loop = CurrentLoop(kp=3.0, bemf_compensation=False)
     assert advance(Actuator(motor, loop), 0.1, 1.0, 0.5, 0.25, 1.0, 4.0)[0] == pytest.approx(1.2, rel=1e-14)
-
-
-def test_no_two_features_have_the_same_expected_numbers():
-    numbers = [(u, i) for _, u, i in FEATURES.values()]
-    assert all(a != b for a, b in itertools.combinations(numbers, 2))
 
 
 # -- filters ------------------------------------------------------------------------------------------------

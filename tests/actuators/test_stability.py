@@ -162,12 +162,6 @@ def test_the_simulated_loop_decays_where_stable_and_grows_where_not(actuator, dt
     assert size < 1e-3 * start if radius < 1.0 else size > 1e3 * start
 
 
-@given(motors, plain_loops, timesteps)
-def test_only_states_that_a_gain_reads_are_part_of_the_loop(motor, loop, dt):
-    size = 1 + (loop.ki > 0) + (loop.kd > 0)
-    assert closed_loop_matrix(Actuator(motor, loop), dt).shape == (size, size)
-
-
 def test_an_integral_that_no_gain_reads_does_not_make_a_loop_marginal():
     # the unread integral would put a pole at 1 exactly
     check_stable(Actuator(controller=CurrentLoop(kp=1.0, ki=0.0)), 0.01)

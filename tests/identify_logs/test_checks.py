@@ -50,12 +50,6 @@ def logged(motor="small", kind="prbs", sag=0.0, jitter=0.0, dropped=0.0, seed=0,
     return simulate(drive, excitation_of(motor, kind), load, sensors, sampler, seed)
 
 
-@functools.cache
-def alone():
-    """Without what a torque and a supply tell of the current and the voltage."""
-    return without(logged(), "torque", "bus")
-
-
 def scaled(log, **factors):
     """Signals times a factor, as by a wrong unit or sign."""
     signals = {name: factors.get(name, 1.0) * values for name, values in log.signals.items()}
@@ -162,7 +156,7 @@ def test_degrees_for_radians_are_an_error_by_the_encoder():
     ],
 )
 def test_what_no_bench_has_is_found_without_a_datasheet(make, says, severity):
-    clean = alone()
+    clean = without(logged(), "torque", "bus")
     told = [one for one in found(make(clean), "unit") if says in one.message]
     assert [one.severity for one in told] == [severity]
     assert found(clean, "unit") == []
