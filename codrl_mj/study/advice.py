@@ -67,9 +67,9 @@ def decide(options: Mapping[str, Prospect]) -> str:
     if better:
         best = min(most[name].mean for name in better)
         return next(name for name in better if most[name].mean <= best + MARGIN)
-    tried = all(option.most is not None for name, option in known.items() if name != IDEAL)  # that none of it wins
+    others = (option.most for name, option in known.items() if name != IDEAL)  # of which an untried one might win
     lost = all(option.least is not None and option.least.hurt for option in known.values())
-    return BUY if tried and lost else MEASURE
+    return BUY if lost and None not in others else MEASURE
 
 
 class Advice(NamedTuple):

@@ -38,7 +38,7 @@ def noisy(level):
     """About a level, otherwise for every seed, and with ideal-trained policies at exactly 1 on the mean at home."""
 
     def score(trial, seed):
-        return level(trial) + 0.02 * np.cos(np.pi * (seed + 0.5))  # sums to 0 over an even number of seeds
+        return level(trial) + 0.02 * (-1.0) ** seed  # sums to 0 over an even number of seeds
 
     return score
 
