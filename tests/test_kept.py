@@ -1,5 +1,6 @@
 """Compiled code that is kept on disk: what was changed is compiled anew, what is damaged or not ours is not used."""
 
+import importlib
 import os
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from numba.core import event
 
+import codrl_mj
 from codrl_mj import kept
 from codrl_mj.cli import main
 
@@ -43,9 +45,6 @@ def scaled(value):
     return inner(value) + {added}
 """
 STEPS = """
-import sys, time
-sys.path.insert(0, sys.argv[1])
-import numba
 from numba.core import event
 import codrl_mj
 compiled = []
@@ -58,12 +57,7 @@ class Counted(event.Listener):
         pass
 
 event.register("numba:compile", Counted())
-actuator = sys.argv[2]
-if ":" in actuator:
-    import importlib
-    module, name = actuator.split(":")
-    actuator = getattr(importlib.import_module(module), name)()
-env = codrl_mj.make(sys.argv[3], actuator)
+env = codrl_mj.make("InvertedPendulum-v5", "lag")
 seen = [env.reset(seed=3)[0].tolist()] + [env.step(env.action_space.low * 0 + 0.3)[0].tolist() for _ in range(20)]
 print(len(compiled), seen)
 """
@@ -76,31 +70,25 @@ def place(tmp_path, monkeypatch):
     return tmp_path / "kept"
 
 
-def process(folder, actuator="lag", env="InvertedPendulum-v5", cache=None, **variables):
-    """How much a new process compiled, and what it saw."""
-    (folder / "steps.py").write_text(STEPS)
-    environment = {**os.environ, **({} if cache is None else {"CODRL_MJ_CACHE": str(cache)}), **variables}
-    command = [sys.executable, str(folder / "steps.py"), str(folder), actuator, env]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=300)
-    count, seen = done.stdout.split(" ", 1)
-    return int(count), seen
+def printed(cache, program, *words):
+    """What a new process prints that keeps its code in a folder."""
+    environment = {**os.environ, "CODRL_MJ_CACHE": str(cache)}
+    command = [sys.executable, "-c", program, *map(str, words)]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=300).stdout
 
 
 @pytest.fixture(scope="module")
 def filled(tmp_path_factory):
     """A folder that one process filled, and what that process saw."""
-    folder = tmp_path_factory.mktemp("filled")
-    count, seen = process(folder, cache=folder / "kept")
-    assert count > 10
+    folder = tmp_path_factory.mktemp("filled") / "kept"
+    count, seen = printed(folder, STEPS).split(" ", 1)
+    assert int(count) > 10
     return folder, seen
 
 
-def test_the_next_process_compiles_nothing_and_sees_the_same_as_without(filled):
+def test_the_next_process_compiles_nothing_and_sees_the_same(filled):
     folder, seen = filled
-    assert process(folder, cache=folder / "kept") == (0, seen)
-    count, again = process(folder, cache="off")
-    assert count > 10
-    assert again == seen
+    assert printed(folder, STEPS) == f"0 {seen}"
 
 
 TWINS = """
@@ -124,88 +112,91 @@ print([made(float(word))(1.0) for word in sys.argv[1:]])
 """.replace("LONG", "        total += math.sin(value) + math.cos(total) * math.exp(-total * total)\n" * 40)
 
 
-def test_functions_of_one_name_that_two_processes_compiled_stay_apart(tmp_path):
+def test_functions_of_one_name_that_two_processes_compiled_stay_apart(place):
     """Each is the first of its process, so that a count would call them alike."""
-
-    def run(*factors):
-        environment = {**os.environ, "CODRL_MJ_CACHE": str(tmp_path / "kept")}
-        command = [sys.executable, "-c", TWINS, *map(str, factors)]
-        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.strip()
-
-    for factor in (2.0, 5.0, 7.0):
-        run(factor)
-    assert len([*(tmp_path / "kept").iterdir()]) == 3
-    assert run(2.0, 5.0, 7.0) == "[12.0, 30.0, 42.0]"
-    assert run(7.0, 3.0, 2.0) == "[42.0, 18.0, 12.0]"
+    for factor in (2.0, 5.0):
+        printed(place, TWINS, factor)
+    assert len([*place.iterdir()]) == 2
+    assert printed(place, TWINS, 5.0, 3.0, 2.0).strip() == "[30.0, 18.0, 12.0]"
 
 
-@pytest.mark.parametrize("variables", [{"NUMBA_CPU_NAME": "generic"}, {"NUMBA_OPT": "1"}])
-def test_code_of_another_cpu_or_of_other_settings_is_not_used(filled, variables):
-    folder, seen = filled
-    count, _ = process(folder, cache=folder / "kept", **variables)
-    assert count > 10
-    assert process(folder, cache=folder / "kept") == (0, seen)
+@pytest.mark.parametrize(("name", "value"), [("NUMBA_CPU_NAME", "generic"), ("NUMBA_OPT", "1")])
+def test_every_setting_is_in_the_key(name, value, monkeypatch):
+    before = kept._foundation.__wrapped__()
+    with monkeypatch.context() as patch:
+        patch.setenv(name, value)
+        numba.config.reload_config()
+        assert kept._foundation.__wrapped__() != before
+    numba.config.reload_config()
+    assert kept._foundation.__wrapped__() == before
 
 
-def test_what_is_damaged_is_compiled_anew(filled, tmp_path):
-    folder, seen = filled
-    files = sorted((folder / "kept").iterdir())
-    before = {file: file.read_bytes() for file in files}
-    for number, file in enumerate(files):
-        content = before[file]
-        file.write_bytes([content[:-1], b"", content[:32] + b"x" * 500, os.urandom(200)][number % 4])
-    count, again = process(folder, cache=folder / "kept")
-    assert count > 10
-    assert again == seen
-    assert {file.name for file in (folder / "kept").iterdir()} == {file.name for file in files}  # written anew
-    assert process(folder, cache=folder / "kept") == (0, seen)
+@pytest.mark.parametrize("name", ["get_host_cpu_name", "get_host_cpu_features"])
+def test_so_is_the_cpu(name, monkeypatch):
+    before = kept._foundation.__wrapped__()
+    monkeypatch.setattr(kept.binding, name, lambda: type("Other", (str,), {"flatten": str})("another"))
+    assert kept._foundation.__wrapped__() != before
 
 
-def test_two_processes_at_once_leave_whole_files(tmp_path):
-    with ThreadPoolExecutor(2) as both:
-        found = [*both.map(lambda _: process(tmp_path, cache=tmp_path / "kept"), range(2))]
-    assert len({seen for _, seen in found}) == 1
-    assert not [*(tmp_path / "kept").glob("*.part")]
-    assert process(tmp_path, cache=tmp_path / "kept") == (0, found[0][1])
+@pytest.mark.parametrize(("length", "more"), [(-1, b""), (0, b""), (32, b"x" * 500), (0, bytes(range(200)))])
+def test_what_is_damaged_is_compiled_anew(place, length, more):
+    assert compiled_by(lambda: function(6.0)(1.0)) == (1, 6.0)
+    (file,) = place.iterdir()
+    file.write_bytes(file.read_bytes()[:length] + more)
+    assert compiled_by(lambda: function(6.0)(1.0)) == (1, 6.0)
+    assert [*place.iterdir()] == [file]  # written anew
+    assert compiled_by(lambda: function(6.0)(1.0)) == (0, 6.0)
 
 
-def test_a_change_deep_in_somebodys_own_modules_is_seen(tmp_path):
+def test_two_that_write_at_once_leave_whole_files(place):
+    """Whoever reads meanwhile gets what one of them wrote."""
+    contents = [bytes([number]) * size for number, size in enumerate((3_000_000, 1_000_000))]
+    kept._write(place / "one.code", contents[0])
+    with ThreadPoolExecutor(3) as pool:
+        for content in contents:
+            pool.submit(lambda content=content: [kept._write(place / "one.code", content) for _ in range(30)])
+        found = [*pool.map(lambda _: kept._read(place / "one.code"), range(60))]
+    assert set(found) <= set(contents)
+    assert [path.name for path in place.iterdir()] == ["one.code"]
+
+
+def test_a_change_deep_in_somebodys_own_modules_is_seen(filled, tmp_path, monkeypatch):
     """A constant in a helper of a helper: of the value alone, of the code alone, and back."""
+    monkeypatch.setenv("CODRL_MJ_CACHE", str(filled[0]))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    (tmp_path / "own.py").write_text(FAMILY)
 
-    def write(factor, added):
-        (tmp_path / "own.py").write_text(FAMILY)
+    def seen(factor, added):
+        """As in a new process."""
         (tmp_path / "deeper.py").write_text(HELPER.format(added=added))
         (tmp_path / "constants.py").write_text(f"FACTOR = {factor}\n")
+        kept._file.cache_clear()
+        env = codrl_mj.make("InvertedPendulum-v5", importlib.import_module("own").Spring())
+        for name in ("own", "deeper", "constants"):
+            del sys.modules[name]
+        env.reset(seed=3)
+        return [env.step(env.action_space.low * 0 + 0.3)[0].tolist() for _ in range(5)]
 
-    def seen():
-        return process(tmp_path, "own:Spring", cache=tmp_path / "kept", PYTHONDONTWRITEBYTECODE="1")
-
-    write(1.0, 0.0)
-    _, first = seen()
-    assert seen() == (0, first)
-    write(2.0, 0.0)
-    count, other = seen()
-    assert count > 0
-    assert other != first
-    write(1.0, 0.25)
-    count, third = seen()
-    assert count > 0
-    assert len({first, other, third}) == 3
-    write(1.0, 0.0)
-    assert seen() == (0, first)
+    first = seen(1.0, 0.0)
+    assert compiled_by(lambda: seen(1.0, 0.0)) == (0, first)
+    for factor, added in ((2.0, 0.0), (1.0, 0.25)):
+        count, other = compiled_by(lambda factor=factor, added=added: seen(factor, added))
+        assert count > 0
+        assert other != first
+    assert compiled_by(lambda: seen(1.0, 0.0)) == (0, first)
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() == 0, reason="root may write everywhere")
-def test_a_folder_that_cannot_be_written_is_no_error(tmp_path):
-    (tmp_path / "kept").mkdir(mode=0o500)
-    count, _ = process(tmp_path, cache=tmp_path / "kept")
-    assert count > 10
+def test_a_folder_that_cannot_be_written_is_no_error(place):
+    place.mkdir(mode=0o500)
+    assert compiled_by(lambda: function(5.0)(1.0)) == (1, 5.0)
 
 
-def test_where_no_folder_can_be_nothing_is_kept(tmp_path):
+def test_where_no_folder_can_be_nothing_is_kept(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
-    count, _ = process(tmp_path, cache=tmp_path / "file" / "inside")
-    assert count > 10
+    monkeypatch.setenv("CODRL_MJ_CACHE", str(tmp_path / "file" / "inside"))
+    assert compiled_by(lambda: function(5.0)(1.0)) == (1, 5.0)
 
 
 def function(factor):
