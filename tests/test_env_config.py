@@ -275,7 +275,7 @@ def test_what_is_no_configuration_is_named(mapping, message):
 
 def _rendered(folder, *flags):
     """The currents of an episode that the command line films."""
-    arguments = ["render", "pendulum", "--width", "160", "--height", "120", "--env.max-episode-steps", "12"]
+    arguments = ["render", "pendulum", "--width", "160", "--height", "120", "--env.max-episode-steps", "3"]
     trajectory = folder / "episode.npz"
     assert main([*arguments, "--out", str(folder / "frames"), "--trajectory", str(trajectory), *flags]) == 0
     with np.load(trajectory) as episode:
