@@ -20,6 +20,7 @@ class RenderingUnavailableError(RuntimeError):
 
 
 _open: "weakref.WeakSet[OffscreenRenderer]" = weakref.WeakSet()
+_fatal: list[mujoco.FatalError] = []  # why there is no OpenGL in this process: another attempt would end it
 
 
 @functools.cache
@@ -109,8 +110,11 @@ class OffscreenRenderer:
             if egl is not None and egl.EGL_DISPLAY:  # MuJoCo makes it once, but SDL (pygame) ends it with its window
                 egl.EGL.eglInitialize(egl.EGL_DISPLAY, None, None)
             limits.offwidth, limits.offheight = self._size
+            if _fatal:
+                raise _fatal[0]
             return mujoco.Renderer(self._model, height=height, width=width)
         except Exception as error:  # each backend raises its own kind, most of them not exported
+            _fatal.extend([error] if isinstance(error, mujoco.FatalError) else [])
             backend = os.environ.get("MUJOCO_GL", "not set")
             raise RenderingUnavailableError(
                 f"cannot make an OpenGL context (MUJOCO_GL is {backend}): {type(error).__name__}: {error}. Without a "

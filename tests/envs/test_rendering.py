@@ -211,10 +211,11 @@ import gymnasium, codrl_mj
 from codrl_mj.physics.offscreen import RenderingUnavailableError
 env = gymnasium.make("codrl_mj/CartPole-v0", actuator="ideal", render_mode="rgb_array", width=64, height=48)
 env.reset(seed=0)
-try:
-    env.render()
-except RenderingUnavailableError as error:
-    print(error)
+for _ in range(2):
+    try:
+        env.render()
+    except RenderingUnavailableError as error:
+        print(error)
 print(env.step(1)[1])
 """
 
@@ -226,7 +227,7 @@ def test_where_there_can_be_no_image_the_error_says_what_to_do():
     }
     line = [sys.executable, "-c", PROGRAM]
     done = subprocess.run(line, env=without, capture_output=True, text=True, timeout=120, check=False)
-    assert "MUJOCO_GL is not set" in done.stdout
+    assert done.stdout.count("MUJOCO_GL is not set") == 2  # MuJoCo's own second attempt ends the process
     assert "set MUJOCO_GL=egl before mujoco is first imported" in done.stdout
     assert "apt-get install libegl1" in done.stdout
     assert done.stdout.endswith("1.0\n")  # the environment itself goes on
