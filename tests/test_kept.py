@@ -114,8 +114,8 @@ print([made(float(word))(1.0) for word in sys.argv[1:]])
 
 def test_functions_of_one_name_that_two_processes_compiled_stay_apart(place):
     """Each is the first of its process, so that a count would call them alike."""
-    for factor in (2.0, 5.0):
-        printed(place, TWINS, factor)
+    with ThreadPoolExecutor(2) as both:  # at once
+        both.map(lambda factor: printed(place, TWINS, factor), (2.0, 5.0))
     assert len([*place.iterdir()]) == 2
     assert printed(place, TWINS, 5.0, 3.0, 2.0).strip() == "[30.0, 18.0, 12.0]"
 
