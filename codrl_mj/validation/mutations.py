@@ -98,7 +98,7 @@ _HIDDEN = np.zeros(64)
 def _wrong_callbacks(edits: tuple[Edit, ...]) -> Callable[[], Any]:
     wrong = edited(control, edits)
     wrong.HIDDEN = _HIDDEN.ctypes.data  # type: ignore[attr-defined]
-    return wrong.compiled
+    return wrong.compiled_motors
 
 
 @contextlib.contextmanager

@@ -328,6 +328,8 @@ def test_the_published_page_is_what_the_published_rows_say(tmp_path):
     for name in ("runs.csv", "totals.json"):
         (tmp_path / FOLDER).mkdir(exist_ok=True)
         shutil.copy(RESULTS / FOLDER / name, tmp_path / FOLDER)
+    (tmp_path / "insurance").mkdir()  # what advice knows, too
+    shutil.copy(RESULTS / "insurance" / "runs.csv", tmp_path / "insurance")
     shutil.copy(RESULTS / "actuators_conclusions.md", tmp_path)
     files, failures = ActuatorStudy(root=tmp_path / "none", out=tmp_path).write()
     assert not failures
