@@ -114,7 +114,8 @@ class OffscreenRenderer:
                 raise _fatal[0]
             return mujoco.Renderer(self._model, height=height, width=width)
         except Exception as error:  # each backend raises its own kind, most of them not exported
-            _fatal.extend([error] if isinstance(error, mujoco.FatalError) else [])
+            if not _fatal and isinstance(error, mujoco.FatalError) and "platform library" in str(error):
+                _fatal.append(error)
             backend = os.environ.get("MUJOCO_GL", "not set")
             raise RenderingUnavailableError(
                 f"cannot make an OpenGL context (MUJOCO_GL is {backend}): {type(error).__name__}: {error}. Without a "

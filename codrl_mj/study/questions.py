@@ -113,9 +113,7 @@ class Verdict(NamedTuple):
     effect: Interval
     """Mean difference of scores [shares of the span], with its 95 % interval; NaN without any contrast."""
     p: float
-    """Of the test, uncorrected: of no difference, or, of `equivalent`, of one as large as the margin.
-
-    NaN: not judged."""
+    """Uncorrected: of no difference, or, of `equivalent`, of one as large as the margin; NaN if it is not judged."""
     corrected: float
     """The same after the correction for the number of questions that are judged together."""
 
@@ -197,4 +195,4 @@ def judge(scores: Scores, questions: Sequence[Question], primary: bool = False, 
         p = equivalence_p(strata, MARGIN) if question.kind == "equivalent" else permutation_p(strata)
         tested.append((question, fewest, counts, effect(strata), p if min(fewest) >= least else np.nan))
     corrected = (holm if primary else false_discovery)([1.0 if np.isnan(p) else p for *_, p in tested])
-    return [Verdict(*one, float(p) if one[-1] <= 1.0 else np.nan) for one, p in zip(tested, corrected, strict=True)]
+    return [Verdict(*one, np.nan if np.isnan(one[-1]) else float(p)) for one, p in zip(tested, corrected, strict=True)]
