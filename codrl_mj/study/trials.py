@@ -200,7 +200,8 @@ class Grid:
             workers: what computes it.
             accept_changes: continue begun trainings even if code or packages have changed since.
             on_cell: called with `training` or `test` when one is finished or has failed.
-            on_seed: called when all of a seed's are, unless nothing came of it.
+            on_seed: called when all of a seed's are, or of the fewest seeds that occupy every core, unless nothing
+                came of it.
 
         Raises:
             ValueError: Ray is asked for and not installed.
@@ -208,15 +209,21 @@ class Grid:
         """
         cells, folders, tests = self.cells, self.folders, self._untested()
         needed = {test.run for test in tests.values()}
+        left = [cell[1] for cell, folder in folders.items() if folder in needed and not finished(folder)]
+        rounds: list[list[int]] = [[]]
         for seed in sorted({seed for _, seed in cells}):  # trained and tested, so that a part says something of all
-            runs = {folders[cell]: config for cell, config in cells.items() if cell[1] == seed}
+            rounds[-1].append(seed)
+            if sum(map(left.count, rounds[-1])) >= workers.cores:
+                rounds.append([])
+        for seeds in filter(None, rounds):
+            runs = {folders[cell]: config for cell, config in cells.items() if cell[1] in seeds}
             for _ in set(runs) - needed:
                 on_cell("training")
             waiting = {folder: config for folder, config in runs.items() if folder in needed}
             train_runs(
                 waiting, workers, lambda _: on_cell("training"), accept_changes=accept_changes, tensorboard=False
             )
-            ready = {called(*key): test for key, test in tests.items() if key[1] == seed and finished(test.run)}
+            ready = {called(*key): test for key, test in tests.items() if key[1] in seeds and finished(test.run)}
             deploy_cells(ready, workers, lambda _: on_cell("test"))
             if any(map(finished, waiting)) or any(test.record.is_file() for test in ready.values()):
                 on_seed()

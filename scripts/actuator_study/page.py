@@ -148,11 +148,11 @@ measure.
 *friction* what brakes at any command. *Missing voltage* is a share of [what the task needs](plan.md#doses), all the
 time, under a loop with anti-windup: without it 35 % ruins four of 20 policies on Furuta. Each was tested alone.
 
-{markdown_table(["task: policy step, largest force", *_THINGS.values()], rows)}
+{markdown_table(["task: policy step, largest force", *THINGS.values()], rows)}
 {_figure(drawn, "losses", "What ideal-trained policies lose, by task and dose")}"""
 
 
-_THINGS: Mapping[str, str] = {
+THINGS: Mapping[str, str] = {
     "lag": "lag",
     "weakness": "missing force",
     "supply": "missing voltage",
@@ -179,7 +179,8 @@ def _short(value: float) -> str:
     return f"{float(f'{value:.2g}'):g}"
 
 
-def _dose(task: str, axis: str, dose: float) -> str:
+def dose_text(task: str, axis: str, dose: float) -> str:
+    """A dose in the units of a task."""
     scale, unit = _scale(task, axis)
     return f"{_short(scale * dose)} {unit}"
 
@@ -188,14 +189,15 @@ def _insured(drawn: Mapping[str, Path]) -> str:
     if "insured" not in drawn:
         return ""
     rows = [
-        [TITLES[task], *(_dose(task, name, axis.trained[task]) for name, axis in AXES.items())] for task in arms.TRAINED
+        [TITLES[task], *(dose_text(task, name, axis.trained[task]) for name, axis in AXES.items())]
+        for task in arms.TRAINED
     ]
     return f"""## Train through it, or randomise?
 
 Twenty policies a column, tested at one dose of each thing, which was chosen to hurt. Nothing is known of larger ones:
 measure.
 
-{markdown_table(["trained and tested at", *_THINGS.values()], rows)}
+{markdown_table(["trained and tested at", *THINGS.values()], rows)}
 *Random actuators* draws strength, lag, delay and pushes, which three of the six things are of. It reaches the lag that
 is tested on Pendulum, and 0.8 of its two steps of delay; on Furuta four times the lag and 1.6 times the delay.
 

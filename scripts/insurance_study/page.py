@@ -9,11 +9,21 @@ import numpy as np
 
 from actuator_study.arms import DRAWN
 from actuator_study.figures import dots
-from actuator_study.page import HYPOTHESES, TRIALS, decided_table, effect_text, p_text, write_tables
+from actuator_study.page import (
+    HYPOTHESES,
+    THINGS,
+    TRIALS,
+    decided_table,
+    dose_text,
+    effect_text,
+    p_text,
+    write_tables,
+)
 from codrl_mj.study.doses import AXES, FLOORS, at_home, ideal
 from codrl_mj.study.pages import COLOURS, TITLES, conclusions, legend, markdown_table, save, write_csv, write_page
 from codrl_mj.study.questions import MARGIN, Scores, Verdict, judge
 from codrl_mj.study.trials import FAILED, RUNS, Collected, Trial
+from codrl_mj.tasks import find_task
 from insurance_study.learning import LEARNING, learning_rows, still_rising
 from insurance_study.questions import DOSES, KINDS, REMEMBERED, TASKS, home, primary, reach, secondary, under
 
@@ -22,8 +32,8 @@ PAGE, FOLDER, FIGURE = "insurance.md", "insurance", "insured.svg"
 SAYS: Mapping[str, str] = {
     "ideal": "ideal forces",
     "matched": "the very dose",
-    "drawn": "doses of the very thing, drawn (four of them)",
-    "remembering": "the very dose, seeing its last commands (lag, delay)",
+    "drawn": "the very thing, drawn (without delay, friction)",
+    "remembering": "the very dose, seeing its last commands (lag, delay alone)",
     "random": "random actuators",
     "half": "random actuators, half the reach",
     "double": "random actuators, twice the reach",
@@ -36,6 +46,10 @@ PLANNED = 20
 _AXES: Mapping[str, Sequence[str]] = {"drawn": DRAWN, "remembering": REMEMBERED}
 
 
+_SHOWN = ("ideal", "matched", "drawn", "random", "double")
+"""Kinds that stand beside each other for every thing."""
+
+
 class Found(NamedTuple):
     """What policies of a kind came to in some tests, a number for each policy and test."""
 
@@ -45,11 +59,16 @@ class Found(NamedTuple):
     @property
     def text(self) -> str:
         """Mean, median, how many fail, success."""
-        if not self.scores.size:
-            return "–"
+        return self._told(f", {np.median(self.scores):z.2f}", f" of {self.scores.size}") if self.scores.size else "–"
+
+    @property
+    def short(self) -> str:
+        """Mean, how many fail, success."""
+        return self._told("", "") if self.scores.size else "–"
+
+    def _told(self, median: str, tests: str) -> str:
         failed, success = np.sum(self.scores < 1.0 - FAILED), np.mean(self.success)
-        mean, median = np.mean(self.scores), np.median(self.scores)
-        return f"{mean:z.2f}, {median:z.2f}; {failed} of {self.scores.size}; {100 * success:.0f} %"
+        return f"{np.mean(self.scores):z.2f}{median}; {failed}{tests}; {100 * success:.0f} %"
 
 
 def found(collected: Collected, scores: Scores, trials: Iterable[Trial]) -> Found:
@@ -79,14 +98,44 @@ def write(collected: Collected, out: Path) -> list[Path]:
     parts = [
         "# What insures a policy?\n",
         conclusions(out / PAGE),
+        _things(collected, scores),
         _kinds(collected, scores),
         f"![Scores by what policies were trained on]({FOLDER}/{FIGURE})\n",
-        _verdicts(first),
+        _verdicts(first, scores),
         _secondary(others),
         _method(collected, *still_rising(learned, spans, MARGIN)),
     ]
     write_page(out / PAGE, parts)
     return [out / PAGE, folder / FIGURE, folder / LEARNING, *tables]
+
+
+def _things(collected: Collected, scores: Scores) -> str:
+    """A row for every task and thing: what policies of the kinds that an owner chooses between come to there."""
+    rows = []
+    for task in TASKS:
+        for axis, thing in THINGS.items():
+            kinds = {kind: KINDS[kind](task, axis) for kind in _SHOWN if axis in _AXES.get(kind, AXES)}
+            there = {kind: found(collected, scores, [under(trained, axis)]) for kind, trained in kinds.items()}
+            best = max((np.mean(one.scores) for one in there.values() if one.scores.size), default=np.nan)
+            cells = [f"{TITLES[task]}, {1000 * find_task(task).step_duration:g} ms"]
+            cells.append(f"{thing} {dose_text(task, axis, DOSES[task][axis])}")
+            far = {"lag": "", "delay": "", "weakness": "±"}  # what random actuators draw
+            cells.append(far[axis] + dose_text(task, axis, reach(task, axis)) if axis in far else "–")
+            for kind in _SHOWN:
+                text = there[kind].short if kind in there else "–"
+                cells.append(f"**{text}**" if kind in there and np.mean(there[kind].scores) == best else text)
+            rows.append(cells)
+    header = ["task, policy step", "tested on", "reach", *(SAYS[kind].partition(" (")[0] for kind in _SHOWN)]
+    text = f"""Look for what is most like yours. Mean score, 1 being ideal-trained policies on ideal forces and 0 random
+actions; how many of {PLANNED} policies fail, by losing more than {FAILED:g}; how often episodes succeed. The highest
+mean is bold. *Random actuators* draw strength, lag and delay for every episode, and push; they reach as far as the
+third column says. *The very dose* is what it is tested on; *drawn* is that one thing alone, from none to twice as much.
+Forces are shares of the largest one, or N·m; voltages are shares of [what the task needs](plan.md#doses)."""
+    return f"""## What each kind of training comes to
+
+{textwrap.fill(" ".join(text.split()), 120, break_long_words=False)}
+
+{markdown_table(header, rows)}"""
 
 
 def _kinds(collected: Collected, scores: Scores) -> str:
@@ -102,10 +151,10 @@ def _kinds(collected: Collected, scores: Scores) -> str:
             cells.append(found(collected, scores, there).text)
         rows.append(cells)
     header = ["trained on", *(text for task in TASKS for text in (f"{TITLES[task]}: ideal", "six doses"))]
-    return f"""## What each kind of training comes to
+    return f"""## Every kind of training, on the mean
 
-Mean score on ideal forces. Then on the six doses: mean, median; how many tests failed, a policy's on a dose each (it
-lost more than {FAILED:g}); success.
+Mean score on ideal forces. Then on the six doses above, or those of them that are named: mean, median; how many tests
+failed, a policy's on a dose each; success. The six hide much: compare rows above first.
 
 {markdown_table(header, rows)}"""
 
@@ -124,7 +173,8 @@ def draw(path: Path, scores: Scores) -> None:
                     values = list(scores.of(under(KINDS[kind](task, axis), axis)).values())
                     if values:
                         dots(panel, place + 0.14 * (number - 2.5), values, COLOURS[shown[kind]], SAYS[kind])
-        panel.set_xticks(range(len(AXES)), [f"{one.title} {DOSES[task][name]:g}" for name, one in AXES.items()])
+        doses = [f"{thing} {dose_text(task, name, DOSES[task][name])}" for name, thing in THINGS.items()]
+        panel.set_xticks(range(len(AXES)), doses)
         panel.set(title=TITLES[task], ylabel="score [share of the span]")
         panel.grid(axis="y", color="0.9")
         panel.set_axisbelow(True)
@@ -132,21 +182,34 @@ def draw(path: Path, scores: Scores) -> None:
     save(figure, path)
 
 
-def _verdicts(verdicts: Sequence[Verdict]) -> str:
+def _verdicts(verdicts: Sequence[Verdict], scores: Scores) -> str:
     rows = []
     for verdict in verdicts:
         says = verdict.question.statement
         tested, wanted = verdict.strata
         if tested < wanted:
             says += f" ({tested} of {wanted} comparisons have runs)"
-        judged = [verdict.outcome, effect_text(verdict), p_text(verdict.corrected)]
+        judged = [verdict.outcome, effect_text(verdict), _by_task(verdict, scores), p_text(verdict.corrected)]
         rows.append([verdict.question.name, *judged, str(min(verdict.runs)), says])
-    header = ["", "holds", "effect [95 %]", "corrected p", "policies", "says"]
+    header = ["", "holds", "effect [95 %]", "by task", "corrected p", "policies", "says"]
     return f"""## The ten hypotheses
 
-Nothing is judged before there are {PLANNED} policies of every kind.
+Nothing is judged before there are {PLANNED} policies of every kind. Tasks: {_TASKS}.
 
 {markdown_table(header, rows)}"""
+
+
+_TASKS = ", ".join(TITLES[task] for task in TASKS)
+
+
+def _by_task(verdict: Verdict, scores: Scores) -> str:
+    """The mean effect on each task, of the contrasts that have runs."""
+    texts = []
+    for task in TASKS:
+        pairs = [pair for pair in verdict.question.contrasts if pair.one.arm.task == task and scores.stratum([pair])]
+        stratum = scores.stratum(pairs) if pairs else None
+        texts.append("–" if stratum is None else f"{np.mean(stratum.one) - np.mean(stratum.other):+.2f}")
+    return ", ".join(texts)
 
 
 def _secondary(verdicts: Sequence[Verdict]) -> str:
@@ -161,14 +224,10 @@ def _secondary(verdicts: Sequence[Verdict]) -> str:
 def _method(collected: Collected, rising: Sequence[str], count: int) -> str:
     totals, wanted = collected.totals, len(collected.grid.cells)
     done, tests = sum(map(len, collected.evaluations.values())), len(collected.grid.deployments)
-    reaches = "; ".join(
-        f"{TITLES[task]} {', '.join(f'{axis} {reach(task, axis):g}' for axis in ('lag', 'weakness', 'delay'))}"
-        for task in TASKS
-    )
     text = f"""By [the plan](insurance_plan.md), scores and tests as in [what an actuator costs](actuators.md). {done}
-of {tests} tests of {wanted} policies are there ({totals.seconds / 3600:.1f} hours of one core at hand). Random
-actuators reach up to (policy steps, share, policy steps): {reaches}. `scripts/study_insurance.py`
-([how](../studies.md)) writes this page, [every policy]({FOLDER}/{RUNS}), [trials]({FOLDER}/{TRIALS}) with medians and
+of {tests} tests of {wanted} policies are there ({totals.seconds / 3600:.1f} hours of one core at hand).
+`scripts/study_insurance.py` ([how](../studies.md)) writes this page, [every
+policy]({FOLDER}/{RUNS}), [trials]({FOLDER}/{TRIALS}) with medians and
 failures, [every comparison]({FOLDER}/{HYPOTHESES}), and [what was returned in tenths of the
 training]({FOLDER}/{LEARNING}). Of {count} kinds of training {len(rising)} had not levelled off
 ({"; ".join(rising) or "none"}): in their last tenth they return more than in the eighth, on the mean by more than

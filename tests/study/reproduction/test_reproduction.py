@@ -20,6 +20,7 @@ from codrl_mj.evaluation import evaluate
 from codrl_mj.evaluation.episodes import Episode
 from codrl_mj.physics import trace_names
 from codrl_mj.runs.policies import load_policy
+from codrl_mj.study import trials
 from codrl_mj.study.parallel import Workers
 from codrl_mj.study.program import main
 from codrl_mj.study.trials import TEST_SECONDS
@@ -288,6 +289,18 @@ def test_all_arms_first_seeds_are_trained_first_and_the_longest_before_the_other
     seconds = {arm.name: arm.seconds for arm in ARMS}
     first = [seconds[name] for name, seed in order if seed == 0]
     assert first == sorted(first, reverse=True)
+
+
+def test_as_many_seeds_are_trained_at_once_as_occupy_every_core(tmp_path, monkeypatch):
+    at_once = []
+    monkeypatch.setattr(
+        trials, "train_runs", lambda runs, *_, **__: at_once.append(sorted(c.seed for c in runs.values()))
+    )
+    plan = Reproduction(root=tmp_path, out=tmp_path, tasks=("pendulum",), settings=("paper",), seeds=5)
+    for jobs in (1, 2, 3):
+        plan.every.compute(Workers(jobs=jobs))
+    one_each, three = [[seed, seed] for seed in range(5)], [[0, 0, 1, 1], [2, 2, 3, 3], [4, 4]]
+    assert at_once == [*one_each, *one_each, *three]
 
 
 @pytest.mark.parametrize(
