@@ -116,14 +116,14 @@ def _things(collected: Collected, scores: Scores) -> str:
         for axis, thing in THINGS.items():
             kinds = {kind: KINDS[kind](task, axis) for kind in _SHOWN if axis in _AXES.get(kind, AXES)}
             there = {kind: found(collected, scores, [under(trained, axis)]) for kind, trained in kinds.items()}
-            best = max((np.mean(one.scores) for one in there.values() if one.scores.size), default=np.nan)
+            means = {kind: np.mean(one.scores) for kind, one in there.items() if one.scores.size}
             cells = [f"{TITLES[task]}, {1000 * find_task(task).step_duration:g} ms"]
             cells.append(f"{thing} {dose_text(task, axis, DOSES[task][axis])}")
             far = {"lag": "", "delay": "", "weakness": "±"}  # what random actuators draw
             cells.append(far[axis] + dose_text(task, axis, reach(task, axis)) if axis in far else "–")
             for kind in _SHOWN:
                 text = there[kind].short if kind in there else "–"
-                cells.append(f"**{text}**" if kind in there and np.mean(there[kind].scores) == best else text)
+                cells.append(f"**{text}**" if kind in means and means[kind] == max(means.values()) else text)
             rows.append(cells)
     header = ["task, policy step", "tested on", "reach", *(SAYS[kind].partition(" (")[0] for kind in _SHOWN)]
     text = f"""Look for what is most like yours. Mean score, 1 being ideal-trained policies on ideal forces and 0 random
